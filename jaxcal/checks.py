@@ -39,6 +39,8 @@ def axis_letter(index: int, count: int) -> str:
 
 
 def numbers(name: str, values: ArrayLike, *, finite: bool = True) -> Array:
+    if np.ma.is_masked(values):
+        raise ValueError(f"{name} must not be masked; leave those rows out")
     try:
         given = np.asarray(values)
         if given.dtype.kind not in "biufO":
@@ -46,7 +48,8 @@ def numbers(name: str, values: ArrayLike, *, finite: bool = True) -> Array:
         array = given.astype(np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(
-            f"{name} must be an array of numbers, got {type(values).__name__}"
+            f"{name} must be an array of numbers, got "
+            f"{getattr(values, 'dtype', type(values).__name__)}"
         ) from error
     if finite:
         require_finite(name, array)
@@ -127,8 +130,9 @@ def axis_names(
     if names is None:
         return tuple(f"{letter}_{axis_letter(i, count)}" for i in range(count))
     given = () if isinstance(names, str) else tuple(names)
-    if len(given) != count or not all(isinstance(name, str) and name for name in given):
-        raise ValueError(f"{argument} must hold {count} names, got {names!r}")
+    texts = all(isinstance(name, str) and name for name in given)
+    if len(given) != count or not texts or len(set(given)) < count:
+        raise ValueError(f"{argument} must hold {count} different names, got {names!r}")
     return given
 
 

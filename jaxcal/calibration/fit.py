@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers
+from jaxcal.checks import array_of, numbers
 from jaxcal.information.singular import depends
 from jaxcal.models import Affine, Model, Prior, SerialChain, identifiability
 from jaxcal.models.identifiability import Identifiability
@@ -283,7 +283,7 @@ class Fit:
 
     def _quantile(self, confidence: float) -> float:
         """Half-width of an interval in standard errors."""
-        if not 0.0 < numbers("confidence", confidence) < 1.0:
+        if not 0.0 < array_of("confidence", confidence) < 1.0:
             raise ValueError(f"confidence must be in (0, 1), got {confidence}")
         from scipy import special  # loads in half the time of scipy.stats
 

@@ -67,7 +67,7 @@ class ArmOptions:
 
     def commands(self, arm: SerialChain, table: Table, inputs: Sequence[str]) -> Array:
         """(N, n) the columns of joints and sensor, in degrees."""
-        commands = table.columns(inputs).copy()
+        commands = table.columns(inputs)
         if self.radians:
             turning = np.flatnonzero(np.array(arm.command_units) == "deg")
             commands[:, turning] = np.degrees(commands[:, turning])
@@ -121,6 +121,8 @@ def identify(
         known, names = table.outputs(outputs), table.inputs(inputs)
         if not inputs:
             names = tuple(n for n in names if n not in (*known, weights))
+        if both := sorted({*names} & {*known}):
+            raise ValueError(f"--inputs and --outputs must differ, both hold {both[0]}")
         commands, measured = table.columns(names), table.columns(known)
         machine = read_model(model)
     calibration = identified(

@@ -53,7 +53,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run one command.
 
     Returns:
-        The exit code: 0, or 2 where something given was wrong.
+        The exit code: 0, 2 where something given was wrong, 130 after Ctrl-C.
     """
     given = sys.argv[1:] if argv is None else argv
     if given and given[0] in _WHOLE:
@@ -75,6 +75,9 @@ def main(argv: list[str] | None = None) -> int:
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of a pipe, such as head, has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except KeyboardInterrupt:
+        print(f"jaxcal {arguments.command}: interrupted", file=sys.stderr)
+        return 130
     except (ValueError, OSError, MissingExtraError) as error:
         return refused(f"jaxcal {arguments.command}", error)
     finally:

@@ -46,7 +46,7 @@ class Asked:
         model, mask = read_model(self.model), table.available()
         names = getattr(model, "inputs", ()) if self.columns is None else ()
         names = tuple(names) or table.inputs(self.columns)
-        candidates = table.candidates(names)
+        candidates = table.columns(names, mask)
         if self.outputs is not None:
             if model is not None:
                 rule = "must be left out with --model, which has them"

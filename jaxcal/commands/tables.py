@@ -45,12 +45,14 @@ class Table:
     def __len__(self) -> int:
         return len(self.values)
 
-    def columns(self, wanted: Sequence[str], available: Any = True) -> Array:
+    def columns(
+        self, wanted: Sequence[str], used: NDArray[np.bool_] | None = None
+    ) -> Array:
         """(N, len(wanted)) the named columns, in that order.
 
         Raises:
-            ValueError: there is none of that name, or a cell of a row that is
-                ``available``, (N,), is no finite number.
+            ValueError: there is no such column, or a cell of a row that is ``used``
+                (N,), all when not given, is empty, NaN or infinite.
         """
         for name in wanted:
             if name in self.labels:
@@ -64,19 +66,14 @@ class Table:
                     f"{self.source}: there is no column {name!r}; columns: {known}"
                 )
         values = self.values[:, [self.names.index(name) for name in wanted]]
-        bad = ~np.isfinite(values) & np.reshape(available, (-1, 1))
-        for row, place in np.argwhere(bad):
+        bad = ~np.isfinite(values)
+        for row, place in np.argwhere(bad if used is None else bad & used[:, None]):
             raise ValueError(
                 f"{self.source}: line {self.lines[row]}, column {wanted[place]!r} must "
                 f"hold a number, got {values[row, place]} or an empty cell; fill it or "
                 "leave the row out"
             )
         return values
-
-    def candidates(self, wanted: Sequence[str]) -> Array:
-        """(N, len(wanted)) the named columns; rows not available may have gaps."""
-        mask = self.available()
-        return self.columns(wanted, True if mask is None else mask)
 
     def inputs(self, chosen: str | None) -> tuple[str, ...]:
         """Columns of commands: those chosen, else ``u_...``, else all but outputs."""

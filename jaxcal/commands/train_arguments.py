@@ -200,7 +200,8 @@ def candidates_of(path: str) -> GivenCandidates:
         values, available = dataset.candidates, dataset.available
     else:
         table = read_table(path)
-        values, mask = table.candidates(table.inputs(None))[None], table.available()
+        mask = table.available()
+        values = table.columns(table.inputs(None), mask)[None]
         available = None if mask is None else mask[None]
     used = values if available is None else values[available]
     used = used.reshape(-1, used.shape[-1])

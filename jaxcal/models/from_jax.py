@@ -50,8 +50,6 @@ class FromJax:
         p = self.num_parameters = len(self.nominal)
         given = tuple(f"t{i + 1}" for i in range(p)) if names is None else names
         self.names = axis_names("names", given, "t", p)
-        if len(set(self.names)) < p:
-            raise ValueError(f"names must differ, got {self.names}")
         self._num_inputs: int | None = None
         with needs("policy", "FromJax"):
             import jax  # noqa: F401  # refused here where it is not installed

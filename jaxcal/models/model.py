@@ -81,9 +81,10 @@ def require_model(model: Any) -> None:
     methods = ("predict", "jacobian", "command_jacobian", "default_prior")
     missing = [name for name in methods if not callable(getattr(model, name, None))]
     if missing or isinstance(model, type):
+        got = repr(model) if isinstance(model, type) else type(model).__name__
         raise ValueError(
             "model must be of jaxcal.models, or an object with the methods of "
-            f"jaxcal.models.Model, got {model!r}"
+            f"jaxcal.models.Model, got {got}"
             + (f" without {missing[0]}" if missing else "")
         )
 

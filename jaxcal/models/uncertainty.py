@@ -99,7 +99,8 @@ def _by_name(
                     f"{argument} must name parameters of the model "
                     f"({', '.join(names)}), got {name!r}"
                 )
-            result[names.index(name)] = value
+            number = array_of(f"{argument} of {name}", value, finite=False)
+            result[names.index(name)] = number
         return result
     return one_or_each(argument, values, len(names), " or a mapping from names").copy()
 

@@ -501,7 +501,7 @@ def broken(method: str, answer: Any) -> Any:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"model": 3}, "model must be of jaxcal.models, .* got 3 without predict"),
+        ({"model": 3}, "model must be of jaxcal.models, .* got int without predict"),
         (
             {"model": Affine(3, 2), "loss": "student"},
             r"commands must have shape \(N, 3\) for this mo",
@@ -524,6 +524,7 @@ def broken(method: str, answer: Any) -> Any:
             "model.jacobian must be finite, got inf by a, b.* for the command",
         ),
         ({"prior": 1.0}, r"prior must be a jaxcal.Prior\(std=...\), got float"),
+        ({"prior": Prior(1.0, {"a": "x"})}, "mean of the prior of a must be an array"),
         ({"prior": Prior({"zz": 1.0})}, "must name parameters of the model"),
         ({"noise": Noise(1.0), "noise_std": 1.0}, "give one of them"),
         ({"noise": Noise(np.ones((3, 2)))}, r"std of the noise must be .* \(3, 2\)"),
@@ -532,7 +533,7 @@ def broken(method: str, answer: Any) -> Any:
         ({"noise_std": 1.0, "common_noise": True}, "give one of them"),
         ({"noise": 0.1}, r"noise must be a jaxcal.Noise\(std=...\), got float"),
         ({"common_noise": "no"}, "common_noise must be True or False, got 'no'"),
-        ({"input_names": "ab"}, "input_names must hold 2 names, got 'ab'"),
+        ({"input_names": "ab"}, "input_names must hold 2 different names, got 'ab'"),
         ({"loss": "huber"}, "loss must be one of student, gaussian"),
         ({"weights": np.zeros(12)}, "weights must be positive for one"),
     ],

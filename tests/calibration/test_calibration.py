@@ -563,7 +563,7 @@ good = np.vstack([np.zeros(3), np.eye(3), np.ones(3)])
         ({"measured": good * np.nan}, r"measured must be finite, got nan at \(0, 0\)"),
         ({"commands": good + np.inf}, r"commands must be finite, got inf"),
         ({"commands": [["a"] * 3] * 5}, "commands must be an array of numbers"),
-        ({"commands": good + 1j}, "commands must be an array of numbers"),
+        ({"commands": good + 1j}, "commands must be an array of numbers, got complex"),
         ({"commands": [["1"] * 3] * 5}, "commands must be an array of numbers"),
         ({"commands": [[None] * 3] * 5}, r"commands must be (an array of|finite)"),
         ({"weights": [1, 1, 1, 1]}, r"weights must have shape \(5,\), got \(4,\)"),
@@ -574,8 +574,10 @@ good = np.vstack([np.zeros(3), np.eye(3), np.ones(3)])
         ({"noise_std": [1, 1]}, r"noise_std must be one number or \(3,\), got \(2,\)"),
         ({"noise_std": np.nan}, "noise_std must be finite"),
         ({"noise_std": 1.0, "common_noise": True}, "give one of them"),
-        ({"input_names": ["a", "b"]}, "input_names must hold 3 names"),
-        ({"output_names": ["a", "b", 3]}, "output_names must hold 3 names"),
+        ({"input_names": ["a", "b"]}, "input_names must hold 3 different names"),
+        ({"output_names": ["a", "b", 3]}, "output_names must hold 3 different names"),
+        ({"input_names": ["a", "b", "a"]}, "input_names must hold 3 different names"),
+        ({"measured": np.ma.masked_less(good, 1)}, "measured must not be masked"),
         ({"notes": {"x": np.eye(2)}}, "notes must be what JSON can hold"),
         ({"notes": {"x": float("nan")}}, "notes must be what JSON can hold"),
         ({"command_unit": 3}, "command_unit must be text, got 3"),
@@ -595,6 +597,8 @@ def test_bad_calls_are_named() -> None:
         found.command_for([np.nan, 0, 0])
     with pytest.raises(ValueError, match=r"confidence must be in \(0, 1\), got 95"):
         found.confidence_intervals(95)
+    with pytest.raises(ValueError, match=r"confidence must have shape \(\), got"):
+        found.confidence_intervals([0.9, 0.95])  # type: ignore[arg-type]  # bad
 
 
 # -- the file --------------------------------------------------------------------------

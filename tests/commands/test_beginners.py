@@ -83,6 +83,7 @@ CASES = [  # what was typed, what the line must hold
     ("score table.csv --subset 1,2,3,4", "--indices 1,2,3,4"),
     ("plan table.csv --accuracy 0.001 --noise 0.1", "best design found has a largest"),
     ("identify table.csv", "no column begins with y_", "--outputs"),
+    ("identify pairs.csv --inputs u_yaw,y_yaw", "must differ, both hold y_yaw"),
     ("identify unread.csv", "unread.csv: line 3, column 'y_a' must hold a number"),
     ("identify three.csv", "at least 4 postures", "got 3"),
     ("command calibration.json far.csv --limits=-20,20", "u_pitch = 457.9", "[-20, 20"),
@@ -139,6 +140,15 @@ def test_radians_are_named(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert main("select radians.csv -k 4 --model arm.urdf".split()) == 0
     assert "joints are in degrees" in capsys.readouterr().err
+
+
+def test_ctrl_c_is_told_in_one_line(monkeypatch, capsys):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("jaxcal.commands.questions.read_table", interrupt)
+    assert main(["select", "table.csv"]) == 130
+    assert capsys.readouterr().err == "jaxcal select: interrupted\n"
 
 
 def test_the_columns_of_an_arm_in_any_company(folder, monkeypatch, capsys):

@@ -128,8 +128,8 @@ def test_functions_that_are_no_model_are_refused(f, message):
     [
         ([[1.0]], None, r"nominal must have shape \(p,\)"),
         ([np.nan], None, "nominal must be finite"),
-        ([1.0, 2.0], ["a"], "names must hold 2 names"),
-        ([1.0, 2.0], ["a", "a"], "names must differ"),
+        ([1.0, 2.0], ["a"], "names must hold 2 different names"),
+        ([1.0, 2.0], ["a", "a"], "names must hold 2 different names"),
     ],
 )
 def test_parameters_that_do_not_fit_are_refused(nominal, names, message):

@@ -126,7 +126,11 @@ def test_a_data_frame_is_read_by_its_columns():
         (3, {}, "features must be a formula or a function, got 3"),
         (np.sin, {}, "inputs must be given with a function"),
         (lambda u: u[:, 0], {"inputs": 2}, r"must return \(1, r\) for commands"),
-        (lambda u: u, {"inputs": 2, "terms": ["a"]}, "terms must hold 2 names"),
+        (
+            lambda u: u,
+            {"inputs": 2, "terms": ["a"]},
+            "terms must hold 2 different names",
+        ),
     ],
 )
 def test_features_that_do_not_fit_are_refused(features, options, message):
