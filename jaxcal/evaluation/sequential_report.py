@@ -118,6 +118,7 @@ def figure(result: Result) -> Any:
         mean, error = np.array(values).T
         axes.errorbar(mean, y, xerr=1.96 * error, fmt="o", color=COLOURS[0], capsize=3)
         axes.set_yticks(y, names)
+        axes.set_ylim(-0.5, len(names) - 0.5)
     left.set_xlabel("information gained in a session (nats)")
     right.set_xlabel(f"less that of {result.reference}, in pairs (nats)")
     right.axvline(0.0, color=COLOURS[1], linestyle="--")
