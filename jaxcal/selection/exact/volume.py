@@ -102,8 +102,8 @@ def _climbed(vectors: Array) -> Indices:
     kernel = compiled.kernel("jaxcal.selection.exchange.kernel")
     q, none = vectors.shape[1], np.zeros(0, dtype=np.int64)
     blocks = np.ascontiguousarray(vectors[:, None])
-    nothing, unit = np.zeros((q, q)), np.eye(q)
-    climber = kernel.Climber(kernel.DET, blocks, nothing, unit, 1, none, q, 0)
+    nothing, unit, every = np.zeros((q, q)), np.eye(q), np.ones(len(blocks), np.uint8)
+    climber = kernel.Climber(kernel.DET, blocks, nothing, unit, every, 1, none, q, 0)
     chosen, phi = climber.climb(none, _SHARE, 1, math.inf)
     return np.asarray(climber.random_climbs(_STARTS, chosen, phi, math.inf)[0])
 

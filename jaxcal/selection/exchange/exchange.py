@@ -95,20 +95,12 @@ def default_restarts(problem: Problem) -> int:
 
 
 class Climbs:
-    """The available candidates of a problem as the compiled kernel takes them.
-
-    E is grown and climbed as A, but for ``swaps`` of 2.
-    """
+    """A problem as the compiled kernel takes it; E is grown and climbed as A."""
 
     def __init__(self, problem: Problem, seed: int, deadline: float | None) -> None:
         kernel = compiled.kernel("jaxcal.selection.exchange.kernel")
         self._required, self._deadline = problem.required, deadline
-        self._usable: Indices | None = None  # where not all are
-        blocks = problem.blocks
-        if np.count_nonzero(problem.available) < len(blocks):
-            self._usable = np.flatnonzero(problem.available)
-            blocks = blocks[self._usable]
-        criterion, (_, q, p) = problem.criterion, blocks.shape
+        criterion, (_, q, p) = problem.criterion, problem.blocks.shape
         kind, root = kernel.TRACE, criterion.root
         if criterion.name == "D":
             kind = kernel.DET
@@ -118,22 +110,14 @@ class Climbs:
         self.share = _SHARE * min(1.0, problem.k * q / p) ** 6
         self._climber = kernel.Climber(
             kind,
-            *map(np.ascontiguousarray, (blocks, problem.prior, root)),
+            *map(np.ascontiguousarray, (problem.blocks, problem.prior, root)),
+            problem.available.view(np.uint8),
             min(problem.max_replicates, problem.k),
-            self._inside(problem.required),
+            problem.required,
             problem.k,
             seed,
         )
-
-    def _inside(self, indices: Indices) -> Indices:
-        """Candidates as the kernel counts them."""
-        if self._usable is None:
-            return indices
-        return np.searchsorted(self._usable, indices)
-
-    def _outside(self, indices: Indices) -> Indices:
-        """Candidates of the kernel as the caller counts them."""
-        return indices if self._usable is None else self._usable[indices]
+        self.random_start = self._climber.random_start  # (k,), the required first
 
     def _seconds(self) -> float:
         """Left until the deadline."""
@@ -144,15 +128,10 @@ class Climbs:
     def climbed(
         self, start: Indices, share: float = 0.0, swaps: int = 1
     ) -> tuple[Indices, float]:
-        """``start`` completed and climbed, required first, and its phi (of 2: E)."""
-        chosen, phi = self._climber.climb(
-            self._inside(start), share, swaps, self._seconds()
-        )
-        return self._outside(chosen), phi
-
-    def random_start(self) -> Indices:
-        """(k,) another random selection, the required first."""
-        return self._outside(self._climber.random_start())
+        """``start`` completed and climbed, required first, and its phi; 2 climbs E."""
+        found: tuple[Indices, float]
+        found = self._climber.climb(start, share, swaps, self._seconds())
+        return found
 
     def best_of(self, restarts: int) -> tuple[Indices, float]:
         """The best local optimum from greedy selections and then random starts."""
@@ -166,10 +145,7 @@ class Climbs:
                 break
         more = max(restarts - len(shares), 0 if phi > -np.inf else _MENDING)
         if more:
-            best, phi = self._climber.random_climbs(
-                more, self._inside(best), phi, self._seconds()
-            )
-            best = self._outside(best)
+            best, phi = self._climber.random_climbs(more, best, phi, self._seconds())
         return best, phi
 
     def best_least(self, problem: Problem, restarts: int) -> tuple[Indices, float]:

@@ -17,7 +17,8 @@ cdef class Climber:
     cdef double* columns  # (groups, q, p, WIDE), zeros after the M
     cdef const double[:, ::1] prior  # (p, p)
     cdef const double[:, ::1] root  # C (s, p)
-    cdef Py_ssize_t cap  # how often each may be chosen
+    cdef const unsigned char[::1] usable  # (M,) which may be chosen
+    cdef Py_ssize_t cap, available  # how often each of them may be, and their number
     cdef Py_ssize_t[::1] counts  # (M,)
     cdef double* closed  # (groups WIDE,), inf where it may not be chosen once more
     cdef Py_ssize_t[::1] chosen  # (k,), the required first

@@ -197,13 +197,14 @@ class Climber:
         blocks: (M, q, p) whitened.
         prior: (p, p).
         root: C (s, p).
-        cap: how often each may be chosen.
+        usable: (M,) which may be chosen; blocks of others are zero.
+        cap: how often each of them may be.
         required: (r,) candidates that are chosen in any case.
         k: candidates to choose.
         seed: of the random starts.
     """
 
-    def __init__(self, kind, blocks, prior, root, cap, required, k, seed):
+    def __init__(self, kind, blocks, prior, root, usable, cap, required, k, seed):
         count: cython.Py_ssize_t = blocks.shape[0]
         q: cython.Py_ssize_t = blocks.shape[1]
         p: cython.Py_ssize_t = blocks.shape[2]
@@ -216,6 +217,7 @@ class Climber:
         self.size = q * q * WIDE
         self.rows = q == 1 and kind == DET
         self.blocks, self.prior, self.root = blocks, prior, root
+        self.usable, self.available = usable, np.count_nonzero(usable)
         self.cap, self.counts = cap, np.zeros(count, dtype=np.intp)
         self.chosen = np.zeros(k, dtype=np.intp)
         for r in range(len(required)):
@@ -323,12 +325,13 @@ class Climber:
         """Nothing is chosen."""
         for i in range(self.counts.shape[0]):
             self.counts[i] = 0
-            self.closed[i] = 0.0
+            self.closed[i] = 0.0 if self.usable[i] else INFINITY
 
     def _count(self, i, more):
         """Candidate i is chosen once more, or once less."""
         self.counts[i] += more
-        self.closed[i] = 0.0 if self.counts[i] < self.cap else INFINITY
+        is_open: cython.bint = self.usable[i] and self.counts[i] < self.cap
+        self.closed[i] = 0.0 if is_open else INFINITY
 
     def _draw(self, below):
         """A whole number in [0, below) from a xorshift generator."""
@@ -339,11 +342,13 @@ class Climber:
 
     def _random_start(self):
         """Fill ``chosen`` at random, distinct where there are enough candidates."""
-        most = 1 if self.k <= self.blocks.shape[0] else self.cap
+        distinct: cython.bint = self.k <= self.available
         self._clear()
         for c in range(self.k):
             i = self.chosen[c] if c < self.fixed else self._draw(self.blocks.shape[0])
-            while c >= self.fixed and self.counts[i] >= most:
+            while c >= self.fixed and (
+                self.closed[i] > 0.0 or (distinct and self.counts[i] > 0)
+            ):
                 i = self._draw(self.blocks.shape[0])
             self.chosen[c] = i
             self._count(i, 1)
@@ -361,7 +366,7 @@ class Climber:
     def _set_known(self, share, ridge):
         """Fill ``known``: prior, ``share`` of k mean candidates' information, ridge."""
         p = self.p
-        weight = share * self.k / self.blocks.shape[0]
+        weight = share * self.k / self.available
         for a in range(p):
             for b in range(p):
                 self.known[a * p + b] = (1.0 - weight) * self.prior[a, b]

@@ -23,8 +23,10 @@ __all__ = ["DECODINGS", "choose", "load_policy", "select_batch"]
 
 DECODINGS = ("greedy", "samples", "first", "exchange")
 
-Indices = NDArray[np.int64]
+_CELLS = 4_000_000  # pairs of candidates that JAX scores at once: bounds memory alone
+_LARGEST_CALL = 512  # sets
 
+Indices = NDArray[np.int64]
 
 # From problems of one M, n, k and number of required, decoding, num and seed to (B, k)
 # indices, the required first, then in the order of choice.
@@ -61,8 +63,61 @@ def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Network:
 
         return CompactNetwork(found.network, found.arrays)
     with needs("policy", f"checkpoint {path}, whose network is not compact,"):
-        from jaxcal.selection.policy.through_jax import JaxNetwork
-    return JaxNetwork(path if path.is_file() else path.parent)
+        return _through_jax(path if path.is_file() else path.parent)
+
+
+def _through_jax(path: pathlib.Path) -> Network:
+    """A network that reads the candidates' own coordinates, compiled for each shape."""
+    import jax
+
+    from jaxcal.learning.policies import decoding as decoders
+    from jaxcal.learning.training import checkpoint
+
+    policy = checkpoint.load(path)
+
+    def choose(
+        problems: Sequence[Problem], decoding: str, num: int, seed: int
+    ) -> Indices:
+        k, required = problems[0].k, len(problems[0].required)
+        m, tries = len(problems[0].available), 1 if decoding == "greedy" else num
+        # A power of two, filled up by repeating the last set: few shapes to compile.
+        most = max(1, min(_LARGEST_CALL, _CELLS // (m * m * tries)))
+        size = min(1 << (len(problems) - 1).bit_length(), 1 << (most.bit_length() - 1))
+        chosen = []
+        for begin in range(0, len(problems), size):
+            part = list(problems[begin : begin + size])
+            filled = part + part[-1:] * (size - len(part))
+            indices = decoders.choose(
+                policy.network,
+                policy.params,
+                np.stack([_in_unit_range(problem) for problem in filled]),
+                np.stack([problem.available for problem in filled]),
+                np.stack([problem.required for problem in filled]).astype(np.int32),
+                jax.random.fold_in(jax.random.key(seed), begin),
+                k=k,
+                num_required=required,
+                decoding=decoding,
+                num=tries,
+            )
+            chosen.append(np.asarray(indices, np.int64)[: len(part)])
+        return np.concatenate(chosen)
+
+    return choose
+
+
+def _in_unit_range(problem: Problem) -> NDArray[np.float32]:
+    """(M, n) candidates on [0, 1], on which such networks are trained.
+
+    Those of a set that lies in [0, 1] are left as they are; others are mapped axis by
+    axis, the least available one to 0 and the largest to 1. 0 where masked.
+    """
+    assert problem.candidates is not None  # blocks are refused before
+    usable = problem.candidates[problem.available]
+    low, high = usable.min(axis=0), usable.max(axis=0)
+    if low.min() >= 0.0 and high.max() <= 1.0:
+        low, high = np.zeros_like(low), np.ones_like(high)
+    scaled = (problem.candidates - low) / (high - low)
+    return np.where(problem.available[:, None], scaled, 0.0).astype(np.float32)
 
 
 def select_batch(
