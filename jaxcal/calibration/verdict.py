@@ -26,6 +26,7 @@ _MOVED = 3.0  # times the scatter of a socket's contacts: it was moved
 _SHUFFLES = 400
 _FEW = 4  # contacts: fewer that lie apart are outliers, not a socket that was moved
 _LOOSE = 7.0  # standard deviations: no scatter, a reading of something else
+_SPARSE = 12  # measurements: so few have no outlier that is scatter
 _TIP = 0.01  # of the arm's length between the tip as found and as described
 
 
@@ -100,7 +101,8 @@ def verdict(calibration: Fit) -> Verdict | None:
     exchanged = _exchanged(calibration, model)
     other_tip = _other_tip(calibration)
     reasons += exchanged + _far(calibration) + other_tip
-    loose = (calibration.distance[list(calibration.outliers)] > _LOOSE**2).any()
+    limit = _LOOSE if len(used) > _SPARSE else 0.0
+    loose = (calibration.distance[list(calibration.outliers)] > limit**2).any()
     return Verdict(
         explains=explains,
         helps=mean < nominal,

@@ -79,6 +79,17 @@ def test_rows_in_the_wrong_file_and_loose_contacts_are_named():
     assert any(why.startswith("measurement 20 is ") for why in verdict.reasons)
 
 
+def test_of_twelve_contacts_a_loose_one_cannot_be_scatter():
+    """The eleven others give little to tell it by: it is 5.6 deviations off."""
+    joints, sockets = contacts.load("kuka_14")["left_back"]
+    rows = [0, 1, 5, 10, 20, 29, 41, 42, 45, 49, 52, 61]
+    joints = joints[rows].copy()
+    assert _fit("kuka_14", joints, sockets[rows]).verdict.good
+    joints[5, 1] += 1.0
+    with pytest.warns(UserWarning, match="measurement 5 is 5"):
+        assert not _fit("kuka_14", joints, sockets[rows]).verdict.good
+
+
 def test_one_loose_contact_is_named_and_no_file_is_written(tmp_path, capsys):
     joints = PLACE[0].copy()
     joints[20, 3] += 0.3

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.models.sensors.sensor import BASE, Named, Placed, Reading, Tip
+from jaxcal.models.sensors.sensor import Placed, Reading, Tip
 
 __all__ = ["Distance"]
 
@@ -37,9 +37,6 @@ class Distance(Placed):
 
     def usual_noise(self, length: float) -> ArrayLike:
         return 1e-4 * length
-
-    def unseen(self, arm: Named) -> tuple[str, ...]:
-        return BASE
 
     def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
         which = self.of_rows(inputs)

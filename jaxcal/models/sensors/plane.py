@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.models.sensors.sensor import BASE, Named, Placed, Reading, Tip, across
+from jaxcal.models.sensors.sensor import Placed, Reading, Tip
 
 __all__ = ["Plane"]
 
@@ -59,13 +59,10 @@ class Plane(Placed):
     def usual_noise(self, length: float) -> ArrayLike:
         return 1e-4 * length
 
-    def unseen(self, arm: Named) -> tuple[str, ...]:
-        return BASE
-
     def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
         which, points = self.of_rows(inputs), tip.position
         normals = self._rows()[which, :3]
-        first, second = across(normals)
+        first, second = _across(normals)
         tilt1, tilt2, offset = own.reshape(-1, 3)[which].T
         leaning = (
             np.radians(tilt1)[:, None] * first + np.radians(tilt2)[:, None] * second
@@ -103,3 +100,11 @@ class Plane(Placed):
             normal = normal * (np.sign(normal[np.abs(normal).argmax()]) or 1.0)
             rows[i] = [*normal, normal @ middle]
         return dataclasses.replace(self, places=rows), None
+
+
+def _across(normals: Array) -> tuple[Array, Array]:
+    """Two unit vectors (..., 3) across unit vectors and each other."""
+    least = np.eye(3)[np.abs(normals).argmin(axis=-1)]
+    first = np.cross(normals, least)
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return first, np.cross(normals, first)

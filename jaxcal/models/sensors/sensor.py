@@ -20,7 +20,6 @@ __all__ = [
     "Reading",
     "Sensor",
     "Tip",
-    "across",
     "hats",
     "label",
 ]
@@ -226,6 +225,9 @@ class Placed(Sensor):
             return np.zeros(self.count * len(self.axes))
         return self.places.ravel()
 
+    def unseen(self, arm: Named) -> tuple[str, ...]:
+        return BASE
+
     def of_rows(self, inputs: Array) -> NDArray[np.int64]:
         """(N,) which one each row is of."""
         if self.count == 1:
@@ -245,14 +247,6 @@ def hats(vectors: Array) -> Array:
     matrix = np.zeros((*vectors.shape[:-1], 3, 3))
     matrix[..., [2, 0, 1], [1, 2, 0]] = vectors
     return matrix - np.matrix_transpose(matrix)
-
-
-def across(normals: Array) -> tuple[Array, Array]:
-    """Two unit vectors (..., 3) across unit vectors and each other."""
-    least = np.eye(3)[np.abs(normals).argmin(axis=-1)]
-    first = np.cross(normals, least)
-    first /= np.linalg.norm(first, axis=-1, keepdims=True)
-    return first, np.cross(normals, first)
 
 
 def label(what: str, column: Array, count: int) -> NDArray[np.int64]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers
-from jaxcal.models.sensors.sensor import BASE, Named, Placed, Reading, Tip, label
+from jaxcal.models.sensors.sensor import Placed, Reading, Tip, label
 
 __all__ = ["Socket"]
 
@@ -60,9 +60,6 @@ class Socket(Placed):
 
     def usual_noise(self, length: float) -> ArrayLike:
         return 2e-4 * length
-
-    def unseen(self, arm: Named) -> tuple[str, ...]:
-        return BASE
 
     def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
         which = self.of_rows(inputs)
