@@ -1,4 +1,4 @@
-"""Checks of what a caller hands over; each error names the argument and the value."""
+"""Checks of what a caller hands over, whose errors name argument and value; words."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
+    "aligned",
     "array_of",
     "axis_letter",
     "axis_names",
@@ -32,6 +33,13 @@ Array = NDArray[np.float64]
 
 def in_words(values: Array) -> str:
     return "(" + ", ".join(f"{value:.6g}" for value in np.atleast_1d(values)) + ")"
+
+
+def aligned(rows: Sequence[Sequence[str]], *, left: bool = False) -> list[str]:
+    """Rows of cells as lines, every column padded to one width."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    pad = str.ljust if left else str.rjust
+    return ["  ".join(map(pad, row, widths)).rstrip() for row in rows]
 
 
 def axis_letter(index: int, count: int) -> str:

@@ -16,7 +16,7 @@ from jaxcal.calibration.file import save, to_dict
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.inverse import command_for
 from jaxcal.calibration.verdict import verdict
-from jaxcal.checks import in_words
+from jaxcal.checks import aligned, in_words
 from jaxcal.models import Affine, Model, Noise, SerialChain
 
 __all__ = ["Calibration"]
@@ -72,7 +72,9 @@ class Calibration(Fit):
                 cells["from data"] = [f"{share:.0%}" for share in shares]
         if any(units := _units(self)):
             cells["unit"] = units
-        lines += _in_lines(cells)
+        table = [[name, *column] for name, column in cells.items()]
+        rows = [*zip(*table, strict=True)]
+        lines += [f"  {line}" for line in aligned(rows, left=True)]
         unit = f" {self.measured_unit}" if self.measured_unit else ""
         size = np.sqrt(np.mean(self.residuals**2, axis=0))
         lack = self.lack_of_fit()
@@ -196,13 +198,3 @@ def _units(fit: Fit) -> list[str]:
     slope = (fit.measured_unit or "1") + per if per else fit.measured_unit
     m = fit.num_outputs
     return [slope] * (m * fit.num_inputs) + [fit.measured_unit] * m
-
-
-def _in_lines(columns: dict[str, list[str]]) -> list[str]:
-    """A header and a line for each row, columns padded to the same width."""
-    widths = [max(map(len, [name, *column])) for name, column in columns.items()]
-    lines = []
-    for row in [list(columns), *zip(*columns.values(), strict=True)]:
-        padded = [f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)]
-        lines.append(("  " + "  ".join(padded)).rstrip())
-    return lines

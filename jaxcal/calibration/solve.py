@@ -50,22 +50,6 @@ class Task:
     student: bool
 
 
-@dataclasses.dataclass
-class Solution:
-    """Where a search stands."""
-
-    parameters: Array  # (P,)
-    commands: Array  # (N, n) as estimated; as given where they are exact
-    residuals: Array  # (N, q) measured less predicted at these commands
-    level: Array  # (q,) of the noise
-    weights: Array  # (N,) of the loss, 1 for least squares
-    distance: Array  # (N,) squared, of each measurement from the fit, in noise
-    deleted: Array  # (N,) the same from the fit without that measurement
-    left: int  # readings of a measurement less its unknown commands
-    freedom: Array  # (q,) residual degrees of freedom of each output
-    rows: Array  # (N, R, F) whitened derivatives, commands eliminated, no weights
-
-
 @functools.lru_cache
 def student_constants(q: int) -> tuple[float, float, float]:
     """Student's loss where the noise of q readings is normal.
@@ -108,7 +92,7 @@ def solve(
     if task.student and start is None:
         start = solve(dataclasses.replace(task, student=False), rough=True)
         start.weights = student_weight(start.deleted, start.left)
-    search = _Search(task, start, rough)
+    search = Solution(task, start, rough)
     evidence: list[float] = []
     for _ in range(_LIMIT):
         evidence.append(search.evidence)
@@ -122,7 +106,7 @@ def solve(
             creeps = gain < max(asked, 1e-3 * search.cost)
         slack = 100.0 if creeps else 1.0
         if search.settle(slack) and (done or creeps):
-            return search.solution()
+            return search.finish()
     raise ValueError(
         f"identify did not converge in {_LIMIT} iterations: begin nearer, with "
         "Prior(mean=...), narrow the prior, or fix parameters that the measurements "
@@ -134,8 +118,19 @@ def _times(matrices: Array, vectors: Array) -> Array:
     return np.asarray((matrices @ vectors[..., None])[..., 0])
 
 
-class _Search:
-    """The state of a search, and its two moves: step (parameters), settle (levels)."""
+class Solution:
+    """A search, its two moves step (parameters) and settle (levels), and its end."""
+
+    parameters: Array  # (P,)
+    commands: Array  # (N, n) as estimated; as given where they are exact
+    residuals: Array  # (N, q) measured less predicted at these commands
+    level: Array  # (q,) of the noise
+    weights: Array  # (N,) of the loss, 1 for least squares
+    distance: Array  # (N,) squared, of each measurement from the fit, in noise
+    deleted: Array  # (N,) the same from the fit without that measurement
+    left: int  # readings of a measurement less its unknown commands
+    freedom: Array  # (q,) residual degrees of freedom of each output
+    rows: Array  # (N, R, F) whitened derivatives, commands eliminated, no weights
 
     def __init__(self, task: Task, start: Solution | None, rough: bool) -> None:
         self.task = task
@@ -153,9 +148,11 @@ class _Search:
         self.floor = 1e-13 * largest or 1e-100
         self.freedom = np.zeros(q)
         self.shared = task.levels
-        self.theta = task.mean if start is None else start.parameters
+        self.parameters = task.mean if start is None else start.parameters
         self.commands = task.commands if start is None else start.commands
-        self.residuals = task.measured - predict(task.model, self.commands, self.theta)
+        self.residuals = task.measured - predict(
+            task.model, self.commands, self.parameters
+        )
         if start is None:
             self.weights, self.level = np.ones(count), np.ones(q)
             if not task.known:
@@ -168,15 +165,15 @@ class _Search:
     def _linearise(self) -> None:
         """Derivatives at the present parameters, whitened at level 1."""
         task = self.task
-        rows = derivative(task.model, self.commands, self.theta)
+        rows = derivative(task.model, self.commands, self.parameters)
         rows = rows[..., task.free]
         largest = np.abs(rows).max(axis=(0, 1))
         still = flat(largest, largest.max(initial=0.0))
-        self.known, self.more = facts(task.model, self.theta)
+        self.known, self.more = facts(task.model, self.parameters)
         self.by_theta = task.white @ np.where(still, 0.0, rows)
         if self.uncertain.any():
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
-            rows = derivative(task.model, self.commands, self.theta, inputs)
+            rows = derivative(task.model, self.commands, self.parameters, inputs)
             self.by_command = task.white @ rows[..., self.uncertain]
 
     def _distance(self, residuals: Array, commands: Array) -> Array:
@@ -188,7 +185,7 @@ class _Search:
     @property
     def cost(self) -> float:
         """Sum of squares of readings, commands and prior, weighted."""
-        return self._cost(self.residuals, self.theta, self.commands, self.known)
+        return self._cost(self.residuals, self.parameters, self.commands, self.known)
 
     @property
     def evidence(self) -> float:
@@ -241,7 +238,7 @@ class _Search:
         rows = np.concatenate([rows, np.diag(root), self.more[:, free]])
         scale = np.sqrt((rows**2).sum(axis=0))
         scale = np.where(scale > 0.0, scale, 1.0)
-        off = root * (self.task.mean - self.theta)[free]
+        off = root * (self.task.mean - self.parameters)[free]
         return (
             rows / scale,
             np.concatenate([(weight * right).ravel(), off, self.known]),
@@ -261,7 +258,7 @@ class _Search:
             gain = float(right @ right - rest @ rest)
             if gain <= self.least + 1e-13 * cost:
                 return True
-            theta = self.theta.copy()
+            theta = self.parameters.copy()
             theta[task.free] += step / scale
             commands = self._moved(step / scale)
             residuals = task.measured - predict(
@@ -271,7 +268,11 @@ class _Search:
             after = self._cost(residuals, theta, commands, known)
             ratio = (cost - after) / gain if np.isfinite(after) else -1.0
             if ratio > 1e-4:
-                self.theta, self.commands, self.residuals = theta, commands, residuals
+                self.parameters, self.commands, self.residuals = (
+                    theta,
+                    commands,
+                    residuals,
+                )
                 shrunk = self.damping * max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3)
                 self.damping, self.grow = max(shrunk, _LEAST_DAMPING), 2.0
                 self._linearise()
@@ -349,24 +350,17 @@ class _Search:
         none = (self.residuals == 0.0) & (self.by_theta == 0.0).all(axis=-1)
         return np.asarray(count - none.sum(axis=0) - used.sum(axis=0))
 
-    def solution(self) -> Solution:
+    def finish(self) -> Solution:
+        """Itself, with what is said of the measurements where it ended."""
         readings = self._leverage()
-        rows, right = self._reduce(0.0)
-        gap = np.eye(rows.shape[1]) - readings @ np.matrix_transpose(readings)
-        gap += 1e-9 * np.eye(rows.shape[1])
+        self.rows, right = self._reduce(0.0)
+        self.freedom = self._freedom(readings)
+        self.distance = self._distance(self.residuals, self.commands)
+        gap = np.eye(right.shape[1]) - readings @ np.matrix_transpose(readings)
+        gap += 1e-9 * np.eye(right.shape[1])
         deleted = np.linalg.solve(gap, right[..., None])[..., 0]
-        return Solution(
-            parameters=self.theta,
-            commands=self.commands,
-            residuals=self.residuals,
-            level=self.level,
-            weights=self.weights,
-            distance=self._distance(self.residuals, self.commands),
-            deleted=np.maximum((right * deleted).sum(axis=1), 0.0),
-            left=self.left,
-            freedom=self._freedom(readings),
-            rows=rows,
-        )
+        self.deleted = np.maximum((right * deleted).sum(axis=1), 0.0)
+        return self
 
 
 def _factor(rows: Array, right: Array, damping: float) -> tuple[Array, Array]:

@@ -1,9 +1,10 @@
-"""``jaxcal identify``, ``predict`` and ``command``: making a calibration, using it."""
+"""``jaxcal postures``, ``identify``, ``predict``, ``command``: calibrate a machine."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
+import pathlib
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from jaxcal.arguments import several
 from jaxcal.calibration import Calibration
 from jaxcal.calibration import identify as identified
+from jaxcal.checks import aligned
 from jaxcal.commands.questions import ModelPath, Numbers, read_model
 from jaxcal.commands.tables import (
     Output,
@@ -22,10 +24,12 @@ from jaxcal.commands.tables import (
     write_json,
     write_rows,
 )
+from jaxcal.extras import needs
 from jaxcal.models import SerialChain
 from jaxcal.models.sensors import SENSORS, Placed, Socket
+from jaxcal.selection import select
 
-__all__ = ["ArmOptions", "command", "identify", "predict"]
+__all__ = ["command", "identify", "postures", "predict"]
 
 Array = NDArray[np.float64]
 
@@ -72,6 +76,70 @@ class ArmOptions:
             turning = np.flatnonzero(np.array(arm.command_units) == "deg")
             commands[:, turning] = np.degrees(commands[:, turning])
         return commands
+
+
+def postures(
+    model: Annotated[str, "the arm's .urdf"],
+    *,
+    k: Annotated[int, "postures to measure in all", "K"],
+    of_arm: ArmOptions,
+    near: Annotated[
+        list[list[float]] | None,
+        "where a socket (x,y,z), a plane (normal, offset) or an anchor (x,y,z,zero) "
+        "is, roughly; for other sensors x,y,z,radius around the tip; once for each",
+        several(float, "numbers"),
+    ] = None,
+    measured: Annotated[
+        str | None,
+        "postures that were reached already: a table with columns named as the joints, "
+        "and the sensor's",
+        "FILE",
+    ] = None,
+    count: Annotated[int, "postures to choose from"] = 300,
+    seed: Annotated[int, "of these"] = 0,
+    picture: Annotated[
+        pathlib.Path | None, "draw the arm at each of them: .png, .pdf, .svg"
+    ] = None,
+    output: Output,
+) -> None:
+    """Choose the postures to measure, in an order of little travel.
+
+    Postures are made within the joint limits, where the sensor reads, and chosen for
+    the predictions of the calibrated arm. With --measured the rest of the K is chosen
+    beside what was reached, which shows where sockets and planes are, too. Collisions
+    are not looked at.
+    """
+    reached = None if measured is None else read_table(measured)
+    placed = issubclass(SENSORS[of_arm.sensor], Placed)
+    arm = of_arm.read(model, reached, near if placed else None)
+    header, done = (*arm.joint_names, *arm.sensor.inputs), None
+    if reached is not None:
+        done = of_arm.commands(arm, reached, header)
+        arm = arm.located(done)
+    left = k - (0 if done is None else len(done))
+    if left < 1:
+        reason = f"-k must be more than the {k - left} that were reached"
+        raise ValueError(f"{reason}, got {k}")
+    targets = None if placed else near
+    offered = arm.postures(count, seed=seed, near=targets)
+    chosen = select(offered, left, "exchange", model=arm, measured=done).indices
+    plan = offered[chosen]
+    plan = plan[arm.in_turn(plan)]
+    if picture:
+        with needs("study", "--picture"):
+            from matplotlib.figure import Figure
+
+        from jaxcal import plots
+
+        figure = Figure(figsize=(8, 2.2 * -(-left // 4)), layout="constrained")
+        plots.postures(figure, arm, plan).savefig(picture)
+    if of_arm.radians:
+        turning = [i for i, unit in enumerate(arm.command_units) if unit == "deg"]
+        plan[:, turning] = np.radians(plan[:, turning])
+    rows = plan.tolist()
+    if not output.written(header, rows):
+        cells = [[f"{i + 1}", *(f"{x:.4g}" for x in r)] for i, r in enumerate(rows)]
+        print("\n".join(aligned([["", *header], *cells])))
 
 
 def identify(
@@ -180,10 +248,10 @@ def command(
     *,
     columns: Annotated[str | None, "columns of desired outputs", "A,B"] = None,
     limits: Annotated[
-        str | None,
-        "of every command, or LOW,HIGH for each separated by spaces "
-        "(--limits='-20,20 -30,30'); inf where there is none",
+        list[list[float]] | None,
+        "of every command, or once for each; inf where there is none",
         "LOW,HIGH",
+        several(float, "numbers"),
     ] = None,
     clip: Annotated[bool, "move onto the limits"] = False,
     output: Output,
@@ -193,27 +261,13 @@ def command(
     A command beyond its limits is refused; --clip moves it onto the limit instead.
     """
     found = Calibration.load(calibration)
-    desired, bounds = _given(file, columns, found.output_names), None
-    if limits is not None:
-        bounds = _limits(limits, found.num_inputs)
-    elif clip:
+    desired = _given(file, columns, found.output_names)
+    if clip and not limits:
         raise ValueError("--clip needs --limits")
-    commands = found.command_for(desired, limits=bounds, clip=clip)
+    if limits and len(limits) == 1:
+        limits = limits * found.num_inputs
+    commands = found.command_for(desired, limits=limits or None, clip=clip)
     _emit(output, found.input_names, commands)
-
-
-def _limits(text: str, count: int) -> list[list[float]]:
-    """(count, 2) least and greatest command."""
-    try:
-        pairs = [[float(end) for end in pair.split(",")] for pair in text.split()]
-    except ValueError:
-        pairs = []
-    if len(pairs) not in (1, count) or any(len(pair) != 2 for pair in pairs):
-        raise ValueError(
-            f"--limits must be LOW,HIGH, once or for each of {count} commands, got "
-            f"{text!r}"
-        )
-    return pairs * count if len(pairs) == 1 else pairs
 
 
 def _given(file: str, chosen: str | None, known: tuple[str, ...]) -> Array:
@@ -233,6 +287,5 @@ def _given(file: str, chosen: str | None, known: tuple[str, ...]) -> Array:
 def _emit(output: Output, names: Sequence[str], values: Array) -> None:
     """Rows (N, len(names)) as JSON, else as CSV."""
     rows = values.tolist()
-    document = [dict(zip(names, row, strict=True)) for row in rows]
-    if not output.written(names, rows, document):
+    if not output.written(names, rows):
         write_rows("", names, rows)

@@ -13,6 +13,7 @@ import warnings
 from typing import Annotated
 
 from jaxcal.arguments import Parser, refused, values_of
+from jaxcal.checks import aligned
 from jaxcal.extras import MissingExtraError
 
 __all__ = ["COMMANDS", "main"]
@@ -21,7 +22,7 @@ _HERE = {  # command: one line of help, and the module with its flags and functi
     "select": ("choose the few rows of a table worth measuring", "questions"),
     "score": ("judge a choice made elsewhere", "questions"),
     "plan": ("how many measurements a wanted accuracy takes", "questions"),
-    "postures": ("where to put an arm to calibrate it, as a plan", "postures"),
+    "postures": ("where to put an arm to calibrate it, as a plan", "calibrations"),
     "identify": (
         "fit y = A u + b, or a model, to measurements and save the calibration",
         "calibrations",
@@ -127,9 +128,7 @@ def doctor(*, json: Annotated[bool, "print JSON"] = False) -> None:
     if json:
         write_json("", found)
         return
-    width = max(map(len, found))
-    for name, value in found.items():
-        print(f"{name:<{width}}  {value}")
+    print("\n".join(aligned([*found.items()], left=True)))
 
 
 def _version(package: str, missing: str) -> str:

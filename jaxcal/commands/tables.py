@@ -203,13 +203,17 @@ class Output:
     out: Annotated[str, "write to FILE (.csv or .json) instead", "FILE"] = ""
 
     def written(
-        self, names: Sequence[str], rows: Sequence[Sequence[Any]], document: Any
+        self, names: Sequence[str], rows: Sequence[Sequence[Any]], document: Any = None
     ) -> bool:
-        """Write where a form or a file is asked for; False where neither is."""
+        """Write where a form or a file is asked for; False where neither is.
+
+        As JSON the document, an object for each row where there is none.
+        """
         if self.json and self.csv:
             raise ValueError("one of --json and --csv must be left out")
         if self.json or self.out.endswith(".json"):
-            write_json(self.out, document)
+            each = [dict(zip(names, row, strict=True)) for row in rows]
+            write_json(self.out, each if document is None else document)
         elif self.csv or self.out:
             write_rows(self.out, names, rows)
         else:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.checks import axis_names
+from jaxcal.checks import aligned, axis_names
 from jaxcal.information.criteria import Criteria, criteria
 from jaxcal.selection.criteria import CRITERIA
 from jaxcal.selection.problem import Problem
@@ -122,7 +122,8 @@ class Selection:
 
     def _axes(self) -> tuple[str, ...]:
         assert self.problem.candidates is not None
-        return axis_names("names", self.axes, "u", self.problem.candidates.shape[1])
+        count = self.problem.candidates.shape[1]
+        return self.axes or axis_names("names", None, "u", count)
 
     def __str__(self) -> str:
         head = ["candidate"] + (["name"] if self.names is not None else [])
@@ -133,20 +134,13 @@ class Selection:
             head += self._axes()
             for row, i in zip(cells, self.indices, strict=True):
                 row += [f"{x:.6g}" for x in self.problem.candidates[i]]
-        widths = [max(map(len, column)) for column in zip(head, *cells, strict=True)]
-        lines = [
-            "  ".join(
-                cell.rjust(width) for cell, width in zip(row, widths, strict=True)
-            )
-            for row in (head, *cells)
-        ]
         count = int(self.problem.available.sum())
         side = "upper" if self.problem.criterion.larger_is_better else "lower"
         best = "proven optimal" if self.proven else f"{side} bound {self.bound:.6g}"
         extra = "" if self.seed is None else f", seed {self.seed}"
         lines = [
             f"{len(self.indices)} of {count} candidates, method {self.method}",
-            *lines,
+            *aligned([head, *cells]),
             f"{CRITERIA[self.criterion].says:13} {self.value:.6g} ({best})",
             f"{self.criterion + '-efficiency':13} {self.efficiency:.6f}"
             + ("" if self.proven else " or more"),

@@ -140,7 +140,10 @@ def test_predict_and_command_are_inverse(calibration, tmp_path, commands, capsys
         (["select", "CANDIDATES", "--columns", "pitch,sway"], "no column 'sway'"),
         (["score", "CANDIDATES", "--indices", "0,1,2,99"], "99"),
         (["command", "CALIBRATION", "CANDIDATES", "--clip"], "--clip needs --limits"),
-        (["command", "CALIBRATION", "CANDIDATES", "--limits", "1"], "LOW,HIGH"),
+        (
+            ["command", "CALIBRATION", "CANDIDATES", "--limits", "1"],
+            "limits must have shape (3, 2), got (3, 1)",
+        ),
     ],
 )
 def test_bad_input_is_one_line_and_exit_2(

@@ -9,6 +9,7 @@ import pathlib
 
 import numpy as np
 
+from jaxcal.checks import aligned
 from jaxcal.pages import Badge, Block, Page, Section, Table, Text, write_page
 from rig.config import AXIS_NAMES
 from rig.journal import JournalError, Record, read_journal
@@ -99,11 +100,7 @@ def _moved(before: Record, now: Record) -> list[str]:
 
 def trend_lines(device: Device) -> list[str]:
     """The table and the verdict for the console."""
-    wide = [max(map(len, column)) for column in zip(HEAD, *device.rows, strict=True)]
-    table = [
-        "  " + "  ".join(c.ljust(w) for c, w in zip(row, wide, strict=True)).rstrip()
-        for row in [HEAD, *device.rows]
-    ]
+    table = [f"  {line}" for line in aligned([HEAD, *device.rows], left=True)]
     told, keys = device.fingerprint, ("map", "unit", "pulses_per_rev", "reduction")
     axes = (
         " ".join([name, *(str(told.get(f"axes.{name}.{k}", "?")) for k in keys)])
