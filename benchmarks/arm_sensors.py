@@ -1,6 +1,6 @@
-"""Is each sensor's calibration of an arm as uncertain as it says? Four tables more.
+"""Is each sensor's calibration of an arm as uncertain as it says? Five tables more.
 
-    python -m benchmarks.arm_sensors [draws] [intervals sizes misfit checks contacts]
+    python -m benchmarks.arm_sensors [draws] [NAMES OF TABLES]
 
 ``intervals``: arms whose errors are drawn from the default prior, each sensor alone and
 in pairs, 60 readings of each or more: how many 95 % intervals hold the truth.
@@ -13,7 +13,8 @@ postures and random ones can tell of a drift. ``contacts``: of real arms, traine
 place and judged at the others: 12 and 16 contacts that are random, chosen, or chosen
 for the very postures they are judged at; measured, and as expected of a model without
 any error, with the noise and the sizes that all contacts of the place show; and with
-stiff joints, stated tolerances and noise (of the choice and the fit).
+stiff joints, stated tolerances and noise (of the choice and the fit). ``distances``:
+how far apart sockets of other places are found, which were printed 50 mm (0.1) apart.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 import jaxcal
 from jaxcal.models import (
@@ -395,7 +397,40 @@ def _expected(
     return error, best
 
 
-TABLES = {each.__name__: each for each in (intervals, sizes, misfit, checks, contacts)}
+def distances(_: int) -> None:
+    """How far apart an arm fitted at one place puts the sockets of another: 50 mm."""
+    sys.path.insert(0, str(EXAMPLES))
+    import contacts as example
+
+    print("| arm, trained on | judged at | distance, mm | 95 % |")
+    print("| --- | --- | --- | --- |")
+    for name in ("panda_1", "kuka_14"):
+        places = example.load(name)
+        for trained, place in places.items():
+            found = example.identify(name, place, np.arange(len(place[0])))
+            own = [found.names.index(each) for each in found.model.sensor.names]
+            for other, (joints, sockets) in places.items():
+                if other == trained:
+                    continue
+                table = np.column_stack([joints, sockets])
+                slopes, covariance = found.linear(table)
+                slopes[..., own] = 0.0  # those sockets are of the other place
+                which = [sockets == 0, sockets == 1]
+                points = [found.arm.predict(joints[at]).mean(axis=0) for at in which]
+                apart = points[1] - points[0]
+                far = float(np.linalg.norm(apart))
+                first, last = (slopes[at].mean(axis=0) for at in which)
+                by = apart / far @ (last - first)
+                few = sum(1.0 / at.sum() for at in which)
+                std = np.sqrt(by @ covariance @ by + found.noise_std[0] ** 2 * few)
+                half = 1e3 * stats.t.ppf(0.975, found.noise_dof) * np.hypot(std, 1e-4)
+                print(f"| {name}, {trained} | {other} | {1e3 * far:.2f} | {half:.2f} |")
+
+
+TABLES = {
+    each.__name__: each
+    for each in (intervals, sizes, misfit, checks, contacts, distances)
+}
 
 if __name__ == "__main__":
     given = sys.argv[1:]

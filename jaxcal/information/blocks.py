@@ -105,13 +105,13 @@ def rank_of_blocks(
         blocks: (S, N, q, p), the N of each of S sets measured together.
         root: (r, p) of the prior precision, r = 0 without one.
         size: (p,) of what the blocks were computed beside, the largest of a model's
-            derivatives; zero or None: they are the caller's own numbers.
+            derivatives; None: they are the caller's own numbers.
 
     Returns:
         (S,) of both.
     """
     rows, largest, _ = _kernel().centred(blocks, None, root)
-    if size is None or not size.any():
+    if size is None:
         return rank_rule(rows, largest, blocks.shape[1])
     largest = np.maximum(largest, size)
     return rank_rule(rows, largest, blocks.shape[1], computed=True)
@@ -161,7 +161,7 @@ class Whitened(NamedTuple):
     prior: Array  # (p, p) precision
     basis: Array  # (p, p): raw blocks times it are whitened
     triangle: Array  # (p, p): whitened blocks times it are the centred raw ones
-    size: Array  # (p,) of what the centred blocks are rounded by, beside themselves
+    size: Array | None  # (p,) of what computed blocks are rounded by, or None
     log_scale: float  # log det of unwhitened less whitened information
 
 
@@ -214,9 +214,9 @@ def whiten(
     if len(root):
         known, white = white[:, num * q :], white[:, : num * q]
         prior = known.transpose(0, 2, 1) @ known
-    size = largest if computed else np.zeros((sets, p))
-    parts = (white.reshape(blocks.shape), prior, basis, back, size)
-    for part in parts:
+    parts = (white.reshape(blocks.shape), prior, basis, back)
+    for part in (*parts, largest):
         part.flags.writeable = False
-    found = map(Whitened, *parts, log_scale)
+    size = largest if computed else [None] * sets
+    found = map(Whitened, *parts, size, log_scale)
     return [one if lost[n] <= _LOSS else None for n, one in enumerate(found)]

@@ -50,7 +50,7 @@ class Problem:
     basis: Array  # (p, p) raw blocks times it are whitened
     root: Array  # (r, p) root of the caller's prior precision, with what was measured
     triangle: Array  # (p, p) whitened blocks times it are the centred raw ones
-    size: Array  # (p,) of what these are rounded by, beside themselves
+    size: Array | None  # (p,) of what computed blocks are rounded by, or None
     candidates: Array | None = None  # (M, n) in the caller's unit, where there are any
     model: Model | None = None  # what made blocks of the candidates
 
@@ -125,7 +125,9 @@ class Problem:
         least, largest = np.linalg.eigvalsh(rows.T @ rows + self.prior)[[0, -1]]
         if not least > 0.0:
             return np.inf
-        size = np.abs(rows @ self.triangle) + self.size
+        size = np.abs(rows @ self.triangle)
+        if self.size is not None:
+            size += self.size
         error = _EPS * p * (size @ np.abs(np.linalg.inv(self.triangle)))
         of_blocks = 2.0 * np.linalg.norm(error) / np.sqrt(least)
         return float(of_blocks + _EPS * len(rows) * largest / least)
