@@ -67,7 +67,7 @@ def test_the_parameters_of_that_direction_are_named_and_not_used(
     assert significant(np.linalg.svd(directions, compute_uv=False)).sum() == 3
     both /= np.linalg.norm(both, axis=1, keepdims=True)
     assert significant(np.linalg.svd(both, compute_uv=False)).sum() == 3
-    # In the plane the answer is known, across it nobody gives one.
+    # Within the plane a command is found; across it the question is refused.
     np.testing.assert_allclose(fit.command_for(u @ matrix.T), u, atol=1e-9)
     across = u[:1] + PLANE
     assert np.isinf(fit.predict_std(across)).all()

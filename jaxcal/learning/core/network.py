@@ -36,7 +36,7 @@ class Network(nn.Module):
 
     def candidate_features(self, candidates: jax.Array, usable: jax.Array) -> Any:
         """Features of sets (..., M, n); (..., M) bool usable: available or chosen."""
-        raise NotImplementedError(_OWN)
+        raise NotImplementedError(_OWN)  # abstract
 
     def decision_features(
         self,
@@ -53,19 +53,19 @@ class Network(nn.Module):
             available: (..., M) bool.
             count: choices made.
         """
-        raise NotImplementedError(_OWN)
+        raise NotImplementedError(_OWN)  # abstract
 
     def encode(self, features: Any) -> jax.Array:
         """(..., M, width) memory of a set."""
-        raise NotImplementedError(_OWN)
+        raise NotImplementedError(_OWN)  # abstract
 
     def decode(self, memory: jax.Array, decision: Any) -> tuple[jax.Array, jax.Array]:
         """(..., M) logits, masked, and (...,) value."""
-        raise NotImplementedError(_OWN)
+        raise NotImplementedError(_OWN)  # abstract
 
     def lookahead_logits(self, decision: Any) -> tuple[jax.Array, jax.Array]:
         """As ``decode``, for one of the last ``num_unlearned`` choices."""
-        raise NotImplementedError(_LAST)
+        raise NotImplementedError(_LAST)  # abstract
 
     def __call__(
         self, candidates: jax.Array, available: jax.Array, chosen: jax.Array
