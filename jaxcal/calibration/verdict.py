@@ -170,6 +170,8 @@ def _other_tip(calibration: Fit) -> list[str]:
     if not (isinstance(model, SerialChain) and model.sensor.zeros):
         return []
     names = calibration.names
+    if "tool rx" in names:  # where a camera or board is on the tip is asked for
+        return []
     at = [names.index(f"tool {axis}") for axis in "xyz" if f"tool {axis}" in names]
     moved = calibration.parameters[at] - model.nominal[at]
     variance = moved @ np.asarray(calibration.covariance)[np.ix_(at, at)] @ moved
