@@ -83,9 +83,9 @@ class Calibration(Fit):
             "degrees of freedom"
             + ("" if lack is None else f"; lack-of-fit p = {lack:.3g}")
         )
-        if self.noise_std is None:
+        if self.noise_std is None and self.verdict is None:
             lines.append(self.no_noise("intervals"))
-        else:
+        elif self.noise_std is not None:
             source = "as given" if self.noise_known else "from the residuals"
             lines.append(f"noise std {in_words(self.noise_std)}{unit}, {source}")
             if self.dof < 0.5:

@@ -175,7 +175,8 @@ def _require_postures(arm: SerialChain, commands: Array, measured: Array) -> Non
             "give limits={name: (low, high)}"
         )
     largest = np.abs(joints[:, units == "deg"]).max(initial=0.0)
-    if arm.sensor.zeros and arm.num_joints > 2 and 1.0 < largest < 7.0:
+    small = arm.num_joints > 2 and 1.0 < largest < 7.0
+    if small and arm.sensor.kind not in ("position", "pose", "several"):
         raise ValueError(
             f"commands must be in degrees, got angles of at most {largest:.3g}, which "
             "look like radians: np.degrees(commands), --radians"

@@ -27,16 +27,17 @@ _SHUFFLES = 400
 _FEW = 4  # contacts: fewer that lie apart are outliers, not a socket that was moved
 _LOOSE = 7.0  # standard deviations: no scatter, a reading of something else
 _SPARSE = 12  # measurements: so few have no outlier that is scatter
-_TIP = 0.01  # of the arm's length between the tip as found and as described
+_TIP = 0.004  # of the arm's length: tools are built nearer to their description
 
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
     """What the readings say of a calibration; printed, the reasons line by line."""
 
-    explains: bool  # the scatter of the readings is what the sensor's noise can be
-    helps: bool  # held-out errors are smaller than those of the nominal machine
-    clean: bool  # no reading is of another socket, far from the others' fit, or tip
+    # None where there are too few measurements to tell.
+    explains: bool | None  # the scatter of the readings is what the noise can be
+    helps: bool | None  # held-out errors are smaller than those of the nominal machine
+    clean: bool | None  # no reading is of another socket, far from the fit, or tip
     held_out: float  # mean held-out error of a measurement, in the readings' unit
     interval: tuple[float, float]  # 95 % of that mean
     nominal: float  # mean error of the nominal machine
@@ -45,9 +46,11 @@ class Verdict:
     @property
     def good(self) -> bool:
         """It may be used."""
-        return self.explains and self.helps and self.clean
+        return bool(self.explains and self.helps and self.clean)
 
     def __str__(self) -> str:
+        if self.explains is None:
+            return "\n".join(self.reasons)
         low, high = self.interval
         lines = [
             f"held-out error {self.held_out:.3g} [{low:.3g}, {high:.3g}], nominal "
@@ -67,12 +70,14 @@ def verdict(calibration: Fit) -> Verdict | None:
 
     Held-out errors with an interval beside those of the nominal arm, the scatter
     against the sensor's usual noise, and by name: outliers, contacts of another socket,
-    a socket that was moved, parameters far from what was known. None for other models,
-    and where the noise is unknown.
+    a socket that was moved, parameters far from what was known. None for other models.
     """
     model = calibration.model
-    if not isinstance(model, SerialChain) or calibration.noise_std is None:
+    if not isinstance(model, SerialChain):
         return None
+    if calibration.noise_std is None:
+        why = calibration.no_noise("intervals and no verdict")
+        return Verdict(None, None, None, np.nan, (np.nan, np.nan), np.nan, (why,))
     used = np.flatnonzero(calibration.loss_weights > 0.0)
     commands, residuals = calibration.commands[used], calibration.residuals[used]
     usual = np.asarray(model.default_noise().std)
@@ -170,11 +175,13 @@ def _other_tip(calibration: Fit) -> list[str]:
     if not (isinstance(model, SerialChain) and model.sensor.zeros):
         return []
     names = calibration.names
+    if "tool rx" in names:  # where a camera or board is on the tip is asked for
+        return []
     at = [names.index(f"tool {axis}") for axis in "xyz" if f"tool {axis}" in names]
     moved = calibration.parameters[at] - model.nominal[at]
-    errors = np.sqrt(np.diag(np.asarray(calibration.covariance))[at])
+    variance = moved @ np.asarray(calibration.covariance)[np.ix_(at, at)] @ moved
     far = float(np.linalg.norm(moved))
-    if far < _TIP * model.length or (np.abs(moved) < _FAR * errors).all():
+    if far**2 - 2.0 * np.sqrt(variance) <= _TIP * model.length * far:
         return []
     return [
         f"the tip is {far:.3g} from where the arm's description has it "

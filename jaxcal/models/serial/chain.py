@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, in_words, numbers, one_of
-from jaxcal.files import write_text
+from jaxcal.files import atomic_write
 from jaxcal.models.model import as_commands, as_parameters
 from jaxcal.models.sensors import SENSORS, Position, Sensor, Several
 from jaxcal.models.serial.arguments import (
@@ -405,7 +405,8 @@ class SerialChain(Arm):
             raise FileExistsError(
                 f"{os.fspath(path)} is there already; force=True writes over it"
             )
-        write_text(path, text)
+        with atomic_write(path) as file:
+            file.write(text.encode("utf-8", "surrogateescape"))
         return tip
 
     def together(
