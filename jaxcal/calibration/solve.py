@@ -153,6 +153,8 @@ class Solution:
         self.residuals = task.measured - predict(
             task.model, self.commands, self.parameters
         )
+        # The last step of the logarithms of the levels, and how much of one is taken.
+        self.climbed, self.trust = np.zeros(q), 1.0
         if start is None:
             self.weights, self.level = np.ones(count), np.ones(q)
             if not task.known:
@@ -326,7 +328,12 @@ class Solution:
             faster = pulled.sum() / max(pulled @ self.weights, 1e-300)
         change = np.log(np.maximum(np.sqrt(square / freedom), self.floor) / self.level)
         near = np.abs(change).max() < 0.3
-        self.level = self.level * np.exp(change * (faster if near else 1.0))
+        step = change * (faster if near else 1.0)
+        # One that went too far and comes back might do so for ever.
+        back = step @ self.climbed < 0.0
+        self.trust = 0.5 * self.trust if back else min(1.5 * self.trust, 1.0)
+        self.climbed = self.trust * step
+        self.level = self.level * np.exp(self.climbed)
 
     def _leverage(self, solved: tuple[Array, Array] | None = None) -> Array:
         """(N, R, F) roots of the hat matrix, of the readings."""

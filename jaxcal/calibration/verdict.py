@@ -123,6 +123,11 @@ def _left_out(calibration: Fit, used: NDArray[np.intp]) -> Array:
     """(N, q) residual of each measurement from the fit without it."""
     noise = np.diag(np.asarray(calibration.noise_std) ** 2)
     slopes, covariance = calibration.linear(calibration.commands[used])
+    p = len(calibration.names)
+    if not calibration.estimate[p:].any():  # harmonics were not fitted: without them
+        covariance, by = covariance[:p, :p], covariance[:p, p:]
+        slopes = slopes[..., :p]
+        covariance = covariance - by * calibration.prior_precision[p:] @ by.T
     spread = slopes @ covariance @ np.matrix_transpose(slopes)
     # Of an outlier little was fitted: its weight says how much.
     share = np.minimum(calibration.loss_weights[used], 1.0)[:, None, None]
@@ -170,6 +175,8 @@ def _other_tip(calibration: Fit) -> list[str]:
     if not (isinstance(model, SerialChain) and model.sensor.zeros):
         return []
     names = calibration.names
+    if "tool rx" in names:  # where a camera or board is on the tip is asked for
+        return []
     at = [names.index(f"tool {axis}") for axis in "xyz" if f"tool {axis}" in names]
     moved = calibration.parameters[at] - model.nominal[at]
     variance = moved @ np.asarray(calibration.covariance)[np.ix_(at, at)] @ moved

@@ -25,7 +25,7 @@ from jaxcal.models import (
 )
 from jaxcal.models.sensors import SENSORS, Reading
 
-from .arms import CONTACTS, differences, ur5
+from .arms import CONTACTS, UR5_TABLE, differences, ur5
 from .test_serial_chain import _matrix, tool_frame
 
 RNG = np.random.default_rng(0)
@@ -273,6 +273,57 @@ def test_hand_and_eye_are_found_without_a_guess(moves):
         model.located(still)
 
 
+def _views(moves, count=20):
+    """Postures and poses of a board seen in them, by frames alone; mm and degrees."""
+    joints = np.random.default_rng(5).uniform(-100.0, 100.0, (count, 6))
+    stand = _matrix(Rotation.from_euler("xyz", [3.0, 0.1, 2.0]), (600.0, 100.0, 0.0))
+    arm = SerialChain.from_dh(UR5_TABLE)
+    values = dict(zip(arm.names, arm.nominal, strict=True))
+    tips = [tool_frame(arm, row, values) @ MOUNT for row in joints]
+    ends = [(tip, stand) if moves == "camera" else (stand, tip) for tip in tips]
+    seen = np.array([np.linalg.inv(camera) @ board for camera, board in ends])
+    return joints, seen
+
+
+def _as_columns(poses):
+    vectors = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec(degrees=True)
+    return np.hstack([poses[:, :3, 3], vectors])
+
+
+@pytest.mark.parametrize("moves", ["camera", "board"])
+def test_views_in_another_convention_are_told_by_name(moves):
+    joints, seen = _views(moves)
+    model = SerialChain.from_dh(UR5_TABLE, sensor=Board(moves))
+    right = _as_columns(seen)
+    metres, radians, euler = right.copy(), right.copy(), right.copy()
+    metres[:, :3] /= 1000.0
+    radians[:, 3:] = np.radians(right[:, 3:])
+    turns = Rotation.from_matrix(seen[:, :3, :3])
+    euler[:, 3:] = turns.as_euler("xyz", degrees=True)
+    for columns, how in (
+        (_as_columns(np.linalg.inv(seen)), "inverted, or with the other of camera"),
+        (metres, "1000 times as large"),
+        (radians, "turns in degrees"),
+        (euler, "Euler angles as rotation vectors"),
+    ):
+        with pytest.raises(ValueError, match=f"fit the arm only .*{how}"):
+            model.located(np.hstack([joints, columns]))
+    right[:4, :3] += [[90.0], [-50.0], [70.0], [40.0]]  # and bad views do no harm
+    found = model.located(np.hstack([joints, right]))
+    np.testing.assert_allclose(found.tool, MOUNT, atol=1e-5)
+    right += np.random.default_rng(1).normal(size=right.shape) * [
+        1,
+        1,
+        1,
+        0.1,
+        0.1,
+        0.1,
+    ]
+    fit = jaxcal.identify(np.hstack([joints, right]), np.zeros((20, 6)), model=model)
+    np.testing.assert_allclose(fit.arm.tool[:3, 3], MOUNT[:3, 3], atol=4.0)
+    assert "measurement 0 is" in str(fit.verdict)
+
+
 def test_sockets_planes_and_anchors_are_found_from_nominal_postures():
     commands = np.hstack([JOINTS, WHICH])
     points = ur5().predict(JOINTS)
@@ -287,6 +338,8 @@ def test_sockets_planes_and_anchors_are_found_from_nominal_postures():
     np.testing.assert_allclose(found, [[*ANCHORS[0, :3], 0.0]], atol=1e-8)
     with pytest.raises(ValueError, match="anchor 0 has 3 lengths, and four are needed"):
         wire.located(many[:3], far[:3])
+    with pytest.raises(ValueError, match=r"anchor 0 fit no anchor .* unit of the arm"):
+        wire.located(many, far / 1000.0)
     plane = ur5(sensor=Plane()).located(many)
     offs = plane.predict(many)
     rng = np.random.default_rng(3)

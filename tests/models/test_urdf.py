@@ -282,9 +282,27 @@ def test_links_that_do_not_fit_are_refused(tmp_path):
         _read(tmp_path, ring, tip="link1")
 
 
+def test_axes_that_are_almost_parallel_keep_lengths_short_and_exact(tmp_path):
+    """A file that was calibrated: axes off by tenths of degrees, and one near -z."""
+    joints = [
+        ("revolute", (0, 0, 0.1), (np.pi - 1e-6, 0, 0), (0, 0, 1)),
+        ("revolute", (0, 0, 0.1), (np.pi / 2, 0, 0), (0, 0, 1)),
+        ("revolute", (0.4, 0, 0), (0.005, 0, 0), (0, 0, 1)),
+        ("revolute", (0.3, 0, 0), (np.pi + 0.05, 0.02, 0), (0, 0, 1)),
+        ("fixed", (0, 0.1, 0), (0, 0, 0), (0, 0, 1)),
+    ]
+    model = _read(tmp_path, _urdf(joints))
+    assert model.length < 1.5  # the common normal of such axes is 80 m away
+    for command in np.random.default_rng(0).uniform(-180.0, 180.0, (9, 4)):
+        found = model.predict(command[None])[0]
+        np.testing.assert_allclose(found, _tip(joints, command)[:3, 3], atol=1e-13)
+
+
 def test_what_xacro_left_behind_and_the_shape_of_links_do_not_matter(tmp_path):
     left = '<!-- <xacro:include filename="$(find x)"/> --><material name="${colour}"/>'
     assert _read(tmp_path, _urdf(ONE, left)).joint_names == ("j1",)
+    gazebo = '<controller:gazebo_manager name="of no declared name space"/>'
+    assert _read(tmp_path, _urdf(ONE, gazebo)).joint_names == ("j1",)
 
 
 def test_a_finger_that_mimics_a_slide_elsewhere_is_told_in_lengths(tmp_path):

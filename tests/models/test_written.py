@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -88,6 +90,31 @@ def test_all_but_the_origins_is_kept(tmp_path):
     unchanged = tmp_path / "same.urdf"
     model.write("urdf", unchanged, model.nominal)
     assert unchanged.read_text(encoding="utf-8") == ARM
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "iso-8859-1"])
+def test_every_other_byte_is_kept(tmp_path, encoding):
+    """Ends of lines, byte order mark, declared encoding, and what follows the robot."""
+    text = ARM.replace("utf-8", encoding.removesuffix("-sig")).replace("\n", "\r\n")
+    data = (text + "<!-- </robot> -->\r\n").encode(encoding)
+    path, out = tmp_path / "arm.urdf", tmp_path / "out.urdf"
+    path.write_bytes(data)
+    model = SerialChain.from_urdf(path, tip="hand")
+    model = from_dict(json.loads(json.dumps(model.to_dict())))
+    model.write("urdf", out, model.nominal)
+    assert out.read_bytes() == data
+    off = model.nominal + 0.01
+    for tip in ("hand_calibrated", "hand_calibrated_again"):
+        assert model.write("urdf", out, off, force=True) == tip
+        before, after = data.splitlines(), out.read_bytes().splitlines()
+        lost = [line for line in before if line not in after]
+        assert all(b"<origin" in each or b"wrist" in each for each in lost)
+        again = SerialChain.from_urdf(out, tip=tip)
+        commands = np.array([[10.0, 20.0, 30.0]])
+        found = again.predict(commands)
+        np.testing.assert_allclose(found, model.predict(commands, off), atol=1e-12)
+        model = SerialChain.from_urdf(out, tip="hand")  # and calibrated once more
+        off, data = model.nominal + 0.01, out.read_bytes()
 
 
 def test_nothing_is_written_over_a_file_without_force(tmp_path):

@@ -16,6 +16,8 @@ __all__ = ["Board"]
 
 Array = NDArray[np.float64]
 
+_WRONG = 0.2  # views so far off, in radians and lengths of the arm, are read wrongly
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Board(Sensor):
@@ -169,26 +171,37 @@ class Board(Sensor):
             shift = inputs[:, :3]
         else:
             turn, shift = self._poses(measured)
-        if self.moves == "camera":
-            turn = np.matrix_transpose(turn)
-            shift = -(turn @ shift[..., None])[..., 0]
-        arm = tip.rotation
-        # R_X = R_A' R_Z R_B, summed over the views, as a matrix on the nine of R_Z.
-        mix = np.einsum("nki,nlj->ijkl", arm, turn).reshape(9, 9)
-        left, size, right = np.linalg.svd(mix)
-        if size[1] > 0.999 * size[0]:
+
+        def fit(turn: Array, shift: Array) -> tuple[float, Array, Array]:
+            if self.moves == "camera":
+                turn, shift = _inverse(turn, shift)
+            return _hand_and_eye(tip, turn, shift)
+
+        off, place, new = fit(turn, shift)
+        if off > _WRONG:
+            others = {
+                "inverted, or with the other of camera and board on the tip": _inverse(
+                    turn, shift
+                ),
+                "with lengths 1000 times as small": (turn, shift / 1000.0),
+                "with lengths 1000 times as large": (turn, shift * 1000.0),
+            }
+            if self.corners is None:
+                vector = Rotation.from_rotvec(inputs[:, 3:])
+                euler = Rotation.from_euler("xyz", inputs[:, 3:], degrees=True)
+                others["with turns in degrees"] = vector.as_matrix(), shift
+                others["with its Euler angles as rotation vectors"] = (
+                    euler.as_matrix(),
+                    shift,
+                )
+            for how, pose in others.items():
+                if fit(*pose)[0] < 0.5 * _WRONG:
+                    raise ValueError(f"views of the board fit the arm only {how}")
+        if not np.isfinite(off):
             raise ValueError(
                 "views must turn the tip about two axes at least: with these the board "
                 "and the camera cannot be told apart"
             )
-        tool, stand = (_nearest(v.reshape(3, 3)) for v in (left[:, 0], right[0]))
-        eye = np.broadcast_to(-np.eye(3), arm.shape)
-        rows = np.concatenate([arm, eye], axis=-1).reshape(-1, 6)
-        offset = (shift @ stand.T - tip.position).ravel()
-        shifts = np.linalg.lstsq(rows, offset, rcond=None)[0]
-        place, new = np.eye(4), np.eye(4)
-        new[:3, :3], new[:3, 3] = tool, shifts[:3]
-        place[:3, :3], place[:3, 3] = stand, shifts[3:]
         return dataclasses.replace(self, place=place), new
 
     def _poses(self, pixels: Array) -> tuple[Array, Array]:
@@ -214,6 +227,44 @@ class Board(Sensor):
         turn = np.stack([x, y, np.cross(x, y) / scale[:, None]], axis=-1)
         left, _, right = np.linalg.svd(turn)
         return left @ right, plane[..., 2] / scale[:, None]
+
+
+def _hand_and_eye(tip: Tip, turn: Array, shift: Array) -> tuple[float, Array, Array]:
+    """How far off the views are, the place Z and the tool X of ``A X = Z B``.
+
+    Far off, in the median of turns in radians and shifts in lengths of the arm, where
+    the views do not determine them. Views four times as far off as that are left out.
+    """
+    place, new = np.eye(4), np.eye(4)
+    used, off = np.ones(len(turn), dtype=bool), np.full(len(turn), np.inf)
+    for _ in range(5):
+        arm = tip.rotation[used]
+        # R_X = R_A' R_Z R_B, summed over the views, as a matrix on the nine of R_Z.
+        mix = np.einsum("nki,nlj->ijkl", arm, turn[used]).reshape(9, 9)
+        left, size, right = np.linalg.svd(mix)
+        if size[1] > 0.999 * size[0]:
+            return np.inf, place, new
+        tool, stand = (_nearest(v.reshape(3, 3)) for v in (left[:, 0], right[0]))
+        eye = np.broadcast_to(-np.eye(3), arm.shape)
+        rows = np.concatenate([arm, eye], axis=-1).reshape(-1, 6)
+        right_side = (shift @ stand.T - tip.position)[used].ravel()
+        shifts = np.linalg.lstsq(rows, right_side, rcond=None)[0]
+        new[:3, :3], new[:3, 3] = tool, shifts[:3]
+        place[:3, :3], place[:3, 3] = stand, shifts[3:]
+        apart = tip.rotation @ shifts[:3] + tip.position - shift @ stand.T - shifts[3:]
+        trace = np.einsum("nij,nij->n", tip.rotation @ tool, stand @ turn)
+        off = np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))
+        off = off + np.linalg.norm(apart, axis=1) / (tip.length or 1.0)
+        kept = off <= 4.0 * np.median(off)
+        if (kept == used).all() or kept.sum() < 3:
+            break
+        used = kept
+    return float(np.median(off)), place, new
+
+
+def _inverse(turn: Array, shift: Array) -> tuple[Array, Array]:
+    back = np.matrix_transpose(turn)
+    return back, -(back @ shift[..., None])[..., 0]
 
 
 def _nearest(matrix: Array) -> Array:

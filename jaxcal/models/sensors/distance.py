@@ -20,7 +20,7 @@ class Distance(Placed):
     """One length: the tip's distance from its anchor, less the zero of the wire.
 
     Where the arm stands is not shown, so ``base`` is held. ``places`` are rows (x, y,
-    z, zero); the zero is known to 1 % of the arm's length. Noise 0.01 % of it.
+    z, zero); the zero is known to 1 % of the arm's length. Noise 0.05 % of it.
     """
 
     kind = "distance"
@@ -36,7 +36,7 @@ class Distance(Placed):
         return np.tile([np.inf, np.inf, np.inf, 0.01 * length], self.count)
 
     def usual_noise(self, length: float) -> ArrayLike:
-        return 1e-4 * length
+        return 5e-4 * length
 
     def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
         which = self.of_rows(inputs)
@@ -66,5 +66,13 @@ class Distance(Placed):
             points = points - middle
             rows = np.column_stack([2.0 * points, np.ones(len(points))])
             right = (points**2).sum(axis=1) - far**2
-            places[i, :3] = np.linalg.lstsq(rows, right, rcond=1e-6)[0][:3] + middle
+            anchor = np.linalg.lstsq(rows, right, rcond=1e-6)[0][:3]
+            off = np.median(np.abs(np.linalg.norm(points - anchor, axis=1) - far))
+            if off > 0.2 * tip.length:
+                raise ValueError(
+                    f"lengths to anchor {i} fit no anchor to {off:.3g}: measured must "
+                    f"be in the unit of the arm, whose length is {tip.length:.3g}, and "
+                    "commands in degrees"
+                )
+            places[i, :3] = anchor + middle
         return dataclasses.replace(self, places=places), None

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, in_words, numbers, one_of
-from jaxcal.files import write_text
+from jaxcal.files import atomic_write
 from jaxcal.models.model import as_commands, as_parameters
 from jaxcal.models.sensors import SENSORS, Position, Sensor, Several
 from jaxcal.models.serial.arguments import (
@@ -239,12 +239,12 @@ class SerialChain(Arm):
         return dataclasses.replace(self, sensor=sensor)
 
     def with_misfit(self) -> Self:
-        """This arm with harmonics of its joints, where its sensor asks for them.
+        """This arm with harmonics of its joints.
 
         They are no parameters of the arm: ``identify``, and ``select`` for predictions,
-        add them where no prior is given, as what the parameters do not explain.
+        count on them where no prior is given, as what the parameters do not explain.
         """
-        if self.harmonics or not self.sensor.misfit:
+        if self.harmonics or "R" not in self.joints:
             return self
         bent = tuple(i + 1 for i, kind in enumerate(self.joints) if kind == "R")
         waves = np.zeros((len(bent), 4))
@@ -405,7 +405,8 @@ class SerialChain(Arm):
             raise FileExistsError(
                 f"{os.fspath(path)} is there already; force=True writes over it"
             )
-        write_text(path, text)
+        with atomic_write(path) as file:
+            file.write(text.encode("utf-8", "surrogateescape"))
         return tip
 
     def together(

@@ -11,6 +11,7 @@ import pathlib
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 from xml.etree import ElementTree
+from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-_PARALLEL = 1e-3  # sine; below it the common normal of two axes is ill defined
+_PARALLEL = 0.2  # sine; below it the common normal of two axes is far away
 
 
 class Chain(NamedTuple):
@@ -77,7 +78,8 @@ def read_urdf(
         in it; the message names the link or joint.
     """
     name = os.fspath(path)
-    text = pathlib.Path(path).read_text(encoding="utf-8")
+    # Bytes of any encoding and ends of lines come through text unchanged.
+    text = pathlib.Path(path).read_bytes().decode("utf-8", "surrogateescape")
     try:
         chain = list(walk(text, base, tip, locked))
         source: dict[str, object] = {"text": text, "locked": dict(locked)}
@@ -162,14 +164,17 @@ def _up(link: str, above: dict[str, Joint]) -> list[Joint]:
 
 
 def _robot(text: str) -> ElementTree.Element:
+    # Without name spaces: files of robots have prefixes that nothing declares.
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
     try:
-        robot = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        if "<xacro:" in text:
-            raise ValueError(f"it is a {_XACRO}") from None
+        parser.Parse(text.encode("utf-8", "surrogateescape"), True)
+    except expat.ExpatError as error:
         raise ValueError(f"is not a URDF file: {error}") from error
-    # Expanded files may keep their name space, and comments with it.
-    if any("xacro}" in each.tag for each in robot.iter()):
+    robot = builder.close()
+    # Expanded files may keep the name space, and comments with it.
+    if any(each.tag.startswith("xacro:") for each in robot.iter()):
         raise ValueError(f"it is a {_XACRO}")
     if robot.tag != "robot":
         raise ValueError(f"it must hold a <robot>, got <{robot.tag}>")
@@ -363,11 +368,18 @@ def _table(
 
 def _turn_of_z(axis: Array) -> Array:
     """(3, 3) the smallest rotation that takes z to ``axis``."""
-    if axis[2] < -1.0 + 1e-12:
-        return np.diag([1.0, -1.0, -1.0])
-    vector = np.cross([0.0, 0.0, 1.0], axis)
-    hat = np.cross(np.eye(3), vector)
-    return np.eye(3) + hat + hat @ hat / (1.0 + axis[2])
+    x, y, z = axis
+    across = x * x + y * y
+    if across < 1e-60:
+        return np.diag([1.0, np.sign(z), np.sign(z)])
+    share = (1.0 - z) / across  # 1 / (1 + z), exact near -1 too
+    return np.array(
+        [
+            [1.0 - share * x * x, -share * x * y, x],
+            [-share * x * y, 1.0 - share * y * y, y],
+            [-x, -y, z],
+        ]
+    )
 
 
 def _row(frame: Array, axis: Array, point: Array) -> Array:

@@ -68,18 +68,18 @@ def _urdf_text(nominal: Arm, calibrated: Arm) -> tuple[str, str]:
         raise ValueError("the arm must come from a URDF file: SerialChain.from_urdf")
     text, tip = source["text"], source["tip"]
     origins, extra = _origins(nominal, calibrated)
-    written = _with_origins(text, origins)
     if extra is None:
-        return written, tip
+        return _with_origins(text, origins), tip
     name = f"{tip}_calibrated"
+    while f'"{name}"' in text:  # a file that was calibrated before
+        name += "_again"
     numbers = _pose(extra)
     more = (
         f'  <link name="{name}"/>\n  <joint name="{name}_joint" type="fixed">\n'
         f'    <parent link="{tip}"/>\n    <child link="{name}"/>\n'
         f'    <origin xyz="{numbers["xyz"]}" rpy="{numbers["rpy"]}"/>\n  </joint>\n'
     )
-    at = written.rindex("</robot")
-    return written[:at] + more + written[at:], name
+    return _with_origins(text, origins, more), name
 
 
 def _dh_text(calibrated: Arm) -> str:
@@ -208,11 +208,11 @@ def _pose(matrix: Array) -> dict[str, str]:
     return {"xyz": words[0], "rpy": words[1]}
 
 
-def _with_origins(text: str, origins: Mapping[str, Array]) -> str:
-    """``text`` with other origins of some joints, every other character kept."""
-    data = text.encode("utf-8")
-    places = _places(data)
-    edits = []
+def _with_origins(text: str, origins: Mapping[str, Array], more: str = "") -> str:
+    """``text`` with other origins of some joints and ``more`` at the robot's end."""
+    data = text.encode("utf-8", "surrogateescape")
+    places, last = _places(data)
+    edits = [(last, last, more)]
     for name, matrix in origins.items():
         pose = _pose(matrix)
         joint, origin = places[name]
@@ -222,7 +222,7 @@ def _with_origins(text: str, origins: Mapping[str, Array]) -> str:
             edits.append((end, end, new))
             continue
         end = _end_of_tag(data, origin)
-        tag = data[origin:end].decode("utf-8")
+        tag = data[origin:end].decode("utf-8", "surrogateescape")
         for key, words in pose.items():
             there = re.compile(rf"""(\s{key}\s*=\s*)(["'])[^"']*\2""")
             if there.search(tag):
@@ -231,16 +231,16 @@ def _with_origins(text: str, origins: Mapping[str, Array]) -> str:
                 tag = tag.replace("<origin", f'<origin {key}="{words}"', 1)
         edits.append((origin, end, tag))
     for start, end, new in sorted(edits, reverse=True):
-        data = data[:start] + new.encode("utf-8") + data[end:]
-    return data.decode("utf-8")
+        data = data[:start] + new.encode("utf-8", "surrogateescape") + data[end:]
+    return data.decode("utf-8", "surrogateescape")
 
 
-def _places(data: bytes) -> dict[str, tuple[int, int | None]]:
-    """Of each joint where its tag begins, and where that of its origin, in bytes."""
-    parser = expat.ParserCreate("utf-8")
+def _places(data: bytes) -> tuple[dict[str, tuple[int, int | None]], int]:
+    """Of each joint where its tag begins, and its origin's; the robot's end; bytes."""
+    parser = expat.ParserCreate()
     path: list[str] = []
     found: dict[str, tuple[int, int | None]] = {}
-    name = ""
+    name, last = "", 0
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal name
@@ -248,13 +248,18 @@ def _places(data: bytes) -> dict[str, tuple[int, int | None]]:
         if path == ["robot", "joint"]:
             name = attributes["name"]
             found[name] = (parser.CurrentByteIndex, None)
-        elif path == ["robot", "joint", "origin"]:
+        elif path == ["robot", "joint", "origin"] and found[name][1] is None:
             found[name] = (found[name][0], parser.CurrentByteIndex)
 
+    def end(tag: str) -> None:
+        nonlocal last
+        path.pop()
+        last = parser.CurrentByteIndex
+
     parser.StartElementHandler = start
-    parser.EndElementHandler = lambda tag: path.pop()
+    parser.EndElementHandler = end
     parser.Parse(data, True)
-    return found
+    return found, last
 
 
 def _end_of_tag(data: bytes, start: int) -> int:
