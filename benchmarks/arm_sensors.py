@@ -10,12 +10,13 @@ and over that of ``identify`` as it comes, with harmonics.
 ``misfit``: positions of arms that no table explains (cables, eccentric gears): the
 error elsewhere with and without harmonics of the joints. ``trial``: the simulated ones
 fitted as a real one was. ``checks``: what a few chosen postures and random ones can
-tell of a drift. ``contacts``: of real arms, trained on one
-place and judged at the others: 12 and 16 contacts that are random, chosen, or chosen
-for the very postures they are judged at; measured, and as expected of a model without
-any error, with the noise and the sizes that all contacts of the place show; and with
-stiff joints, stated tolerances and noise (of the choice and the fit). ``distances``:
-how far apart sockets of other places are found, which were printed 50 mm (0.1) apart.
+tell of a drift. ``contacts``: of real arms, trained on one place and judged at the
+others: 12 and 16 contacts that are random or chosen, and all; likewise with stiff
+joints, stated tolerances and noise (of the choice and the fit); and what is expected of
+those chosen, and at best (chosen for the very postures they are judged at), of a model
+without any error, with the noise and sizes that all contacts of the place show; then
+trained on two places and on three. ``distances``: how far apart sockets of other places
+are found, which were printed 50 mm (0.1) apart.
 """
 
 from __future__ import annotations
@@ -24,8 +25,10 @@ import dataclasses
 import pathlib
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -354,68 +357,91 @@ def sizes(draws: int) -> None:
 
 
 def contacts(draws: int) -> None:
-    """Errors at other places over those of as many random contacts, and of all."""
+    """Errors at other places: mm, and what a choice could reach at best."""
     sys.path.insert(0, str(EXAMPLES))
     import contacts as example
 
     print(
-        "| arm, trained on | K | over random: measured, expected, at best | over all "
-        "| stiff: over random, all | mm: default, stiff |"
+        "| arm, trained on | K | mm: random, chosen, all | stiff: random, chosen, all "
+        "| over random, expected: chosen, at best |\n| --- | --- | --- | --- | --- |"
     )
-    print("| --- | --- | --- | --- | --- | --- |")
-    for name in ("panda_1", "kuka_14"):
-        places, arm = example.load(name), example.arm(name)
-        stiff = dataclasses.replace(arm, compliance=(), yields=np.zeros(0))
-        stated = dataclasses.replace(stiff.default_prior(), by_data=False)
-        for trained, place in places.items():
-            others = [each for at, each in places.items() if at != trained]
-            table = np.column_stack(place)
-            every = np.arange(len(table))
+    arms = {name: example.load(name) for name in ("panda_1", "kuka_14")}
+    for k in (12, 16):
+        lines = []
+        for name, places in arms.items():
+            for trained in places:
+                lines.append(_trained(example, name, trained, k, draws))
+                _print_contacts(f"{name}, {trained}", k, lines[-1])
+        mean = np.mean(lines, axis=0)
+        _print_contacts("mean", k, mean)
+        for i, label in ((0, "by default"), (3, "stiff")):
+            random, chosen, every = mean[i : i + 3]
+            print(f"{label}, {k}: {chosen / every:.2f} of all, ", end="")
+            print(f"{chosen / random:.2f} of random", flush=True)
+    print("\n| arm | judged at | trained on the other places, mm | on all |")
+    print("| --- | --- | --- | --- |")
+    for name, places in arms.items():
+        for judged, place in places.items():
+            others = [each for at, each in places.items() if at != judged]
+            both = [
+                _together(example, name, kept) for kept in (others, places.values())
+            ]
+            cells = " | ".join(f"{example.consistency(on, place):.2f}" for on in both)
+            print(f"| {name} | {judged} | {cells} |", flush=True)
 
-            def by_default(rows: Array) -> float:
-                found = example.identify(name, place, rows).arm  # noqa: B023 - called here
-                return np.mean([example.consistency(found, each) for each in others])  # noqa: B023
 
-            def as_stated(rows: Array) -> float:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", UserWarning)
-                    found = jaxcal.identify(
-                        table[rows],  # noqa: B023
-                        np.zeros((len(rows), 3)),
-                        model=stiff,  # noqa: B023
-                        prior=stated,  # noqa: B023
-                        noise_std=PLAY,
-                        loss="gaussian",
-                    ).arm
-                return np.mean([example.consistency(found, each) for each in others])  # noqa: B023
+def _print_contacts(label: str, k: int, values: Sequence[float]) -> None:
+    cells = [f"{each:.2f}" for each in values]
+    groups = (", ".join(cells[i:j]) for i, j in ((0, 3), (3, 6), (6, 8)))
+    print(f"| {label} | {k} | {' | '.join(groups)} |", flush=True)
 
-            expected, best = _expected(arm, table, others)
-            for k in (12, 16):
-                rng = np.random.default_rng(0)
-                random = [rng.choice(every, k, replace=False) for _ in range(draws)]
-                plain = jaxcal.select(
-                    table, k, "exchange", model=stiff, prior=stated,
-                    noise=jaxcal.Noise(std=PLAY),
-                ).indices  # fmt: skip
-                chosen = example.choose("I", name, place, k, rng)
-                rows = {"chosen": [chosen], "random": random, "best": [best(k)]}
-                real, theory = (
-                    {at: np.mean([error(each) for each in rows[at]]) for at in rows}
-                    for error in (by_default, expected)
-                )
-                tried = as_stated(plain)
-                cells = (
-                    f"{real['chosen'] / real['random']:.2f}, "
-                    f"{theory['chosen'] / theory['random']:.2f}, "
-                    f"{theory['best'] / theory['random']:.2f} | "
-                    f"{real['chosen'] / by_default(every):.2f}, "
-                    f"{theory['chosen'] / expected(every):.2f}, "
-                    f"{theory['best'] / expected(every):.2f} | "
-                    f"{tried / np.mean([as_stated(each) for each in random]):.2f}, "
-                    f"{tried / as_stated(every):.2f} | "
-                    f"{real['chosen']:.2f}, {tried:.2f}"
-                )
-                print(f"| {name}, {trained} | {k} | {cells} |", flush=True)
+
+def _together(example: ModuleType, name: str, places: Iterable[Any]) -> SerialChain:
+    """The arm fitted to all contacts of several places, two sockets each."""
+    tables = [
+        np.column_stack([joints, sockets + 2 * i])
+        for i, (joints, sockets) in enumerate(places)
+    ]
+    apart = [(2 * i, 2 * i + 1, 0.05, 1e-4) for i in range(len(tables))]
+    table = np.vstack(tables)
+    model = example.arm(name).measured_with(Socket(2 * len(tables), distances=apart))
+    return jaxcal.identify(table, np.zeros((len(table), 3)), model=model).arm
+
+
+def _trained(
+    example: ModuleType, name: str, trained: str, k: int, draws: int
+) -> list[float]:
+    """Errors at the other places, mm: random, chosen, all; stiff; expected ratios."""
+    places, arm = example.load(name), example.arm(name)
+    others = [each for at, each in places.items() if at != trained]
+    table = np.column_stack(places[trained])
+    stiff = dataclasses.replace(arm, compliance=(), yields=np.zeros(0))
+    stated = dataclasses.replace(stiff.default_prior(), by_data=False)
+    as_stated = {
+        "model": stiff, "prior": stated, "noise_std": PLAY, "loss": "gaussian"
+    }  # fmt: skip
+
+    def error(rows: Array, **options: Any) -> float:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            zeros = np.zeros((len(rows), 3))
+            found = jaxcal.identify(table[rows], zeros, **({"model": arm} | options))
+        return float(np.mean([example.consistency(found.arm, at) for at in others]))
+
+    rng = np.random.default_rng(0)
+    random = [rng.choice(len(table), k, replace=False) for _ in range(draws)]
+    chosen = example.choose("I", name, places[trained], k, rng)
+    plain = jaxcal.select(
+        table, k, "exchange", model=stiff, prior=stated, noise=jaxcal.Noise(std=PLAY)
+    ).indices
+    every = np.arange(len(table))
+    found = []
+    for rows, options in ((chosen, {}), (plain, as_stated)):
+        found.append(np.mean([error(each, **options) for each in random]))
+        found += [error(rows, **options), error(every, **options)]
+    expected, best = _expected(arm, table, others)
+    by_chance = np.mean([expected(each) for each in random])
+    return [*found, expected(chosen) / by_chance, expected(best(k)) / by_chance]
 
 
 def _expected(

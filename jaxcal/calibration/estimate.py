@@ -23,7 +23,7 @@ from jaxcal.models import (
     Socket,
 )
 from jaxcal.models.identifiability import unknown
-from jaxcal.models.model import facts, require_model
+from jaxcal.models.model import derivative, facts, require_model
 
 __all__ = ["fit_model", "require_fitting"]
 
@@ -93,10 +93,12 @@ def fit_model(
     if common_noise is not None or spread.any():
         levels = each if common_noise is False else 0 * each
     asked = prior is not None
-    whole = model
-    # Of a URDF file what is written back is what is predicted: it holds no harmonics.
-    if isinstance(model, SerialChain) and model.source is None:
-        whole = model if asked or spread.any() else model.with_misfit()
+    whole, bent = model, model
+    if isinstance(model, SerialChain) and not (asked or spread.any()):
+        bent = model.with_misfit()
+        # Of a URDF file what is written back is what is predicted, without harmonics.
+        if model.sensor.misfit and model.source is None:
+            whole = bent
     prior = prior or whole.default_prior()
     resolved = prior.resolve(whole)
     task = Task(
@@ -130,8 +132,12 @@ def fit_model(
         if other.freedom.min() >= 1.0:
             task, found = apart, other
     fields = _fields(task, found, commands, measured, weights)
-    if sizes is not None and fields["joint_covariance"] is not None:
-        fields["joint_covariance"] += of_sizes(task, found, sizes)
+    if fields["joint_covariance"] is not None:
+        within = fields["joint_covariance"].copy()
+        if sizes is not None:
+            fields["joint_covariance"] += of_sizes(task, found, sizes)
+        if isinstance(bent, SerialChain) and bent is not whole:
+            fields |= _misfit(bent, task, found, fields, within)
     return fields | {"model": model, "loss": loss}
 
 
@@ -257,6 +263,60 @@ def _levels_differ(task: Task, found: Solution) -> bool:
     return bool(chance * q * (q - 1) < 1e-3)
 
 
+def _misfit(
+    bent: SerialChain,
+    task: Task,
+    found: Solution,
+    fields: dict[str, Any],
+    within: Array,
+) -> dict[str, Any]:
+    """The fields with harmonics that were not fitted, but may be there.
+
+    They bend what was fitted and go on where nothing was measured, so predictions err
+    by more than the noise explains. Their size is the default prior's times the
+    scatter of the readings over the sensor's usual noise.
+
+    Args:
+        bent: the arm with them.
+        task: that was solved.
+        found: its solution.
+        fields: of it, with the covariance (P, P) that is returned.
+        within: (P, P) covariance of the parameters by the noise alone.
+    """
+    count = bent.waves.size
+    usual = np.asarray(bent.default_noise().std)
+    times = np.sqrt(np.mean((fields["noise_std"] / usual) ** 2))
+    std = times * np.asarray(bent.default_prior().std)[-count:]
+    none = np.zeros(count)
+    theta = np.concatenate([found.parameters, none])
+    waves = derivative(bent, task.commands, theta)[..., -count:]
+    white = task.white / found.level[:, None] @ (waves * std)
+    gram = np.einsum("n,nrf,nrw->fw", _informs(task, found), found.rows, white)
+    turned = within[:, task.free] @ gram
+    joint = np.zeros((len(theta), len(theta)))
+    joint[:-count, :-count] = fields["joint_covariance"] + turned @ turned.T
+    joint[:-count, -count:] = -turned * std
+    joint[-count:, :-count] = joint[:-count, -count:].T
+    joint[-count:, -count:] = np.diag(std**2)
+    null = fields["unidentified"]
+    return {
+        "estimate": theta,
+        "joint_covariance": joint,
+        "unidentified": null if null is None else np.pad(null, ((0, 0), (0, count))),
+        "prior_mean": np.concatenate([task.mean, none]),
+        "prior_precision": np.concatenate([task.precision, std**-2.0]),
+        "free": np.concatenate([fields["free"], none + 1.0]),
+    }
+
+
+def _informs(task: Task, found: Solution) -> Array:
+    """(N,) how much each measurement says, one in full."""
+    if not task.student:
+        return found.weights
+    _, mean, efficiency = student_constants(found.left)
+    return np.asarray(efficiency * np.minimum(1.0, found.weights / mean))
+
+
 def _fields(
     task: Task,
     found: Solution,
@@ -264,11 +324,8 @@ def _fields(
     measured: Array,
     weights: Array,
 ) -> dict[str, Any]:
-    used, information = weights > 0.0, found.weights
-    if task.student:
-        _, mean, efficiency = student_constants(found.left)
-        information = efficiency * np.minimum(1.0, found.weights / mean)
-    rows = np.sqrt(information)[:, None, None] * found.rows
+    used = weights > 0.0
+    rows = np.sqrt(_informs(task, found))[:, None, None] * found.rows
     rows = rows.reshape(-1, rows.shape[-1])
     known = facts(task.model, found.parameters)[1][:, task.free]
     rows = np.concatenate([rows, known])
@@ -337,12 +394,14 @@ def _covariance(task: Task, found: Solution, rows: Array) -> tuple[Array, Array 
         of_rows = significant(np.linalg.svd(rows / scale, compute_uv=False)).sum()
     if of_rows >= readings:
         prior = found.parameters, task.precision, task.free
-        left = unknown(task.model, task.commands, *prior)
+        left = "; ".join(
+            each.words for each in unknown(task.model, task.commands, *prior)
+        )
         raise ValueError(
             f"measured holds {readings} independent readings, too few for "
             f"{len(free)} free parameters: {int((~known).sum())} combinations of them "
-            f"stay unknown ({'; '.join(each.words for each in left)}); measure "
-            "more, or give a prior or fixed parameters"
+            f"stay unknown{f' ({left})' if left else ''}; measure more, or give a "
+            "prior or fixed parameters"
         )
     root = right[known] / singular[known, None] / scale
     covariance = np.zeros((size, size))

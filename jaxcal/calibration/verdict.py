@@ -123,6 +123,11 @@ def _left_out(calibration: Fit, used: NDArray[np.intp]) -> Array:
     """(N, q) residual of each measurement from the fit without it."""
     noise = np.diag(np.asarray(calibration.noise_std) ** 2)
     slopes, covariance = calibration.linear(calibration.commands[used])
+    p = len(calibration.names)
+    if not calibration.estimate[p:].any():  # harmonics were not fitted: without them
+        covariance, by = covariance[:p, :p], covariance[:p, p:]
+        slopes = slopes[..., :p]
+        covariance = covariance - by * calibration.prior_precision[p:] @ by.T
     spread = slopes @ covariance @ np.matrix_transpose(slopes)
     # Of an outlier little was fitted: its weight says how much.
     share = np.minimum(calibration.loss_weights[used], 1.0)[:, None, None]

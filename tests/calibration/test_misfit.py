@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal.models import Pose, SerialChain
+from jaxcal.models import Pose, SerialChain, Socket
 
-from ..models.arms import CONTACTS, ur5
+from ..models.arms import CONTACTS, contacts_of_a_panda, ur5
 
 ARM = ur5()
 WHOLE = ARM.with_misfit()
@@ -122,3 +122,58 @@ def test_positions_have_one_level_of_noise_and_turns_another(seed, count):
     if count > 8:
         np.testing.assert_allclose([place[0], turn[0]], [0.1, 0.02], rtol=0.2)
         assert found.noise_dof > 100.0
+
+
+def test_contacts_of_eccentric_gears_err_elsewhere_as_predicted():
+    """One socket does not show them; the fit bends its parameters instead."""
+    arm = SerialChain.from_urdf(
+        CONTACTS / "panda.urdf", tip="ball_link", sensor=Socket(1, [[0.45, 0.0, 0.3]])
+    )
+    bent = arm.with_misfit()
+    waves = np.asarray(bent.default_prior().std)[-28:]
+    there = arm.postures(40, seed=1)
+    wide = arm.measured_with(Socket(1, [[0.2, 0.4, 0.6]])).postures(40, seed=2)
+    covered = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        truth = np.append(arm.nominal, waves * rng.normal(size=28))
+        measured = bent.predict(there, truth) + 2e-4 * rng.normal(size=(40, 3))
+        found = jaxcal.identify(there, measured, model=arm)
+        assert len(found.estimate) == len(found.names) + 28
+        np.testing.assert_array_equal(found.estimate[-28:], 0.0)
+        off = found.arm.predict(wide[:, :7])
+        off -= bent.calibrated(truth).predict(wide[:, :7])
+        slopes, whole = found.linear(wide)
+        p = len(found.names)
+        alone = whole[:p, p:] * found.prior_precision[p:] @ whole[p:, :p]
+        moves = slopes - slopes.mean(axis=0)  # a place is known by its middle
+        inside = []
+        for rows, covariance in (
+            (moves, whole),
+            (moves[..., :p], whole[:p, :p] - alone),
+        ):
+            variance = np.einsum("nqi,ij,nqj->nq", rows, covariance, rows)
+            inside.append(np.abs(off - off.mean(axis=0)) < 1.96 * np.sqrt(variance))
+        covered.append(np.mean(inside, axis=(1, 2)))
+    with_misfit, without = np.mean(covered, axis=0)
+    assert with_misfit > 0.9 and without < 0.8
+
+
+def test_the_covariance_of_what_may_be_there_is_that_of_a_dense_formula():
+    """An estimate that ignores harmonics w errs by -K G w, its prediction by G w."""
+    path, joints, sockets = contacts_of_a_panda("front")
+    arm = SerialChain.from_urdf(path, tip="ball_link", sensor=Socket(2))
+    commands = np.column_stack([np.degrees(joints), sockets])
+    options = {"loss": "gaussian", "noise_std": 2e-4}
+    found = jaxcal.identify(
+        commands, np.zeros((len(commands), 3)), model=arm, **options
+    )
+    p, free = len(found.names), found.free > 0.0
+    slopes = found.whole.jacobian(commands, found.estimate).reshape(-1, p + 28) / 2e-4
+    fitted, waves = slopes[:, :p][:, free[:p]], slopes[:, p:]
+    precision = np.diag(found.prior_precision[:p][free[:p]])
+    gain = np.linalg.solve(fitted.T @ fitted + precision, fitted.T)
+    std = 0.045 * 2e-4 / np.asarray(arm.default_noise().std)[0]
+    np.testing.assert_allclose(found.prior_precision[p:], std**-2.0)
+    across = found.joint_covariance[:p, p:][free[:p]]
+    np.testing.assert_allclose(across, -gain @ waves * std**2, rtol=1e-4, atol=1e-12)

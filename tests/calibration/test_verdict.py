@@ -37,13 +37,16 @@ def test_good_contacts_get_a_good_verdict():
     assert "held-out error" in found.summary()
 
 
-def test_held_out_errors_are_those_of_fits_without_each_contact():
+@pytest.mark.parametrize("by_default", [False, True])
+def test_held_out_errors_are_those_of_fits_without_each_contact(by_default):
     rows = np.arange(0, 62, 2)
     joints, sockets = PLACE[0][rows], PLACE[1][rows]
     commands = np.column_stack([joints, sockets])
     arm = contacts.arm("panda_1")
     stated = dataclasses.replace(arm.default_prior(), by_data=False)
     options = {"model": arm, "loss": "gaussian", "noise_std": 2e-4, "prior": stated}
+    if by_default:  # with sizes by the readings, and what may be there besides
+        del options["prior"]
     zeros = np.zeros((len(rows), 3))
     whole = jaxcal.identify(commands, zeros, **options)
     errors = []

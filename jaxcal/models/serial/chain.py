@@ -239,12 +239,12 @@ class SerialChain(Arm):
         return dataclasses.replace(self, sensor=sensor)
 
     def with_misfit(self) -> Self:
-        """This arm with harmonics of its joints, where its sensor asks for them.
+        """This arm with harmonics of its joints.
 
         They are no parameters of the arm: ``identify``, and ``select`` for predictions,
-        add them where no prior is given, as what the parameters do not explain.
+        count on them where no prior is given, as what the parameters do not explain.
         """
-        if self.harmonics or not self.sensor.misfit:
+        if self.harmonics or "R" not in self.joints:
             return self
         bent = tuple(i + 1 for i, kind in enumerate(self.joints) if kind == "R")
         waves = np.zeros((len(bent), 4))

@@ -16,6 +16,7 @@ from jaxcal.checks import array_of, numbers, require_kind
 from jaxcal.information.blocks import coarseness
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, by_name, require_model
+from jaxcal.models.serial import SerialChain
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.criteria import wanted
 from jaxcal.selection.problem.making import (
@@ -174,8 +175,9 @@ class Asked:
             if shares_regressor(model, prior, self.noise):
                 return Shared(model, candidates, self.noise)
         misfit = 0.0
-        if of_predictions and prior is None and hasattr(model, "with_misfit"):
-            model, misfit = model.with_misfit(), model.misfit_std
+        if of_predictions and prior is None and isinstance(model, SerialChain):
+            misfit = model.misfit_std
+            model = model.with_misfit() if misfit else model
         return Modelled(model, candidates, self.available, prior, self.noise, misfit)
 
     def with_noise(self, noise: Noise | None) -> Self:
