@@ -122,12 +122,14 @@ def verdict(calibration: Fit) -> Verdict | None:
 def _left_out(calibration: Fit, used: NDArray[np.intp]) -> Array:
     """(N, q) residual of each measurement from the fit without it."""
     noise = np.diag(np.asarray(calibration.noise_std) ** 2)
-    slopes, covariance = calibration.linear(calibration.commands[used])
-    p = len(calibration.names)
-    if not calibration.estimate[p:].any():  # harmonics were not fitted: without them
-        covariance, by = covariance[:p, :p], covariance[:p, p:]
-        slopes = slopes[..., :p]
-        covariance = covariance - by * calibration.prior_precision[p:] @ by.T
+    commands, p = calibration.commands[used], len(calibration.names)
+    if calibration.estimate[p:].any():
+        slopes, covariance = calibration.linear(commands)
+    else:  # without harmonics, which were not fitted
+        slopes = calibration.model.jacobian(commands, calibration.parameters)
+        joint = np.asarray(calibration.joint_covariance)
+        by = joint[:p, p:]
+        covariance = joint[:p, :p] - by * calibration.prior_precision[p:] @ by.T
     spread = slopes @ covariance @ np.matrix_transpose(slopes)
     # Of an outlier little was fitted: its weight says how much.
     share = np.minimum(calibration.loss_weights[used], 1.0)[:, None, None]

@@ -244,6 +244,10 @@ class SerialChain(Arm):
         They are no parameters of the arm: ``identify``, and ``select`` for predictions,
         count on them where no prior is given, as what the parameters do not explain.
         """
+        return self._bent
+
+    @functools.cached_property
+    def _bent(self) -> Self:  # kept, and what it keeps with it
         if self.harmonics or "R" not in self.joints:
             return self
         bent = tuple(i + 1 for i, kind in enumerate(self.joints) if kind == "R")
