@@ -26,6 +26,7 @@ import pathlib
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -222,24 +223,16 @@ def tracked(draw: int) -> tuple[Array, Array]:
 Made = Callable[[int], tuple[Array, Array]]
 MISFIT: dict[str, tuple[int, Made]] = {
     "UR5, real": (6, tracked),
-    "UR5, no misfit": (6, lambda draw: cable_driven(6, draw, paths=False)),
-    "UR5, cables": (
-        6,
-        lambda draw: cable_driven(6, draw, errors=0.8, smooth=1.0, rough=1.0),
-    ),
-    "WAM, cables": (
-        7,
-        lambda draw: cable_driven(7, draw, errors=0.7, smooth=1.0, rough=1.0),
-    ),
+    "UR5, no misfit": (6, partial(cable_driven, 6, paths=False)),
+    "UR5, cables": (6, partial(cable_driven, 6, errors=0.8, smooth=1.0, rough=1.0)),
+    "WAM, cables": (7, partial(cable_driven, 7, errors=0.7, smooth=1.0, rough=1.0)),
     "WAM, eccentric drums": (
         7,
-        lambda draw: cable_driven(7, draw, errors=0.3, drums=0.1, rough=1.0),
+        partial(cable_driven, 7, errors=0.3, drums=0.1, rough=1.0),
     ),
     "UR5, cables, anywhere": (
         6,
-        lambda draw: cable_driven(
-            6, draw, errors=0.5, smooth=1.0, rough=1.0, paths=False
-        ),
+        partial(cable_driven, 6, errors=0.5, smooth=1.0, rough=1.0, paths=False),
     ),
 }
 

@@ -394,12 +394,14 @@ def _covariance(task: Task, found: Solution, rows: Array) -> tuple[Array, Array 
         of_rows = significant(np.linalg.svd(rows / scale, compute_uv=False)).sum()
     if of_rows >= readings:
         prior = found.parameters, task.precision, task.free
-        left = unknown(task.model, task.commands, *prior)
+        left = "; ".join(
+            each.words for each in unknown(task.model, task.commands, *prior)
+        )
         raise ValueError(
             f"measured holds {readings} independent readings, too few for "
             f"{len(free)} free parameters: {int((~known).sum())} combinations of them "
-            f"stay unknown{' (' * bool(left)}{'; '.join(each.words for each in left)}"
-            f"{')' * bool(left)}; measure more, or give a prior or fixed parameters"
+            f"stay unknown{f' ({left})' if left else ''}; measure more, or give a "
+            "prior or fixed parameters"
         )
     root = right[known] / singular[known, None] / scale
     covariance = np.zeros((size, size))

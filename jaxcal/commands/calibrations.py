@@ -66,6 +66,10 @@ class ArmOptions:
             if kind is not Socket:
                 raise ValueError("--distance is of --sensor socket")
             given["distances"] = self.distance
+            if table is not None and self.sensor not in table.names:
+                raise ValueError(
+                    f"{table.source}: --distance needs a column 'socket', from 0"
+                )
         sensor = kind(**given)
         return SerialChain.from_urdf(path, base=self.base, tip=self.tip, sensor=sensor)
 

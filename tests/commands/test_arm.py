@@ -61,6 +61,13 @@ def test_what_does_not_fit_is_refused(files, capsys, flags, message):
     assert message in capsys.readouterr().err
 
 
+def test_distances_between_sockets_need_to_know_which_is_which(files, capsys):
+    table = files[1]
+    table.write_text(table.read_text().replace("socket", "place"))
+    assert _run(files, "--radians", "--distance", "0,1,0.05,0.0001") == 2
+    assert "--distance needs a column 'socket'" in capsys.readouterr().err
+
+
 def test_joints_far_beyond_their_limits_are_named(files):
     import jaxcal
 

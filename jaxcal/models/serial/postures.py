@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 Chain = Any  # a SerialChain, whose module imports this one
 
 _ROUNDS, _STEPS = 40, 80  # batches of starts; steps of the inverse kinematics
+_BATCH = 2_000  # starts at a time, where few are any good
 _VAIN = 8  # batches in which nothing is found: there is nothing
 _REACHED = 1e-7  # of the arm's length
 _APART = 2.0  # degrees (of a slide: percent of its stroke) between two postures
@@ -53,6 +54,8 @@ def postures(
         if batch == _VAIN and not len(found):
             break
         size = max(2 * (count - len(found)), 64)
+        if len(found):  # more where few were any good: a board is seldom in view
+            size = max(size, min(size * tried // (4 * len(found)), _BATCH))
         tried += size
         starts = rng.uniform(low, high, (size, arm.num_joints))
         labels = np.zeros((size, len(arm.sensor.inputs)))
