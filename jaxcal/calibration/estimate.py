@@ -163,8 +163,15 @@ def _require_postures(arm: SerialChain, commands: Array, measured: Array) -> Non
     """Refuse radians for degrees, and joints far beyond their limits."""
     low, high = arm.limits.T
     units = np.array(arm.command_units)
-    slack = np.where(units == "deg", _BEYOND, 0.01 * _BEYOND * (high - low))
     joints = commands[:, : arm.num_joints]
+    largest = np.abs(joints[:, units == "deg"]).max(initial=0.0)
+    small = arm.num_joints > 2 and 1.0 < largest < 7.0
+    if small and arm.sensor.kind not in ("position", "pose", "several"):
+        raise ValueError(
+            f"commands must be in degrees, got angles of at most {largest:.3g}, which "
+            "look like radians: np.degrees(commands), --radians"
+        )
+    slack = np.where(units == "deg", _BEYOND, 0.01 * _BEYOND * (high - low))
     far = np.argwhere((joints < low - slack) | (joints > high + slack))
     for row, joint in far[:1]:
         raise ValueError(
@@ -173,13 +180,6 @@ def _require_postures(arm: SerialChain, commands: Array, measured: Array) -> Non
             f"{joints[row, joint]:g} in row {row}; are the columns in this order: "
             f"{', '.join(arm.joint_names)}? Where the file's limits are wrong, "
             "give limits={name: (low, high)}"
-        )
-    largest = np.abs(joints[:, units == "deg"]).max(initial=0.0)
-    small = arm.num_joints > 2 and 1.0 < largest < 7.0
-    if small and arm.sensor.kind not in ("position", "pose", "several"):
-        raise ValueError(
-            f"commands must be in degrees, got angles of at most {largest:.3g}, which "
-            "look like radians: np.degrees(commands), --radians"
         )
 
 

@@ -287,7 +287,7 @@ def _swapped(
         apart = np.linalg.norm(points[:, None] - middles, axis=-1)
         own, nearest = apart[np.arange(len(which)), which], apart.min(axis=1)
         if np.median(own) < 0.5 * np.median(apart.max(axis=1)):
-            wrong = np.flatnonzero(nearest < 0.5 * own)
+            wrong = np.flatnonzero(nearest < 0.8 * own)
             fits = labels[apart[wrong].argmin(axis=1)]
             found |= dict(zip(used[wrong].tolist(), fits.tolist(), strict=True))
     return dict(sorted(found.items()))

@@ -208,3 +208,57 @@ def test_too_few_contacts_to_judge_are_said():
     with pytest.warns(UserWarning, match="no intervals and no verdict: 3 measurements"):
         found = _fit("panda_1", PLACE[0][rows], PLACE[1][rows])
     assert not found.verdict.good and found.summary().count("no intervals") == 1
+
+
+def _moved(arm, joints, row, off):
+    """Joints whose ball is ``off`` (3,) from where it was, of one row."""
+    joints, at = joints.copy(), arm.calibrated(arm.nominal)
+    there = at.predict(joints[row : row + 1])[0] + off
+    for _ in range(6):
+        lacks = there - at.predict(joints[row : row + 1])[0]
+        rate = at.command_jacobian(joints[row : row + 1])[0]
+        joints[row] += np.linalg.pinv(rate) @ lacks
+    return joints
+
+
+def _told(arm, joints, sockets):
+    """Reasons of a verdict that is not good."""
+    commands = np.column_stack([joints, sockets])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        zeros = np.zeros((len(joints), 3))
+        verdict = jaxcal.identify(commands, zeros, model=arm).verdict
+    return "" if verdict.good else "\n".join(verdict.reasons)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [12, 16, None])
+@pytest.mark.parametrize("name", ["panda_1", "kuka_14"])
+def test_wrong_contacts_of_every_place_are_told_by_name(name, count):
+    """Rows of the other socket, radians, a tip 10 mm off, a contact 10 mm loose."""
+    arm = contacts.arm(name)
+    for seed, place in enumerate(contacts.load(name).values()):
+        rng = np.random.default_rng(seed)
+        rule = "I" if count else "all"
+        rows = np.asarray(contacts.choose(rule, name, place, count, rng))
+        joints, sockets = place[0][rows], place[1][rows]
+
+        assert not _told(arm, joints, sockets)  # as they are
+        wrong = rng.choice(len(rows), 2, replace=False)
+        other = sockets.copy()
+        other[wrong] = 1.0 - other[wrong]
+        for row in wrong:
+            instead = f"measurement {row} fits socket {sockets[row]:.0f} instead"
+            assert instead in _told(arm, joints, other)
+        with pytest.raises(ValueError, match="look like radians"):
+            _told(arm, np.radians(joints), sockets)
+        for axis in range(3):
+            for off in (-0.01, 0.01):
+                tool = arm.tool.copy()
+                tool[axis, 3] += off
+                wrong_tip = dataclasses.replace(arm, tool=tool)
+                assert "is it another tip?" in _told(wrong_tip, joints, sockets)
+        for _ in range(4):
+            row, off = rng.integers(len(rows)), rng.normal(size=3)
+            loose = _moved(arm, joints, row, 0.01 * off / np.linalg.norm(off))
+            assert f"measurement {row} is " in _told(arm, loose, sockets)

@@ -25,6 +25,7 @@ __all__ = ["written"]
 Array = NDArray[np.float64]
 
 _UR = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+_TAG = re.compile(rb"""(?:[^>"']+|"[^"]*"|'[^']*')*>""")
 _SAME = 1e-13  # metres and radians: no correction
 
 
@@ -264,13 +265,6 @@ def _places(data: bytes) -> tuple[dict[str, tuple[int, int | None]], int]:
 
 def _end_of_tag(data: bytes, start: int) -> int:
     """One after the > of the tag that begins at ``start``."""
-    quote = None
-    for i in range(start, len(data)):
-        letter = data[i : i + 1]
-        if quote is not None:
-            quote = None if letter == quote else quote
-        elif letter in (b'"', b"'"):
-            quote = letter
-        elif letter == b">":
-            return i + 1
-    raise ValueError("a tag does not end")
+    tag = _TAG.match(data, start)
+    assert tag is not None  # the file was parsed
+    return tag.end()
