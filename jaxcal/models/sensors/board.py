@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers, one_of
+from jaxcal.checks import array_of, numbers, one_of
 from jaxcal.models.sensors.pose import rotation_vector_rate
 from jaxcal.models.sensors.sensor import BASE, Named, Reading, Sensor, Tip, hats
 
@@ -49,15 +49,14 @@ class Board(Sensor):
 
     kind = "board"
     tool = ("x", "y", "z", "rx", "ry", "rz")
+    names = tuple(f"stand {axis}" for axis in tool)
+    units = ("length",) * 3 + ("deg",) * 3
     _seen: ClassVar[tuple[str, ...]] = tuple(f"seen {axis}" for axis in tool)
 
     def __post_init__(self) -> None:
         one_of("moves", self.moves, ("camera", "board"))
         if self.place is not None:
-            place = numbers("place", self.place)
-            if place.shape != (4, 4):
-                raise ValueError(f"place must have shape (4, 4), got {place.shape}")
-            object.__setattr__(self, "place", place)
+            object.__setattr__(self, "place", array_of("place", self.place, 4, 4))
         if self.corners is None:
             return
         corners = numbers("corners", self.corners)
@@ -89,14 +88,6 @@ class Board(Sensor):
         if self.corners is None:
             return tuple(f"off {axis}" for axis in self.tool)
         return tuple(f"{a}{i + 1}" for i in range(len(self.corners)) for a in "uv")
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(f"stand {axis}" for axis in self.tool)
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        return ("length",) * 3 + ("deg",) * 3
 
     @property
     def nominal(self) -> Array:

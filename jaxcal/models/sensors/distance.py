@@ -24,13 +24,10 @@ class Distance(Placed):
     """
 
     kind = "distance"
+    outputs = ("length",)
     axes = ("x", "y", "z", "zero")
     axis_units = ("length",) * 4
     width = 4
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        return ("length",)
 
     def prior_std(self, length: float) -> Array:
         return np.tile([np.inf, np.inf, np.inf, 0.01 * length], self.count)

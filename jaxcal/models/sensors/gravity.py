@@ -34,6 +34,9 @@ class Gravity(Sensor):
 
     kind = "gravity"
     tool = ("rx", "ry", "rz")
+    outputs = ("acceleration x", "acceleration y", "acceleration z")
+    names = ("gravity scale", "bias x", "bias y", "bias z")
+    units = ("ratio", *["acceleration"] * 3)
 
     def __post_init__(self) -> None:
         up = numbers("up", self.up)
@@ -42,18 +45,6 @@ class Gravity(Sensor):
         if not numbers("magnitude", self.magnitude) > 0.0:
             raise ValueError(f"magnitude must be positive, got {self.magnitude}")
         object.__setattr__(self, "up", tuple((up / np.linalg.norm(up)).tolist()))
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        return ("acceleration x", "acceleration y", "acceleration z")
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return ("gravity scale", "bias x", "bias y", "bias z")
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        return ("ratio", *["acceleration"] * 3)
 
     @property
     def nominal(self) -> Array:

@@ -26,6 +26,7 @@ class Plane(Placed):
     """
 
     kind = "plane"
+    outputs = ("height",)
     zeros = True
     axes = ("tilt1", "tilt2", "offset")
     axis_units = ("deg", "deg", "length")
@@ -41,10 +42,6 @@ class Plane(Placed):
                 [self.places[:, :3] / size[:, None], self.places[:, 3]]
             )
             object.__setattr__(self, "places", places)
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        return ("height",)
 
     @property
     def nominal(self) -> Array:

@@ -24,10 +24,7 @@ class Pose(Sensor):
 
     kind = "pose"
     tool = ("x", "y", "z", "rx", "ry", "rz")
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        return self.tool
+    outputs = tool
 
     def usual_noise(self, length: float) -> ArrayLike:
         return [1e-4 * length] * 3 + [float(np.degrees(1e-4))] * 3

@@ -19,12 +19,9 @@ class Position(Sensor):
     """x, y, z of the tip in the measuring frame; noise 0.01 % of the arm's length."""
 
     kind = "position"
+    outputs = ("x", "y", "z")
     sizes_prior = True
     misfit = 3e-4
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        return ("x", "y", "z")
 
     def usual_noise(self, length: float) -> ArrayLike:
         return 1e-4 * length

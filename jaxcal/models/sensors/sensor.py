@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers, whole_number
+from jaxcal.checks import array_of, numbers, whole_number
 
 __all__ = [
     "BASE",
@@ -199,10 +199,7 @@ class Placed(Sensor):
     def __post_init__(self) -> None:
         whole_number("count", self.count, 1)
         if self.places is not None:
-            places = numbers("places", self.places)
-            shape = (self.count, self.width)
-            if places.shape != shape:
-                raise ValueError(f"places must have shape {shape}, got {places.shape}")
+            places = array_of("places", self.places, self.count, self.width)
             object.__setattr__(self, "places", places)
 
     @property

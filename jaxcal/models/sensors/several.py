@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers, table
+from jaxcal.checks import array_of, table
 from jaxcal.models.sensors.sensor import Named, Reading, Sensor, Tip, hats, label
 
 __all__ = ["Several"]
@@ -46,11 +46,7 @@ class Several(Sensor):
         object.__setattr__(self, "sensors", given)
         frames = np.tile(np.eye(4), (len(given) - 1, 1, 1))
         if self.mounts is not None:
-            frames = numbers("mounts", self.mounts)
-        if frames.shape != (len(given) - 1, 4, 4):
-            raise ValueError(
-                f"mounts must have shape ({len(given) - 1}, 4, 4), got {frames.shape}"
-            )
+            frames = array_of("mounts", self.mounts, len(given) - 1, 4, 4)
         object.__setattr__(self, "mounts", frames)
 
     @property
@@ -108,16 +104,11 @@ class Several(Sensor):
 
     def prior_std(self, length: float) -> Array:
         mounting = {"r": 1.7, "": 0.1 * length}  # as the tool's
-        parts = [
-            np.concatenate(
-                [
-                    [mounting[axis[:-1]] for axis in (one.tool if i else ())],
-                    one.prior_std(length),
-                ]
-            )
-            for i, one in enumerate(self.sensors)
-        ]
-        return np.concatenate(parts)
+        parts: list[float] = []
+        for i, one in enumerate(self.sensors):
+            parts += [mounting[axis[:-1]] for axis in (one.tool if i else ())]
+            parts += one.prior_std(length).tolist()
+        return np.array(parts)
 
     def usual_noise(self, length: float) -> ArrayLike:
         return 1.0
@@ -262,12 +253,8 @@ class Several(Sensor):
             measured = np.zeros((len(commands), q))
             width = len(one.outputs)
             if read is not None:
-                values = table("measured", read)
-                if values.shape != (len(commands), width):
-                    raise ValueError(
-                        f"measured of {one.kind} must have shape "
-                        f"({len(commands)}, {width}), got {values.shape}"
-                    )
+                what = f"measured of {one.kind}"
+                values = array_of(what, read, len(commands), width)
                 measured[:, :width] = values / one.stds(length)
             all_commands.append(np.hstack([commands[:, :joints], own]))
             all_measured.append(measured)

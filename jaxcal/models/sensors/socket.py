@@ -34,6 +34,7 @@ class Socket(Placed):
     distances: Sequence[Sequence[float]] = ()
 
     kind = "socket"
+    outputs = ("off x", "off y", "off z")
     zeros = True
     sizes_prior = True
     compliant = True
@@ -53,10 +54,6 @@ class Socket(Placed):
         if (pairs[0] == pairs[1]).any():
             raise ValueError(f"distances must name two sockets, got {self.distances!r}")
         object.__setattr__(self, "distances", tuple(map(tuple, rows.tolist())))
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        return ("off x", "off y", "off z")
 
     def usual_noise(self, length: float) -> ArrayLike:
         return 2e-4 * length
