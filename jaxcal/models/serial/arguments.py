@@ -60,10 +60,18 @@ def pose_matrix(pose: Array) -> Array:
     return matrix
 
 
-def joint_numbers(argument: str, given: Sequence[int], n: int) -> tuple[int, ...]:
+def joint_numbers(
+    argument: str, given: Sequence[int], joints: str, kinds: str = "RP"
+) -> tuple[int, ...]:
+    n = len(joints)
     result = tuple(whole_number(argument, joint, 1) for joint in given)
     if len(set(result)) < len(result) or max(result, default=1) > n:
         raise ValueError(f"{argument} must hold joints of 1 to {n} once, got {given!r}")
+    for joint in result:
+        if joints[joint - 1] not in kinds:
+            raise ValueError(
+                f"{argument} must name revolute joints, joint {joint} is prismatic"
+            )
     return result
 
 

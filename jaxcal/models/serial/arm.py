@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers
+from jaxcal.checks import array_of, numbers
 from jaxcal.models.model import as_commands
 from jaxcal.models.sensors import Sensor, Tip
 from jaxcal.models.serial.kernel import forward
@@ -102,12 +102,7 @@ class Arm:
         from scipy.spatial.transform import Rotation
 
         commands = as_commands(self, commands)
-        rotations = numbers("rotations", rotations)
-        if rotations.shape != (len(commands), 3, 3):
-            raise ValueError(
-                f"rotations must have shape ({len(commands)}, 3, 3), "
-                f"got {rotations.shape}"
-            )
+        rotations = array_of("rotations", rotations, len(commands), 3, 3)
         nominal = self._nominal_rotations(commands)
         turn = rotations @ np.matrix_transpose(nominal)
         return np.asarray(Rotation.from_matrix(turn).as_rotvec(degrees=True))

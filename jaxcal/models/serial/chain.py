@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import array_of, in_words, numbers, one_of
+from jaxcal.checks import array_of, axis_names, in_words, numbers, one_of
 from jaxcal.files import atomic_write
 from jaxcal.models.model import as_commands, as_parameters
 from jaxcal.models.sensors import SENSORS, Position, Sensor, Several
@@ -132,17 +132,10 @@ class SerialChain(Arm):
                 f"joints must be {n} letters R (revolute) or P (prismatic), "
                 f"got {joints!r}"
             )
-        moves = np.eye(n) if drive is None else numbers("drive", drive)
-        if moves.ndim != 2 or len(moves) != n:
-            raise ValueError(f"drive must have shape ({n}, J), got {moves.shape}")
+        moves = np.eye(n) if drive is None else array_of("drive", drive, n, "J")
         columns = moves.shape[1]
-        if joint_names and len(joint_names) != columns:
-            raise ValueError(
-                f"joint_names must hold {columns} names, got {joint_names!r}"
-            )
-        at_zero = np.zeros(n) if offset is None else numbers("offset", offset)
-        if at_zero.shape != (n,):
-            raise ValueError(f"offset must have shape ({n},), got {at_zero.shape}")
+        names = joint_names or _numbered(columns)
+        at_zero = np.zeros(n) if offset is None else array_of("offset", offset, n)
         sensor = Position() if sensor is None else sensor
         if isinstance(sensor, Mapping):
             kind = one_of("kind of the sensor", sensor.get("kind"), tuple(SENSORS))
@@ -155,17 +148,9 @@ class SerialChain(Arm):
         if compliance is None:
             turning = [i + 1 for i in range(n) if joints[i] == "R"]
             compliance = turning if sensor.compliant else ()
-        number = joint_numbers("compliance", compliance, n)
-        bent = joint_numbers("harmonics", harmonics, n)
-        for what, named in (("compliance", number), ("harmonics", bent)):
-            for joint in named:
-                if joints[joint - 1] == "P":
-                    raise ValueError(
-                        f"{what} must name revolute joints, joint {joint} is prismatic"
-                    )
-        known = np.zeros(len(number)) if yields is None else numbers("yields", yields)
-        if known.shape != (len(number),):
-            raise ValueError(f"yields must have shape ({len(number)},)")
+        number = joint_numbers("compliance", compliance, joints, "R")
+        bent = joint_numbers("harmonics", harmonics, joints, "R")
+        known = np.zeros(len(number)) if yields is None else yields
         swings = np.zeros((len(bent), 4)) if waves is None else numbers("waves", waves)
         if swings.size != 4 * len(bent):
             raise ValueError(f"waves must have shape ({len(bent)}, 4)")
@@ -180,14 +165,14 @@ class SerialChain(Arm):
             transform("base", base),
             end,
             sensor,
-            joint_numbers("gears", gears, n),
+            joint_numbers("gears", gears, joints),
             number,
-            known,
+            array_of("yields", known, len(number)),
             bent,
             swings.reshape(-1, 4),
             tuple(load(each, n) for each in given),
             tuple(array_of("gravity", gravity, 3).tolist()),
-            tuple(joint_names) or _numbered(columns),
+            axis_names("joint_names", names, "", columns),
             moves,
             at_zero,
             _limits(limits, columns),
@@ -228,7 +213,7 @@ class SerialChain(Arm):
         # scipy.spatial and the XML parser take half a second to load.
         from jaxcal.models.serial.urdf import read_urdf
 
-        arm = read_urdf(path, tip, base, locked or {})._asdict()
+        arm = read_urdf(path, tip, base, locked or {})
         for name, ends in (limits or {}).items():
             joint = one_of("limits", name, tuple(arm["joint_names"]))
             arm["limits"][arm["joint_names"].index(joint)] = ends
@@ -623,9 +608,7 @@ def _limits(given: ArrayLike | None, columns: int) -> Array:
     open_ended = np.tile([-np.inf, np.inf], (columns, 1))
     if given is None:
         return open_ended
-    limits = numbers("limits", given, finite=False)  # None becomes NaN
-    if limits.shape != (columns, 2):
-        raise ValueError(f"limits must have shape ({columns}, 2), got {limits.shape}")
+    limits = array_of("limits", given, columns, 2, finite=False)  # None becomes NaN
     limits = np.where(np.isnan(limits), open_ended, limits)
     bad = np.flatnonzero(limits[:, 0] > limits[:, 1])
     if bad.size:

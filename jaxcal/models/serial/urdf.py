@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import pathlib
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 from jaxcal.checks import numbers
 
 __all__ = [
-    "Chain",
     "Joint",
     "joints_of",
     "led",
@@ -33,20 +32,6 @@ __all__ = [
 Array = NDArray[np.float64]
 
 _PARALLEL = 0.2  # sine; below it the common normal of two axes is far away
-
-
-class Chain(NamedTuple):
-    """Arguments of ``SerialChain.from_dh``; angles in degrees, lengths in metres."""
-
-    table: Array  # (n, 5)
-    joints: str
-    joint_names: tuple[str, ...]  # J columns of the commands
-    base: Array  # (4, 4)
-    tool: Array  # (4, 4)
-    drive: Array  # (n, J)
-    offset: Array  # (n,)
-    limits: Array  # (J, 2)
-    source: dict[str, object]  # text, base, tip, locked: what ``walk`` asks for
 
 
 class Joint(NamedTuple):
@@ -71,9 +56,11 @@ def read_urdf(
     tip: str | None,
     base: str | None,
     locked: Mapping[str, float],
-) -> Chain:
-    """Raises:
-    ValueError: the file is malformed or a xacro file, a joint of the chain is of
+) -> dict[str, Any]:
+    """Arguments of ``SerialChain.from_dh``; angles in degrees, lengths in metres.
+
+    Raises:
+        ValueError: the file is malformed or a xacro file, a joint of the chain is of
         another type, the links form a loop, or ``tip``, ``base`` and ``locked`` are not
         in it; the message names the link or joint.
     """
@@ -312,7 +299,7 @@ def _table(
     joints: dict[str, Joint],
     locked: Mapping[str, float],
     source: dict[str, object],
-) -> Chain:
+) -> dict[str, Any]:
     frame = np.eye(4)
     lines, kinds, leads = [], [], []
     for joint, down in chain:
@@ -353,17 +340,17 @@ def _table(
         rows.append(row)
         reached = reached @ row_matrix(row)
     rows.append(np.zeros(5))
-    return Chain(
-        np.array(rows),
-        "".join(kinds),
-        tuple(columns),
-        base,
-        np.linalg.inv(reached) @ frame,
-        drive,
-        np.array([plus for _, _, plus in leads]),
-        np.array(limits),
-        source,
-    )
+    return {
+        "table": np.array(rows),
+        "joints": "".join(kinds),
+        "joint_names": tuple(columns),
+        "base": base,
+        "tool": np.linalg.inv(reached) @ frame,
+        "drive": drive,
+        "offset": np.array([plus for _, _, plus in leads]),
+        "limits": np.array(limits),
+        "source": source,
+    }
 
 
 def _turn_of_z(axis: Array) -> Array:
