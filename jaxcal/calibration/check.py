@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.fit import Fit
-from jaxcal.checks import numbers, table, whole_number
+from jaxcal.checks import array_of, numbers, table, whole_number
 from jaxcal.information.blocks import without
 from jaxcal.models import SerialChain
 
@@ -74,20 +74,14 @@ def check(
     """
     from scipy import special
 
-    commands, measured = table("commands", commands), table("measured", measured)
-    if len(commands) != len(measured) or not len(commands):
-        raise ValueError(
-            "commands and measured must have as many rows, at least one, got "
-            f"{len(commands)} and {len(measured)}"
-        )
-    noise = calibration.noise_std
-    if noise is None:
-        raise ValueError("no check: the noise of the calibration is not known")
+    commands = table("commands", commands)
+    shape = len(commands), calibration.num_outputs
+    rule = ": as many rows as commands"
+    measured = array_of("measured", measured, *shape, rule=rule)
+    noise = calibration.require_noise("check")
     model, theta = calibration.model, calibration.parameters
     slopes = np.asarray(model.jacobian(commands, theta))
-    p, q = slopes.shape[-1], slopes.shape[1]
-    if measured.shape[1] != q:
-        raise ValueError(f"measured must have {q} columns, got {measured.shape[1]}")
+    p = slopes.shape[-1]
     off = (measured - calibration.predict(commands)).ravel()
     rows = slopes.reshape(-1, p)
     known, covariance = calibration.linear(commands)
@@ -105,24 +99,22 @@ def check(
         white, by = without(by[:, own], white, by)
     freedom = len(white)
     if not freedom:
-        raise ValueError("measured leaves no reading beside what was placed anew")
+        raise ValueError("measured must hold a reading beside what was placed anew")
     square = float(white @ white)
     if calibration.noise_known:
         p_value = float(special.chdtrc(freedom, square))
     else:
         p_value = float(special.fdtrc(freedom, calibration.noise_dof, square / freedom))
-    limit = float(special.chdtri(freedom, 0.05))
-    needed = _noncentrality(freedom, limit)
+    limit = special.chdtri(freedom, 0.05)
+    needed = float(special.chndtrinc(limit, freedom, 1.0 - _POWER))
     free = (calibration.free[:p] > 0.0) & ~own
     seen = np.sqrt((by**2).sum(axis=0))
-    size = np.sqrt(needed) / np.where(seen > 0.0, seen, np.nan)
-    matters = _tolerance(tolerance, noise)
-    used = np.asarray(model.jacobian(calibration.commands, theta))
-    per_unit = np.sqrt((used**2).mean(axis=(0, 1)) * q)
-    moved = np.where(np.isnan(size), np.inf, np.nan_to_num(size)) * per_unit
-    judged = free & (per_unit > 0.0)
-    hidden = judged & (moved > matters)
-    power = _mean_power(freedom, (matters * seen[judged] / per_unit[judged]) ** 2)
+    with np.errstate(divide="ignore"):
+        size = np.sqrt(needed) / seen  # infinite where nothing shows it
+    change, tolerance = _changes(calibration, calibration.commands, tolerance)
+    judged = free & np.isfinite(change)
+    hidden = judged & (size > change)
+    power = _mean_power(freedom, (change[judged] * seen[judged]) ** 2)
     if p_value < 0.05:
         says = "does not hold"
     else:
@@ -131,21 +123,28 @@ def check(
         says=says,
         p_value=p_value,
         power=float(power),
-        drift={
-            name: float(value) if np.isfinite(value) else np.inf
-            for name, value, is_free in zip(names, size, free, strict=True)
-            if is_free
-        },
-        unseen=tuple(name for name, lost in zip(names, hidden, strict=True) if lost),
-        tolerance=matters,
+        drift={names[i]: float(size[i]) for i in np.flatnonzero(free)},
+        unseen=tuple(names[i] for i in np.flatnonzero(hidden)),
+        tolerance=tolerance,
     )
 
 
-def _tolerance(given: float | None, noise: Array) -> float:
-    matters = float(3.0 * np.sqrt(np.mean(noise**2))) if given is None else given
-    if not numbers("tolerance", matters) > 0.0:
-        raise ValueError(f"tolerance must be positive, got {given}")
-    return matters
+def _changes(
+    calibration: Fit, where: Array, tolerance: float | None
+) -> tuple[Array, float]:
+    """(p,) what each parameter may change by, infinite of no effect; the tolerance.
+
+    Then the outputs at ``where`` (R, n) change by the tolerance, root mean square.
+    """
+    if tolerance is None:
+        tolerance = float(
+            3.0 * np.sqrt(np.mean(np.asarray(calibration.noise_std) ** 2))
+        )
+    if not numbers("tolerance", tolerance) > 0.0:
+        raise ValueError(f"tolerance must be positive, got {tolerance}")
+    slopes = np.asarray(calibration.model.jacobian(where, calibration.parameters))
+    with np.errstate(divide="ignore"):
+        return tolerance / np.sqrt((slopes**2).sum(axis=1).mean(axis=0)), tolerance
 
 
 def _mean_power(freedom: int, shifts: Array) -> Array:
@@ -155,17 +154,6 @@ def _mean_power(freedom: int, shifts: Array) -> Array:
     missed = special.chndtr(special.chdtri(freedom, 0.05), freedom, shifts)
     seen = 1.0 - np.nan_to_num(missed, nan=0.0)  # NaN where far too large
     return np.asarray(seen.mean(axis=-1))
-
-
-def _noncentrality(freedom: int, limit: float) -> float:
-    """Of a chi-square that exceeds ``limit`` with the power that is asked for."""
-    from scipy import optimize, special
-
-    return float(
-        optimize.brentq(
-            lambda size: 1.0 - special.chndtr(limit, freedom, size) - _POWER, 1e-3, 1e4
-        )
-    )
 
 
 def verification(
@@ -194,22 +182,17 @@ def verification(
     points = table("candidates", candidates)
     if not 1 <= whole_number("k", k, 1) <= len(points):
         raise ValueError(f"k must be in [1, {len(points)}], got {k}")
-    noise = calibration.noise_std
-    if noise is None:
-        raise ValueError("no verification: the noise of the calibration is not known")
-    model, theta = calibration.model, calibration.parameters
-    slopes = np.asarray(model.jacobian(points, theta))
+    noise = calibration.require_noise("verification")
+    slopes = np.asarray(calibration.model.jacobian(points, calibration.parameters))
     known, covariance = calibration.linear(points)
     spread = known @ covariance @ np.matrix_transpose(known) + np.diag(noise**2)
     white = np.linalg.inv(np.linalg.cholesky(spread)) @ slopes
     seen = (white**2).sum(axis=1)  # (M, p) by a drift of one
     where = calibration.commands if region is None else table("region", region)
-    used = np.asarray(model.jacobian(where, theta))
-    q = used.shape[1]
-    per_unit = (used**2).mean(axis=(0, 1)) * q
-    matters = (calibration.free[: len(theta)] > 0.0) & (per_unit > 0.0)
-    by_change = _tolerance(tolerance, noise) ** 2 / per_unit[matters]
-    shifts = seen[:, matters] * by_change  # noncentralities of one posture
+    change, _ = _changes(calibration, where, tolerance)
+    judged = (calibration.free[: len(change)] > 0.0) & np.isfinite(change)
+    shifts = seen[:, judged] * change[judged] ** 2  # noncentralities of one posture
+    q = slopes.shape[1]
 
     def value(rows: list[int]) -> Array:
         """(M,) of the rows and each candidate."""

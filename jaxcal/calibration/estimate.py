@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from jaxcal.calibration.sizes import Sizes, group_sizes, of_sizes
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
-from jaxcal.checks import in_words, one_of, require_kind
+from jaxcal.checks import array_of, in_words, one_of, require_kind
 from jaxcal.information.blocks import triangle
 from jaxcal.information.singular import exact_zeros, significant
 from jaxcal.models import (
@@ -40,14 +40,9 @@ def require_fitting(model: Any, commands: Array, measured: Array) -> None:
     if not len(commands):
         raise ValueError("commands must hold at least one row, got none")
     model.predict(commands, None)  # tells some models their number of inputs
-    for name, table, count in (
-        ("commands", commands, model.num_inputs),
-        ("measured", measured, model.num_outputs),
-    ):
-        if table.shape[1] != count:
-            raise ValueError(
-                f"{name} must have {count} columns for this model, got {table.shape[1]}"
-            )
+    rule = " for this model"
+    array_of("commands", commands, "N", model.num_inputs, rule=rule)
+    array_of("measured", measured, "N", model.num_outputs, rule=rule)
 
 
 def fit_model(

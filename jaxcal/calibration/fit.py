@@ -166,7 +166,7 @@ class Fit:
         Raises:
             ValueError: the noise is unknown, or ``confidence`` is not in (0, 1).
         """
-        self._require_noise("confidence intervals")
+        self.require_noise("confidence intervals")
         half = self._quantile(confidence) * np.asarray(self.standard_errors)
         return np.stack([self.parameters - half, self.parameters + half], axis=-1)
 
@@ -233,7 +233,7 @@ class Fit:
             ValueError: the noise is unknown.
         """
         points = self.points("commands", commands, self.num_inputs)
-        noise = self._require_noise("prediction uncertainty")
+        noise = self.require_noise("prediction uncertainty")
         slopes, covariance = self.linear(points.reshape(-1, self.num_inputs))
         variance = ((slopes @ covariance) * slopes).sum(axis=-1)
         std = np.sqrt(np.maximum(variance, 0.0) + float(new_measurement) * noise**2)
@@ -276,7 +276,7 @@ class Fit:
             )
         return points
 
-    def _require_noise(self, what: str) -> Array:
+    def require_noise(self, what: str) -> Array:
         if self.noise_std is None:
             raise ValueError(self.no_noise(what))
         return self.noise_std

@@ -99,12 +99,9 @@ def identify(
     """
     commands = by_name(model, commands)
     commands = table("commands", commands)
+    rule = ": as many rows as commands"
     measured = table("measured", measured)
-    if len(commands) != len(measured):
-        raise ValueError(
-            "commands and measured must have as many rows, got "
-            f"{len(commands)} and {len(measured)}"
-        )
+    measured = array_of("measured", measured, len(commands), "m", rule=rule)
     n, m = commands.shape[1], measured.shape[1]
     inputs = axis_names("input_names", input_names, "u", n)
     outputs = axis_names("output_names", output_names, "y", m)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.fit import Fit
-from jaxcal.checks import in_words, numbers
+from jaxcal.checks import array_of, in_words
 from jaxcal.information.singular import (
     depends,
     direction_in_words,
@@ -89,11 +89,7 @@ def _limits(limits: ArrayLike | None, names: tuple[str, ...]) -> Array:
     """(n, 2), least below greatest, with at least one finite command between them."""
     if limits is None:
         return np.tile([-np.inf, np.inf], (len(names), 1))
-    bounds = numbers("limits", limits, finite=False)
-    if bounds.shape != (len(names), 2):
-        raise ValueError(
-            f"limits must have shape ({len(names)}, 2), got {bounds.shape}"
-        )
+    bounds = array_of("limits", limits, len(names), 2, finite=False)
     low, high = bounds.T
     bad = np.flatnonzero(~((low <= high) & (low < np.inf) & (high > -np.inf)))
     if bad.size:

@@ -224,13 +224,13 @@ def _moved(
     for i, rows in enumerate(_groups(model, commands)):
         if len(rows) < 2 * _FEW:
             continue
-        value, at, apart, within = _split(residuals[rows])
+        gain, at, apart, within = _split(residuals[rows])
         if apart < _MOVED * within:
             continue
         shuffled = [
             _split(residuals[rng.permutation(rows)])[0] for _ in range(_SHUFFLES)
         ]
-        if value > np.quantile(shuffled, 0.99):
+        if gain > np.quantile(shuffled, 0.99):
             first, last = names[rows[:at]], names[rows[at:]]
             found.append(
                 f"{model.sensor.kind} {i} seems to have moved by {apart:.3g} between "
@@ -240,7 +240,7 @@ def _moved(
 
 
 def _split(values: Array) -> tuple[float, int, float, float]:
-    """Best split of (n, q) in two: its share of the squares, where, step, scatter."""
+    """Best split of (n, q) in two: what the squares lose, where, step, scatter."""
     n = len(values)
     sums = np.cumsum(values, axis=0)
     at = np.arange(_FEW, n - _FEW + 1)
@@ -251,12 +251,7 @@ def _split(values: Array) -> tuple[float, int, float, float]:
     best = int(gain.argmax())
     total = float(((values - values.mean(axis=0)) ** 2).sum())
     within = np.sqrt(max(total - gain[best], 0.0) / (n - 2))
-    return (
-        float(gain[best]) / total if total else 0.0,
-        int(at[best]),
-        float(apart[best]),
-        float(within),
-    )
+    return float(gain[best]), int(at[best]), float(apart[best]), float(within)
 
 
 def _swapped(

@@ -506,7 +506,7 @@ def broken(method: str, answer: Any) -> Any:
             {"model": Affine(3, 2), "loss": "student"},
             r"commands must have shape \(N, 3\) for this mo",
         ),
-        ({"model": Polynomial(1, 2, 3)}, "measured must have 3 columns"),
+        ({"model": Polynomial(1, 2, 3)}, r"measured must have shape \(N, 3\)"),
         (
             {"model": broken("predict", lambda n: np.zeros((n, 3)))},
             r"model.predict must return \(12, 2\), got \(12, 3\)",

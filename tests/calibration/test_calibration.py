@@ -559,7 +559,7 @@ good = np.vstack([np.zeros(3), np.eye(3), np.ones(3)])
     [
         ({"commands": good[0]}, r"commands must have shape \(N, n\), got \(3,\)"),
         ({"measured": good[:, 0]}, r"measured must have shape \(N, m\), got \(5,\)"),
-        ({"measured": good[:4]}, "as many rows, got 5 and 4"),
+        ({"measured": good[:4]}, r"\(5, m\): as many rows as commands, got \(4, 3\)"),
         ({"measured": good * np.nan}, r"measured must be finite, got nan at \(0, 0\)"),
         ({"commands": good + np.inf}, r"commands must be finite, got inf"),
         ({"commands": [["a"] * 3] * 5}, "commands must be an array of numbers"),

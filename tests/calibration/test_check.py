@@ -114,8 +114,8 @@ def test_the_affine_device_is_checked_too():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ((JOINTS[:2], MEASURED[:3]), "must have as many rows, at least one"),
-        ((JOINTS[:2], MEASURED[:2, :2]), "measured must have 3 columns"),
+        ((JOINTS[:2], MEASURED[:3]), "as many rows as commands, got"),
+        ((JOINTS[:2], MEASURED[:2, :2]), r"measured must have shape \(2, 3\)"),
         ((JOINTS[:2], MEASURED[:2], 0.0), "tolerance must be positive"),
         ((JOINTS[:2], MEASURED[:2], None, True), "whose sensor stands somewhere"),
     ],
