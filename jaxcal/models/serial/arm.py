@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -273,68 +273,42 @@ class Arm:
         return found.by_tip @ motion.transpose(2, 1, 0), found.by_own
 
     def _torque(self, commands: Array) -> tuple[Array, ...]:
-        """Of the compliant joints of the nominal arm (C, N), and its rate (C, n, N)."""
+        """Of the loads on the compliant joints of the nominal arm, and its derivative.
+
+        A joint's torque is the work of the loads per radian, so its derivative by
+        another joint is a second derivative of their positions: ``w_i x J_j``, i before
+        j.
+
+        Returns:
+            (C, N) and (C, n, N), the latter per degree or unit of length.
+        """
         first = self.table.size + len(self.gears)
         stiff = self.nominal
         stiff[first : first + len(self.compliance)] = 0.0
 
         def find() -> tuple[Array, ...]:
             _, axes, origins = self._after(commands, stiff)
-            return _torques(
-                axes[self._steps_of_joints],
-                origins[self._steps_of_joints],
-                np.array([kind == "R" for kind in self.joints]),
-                np.array(self.compliance) - 1,
-                self.loads,
-                lambda link: self._after(commands, stiff, link)[0],
-                np.array(self.gravity),
-            )
+            axes, origins = axes[self._steps_of_joints], origins[self._steps_of_joints]
+            n, at = len(axes), np.array(self.compliance) - 1
+            revolute = np.array([kind == "R" for kind in self.joints])
+            turns = revolute[:, None, None]
+            first = np.minimum(at[:, None], np.arange(n))
+            second = np.maximum(at[:, None], np.arange(n))
+            result = np.zeros((len(at), len(commands)))
+            rate = np.zeros((len(at), n, len(commands)))
+            for link, weight, centre in self.loads:
+                reached = self._after(commands, stiff, link)[0]
+                point = reached[3] + np.einsum("k,kcn->cn", centre, reached[:3])
+                motion = np.where(turns, _cross(axes, point - origins), axes)
+                motion[link:] = 0.0
+                force = weight * np.array(self.gravity)
+                result += np.einsum("c,jcn->jn", force, motion[at])
+                bent = _cross((axes * turns)[first], motion[second])
+                rate += np.einsum("c,ijcn->ijn", force, bent)
+            rate[:, revolute] = np.radians(rate[:, revolute])
+            return result, rate
 
         return self._kept("_last_torque", (commands,), find)
-
-
-def _torques(
-    axes: Array,
-    origins: Array,
-    revolute: NDArray[np.bool_],
-    at: NDArray[np.int64],
-    loads: Sequence[Load],
-    frame: Callable[[int], Array],
-    gravity: Array,
-) -> tuple[Array, Array]:
-    """Torque of the loads on some joints, and its derivative by the commands.
-
-    A joint's torque is the work of the loads per radian, so its derivative by another
-    joint is a second derivative of their positions: ``w_i x J_j``, i before j.
-
-    Args:
-        axes: (n, 3, N) of the joints.
-        origins: (n, 3, N) of these axes.
-        revolute: (n,) else prismatic.
-        at: (C,) joints, from 0, whose torque is asked for.
-        loads: each in the frame after its link's row.
-        frame: of a link, its axes and origin (4, 3, N).
-        gravity: (3,) direction.
-
-    Returns:
-        (C, N) and (C, n, N), the latter per degree or unit of length.
-    """
-    n, count = len(axes), axes.shape[-1]
-    turns = revolute[:, None, None]
-    first = np.minimum(at[:, None], np.arange(n))
-    second = np.maximum(at[:, None], np.arange(n))
-    result, rate = np.zeros((len(at), count)), np.zeros((len(at), n, count))
-    for link, weight, centre in loads:
-        reached = frame(link)
-        point = reached[3] + np.einsum("k,kcn->cn", centre, reached[:3])
-        motion = np.where(turns, _cross(axes, point - origins), axes)
-        motion[link:] = 0.0
-        force = weight * gravity
-        result += np.einsum("c,jcn->jn", force, motion[at])
-        bent = _cross((axes * turns)[first], motion[second])
-        rate += np.einsum("c,ijcn->ijn", force, bent)
-    rate[:, revolute] = np.radians(rate[:, revolute])
-    return result, rate
 
 
 def _cross(left: Array, right: Array) -> Array:
