@@ -29,12 +29,6 @@ __all__ = [
 
 # By their names in files and on the command line; a sensor of one's own is added here.
 SENSORS: dict[str, type[Sensor]] = {
-    "position": Position,
-    "pose": Pose,
-    "socket": Socket,
-    "plane": Plane,
-    "distance": Distance,
-    "gravity": Gravity,
-    "board": Board,
-    "several": Several,
+    one.kind: one
+    for one in (Position, Pose, Socket, Plane, Distance, Gravity, Board, Several)
 }

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, numbers, one_of
 from jaxcal.models.sensors.pose import rotation_vector_rate
-from jaxcal.models.sensors.sensor import BASE, Named, Reading, Sensor, Tip, hats
+from jaxcal.models.sensors.sensor import BASE, Named, Reading, Sensor, Tip, hats, turns
 
 __all__ = ["Board"]
 
@@ -104,13 +104,8 @@ class Board(Sensor):
         from scipy.spatial.transform import Rotation
 
         place = np.eye(3) if self.place is None else self.place[:3, :3]
-        turns = [
-            Rotation.from_euler(a, t, True) for a, t in zip("xyz", own[3:], strict=True)
-        ]
-        stand = (turns[0] * turns[1] * turns[2]).as_matrix() @ place
-        axes = [np.eye(3)[0], turns[0].apply(np.eye(3)[1])]
-        axes.append((turns[0] * turns[1]).apply(np.eye(3)[2]))
-        turn = np.radians(np.stack(axes, axis=1))  # of the stand, by its angles
+        turn, axes = turns(own[3:])
+        stand, turn = turn @ place, np.radians(axes)  # of the stand, by its angles
         count, moved = len(inputs), tip.position - own[:3]
         # How the board shifts and turns in the camera, by the tip and by the stand.
         by_tip, by_own = np.zeros((2, count, 6, 6))

@@ -22,6 +22,7 @@ __all__ = [
     "Tip",
     "hats",
     "label",
+    "turns",
 ]
 
 Array = NDArray[np.float64]
@@ -244,6 +245,17 @@ def hats(vectors: Array) -> Array:
     matrix = np.zeros((*vectors.shape[:-1], 3, 3))
     matrix[..., [2, 0, 1], [1, 2, 0]] = vectors
     return matrix - np.matrix_transpose(matrix)
+
+
+def turns(angles: Array) -> tuple[Array, Array]:
+    """Rotation (3, 3) Rx Ry Rz by degrees (3,); the axes of its turns as columns."""
+    from scipy.spatial.transform import Rotation
+
+    whole, axes = np.eye(3), np.eye(3)
+    for k, axis in enumerate("xyz"):
+        axes[:, k] = whole[:, k]
+        whole = whole @ Rotation.from_euler(axis, angles[k], degrees=True).as_matrix()
+    return whole, axes
 
 
 def label(what: str, column: Array, count: int) -> NDArray[np.int64]:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, table
-from jaxcal.models.sensors.sensor import Named, Reading, Sensor, Tip, hats, label
+from jaxcal.models.sensors.sensor import Named, Reading, Sensor, Tip, hats, label, turns
 
 __all__ = ["Several"]
 
@@ -118,47 +118,39 @@ class Several(Sensor):
         hidden = [set(one.unseen(arm)) for one in self.sensors]
         return tuple(name for name in arm.names if all(name in h for h in hidden))
 
-    def _parts(self, inputs: Array) -> list[tuple[NDArray[np.intp], Array]]:
-        """Of each sensor its rows, and its columns there."""
+    def _parts(
+        self, inputs: Array
+    ) -> Iterator[tuple[int, Sensor, NDArray[np.intp], Array]]:
+        """Each sensor and its number, its rows, and its columns there."""
         which = label("sensor", inputs[:, 0], len(self.sensors))
-        columns, parts = self.inputs, []
         for i, one in enumerate(self.sensors):
             rows = np.flatnonzero(which == i)
-            at = [columns.index(name) for name in one.inputs]
-            parts.append((rows, inputs[rows][:, at]))
-        return parts
+            at = [self.inputs.index(name) for name in one.inputs]
+            yield i, one, rows, inputs[rows][:, at]
 
     def _tip(self, i: int, tip: Tip, rows: NDArray[np.intp], given: Array) -> Tip:
         """The place of sensor ``i`` at its rows, its mounting as ``given``."""
         frame, nominal = tip.frame[:, :, rows], lambda: tip.nominal()[rows]
         if i:
-            shift, turn = self._mount(i, given)
-            turned = np.einsum("jcn,jk->kcn", frame[:3], turn[-1])
+            shift, turn, _ = self._mount(i, given)
+            turned = np.einsum("jcn,jk->kcn", frame[:3], turn)
             origin = frame[3] + np.einsum("jcn,j->cn", frame[:3], shift)
             frame = np.concatenate([turned, origin[None]])
         return Tip(frame, nominal, tip.length)
 
-    def _mount(self, i: int, given: Array) -> tuple[Array, list[Array]]:
-        """Shift (3,) and rotations after none, one, two turns, and after all (3, 3)."""
-        from scipy.spatial.transform import Rotation
-
+    def _mount(self, i: int, given: Array) -> tuple[Array, Array, Array]:
+        """Shift (3,), rotation (3, 3), and the axes of its turns as columns (3, 3)."""
         whole = dict.fromkeys(_MOUNTING, 0.0)
         whole |= dict(zip(self.sensors[i].tool, given, strict=True))
-        turns = [np.eye(3)]
-        for axis in "xyz":
-            one = Rotation.from_euler(axis, whole[f"r{axis}"], degrees=True)
-            turns.append(turns[-1] @ one.as_matrix())
-        turns.append(turns[-1] @ np.asarray(self.mounts)[i - 1, :3, :3])
-        return np.array([whole[axis] for axis in "xyz"]), turns
+        shift, angles = np.array([*whole.values()]).reshape(2, 3)
+        turn, axes = turns(angles)
+        return shift, turn @ np.asarray(self.mounts)[i - 1, :3, :3], axes
 
     def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
         count, q, first = len(inputs), len(self.outputs), 0
         values = np.zeros((count, q))
         by_tip, by_own = np.zeros((count, q, 6)), np.zeros((count, q, len(own)))
-        parts = self._parts(inputs)
-        for i, (one, (rows, columns)) in enumerate(
-            zip(self.sensors, parts, strict=True)
-        ):
+        for i, one, rows, columns in self._parts(inputs):
             size = len(one.tool) if i else 0
             last = first + size + len(one.names)
             mount, width = own[first : first + size], len(one.outputs)
@@ -170,15 +162,12 @@ class Several(Sensor):
             seen = found.by_tip / scale
             by_own[rows, :width, first + size : last] = found.by_own / scale
             if i:
-                shift, turns = self._mount(i, mount)
+                shift, _, axes = self._mount(i, mount)
                 rotation = tip.rotation[rows]
                 moves, turned = seen[..., :3] @ rotation, seen[..., 3:] @ rotation
-                slopes = {axis: moves[..., k] for k, axis in enumerate("xyz")}
-                for k, axis in enumerate("xyz"):
-                    slopes[f"r{axis}"] = np.radians(turned @ turns[k][:, k])
-                for k, axis in enumerate(one.tool):
-                    by_own[rows, :width, first + k] = slopes[axis]
-                seen = seen.copy()
+                slopes = np.concatenate([moves, np.radians(turned @ axes)], axis=-1)
+                at = [_MOUNTING.index(axis) for axis in one.tool]
+                by_own[rows, :width, first : first + size] = slopes[..., at]
                 seen[..., 3:] -= seen[..., :3] @ hats(rotation @ shift)
             by_tip[rows, :width] = seen
             first = last
@@ -188,12 +177,9 @@ class Several(Sensor):
         self, tip: Tip, inputs: Array, measured: Array | None
     ) -> tuple[Self, Array | None]:
         """Each of them, and where those that find it are on the tool."""
-        parts = self._parts(inputs)
         sensors, mounts = [], np.array(self.mounts)
         tool = None
-        for i, (one, (rows, columns)) in enumerate(
-            zip(self.sensors, parts, strict=True)
-        ):
+        for i, one, rows, columns in self._parts(inputs):
             read = None
             if measured is not None:
                 read = measured[rows, : len(one.outputs)] * one.stds(tip.length)

@@ -326,8 +326,8 @@ class SerialChain(Arm):
         base, tool, _ = self._split(theta)
         turned = pose_matrix(base)
         turned[:3, :3] = turned[:3, :3] @ self.base[:3, :3]
-        end = pose_matrix(np.concatenate([tool[:3], np.zeros(3)]))
-        end[:3, :3] = self.tool[:3, :3] @ pose_matrix(tool)[:3, :3]
+        end = pose_matrix(tool)
+        end[:3, :3] = self.tool[:3, :3] @ end[:3, :3]
         return dataclasses.replace(
             self,
             table=theta[: self.table.size].reshape(self.table.shape),

@@ -180,12 +180,9 @@ def _in_view(arm: Chain, commands: Array) -> tuple[Array, list[str]]:
     far = np.linalg.norm(seen[:, :3], axis=1)
     ahead = seen[:, 2] / np.where(far > 0.0, far, 1.0) > _VIEW
     turned = np.abs(face[:, 2]) > 0.5  # less than 60 degrees from facing it
-    reasons = []
-    for one, two in zip(ahead, turned, strict=True):
-        blind = "do not have the board before the camera"
-        aslant = "see the board too much from the side"
-        reasons.append(blind if not one else "" if two else aslant)
-    return commands, reasons
+    reasons = np.where(turned, "", "see the board too much from the side")
+    reasons = np.where(ahead, reasons, "do not have the board before the camera")
+    return commands, reasons.tolist()
 
 
 def in_turn(found: Array, joints: int) -> NDArray[np.int64]:

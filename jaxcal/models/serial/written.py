@@ -177,13 +177,11 @@ def _gaps(source: Mapping[str, Any]) -> list[list[_Part]]:
         leader, _, plus = led(joint, joints, locked)
         stands = np.eye(4) if leader else moved(joint, plus)
         part = _Part(joint, down, stands, leader is not None)
-        if leader is None:
-            gaps[-1].append(part)
-        elif down:
-            gaps[-1].append(part)
+        if part.drives and not down:
             gaps.append([])
-        else:
-            gaps.append([part])
+        gaps[-1].append(part)
+        if part.drives and down:
+            gaps.append([])
     return gaps
 
 
