@@ -94,8 +94,7 @@ def check(
     if placed_anew:
         if not (isinstance(model, SerialChain) and len(model.sensor.names)):
             raise ValueError("placed_anew is of an arm whose sensor stands somewhere")
-        own[:] = np.isin(names, model.sensor.names)
-    if own.any():  # what stands elsewhere now says nothing
+        own = np.isin(names, model.sensor.names)  # which says nothing now
         white, by = without(by[:, own], white, by)
     freedom = len(white)
     if not freedom:

@@ -68,7 +68,6 @@ def fit_model(
             "common_noise says how to estimate the noise, and noise says what it is: "
             "give one of them"
         )
-    _require_unit(model, commands[used], measured[used])
     pose = isinstance(model, SerialChain) and isinstance(model.sensor, Pose)
     if spread.any() and pose:
         raise ValueError(
@@ -78,6 +77,7 @@ def fit_model(
     each = np.arange(measured.shape[1])
     levels = 0 * each
     if isinstance(model, SerialChain):
+        _require_unit(model, commands[used], measured[used])
         _require_postures(model, commands[used], measured[used])
         model = model.located(commands[used], measured[used])
         _require_sockets(model, commands[used], measured[used])
@@ -136,10 +136,8 @@ def fit_model(
     return fields | {"model": model, "loss": loss}
 
 
-def _require_unit(model: Any, commands: Array, measured: Array) -> None:
+def _require_unit(model: SerialChain, commands: Array, measured: Array) -> None:
     """Refuse millimetres for metres, radians for degrees: an arm is not off tenfold."""
-    if not isinstance(model, SerialChain):
-        return
     if not isinstance(model.sensor, Position | Pose):
         return
     spread = []

@@ -104,7 +104,7 @@ def verdict(calibration: Fit) -> Verdict | None:
     right = ~np.isin(used, list(swapped))
     reasons += _moved(model, commands[right], residuals[right], used[right])
     exchanged = _exchanged(calibration, model)
-    other_tip = _other_tip(calibration)
+    other_tip = _other_tip(calibration, model)
     reasons += exchanged + _far(calibration) + other_tip
     limit = _LOOSE if len(used) > _SPARSE else 0.0
     loose = (calibration.distance[list(calibration.outliers)] > limit**2).any()
@@ -171,10 +171,9 @@ def _far(calibration: Fit) -> list[str]:
     ]
 
 
-def _other_tip(calibration: Fit) -> list[str]:
+def _other_tip(calibration: Fit, model: SerialChain) -> list[str]:
     """A tip far from where the arm's description has it, if a prior allowed that."""
-    model = calibration.model
-    if not (isinstance(model, SerialChain) and model.sensor.zeros):
+    if not model.sensor.zeros:
         return []
     names = calibration.names
     if "tool rx" in names:  # where a camera or board is on the tip is asked for

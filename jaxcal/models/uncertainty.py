@@ -13,6 +13,7 @@ from jaxcal.checks import (
     array_of,
     in_words,
     numbers,
+    one_of,
     one_or_each,
     require_finite,
     require_none,
@@ -94,11 +95,7 @@ def _by_name(
     if values is None or isinstance(values, Mapping):
         result = default.copy()
         for name, value in (values or {}).items():
-            if name not in names:
-                raise ValueError(
-                    f"{argument} must name parameters of the model "
-                    f"({', '.join(names)}), got {name!r}"
-                )
+            one_of(f"parameter in {argument}", name, names)
             number = array_of(f"{argument} of {name}", value, finite=False)
             result[names.index(name)] = number
         return result

@@ -50,7 +50,7 @@ def test_contacts_become_a_calibrated_file(files, capsys):
     ("flags", "message"),
     [
         (["--out", "a.urdf"], "which look like radians"),
-        (["--radians", "--tip", "thumb"], "tip must be a link of it"),
+        (["--radians", "--tip", "thumb"], "tip link must be one of"),
         (["--radians", "--distance", "0,1,0.05"], "distances must be rows"),
         (["--radians", "--sensor", "plane", "--distance", "0,1,2,3"], "is of --sensor"),
         (["--radians", "--base", "panda_rightfinger"], "there is no column"),

@@ -34,10 +34,16 @@ def test_one_number_and_a_row_of_them():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"std": {"a99": 1.0}}, "std of the prior must name parameters .* got 'a99'"),
-        ({"std": 1.0, "mean": {"x": 1}}, "mean of the prior must name parameters"),
+        (
+            {"std": {"a99": 1.0}},
+            "parameter in std of the prior must be one of .* got 'a99'",
+        ),
+        (
+            {"std": 1.0, "mean": {"x": 1}},
+            "parameter in mean of the prior must be one of",
+        ),
         ({"std": 1.0, "mean": np.nan}, "mean of the prior must be finite"),
-        ({"std": 1.0, "fixed": ["x"]}, "fixed must name parameters .* got 'x'"),
+        ({"std": 1.0, "fixed": ["x"]}, "parameter in fixed must be one of .* got 'x'"),
         ({"std": 1.0, "fixed": "b1"}, "fixed must be a sequence of names"),
         ({"std": [1.0, 2.0]}, r"one number or \(4,\) or a mapping"),
         ({"std": 0.0}, r"std of the prior must be positive .*, got \(0\)"),

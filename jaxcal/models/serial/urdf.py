@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from jaxcal.checks import numbers
+from jaxcal.checks import numbers, one_of
 
 __all__ = [
     "Joint",
@@ -84,11 +84,7 @@ def walk(
     """The joints from ``base`` to ``tip``, and whether each is passed downwards."""
     joints = joints_of(text)
     for name, value in locked.items():
-        if name not in joints:
-            raise ValueError(
-                f"locked must name joints of the file ({', '.join(joints)}), "
-                f"got {name!r}"
-            )
+        one_of("locked joint", name, tuple(joints))
         numbers(f"locked[{name!r}]", value)
     above: dict[str, Joint] = {}
     for joint in joints.values():
@@ -100,10 +96,8 @@ def walk(
         above[joint.child] = joint
     links = _links_of(text)
     for argument, link in (("tip", tip), ("base", base)):
-        if link is not None and link not in links:
-            raise ValueError(
-                f"{argument} must be a link of it ({', '.join(links)}), got {link!r}"
-            )
+        if link is not None:
+            one_of(f"{argument} link", link, links)
     if tip is None:
         parents = {joint.parent for joint in above.values()}
         leaves = [link for link in links if link not in parents]
