@@ -273,9 +273,10 @@ def test_hand_and_eye_are_found_without_a_guess(moves):
         model.located(still)
 
 
-def _views(moves, count=20):
+def _views(moves, count=20, joints=None):
     """Postures and poses of a board seen in them, by frames alone; mm and degrees."""
-    joints = np.random.default_rng(5).uniform(-100.0, 100.0, (count, 6))
+    if joints is None:
+        joints = np.random.default_rng(5).uniform(-100.0, 100.0, (count, 6))
     stand = _matrix(Rotation.from_euler("xyz", [3.0, 0.1, 2.0]), (600.0, 100.0, 0.0))
     arm = SerialChain.from_dh(UR5_TABLE)
     values = dict(zip(arm.names, arm.nominal, strict=True))
@@ -482,3 +483,33 @@ def test_views_of_a_board_weigh_by_their_covariance():
         commands[1:], zeros[1:], noise=jaxcal.Noise(covariance=spread), **options
     )
     assert np.abs(plain.parameters - without.parameters).max() > 1e-4
+
+
+@pytest.mark.parametrize("ahead", [1.0, 5.0, 20.0])
+@pytest.mark.parametrize("way", [3.0, 60.0])
+def test_far_anchors_are_found_by_an_arm_that_is_off(ahead, way):
+    """In units of the arm's length; what the lengths leave open does no harm."""
+    rng = np.random.default_rng(5)
+    joints = rng.uniform(-90.0, 90.0, 6) + way * rng.uniform(-1.0, 1.0, (8, 6))
+    wire = ur5(sensor=Distance(1))
+    true = ur5().predict(joints) + 0.003 * wire.length * rng.normal(size=(8, 3))
+    anchor = ahead * wire.length * np.array([0.6, -0.48, 0.64])
+    far = np.linalg.norm(true - anchor, axis=1, keepdims=True)
+    off = wire.located(joints, far).predict(joints) - far
+    assert np.abs(off).max() < 0.02 * wire.length
+
+
+def test_views_that_hardly_turn_are_of_no_other_convention():
+    model = SerialChain.from_dh(UR5_TABLE, sensor=Board("camera"))
+    rng, told = np.random.default_rng(8), []
+    for _ in range(60):
+        about = np.eye(6)[rng.integers(6)] + 0.1
+        joints = rng.uniform(-100.0, 100.0, 6) + about * rng.uniform(-5.0, 5.0, (5, 6))
+        right = _as_columns(_views("camera", joints=joints)[1])
+        right[:, 3:] += rng.normal(0.0, 0.3, (5, 3))
+        try:
+            model.located(np.hstack([joints, right]))
+        except ValueError as error:
+            told.append(str(error))
+    assert told
+    assert all("about two axes at least" in each for each in told)

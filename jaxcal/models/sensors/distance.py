@@ -48,7 +48,13 @@ class Distance(Placed):
     def located(
         self, tip: Tip, inputs: Array, measured: Array | None
     ) -> tuple[Self, Array | None]:
-        """Anchors from nominal points and lengths, linear in (anchor, its square)."""
+        """Anchors nearest to nominal points and lengths, from two linear starts.
+
+        One is linear in the anchor and its square; of one that is far, with short ways
+        of the tip, the lengths are.
+        """
+        from scipy import optimize
+
         if self.places is not None or measured is None:
             return self, None
         which, places = self.of_rows(inputs), np.zeros((self.count, 4))
@@ -61,10 +67,20 @@ class Distance(Placed):
                 )
             middle = points.mean(axis=0)
             points = points - middle
-            rows = np.column_stack([2.0 * points, np.ones(len(points))])
-            right = (points**2).sum(axis=1) - far**2
-            anchor = np.linalg.lstsq(rows, right, rcond=1e-6)[0][:3]
-            off = np.median(np.abs(np.linalg.norm(points - anchor, axis=1) - far))
+            rows = np.column_stack([points, np.full(len(points), 0.5)])
+            right = np.column_stack([((points**2).sum(axis=1) - far**2) / 2.0, -far])
+            near, along = np.linalg.lstsq(rows, right, rcond=1e-6)[0][:3].T
+            size = float(np.linalg.norm(along)) or 1.0
+            fits = [
+                optimize.least_squares(
+                    lambda at, p=points, r=far: np.linalg.norm(p - at, axis=1) - r,
+                    start,
+                    method="lm",
+                )
+                for start in (near, along / size * far.mean())
+            ]
+            best = min(fits, key=lambda fit: fit.cost)
+            anchor, off = best.x, np.median(np.abs(best.fun))
             if off > 0.2 * tip.length:
                 raise ValueError(
                     f"lengths to anchor {i} fit no anchor to {off:.3g}: measured must "
