@@ -176,7 +176,7 @@ def _require_postures(arm: SerialChain, commands: Array, measured: Array) -> Non
             f"{in_words(arm.limits[joint])}, to {slack[joint]:g}, got "
             f"{joints[row, joint]:g} in row {row}; are the columns in this order: "
             f"{', '.join(arm.joint_names)}? Where the file's limits are wrong, "
-            "give limits={name: (low, high)}"
+            "give limits={name: (low, high)}, --limits"
         )
 
 

@@ -36,6 +36,11 @@ Array = NDArray[np.float64]
 _KINDS = [kind for kind in SENSORS if kind != "several"]
 
 
+def _of_joint(text: str) -> list[Any]:
+    name, _, values = text.rpartition("=")
+    return [name, several(float, "numbers")(values)]
+
+
 @dataclasses.dataclass
 class ArmOptions:
     """Of an arm in a URDF file: its links, its sensor, the unit of its columns."""
@@ -46,6 +51,16 @@ class ArmOptions:
     base: Annotated[str | None, "of an arm, the link that stands still", "LINK"] = None
     tip: Annotated[str | None, "of an arm, the link that is measured", "LINK"] = None
     radians: Annotated[bool, "joint columns are in radians"] = False
+    locked: Annotated[
+        list[list[Any]] | None,
+        "a joint that stands still, and where, degrees or metres: finger=0.01",
+        _of_joint,
+    ] = None
+    limits: Annotated[
+        list[list[Any]] | None,
+        "of a joint instead of the file's, degrees or metres: wrist=-160,160",
+        _of_joint,
+    ] = None
     distance: Annotated[
         list[list[float]] | None,
         "two sockets, how far apart they are and its std: 0,1,0.05,0.0001",
@@ -71,7 +86,19 @@ class ArmOptions:
                     f"{table.source}: --distance needs a column 'socket', from 0"
                 )
         sensor = kind(**given)
-        return SerialChain.from_urdf(path, base=self.base, tip=self.tip, sensor=sensor)
+        for option, count in (("locked", 1), ("limits", 2)):
+            for name, values in getattr(self, option) or ():
+                if not name or len(values) != count:
+                    numbers = "LOW,HIGH" if count == 2 else "VALUE"
+                    raise ValueError(f"--{option} must be JOINT={numbers}")
+        return SerialChain.from_urdf(
+            path,
+            base=self.base,
+            tip=self.tip,
+            sensor=sensor,
+            locked={name: value for name, (value,) in self.locked or ()},
+            limits=dict(self.limits or ()),
+        )
 
     def commands(self, arm: SerialChain, table: Table, inputs: Sequence[str]) -> Array:
         """(N, n) the columns of joints and sensor, in degrees."""

@@ -81,6 +81,17 @@ def test_joints_far_beyond_their_limits_are_named(files):
         jaxcal.identify(swapped, np.zeros((len(q), 3)), model=arm)
 
 
+def test_joints_are_locked_and_have_other_limits(files, capsys):
+    given = ["postures", str(files[0]), "--tip", "ball_link", "-k", "4", "--csv",
+             "--count", "12", "--limits", "panda_joint1=20,30"]  # fmt: skip
+    assert main([*given, "--locked", "panda_joint7=45"]) == 0
+    header, *rows = capsys.readouterr().out.splitlines()
+    assert header == ",".join(f"panda_joint{i}" for i in range(1, 7))
+    assert all(20.0 <= float(row.split(",")[0]) <= 30.0 for row in rows)
+    assert main([*given, "--locked", "panda_joint7=1,2"]) == 2
+    assert "--locked must be JOINT=VALUE" in capsys.readouterr().err
+
+
 def test_postures_are_planned_and_the_rest_chosen_again(files, capsys):
     urdf, _, folder = files
     out, reached, picture = (folder / name for name in ("a.csv", "b.csv", "plan.png"))
