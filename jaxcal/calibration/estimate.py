@@ -81,10 +81,12 @@ def fit_model(
     each = np.arange(measured.shape[1])
     levels = 0 * each
     if isinstance(model, SerialChain):
-        _require_unit(model, commands[used], measured[used])
+        for part in model.of_each_sensor(commands[used], measured[used]):
+            _require_unit(*part)
         _require_postures(model, commands[used], measured[used])
         model = model.located(commands[used], measured[used])
-        _require_sockets(model, commands[used], measured[used])
+        for part in model.of_each_sensor(commands[used], measured[used]):
+            _require_sockets(*part)
         if not known:
             usual = np.asarray(model.default_noise().std)
             white = white / usual[:, None]

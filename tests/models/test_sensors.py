@@ -367,6 +367,17 @@ def test_distances_between_sockets_are_facts():
     assert ur5().facts()[1].shape == (0, 39)
 
 
+def test_wrong_readings_of_one_of_several_sensors_are_refused():
+    arm = ur5(sensor=Several((Position(), Socket(2, distances=[(0, 1, 50.0, 0.1)]))))
+    joints = np.random.default_rng(4).uniform(-120.0, 120.0, (12, 6))
+    seen = ur5().predict(joints)
+    contacts = np.column_stack([joints, np.arange(12) % 2])
+    for at, message in ((0.001, "measured must be in the unit"), (1.0, "at one point")):
+        together = arm.together((joints, at * seen), (contacts, None))
+        with pytest.raises(ValueError, match=message):
+            jaxcal.identify(*together, model=arm)
+
+
 def test_what_a_sensor_cannot_see_is_held_and_named():
     base = [f"base {axis}" for axis in ("x", "y", "z", "rx", "ry", "rz")]
     for sensor in (Socket(), Plane(), Distance(), Board()):

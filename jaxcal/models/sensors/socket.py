@@ -93,6 +93,6 @@ class Socket(Placed):
             apart = places[j] - places[i]
             far = float(np.linalg.norm(apart))
             off[k] = (distance - far) / std
-            rows[k, j] = apart / (far or 1.0) / std
+            rows[k, j] = (apart / far if far else np.eye(3)[0]) / std
             rows[k, i] = -rows[k, j]
         return off, rows.reshape(len(off), own.size)

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -430,13 +430,9 @@ class SerialChain(Arm):
         inputs = commands[:, self.num_joints :]
         moved = np.eye(4)
         if read is not None:
-            first, rows = self.sensor, np.ones(len(read), dtype=np.bool_)
-            scale: Array | float = 1.0
-            if isinstance(first, Several):
-                first, rows = first.sensors[0], inputs[:, 0] == 0.0
-                scale = first.stds(self.length)
-            if isinstance(first, Position):
-                moved = _far(frame[3].T[rows], scale * read[rows, :3], self.length)
+            first, at, seen = next(self.of_each_sensor(commands, read))
+            if isinstance(first.sensor, Position):
+                moved = _far(first.predict(at), seen, self.length)
             frame = np.einsum("ab,kbn->kan", moved[:3, :3], frame)
             frame[3] += moved[:3, 3:]
         sensor, new = self.sensor.located(self._tip_at(commands, frame), inputs, read)
@@ -446,6 +442,19 @@ class SerialChain(Arm):
         return dataclasses.replace(
             self, base=moved @ self.base, sensor=sensor, tool=tool
         )
+
+    def of_each_sensor(
+        self, commands: Array, measured: Array
+    ) -> Iterator[tuple[Self, Array, Array]]:
+        """The arm with each sensor of ``Several`` that read, its commands, readings."""
+        if not isinstance(self.sensor, Several):
+            yield self, commands, measured
+            return
+        joints, inputs = np.split(commands, [self.num_joints], axis=1)
+        for _, one, rows, columns in self.sensor.parts(inputs):
+            read = measured[rows, : len(one.outputs)] * one.stds(self.length)
+            if len(rows):
+                yield self.measured_with(one), np.hstack([joints[rows], columns]), read
 
     @property
     def inputs(self) -> tuple[str, ...]:
