@@ -61,8 +61,10 @@ def fit_model(
     require_kind("prior", prior, Prior)
     contacts = isinstance(model, SerialChain) and model.sensor.zeros
     if contacts and not measured.any():  # one that is written twice counts once
-        _, first = np.unique(commands, axis=0, return_index=True)
-        weights = np.where(np.isin(np.arange(len(weights)), first), weights, 0.0)
+        once, rows = np.zeros_like(weights), np.flatnonzero(weights > 0.0)
+        first = rows[np.unique(commands[rows], axis=0, return_index=True)[1]]
+        once[first] = weights[first]
+        weights = once
     used = weights > 0.0
     if not used.any():
         raise ValueError("weights must be positive for one measurement at least")
