@@ -103,10 +103,14 @@ class ArmOptions:
     def commands(self, arm: SerialChain, table: Table, inputs: Sequence[str]) -> Array:
         """(N, n) the columns of joints and sensor, in degrees."""
         commands = table.columns(inputs)
-        if self.radians:
-            turning = np.flatnonzero(np.array(arm.command_units) == "deg")
-            commands[:, turning] = np.degrees(commands[:, turning])
-        return commands
+        return _degrees(arm, commands) if self.radians else commands
+
+
+def _degrees(arm: SerialChain, commands: Array) -> Array:
+    """The same commands, of turning joints in degrees instead of radians."""
+    turning = np.flatnonzero(np.array(arm.command_units) == "deg")
+    commands[:, turning] = np.degrees(commands[:, turning])
+    return commands
 
 
 def postures(
@@ -261,11 +265,16 @@ def predict(
     *,
     columns: Annotated[str | None, "columns of commands", "A,B"] = None,
     std: Annotated[bool, "and the standard error of each output"] = False,
+    radians: Annotated[bool, "of an arm: joint columns are in radians"] = False,
     output: Output,
 ) -> None:
     """Where a calibrated machine goes for given commands."""
     found = Calibration.load(calibration)
     commands = _given(file, columns, found.input_names)
+    if radians:
+        if not isinstance(found.model, SerialChain):
+            raise ValueError("--radians is of arms")
+        commands = _degrees(found.model, commands)
     names, values = found.output_names, found.predict(commands)
     if std:
         names = (*names, *(f"std_{name}" for name in names))

@@ -81,6 +81,15 @@ def test_joints_far_beyond_their_limits_are_named(files):
         jaxcal.identify(swapped, np.zeros((len(q), 3)), model=arm)
 
 
+def test_predictions_take_the_columns_of_the_fit(files, capsys):
+    saved = str(files[2] / "calibration.json")
+    assert _run(files, "--radians", "--out", saved) == 0
+    capsys.readouterr()
+    assert main(["predict", saved, str(files[1]), "--radians"]) == 0
+    off = np.loadtxt(capsys.readouterr().out.splitlines()[1:], delimiter=",")
+    assert np.abs(off).max() < 0.002  # of contacts: zeros
+
+
 def test_joints_are_locked_and_have_other_limits(files, capsys):
     given = ["postures", str(files[0]), "--tip", "ball_link", "-k", "4", "--csv",
              "--count", "12", "--limits", "panda_joint1=20,30"]  # fmt: skip
