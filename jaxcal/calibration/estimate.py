@@ -25,7 +25,7 @@ from jaxcal.models import (
 from jaxcal.models.identifiability import unknown
 from jaxcal.models.model import derivative, facts, require_model
 
-__all__ = ["fit_model", "require_fitting"]
+__all__ = ["fit_model", "require_fitting", "require_postures"]
 
 Array = NDArray[np.float64]
 
@@ -85,7 +85,7 @@ def fit_model(
     if isinstance(model, SerialChain):
         for part in model.of_each_sensor(commands[used], measured[used]):
             _require_unit(*part)
-        _require_postures(model, commands[used], measured[used])
+        require_postures(model, commands[used])
         model = model.located(commands[used], measured[used])
         for part in model.of_each_sensor(commands[used], measured[used]):
             _require_sockets(*part)
@@ -160,7 +160,7 @@ def _require_unit(model: SerialChain, commands: Array, measured: Array) -> None:
         )
 
 
-def _require_postures(arm: SerialChain, commands: Array, measured: Array) -> None:
+def require_postures(arm: SerialChain, commands: Array) -> None:
     """Refuse radians for degrees, and joints far beyond their limits."""
     low, high = arm.limits.T
     units = np.array(arm.command_units)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from jaxcal.arguments import several
 from jaxcal.calibration import Calibration
 from jaxcal.calibration import identify as identified
+from jaxcal.calibration.estimate import require_postures
 from jaxcal.checks import aligned
 from jaxcal.commands.questions import ModelPath, Numbers, read_model
 from jaxcal.commands.tables import (
@@ -73,6 +74,11 @@ class ArmOptions:
         given: dict[str, Any] = {}
         if issubclass(kind, Placed):
             if places is not None:
+                if {len(place) for place in places} != {kind.width}:
+                    raise ValueError(
+                        f"--near must be {kind.width} numbers for --sensor "
+                        f"{self.sensor}, got {places}"
+                    )
                 given |= {"count": len(places), "places": places}
             elif table is not None and self.sensor in table.names:
                 column = table.columns([self.sensor])
@@ -150,6 +156,7 @@ def postures(
     header, done = (*arm.joint_names, *arm.sensor.inputs), None
     if reached is not None:
         done = of_arm.commands(arm, reached, header)
+        require_postures(arm, done)
         arm = arm.located(done)
     left = k - (0 if done is None else len(done))
     if left < 1:

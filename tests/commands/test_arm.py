@@ -127,3 +127,8 @@ def test_postures_are_planned_and_the_rest_chosen_again(files, capsys):
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert main([*given, "-k", "4"]) == 2
     assert "more than the 4 that were reached" in capsys.readouterr().err
+    given.remove("--radians")
+    assert main([*given, "-k", "7"]) == 2
+    assert "which look like radians" in capsys.readouterr().err
+    assert main([*given, *near, "--near=.4,.2", "-k", "7"]) == 2
+    assert "--near must be 3 numbers for --sensor socket" in capsys.readouterr().err
