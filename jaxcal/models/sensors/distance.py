@@ -48,10 +48,11 @@ class Distance(Placed):
     def located(
         self, tip: Tip, inputs: Array, measured: Array | None
     ) -> tuple[Self, Array | None]:
-        """Anchors nearest to nominal points and lengths, from two linear starts.
+        """Anchors nearest to nominal points and lengths, from linear starts.
 
         One is linear in the anchor and its square; of one that is far, with short ways
-        of the tip, the lengths are.
+        of the tip, the lengths are. The zero too, where lengths fit three times as well
+        with another one.
         """
         from scipy import optimize
 
@@ -67,25 +68,29 @@ class Distance(Placed):
                 )
             middle = points.mean(axis=0)
             points = points - middle
-            rows = np.column_stack([points, np.full(len(points), 0.5)])
-            right = np.column_stack([((points**2).sum(axis=1) - far**2) / 2.0, -far])
-            near, along = np.linalg.lstsq(rows, right, rcond=1e-6)[0][:3].T
+            rows = np.column_stack([points, np.full(len(points), 0.5), far])
+            square = ((points**2).sum(axis=1) - far**2) / 2.0
+            both = np.column_stack([square, -far])
+            near, along = np.linalg.lstsq(rows[:, :4], both, rcond=1e-6)[0][:3].T
             size = float(np.linalg.norm(along)) or 1.0
-            fits = [
-                optimize.least_squares(
-                    lambda at, p=points, r=far: np.linalg.norm(p - at, axis=1) - r,
-                    start,
-                    method="lm",
-                )
-                for start in (near, along / size * far.mean())
-            ]
-            best = min(fits, key=lambda fit: fit.cost)
-            anchor, off = best.x, np.median(np.abs(best.fun))
+            loose = np.linalg.lstsq(rows, square, rcond=1e-6)[0][[0, 1, 2, 4]]
+
+            def apart(at: Array, p: Array = points, r: Array = far) -> Array:
+                each = np.linalg.norm(p - at[:3], axis=1) - r - at[3:].sum()
+                return np.asarray(each, dtype=float)
+
+            starts = near, along / size * far.mean()
+            held = [optimize.least_squares(apart, one, method="lm") for one in starts]
+            best = min(held, key=lambda fit: fit.cost).x
+            off, other = (np.median(np.abs(apart(at))) for at in (best, loose))
+            if other < off / 3.0 and len(points) > 10:
+                best, off = loose, other
+            anchor, zero = best[:3], best[3:].sum()
             if off > 0.2 * tip.length:
                 raise ValueError(
                     f"lengths to anchor {i} fit no anchor to {off:.3g}: measured must "
                     f"be in the unit of the arm, whose length is {tip.length:.3g}, and "
                     "commands in degrees"
                 )
-            places[i, :3] = anchor + middle
+            places[i] = *(anchor + middle), zero
         return dataclasses.replace(self, places=places), None
