@@ -25,7 +25,7 @@ from jaxcal.models import (
 from jaxcal.models.identifiability import unknown
 from jaxcal.models.model import derivative, facts, require_model
 
-__all__ = ["fit_model", "require_fitting"]
+__all__ = ["fit_model", "require_fitting", "require_postures"]
 
 Array = NDArray[np.float64]
 
@@ -59,6 +59,12 @@ def fit_model(
     """The fields of a ``Calibration`` but names, units and provenance."""
     one_of("loss", loss, ("student", "gaussian"))
     require_kind("prior", prior, Prior)
+    contacts = isinstance(model, SerialChain) and model.sensor.zeros
+    if contacts and not measured.any():  # one that is written twice counts once
+        once, rows = np.zeros_like(weights), np.flatnonzero(weights > 0.0)
+        first = rows[np.unique(commands[rows], axis=0, return_index=True)[1]]
+        once[first] = weights[first]
+        weights = once
     used = weights > 0.0
     if not used.any():
         raise ValueError("weights must be positive for one measurement at least")
@@ -71,10 +77,12 @@ def fit_model(
                 "command_std must not be given with a Pose: the orientations are "
                 "compared with those of the commands given; raise the std of the noise"
             )
-        _require_unit(model, commands[used], measured[used])
-        _require_postures(model, commands[used], measured[used])
+        for part in model.of_each_sensor(commands[used], measured[used]):
+            _require_unit(*part)
+        require_postures(model, commands[used])
         model = model.located(commands[used], measured[used])
-        _require_sockets(model, commands[used], measured[used])
+        for part in model.of_each_sensor(commands[used], measured[used]):
+            _require_sockets(*part)
         if not known:
             usual = np.asarray(model.default_noise().std)
             white = white / usual[:, None]
@@ -146,7 +154,7 @@ def _require_unit(model: SerialChain, commands: Array, measured: Array) -> None:
         )
 
 
-def _require_postures(arm: SerialChain, commands: Array, measured: Array) -> None:
+def require_postures(arm: SerialChain, commands: Array) -> None:
     """Refuse radians for degrees, and joints far beyond their limits."""
     low, high = arm.limits.T
     units = np.array(arm.command_units)
@@ -166,7 +174,7 @@ def _require_postures(arm: SerialChain, commands: Array, measured: Array) -> Non
             f"{in_words(arm.limits[joint])}, to {slack[joint]:g}, got "
             f"{joints[row, joint]:g} in row {row}; are the columns in this order: "
             f"{', '.join(arm.joint_names)}? Where the file's limits are wrong, "
-            "give limits={name: (low, high)}"
+            "give limits={name: (low, high)}, --limits"
         )
 
 

@@ -145,7 +145,7 @@ class Solution:
         # From where another search ended, the derivatives are right far enough.
         self.damping, self.grow = 1e-3 if start is None else 1e-10, 2.0
         largest = float(np.abs(_times(task.white, task.measured)).max())
-        self.floor = 1e-13 * largest or 1e-100
+        self.floor = 1e-13 * largest or 1e-6  # of contacts, in their usual noise
         self.freedom = np.zeros(q)
         self.shared = task.levels
         self.parameters = task.mean if start is None else start.parameters

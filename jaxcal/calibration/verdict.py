@@ -28,6 +28,7 @@ _FEW = 4  # contacts: fewer that lie apart are outliers, not a socket that was m
 _LOOSE = 7.0  # standard deviations: no scatter, a reading of something else
 _SPARSE = 12  # measurements: so few have no outlier that is scatter
 _TIP = 0.004  # of the arm's length: tools are built nearer to their description
+_LINK = 0.02  # likewise; without a known distance an arm may shrink to fit contacts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Verdict:
     # None where there are too few measurements to tell.
     explains: bool | None  # the scatter of the readings is what the noise can be
     helps: bool | None  # held-out errors are smaller than those of the nominal machine
-    clean: bool | None  # no reading is of another socket, far from the fit, or tip
+    clean: bool | None  # no reading is of another socket, far from the fit, tip or arm
     held_out: float  # mean held-out error of a measurement, in the readings' unit
     interval: tuple[float, float]  # 95 % of that mean
     nominal: float  # mean error of the nominal machine
@@ -101,17 +102,21 @@ def verdict(calibration: Fit) -> Verdict | None:
                 f"measurement {row} is {calibration.distance[row] ** 0.5:.3g} standard "
                 "deviations from the fit of the others"
             )
+    for left in np.flatnonzero(calibration.loss_weights == 0.0):
+        same = (commands == calibration.commands[left]).all(axis=1)
+        if model.sensor.zeros and same.any():
+            reasons.append(f"measurement {left} is {used[same][0]} again, counted once")
     right = ~np.isin(used, list(swapped))
     reasons += _moved(model, commands[right], residuals[right], used[right])
     exchanged = _exchanged(calibration, model)
-    other_tip = _other_tip(calibration, model)
-    reasons += exchanged + _far(calibration) + other_tip
+    other_arm = _other_tip(calibration, model) + _other_links(calibration, model)
+    reasons += exchanged + _far(calibration) + other_arm
     limit = _LOOSE if len(used) > _SPARSE else 0.0
     loose = (calibration.distance[list(calibration.outliers)] > limit**2).any()
     return Verdict(
         explains=explains,
         helps=mean < nominal,
-        clean=not (swapped or exchanged or loose or other_tip),
+        clean=not (swapped or exchanged or loose or other_arm),
         held_out=mean,
         interval=(max(mean - half, 0.0), mean + half),
         nominal=nominal,
@@ -187,6 +192,22 @@ def _other_tip(calibration: Fit, model: SerialChain) -> list[str]:
     return [
         f"the tip is {far:.3g} from where the arm's description has it "
         f"(tool {', '.join(f'{each:.3g}' for each in moved)}): is it another tip?"
+    ]
+
+
+def _other_links(calibration: Fit, model: SerialChain) -> list[str]:
+    """Lengths far from the arm's description, which sizes taken from data may allow."""
+    if not model.sensor.zeros:
+        return []
+    at = np.flatnonzero(np.array(model.units[: model.table.size]) == "length")
+    off = np.abs(calibration.parameters - model.nominal)[at]
+    std = np.sqrt(np.diagonal(np.asarray(calibration.covariance))[at])
+    far = off - 2.0 * std > _LINK * model.length
+    if not far.any():
+        return []
+    return [
+        f"{', '.join(model.names[i] for i in at[far])}: to {off[far].max():.3g} from "
+        "the arm's description: contacts of another arm, or of several sockets as one?"
     ]
 
 

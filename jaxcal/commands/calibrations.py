@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from jaxcal.arguments import several
 from jaxcal.calibration import Calibration
 from jaxcal.calibration import identify as identified
+from jaxcal.calibration.estimate import require_postures
 from jaxcal.checks import aligned
 from jaxcal.commands.questions import ModelPath, Numbers, read_model
 from jaxcal.commands.tables import (
@@ -36,6 +37,11 @@ Array = NDArray[np.float64]
 _KINDS = [kind for kind in SENSORS if kind != "several"]
 
 
+def _of_joint(text: str) -> list[Any]:
+    name, _, values = text.rpartition("=")
+    return [name, several(float, "numbers")(values)]
+
+
 @dataclasses.dataclass
 class ArmOptions:
     """Of an arm in a URDF file: its links, its sensor, the unit of its columns."""
@@ -46,6 +52,16 @@ class ArmOptions:
     base: Annotated[str | None, "of an arm, the link that stands still", "LINK"] = None
     tip: Annotated[str | None, "of an arm, the link that is measured", "LINK"] = None
     radians: Annotated[bool, "joint columns are in radians"] = False
+    locked: Annotated[
+        list[list[Any]] | None,
+        "a joint that stands still, and where, degrees or metres: finger=0.01",
+        _of_joint,
+    ] = None
+    limits: Annotated[
+        list[list[Any]] | None,
+        "of a joint instead of the file's, degrees or metres: wrist=-160,160",
+        _of_joint,
+    ] = None
     distance: Annotated[
         list[list[float]] | None,
         "two sockets, how far apart they are and its std: 0,1,0.05,0.0001",
@@ -58,6 +74,11 @@ class ArmOptions:
         given: dict[str, Any] = {}
         if issubclass(kind, Placed):
             if places is not None:
+                if {len(place) for place in places} != {kind.width}:
+                    raise ValueError(
+                        f"--near must be {kind.width} numbers for --sensor "
+                        f"{self.sensor}, got {places}"
+                    )
                 given |= {"count": len(places), "places": places}
             elif table is not None and self.sensor in table.names:
                 column = table.columns([self.sensor])
@@ -71,15 +92,31 @@ class ArmOptions:
                     f"{table.source}: --distance needs a column 'socket', from 0"
                 )
         sensor = kind(**given)
-        return SerialChain.from_urdf(path, base=self.base, tip=self.tip, sensor=sensor)
+        for option, count in (("locked", 1), ("limits", 2)):
+            for name, values in getattr(self, option) or ():
+                if not name or len(values) != count:
+                    numbers = "LOW,HIGH" if count == 2 else "VALUE"
+                    raise ValueError(f"--{option} must be JOINT={numbers}")
+        return SerialChain.from_urdf(
+            path,
+            base=self.base,
+            tip=self.tip,
+            sensor=sensor,
+            locked={name: value for name, (value,) in self.locked or ()},
+            limits=dict(self.limits or ()),
+        )
 
     def commands(self, arm: SerialChain, table: Table, inputs: Sequence[str]) -> Array:
         """(N, n) the columns of joints and sensor, in degrees."""
         commands = table.columns(inputs)
-        if self.radians:
-            turning = np.flatnonzero(np.array(arm.command_units) == "deg")
-            commands[:, turning] = np.degrees(commands[:, turning])
-        return commands
+        return _degrees(arm, commands) if self.radians else commands
+
+
+def _degrees(arm: SerialChain, commands: Array) -> Array:
+    """The same commands, of turning joints in degrees instead of radians."""
+    turning = np.flatnonzero(np.array(arm.command_units) == "deg")
+    commands[:, turning] = np.degrees(commands[:, turning])
+    return commands
 
 
 def postures(
@@ -119,6 +156,7 @@ def postures(
     header, done = (*arm.joint_names, *arm.sensor.inputs), None
     if reached is not None:
         done = of_arm.commands(arm, reached, header)
+        require_postures(arm, done)
         arm = arm.located(done)
     left = k - (0 if done is None else len(done))
     if left < 1:
@@ -234,11 +272,16 @@ def predict(
     *,
     columns: Annotated[str | None, "columns of commands", "A,B"] = None,
     std: Annotated[bool, "and the standard error of each output"] = False,
+    radians: Annotated[bool, "of an arm: joint columns are in radians"] = False,
     output: Output,
 ) -> None:
     """Where a calibrated machine goes for given commands."""
     found = Calibration.load(calibration)
     commands = _given(file, columns, found.input_names)
+    if radians:
+        if not isinstance(found.model, SerialChain):
+            raise ValueError("--radians is of arms")
+        commands = _degrees(found.model, commands)
     names, values = found.output_names, found.predict(commands)
     if std:
         names = (*names, *(f"std_{name}" for name in names))

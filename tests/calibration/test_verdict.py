@@ -16,6 +16,7 @@ import pytest
 
 import jaxcal
 from jaxcal.commands.main import main
+from jaxcal.models import Socket
 
 from ..models.arms import ur5
 
@@ -174,6 +175,25 @@ def test_many_contacts_of_the_other_socket_are_named():
     reasons = _fit("panda_1", joints, mixed).verdict.reasons
     named = {int(why.split()[1]) for why in reasons if why.endswith("socket 0 instead")}
     assert named == set(wrong.tolist())
+
+
+def test_sockets_as_one_are_told():
+    """Without a known distance, an arm shrunk to nothing fits them exactly."""
+    joints = PLACE[0][::4]
+    arm = contacts.arm("panda_1").measured_with(Socket())
+    with pytest.warns(UserWarning, match="or of several sockets as one"):
+        found = jaxcal.identify(joints, np.zeros((len(joints), 3)), model=arm)
+    assert not found.verdict.good
+
+
+def test_a_contact_that_is_written_twice_counts_once():
+    rows = np.arange(0, 62, 5)
+    once, twice = (
+        _fit("panda_1", PLACE[0][each], PLACE[1][each])
+        for each in (rows, np.append(rows, rows[0]))
+    )
+    np.testing.assert_array_equal(once.parameters, twice.parameters)
+    assert twice.verdict.reasons[-1] == "measurement 13 is 0 again, counted once"
 
 
 @pytest.mark.parametrize(("name", "off"), [("panda_1", -0.01), ("kuka_14", 0.01)])

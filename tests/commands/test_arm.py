@@ -81,6 +81,26 @@ def test_joints_far_beyond_their_limits_are_named(files):
         jaxcal.identify(swapped, np.zeros((len(q), 3)), model=arm)
 
 
+def test_predictions_take_the_columns_of_the_fit(files, capsys):
+    saved = str(files[2] / "calibration.json")
+    assert _run(files, "--radians", "--out", saved) == 0
+    capsys.readouterr()
+    assert main(["predict", saved, str(files[1]), "--radians"]) == 0
+    off = np.loadtxt(capsys.readouterr().out.splitlines()[1:], delimiter=",")
+    assert np.abs(off).max() < 0.002  # of contacts: zeros
+
+
+def test_joints_are_locked_and_have_other_limits(files, capsys):
+    given = ["postures", str(files[0]), "--tip", "ball_link", "-k", "4", "--csv",
+             "--count", "12", "--limits", "panda_joint1=20,30"]  # fmt: skip
+    assert main([*given, "--locked", "panda_joint7=45"]) == 0
+    header, *rows = capsys.readouterr().out.splitlines()
+    assert header == ",".join(f"panda_joint{i}" for i in range(1, 7))
+    assert all(20.0 <= float(row.split(",")[0]) <= 30.0 for row in rows)
+    assert main([*given, "--locked", "panda_joint7=1,2"]) == 2
+    assert "--locked must be JOINT=VALUE" in capsys.readouterr().err
+
+
 def test_postures_are_planned_and_the_rest_chosen_again(files, capsys):
     urdf, _, folder = files
     out, reached, picture = (folder / name for name in ("a.csv", "b.csv", "plan.png"))
@@ -107,3 +127,8 @@ def test_postures_are_planned_and_the_rest_chosen_again(files, capsys):
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert main([*given, "-k", "4"]) == 2
     assert "more than the 4 that were reached" in capsys.readouterr().err
+    given.remove("--radians")
+    assert main([*given, "-k", "7"]) == 2
+    assert "which look like radians" in capsys.readouterr().err
+    assert main([*given, *near, "--near=.4,.2", "-k", "7"]) == 2
+    assert "--near must be 3 numbers for --sensor socket" in capsys.readouterr().err

@@ -336,6 +336,8 @@ def test_sockets_planes_and_anchors_are_found_from_nominal_postures():
     far = np.linalg.norm(ur5().predict(many) - ANCHORS[0, :3], axis=1, keepdims=True)
     found = wire.located(many, far).sensor.places
     np.testing.assert_allclose(found, [[*ANCHORS[0, :3], 0.0]], atol=1e-8)
+    found = wire.located(many, far + 300.0).sensor.places  # and its zero
+    np.testing.assert_allclose(found, [[*ANCHORS[0, :3], -300.0]], atol=1e-8)
     with pytest.raises(ValueError, match="anchor 0 has 3 lengths, and four are needed"):
         wire.located(many[:3], far[:3])
     with pytest.raises(ValueError, match=r"anchor 0 fit no anchor .* unit of the arm"):
@@ -363,6 +365,17 @@ def test_distances_between_sockets_are_facts():
         "socket1 y",
     ]
     assert ur5().facts()[1].shape == (0, 39)
+
+
+def test_wrong_readings_of_one_of_several_sensors_are_refused():
+    arm = ur5(sensor=Several((Position(), Socket(2, distances=[(0, 1, 50.0, 0.1)]))))
+    joints = np.random.default_rng(4).uniform(-120.0, 120.0, (12, 6))
+    seen = ur5().predict(joints)
+    contacts = np.column_stack([joints, np.arange(12) % 2])
+    for at, message in ((0.001, "measured must be in the unit"), (1.0, "at one point")):
+        together = arm.together((joints, at * seen), (contacts, None))
+        with pytest.raises(ValueError, match=message):
+            jaxcal.identify(*together, model=arm)
 
 
 def test_what_a_sensor_cannot_see_is_held_and_named():
@@ -433,8 +446,8 @@ def test_a_sensor_of_ones_own_needs_no_more_than_a_class():
         (lambda: Socket(0), "count must be at least 1"),
         (lambda: Socket(2, np.zeros((3, 3))), r"places must have shape \(2, 3\)"),
         (lambda: Socket(2, distances=[(0, 1, 50.0)]), "distances must be rows"),
-        (lambda: Socket(2, distances=[(0, 2, 50.0, 0.1)]), r"in \[0, 2\), got 2"),
-        (lambda: Socket(2, distances=[(1, 1, 50.0, 0.1)]), "must name two sockets"),
+        (lambda: Socket(2, distances=[(0, 2, 50.0, 0.1)]), "two of 2 sockets, from 0"),
+        (lambda: Socket(2, distances=[(1, 1, 50.0, 0.1)]), "two of 2 sockets, from 0"),
         (lambda: Plane(1, [[0, 0, 0, 1]]), "must have normals other than zero"),
         (lambda: Gravity(up=(0, 0, 0)), "up must be a direction"),
         (lambda: Gravity(0.0), "magnitude must be positive"),

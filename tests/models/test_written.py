@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import jaxcal
 from jaxcal.models import Pose, Position, SerialChain, Socket, from_dict
 
 from .arms import UR5_TABLE, ur5
@@ -223,6 +224,26 @@ def test_the_kinematics_file_of_universal_robots(tmp_path):
     np.testing.assert_allclose(frames[4][:3, 3], [0.0, -0.09456, 0.0], atol=2e-4)
     with pytest.raises(ValueError, match="must be in metres"):
         ur5().write("ur", path, ur5().nominal)
+
+
+def test_where_a_tracker_stands_is_found_and_is_in_the_file(tmp_path):
+    """Its frame is 5 m away and turned by 130 degrees."""
+    path, out = tmp_path / "arm.urdf", tmp_path / "calibrated.urdf"
+    path.write_text(ARM, encoding="utf-8")
+    arm, rng = SerialChain.from_urdf(path), np.random.default_rng(0)
+    off = np.where(np.array(arm.units) == "length", 0.001, 0.1)
+    truth = arm.nominal + off * rng.normal(size=arm.num_parameters)
+    joints = rng.uniform(-120.0, 120.0, (40, 3))
+    turn = Rotation.from_rotvec([80.0, -60.0, 80.0], degrees=True)
+    seen = turn.apply(arm.predict(joints, truth)) + np.array([3.0, -4.0, 1.0])
+    found = jaxcal.identify(joints[:30], seen[:30], model=arm, noise_std=1e-5)
+    np.testing.assert_allclose(found.predict(joints), seen, atol=1e-5)
+    assert found.verdict.good and found.verdict.nominal < 0.02
+    tip = found.to_urdf(out)
+    again = SerialChain.from_urdf(out, tip=tip)
+    np.testing.assert_allclose(
+        again.predict(joints), found.predict(joints), rtol=0, atol=1e-9
+    )
 
 
 def test_the_table_as_csv(tmp_path):

@@ -48,7 +48,10 @@ class Distance(Placed):
     def located(
         self, tip: Tip, inputs: Array, measured: Array | None
     ) -> tuple[Self, Array | None]:
-        """Anchors from nominal points and lengths, linear in (anchor, its square)."""
+        """Anchors from nominal points and lengths, linear in (anchor, a constant).
+
+        And in the zero, where lengths fit three times as well with another one.
+        """
         if self.places is not None or measured is None:
             return self, None
         which, places = self.of_rows(inputs), np.zeros((self.count, 4))
@@ -61,15 +64,21 @@ class Distance(Placed):
                 )
             middle = points.mean(axis=0)
             points = points - middle
-            rows = np.column_stack([2.0 * points, np.ones(len(points))])
+            rows = np.column_stack([2.0 * points, np.ones(len(points)), 2.0 * far])
             right = (points**2).sum(axis=1) - far**2
-            anchor = np.linalg.lstsq(rows, right, rcond=1e-6)[0][:3]
-            off = np.median(np.abs(np.linalg.norm(points - anchor, axis=1) - far))
+            off, anchor, zero = np.inf, np.zeros(3), 0.0
+            for width in (4, 5):
+                found = np.linalg.lstsq(rows[:, :width], right, rcond=1e-6)[0]
+                wire = far + found[4:].sum()
+                each = np.linalg.norm(points - found[:3], axis=1) - wire
+                left = np.median(np.abs(each))
+                if width == 4 or (left < off / 3.0 and len(points) > 10):
+                    off, anchor, zero = left, found[:3], found[4:].sum()
             if off > 0.2 * tip.length:
                 raise ValueError(
                     f"lengths to anchor {i} fit no anchor to {off:.3g}: measured must "
                     f"be in the unit of the arm, whose length is {tip.length:.3g}, and "
                     "commands in degrees"
                 )
-            places[i, :3] = anchor + middle
+            places[i] = *(anchor + middle), zero
         return dataclasses.replace(self, places=places), None

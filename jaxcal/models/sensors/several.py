@@ -118,7 +118,7 @@ class Several(Sensor):
         hidden = [set(one.unseen(arm)) for one in self.sensors]
         return tuple(name for name in arm.names if all(name in h for h in hidden))
 
-    def _parts(
+    def parts(
         self, inputs: Array
     ) -> Iterator[tuple[int, Sensor, NDArray[np.intp], Array]]:
         """Each sensor and its number, its rows, and its columns there."""
@@ -150,7 +150,7 @@ class Several(Sensor):
         count, q, first = len(inputs), len(self.outputs), 0
         values = np.zeros((count, q))
         by_tip, by_own = np.zeros((count, q, 6)), np.zeros((count, q, len(own)))
-        for i, one, rows, columns in self._parts(inputs):
+        for i, one, rows, columns in self.parts(inputs):
             size = len(one.tool) if i else 0
             last = first + size + len(one.names)
             mount, width = own[first : first + size], len(one.outputs)
@@ -179,7 +179,7 @@ class Several(Sensor):
         """Each of them, and where those that find it are on the tool."""
         sensors, mounts = [], np.array(self.mounts)
         tool = None
-        for i, one, rows, columns in self._parts(inputs):
+        for i, one, rows, columns in self.parts(inputs):
             read = None
             if measured is not None:
                 read = measured[rows, : len(one.outputs)] * one.stds(tip.length)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers
-from jaxcal.models.sensors.sensor import Placed, Reading, Tip, label
+from jaxcal.models.sensors.sensor import Placed, Reading, Tip
 
 __all__ = ["Socket"]
 
@@ -50,9 +50,13 @@ class Socket(Placed):
                 "distances must be rows (first socket, second, distance, std), the "
                 f"last two positive, got {self.distances!r}"
             )
-        pairs = [label("of distances", column, self.count) for column in rows[:, :2].T]
-        if (pairs[0] == pairs[1]).any():
-            raise ValueError(f"distances must name two sockets, got {self.distances!r}")
+        one, two = pairs = rows[:, :2].T
+        known = (pairs == pairs.round()) & (pairs >= 0.0) & (pairs < self.count)
+        if not known.all() or (one == two).any():
+            raise ValueError(
+                f"distances must name two of {self.count} sockets, from 0, got "
+                f"{self.distances!r}"
+            )
         object.__setattr__(self, "distances", tuple(map(tuple, rows.tolist())))
 
     def usual_noise(self, length: float) -> ArrayLike:
@@ -89,6 +93,6 @@ class Socket(Placed):
             apart = places[j] - places[i]
             far = float(np.linalg.norm(apart))
             off[k] = (distance - far) / std
-            rows[k, j] = apart / (far or 1.0) / std
+            rows[k, j] = (apart / far if far else np.eye(3)[0]) / std
             rows[k, i] = -rows[k, j]
         return off, rows.reshape(len(off), own.size)

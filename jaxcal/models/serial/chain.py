@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -38,6 +38,8 @@ _LENGTH, _TWIST, _ZERO = 1.5e-3, 0.3, 0.5  # share of the links' length; degrees
 _GEAR, _SAG = 5e-3, 0.5  # ratio; degrees under the largest torque
 _WAVES, _WAVE = ("sin", "cos", "sin2", "cos2"), 0.045  # of gears; degrees
 _MOUNTING, _MOUNTING_ANGLE = 0.1, 1.7
+# Of the arm's length: positions so far off are in another frame; so alike, of this arm.
+_NEAR, _ALIKE = 0.2, 0.05
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -419,17 +421,40 @@ class SerialChain(Arm):
         """This arm with its sensor where nominal postures and readings put it.
 
         Nothing is changed that was given: sockets, planes, anchors, boards and their
-        cameras have no place of their own until the first readings.
+        cameras have no place of their own until the first readings. Of a tracker that
+        is far from where it was said to be the base is found.
         """
         commands = as_commands(self, commands)
         read = None if measured is None else numbers("measured", measured)
         frame = self._chain(commands, self.nominal)[0]
         inputs = commands[:, self.num_joints :]
+        moved = np.eye(4)
+        if read is not None:
+            first, at, seen = next(self.of_each_sensor(commands, read))
+            if isinstance(first.sensor, Position):
+                moved = _far(first.predict(at), seen, self.length)
+            frame = np.einsum("ab,kbn->kan", moved[:3, :3], frame)
+            frame[3] += moved[:3, 3:]
         sensor, new = self.sensor.located(self._tip_at(commands, frame), inputs, read)
-        if sensor is self.sensor and new is None:
+        if sensor is self.sensor and new is None and (moved == np.eye(4)).all():
             return self
         tool = self.tool if new is None else self.tool @ new
-        return dataclasses.replace(self, sensor=sensor, tool=tool)
+        return dataclasses.replace(
+            self, base=moved @ self.base, sensor=sensor, tool=tool
+        )
+
+    def of_each_sensor(
+        self, commands: Array, measured: Array
+    ) -> Iterator[tuple[Self, Array, Array]]:
+        """The arm with each sensor of ``Several`` that read, its commands, readings."""
+        if not isinstance(self.sensor, Several):
+            yield self, commands, measured
+            return
+        joints, inputs = np.split(commands, [self.num_joints], axis=1)
+        for _, one, rows, columns in self.sensor.parts(inputs):
+            read = measured[rows, : len(one.outputs)] * one.stds(self.length)
+            if len(rows):
+                yield self.measured_with(one), np.hstack([joints[rows], columns]), read
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -596,6 +621,23 @@ class SerialChain(Arm):
         ]
         sensor = self.sensor.to_dict()
         return {"kind": "serial_chain", **data, "limits": ends, "sensor": sensor}
+
+
+def _far(points: Array, measured: Array, length: float) -> Array:
+    """(4, 4) that takes nominal points (N, 3) to those measured, if those are far off.
+
+    It stays one where the fit finds the base by itself, or no other explains them.
+    """
+    moved, off = np.eye(4), np.linalg.norm(measured - points, axis=1)
+    if len(points) < 4 or np.median(off) < _NEAR * length:
+        return moved
+    from scipy.spatial.transform import Rotation
+
+    middle, there = points.mean(axis=0), measured.mean(axis=0)
+    turn = Rotation.align_vectors(measured - there, points - middle)[0].as_matrix()
+    moved[:3, :3], moved[:3, 3] = turn, there - turn @ middle
+    left = np.linalg.norm(points @ turn.T + moved[:3, 3] - measured, axis=1)
+    return moved if np.median(left) < _ALIKE * length else np.eye(4)
 
 
 def _numbered(columns: int) -> tuple[str, ...]:

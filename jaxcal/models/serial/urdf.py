@@ -26,6 +26,7 @@ __all__ = [
     "moved",
     "read_urdf",
     "row_matrix",
+    "table_of",
     "walk",
 ]
 
@@ -73,7 +74,7 @@ def read_urdf(
         (first, down), (last, ends_down) = chain[0], chain[-1]
         source["base"] = first.parent if down else first.child
         source["tip"] = last.child if ends_down else last.parent
-        return _table(chain, joints_of(text), locked, source)
+        return table_of(chain, joints_of(text), locked, source)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
 
@@ -288,7 +289,7 @@ def _unit(joint: Joint) -> float:
     return float(np.radians(1.0)) if joint.kind == "R" else 1.0
 
 
-def _table(
+def table_of(
     chain: list[tuple[Joint, bool]],
     joints: dict[str, Joint],
     locked: Mapping[str, float],

@@ -15,7 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.checks import one_of
-from jaxcal.models.serial.urdf import Joint, joints_of, led, moved, row_matrix, walk
+from jaxcal.models.serial.urdf import (
+    Joint,
+    joints_of,
+    led,
+    moved,
+    row_matrix,
+    table_of,
+    walk,
+)
 
 if TYPE_CHECKING:
     from jaxcal.models.serial.arm import Arm
@@ -113,7 +121,7 @@ def _ur_text(nominal: Arm, calibrated: Arm) -> str:
             f"{nominal.length:g} in all"
         )
     if nominal.source is not None:
-        found, _ = _origins(nominal, calibrated)
+        found, _ = _origins(nominal, calibrated, placed=False)
         joints = joints_of(nominal.source["text"])
         frames = [found.get(n, joints[n].origin) for n in nominal.joint_names]
     else:
@@ -135,16 +143,25 @@ def _ur_text(nominal: Arm, calibrated: Arm) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _origins(nominal: Arm, calibrated: Arm) -> tuple[dict[str, Array], Array | None]:
-    """New origins by joint, and what no joint before the tip can hold, if anything."""
+def _origins(
+    nominal: Arm, calibrated: Arm, *, placed: bool = True
+) -> tuple[dict[str, Array], Array | None]:
+    """New origins by joint, and what no joint before the tip can hold, if anything.
+
+    With the base where it was found, or as in the file where it is not ``placed``.
+    """
     assert nominal.source is not None  # the caller has looked
+    text, locked = nominal.source["text"], nominal.source["locked"]
+    joints, ends = joints_of(text), (nominal.source["base"], nominal.source["tip"])
     gaps = _gaps(nominal.source)
+    # The nominal base may be where a tracker sees it, and not the file's.
+    base = table_of(list(walk(text, *ends, locked)), joints, locked, {})["base"]
     rows = [row_matrix(row) for row in nominal.table]
     new = [row_matrix(row) for row in calibrated.table]
-    turns = [np.linalg.inv(nominal.base) @ _product(gaps[0])]
+    turns = [np.linalg.inv(base) @ _product(gaps[0])]
     for row, gap in zip(rows[:-1], gaps[1:-1], strict=True):
         turns.append(np.linalg.inv(row) @ turns[-1] @ _product(gap))
-    wanted = [calibrated.base @ turns[0]]
+    wanted = [(calibrated.base if placed else base) @ turns[0]]
     for turn, row, after in zip(turns, new, turns[1:], strict=False):
         wanted.append(np.linalg.inv(turn) @ row @ after)
     wanted.append(np.linalg.inv(turns[-1]) @ new[-1] @ calibrated.tool)
