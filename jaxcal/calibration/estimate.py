@@ -69,20 +69,14 @@ def fit_model(
     if not used.any():
         raise ValueError("weights must be positive for one measurement at least")
     white, known, spread = _noise_of(noise, weights, commands, measured.shape[1])
-    if known and common_noise is not None:
-        raise ValueError(
-            "common_noise says how to estimate the noise, and noise says what it is: "
-            "give one of them"
-        )
-    pose = isinstance(model, SerialChain) and isinstance(model.sensor, Pose)
-    if spread.any() and pose:
-        raise ValueError(
-            "command_std must not be given with a Pose: the orientations are "
-            "compared with those of the commands given; raise the std of the noise"
-        )
     each = np.arange(measured.shape[1])
     levels = 0 * each
     if isinstance(model, SerialChain):
+        if spread.any() and isinstance(model.sensor, Pose):
+            raise ValueError(
+                "command_std must not be given with a Pose: the orientations are "
+                "compared with those of the commands given; raise the std of the noise"
+            )
         for part in model.of_each_sensor(commands[used], measured[used]):
             _require_unit(*part)
         require_postures(model, commands[used])

@@ -119,9 +119,10 @@ def identify(
         if plain and np.ndim(0.0 if noise.std is None else noise.std) < 2:
             noise_std, noise = noise.std, None
     level = None if noise_std is None else levels("noise_std", noise_std, m)
-    if level is not None and common_noise is not None:
+    of_readings = (noise.std, noise.covariance) if noise is not None else (level,)
+    if common_noise is not None and any(one is not None for one in of_readings):
         raise ValueError(
-            "common_noise says how to estimate the noise and noise_std what it is: "
+            "common_noise says how to estimate the noise, and noise says what it is: "
             "give one of them"
         )
     for name, unit in (
