@@ -211,7 +211,10 @@ class Output:
         """
         if self.json and self.csv:
             raise ValueError("one of --json and --csv must be left out")
-        if self.json or self.out.endswith(".json"):
+        ending = pathlib.PurePath(self.out).suffix.lower()
+        if ending not in ("", ".csv", ".json", ".txt"):
+            raise ValueError(f"--out must end in .csv or .json, got {self.out}")
+        if self.json or ending == ".json":
             each = [dict(zip(names, row, strict=True)) for row in rows]
             write_json(self.out, each if document is None else document)
         elif self.csv or self.out:

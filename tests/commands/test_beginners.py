@@ -73,6 +73,7 @@ CASES = [  # what was typed, what the line must hold
     ("select empty.csv", "the table is empty"),
     ("select twice.csv", "column 'pitch' comes twice"),
     ("select book.xlsx", "save this one as CSV"),
+    ("select table.csv --out plan.xlsx", "must end in .csv or .json, got plan.xlsx"),
     ("select table.csv -k 3", "k must be at least 4"),
     ("select table.csv -k 13", "12 candidates, got 13"),
     ("select table.csv --columns pitch,jaw", "no column 'jaw'; columns: pitch, yaw"),
