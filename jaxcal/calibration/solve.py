@@ -376,20 +376,16 @@ def _factor(rows: Array, right: Array, damping: float) -> tuple[Array, Array]:
     Cholesky twice (Yamamoto et al., 2015) is as exact as Householder's reflections
     where it succeeds, and does not wait for BLAS's threads in every column.
     """
-    from scipy.linalg.lapack import dtrtri
+    from scipy.linalg.lapack import dpotrf, dtrtri
 
-    width = rows.shape[1]
-    whole = np.concatenate([rows, np.sqrt(damping) * np.eye(width)])
-    inverse = np.eye(width)
-    try:
-        for _ in range(2):
-            turned = whole @ inverse
-            root = np.linalg.cholesky(turned.T @ turned).T
-            size = np.diagonal(root)
-            if size.min(initial=np.inf) < _CHOLESKY * size.max(initial=0.0):
-                raise np.linalg.LinAlgError
-            inverse = inverse @ dtrtri(root)[0]
-        return inverse, inverse.T @ (rows.T @ right)
-    except np.linalg.LinAlgError:
-        turned, triangle = np.linalg.qr(whole)
-        return np.linalg.inv(triangle), turned[: len(rows)].T @ right
+    damp = damping * np.eye(rows.shape[1])
+    turned, inverse = rows, np.eye(rows.shape[1])
+    for _ in range(2):
+        root, failed = dpotrf(turned.T @ turned + inverse.T @ damp @ inverse)
+        size = np.diagonal(root)
+        if failed or size.min(initial=np.inf) < _CHOLESKY * size.max(initial=0.0):
+            whole, triangle = np.linalg.qr(np.concatenate([rows, np.sqrt(damp)]))
+            return np.linalg.inv(triangle), whole[: len(rows)].T @ right
+        inverse = inverse @ dtrtri(root)[0]
+        turned = rows @ inverse
+    return inverse, turned.T @ right

@@ -85,6 +85,8 @@ class Prior:
         require_finite("mean of the prior", mean)
         _by_name("fixed", dict.fromkeys(self.fixed, 0.0), names, unknown)
         free = ~np.isin(names, list(self.fixed))
+        if not free.any():
+            raise ValueError("prior must leave a parameter free, but it fixes them all")
         return ResolvedPrior(mean, np.diag(std**-2.0), free)
 
 

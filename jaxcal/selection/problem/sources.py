@@ -138,8 +138,6 @@ class Modelled(Source):
         self._read = self._noise.beside(misfit) if misfit else self._noise
         self._prior = model.default_prior() if prior is None else prior
         known = self._prior.resolve(model)
-        if not known.free.any():
-            raise ValueError("prior must leave a parameter free, but it fixes them all")
         self._mean, self._free = known.mean, known.free
         pairs = zip(model.names, known.free, strict=True)
         self.names = tuple(name for name, free in pairs if free)
