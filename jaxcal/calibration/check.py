@@ -17,6 +17,7 @@ __all__ = ["Check", "check", "verification"]
 Array = NDArray[np.float64]
 
 _POWER = 0.8
+_KNOWN = 1e9  # degrees of freedom of noise that was given
 _SWEEPS = 20  # of swaps, at most
 
 
@@ -74,20 +75,35 @@ def check(
     """
     from scipy import special
 
-    commands = table("commands", commands)
+    commands = _postures(calibration, "commands", commands)
     shape = len(commands), calibration.num_outputs
     rule = ": as many rows as commands"
     measured = array_of("measured", measured, *shape, rule=rule)
+    model = calibration.model
+    if isinstance(model, SerialChain) and model.sensor.zeros and not measured.any():
+        first = np.sort(np.unique(commands, axis=0, return_index=True)[1])
+        commands, measured = commands[first], measured[first]  # one written twice
     noise = calibration.require_noise("check")
-    model, theta = calibration.model, calibration.parameters
+    theta = calibration.parameters
     slopes = np.asarray(model.jacobian(commands, theta))
     p = slopes.shape[-1]
     off = (measured - calibration.predict(commands)).ravel()
     rows = slopes.reshape(-1, p)
-    known, covariance = calibration.linear(commands)
-    known = known.reshape(len(rows), -1)
-    whole = np.diag(np.tile(noise**2, len(commands))) + known @ covariance @ known.T
-    root = np.linalg.inv(np.linalg.cholesky(whole))
+
+    def spread(misfit: bool) -> Array:
+        known, covariance = calibration.linear(commands, misfit=misfit)
+        known = known.reshape(len(rows), -1)
+        return np.diag(np.tile(noise**2, len(commands))) + known @ covariance @ known.T
+
+    try:
+        root = np.linalg.inv(np.linalg.cholesky(spread(True)))
+    except np.linalg.LinAlgError:
+        raise ValueError(
+            "the calibration must predict what is checked, but its uncertainty there "
+            "is beyond rounding: see calibration.verdict"
+        ) from None
+    # Misfit that is allowed for may not be there, and hides a drift all the same.
+    least = float(np.trace(root @ spread(False) @ root.T)) / len(rows)
     white, by = root @ off, root @ rows
     names = calibration.names
     own = np.zeros(p, dtype=np.bool_)
@@ -100,12 +116,10 @@ def check(
     if not freedom:
         raise ValueError("measured must hold a reading beside what was placed anew")
     square = float(white @ white)
-    if calibration.noise_known:
-        p_value = float(special.chdtrc(freedom, square))
-    else:
-        p_value = float(special.fdtrc(freedom, calibration.noise_dof, square / freedom))
-    limit = special.chdtri(freedom, 0.05)
-    needed = float(special.chndtrinc(limit, freedom, 1.0 - _POWER))
+    dof = calibration.noise_dof or _KNOWN
+    p_value = float(special.fdtrc(freedom, dof, square / freedom))
+    limit = special.fdtri(freedom, dof, 0.95) / least
+    needed = least * float(special.ncfdtrinc(freedom, dof, 1.0 - _POWER, limit))
     free = (calibration.free[:p] > 0.0) & ~own
     seen = np.sqrt((by**2).sum(axis=0))
     with np.errstate(divide="ignore"):
@@ -113,7 +127,7 @@ def check(
     change, tolerance = _changes(calibration, calibration.commands, tolerance)
     judged = free & np.isfinite(change)
     hidden = judged & (size > change)
-    power = _mean_power(freedom, (change[judged] * seen[judged]) ** 2)
+    power = _mean_power(freedom, dof, (change[judged] * seen[judged]) ** 2, least)
     if p_value < 0.05:
         says = "does not hold"
     else:
@@ -126,6 +140,16 @@ def check(
         unseen=tuple(names[i] for i in np.flatnonzero(hidden)),
         tolerance=tolerance,
     )
+
+
+def _postures(calibration: Fit, name: str, given: ArrayLike) -> Array:
+    """(N, n) commands that the calibration's machine can take."""
+    rows = array_of(name, given, "N", calibration.num_inputs)
+    if not len(rows):
+        raise ValueError(f"{name} must hold at least one row, got none")
+    if isinstance(calibration.model, SerialChain):
+        calibration.model.require_postures(rows)
+    return rows
 
 
 def _changes(
@@ -146,11 +170,15 @@ def _changes(
         return tolerance / np.sqrt((slopes**2).sum(axis=1).mean(axis=0)), tolerance
 
 
-def _mean_power(freedom: int, shifts: Array) -> Array:
-    """(...,) of changes with noncentralities (..., p), at 5 % false alarms."""
+def _mean_power(freedom: int, dof: float, shifts: Array, least: float = 1.0) -> Array:
+    """(...,) of changes with noncentralities (..., p), at 5 % false alarms.
+
+    ``least`` is the mean square of a reading without a change, 1 as the test has it.
+    """
     from scipy import special
 
-    missed = special.chndtr(special.chdtri(freedom, 0.05), freedom, shifts)
+    limit = special.fdtri(freedom, dof, 0.95) / least
+    missed = special.ncfdtr(freedom, dof, shifts / least, limit)
     seen = 1.0 - np.nan_to_num(missed, nan=0.0)  # NaN where far too large
     return np.asarray(seen.mean(axis=-1))
 
@@ -178,7 +206,7 @@ def verification(
     Returns:
         (k,) indices.
     """
-    points = table("candidates", candidates)
+    points = _postures(calibration, "candidates", candidates)
     if not 1 <= whole_number("k", k, 1) <= len(points):
         raise ValueError(f"k must be in [1, {len(points)}], got {k}")
     noise = calibration.require_noise("verification")
@@ -191,11 +219,12 @@ def verification(
     change, _ = _changes(calibration, where, tolerance)
     judged = (calibration.free[: len(change)] > 0.0) & np.isfinite(change)
     shifts = seen[:, judged] * change[judged] ** 2  # noncentralities of one posture
-    q = slopes.shape[1]
+    q, dof = slopes.shape[1], calibration.noise_dof or _KNOWN
 
     def value(rows: list[int]) -> Array:
         """(M,) of the rows and each candidate."""
-        return _mean_power(q * (len(rows) + 1), shifts[rows].sum(axis=0) + shifts)
+        shift = shifts[rows].sum(axis=0) + shifts
+        return _mean_power(q * (len(rows) + 1), dof, shift)
 
     chosen: list[int] = []
     for _ in range(k):

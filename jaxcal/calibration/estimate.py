@@ -25,13 +25,13 @@ from jaxcal.models import (
 from jaxcal.models.identifiability import unknown
 from jaxcal.models.model import derivative, facts, require_model
 
-__all__ = ["fit_model", "require_fitting", "require_postures"]
+__all__ = ["fit_model", "require_fitting"]
 
 Array = NDArray[np.float64]
 
-_BEYOND = 2.0  # degrees beyond a limit, or percent of a slide's stroke
 _NOMINAL = 0.1  # of its length: no arm is so far off, tip included, before it is fitted
 _APART = 0.2  # of it: what two sockets may seem to be off their distance
+_OTHER_UNIT = 0.01  # of it: so far off and tenfold, a distance is in another unit
 
 
 def require_fitting(model: Any, commands: Array, measured: Array) -> None:
@@ -79,7 +79,7 @@ def fit_model(
             )
         for part in model.of_each_sensor(commands[used], measured[used]):
             _require_unit(*part)
-        require_postures(model, commands[used])
+        model.require_postures(commands[used])
         model = model.located(commands[used], measured[used])
         for part in model.of_each_sensor(commands[used], measured[used]):
             _require_sockets(*part)
@@ -154,30 +154,6 @@ def _require_unit(model: SerialChain, commands: Array, measured: Array) -> None:
         )
 
 
-def require_postures(arm: SerialChain, commands: Array) -> None:
-    """Refuse radians for degrees, and joints far beyond their limits."""
-    low, high = arm.limits.T
-    units = np.array(arm.command_units)
-    joints = commands[:, : arm.num_joints]
-    largest = np.abs(joints[:, units == "deg"]).max(initial=0.0)
-    small = arm.num_joints > 2 and 1.0 < largest < 7.0
-    if small and arm.sensor.kind not in ("position", "pose", "several"):
-        raise ValueError(
-            f"commands must be in degrees, got angles of at most {largest:.3g}, which "
-            "look like radians: np.degrees(commands), --radians"
-        )
-    slack = np.where(units == "deg", _BEYOND, 0.01 * _BEYOND * (high - low))
-    far = np.argwhere((joints < low - slack) | (joints > high + slack))
-    for row, joint in far[:1]:
-        raise ValueError(
-            f"{arm.joint_names[joint]} must be within its limits "
-            f"{in_words(arm.limits[joint])}, to {slack[joint]:g}, got "
-            f"{joints[row, joint]:g} in row {row}; are the columns in this order: "
-            f"{', '.join(arm.joint_names)}? Where the file's limits are wrong, "
-            "give limits={name: (low, high)}, --limits"
-        )
-
-
 def _require_sockets(arm: SerialChain, commands: Array, measured: Array) -> None:
     """Refuse contacts that no arm near the nominal one can have made."""
     if not isinstance(arm.sensor, Socket):
@@ -219,7 +195,9 @@ def _require_sockets(arm: SerialChain, commands: Array, measured: Array) -> None
                 "distance from another is given"
             )
         found = float(np.linalg.norm(middles[int(one)] - middles[int(other)]))
-        if abs(found - distance) > _APART * arm.length:
+        off = abs(found - distance) / arm.length
+        unit = off > _OTHER_UNIT and not 0.1 < found / distance < 10.0
+        if off > _APART or unit:
             raise ValueError(
                 f"sockets {int(one)} and {int(other)} must be {distance:g} apart, but "
                 f"the arm as described puts them {found:.3g} apart: rows of another "

@@ -243,15 +243,26 @@ class Fit:
 
     # -- inside ------------------------------------------------------------------------
 
-    def linear(self, rows: Array) -> tuple[Array, Array]:
+    def linear(self, rows: Array, *, misfit: bool = True) -> tuple[Array, Array]:
         """(N, m, P) derivatives of predictions at ``rows`` (N, n), and what varies.
 
-        The latter is the covariance (P, P) of all parameters.
+        The latter is the covariance (P, P) of all parameters; without ``misfit`` of the
+        model's alone, as if there were no harmonics but those that were fitted.
         """
         if self.centre is not None:
             rows = rows - self.centre
-        slopes = derivative(self.whole, rows, self.estimate)
-        return slopes, np.asarray(self.joint_covariance)
+        joint, p = np.asarray(self.joint_covariance), len(self.names)
+        if misfit or not self.not_fitted:
+            return derivative(self.whole, rows, self.estimate), joint
+        by = joint[:p, p:]
+        within = joint[:p, :p] - by * self.prior_precision[p:] @ by.T
+        return derivative(self.model, rows, self.parameters), within
+
+    @property
+    def not_fitted(self) -> bool:
+        """Harmonics that were not fitted are counted in what is predicted."""
+        more = self.estimate[len(self.names) :]
+        return bool(more.size and not more.any())
 
     @functools.cached_property
     def whole(self) -> Model:

@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration.fit import Fit
+from jaxcal.information.singular import depends
 from jaxcal.models import SerialChain
-from jaxcal.models.sensors import Placed, Socket
+from jaxcal.models.sensors import Placed, Pose, Position, Socket
+from jaxcal.models.sensors.sensor import hats
 
 __all__ = ["Verdict", "verdict"]
 
@@ -29,6 +31,9 @@ _LOOSE = 7.0  # standard deviations: no scatter, a reading of something else
 _SPARSE = 12  # measurements: so few have no outlier that is scatter
 _TIP = 0.004  # of the arm's length: tools are built nearer to their description
 _LINK = 0.02  # likewise; without a known distance an arm may shrink to fit contacts
+_ZERO = 10.0  # degrees: no zero of a joint is set so badly
+_LOUD, _IDLE = 10.0, 0.2  # times the usual noise; of it, what the readings scatter by
+_DRAWN = 200  # postures anywhere within the limits
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +47,7 @@ class Verdict:
     held_out: float  # mean held-out error of a measurement, in the readings' unit
     interval: tuple[float, float]  # 95 % of that mean
     nominal: float  # mean error of the nominal machine
+    anywhere: float  # standard deviation within the limits; NaN where not known
     reasons: tuple[str, ...]
 
     @property
@@ -57,6 +63,11 @@ class Verdict:
             f"held-out error {self.held_out:.3g} [{low:.3g}, {high:.3g}], nominal "
             f"{self.nominal:.3g}"
         ]
+        if np.isfinite(self.anywhere):
+            lines.append(
+                f"anywhere within its limits {self.anywhere:.3g} (standard deviation, "
+                "beside a displacement of the whole arm)"
+            )
         if not self.explains:
             lines.append("this model does not explain these readings")
         if not self.helps:
@@ -78,7 +89,9 @@ def verdict(calibration: Fit) -> Verdict | None:
         return None
     if calibration.noise_std is None:
         why = calibration.no_noise("intervals and no verdict")
-        return Verdict(None, None, None, np.nan, (np.nan, np.nan), np.nan, (why,))
+        return Verdict(
+            None, None, None, np.nan, (np.nan, np.nan), np.nan, np.nan, (why,)
+        )
     used = np.flatnonzero(calibration.loss_weights > 0.0)
     commands, residuals = calibration.commands[used], calibration.residuals[used]
     usual = np.asarray(model.default_noise().std)
@@ -120,6 +133,7 @@ def verdict(calibration: Fit) -> Verdict | None:
         held_out=mean,
         interval=(max(mean - half, 0.0), mean + half),
         nominal=nominal,
+        anywhere=_anywhere(calibration, model, commands),
         reasons=tuple(reasons),
     )
 
@@ -127,14 +141,7 @@ def verdict(calibration: Fit) -> Verdict | None:
 def _left_out(calibration: Fit, used: NDArray[np.intp]) -> Array:
     """(N, q) residual of each measurement from the fit without it."""
     noise = np.diag(np.asarray(calibration.noise_std) ** 2)
-    commands, p = calibration.commands[used], len(calibration.names)
-    if calibration.estimate[p:].any():
-        slopes, covariance = calibration.linear(commands)
-    else:  # without harmonics, which were not fitted
-        slopes = calibration.model.jacobian(commands, calibration.parameters)
-        joint = np.asarray(calibration.joint_covariance)
-        by = joint[:p, p:]
-        covariance = joint[:p, :p] - by * calibration.prior_precision[p:] @ by.T
+    slopes, covariance = calibration.linear(calibration.commands[used], misfit=False)
     spread = slopes @ covariance @ np.matrix_transpose(slopes)
     # Of an outlier little was fitted: its weight says how much.
     share = np.minimum(calibration.loss_weights[used], 1.0)[:, None, None]
@@ -149,6 +156,14 @@ def _scattered(calibration: Fit, usual: Array) -> tuple[bool, list[str]]:
     """Whether the noise explains the scatter, and why not."""
     if calibration.noise_known:
         fit = calibration.lack_of_fit()
+        times = float((np.asarray(calibration.noise_std) / usual).max())
+        ratio = np.sqrt(calibration.square / max(calibration.dof, 1.0))
+        if times > _LOUD and ratio < _IDLE:
+            return False, [
+                f"the noise that was given is {times:.3g} times what this sensor "
+                f"usually has, and the readings scatter by {ratio:.2g} of it: is it in "
+                "their unit?"
+            ]
         if fit is None or fit > _UNLIKELY:
             return True, []
         return False, [f"lack of fit under the noise that was given: p = {fit:.2g}"]
@@ -196,19 +211,64 @@ def _other_tip(calibration: Fit, model: SerialChain) -> list[str]:
 
 
 def _other_links(calibration: Fit, model: SerialChain) -> list[str]:
-    """Lengths far from the arm's description, which sizes taken from data may allow."""
-    if not model.sensor.zeros:
-        return []
-    at = np.flatnonzero(np.array(model.units[: model.table.size]) == "length")
-    off = np.abs(calibration.parameters - model.nominal)[at]
-    std = np.sqrt(np.diagonal(np.asarray(calibration.covariance))[at])
-    far = off - 2.0 * std > _LINK * model.length
-    if not far.any():
-        return []
-    return [
-        f"{', '.join(model.names[i] for i in at[far])}: to {off[far].max():.3g} from "
-        "the arm's description: contacts of another arm, or of several sockets as one?"
-    ]
+    """Lengths and zeros far from the arm's description, if a prior allowed that."""
+    names, units = np.array(model.names), np.array(model.units)
+    off = np.abs(calibration.parameters - model.nominal)
+    std = np.asarray(calibration.standard_errors)
+    sure = np.where(np.isfinite(std), off - 2.0 * std, 0.0)[: model.table.size]
+    lengths = units[: model.table.size] == "length"
+    most = np.full(model.table.size, _LINK * model.length)
+    if not model.sensor.sizes_prior:  # the prior is as stated
+        known = np.sqrt(calibration.prior_precision[: model.table.size])
+        most = np.minimum(_FAR / np.maximum(known, 1e-300), most)
+    found = []
+    if model.sensor.zeros or not model.sensor.sizes_prior:
+        far = np.flatnonzero(lengths & (sure > most))
+        if far.size:
+            found.append(
+                f"{', '.join(names[far])}: to {off[far].max():.3g} from the arm's "
+                "description: readings of another arm, in another unit, of a board of "
+                "another size, or of several sockets as one?"
+            )
+    turned = [name.startswith("theta") for name in names[: model.table.size]]
+    for i in np.flatnonzero(turned & (sure > _ZERO)):
+        found.append(
+            f"{names[i]} is {off[i]:.3g} degrees from the arm's description: is the "
+            "joint's zero another, or its sign?"
+        )
+    return found
+
+
+def _anywhere(calibration: Fit, model: SerialChain, commands: Array) -> float:
+    """Standard deviation of the tip's position at postures of any kind.
+
+    Beside a shift and a turn of the whole arm, which contacts do not show. NaN of
+    sensors that read no position, and where nothing determines it.
+    """
+    if not isinstance(model.sensor, Position | Pose | Socket):
+        return np.nan
+    joints, columns = np.split(commands, [model.num_joints], axis=1)
+    turning = np.array(model.command_units) == "deg"
+    low, high = np.clip(model.limits, -180.0, 180.0).T
+    low = np.where(turning, low, joints.min(axis=0))
+    high = np.where(turning, high, joints.max(axis=0))
+    drawn = np.random.default_rng(0).uniform(low, high, (_DRAWN, model.num_joints))
+    slopes, covariance = calibration.linear(
+        np.hstack([drawn, np.repeat(columns[:1], _DRAWN, axis=0)])
+    )
+    slopes = slopes[:, :3]
+    slopes[..., [model.names.index(name) for name in model.sensor.names]] = 0.0
+    if (
+        calibration.unidentified is not None
+        and depends(slopes, calibration.unidentified).any()
+    ):
+        return np.nan
+    points = model.calibrated(model.nominal).predict(drawn)
+    whole = np.repeat(np.eye(3, 6)[None], _DRAWN, axis=0)
+    whole[..., 3:] = hats(points - points.mean(axis=0))
+    moves, whole = slopes.reshape(3 * _DRAWN, -1), whole.reshape(-1, 6)
+    moves = moves - whole @ np.linalg.lstsq(whole, moves)[0]
+    return float(np.sqrt(((moves @ covariance) * moves).sum() / _DRAWN))
 
 
 def _exchanged(calibration: Fit, model: SerialChain) -> list[str]:

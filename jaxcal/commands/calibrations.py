@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from jaxcal.arguments import several
 from jaxcal.calibration import Calibration
 from jaxcal.calibration import identify as identified
-from jaxcal.calibration.estimate import require_postures
 from jaxcal.checks import aligned
 from jaxcal.commands.questions import ModelPath, Numbers, read_model
 from jaxcal.commands.tables import (
@@ -156,7 +155,7 @@ def postures(
     header, done = (*arm.joint_names, *arm.sensor.inputs), None
     if reached is not None:
         done = of_arm.commands(arm, reached, header)
-        require_postures(arm, done)
+        arm.require_postures(done)
         arm = arm.located(done)
     left = k - (0 if done is None else len(done))
     if left < 1:
@@ -282,6 +281,8 @@ def predict(
         if not isinstance(found.model, SerialChain):
             raise ValueError("--radians is of arms")
         commands = _degrees(found.model, commands)
+    if isinstance(found.model, SerialChain):
+        found.model.require_postures(commands)
     names, values = found.output_names, found.predict(commands)
     if std:
         names = (*names, *(f"std_{name}" for name in names))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contacts
 import numpy as np
 import pytest
 from scipy import stats
@@ -111,11 +112,46 @@ def test_the_affine_device_is_checked_too():
     assert found.check(new, found.predict(new) + 0.2).says == "does not hold"
 
 
+@pytest.mark.parametrize("name", ["panda_1", "kuka_14"])
+def test_a_drift_it_states_is_seen_at_real_contacts(name):
+    """Of a few contacts the noise is uncertain too, and misfit may not be there."""
+    joints, sockets = contacts.load(name)["front"]
+    table, seen = np.column_stack([joints, sockets]), []
+    for seed in range(4):
+        rows = np.random.default_rng(seed).permutation(len(table))
+        found = contacts.identify(name, (joints, sockets), rows[:14])
+        new = table[rows[14:18]]
+        slopes = found.model.jacobian(new, found.parameters)
+        drifts = found.check(new, np.zeros((4, 3))).drift
+        for at, drift in drifts.items():
+            if np.isfinite(drift):
+                moved = drift * slopes[..., found.names.index(at)]
+                for by in (-1.0, 1.0):
+                    seen.append(found.check(new, by * moved).p_value < 0.05)
+    assert 0.7 <= np.mean(seen) <= 0.97
+
+
+def test_contacts_are_checked_as_they_are_fitted():
+    joints, sockets = contacts.load("kuka_14")["front"]
+    table = np.column_stack([joints, sockets])
+    found = contacts.identify("kuka_14", (joints, sockets), np.arange(40))
+    once = found.check(table[40:43], np.zeros((3, 3)))
+    twice = found.check(table[[40, 41, 42, 41]], np.zeros((4, 3)))
+    assert twice == once
+    with pytest.raises(ValueError, match="look like radians"):
+        found.check(
+            np.column_stack([np.radians(joints), sockets])[:3], np.zeros((3, 3))
+        )
+    with pytest.raises(ValueError, match="look like radians"):
+        found.verification(np.column_stack([np.radians(joints), sockets]), 3)
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
         ((JOINTS[:2], MEASURED[:3]), "as many rows as commands, got"),
         ((JOINTS[:2], MEASURED[:2, :2]), r"measured must have shape \(2, 3\)"),
+        ((JOINTS[:0], MEASURED[:0]), "commands must hold at least one row, got none"),
         ((JOINTS[:2], MEASURED[:2], 0.0), "tolerance must be positive"),
         ((JOINTS[:2], MEASURED[:2], None, True), "whose sensor stands somewhere"),
     ],

@@ -186,6 +186,32 @@ def test_sockets_as_one_are_told():
     assert not found.verdict.good
 
 
+def test_another_zero_and_noise_in_another_unit_are_named():
+    arm, joints = ur5(), np.random.default_rng(0).uniform(-120.0, 120.0, (40, 6))
+    turned = joints + 20.0 * np.eye(6)[1]
+    with pytest.warns(UserWarning, match=r"theta2 is 20 degrees from the arm's"):
+        found = jaxcal.identify(joints, arm.predict(turned), model=arm)
+    assert not found.verdict.good
+    for std, good in ((2e-4, True), (0.15, False)):
+        options = {"model": contacts.arm("panda_1"), "noise_std": std}
+        with warnings.catch_warnings(record=True):
+            warnings.simplefilter("always")
+            found = jaxcal.identify(
+                np.column_stack(PLACE), np.zeros((len(PLACE[0]), 3)), **options
+            )
+        told = "is it in their unit?" in str(found.verdict)
+        assert (found.verdict.good, told) == (good, not good)
+
+
+def test_what_is_known_anywhere_is_said():
+    few, all_ = (
+        _fit("panda_1", PLACE[0][rows], PLACE[1][rows]).verdict
+        for rows in (np.arange(0, 62, 5), np.arange(62))
+    )
+    assert few.anywhere > all_.anywhere > few.held_out
+    assert f"anywhere within its limits {few.anywhere:.3g}" in str(few)
+
+
 def test_a_contact_that_is_written_twice_counts_once():
     rows = np.arange(0, 62, 5)
     once, twice = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
@@ -289,6 +290,32 @@ def _views(moves, count=20, joints=None):
 def _as_columns(poses):
     vectors = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec(degrees=True)
     return np.hstack([poses[:, :3, 3], vectors])
+
+
+def test_a_board_of_another_size_is_named():
+    """Its squares 8 % too large: the arm is stretched, and every pixel is met."""
+    first, seen = _views("camera", 200)
+    aside = np.abs(seen[:, :2, 3] / seen[:, 2:3, 3]).max(axis=1)
+    first = first[np.where(seen[:, 2, 3] > 0.0, aside, np.inf).argmin()]
+    drawn = first + np.random.default_rng(1).uniform(-40.0, 40.0, (60, 6))
+    joints, seen = _views("camera", joints=drawn)
+    aside = np.abs(seen[:, :2, 3] / seen[:, 2:3, 3]).max(axis=1)
+    ahead = (seen[:, 2, 3] > 0.0) & (aside < 0.5)
+    joints, seen = joints[ahead], _as_columns(seen[ahead])
+    arm = SerialChain.from_dh(UR5_TABLE, sensor=Board("camera"))
+    true = arm.located(np.hstack([joints, seen]))
+    stand = true.sensor.place
+    pixels = true.measured_with(Board("camera", stand, CORNERS, CAMERA)).predict(joints)
+    pixels = pixels + np.random.default_rng(0).normal(0.0, 0.2, pixels.shape)
+    for by, good in ((1.0, True), (1.08, False)):
+        model = SerialChain.from_dh(
+            UR5_TABLE, sensor=Board("camera", None, by * CORNERS, CAMERA)
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            found = jaxcal.identify(joints, pixels, model=model)
+        told = "a board of another size" in str(found.verdict)
+        assert (found.verdict.good, told) == (good, not good)
 
 
 @pytest.mark.parametrize("moves", ["camera", "board"])

@@ -40,6 +40,7 @@ _WAVES, _WAVE = ("sin", "cos", "sin2", "cos2"), 0.045  # of gears; degrees
 _MOUNTING, _MOUNTING_ANGLE = 0.1, 1.7
 # Of the arm's length: positions so far off are in another frame; so alike, of this arm.
 _NEAR, _ALIKE = 0.2, 0.05
+_BEYOND = 2.0  # degrees beyond a limit, or percent of a slide's stroke
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -278,6 +279,29 @@ class SerialChain(Arm):
         from jaxcal.models.serial.postures import postures
 
         return postures(self, count, seed, near, allowed)
+
+    def require_postures(self, commands: Array) -> None:
+        """Refuse radians for degrees, and joints far beyond their limits."""
+        low, high = self.limits.T
+        units = np.array(self.command_units)
+        joints = commands[:, : self.num_joints]
+        largest = np.abs(joints[:, units == "deg"]).max(initial=0.0)
+        small = self.num_joints > 2 and 1.0 < largest < 7.0
+        if small and self.sensor.kind not in ("position", "pose", "several"):
+            raise ValueError(
+                f"commands must be in degrees, got angles of at most {largest:.3g}, "
+                "which look like radians: np.degrees(commands), --radians"
+            )
+        slack = np.where(units == "deg", _BEYOND, 0.01 * _BEYOND * (high - low))
+        far = np.argwhere((joints < low - slack) | (joints > high + slack))
+        for row, joint in far[:1]:
+            raise ValueError(
+                f"{self.joint_names[joint]} must be within its limits "
+                f"{in_words(self.limits[joint])}, to {slack[joint]:g}, got "
+                f"{joints[row, joint]:g} in row {row}; are the columns in this order: "
+                f"{', '.join(self.joint_names)}? Where the file's limits are wrong, "
+                "give limits={name: (low, high)}, --limits"
+            )
 
     def at_rest(
         self,

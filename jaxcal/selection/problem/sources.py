@@ -131,6 +131,7 @@ class Modelled(Source):
     ) -> None:
         if hasattr(model, "located"):  # an arm whose sensor stands somewhere
             model = model.located(candidates[available])
+            model.require_postures(candidates[available])  # type: ignore[attr-defined]
             _warn_of_radians(model, candidates[available])
         self._model, self._candidates, self._available = model, candidates, available
         self._noise = Noise() if noise is None else noise
