@@ -70,7 +70,9 @@ class Verdict:
             )
         if not self.explains:
             lines.append("this model does not explain these readings")
-        if not self.helps:
+        if self.helps is None:
+            lines.append("whether it is better than the nominal machine is not sure")
+        elif not self.helps:
             lines.append("it is no better than the nominal machine")
         if not self.clean:
             lines.append("some readings contradict the others")
@@ -128,7 +130,7 @@ def verdict(calibration: Fit) -> Verdict | None:
     loose = (calibration.distance[list(calibration.outliers)] > limit**2).any()
     return Verdict(
         explains=explains,
-        helps=mean < nominal,
+        helps=True if mean < nominal else None if mean - half < nominal else False,
         clean=not (swapped or exchanged or loose or other_arm),
         held_out=mean,
         interval=(max(mean - half, 0.0), mean + half),

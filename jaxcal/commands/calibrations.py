@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import pathlib
 from collections.abc import Sequence
@@ -15,10 +14,10 @@ from jaxcal.arguments import several
 from jaxcal.calibration import Calibration
 from jaxcal.calibration import identify as identified
 from jaxcal.checks import aligned
-from jaxcal.commands.questions import ModelPath, Numbers, read_model
+from jaxcal.commands.arms import ArmOptions, ModelPath, in_degrees
+from jaxcal.commands.questions import Numbers
 from jaxcal.commands.tables import (
     Output,
-    Table,
     TablePath,
     read_table,
     write_json,
@@ -26,96 +25,12 @@ from jaxcal.commands.tables import (
 )
 from jaxcal.extras import needs
 from jaxcal.models import SerialChain
-from jaxcal.models.sensors import SENSORS, Placed, Socket
+from jaxcal.models.sensors import SENSORS, Placed
 from jaxcal.selection import select
 
 __all__ = ["command", "identify", "postures", "predict"]
 
 Array = NDArray[np.float64]
-
-_KINDS = [kind for kind in SENSORS if kind != "several"]
-
-
-def _of_joint(text: str) -> list[Any]:
-    name, _, values = text.rpartition("=")
-    return [name, several(float, "numbers")(values)]
-
-
-@dataclasses.dataclass
-class ArmOptions:
-    """Of an arm in a URDF file: its links, its sensor, the unit of its columns."""
-
-    sensor: Annotated[str, "of an arm, what its tip is measured with", _KINDS] = (
-        "position"
-    )
-    base: Annotated[str | None, "of an arm, the link that stands still", "LINK"] = None
-    tip: Annotated[str | None, "of an arm, the link that is measured", "LINK"] = None
-    radians: Annotated[bool, "joint columns are in radians"] = False
-    locked: Annotated[
-        list[list[Any]] | None,
-        "a joint that stands still, and where, degrees or metres: finger=0.01",
-        _of_joint,
-    ] = None
-    limits: Annotated[
-        list[list[Any]] | None,
-        "of a joint instead of the file's, degrees or metres: wrist=-160,160",
-        _of_joint,
-    ] = None
-    distance: Annotated[
-        list[list[float]] | None,
-        "two sockets, how far apart they are and its std: 0,1,0.05,0.0001",
-        several(float, "numbers"),
-    ] = None
-
-    def read(self, path: str, table: Table | None, places: Any = None) -> SerialChain:
-        """The arm in this file; things that it touches are given or in the table."""
-        kind = SENSORS[self.sensor]
-        given: dict[str, Any] = {}
-        if issubclass(kind, Placed):
-            if places is not None:
-                if {len(place) for place in places} != {kind.width}:
-                    raise ValueError(
-                        f"--near must be {kind.width} numbers for --sensor "
-                        f"{self.sensor}, got {places}"
-                    )
-                given |= {"count": len(places), "places": places}
-            elif table is not None and self.sensor in table.names:
-                column = table.columns([self.sensor])
-                given["count"] = 1 + int(column.max(initial=0.0))
-        if self.distance:
-            if kind is not Socket:
-                raise ValueError("--distance is of --sensor socket")
-            given["distances"] = self.distance
-            if table is not None and self.sensor not in table.names:
-                raise ValueError(
-                    f"{table.source}: --distance needs a column 'socket', from 0"
-                )
-        sensor = kind(**given)
-        for option, count in (("locked", 1), ("limits", 2)):
-            for name, values in getattr(self, option) or ():
-                if not name or len(values) != count:
-                    numbers = "LOW,HIGH" if count == 2 else "VALUE"
-                    raise ValueError(f"--{option} must be JOINT={numbers}")
-        return SerialChain.from_urdf(
-            path,
-            base=self.base,
-            tip=self.tip,
-            sensor=sensor,
-            locked={name: value for name, (value,) in self.locked or ()},
-            limits=dict(self.limits or ()),
-        )
-
-    def commands(self, arm: SerialChain, table: Table, inputs: Sequence[str]) -> Array:
-        """(N, n) the columns of joints and sensor, in degrees."""
-        commands = table.columns(inputs)
-        return _degrees(arm, commands) if self.radians else commands
-
-
-def _degrees(arm: SerialChain, commands: Array) -> Array:
-    """The same commands, of turning joints in degrees instead of radians."""
-    turning = np.flatnonzero(np.array(arm.command_units) == "deg")
-    commands[:, turning] = np.degrees(commands[:, turning])
-    return commands
 
 
 def postures(
@@ -209,8 +124,8 @@ def identify(
     named as its joints, in any order, and what its sensor asks for.
     """
     table, as_urdf = read_table(file), out.lower().endswith(".urdf")
+    machine: Any = of_arm.machine(model, table)
     if (model or "").lower().endswith(".urdf"):
-        machine: Any = of_arm.read(str(model), table)
         names = table.inputs(inputs) if inputs else machine.inputs
         commands = of_arm.commands(machine, table, names)
         known = machine.sensor.outputs
@@ -225,15 +140,12 @@ def identify(
     else:
         if as_urdf:
             raise ValueError("--out FILE.urdf needs --model FILE.urdf")
-        if of_arm != ArmOptions():
-            raise ValueError("options of an arm need --model FILE.urdf")
         known, names = table.outputs(outputs), table.inputs(inputs)
         if not inputs:
             names = tuple(n for n in names if n not in (*known, weights))
         if both := sorted({*names} & {*known}):
             raise ValueError(f"--inputs and --outputs must differ, both hold {both[0]}")
         commands, measured = table.columns(names), table.columns(known)
-        machine = read_model(model)
     calibration = identified(
         commands,
         measured,
@@ -280,7 +192,7 @@ def predict(
     if radians:
         if not isinstance(found.model, SerialChain):
             raise ValueError("--radians is of arms")
-        commands = _degrees(found.model, commands)
+        commands = in_degrees(found.model, commands)
     if isinstance(found.model, SerialChain):
         found.model.require_postures(commands)
     names, values = found.output_names, found.predict(commands)

@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import pathlib
 from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from jaxcal.arguments import several
+from jaxcal.commands.arms import ArmOptions, ModelPath, in_degrees
 from jaxcal.commands.tables import Output, Table, TablePath, read_table
 from jaxcal.information.singular import require_excited
-from jaxcal.models import Affine, Model, Noise, SerialChain, from_dict
+from jaxcal.models import Affine, Noise, SerialChain
 from jaxcal.selection import Design, Selection
 from jaxcal.selection.criteria import CRITERIA
 
-__all__ = ["ModelPath", "Numbers", "plan", "read_model", "score", "select"]
+__all__ = ["Numbers", "plan", "score", "select"]
 
 Numbers = Annotated[list[float] | None, several(float, "numbers")]
 Names = Annotated[list[str] | None, several(str, "names")]
 Rows = Annotated[list[int] | None, several(int, "whole numbers")]
-ModelPath = Annotated[
-    str | None,
-    "model: JSON of its to_dict(), or an arm's .urdf; y = A u + b by default",
-    "FILE",
-]
 
 
 @dataclasses.dataclass
@@ -41,12 +35,14 @@ class Asked:
     replicates: Annotated[int, "how often one row may be measured", "R"] = 1
     required: Annotated[Rows, "rows, counted from 0, that must be chosen", "I,J"] = None
 
-    def design(self, table: Table) -> Design:
+    def design(self, table: Table, of_arm: ArmOptions) -> Design:
         """Of these candidates."""
-        model, mask = read_model(self.model), table.available()
+        model, mask = of_arm.machine(self.model, table), table.available()
         names = getattr(model, "inputs", ()) if self.columns is None else ()
         names = tuple(names) or table.inputs(self.columns)
         candidates = table.columns(names, mask)
+        if of_arm.radians and isinstance(model, SerialChain):
+            candidates = in_degrees(model, candidates)
         if self.outputs is not None:
             if model is not None:
                 rule = "must be left out with --model, which has them"
@@ -108,6 +104,7 @@ class Options:
 def select(
     file: TablePath,
     asked: Asked,
+    of_arm: ArmOptions,
     *,
     k: Annotated[int | None, "rows to choose", "K"] = None,
     method: Annotated[
@@ -126,13 +123,14 @@ def select(
     """
     table = read_table(file)
     given = {name: x for name, x in vars(options).items() if x is not None}
-    selection = asked.design(table).select(k, judged.by(), method, **given)
+    selection = asked.design(table, of_arm).select(k, judged.by(), method, **given)
     _show(selection, table, output)
 
 
 def score(
     file: TablePath,
     asked: Asked,
+    of_arm: ArmOptions,
     judged: Judged,
     *,
     indices: Annotated[Rows, "rows, counted from 0", "I,J"] = None,
@@ -158,7 +156,7 @@ def score(
         if not (column == column.round()).all():
             raise ValueError(f"{subset}: index must hold whole numbers")
         rows = column.astype(int)
-    selection = asked.design(table).score(
+    selection = asked.design(table, of_arm).score(
         rows, judged.by(), reference=reference, time_limit=time_limit
     )
     _show(selection, table, output)
@@ -167,6 +165,7 @@ def score(
 def plan(
     file: TablePath,
     asked: Asked,
+    of_arm: ArmOptions,
     *,
     accuracy: Annotated[
         list[float],
@@ -185,7 +184,7 @@ def plan(
     """How many measurements a wanted accuracy takes."""
     if asked.noise is None:
         raise ValueError("--noise, the std of a measurement, must be given")
-    result = asked.design(read_table(file)).plan(
+    result = asked.design(read_table(file), of_arm).plan(
         _one_or_all(accuracy), criterion=criterion, max_k=max_k, more=more
     )
     header = ("k", "distinct", "standard_error", "least_error")
@@ -196,34 +195,6 @@ def plan(
     if not output.written(header, rows, dataclasses.asdict(result)):
         print(result.table())
         print(f"measure rows {', '.join(str(i) for i in result.indices)}")
-
-
-def read_model(path: str | None) -> Model | None:
-    """The model in a file; None without one.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: naming the file and what is wrong in it.
-    """
-    if path is None:
-        return None
-    if path.lower().endswith(".urdf"):
-        return SerialChain.from_urdf(path)
-    try:
-        read = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
-    except ValueError:
-        raise ValueError(
-            f"{path}: a model must be a JSON file of its to_dict(), or an arm's .urdf"
-        ) from None
-    if isinstance(read, dict) and read.get("format") == "jaxcal-calibration":
-        raise ValueError(
-            f"{path}: a model is needed, this is a calibration; commands that apply "
-            "one are predict and command"
-        )
-    try:
-        return from_dict(read)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
 
 
 def _one_or_all(values: list[float]) -> float | list[float]:

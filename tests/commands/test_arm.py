@@ -7,6 +7,7 @@ import pytest
 
 from jaxcal.commands.main import main
 from jaxcal.models import Position, SerialChain, Socket
+from jaxcal.selection import select
 
 from ..models.arms import contacts_of_a_panda
 
@@ -81,6 +82,24 @@ def test_joints_far_beyond_their_limits_are_named(files):
         jaxcal.identify(swapped, np.zeros((len(q), 3)), model=arm)
 
 
+def test_contacts_are_chosen_from_a_table(files, capsys):
+    urdf, table, _ = files
+    given = ["select", str(table), "--model", str(urdf), "--tip", "ball_link",
+             "-k", "12", "--method", "exchange", "--csv"]  # fmt: skip
+    sensor = ["--sensor", "socket", "--distance", "0,1,0.05,0.0001", "--radians"]
+    assert main([*given, *sensor]) == 0
+    rows = np.loadtxt(capsys.readouterr().out.splitlines()[1:], delimiter=",")
+    touching = Socket(2, distances=[(0, 1, 0.05, 1e-4)])
+    arm = SerialChain.from_urdf(urdf, tip="ball_link", sensor=touching)
+    _, q, socket = contacts_of_a_panda("front")
+    contacts = np.column_stack([np.degrees(q), socket])
+    assert set(rows[:, 0]) == set(select(contacts, 12, "exchange", model=arm).indices)
+    assert main([*given, *sensor[:-1]]) == 2
+    assert "which look like radians" in capsys.readouterr().err
+    assert main(["select", str(table), "-k", "4", "--radians"]) == 2
+    assert "options of an arm need --model FILE.urdf" in capsys.readouterr().err
+
+
 def test_predictions_take_the_columns_of_the_fit(files, capsys):
     saved = str(files[2] / "calibration.json")
     assert _run(files, "--radians", "--out", saved) == 0
@@ -88,6 +107,8 @@ def test_predictions_take_the_columns_of_the_fit(files, capsys):
     assert main(["predict", saved, str(files[1]), "--radians"]) == 0
     off = np.loadtxt(capsys.readouterr().out.splitlines()[1:], delimiter=",")
     assert np.abs(off).max() < 0.002  # of contacts: zeros
+    assert main(["predict", saved, str(files[1])]) == 2
+    assert "which look like radians" in capsys.readouterr().err
 
 
 def test_joints_are_locked_and_have_other_limits(files, capsys):

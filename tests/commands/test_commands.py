@@ -15,7 +15,7 @@ import pytest
 
 import jaxcal
 from jaxcal.commands import main
-from jaxcal.commands.questions import read_model
+from jaxcal.commands.arms import ArmOptions
 from jaxcal.models import SerialChain
 
 MATRIX = np.array([[0.43, 0.02, 0.0], [0.0, 0.71, 0.01], [0.03, 0.0, 0.87]])
@@ -254,4 +254,5 @@ def test_an_arm_is_read_from_urdf(tmp_path):
         'type="revolute"><parent link="a"/><child link="b"/>'
         '<origin xyz="0.3 0 0.1" rpy="0 0 0"/><axis xyz="0 0 1"/></joint></robot>'
     )
-    assert read_model(str(path)).to_dict() == SerialChain.from_urdf(path).to_dict()
+    read = ArmOptions().machine(str(path), None)
+    assert read.to_dict() == SerialChain.from_urdf(path).to_dict()

@@ -1,0 +1,148 @@
+"""Of an arm in a URDF file: its options on the command line, and models in files."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.arguments import several
+from jaxcal.commands.tables import Table
+from jaxcal.models import Model, SerialChain, from_dict
+from jaxcal.models.sensors import SENSORS, Placed, Socket
+
+__all__ = ["ArmOptions", "ModelPath", "in_degrees"]
+
+Array = NDArray[np.float64]
+
+ModelPath = Annotated[
+    str | None,
+    "model: JSON of its to_dict(), or an arm's .urdf; y = A u + b by default",
+    "FILE",
+]
+
+_KINDS = [kind for kind in SENSORS if kind != "several"]
+
+
+def _of_joint(text: str) -> list[Any]:
+    name, _, values = text.rpartition("=")
+    return [name, several(float, "numbers")(values)]
+
+
+@dataclasses.dataclass
+class ArmOptions:
+    """Of an arm in a URDF file: its links, its sensor, the unit of its columns."""
+
+    sensor: Annotated[str, "of an arm, what its tip is measured with", _KINDS] = (
+        "position"
+    )
+    base: Annotated[str | None, "of an arm, the link that stands still", "LINK"] = None
+    tip: Annotated[str | None, "of an arm, the link that is measured", "LINK"] = None
+    radians: Annotated[bool, "joint columns are in radians"] = False
+    locked: Annotated[
+        list[list[Any]] | None,
+        "a joint that stands still, and where, degrees or metres: finger=0.01",
+        _of_joint,
+    ] = None
+    limits: Annotated[
+        list[list[Any]] | None,
+        "of a joint instead of the file's, degrees or metres: wrist=-160,160",
+        _of_joint,
+    ] = None
+    distance: Annotated[
+        list[list[float]] | None,
+        "two sockets, how far apart they are and its std: 0,1,0.05,0.0001",
+        several(float, "numbers"),
+    ] = None
+
+    def read(self, path: str, table: Table | None, places: Any = None) -> SerialChain:
+        """The arm in this file; things that it touches are given or in the table."""
+        kind = SENSORS[self.sensor]
+        given: dict[str, Any] = {}
+        if issubclass(kind, Placed):
+            if places is not None:
+                if {len(place) for place in places} != {kind.width}:
+                    raise ValueError(
+                        f"--near must be {kind.width} numbers for --sensor "
+                        f"{self.sensor}, got {places}"
+                    )
+                given |= {"count": len(places), "places": places}
+            elif table is not None and self.sensor in table.names:
+                column = table.columns([self.sensor])
+                given["count"] = 1 + int(column.max(initial=0.0))
+        if self.distance:
+            if kind is not Socket:
+                raise ValueError("--distance is of --sensor socket")
+            given["distances"] = self.distance
+            if table is not None and self.sensor not in table.names:
+                raise ValueError(
+                    f"{table.source}: --distance needs a column 'socket', from 0"
+                )
+        sensor = kind(**given)
+        for option, count in (("locked", 1), ("limits", 2)):
+            for name, values in getattr(self, option) or ():
+                if not name or len(values) != count:
+                    numbers = "LOW,HIGH" if count == 2 else "VALUE"
+                    raise ValueError(f"--{option} must be JOINT={numbers}")
+        return SerialChain.from_urdf(
+            path,
+            base=self.base,
+            tip=self.tip,
+            sensor=sensor,
+            locked={name: value for name, (value,) in self.locked or ()},
+            limits=dict(self.limits or ()),
+        )
+
+    def machine(self, path: str | None, table: Table | None) -> Model | None:
+        """The model in a file, an arm or another; None without one.
+
+        Raises:
+            OSError: the file cannot be read.
+            ValueError: naming the file and what is wrong in it.
+        """
+        if path and path.lower().endswith(".urdf"):
+            return self.read(path, table)
+        if self != ArmOptions():
+            raise ValueError("options of an arm need --model FILE.urdf")
+        return None if path is None else read_model(path)
+
+    def commands(self, arm: SerialChain, table: Table, inputs: Sequence[str]) -> Array:
+        """(N, n) the columns of joints and sensor, in degrees."""
+        commands = table.columns(inputs)
+        return in_degrees(arm, commands) if self.radians else commands
+
+
+def in_degrees(arm: SerialChain, commands: Array) -> Array:
+    """The same commands, of turning joints in degrees instead of radians."""
+    turning = np.flatnonzero(np.array(arm.command_units) == "deg")
+    commands[:, turning] = np.degrees(commands[:, turning])
+    return commands
+
+
+def read_model(path: str) -> Model:
+    """The model in a JSON file.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: naming the file and what is wrong in it.
+    """
+    try:
+        read = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
+    except ValueError:
+        raise ValueError(
+            f"{path}: a model must be a JSON file of its to_dict(), or an arm's .urdf"
+        ) from None
+    if isinstance(read, dict) and read.get("format") == "jaxcal-calibration":
+        raise ValueError(
+            f"{path}: a model is needed, this is a calibration; commands that apply "
+            "one are predict and command"
+        )
+    try:
+        return from_dict(read)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
