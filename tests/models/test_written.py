@@ -13,7 +13,7 @@ from jaxcal.models import Pose, Position, SerialChain, Socket, from_dict
 
 from .arms import UR5_TABLE, ur5
 from .test_serial_chain import _matrix
-from .test_urdf import TREE, _transform, _urdf
+from .test_urdf import TREE, _tip, _transform, _urdf
 
 ARM = """<?xml version="1.0" encoding="utf-8"?>
 <!-- a comment before: µ -->
@@ -224,6 +224,82 @@ def test_the_kinematics_file_of_universal_robots(tmp_path):
     np.testing.assert_allclose(frames[4][:3, 3], [0.0, -0.09456, 0.0], atol=2e-4)
     with pytest.raises(ValueError, match="must be in metres"):
         ur5().write("ur", path, ur5().nominal)
+
+
+def test_the_kinematics_file_of_any_six_joints(tmp_path):
+    """Fixed joints between them, axes that are not z."""
+    joints = [
+        ("revolute", (0, 0, 0.3), (0, 0, 0.2), (0, 1, 0)),
+        ("revolute", (0.1, 0, 0.1), (-1.57, 0, 0.1), (0, 0, -2)),
+        ("continuous", (0, -0.4, 0.02), (0, 0.1, 0), (1, 0, 0)),
+        ("fixed", (0.05, 0, 0.03), (0.3, -0.2, 0.7), (0, 0, 1)),
+        ("revolute", (0.02, 0, 0.35), (1.57, 0, 0), (1, 1, 0)),
+        ("revolute", (0, 0.05, 0), (0, 1.57, 0), (0, -1, 0)),
+        ("revolute", (0, 0, 0.08), (0, 0, 0), (0, 0, 1)),
+    ]
+    source, path = tmp_path / "arm.urdf", tmp_path / "kinematics.yaml"
+    source.write_text(_urdf(joints))
+    arm = SerialChain.from_urdf(source)
+    arm.write("ur", path, arm.nominal)
+    rng = np.random.default_rng(0)
+    parameters, commands = arm.nominal, rng.uniform(-180.0, 180.0, (5, 6))
+    for command in commands:
+        frame = _along(_ur_frames(path.read_text()), command)
+        np.testing.assert_allclose(frame, _tip(joints, command), atol=1e-9)
+    parameters[:25] += 0.01 * rng.normal(size=25)  # the last row moves the tool only
+    arm.write("ur", path, parameters, force=True)
+    found = [_along(_ur_frames(path.read_text()), each)[:3, 3] for each in commands]
+    np.testing.assert_allclose(found, arm.predict(commands, parameters), atol=1e-9)
+
+
+MIMIC = _urdf(
+    [
+        ("revolute", (0, 0, 0.3), (0, 0, 0), (0, 0, 1)),
+        ("prismatic", (0.1, 0, 0.1), (-1.57, 0, 0.1), (0, 0, 1)),
+        ("revolute", (0, -0.4, 0.02), (0, 0.1, 0), (1, 0, 0)),
+        ("revolute", (0.2, 0, 0), (1.0, 0, 0), (0, 1, 0)),
+        ("prismatic", (0.1, 0, 0.1), (0.5, 0, 0.1), (0, 0, 1)),
+    ]
+)
+
+
+@pytest.mark.parametrize(
+    ("times", "joint", "follows"),
+    [(-1.5, "j1", "joint 3 moves by -1.5 j1"), (1.0, "side", None)],
+)
+def test_a_table_on_file_has_the_offsets_of_joints_that_follow(
+    tmp_path, times, joint, follows
+):
+    parts = MIMIC.split("</joint>")
+    parts[2] += f'<mimic joint="{joint}" multiplier="{times}" offset="0.2"/>'
+    parts[4] += '<mimic joint="j2" offset="0.03"/>'
+    side = (
+        '<link name="side"/><joint name="side" type="revolute">'
+        '<parent link="link0"/><child link="side"/></joint></robot>'
+    )
+    source, path = tmp_path / "arm.urdf", tmp_path / "dh.csv"
+    source.write_text("</joint>".join(parts).replace("</robot>", side))
+    arm = SerialChain.from_urdf(source, tip="link5")
+    with pytest.warns(UserWarning, match="joint 5 moves by 1 j2") as told:
+        arm.write("dh", path, arm.nominal)
+    assert follows is None or follows in str(told[0].message)
+    lines = [line.split(",") for line in path.read_text().splitlines()[1:]]
+    third = "joint 3" if follows else "side"
+    assert [line[0] for line in lines] == ["j1", "j2", third, "j4", "joint 5"]
+    rows = [[float(word) for word in line[1:]] for line in lines]
+    plain = SerialChain.from_dh(rows, joints=arm.joints, base=arm.base, tool=arm.tool)
+    command = np.array([[20.0, 0.1, 30.0, 40.0]])[:, : arm.num_joints]
+    moves = command @ arm.drive.T
+    np.testing.assert_allclose(plain.predict(moves), arm.predict(command), atol=1e-12)
+
+
+def test_joints_that_follow_are_not_in_the_file_of_universal_robots(tmp_path):
+    drive = np.eye(6)[:, :5]
+    drive[5, 1] = -1.5
+    metres = np.array(UR5_TABLE) / [1000.0, 1.0, 1000.0, 1.0]
+    arm = SerialChain.from_dh(metres, drive=drive)
+    with pytest.raises(ValueError, match=r"joint 6 moves by -1\.5 joint 2, which"):
+        arm.write("ur", tmp_path / "kinematics.yaml", arm.nominal)
 
 
 def test_where_a_tracker_stands_is_found_and_is_in_the_file(tmp_path):

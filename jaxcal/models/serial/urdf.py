@@ -27,6 +27,7 @@ __all__ = [
     "read_urdf",
     "row_matrix",
     "table_of",
+    "turn_of_z",
     "walk",
 ]
 
@@ -326,7 +327,7 @@ def table_of(
         row[columns.index(leader)] = times
     limits = [np.array(joints[c].limits) / _unit(joints[c]) for c in columns]
     base = np.eye(4)
-    base[:3, :3] = _turn_of_z(lines[0][0])
+    base[:3, :3] = turn_of_z(lines[0][0])
     base[:3, 3] = lines[0][1]
     rows = []
     reached = base.copy()
@@ -348,7 +349,7 @@ def table_of(
     }
 
 
-def _turn_of_z(axis: Array) -> Array:
+def turn_of_z(axis: Array) -> Array:
     """(3, 3) the smallest rotation that takes z to ``axis``."""
     x, y, z = axis
     across = x * x + y * y
