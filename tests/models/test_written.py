@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -116,6 +117,59 @@ def test_every_other_byte_is_kept(tmp_path, encoding):
         np.testing.assert_allclose(found, model.predict(commands, off), atol=1e-12)
         model = SerialChain.from_urdf(out, tip="hand")  # and calibrated once more
         off, data = model.nominal + 0.01, out.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("encoding", "tip", "more", "name"),
+    [
+        ("utf-8", "l&amp;6 'a'", "", "l&6 'a'_calibrated"),
+        ("iso-8859-1", "gerät", "", "gerät_calibrated"),
+        ("utf-8", "l6", "<link name='l6_calibrated'/>", "l6_calibrated_again"),
+        (
+            "utf-8",
+            "l6",
+            '<link name="side"/><joint name="l6_calibrated_joint" type="fixed">'
+            '<parent link="base"/><child link="side"/></joint>',
+            "l6_calibrated_again",
+        ),
+    ],
+)
+def test_a_new_link_is_the_only_one_of_its_name(tmp_path, encoding, tip, more, name):
+    text = ARM.replace("utf-8", encoding).replace('"hand"', f'"{tip}"')
+    text = text.replace("</robot>", f"{more}</robot>").replace("\n", "\r\n")
+    path, out = tmp_path / "arm.urdf", tmp_path / "out.urdf"
+    path.write_bytes(text.encode(encoding))
+    model = SerialChain.from_urdf(path, tip=name.partition("_")[0])
+    off, commands = model.nominal + 0.01, [[10.0, 20.0, 30.0]]
+    assert model.write("urdf", out, off) == name
+    links = [link.get("name") for link in ElementTree.parse(out).iter("link")]
+    assert links.count(name) == 1
+    again = SerialChain.from_urdf(out, tip=name)
+    found = again.predict(commands)
+    np.testing.assert_allclose(found, model.predict(commands, off), atol=1e-12)
+    data = out.read_bytes()
+    assert data.count(b"\n") == data.count(b"\r\n") > text.count("\n")
+    assert name.partition("&")[0].encode(encoding) in data
+
+
+@pytest.mark.parametrize(
+    ("encoding", "origin", "message"),
+    [
+        ("utf-16", '<origin xyz="0 0 0.1"/>', "is in UTF-16, .* save it as UTF-8"),
+        ("utf-8", "&place;", "<origin> of joint ball_joint cannot be written"),
+    ],
+)
+def test_what_cannot_be_written_is_never_told_as_written(
+    tmp_path, encoding, origin, message
+):
+    entity = """<!DOCTYPE robot [<!ENTITY place "<origin xyz='0 0 0.1'/>">]><robot"""
+    text = ARM.replace("utf-8", encoding).replace("<robot", entity)
+    path, out = tmp_path / "arm.urdf", tmp_path / "out.urdf"
+    path.write_text(text.replace('<origin xyz="0 0 0.1"/>', origin), encoding=encoding)
+    model = SerialChain.from_urdf(path)
+    with pytest.raises(ValueError, match=message):
+        model.write("urdf", out, model.nominal + 0.01)
+    assert not out.exists()
 
 
 def test_nothing_is_written_over_a_file_without_force(tmp_path):

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from jaxcal.models.serial.urdf import (
     Joint,
     joints_of,
     led,
+    links_of,
     moved,
     row_matrix,
     table_of,
@@ -81,13 +83,14 @@ def _urdf_text(nominal: Arm, calibrated: Arm) -> tuple[str, str]:
     origins, extra = _origins(nominal, calibrated)
     if extra is None:
         return _with_origins(text, origins), tip
-    name = f"{tip}_calibrated"
-    while f'"{name}"' in text:  # a file that was calibrated before
+    name, links, joints = f"{tip}_calibrated", links_of(text), joints_of(text)
+    while name in links or f"{name}_joint" in joints:  # a file calibrated before
         name += "_again"
-    numbers = _pose(extra)
+    numbers, own = _pose(extra), quoteattr(name)
     more = (
-        f'  <link name="{name}"/>\n  <joint name="{name}_joint" type="fixed">\n'
-        f'    <parent link="{tip}"/>\n    <child link="{name}"/>\n'
+        f"  <link name={own}/>\n"
+        f'  <joint name={quoteattr(f"{name}_joint")} type="fixed">\n'
+        f"    <parent link={quoteattr(tip)}/>\n    <child link={own}/>\n"
         f'    <origin xyz="{numbers["xyz"]}" rpy="{numbers["rpy"]}"/>\n  </joint>\n'
     )
     return _with_origins(text, origins, more), name
@@ -262,15 +265,21 @@ def _pose(matrix: Array) -> dict[str, str]:
 def _with_origins(text: str, origins: Mapping[str, Array], more: str = "") -> str:
     """``text`` with other origins of some joints and ``more`` at the robot's end."""
     data = text.encode("utf-8", "surrogateescape")
-    places, last = _places(data)
-    edits = [(last, last, more)]
+    if b"\0" in data:
+        raise ValueError(
+            "the URDF file is in UTF-16, which is not written: save it as UTF-8"
+        )
+    places, last, encoding = _places(data)
+    newline = "\r\n" if "\r\n" in text else "\n"
+    more = more.replace("\n", newline)
+    edits = [(last, last, more.encode(encoding, "xmlcharrefreplace"))]
     for name, matrix in origins.items():
         pose = _pose(matrix)
         joint, origin = places[name]
         if origin is None:
-            new = f'\n    <origin xyz="{pose["xyz"]}" rpy="{pose["rpy"]}"/>'
+            tag = f'{newline}    <origin xyz="{pose["xyz"]}" rpy="{pose["rpy"]}"/>'
             end = _end_of_tag(data, joint)
-            edits.append((end, end, new))
+            edits.append((end, end, tag.encode()))
             continue
         end = _end_of_tag(data, origin)
         tag = data[origin:end].decode("utf-8", "surrogateescape")
@@ -280,18 +289,33 @@ def _with_origins(text: str, origins: Mapping[str, Array], more: str = "") -> st
                 tag = there.sub(rf'\g<1>"{words}"', tag)
             else:
                 tag = tag.replace("<origin", f'<origin {key}="{words}"', 1)
-        edits.append((origin, end, tag))
+        edits.append((origin, end, tag.encode("utf-8", "surrogateescape")))
     for start, end, new in sorted(edits, reverse=True):
-        data = data[:start] + new.encode("utf-8", "surrogateescape") + data[end:]
-    return data.decode("utf-8", "surrogateescape")
+        data = data[:start] + new + data[end:]
+    text = data.decode("utf-8", "surrogateescape")
+    joints = joints_of(text)
+    for name, matrix in origins.items():
+        if not np.abs(joints[name].origin - matrix).max() < 1e-9:
+            raise ValueError(
+                f"<origin> of joint {name} cannot be written: it must be plain "
+                '<origin xyz="..." rpy="..."/>'
+            )
+    return text
 
 
-def _places(data: bytes) -> tuple[dict[str, tuple[int, int | None]], int]:
-    """Of each joint where its tag begins, and its origin's; the robot's end; bytes."""
+def _places(data: bytes) -> tuple[dict[str, tuple[int, int | None]], int, str]:
+    """Of each joint where its tag begins, and its origin's; the robot's end; encoding.
+
+    Places are bytes.
+    """
     parser = expat.ParserCreate()
     path: list[str] = []
     found: dict[str, tuple[int, int | None]] = {}
-    name, last = "", 0
+    name, last, encoding = "", 0, "utf-8"
+
+    def declared(_version: str, of_file: str | None, _alone: int) -> None:
+        nonlocal encoding
+        encoding = of_file or encoding
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal name
@@ -307,10 +331,11 @@ def _places(data: bytes) -> tuple[dict[str, tuple[int, int | None]], int]:
         path.pop()
         last = parser.CurrentByteIndex
 
+    parser.XmlDeclHandler = declared
     parser.StartElementHandler = start
     parser.EndElementHandler = end
     parser.Parse(data, True)
-    return found, last
+    return found, last, encoding
 
 
 def _end_of_tag(data: bytes, start: int) -> int:
