@@ -134,6 +134,10 @@ ONE = [("revolute", (0, 0, 1), (0, 0, 0), (0, 0, 1))]
         (_urdf(ONE).replace("revolute", "floating"), "type of joint j1 .* 'floating'"),
         (_urdf(ONE).replace('"0.0 0.0 1.0"', '"0 a 1"'), "of joint j1 must be three"),
         (
+            _urdf(ONE).replace("rpy=", 'quat_xyzw="0 0 0.6 0.8" other='),
+            "<origin> of joint j1 must give its turn as rpy.*got quat_xyzw='0 0 0.6",
+        ),
+        (
             _urdf(ONE).replace('axis xyz="0.0 0.0 1.0"', 'axis xyz="0 0 0"'),
             "the axis of joint j1 must not be zero",
         ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from jaxcal.models import Pose, Position, SerialChain, Socket, from_dict
 
 from .arms import UR5_TABLE, ur5
 from .test_serial_chain import _matrix
-from .test_urdf import TREE, _transform, _urdf
+from .test_urdf import TREE, _tip, _transform, _urdf
 
 ARM = """<?xml version="1.0" encoding="utf-8"?>
 <!-- a comment before: µ -->
@@ -116,6 +117,59 @@ def test_every_other_byte_is_kept(tmp_path, encoding):
         np.testing.assert_allclose(found, model.predict(commands, off), atol=1e-12)
         model = SerialChain.from_urdf(out, tip="hand")  # and calibrated once more
         off, data = model.nominal + 0.01, out.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("encoding", "tip", "more", "name"),
+    [
+        ("utf-8", "l&amp;6 'a'", "", "l&6 'a'_calibrated"),
+        ("iso-8859-1", "gerät", "", "gerät_calibrated"),
+        ("utf-8", "l6", "<link name='l6_calibrated'/>", "l6_calibrated_again"),
+        (
+            "utf-8",
+            "l6",
+            '<link name="side"/><joint name="l6_calibrated_joint" type="fixed">'
+            '<parent link="base"/><child link="side"/></joint>',
+            "l6_calibrated_again",
+        ),
+    ],
+)
+def test_a_new_link_is_the_only_one_of_its_name(tmp_path, encoding, tip, more, name):
+    text = ARM.replace("utf-8", encoding).replace('"hand"', f'"{tip}"')
+    text = text.replace("</robot>", f"{more}</robot>").replace("\n", "\r\n")
+    path, out = tmp_path / "arm.urdf", tmp_path / "out.urdf"
+    path.write_bytes(text.encode(encoding))
+    model = SerialChain.from_urdf(path, tip=name.partition("_")[0])
+    off, commands = model.nominal + 0.01, [[10.0, 20.0, 30.0]]
+    assert model.write("urdf", out, off) == name
+    links = [link.get("name") for link in ElementTree.parse(out).iter("link")]
+    assert links.count(name) == 1
+    again = SerialChain.from_urdf(out, tip=name)
+    found = again.predict(commands)
+    np.testing.assert_allclose(found, model.predict(commands, off), atol=1e-12)
+    data = out.read_bytes()
+    assert data.count(b"\n") == data.count(b"\r\n") > text.count("\n")
+    assert name.partition("&")[0].encode(encoding) in data
+
+
+@pytest.mark.parametrize(
+    ("encoding", "origin", "message"),
+    [
+        ("utf-16", '<origin xyz="0 0 0.1"/>', "is in UTF-16, .* save it as UTF-8"),
+        ("utf-8", "&place;", "<origin> of joint ball_joint cannot be written"),
+    ],
+)
+def test_what_cannot_be_written_is_never_told_as_written(
+    tmp_path, encoding, origin, message
+):
+    entity = """<!DOCTYPE robot [<!ENTITY place "<origin xyz='0 0 0.1'/>">]><robot"""
+    text = ARM.replace("utf-8", encoding).replace("<robot", entity)
+    path, out = tmp_path / "arm.urdf", tmp_path / "out.urdf"
+    path.write_text(text.replace('<origin xyz="0 0 0.1"/>', origin), encoding=encoding)
+    model = SerialChain.from_urdf(path)
+    with pytest.raises(ValueError, match=message):
+        model.write("urdf", out, model.nominal + 0.01)
+    assert not out.exists()
 
 
 def test_nothing_is_written_over_a_file_without_force(tmp_path):
@@ -224,6 +278,82 @@ def test_the_kinematics_file_of_universal_robots(tmp_path):
     np.testing.assert_allclose(frames[4][:3, 3], [0.0, -0.09456, 0.0], atol=2e-4)
     with pytest.raises(ValueError, match="must be in metres"):
         ur5().write("ur", path, ur5().nominal)
+
+
+def test_the_kinematics_file_of_any_six_joints(tmp_path):
+    """Fixed joints between them, axes that are not z."""
+    joints = [
+        ("revolute", (0, 0, 0.3), (0, 0, 0.2), (0, 1, 0)),
+        ("revolute", (0.1, 0, 0.1), (-1.57, 0, 0.1), (0, 0, -2)),
+        ("continuous", (0, -0.4, 0.02), (0, 0.1, 0), (1, 0, 0)),
+        ("fixed", (0.05, 0, 0.03), (0.3, -0.2, 0.7), (0, 0, 1)),
+        ("revolute", (0.02, 0, 0.35), (1.57, 0, 0), (1, 1, 0)),
+        ("revolute", (0, 0.05, 0), (0, 1.57, 0), (0, -1, 0)),
+        ("revolute", (0, 0, 0.08), (0, 0, 0), (0, 0, 1)),
+    ]
+    source, path = tmp_path / "arm.urdf", tmp_path / "kinematics.yaml"
+    source.write_text(_urdf(joints))
+    arm = SerialChain.from_urdf(source)
+    arm.write("ur", path, arm.nominal)
+    rng = np.random.default_rng(0)
+    parameters, commands = arm.nominal, rng.uniform(-180.0, 180.0, (5, 6))
+    for command in commands:
+        frame = _along(_ur_frames(path.read_text()), command)
+        np.testing.assert_allclose(frame, _tip(joints, command), atol=1e-9)
+    parameters[:25] += 0.01 * rng.normal(size=25)  # the last row moves the tool only
+    arm.write("ur", path, parameters, force=True)
+    found = [_along(_ur_frames(path.read_text()), each)[:3, 3] for each in commands]
+    np.testing.assert_allclose(found, arm.predict(commands, parameters), atol=1e-9)
+
+
+MIMIC = _urdf(
+    [
+        ("revolute", (0, 0, 0.3), (0, 0, 0), (0, 0, 1)),
+        ("prismatic", (0.1, 0, 0.1), (-1.57, 0, 0.1), (0, 0, 1)),
+        ("revolute", (0, -0.4, 0.02), (0, 0.1, 0), (1, 0, 0)),
+        ("revolute", (0.2, 0, 0), (1.0, 0, 0), (0, 1, 0)),
+        ("prismatic", (0.1, 0, 0.1), (0.5, 0, 0.1), (0, 0, 1)),
+    ]
+)
+
+
+@pytest.mark.parametrize(
+    ("times", "joint", "follows"),
+    [(-1.5, "j1", "joint 3 moves by -1.5 j1"), (1.0, "side", None)],
+)
+def test_a_table_on_file_has_the_offsets_of_joints_that_follow(
+    tmp_path, times, joint, follows
+):
+    parts = MIMIC.split("</joint>")
+    parts[2] += f'<mimic joint="{joint}" multiplier="{times}" offset="0.2"/>'
+    parts[4] += '<mimic joint="j2" offset="0.03"/>'
+    side = (
+        '<link name="side"/><joint name="side" type="revolute">'
+        '<parent link="link0"/><child link="side"/></joint></robot>'
+    )
+    source, path = tmp_path / "arm.urdf", tmp_path / "dh.csv"
+    source.write_text("</joint>".join(parts).replace("</robot>", side))
+    arm = SerialChain.from_urdf(source, tip="link5")
+    with pytest.warns(UserWarning, match="joint 5 moves by 1 j2") as told:
+        arm.write("dh", path, arm.nominal)
+    assert follows is None or follows in str(told[0].message)
+    lines = [line.split(",") for line in path.read_text().splitlines()[1:]]
+    third = "joint 3" if follows else "side"
+    assert [line[0] for line in lines] == ["j1", "j2", third, "j4", "joint 5"]
+    rows = [[float(word) for word in line[1:]] for line in lines]
+    plain = SerialChain.from_dh(rows, joints=arm.joints, base=arm.base, tool=arm.tool)
+    command = np.array([[20.0, 0.1, 30.0, 40.0]])[:, : arm.num_joints]
+    moves = command @ arm.drive.T
+    np.testing.assert_allclose(plain.predict(moves), arm.predict(command), atol=1e-12)
+
+
+def test_joints_that_follow_are_not_in_the_file_of_universal_robots(tmp_path):
+    drive = np.eye(6)[:, :5]
+    drive[5, 1] = -1.5
+    metres = np.array(UR5_TABLE) / [1000.0, 1.0, 1000.0, 1.0]
+    arm = SerialChain.from_dh(metres, drive=drive)
+    with pytest.raises(ValueError, match=r"joint 6 moves by -1\.5 joint 2, which"):
+        arm.write("ur", tmp_path / "kinematics.yaml", arm.nominal)
 
 
 def test_where_a_tracker_stands_is_found_and_is_in_the_file(tmp_path):

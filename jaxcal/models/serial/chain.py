@@ -384,8 +384,9 @@ class SerialChain(Arm):
                 meshes, comments and all else stay as they are, and the tip goes where
                 ``predict`` of positions puts it, the base in the measuring frame
                 included. "dh" is the table as CSV: joint, a, alpha, d, theta (with the
-                joint's offset), beta. "ur" is the YAML file of Universal Robots' ROS
-                description, for its six joints, without base and tool.
+                joint's offset), beta, without base, tool and convention; joints that
+                follow others are named in a warning. "ur" is the YAML file of Universal
+                Robots' ROS description, for six joints, without base and tool.
             path: the file to write.
             parameters: (p,) as ``identify`` found them.
             force: write over a file that is there.
@@ -395,8 +396,8 @@ class SerialChain(Arm):
             the tool; else "".
 
         Raises:
-            ValueError: the arm is not of the form; a gear ratio was found, which none
-                can hold.
+            ValueError: the arm is not of the form, which of "ur" joints that follow
+                others are not; a gear ratio was found, which none can hold.
             FileExistsError: there is a file and ``force`` is not given.
         """
         from jaxcal.models.serial.written import written

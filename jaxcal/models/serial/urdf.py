@@ -23,10 +23,12 @@ __all__ = [
     "Joint",
     "joints_of",
     "led",
+    "links_of",
     "moved",
     "read_urdf",
     "row_matrix",
     "table_of",
+    "turn_of_z",
     "walk",
 ]
 
@@ -95,7 +97,7 @@ def walk(
                 f"{above[joint.child].name} and {joint.name}; a chain cannot hold loops"
             )
         above[joint.child] = joint
-    links = _links_of(text)
+    links = links_of(text)
     for argument, link in (("tip", tip), ("base", base)):
         if link is not None:
             one_of(f"{argument} link", link, links)
@@ -163,13 +165,13 @@ def _robot(text: str) -> ElementTree.Element:
     return robot
 
 
-def _links_of(text: str) -> list[str]:
+def links_of(text: str) -> list[str]:
     return [_name(link, "link") for link in _robot(text).findall("link")]
 
 
 def joints_of(text: str) -> dict[str, Joint]:
     """The joints of a file by name."""
-    links, joints = _links_of(text), {}
+    links, joints = links_of(text), {}
     for element in _robot(text).findall("joint"):
         joint = _read_joint(element)
         for link in (joint.parent, joint.child):
@@ -201,6 +203,12 @@ def _read_joint(element: ElementTree.Element) -> Joint:
         if not link:
             raise ValueError(f"joint {name} has no <{end} link=...>")
         ends[end] = link
+    place = element.find("origin")
+    if place is not None and "quat_xyzw" in place.keys():
+        raise ValueError(
+            f"<origin> of joint {name} must give its turn as rpy, in radians, "
+            f"got quat_xyzw={place.get('quat_xyzw')!r}"
+        )
     origin = np.eye(4)
     origin[:3, 3] = _numbers(element, "origin", "xyz", (0.0, 0.0, 0.0), name)
     turn = _numbers(element, "origin", "rpy", (0.0, 0.0, 0.0), name)
@@ -326,7 +334,7 @@ def table_of(
         row[columns.index(leader)] = times
     limits = [np.array(joints[c].limits) / _unit(joints[c]) for c in columns]
     base = np.eye(4)
-    base[:3, :3] = _turn_of_z(lines[0][0])
+    base[:3, :3] = turn_of_z(lines[0][0])
     base[:3, 3] = lines[0][1]
     rows = []
     reached = base.copy()
@@ -348,7 +356,7 @@ def table_of(
     }
 
 
-def _turn_of_z(axis: Array) -> Array:
+def turn_of_z(axis: Array) -> Array:
     """(3, 3) the smallest rotation that takes z to ``axis``."""
     x, y, z = axis
     across = x * x + y * y

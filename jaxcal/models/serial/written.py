@@ -7,9 +7,11 @@ constants between its joints follow from the table: ``K = C^-1 D C'``, D a row o
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +21,11 @@ from jaxcal.models.serial.urdf import (
     Joint,
     joints_of,
     led,
+    links_of,
     moved,
     row_matrix,
     table_of,
+    turn_of_z,
     walk,
 )
 
@@ -79,13 +83,14 @@ def _urdf_text(nominal: Arm, calibrated: Arm) -> tuple[str, str]:
     origins, extra = _origins(nominal, calibrated)
     if extra is None:
         return _with_origins(text, origins), tip
-    name = f"{tip}_calibrated"
-    while f'"{name}"' in text:  # a file that was calibrated before
+    name, links, joints = f"{tip}_calibrated", links_of(text), joints_of(text)
+    while name in links or f"{name}_joint" in joints:  # a file calibrated before
         name += "_again"
-    numbers = _pose(extra)
+    numbers, own = _pose(extra), quoteattr(name)
     more = (
-        f'  <link name="{name}"/>\n  <joint name="{name}_joint" type="fixed">\n'
-        f'    <parent link="{tip}"/>\n    <child link="{name}"/>\n'
+        f"  <link name={own}/>\n"
+        f'  <joint name={quoteattr(f"{name}_joint")} type="fixed">\n'
+        f"    <parent link={quoteattr(tip)}/>\n    <child link={own}/>\n"
         f'    <origin xyz="{numbers["xyz"]}" rpy="{numbers["rpy"]}"/>\n  </joint>\n'
     )
     return _with_origins(text, origins, more), name
@@ -94,21 +99,41 @@ def _urdf_text(nominal: Arm, calibrated: Arm) -> tuple[str, str]:
 def _dh_text(calibrated: Arm) -> str:
     """The table as CSV: joint, a, alpha, d, theta (with the offset), beta."""
     lines = ["joint,a,alpha,d,theta,beta"]
-    numbers = [f"joint {i + 1}" for i in range(len(calibrated.table))]
-    names = calibrated.joint_names
-    for name, row in zip(
-        names if len(names) == len(numbers) else numbers, calibrated.table, strict=True
-    ):
+    names, others = _moved_by(calibrated)
+    if others:
+        warnings.warn(
+            f"the table does not hold how joints follow: {', '.join(others)}",
+            stacklevel=4,
+        )
+    table = calibrated.table.copy()
+    at = [3 if kind == "R" else 2 for kind in calibrated.joints]  # theta or d
+    table[range(len(at)), at] += calibrated.offset
+    for name, row in zip(names, table, strict=True):
         lines.append(",".join([name, *(repr(float(value)) for value in row)]))
     return "\n".join(lines) + "\n"
+
+
+def _moved_by(arm: Arm) -> tuple[list[str], list[str]]:
+    """The joints' names, of columns that move them by one, and how others move."""
+    names: list[str] = []
+    others = []
+    for i, row in enumerate(arm.drive):
+        by = {arm.joint_names[k]: row[k] for k in np.flatnonzero(row)}
+        if list(by.values()) == [1.0] and not set(by) & set(names):
+            names += by
+            continue
+        names.append(f"joint {i + 1}")
+        terms = " + ".join(f"{times:g} {name}" for name, times in by.items())
+        others.append(f"joint {i + 1} moves by {terms or 0}")
+    return names, others
 
 
 def _ur_text(nominal: Arm, calibrated: Arm) -> str:
     """The kinematics file of Universal Robots' ROS description, in metres.
 
     Raises:
-        ValueError: the arm is not of six revolute joints, or its table has lengths that
-            are no metres.
+        ValueError: the arm is not of six revolute joints, one of them follows others,
+            or its table has lengths that are no metres.
     """
     if nominal.joints != "RRRRRR" or nominal.convention != "standard":
         raise ValueError(
@@ -120,10 +145,22 @@ def _ur_text(nominal: Arm, calibrated: Arm) -> str:
             "the table must be in metres for this file, got links of "
             f"{nominal.length:g} in all"
         )
+    for follows in _moved_by(nominal)[1]:
+        raise ValueError(f"{follows}, which this file cannot hold")
     if nominal.source is not None:
-        found, _ = _origins(nominal, calibrated, placed=False)
-        joints = joints_of(nominal.source["text"])
-        frames = [found.get(n, joints[n].origin) for n in nominal.joint_names]
+        gaps, steps = _steps(nominal, calibrated)
+        parts = [part for gap in gaps for part in gap if part.drives]
+        # The file's joints turn about z: each frame is turned so that its axis is z.
+        turns = [np.eye(4) for _ in parts]
+        for turn, (joint, down, _, _) in zip(turns, parts, strict=True):
+            turn[:3, :3] = turn_of_z(joint.axis if down else -joint.axis)
+        steps[0] = _product(gaps[0][-1:])  # what is before it is the base
+        frames = [
+            np.linalg.inv(before) @ step @ turn
+            for before, step, turn in zip(
+                [np.eye(4), *turns], steps, turns, strict=False
+            )
+        ]
     else:
         frames, before = [], np.eye(4)
         for row in calibrated.table:
@@ -131,8 +168,8 @@ def _ur_text(nominal: Arm, calibrated: Arm) -> str:
             frames.append(before @ row_matrix(np.array([0.0, 0.0, d, theta, 0.0])))
             before = row_matrix(row * [1.0, 1.0, 0.0, 0.0, 1.0])
     lines = ["kinematics:"]
-    for name, frame in zip(_UR, frames, strict=True):
-        pose = _pose(frame)
+    for name, frame, zero in zip(_UR, frames, nominal.offset, strict=True):
+        pose = _pose(frame @ row_matrix(np.array([0.0, 0.0, 0.0, zero, 0.0])))
         values = [*pose["xyz"].split(), *pose["rpy"].split()]
         lines.append(f"  {name}:")
         for key, value in zip(
@@ -143,13 +180,8 @@ def _ur_text(nominal: Arm, calibrated: Arm) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _origins(
-    nominal: Arm, calibrated: Arm, *, placed: bool = True
-) -> tuple[dict[str, Array], Array | None]:
-    """New origins by joint, and what no joint before the tip can hold, if anything.
-
-    With the base where it was found, or as in the file where it is not ``placed``.
-    """
+def _steps(nominal: Arm, calibrated: Arm) -> tuple[list[list[_Part]], list[Array]]:
+    """The gaps of the file, and what each of them is as calibrated, (4, 4)."""
     assert nominal.source is not None  # the caller has looked
     text, locked = nominal.source["text"], nominal.source["locked"]
     joints, ends = joints_of(text), (nominal.source["base"], nominal.source["tip"])
@@ -161,13 +193,19 @@ def _origins(
     turns = [np.linalg.inv(base) @ _product(gaps[0])]
     for row, gap in zip(rows[:-1], gaps[1:-1], strict=True):
         turns.append(np.linalg.inv(row) @ turns[-1] @ _product(gap))
-    wanted = [(calibrated.base if placed else base) @ turns[0]]
+    wanted = [calibrated.base @ turns[0]]
     for turn, row, after in zip(turns, new, turns[1:], strict=False):
         wanted.append(np.linalg.inv(turn) @ row @ after)
     wanted.append(np.linalg.inv(turns[-1]) @ new[-1] @ calibrated.tool)
+    return gaps, wanted
+
+
+def _origins(nominal: Arm, calibrated: Arm) -> tuple[dict[str, Array], Array | None]:
+    """New origins by joint, and what no joint before the tip can hold, if anything."""
+    assert nominal.source is not None  # the caller has looked
     found: dict[str, Array] = {}
     extra = None
-    for i, (gap, matrix) in enumerate(zip(gaps, wanted, strict=True)):
+    for i, (gap, matrix) in enumerate(zip(*_steps(nominal, calibrated), strict=True)):
         if np.abs(matrix - _product(gap)).max() < _SAME:
             continue
         if not gap and i:
@@ -227,15 +265,21 @@ def _pose(matrix: Array) -> dict[str, str]:
 def _with_origins(text: str, origins: Mapping[str, Array], more: str = "") -> str:
     """``text`` with other origins of some joints and ``more`` at the robot's end."""
     data = text.encode("utf-8", "surrogateescape")
-    places, last = _places(data)
-    edits = [(last, last, more)]
+    if b"\0" in data:
+        raise ValueError(
+            "the URDF file is in UTF-16, which is not written: save it as UTF-8"
+        )
+    places, last, encoding = _places(data)
+    newline = "\r\n" if "\r\n" in text else "\n"
+    more = more.replace("\n", newline)
+    edits = [(last, last, more.encode(encoding, "xmlcharrefreplace"))]
     for name, matrix in origins.items():
         pose = _pose(matrix)
         joint, origin = places[name]
         if origin is None:
-            new = f'\n    <origin xyz="{pose["xyz"]}" rpy="{pose["rpy"]}"/>'
+            tag = f'{newline}    <origin xyz="{pose["xyz"]}" rpy="{pose["rpy"]}"/>'
             end = _end_of_tag(data, joint)
-            edits.append((end, end, new))
+            edits.append((end, end, tag.encode()))
             continue
         end = _end_of_tag(data, origin)
         tag = data[origin:end].decode("utf-8", "surrogateescape")
@@ -245,18 +289,33 @@ def _with_origins(text: str, origins: Mapping[str, Array], more: str = "") -> st
                 tag = there.sub(rf'\g<1>"{words}"', tag)
             else:
                 tag = tag.replace("<origin", f'<origin {key}="{words}"', 1)
-        edits.append((origin, end, tag))
+        edits.append((origin, end, tag.encode("utf-8", "surrogateescape")))
     for start, end, new in sorted(edits, reverse=True):
-        data = data[:start] + new.encode("utf-8", "surrogateescape") + data[end:]
-    return data.decode("utf-8", "surrogateescape")
+        data = data[:start] + new + data[end:]
+    text = data.decode("utf-8", "surrogateescape")
+    joints = joints_of(text)
+    for name, matrix in origins.items():
+        if not np.abs(joints[name].origin - matrix).max() < 1e-9:
+            raise ValueError(
+                f"<origin> of joint {name} cannot be written: it must be plain "
+                '<origin xyz="..." rpy="..."/>'
+            )
+    return text
 
 
-def _places(data: bytes) -> tuple[dict[str, tuple[int, int | None]], int]:
-    """Of each joint where its tag begins, and its origin's; the robot's end; bytes."""
+def _places(data: bytes) -> tuple[dict[str, tuple[int, int | None]], int, str]:
+    """Of each joint where its tag begins, and its origin's; the robot's end; encoding.
+
+    Places are bytes.
+    """
     parser = expat.ParserCreate()
     path: list[str] = []
     found: dict[str, tuple[int, int | None]] = {}
-    name, last = "", 0
+    name, last, encoding = "", 0, "utf-8"
+
+    def declared(_version: str, of_file: str | None, _alone: int) -> None:
+        nonlocal encoding
+        encoding = of_file or encoding
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal name
@@ -272,10 +331,11 @@ def _places(data: bytes) -> tuple[dict[str, tuple[int, int | None]], int]:
         path.pop()
         last = parser.CurrentByteIndex
 
+    parser.XmlDeclHandler = declared
     parser.StartElementHandler = start
     parser.EndElementHandler = end
     parser.Parse(data, True)
-    return found, last
+    return found, last, encoding
 
 
 def _end_of_tag(data: bytes, start: int) -> int:
