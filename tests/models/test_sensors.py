@@ -416,6 +416,36 @@ def test_gravity_finds_the_zeros_of_joints_from_twelve_postures():
         assert np.sqrt(np.mean((found.parameters - truth)[at] ** 2)) < 0.05
 
 
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            lambda felt: felt / 9.81,
+            r"of magnitude 9.81 within 20 %, got 1 .*magnitude=",
+        ),
+        (lambda felt: 1000.0 * felt, "within 20 %, got 9810"),
+        (
+            lambda felt: -felt,
+            r"along up, \(0, 0, 1\), got \(0, 0, -1\) .*change .* sign",
+        ),
+        (
+            lambda felt: Rotation.from_euler("z", -90.0, degrees=True).apply(felt),
+            r"turned by 90 degrees .* vector \(0, 0, 90\) in degrees",
+        ),
+    ],
+)
+def test_gravity_in_another_unit_or_frame_is_told_by_name(change, told):
+    arm = ur5(sensor=Gravity())
+    felt = arm.predict(JOINTS)
+    assert arm.located(JOINTS, felt + 0.4) is arm  # a bias
+    with pytest.raises(ValueError, match=told):
+        arm.located(JOINTS, change(felt))
+    turned = _matrix(Rotation.from_euler("z", 90.0, degrees=True), [0.0, 0.0, 31.0])
+    given = SerialChain.from_dh(UR5_TABLE, tool=turned, sensor=Gravity())
+    same = Rotation.from_euler("z", -90.0, degrees=True).apply(felt)
+    np.testing.assert_allclose(given.predict(JOINTS), same, atol=1e-9)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Height(Sensor):
     """A stranger's: the height of the tip above the measuring frame."""
