@@ -542,6 +542,23 @@ def test_far_anchors_are_found_by_an_arm_that_is_off(ahead, way):
     assert np.abs(off).max() < 0.02 * wire.length
 
 
+@pytest.mark.parametrize("zero", [0.0, 0.25, -0.25])
+def test_the_zero_of_a_wire_is_found_by_an_arm_that_is_off(zero):
+    """In units of the arm's length; twelve anchors, all around."""
+    found = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        joints = rng.uniform(-110.0, 110.0, (60, 6))
+        wire = ur5(sensor=Distance(1))
+        true = ur5().predict(joints) + 0.004 * wire.length * rng.normal(size=(60, 3))
+        anchor = rng.normal(size=3)
+        anchor *= wire.length / np.linalg.norm(anchor)
+        far = np.linalg.norm(true - anchor, axis=1) - zero * wire.length
+        found.append(wire.located(joints, far[:, None]).sensor.places[0, 3])
+    off = np.array(found) / wire.length - zero
+    assert np.abs(off).max() < (0.05 if zero else 1e-12)
+
+
 def test_views_that_hardly_turn_are_of_no_other_convention():
     model = SerialChain.from_dh(UR5_TABLE, sensor=Board("camera"))
     rng, told = np.random.default_rng(8), []
