@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -377,6 +378,35 @@ def test_wrong_readings_of_one_of_several_sensors_are_refused():
         together = arm.together((joints, at * seen), (contacts, None))
         with pytest.raises(ValueError, match=message):
             jaxcal.identify(*together, model=arm)
+
+
+def _elsewhere(sensor):
+    """The arm in a frame that is turned by 100 degrees and 3 m away."""
+    far = _matrix(Rotation.from_euler("z", 100.0, degrees=True), [3000.0, -2000.0, 0.0])
+    return far, SerialChain.from_dh(UR5_TABLE, tool=MOUNT, base=far, sensor=sensor)
+
+
+def test_a_trackers_frame_is_found_where_it_is_not_the_first_sensor():
+    shift = _matrix(None, [400.0, 0.0, 0.0])  # of the reflector on the tool
+    sensors = Several((Gravity(), Position()), [shift])
+    far, true = _elsewhere(sensors)
+    together = true.together((JOINTS, None), (JOINTS, None))[0]
+    found = SerialChain.from_dh(UR5_TABLE, tool=MOUNT, sensor=sensors)
+    found = found.located(together, true.predict(together))
+    np.testing.assert_allclose(found.base, far, atol=1e-8)
+
+
+def test_poses_in_a_frame_far_from_the_arms_are_told_the_base():
+    far, true = _elsewhere(Pose())
+    arm = SerialChain.from_dh(UR5_TABLE, tool=MOUNT, sensor=Pose())
+    with pytest.raises(ValueError, match="base must be given, roughly") as told:
+        arm.located(JOINTS, true.predict(JOINTS))
+    given = json.loads(str(told.value).split("base=")[1].split(";")[0])
+    np.testing.assert_allclose(given, far, atol=1e-6)
+    SerialChain.from_dh(UR5_TABLE, base=given)  # as it stands
+    near = true.predict(JOINTS)
+    near[:, 0] += 1000.0  # which the fit finds
+    assert true.located(JOINTS, near) is true
 
 
 def test_what_a_sensor_cannot_see_is_held_and_named():
