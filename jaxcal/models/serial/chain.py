@@ -259,16 +259,16 @@ class SerialChain(Arm):
         """Postures that can be measured, to choose from.
 
         Within the limits (180 degrees where a file has none), two degrees apart at
-        least, with the ball in the socket, the probe on the plane or the board in view:
-        inverse kinematics from random starts, so a redundant arm's self-motions are
-        among them.
+        least, with the ball in the socket, the probe on the plane or the board in view
+        (from either side: which one is printed is not known): inverse kinematics from
+        random starts, so a redundant arm's self-motions are among them.
 
         Args:
             count: how many.
             seed: of the random starts.
             near: where the sensor reads, roughly: (S, 3) sockets or (S, 4) planes where
                 the sensor has no places; rows (x, y, z, radius), one of which the tip
-                must be near, for a sensor that reads everywhere.
+                must be near, for a sensor that reads everywhere; nothing for a board.
             allowed: says of joints (J,) whether they may be taken (collisions).
 
         Returns:
