@@ -470,6 +470,9 @@ def test_gravity_in_another_unit_or_frame_is_told_by_name(change, told):
     assert arm.located(JOINTS, felt + 0.4) is arm  # a bias
     with pytest.raises(ValueError, match=told):
         arm.located(JOINTS, change(felt))
+    little = Rotation.from_euler("xy", [10.0, 7.0], degrees=True).apply(felt)
+    for row in range(6):  # one direction of up shows no turn about itself
+        assert arm.located(JOINTS[[row]], little[[row]]) is arm
     turned = _matrix(Rotation.from_euler("z", 90.0, degrees=True), [0.0, 0.0, 31.0])
     given = SerialChain.from_dh(UR5_TABLE, tool=turned, sensor=Gravity())
     same = Rotation.from_euler("z", -90.0, degrees=True).apply(felt)

@@ -97,12 +97,13 @@ class Gravity(Sensor):
         up = np.einsum("nij,nj->i", tip.rotation, seen) / len(seen)
         if np.linalg.norm(up) > 0.8 and up @ self.up < _ASIDE * np.linalg.norm(up):
             raise ValueError(
-                f"gravity readings must point along up, {in_words(np.array(self.up))}, "
-                f"got {in_words((up / np.linalg.norm(up)).round(2) + 0.0)} in the mean:"
-                " give that as up=, or change their sign where the sensor reads down"
+                "gravity readings must point along up, "
+                f"{in_words(np.round(self.up, 2))}, got "
+                f"{in_words((up / np.linalg.norm(up)).round(2) + 0.0)} in the mean: "
+                "give that as up=, or change their sign where the sensor reads down"
             )
         felt = np.array(self.up) @ tip.rotation
-        left, _, right = np.linalg.svd(felt.T @ seen)
+        left, spread, right = np.linalg.svd(felt.T @ seen)
         left[:, 2] *= np.linalg.det(left @ right)
         turn = Rotation.from_matrix(left @ right)
         off, other = (
@@ -110,7 +111,8 @@ class Gravity(Sensor):
             for one in (seen, turn.apply(seen))
         )
         angle, vector = np.degrees(turn.magnitude()), turn.as_rotvec(degrees=True)
-        if angle > _TURNED and off > 0.1 and other < off / 3.0:
+        told = spread[1] > 0.1 * spread[0]  # by more than one direction
+        if told and angle > _TURNED and off > 0.1 and other < off / 3.0:
             raise ValueError(
                 f"gravity readings fit a sensor turned by {angle:.0f} degrees on the "
                 "tool: multiply the rotation of tool= (of mounts= in Several) from the "
