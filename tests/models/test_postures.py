@@ -81,7 +81,8 @@ def test_what_is_not_allowed_is_left_out():
         (_panda(Socket()), {"near": [[3.0, 0, 0]]}, "at most 0 .* do not reach within"),
         (_panda(Position()), {"allowed": lambda q: False}, "are not allowed"),
         (_panda(Socket()), {}, "near must be given: where each socket is"),
-        (_panda(Board()), {}, "where the board or camera stands is not known"),
+        (_panda(Board()), {}, r"place must be given, Board\(place=...\)"),
+        (_panda(Board()), {"near": [[0.5, 0, 0, 1]]}, "known, and near does not say"),
         (_panda(Position()), {"near": [[0, 0, 0]]}, r"rows \(x, y, z, radius\)"),
         (ur5(), {"count": 0}, "count must be at least 1"),
         (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import warnings
 
 import numpy as np
@@ -406,6 +407,35 @@ def test_wrong_readings_of_one_of_several_sensors_are_refused():
             jaxcal.identify(*together, model=arm)
 
 
+def _elsewhere(sensor):
+    """The arm in a frame that is turned by 100 degrees and 3 m away."""
+    far = _matrix(Rotation.from_euler("z", 100.0, degrees=True), [3000.0, -2000.0, 0.0])
+    return far, SerialChain.from_dh(UR5_TABLE, tool=MOUNT, base=far, sensor=sensor)
+
+
+def test_a_trackers_frame_is_found_where_it_is_not_the_first_sensor():
+    shift = _matrix(None, [400.0, 0.0, 0.0])  # of the reflector on the tool
+    sensors = Several((Gravity(), Position()), [shift])
+    far, true = _elsewhere(sensors)
+    together = true.together((JOINTS, None), (JOINTS, None))[0]
+    found = SerialChain.from_dh(UR5_TABLE, tool=MOUNT, sensor=sensors)
+    found = found.located(together, true.predict(together))
+    np.testing.assert_allclose(found.base, far, atol=1e-8)
+
+
+def test_poses_in_a_frame_far_from_the_arms_are_told_the_base():
+    far, true = _elsewhere(Pose())
+    arm = SerialChain.from_dh(UR5_TABLE, tool=MOUNT, sensor=Pose())
+    with pytest.raises(ValueError, match="base must be given, roughly") as told:
+        arm.located(JOINTS, true.predict(JOINTS))
+    given = json.loads(str(told.value).split("base=")[1].split(";")[0])
+    np.testing.assert_allclose(given, far, atol=1e-6)
+    SerialChain.from_dh(UR5_TABLE, base=given)  # as it stands
+    near = true.predict(JOINTS)
+    near[:, 0] += 1000.0  # which the fit finds
+    assert true.located(JOINTS, near) is true
+
+
 def test_what_a_sensor_cannot_see_is_held_and_named():
     base = [f"base {axis}" for axis in ("x", "y", "z", "rx", "ry", "rz")]
     for sensor in (Socket(), Plane(), Distance(), Board()):
@@ -441,6 +471,39 @@ def test_gravity_finds_the_zeros_of_joints_from_twelve_postures():
         felt = arm.predict(offered[chosen], truth) + 0.00981 * rng.normal(size=(12, 3))
         found = jaxcal.identify(offered[chosen], felt, model=arm)
         assert np.sqrt(np.mean((found.parameters - truth)[at] ** 2)) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            lambda felt: felt / 9.81,
+            r"of magnitude 9.81 within 20 %, got 1 .*magnitude=",
+        ),
+        (lambda felt: 1000.0 * felt, "within 20 %, got 9810"),
+        (
+            lambda felt: -felt,
+            r"along up, \(0, 0, 1\), got \(0, 0, -1\) .*change .* sign",
+        ),
+        (
+            lambda felt: Rotation.from_euler("z", -90.0, degrees=True).apply(felt),
+            r"turned by 90 degrees .* vector \(0, 0, 90\) in degrees",
+        ),
+    ],
+)
+def test_gravity_in_another_unit_or_frame_is_told_by_name(change, told):
+    arm = ur5(sensor=Gravity())
+    felt = arm.predict(JOINTS)
+    assert arm.located(JOINTS, felt + 0.4) is arm  # a bias
+    with pytest.raises(ValueError, match=told):
+        arm.located(JOINTS, change(felt))
+    little = Rotation.from_euler("xy", [10.0, 7.0], degrees=True).apply(felt)
+    for row in range(6):  # one direction of up shows no turn about itself
+        assert arm.located(JOINTS[[row]], little[[row]]) is arm
+    turned = _matrix(Rotation.from_euler("z", 90.0, degrees=True), [0.0, 0.0, 31.0])
+    given = SerialChain.from_dh(UR5_TABLE, tool=turned, sensor=Gravity())
+    same = Rotation.from_euler("z", -90.0, degrees=True).apply(felt)
+    np.testing.assert_allclose(given.predict(JOINTS), same, atol=1e-9)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -537,6 +600,23 @@ def test_far_anchors_are_found_by_an_arm_that_is_off(ahead, way):
     far = np.linalg.norm(true - anchor, axis=1, keepdims=True)
     off = wire.located(joints, far).predict(joints) - far
     assert np.abs(off).max() < 0.02 * wire.length
+
+
+@pytest.mark.parametrize("zero", [0.0, 0.25, -0.25])
+def test_the_zero_of_a_wire_is_found_by_an_arm_that_is_off(zero):
+    """In units of the arm's length; twelve anchors, all around."""
+    found = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        joints = rng.uniform(-110.0, 110.0, (60, 6))
+        wire = ur5(sensor=Distance(1))
+        true = ur5().predict(joints) + 0.004 * wire.length * rng.normal(size=(60, 3))
+        anchor = rng.normal(size=3)
+        anchor *= wire.length / np.linalg.norm(anchor)
+        far = np.linalg.norm(true - anchor, axis=1) - zero * wire.length
+        found.append(wire.located(joints, far[:, None]).sensor.places[0, 3])
+    off = np.array(found) / wire.length - zero
+    assert np.abs(off).max() < (0.05 if zero else 1e-12)
 
 
 def test_views_that_hardly_turn_are_of_no_other_convention():

@@ -52,7 +52,7 @@ class Distance(Placed):
 
         One is linear in the anchor and its square; of one that is far, with short ways
         of the tip, the lengths are. The zero too, where lengths fit three times as well
-        with another one.
+        with another one (twice from 30 lengths on), and to 2 % of the arm.
         """
         from scipy import optimize
 
@@ -79,11 +79,18 @@ class Distance(Placed):
                 each = np.linalg.norm(p - at[:3], axis=1) - r - at[3:].sum()
                 return np.asarray(each, dtype=float)
 
+            def fit(*starts: Array) -> Array:
+                found = [
+                    optimize.least_squares(apart, one, method="lm") for one in starts
+                ]
+                return min(found, key=lambda each: each.cost).x
+
             starts = near, along / size * far.mean()
-            held = [optimize.least_squares(apart, one, method="lm") for one in starts]
-            best = min(held, key=lambda fit: fit.cost).x
+            best = fit(*starts)
+            loose = fit(loose, *(np.append(one, 0.0) for one in (*starts, best)))
             off, other = (np.median(np.abs(apart(at))) for at in (best, loose))
-            if other < off / 3.0 and len(points) > 10:
+            better = min(off / (2.0 if len(points) > 29 else 3.0), 0.02 * tip.length)
+            if other < better and len(points) > 10:
                 best, off = loose, other
             anchor, zero = best[:3], best[3:].sum()
             if off > 0.2 * tip.length:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +14,9 @@ from jaxcal.models.sensors.sensor import Named, Reading, Sensor, Tip, hats
 __all__ = ["Gravity"]
 
 Array = NDArray[np.float64]
+
+_ASIDE = 0.7  # cosine: readings farther from up have another up
+_TURNED = 27.0  # degrees on the tool, from which the fit does not find them
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -74,3 +78,45 @@ class Gravity(Sensor):
         bias = np.broadcast_to(np.eye(3), (count, 3, 3))
         by_own = np.concatenate([felt[..., None], bias], axis=-1)
         return Reading(own[0] * felt + own[1:], by_tip, by_own)
+
+    def located(
+        self, tip: Tip, inputs: Array, measured: Array | None
+    ) -> tuple[Self, Array | None]:
+        """Itself. Refused are another unit or up, and a sensor that is turned."""
+        from scipy.spatial.transform import Rotation
+
+        if measured is None:
+            return self, None
+        size = float(np.median(np.linalg.norm(measured, axis=1)))
+        if abs(size / self.magnitude - 1.0) > 0.2:
+            raise ValueError(
+                f"gravity readings must be of magnitude {self.magnitude:g} within 20 %,"
+                f" got {size:.4g} in the median: Gravity(magnitude=1) for readings in g"
+            )
+        seen = measured / size
+        up = np.einsum("nij,nj->i", tip.rotation, seen) / len(seen)
+        if np.linalg.norm(up) > 0.8 and up @ self.up < _ASIDE * np.linalg.norm(up):
+            raise ValueError(
+                "gravity readings must point along up, "
+                f"{in_words(np.round(self.up, 2))}, got "
+                f"{in_words((up / np.linalg.norm(up)).round(2) + 0.0)} in the mean: "
+                "give that as up=, or change their sign where the sensor reads down"
+            )
+        felt = np.array(self.up) @ tip.rotation
+        left, spread, right = np.linalg.svd(felt.T @ seen)
+        left[:, 2] *= np.linalg.det(left @ right)
+        turn = Rotation.from_matrix(left @ right)
+        off, other = (
+            np.median(np.linalg.norm(felt - one, axis=1))
+            for one in (seen, turn.apply(seen))
+        )
+        angle, vector = np.degrees(turn.magnitude()), turn.as_rotvec(degrees=True)
+        told = spread[1] > 0.1 * spread[0]  # by more than one direction
+        if told and angle > _TURNED and off > 0.1 and other < off / 3.0:
+            raise ValueError(
+                f"gravity readings fit a sensor turned by {angle:.0f} degrees on the "
+                "tool: multiply the rotation of tool= (of mounts= in Several) from the "
+                f"right by that of the vector {in_words(vector.round() + 0.0)} in "
+                "degrees"
+            )
+        return self, None

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import array_of, axis_names, in_words, numbers, one_of
 from jaxcal.files import atomic_write
 from jaxcal.models.model import as_commands, as_parameters
-from jaxcal.models.sensors import SENSORS, Position, Sensor, Several
+from jaxcal.models.sensors import SENSORS, Pose, Position, Sensor, Several
 from jaxcal.models.serial.arguments import (
     joint_numbers,
     load,
@@ -41,6 +41,8 @@ _MOUNTING, _MOUNTING_ANGLE = 0.1, 1.7
 # Of the arm's length: positions so far off are in another frame; so alike, of this arm.
 _NEAR, _ALIKE = 0.2, 0.05
 _BEYOND = 2.0  # degrees beyond a limit, or percent of a slide's stroke
+# Farther away, or turned by more than 37 degrees (a cosine), no fit of poses finds it.
+_AWAY, _ASIDE = 1.5, 0.8
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -258,16 +260,16 @@ class SerialChain(Arm):
         """Postures that can be measured, to choose from.
 
         Within the limits (180 degrees where a file has none), two degrees apart at
-        least, with the ball in the socket, the probe on the plane or the board in view:
-        inverse kinematics from random starts, so a redundant arm's self-motions are
-        among them.
+        least, with the ball in the socket, the probe on the plane or the board in view
+        (from either side: which one is printed is not known): inverse kinematics from
+        random starts, so a redundant arm's self-motions are among them.
 
         Args:
             count: how many.
             seed: of the random starts.
             near: where the sensor reads, roughly: (S, 3) sockets or (S, 4) planes where
                 the sensor has no places; rows (x, y, z, radius), one of which the tip
-                must be near, for a sensor that reads everywhere.
+                must be near, for a sensor that reads everywhere; nothing for a board.
             allowed: says of joints (J,) whether they may be taken (collisions).
 
         Returns:
@@ -448,6 +450,9 @@ class SerialChain(Arm):
         Nothing is changed that was given: sockets, planes, anchors, boards and their
         cameras have no place of their own until the first readings. Of a tracker that
         is far from where it was said to be the base is found.
+
+        Raises:
+            ValueError: the readings fit no such arm, or that of a Pose in another base.
         """
         commands = as_commands(self, commands)
         read = None if measured is None else numbers("measured", measured)
@@ -455,9 +460,7 @@ class SerialChain(Arm):
         inputs = commands[:, self.num_joints :]
         moved = np.eye(4)
         if read is not None:
-            first, at, seen = next(self.of_each_sensor(commands, read))
-            if isinstance(first.sensor, Position):
-                moved = _far(first.predict(at), seen, self.length)
+            moved = self._far(commands, read)
             frame = np.einsum("ab,kbn->kan", moved[:3, :3], frame)
             frame[3] += moved[:3, 3:]
         sensor, new = self.sensor.located(self._tip_at(commands, frame), inputs, read)
@@ -467,6 +470,29 @@ class SerialChain(Arm):
         return dataclasses.replace(
             self, base=moved @ self.base, sensor=sensor, tool=tool
         )
+
+    def _far(self, commands: Array, measured: Array) -> Array:
+        """(4, 4) that takes the arm to where its first tracker sees it, if far off."""
+        nominal = self.of_each_sensor(commands, self.predict(commands))
+        for (one, _, told), (_, _, seen) in zip(
+            nominal, self.of_each_sensor(commands, measured), strict=True
+        ):
+            if isinstance(one.sensor, Position | Pose):
+                moved = _far(told[:, :3], seen[:, :3], self.length)
+                if isinstance(one.sensor, Position):
+                    return moved
+                base = moved @ self.base
+                shift = np.linalg.norm((base - self.base)[:3, 3])
+                turned = np.trace(moved[:3, :3]) < 1.0 + 2.0 * _ASIDE
+                if turned or shift > _AWAY * self.length:
+                    raise ValueError(
+                        "base must be given, roughly, to an arm with Pose, whose turns "
+                        "are from the nominal ones: the positions fit "
+                        f"base={base.round(7).tolist()}; then make the turns by its "
+                        "rotation_vectors"
+                    )
+                break
+        return np.eye(4)
 
     def of_each_sensor(
         self, commands: Array, measured: Array

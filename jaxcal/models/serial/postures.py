@@ -101,8 +101,9 @@ def _aimed(arm: Chain, near: ArrayLike | None) -> tuple[Chain, Array | None]:
     if isinstance(sensor, Board):
         if sensor.place is None:
             raise ValueError(
-                "near must be given: where the board or camera stands is not known; "
-                "three views show it, arm.located(commands)"
+                "place must be given, Board(place=...): where the board or camera "
+                "stands is not known, and near does not say it; three views show it, "
+                "arm.located(commands, measured), in the shell --measured"
             )
         return arm, None
     if places is not None and places.shape[1] != 4:
