@@ -252,17 +252,11 @@ class Fit:
         if self.centre is not None:
             rows = rows - self.centre
         joint, p = np.asarray(self.joint_covariance), len(self.names)
-        if misfit or not self.not_fitted:
+        if misfit or self.estimate[p:].any():
             return derivative(self.whole, rows, self.estimate), joint
         by = joint[:p, p:]
         within = joint[:p, :p] - by * self.prior_precision[p:] @ by.T
         return derivative(self.model, rows, self.parameters), within
-
-    @property
-    def not_fitted(self) -> bool:
-        """Harmonics that were not fitted are counted in what is predicted."""
-        more = self.estimate[len(self.names) :]
-        return bool(more.size and not more.any())
 
     @functools.cached_property
     def whole(self) -> Model:

@@ -329,7 +329,7 @@ class Solution:
         change = np.log(np.maximum(np.sqrt(square / freedom), self.floor) / self.level)
         near = np.abs(change).max() < 0.3
         step = change * (faster if near else 1.0)
-        # One that went too far and comes back might do so for ever.
+        # Levels that go back and forth may never settle: then half a step is taken.
         back = step @ self.climbed < 0.0
         self.trust = 0.5 * self.trust if back else min(1.5 * self.trust, 1.0)
         self.climbed = self.trust * step

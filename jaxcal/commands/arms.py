@@ -109,12 +109,18 @@ class ArmOptions:
             return self.read(path, table)
         if self != ArmOptions():
             raise ValueError("options of an arm need --model FILE.urdf")
-        return None if path is None else read_model(path)
+        return None if path is None else _read_model(path)
 
-    def commands(self, arm: SerialChain, table: Table, inputs: Sequence[str]) -> Array:
-        """(N, n) the columns of joints and sensor, in degrees."""
-        commands = table.columns(inputs)
-        return in_degrees(arm, commands) if self.radians else commands
+    def commands(
+        self,
+        model: Any,
+        table: Table,
+        inputs: Sequence[str],
+        used: NDArray[np.bool_] | None = None,
+    ) -> Array:
+        """(N, n) the columns of the commands, an arm's joints in degrees."""
+        commands = table.columns(inputs, used)
+        return in_degrees(model, commands) if self.radians else commands
 
 
 def in_degrees(arm: SerialChain, commands: Array) -> Array:
@@ -124,7 +130,7 @@ def in_degrees(arm: SerialChain, commands: Array) -> Array:
     return commands
 
 
-def read_model(path: str) -> Model:
+def _read_model(path: str) -> Model:
     """The model in a JSON file.
 
     Raises:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from jaxcal.arguments import several
-from jaxcal.commands.arms import ArmOptions, ModelPath, in_degrees
+from jaxcal.commands.arms import ArmOptions, ModelPath
 from jaxcal.commands.tables import Output, Table, TablePath, read_table
 from jaxcal.information.singular import require_excited
 from jaxcal.models import Affine, Noise, SerialChain
@@ -40,9 +40,7 @@ class Asked:
         model, mask = of_arm.machine(self.model, table), table.available()
         names = getattr(model, "inputs", ()) if self.columns is None else ()
         names = tuple(names) or table.inputs(self.columns)
-        candidates = table.columns(names, mask)
-        if of_arm.radians and isinstance(model, SerialChain):
-            candidates = in_degrees(model, candidates)
+        candidates = of_arm.commands(model, table, names, mask)
         if self.outputs is not None:
             if model is not None:
                 rule = "must be left out with --model, which has them"

@@ -24,6 +24,7 @@ from jaxcal.information.blocks import prior_root
 from jaxcal.models.affine import Affine
 from jaxcal.models.identifiability import identifiability
 from jaxcal.models.model import Model, derivative, facts
+from jaxcal.models.serial import SerialChain
 from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["Given", "Modelled", "Shared", "Source", "shares_regressor"]
@@ -129,9 +130,9 @@ class Modelled(Source):
         noise: Noise | None,
         misfit: float = 0.0,
     ) -> None:
-        if hasattr(model, "located"):  # an arm whose sensor stands somewhere
+        if isinstance(model, SerialChain):  # whose sensor may stand somewhere
             model = model.located(candidates[available])
-            model.require_postures(candidates[available])  # type: ignore[attr-defined]
+            model.require_postures(candidates[available])
             _warn_of_radians(model, candidates[available])
         self._model, self._candidates, self._available = model, candidates, available
         self._noise = Noise() if noise is None else noise
