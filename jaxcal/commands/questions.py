@@ -11,7 +11,7 @@ from jaxcal.arguments import several
 from jaxcal.commands.arms import ArmOptions, ModelPath
 from jaxcal.commands.tables import Output, Table, TablePath, read_table
 from jaxcal.information.singular import require_excited
-from jaxcal.models import Affine, Noise, SerialChain
+from jaxcal.models import Affine, Noise
 from jaxcal.selection import Design, Selection
 from jaxcal.selection.criteria import CRITERIA
 
