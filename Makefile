@@ -51,8 +51,15 @@ test: $(READY) ## set everything up, lint, and run the quick tests (the ones CI 
 	$(BIN)/python -m pytest --collect-only -qq >/dev/null & $(MAKE) --no-print-directory lint && wait
 	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder -m 'not slow' $(ARGS)
 
-test-all: $(READY) lint ## every test, the slow ones too, hypothesis drawing new examples
-	$(BIN)/python -m pytest --hypothesis-profile=new $(ARGS)
+# A part is a folder of tests/, or `files`, the tests beside them. Each is a run of its own:
+# what one process has compiled it keeps, and the whole suite is too much for one.
+PARTS ?= $(notdir $(patsubst %/,%,$(dir $(wildcard tests/*/test_*.py)))) files
+test-all: $(READY) lint ## every test, the slow ones too, hypothesis drawing new examples (some folders: PARTS="rig docs")
+	@failed=; for part in $(sort $(PARTS)); do echo "== $$part"; \
+	if [ $$part = files ]; then tests=`ls tests/test_*.py`; else tests=tests/$$part; fi; \
+	$(BIN)/python -m pytest --hypothesis-profile=new -n 3 --dist loadfile --no-loadscope-reorder \
+	--durations=5 --durations-min=60 $$tests $(ARGS) || failed="$$failed $$part"; done; \
+	[ -z "$$failed" ] || { echo "failed:$$failed"; exit 1; }
 
 lint: $(READY) ## ruff (lint and format), mypy and the import contracts
 	$(BIN)/ruff check .

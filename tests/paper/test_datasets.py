@@ -328,7 +328,8 @@ def test_a_recording_is_made_through_the_rig(tmp_path: pathlib.Path) -> None:
         [*rig, "example", "simulate"], stdout=subprocess.PIPE, text=True, check=True
     )
     (tmp_path / "rig.toml").write_text(f"{example.stdout}\n[session]\nseed = 5\n")
-    collect = card["command"].replace("--count 50", "--count 6").split()[3:]
+    program, *collect = card["command"].replace("--count 50", "--count 6").split()
+    assert program == "jaxcal-rig"
     more = ["--config", str(tmp_path / "rig.toml"), "--out", str(tmp_path / "runs")]
     subprocess.run([*rig, *collect, *more], check=True)
     (pairs,) = (tmp_path / "runs").glob("*/pairs.csv")
