@@ -16,9 +16,9 @@ from jaxcal.calibration.estimate import fit_model
 from jaxcal.calibration.file import save, to_dict
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.inverse import command_for
-from jaxcal.calibration.verdict import verdict
 from jaxcal.checks import aligned, in_words
-from jaxcal.models import Affine, Model, Noise, SerialChain
+from jaxcal.models.model import Model
+from jaxcal.models.uncertainty import Noise
 
 __all__ = ["Calibration"]
 
@@ -36,7 +36,6 @@ class Calibration(Fit):
         return self.summary()
 
     command_for = command_for
-    verdict = functools.cached_property(verdict)
     check = check
     verification = verification
     to_dict = to_dict
@@ -44,11 +43,9 @@ class Calibration(Fit):
 
     def summary(self) -> str:
         """The parameters with their 95 % intervals, the noise and the fit, as text."""
-        affine = isinstance(self.model, Affine)
-        what = "y = A u + b" if affine else f"of {type(self.model).__name__}"
         fixed = int((self.free[: len(self.parameters)] == 0).sum())
         lines = [
-            f"Calibration {what}: {self.num_inputs} inputs "
+            f"Calibration {self.model.title}: {self.num_inputs} inputs "
             f"({', '.join(self.input_names)}), {self.num_outputs} outputs "
             f"({', '.join(self.output_names)}), {self.num_measurements} measurements, "
             f"{len(self.parameters)} parameters"
@@ -56,11 +53,8 @@ class Calibration(Fit):
             + f", {self.loss} loss"
         ]
         cells = {"": list(self.names)}
-        if affine:
-            cells["meaning"] = [
-                *(f"{y} per {u}" for y in self.output_names for u in self.input_names),
-                *(f"{y} at u = 0" for y in self.output_names),
-            ]
+        if means := self.model.meanings(self.input_names, self.output_names):
+            cells["meaning"] = means
         cells["value"] = [f"{value: .6g}" for value in self.parameters]
         errors, shares = self.standard_errors, self.from_data
         if errors is not None and shares is not None:
@@ -71,8 +65,9 @@ class Calibration(Fit):
             ]
             if self.prior_precision.any() or self.unidentified is not None:
                 cells["from data"] = [f"{share:.0%}" for share in shares]
-        if any(units := _units(self)):
-            cells["unit"] = units
+        units = self.model.units_for(self.command_unit, self.measured_unit)
+        if any(units):
+            cells["unit"] = list(units)
         table = [[name, *column] for name, column in cells.items()]
         rows = [*zip(*table, strict=True)]
         lines += [f"  {line}" for line in aligned(rows, left=True)]
@@ -110,37 +105,43 @@ class Calibration(Fit):
             )
         return "\n".join(lines)
 
+    # -- can it be trusted -------------------------------------------------------------
+
+    @functools.cached_property
+    def verdict(self) -> Any:
+        """What the model says of this calibration, of an arm a
+        :class:`jaxcal.models.serial.verdict.Verdict`; None of most models."""
+        return self.model.verdict(self)
+
     # -- an arm, written back ----------------------------------------------------------
 
     @property
-    def arm(self) -> SerialChain:
+    def arm(self) -> Any:
         """The arm as calibrated, its parameters nominal, with Position()."""
-        self._chain()
-        return self.whole.calibrated(self.estimate)  # type: ignore[attr-defined]  # a chain
+        return self.whole.calibrated(self.estimate)
 
     def to_urdf(self, path: str | os.PathLike[str], *, force: bool = False) -> str:
         """The arm's own file, corrected; see :meth:`jaxcal.models.SerialChain.write`.
 
         Returns the tip link.
         """
-        return self._chain().write("urdf", path, self.parameters, force=force)
+        return self.model.write("urdf", path, self.parameters, force=force)
 
     def to_dh(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """The DH table as CSV, fitted without harmonics.
 
         A warning says how far that moves what is predicted.
         """
-        self._chain().write("dh", path, self._of_table(), force=force)
+        self.model.write("dh", path, self._of_table(), force=force)
 
     def to_ur_kinematics(
         self, path: str | os.PathLike[str], *, force: bool = False
     ) -> None:
         """Universal Robots' kinematics file, likewise."""
-        self._chain().write("ur", path, self._of_table(), force=force)
+        self.model.write("ur", path, self._of_table(), force=force)
 
     def _of_table(self) -> Array:
         """(p,) for a file, which holds no harmonics: fitted without them."""
-        chain = self._chain()
         if not self.estimate[len(self.names) :].any():
             return self.parameters
         found = fit_model(
@@ -153,7 +154,7 @@ class Calibration(Fit):
             loss=self.loss,
             common_noise=None,
         )["estimate"]
-        moved = self.predict(self.commands) - chain.predict(self.commands, found)
+        moved = self.predict(self.commands) - self.model.predict(self.commands, found)
         unit = f" {self.measured_unit}" if self.measured_unit else ""
         warnings.warn(
             "harmonics left out of the file: its predictions at the measured postures "
@@ -162,13 +163,6 @@ class Calibration(Fit):
             stacklevel=3,
         )
         return np.asarray(found)
-
-    def _chain(self) -> SerialChain:
-        if not isinstance(self.model, SerialChain):
-            raise ValueError(
-                f"the model must be an arm, got {type(self.model).__name__}"
-            )
-        return self.model
 
     # -- from a file -------------------------------------------------------------------
 
@@ -201,13 +195,3 @@ class Calibration(Fit):
                 message names the key.
         """
         return cls(**file.fields(content, model))
-
-
-def _units(fit: Fit) -> list[str]:
-    """p units of the parameters, "" where not known."""
-    if not isinstance(fit.model, Affine):
-        return list(getattr(fit.model, "units", [""] * len(fit.names)))
-    per = f"/{fit.command_unit}" if fit.command_unit else ""
-    slope = (fit.measured_unit or "1") + per if per else fit.measured_unit
-    m = fit.num_outputs
-    return [slope] * (m * fit.num_inputs) + [fit.measured_unit] * m

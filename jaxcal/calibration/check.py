@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.calibration.fit import Fit
 from jaxcal.checks import array_of, numbers, table, whole_number
 from jaxcal.information.blocks import without
-from jaxcal.models import SerialChain
 
 __all__ = ["Check", "check", "verification"]
 
@@ -80,9 +79,8 @@ def check(
     rule = ": as many rows as commands"
     measured = array_of("measured", measured, *shape, rule=rule)
     model = calibration.model
-    if isinstance(model, SerialChain) and model.sensor.zeros and not measured.any():
-        first = np.sort(np.unique(commands, axis=0, return_index=True)[1])
-        commands, measured = commands[first], measured[first]  # one written twice
+    distinct = model.distinct(commands, measured)
+    commands, measured = commands[distinct], measured[distinct]
     noise = calibration.require_noise("check")
     theta = calibration.parameters
     slopes = np.asarray(model.jacobian(commands, theta))
@@ -108,9 +106,9 @@ def check(
     names = calibration.names
     own = np.zeros(p, dtype=np.bool_)
     if placed_anew:
-        if not (isinstance(model, SerialChain) and len(model.sensor.names)):
+        if not model.placed:
             raise ValueError("placed_anew is of an arm whose sensor stands somewhere")
-        own = np.isin(names, model.sensor.names)  # which says nothing now
+        own = np.isin(names, model.placed)  # which says nothing now
         white, by = without(by[:, own], white, by)
     freedom = len(white)
     if not freedom:
@@ -147,8 +145,7 @@ def _postures(calibration: Fit, name: str, given: ArrayLike) -> Array:
     rows = array_of(name, given, "N", calibration.num_inputs)
     if not len(rows):
         raise ValueError(f"{name} must hold at least one row, got none")
-    if isinstance(calibration.model, SerialChain):
-        calibration.model.require_postures(rows)
+    calibration.model.require_commands(rows)
     return rows
 
 

@@ -10,39 +10,28 @@ from numpy.typing import NDArray
 
 from jaxcal.calibration.sizes import Sizes, group_sizes, of_sizes
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
-from jaxcal.checks import array_of, in_words, one_of, require_kind
+from jaxcal.checks import array_of, one_of, require_kind
 from jaxcal.information.blocks import triangle
 from jaxcal.information.singular import exact_zeros, significant
-from jaxcal.models import (
-    Model,
-    Noise,
-    Pose,
-    Position,
-    Prior,
-    SerialChain,
-    Socket,
-)
 from jaxcal.models.identifiability import unknown
-from jaxcal.models.model import derivative, facts, require_model
+from jaxcal.models.model import Model, as_model, derivative
+from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["fit_model", "require_fitting"]
 
 Array = NDArray[np.float64]
 
-_NOMINAL = 0.1  # of its length: no arm is so far off, tip included, before it is fitted
-_APART = 0.2  # of it: what two sockets may seem to be off their distance
-_OTHER_UNIT = 0.01  # of it: so far off and tenfold, a distance is in another unit
 
-
-def require_fitting(model: Any, commands: Array, measured: Array) -> None:
-    """Refuse what is no model, and a model of other commands or outputs."""
-    require_model(model)
+def require_fitting(model: Any, commands: Array, measured: Array) -> Model:
+    """The model; refused if it is none, or one of other commands or outputs."""
+    model = as_model(model)
     if not len(commands):
         raise ValueError("commands must hold at least one row, got none")
     model.predict(commands, None)  # tells some models their number of inputs
     rule = " for this model"
     array_of("commands", commands, "N", model.num_inputs, rule=rule)
     array_of("measured", measured, "N", model.num_outputs, rule=rule)
+    return model
 
 
 def fit_model(
@@ -59,42 +48,35 @@ def fit_model(
     """The fields of a ``Calibration`` but names, units and provenance."""
     one_of("loss", loss, ("student", "gaussian"))
     require_kind("prior", prior, Prior)
-    contacts = isinstance(model, SerialChain) and model.sensor.zeros
-    if contacts and not measured.any():  # one that is written twice counts once
-        once, rows = np.zeros_like(weights), np.flatnonzero(weights > 0.0)
-        first = rows[np.unique(commands[rows], axis=0, return_index=True)[1]]
-        once[first] = weights[first]
-        weights = once
+    rows = np.flatnonzero(weights > 0.0)
+    once = np.zeros_like(weights)
+    first = rows[model.distinct(commands[rows], measured[rows])]
+    once[first] = weights[first]
+    weights = once
     used = weights > 0.0
     if not used.any():
         raise ValueError("weights must be positive for one measurement at least")
     white, known, spread = _noise_of(noise, weights, commands, measured.shape[1])
     each = np.arange(measured.shape[1])
     levels = 0 * each
-    if isinstance(model, SerialChain):
-        if spread.any() and isinstance(model.sensor, Pose):
-            raise ValueError(
-                "command_std must not be given with a Pose: the orientations are "
-                "compared with those of the commands given; raise the std of the noise"
-            )
-        for part in model.of_each_sensor(commands[used], measured[used]):
-            _require_unit(*part)
-        model.require_postures(commands[used])
-        model = model.located(commands[used], measured[used])
-        for part in model.of_each_sensor(commands[used], measured[used]):
-            _require_sockets(*part)
-        if not known:
-            usual = np.asarray(model.default_noise().std)
-            white = white / usual[:, None]
-            levels = np.unique(usual, return_inverse=True)[1]  # positions and turns
+    if spread.any() and model.relative:
+        raise ValueError(
+            "command_std must not be given with a Pose: the orientations are "
+            "compared with those of the commands given; raise the std of the noise"
+        )
+    model = model.prepared(commands[used], measured[used])
+    usual = model.default_noise()
+    if usual is not None and not known:
+        of_reading = np.broadcast_to(np.asarray(usual.std), each.shape)
+        white = white / of_reading[:, None]
+        levels = np.unique(of_reading, return_inverse=True)[1]  # positions and turns
     if common_noise is not None or spread.any():
         levels = each if common_noise is False else 0 * each
     asked = prior is not None
     whole, bent = model, model
-    if isinstance(model, SerialChain) and not (asked or spread.any()):
+    if not (asked or spread.any()):
         bent = model.with_misfit()
-        # Of a URDF file what is written back is what is predicted, without harmonics.
-        if model.sensor.misfit and model.source is None:
+        if model.fits_misfit:
             whole = bent
     prior = prior or whole.default_prior()
     resolved = prior.resolve(whole)
@@ -113,11 +95,11 @@ def fit_model(
     )
     sizes: Sizes | None = None
     if prior.by_data and (asked or not spread.any()):
-        if not isinstance(model, SerialChain) or spread.any():
+        if whole.error_groups() is None or spread.any():
             raise ValueError("Prior.sized() is of arms, without command_std")
         found, stated = solve(task, rough=True), task
         for last in (False, True):
-            sizes = group_sizes(model, stated, found, sizes)
+            sizes = group_sizes(stated, found, sizes)
             scaled = stated.precision / sizes.factors**2
             task = dataclasses.replace(task, precision=scaled)
             found = solve(task, found, rough=not last)
@@ -133,76 +115,9 @@ def fit_model(
         within = fields["joint_covariance"].copy()
         if sizes is not None:
             fields["joint_covariance"] += of_sizes(task, found, sizes)
-        if isinstance(bent, SerialChain) and bent is not whole:
+        if bent is not whole:
             fields |= _misfit(bent, task, found, fields, within)
     return fields | {"model": model, "loss": loss}
-
-
-def _require_unit(model: SerialChain, commands: Array, measured: Array) -> None:
-    """Refuse millimetres for metres, radians for degrees: an arm is not off tenfold."""
-    if not isinstance(model.sensor, Position | Pose):
-        return
-    spread = []
-    for points in (measured[:, :3], model.predict(commands)[:, :3]):
-        apart = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-        spread.append(float(np.median(apart)))
-    if max(spread) > max(10.0 * min(spread), 0.01 * model.length):
-        raise ValueError(
-            "measured must be in the unit of the model's lengths and commands in "
-            f"degrees: measured positions spread over {spread[0]:g}, those predicted "
-            f"over {spread[1]:g}"
-        )
-
-
-def _require_sockets(arm: SerialChain, commands: Array, measured: Array) -> None:
-    """Refuse contacts that no arm near the nominal one can have made."""
-    if not isinstance(arm.sensor, Socket):
-        return
-    which = arm.sensor.of_rows(commands[:, arm.num_joints :])
-    joints = commands[:, : arm.num_joints]
-    _, first, groups = np.unique(joints, axis=0, return_index=True, return_inverse=True)
-    for row in np.flatnonzero(which != which[first][groups.ravel()])[:1]:
-        raise ValueError(
-            f"a posture must have the ball in one socket, but row {row} is row "
-            f"{first[groups.ravel()[row]]} with another socket: rows of the other file?"
-        )
-    if measured.any():  # offsets that were measured, as in a simulation, are of any tip
-        return
-    points = arm.calibrated(arm.nominal).predict(joints)
-    most, middles = _NOMINAL * arm.length, {}
-    for i in np.unique(which):
-        rows = np.flatnonzero(which == i)
-        middles[i] = np.median(points[rows], axis=0)
-        far = np.linalg.norm(points[rows] - middles[i], axis=1)
-        if len(rows) > 2 and np.median(far) > most:
-            raise ValueError(
-                f"contacts of socket {i} must be at one point within {most:.2g}, but "
-                f"the arm as described scatters by {np.median(far):.2g} there: a wrong "
-                "tip, unit, sign or order of columns, or rows of another place?"
-            )
-        lost = rows[far > most + 4.0 * np.median(far)]
-        if lost.size:
-            raise ValueError(
-                f"contacts of socket {i} must be at one point within {most:.2g}, but "
-                f"rows {in_words(lost)} are {far.max():.2g} from the others there: "
-                "rows of another place?"
-            )
-    for one, other, distance, _ in arm.sensor.distances:
-        missing = {int(one), int(other)} - set(middles)
-        if missing:
-            raise ValueError(
-                f"commands must have contacts of socket {missing.pop()}, whose "
-                "distance from another is given"
-            )
-        found = float(np.linalg.norm(middles[int(one)] - middles[int(other)]))
-        off = abs(found - distance) / arm.length
-        unit = off > _OTHER_UNIT and not 0.1 < found / distance < 10.0
-        if off > _APART or unit:
-            raise ValueError(
-                f"sockets {int(one)} and {int(other)} must be {distance:g} apart, but "
-                f"the arm as described puts them {found:.3g} apart: rows of another "
-                "place or another unit?"
-            )
 
 
 def _noise_of(
@@ -237,7 +152,7 @@ def _levels_differ(task: Task, found: Solution) -> bool:
 
 
 def _misfit(
-    bent: SerialChain,
+    bent: Model,
     task: Task,
     found: Solution,
     fields: dict[str, Any],
@@ -256,9 +171,9 @@ def _misfit(
         fields: of it, with the covariance (P, P) that is returned.
         within: (P, P) covariance of the parameters by the noise alone.
     """
-    count = bent.waves.size
-    usual = np.asarray(bent.default_noise().std)
-    times = np.sqrt(np.mean((fields["noise_std"] / usual) ** 2))
+    count = len(bent.names) - len(task.mean)
+    usual = bent.default_noise() or Noise(1.0)
+    times = np.sqrt(np.mean((fields["noise_std"] / np.asarray(usual.std)) ** 2))
     std = times * np.asarray(bent.default_prior().std)[-count:]
     none = np.zeros(count)
     theta = np.concatenate([found.parameters, none])
@@ -300,7 +215,7 @@ def _fields(
     used = weights > 0.0
     rows = np.sqrt(_informs(task, found))[:, None, None] * found.rows
     rows = rows.reshape(-1, rows.shape[-1])
-    known = facts(task.model, found.parameters)[1][:, task.free]
+    known = task.model.facts(found.parameters)[1][:, task.free]
     rows = np.concatenate([rows, known])
     covariance, null = _covariance(task, found, rows)
     freedom = float(found.freedom.sum())

@@ -16,7 +16,8 @@ import numpy as np
 
 from jaxcal.calibration.fit import Fit
 from jaxcal.files import write_text
-from jaxcal.models import Affine, Model, SerialChain, from_dict
+from jaxcal.models.kinds import from_dict
+from jaxcal.models.model import Model, as_model
 
 __all__ = ["fields", "read", "save", "to_dict"]
 
@@ -51,7 +52,7 @@ def to_dict(fit: Fit) -> dict[str, Any]:
         "parameters": fit.parameters.tolist(),
         "covariance": None if covariance is None else covariance.tolist(),
     }
-    if isinstance(fit.model, Affine):
+    if fit.affine is not None:
         content["derived"]["matrix"] = fit.matrix.tolist()
         content["derived"]["bias"] = fit.bias.tolist()
     return content
@@ -133,15 +134,13 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
     for key in ("model", "derived"):
         require(isinstance(content.get(key), dict), key, "be an object")
     names = content["derived"].get("parameter_names")
-    model = from_dict(content["model"]) if model is None else model
+    model = from_dict(content["model"]) if model is None else as_model(model)
     if list(model.names) != names:
         raise ValueError(
             f"model must have the parameters of the file, {names}, got {model.names}"
         )
     size = len(found["estimate"])
-    if size != len(names) and not (
-        isinstance(model, SerialChain) and size == len(model.with_misfit().names)
-    ):
+    if size not in (len(names), len(model.with_misfit().names)):
         raise ValueError(f'"estimate" must have shape ({len(names)},)')
     if (found["noise_std"] is None) != (found["joint_covariance"] is None):
         raise ValueError('"noise_std" and "joint_covariance" contradict each other')

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, numbers
 from jaxcal.information.singular import depends
-from jaxcal.models import Affine, Model, Prior, SerialChain, identifiability
-from jaxcal.models.identifiability import Identifiability
-from jaxcal.models.model import derivative, predict
+from jaxcal.models.identifiability import Identifiability, identifiability
+from jaxcal.models.model import Model, derivative, predict
+from jaxcal.models.uncertainty import Prior
 
 __all__ = ["Fit"]
 
@@ -144,16 +144,19 @@ class Fit:
         return identifiability(self.model, used, prior=here)
 
     @property
+    def affine(self) -> tuple[Array, Array] | None:
+        """A (m, n) and b (m,) where the model is affine, else None."""
+        return self.model.affine(self.parameters)
+
+    @property
     def matrix(self) -> Array:
         """(m, n) A of an affine model."""
-        self._require_affine("matrix")
-        return self.parameters[: -self.num_outputs].reshape(self.num_outputs, -1)
+        return self._affine("matrix")[0]
 
     @property
     def bias(self) -> Array:
         """(m,) b of an affine model."""
-        self._require_affine("bias")
-        return self.parameters[-self.num_outputs :]
+        return self._affine("bias")[1]
 
     def confidence_intervals(self, confidence: float = 0.95) -> Array:
         """(p, 2) lower and upper end for each parameter, one at a time.
@@ -262,9 +265,7 @@ class Fit:
     def whole(self) -> Model:
         """The model with the harmonics that were found, if any: its last parameters."""
         more = len(self.estimate) > len(self.names)
-        if more and isinstance(self.model, SerialChain):
-            return self.model.with_misfit()
-        return self.model
+        return self.model.with_misfit() if more else self.model
 
     @property
     def undetermined(self) -> NDArray[np.bool_]:
@@ -305,6 +306,7 @@ class Fit:
             "noise is unknown; measure more or give noise_std"
         )
 
-    def _require_affine(self, name: str) -> None:
-        if not isinstance(self.model, Affine):
+    def _affine(self, name: str) -> tuple[Array, Array]:
+        if self.affine is None:
             raise AttributeError(f"{name}: only an affine model y = A u + b has one")
+        return self.affine

@@ -29,8 +29,9 @@ from jaxcal.checks import (
     table,
 )
 from jaxcal.information.singular import require_excited
-from jaxcal.models import Affine, Model, Noise, Prior
-from jaxcal.models.model import by_name
+from jaxcal.models.affine import Affine
+from jaxcal.models.model import Model, by_name
+from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["identify"]
 
@@ -140,7 +141,7 @@ def identify(
     }
     affine = model is None
     if model is not None:
-        require_fitting(model, commands, measured)
+        model = require_fitting(model, commands, measured)
         affine = isinstance(model, Affine)
     if affine and loss in (None, "gaussian"):
         if prior is None and noise is None:

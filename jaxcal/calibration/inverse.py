@@ -14,7 +14,6 @@ from jaxcal.information.singular import (
     flat,
     significant,
 )
-from jaxcal.models import Affine, Pose, SerialChain
 from jaxcal.models.identifiability import unknown
 from jaxcal.models.model import derivative, predict
 
@@ -105,16 +104,10 @@ class _Search:
 
     def __init__(self, fit: Fit, wanted: Array, start: Array | None) -> None:
         self.fit, self.model, self.wanted = fit, fit.whole, wanted
-        self.affine = isinstance(fit.model, Affine) and fit.num_inputs == len(wanted.T)
-        self.arm: SerialChain | None = None
-        if isinstance(fit.model, SerialChain) and isinstance(fit.model.sensor, Pose):
-            if start is None:
-                raise ValueError(
-                    "start must be given for an arm's pose: the joints at whose "
-                    "nominal orientation desired is a turn, as rotation_vectors(start, "
-                    "R) makes it"
-                )
-            self.arm, self.turned = fit.model, fit.model.rotations(start, wanted[:, 3:])
+        square = fit.num_inputs == wanted.shape[1]
+        self.affine = square and fit.affine is not None
+        # What the machine answers at commands (R, n) if points ``rows`` are reached.
+        self.goal = fit.model.targets(wanted, start)
         known = fit.commands
         self.spread = np.where(np.ptp(known, axis=0) > 0.0, known.std(axis=0), 1.0)
         points, count = np.arange(len(wanted)), len(known)
@@ -122,19 +115,11 @@ class _Search:
         outputs = predict(self.model, known, fit.estimate)
         there = there.reshape(len(wanted), count, -1) - outputs
         # Relative outputs spread as what is wanted, seen from where it was measured.
-        seen = outputs if self.arm is None else np.concatenate(there)
+        seen = np.concatenate(there) if fit.model.relative else outputs
         self.size = np.where(np.ptp(seen, axis=0) > 0.0, seen.std(axis=0), 1.0)
         with np.errstate(over="ignore"):
             order = np.argsort(((there / self.size) ** 2).sum(axis=-1), axis=1)
         self.nearest = known[order[:, :_STARTS]]  # (P, starts, n)
-
-    def goal(self, commands: Array, rows: NDArray[np.intp]) -> Array:
-        """(R, q) what the machine answers at commands (R, n) if points ``rows`` are
-        reached there: an arm's orientations are relative to the commands."""
-        if self.arm is None:
-            return self.wanted[rows]
-        turns = self.arm.rotation_vectors(commands, self.turned[rows])
-        return np.hstack([self.wanted[rows, :3], turns])
 
     def outputs(self, commands: Array) -> Array:
         return predict(self.model, commands, self.fit.estimate, finite=False)

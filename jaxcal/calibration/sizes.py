@@ -1,11 +1,9 @@
-"""How large an arm's errors are, from its readings: the scales of the prior's groups.
+"""How large a machine's errors are, from its readings: the scales of a prior's groups.
 
-The prior says how errors of lengths compare with each other, and those of angles; how
-large they are altogether is seldom known. Here a factor for all lengths, one for the
-turns of the axes (alpha, beta), one for the zeros of the joints (theta), one for their
-compliance and the level of the noise make the readings most probable (marginal
-likelihood, the model linear about the fit), with a factor of six either way (ten of
-the harmonics) as what is thought of each beforehand.
+The prior says how errors of one kind compare with each other; how large they are
+altogether is seldom known. Here a factor for each of the model's ``error_groups()`` and
+the level of the noise make the readings most probable (marginal likelihood, the model
+linear about the fit), with what the model thinks of each factor beforehand.
 
 Sources: MacKay, 1992; Bishop, Pattern Recognition and Machine Learning, 3.5.
 """
@@ -20,21 +18,15 @@ from numpy.typing import NDArray
 from jaxcal.calibration.solve import Solution, Task
 from jaxcal.information.blocks import triangle, without
 from jaxcal.information.singular import significant
-from jaxcal.models import SerialChain
-from jaxcal.models.model import derivative, facts
+from jaxcal.models.model import derivative
 
 __all__ = ["Sizes", "group_sizes", "of_sizes"]
 
 Array = NDArray[np.float64]
 
-# Beforehand, of the factors of the groups and of the level: median, and the factor of
-# one standard deviation. Most arms have little misfit and some have much.
-_MIDDLE = np.log([1.0, 1.0, 1.0, 1.0, 0.1, 1.0])
-_SPREAD = np.log([6.0, 6.0, 6.0, 6.0, 10.0, 3.0])
+_LEVEL = 3.0  # factor of one standard deviation of the level, beforehand
 _MOST = 5.0  # of a logarithm
 _SCORES = 100  # steps of Fisher's scoring, at most
-_GROUPS = 5  # lengths, turns of the axes, zeros of the joints, compliance, harmonics
-_WAVES = (" sin", " cos", " sin2", " cos2")
 
 
 class Sizes(NamedTuple):
@@ -46,22 +38,20 @@ class Sizes(NamedTuple):
     covariance: Array  # (G, G) of the logarithms of the groups' factors
 
 
-def group_sizes(
-    arm: SerialChain, task: Task, found: Solution, before: Sizes | None
-) -> Sizes:
+def group_sizes(task: Task, found: Solution, before: Sizes | None) -> Sizes:
     """The factors that make the readings most probable.
 
     Args:
-        arm: whose parameters have the groups.
-        task: with the prior that the factors are of.
+        task: with the prior that the factors are of, and a model with groups.
         found: a fit with any such prior; the model is made linear there.
         before: where the search begins; with factors of one where there is nothing.
     """
     p = len(task.mean)
-    groups = np.full(p, -1)
-    groups[: arm.table.size].reshape(-1, 5)[:] = [0, 1, 0, 2, 1]
-    groups[np.flatnonzero(np.array(arm.units) == "deg per torque")] = 3
-    groups[[name.endswith(_WAVES) for name in task.model.names]] = 4
+    of_model = task.model.error_groups()
+    assert of_model is not None
+    groups, num_groups = of_model.members, len(of_model.medians)
+    middle = np.log(np.append(of_model.medians, 1.0))
+    wide = np.log(np.append(of_model.spreads, _LEVEL))
     rows, right = _reduced(task, found)
     sized = groups[task.free & (task.precision > 0.0)]
     count, width = len(right), rows.shape[1]
@@ -70,7 +60,7 @@ def group_sizes(
     top = min(width, len(factor))
     rest = float((factor[top:, width] ** 2).sum())
     rows, right = factor[:top, :width], factor[:top, width]
-    member = sized == np.arange(_GROUPS)[:, None]  # (groups, s)
+    member = sized == np.arange(num_groups)[:, None]  # (groups, s)
 
     def cost(logs: Array) -> tuple[float, Array, Array]:
         """-2 log marginal likelihood with what is thought of the factors.
@@ -88,16 +78,16 @@ def group_sizes(
             spread - member @ (white @ scaled) ** 2,
             level * (np.trace(inverse) - white @ white) + count - top - rest / level,
         )
-        curve = np.diag(_SPREAD**-2.0)
+        curve = np.diag(wide**-2.0)
         curve[:-1, :-1] += 2.0 * member @ (scaled.T @ seen) ** 2 @ member.T
         curve[-1, :-1] = curve[:-1, -1] = 2.0 * level * member @ (seen**2).sum(axis=0)
         curve[-1, -1] += 2.0 * (level**2 * (inverse**2).sum() + count - top)
-        off = (logs - _MIDDLE) / _SPREAD
+        off = (logs - middle) / wide
         value = float(value + off @ off)
-        return value, 2.0 * (slope + off / _SPREAD), 2.0 * curve
+        return value, 2.0 * (slope + off / wide), 2.0 * curve
 
     # A level that is known floats too: misfit beyond it is no size of the errors.
-    best = _MIDDLE if before is None else before.logs
+    best = middle if before is None else before.logs
     least, slope, curve = cost(best)
     for _ in range(_SCORES):
         step = np.linalg.solve(curve, slope)
@@ -112,15 +102,15 @@ def group_sizes(
     factors = np.ones(p)
     factors[groups >= 0] = np.exp(best[groups[groups >= 0]])
     if before is None:  # the sizes of a rough fit, which begin the next
-        return Sizes(best, factors, groups, np.zeros((_GROUPS, _GROUPS)))
+        return Sizes(best, factors, groups, np.zeros((num_groups, num_groups)))
     steps = 1e-3 * np.eye(len(best))
     curves = [cost(best + step)[1] - cost(best - step)[1] for step in steps]
     # Half the cost's, in units of what was thought, which the readings only sharpen.
-    curve = np.array(curves) / 4e-3 * np.outer(_SPREAD, _SPREAD)
+    curve = np.array(curves) / 4e-3 * np.outer(wide, wide)
     size, axes = np.linalg.eigh(curve)
-    axes = _SPREAD[:, None] * axes
+    axes = wide[:, None] * axes
     inside = (axes / np.maximum(size, 1.0)) @ axes.T
-    return Sizes(best, factors, groups, inside[:_GROUPS, :_GROUPS])
+    return Sizes(best, factors, groups, inside[:num_groups, :num_groups])
 
 
 def of_sizes(task: Task, found: Solution, sizes: Sizes) -> Array:
@@ -133,7 +123,7 @@ def of_sizes(task: Task, found: Solution, sizes: Sizes) -> Array:
     groups = sizes.groups[free]
     weights = np.sqrt(np.minimum(found.weights, 1.0))[:, None, None]
     rows = (weights * found.rows).reshape(-1, found.rows.shape[-1])
-    known = facts(task.model, found.parameters)[1][:, free]
+    known = task.model.facts(found.parameters)[1][:, free]
     gram = rows.T @ rows + known.T @ known
     precision = task.precision[free]
     scale = 1.0 / np.sqrt(np.diagonal(gram) + precision + 1e-300)
@@ -151,7 +141,7 @@ def of_sizes(task: Task, found: Solution, sizes: Sizes) -> Array:
         return inverse @ right, inverse
 
     values, axes = np.linalg.eigh(sizes.covariance)
-    middle, spread = at(np.zeros(_GROUPS))[1], np.zeros_like(gram)
+    middle, spread = at(np.zeros(len(values)))[1], np.zeros_like(gram)
     for axis in (np.sqrt(np.maximum(values, 0.0)) * axes).T:
         (first, one), (last, other) = at(axis), at(-axis)
         spread += 0.5 * (one + other) - middle

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.information.singular import flat
-from jaxcal.models import Model
-from jaxcal.models.model import derivative, facts, predict
+from jaxcal.models.model import Model, derivative, predict
 
 __all__ = ["Solution", "Task", "solve", "student_constants"]
 
@@ -171,7 +170,7 @@ class Solution:
         rows = rows[..., task.free]
         largest = np.abs(rows).max(axis=(0, 1))
         still = flat(largest, largest.max(initial=0.0))
-        self.known, self.more = facts(task.model, self.parameters)
+        self.known, self.more = task.model.facts(self.parameters)
         self.by_theta = task.white @ np.where(still, 0.0, rows)
         if self.uncertain.any():
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
@@ -266,7 +265,7 @@ class Solution:
             residuals = task.measured - predict(
                 task.model, commands, theta, finite=False
             )
-            known, _ = facts(task.model, theta)
+            known, _ = task.model.facts(theta)
             after = self._cost(residuals, theta, commands, known)
             ratio = (cost - after) / gain if np.isfinite(after) else -1.0
             if ratio > 1e-4:

@@ -70,7 +70,7 @@ def postures(
     header, done = (*arm.joint_names, *arm.sensor.inputs), None
     if reached is not None:
         done = of_arm.commands(arm, reached, header)
-        arm.require_postures(done)
+        arm.require_commands(done)
         arm = arm.located(done)
     left = k - (0 if done is None else len(done))
     if left < 1:
@@ -193,8 +193,7 @@ def predict(
         if not isinstance(found.model, SerialChain):
             raise ValueError("--radians is of arms")
         commands = in_degrees(found.model, commands)
-    if isinstance(found.model, SerialChain):
-        found.model.require_postures(commands)
+    found.model.require_commands(commands)
     names, values = found.output_names, found.predict(commands)
     if std:
         names = (*names, *(f"std_{name}" for name in names))

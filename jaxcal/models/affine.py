@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import axis_letter, whole_number
 from jaxcal.information.regression import regression_matrix, regressors
-from jaxcal.models.model import as_commands, as_parameters
-from jaxcal.models.uncertainty import Prior
+from jaxcal.models.model import Model, as_commands, as_parameters
 
 __all__ = ["Affine"]
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True)
-class Affine:
+class Affine(Model):
     """n inputs, m outputs; parameters are A row by row, then b (paper, Equation 9).
 
     The outputs share one regressor ``[u, 1]``: with unit noise the information of a
@@ -32,11 +32,6 @@ class Affine:
     def __post_init__(self) -> None:
         whole_number("num_inputs", self.num_inputs, 1)
         whole_number("num_outputs", self.num_outputs, 1)
-
-    @property
-    def num_parameters(self) -> int:
-        """m (n + 1)."""
-        return self.num_outputs * (self.num_inputs + 1)
 
     @property
     def multiplicity(self) -> int:
@@ -84,9 +79,27 @@ class Affine:
         """(..., N, 1, n + 1) information blocks [u, 1] of commands (..., N, n)."""
         return regressors(commands)[..., None, :]
 
-    def default_prior(self) -> Prior:
-        """Nothing is known beforehand."""
-        return Prior(np.inf)
+    def affine(self, parameters: Array) -> tuple[Array, Array]:
+        """A (m, n) and b (m,)."""
+        m, n = self.num_outputs, self.num_inputs
+        return parameters[: m * n].reshape(m, n), parameters[m * n :]
+
+    @property
+    def title(self) -> str:
+        return "y = A u + b"
+
+    def units_for(self, command_unit: str, measured_unit: str) -> tuple[str, ...]:
+        slope = measured_unit
+        if command_unit:
+            slope = f"{measured_unit or '1'}/{command_unit}"
+        m = self.num_outputs
+        return (slope,) * (m * self.num_inputs) + (measured_unit,) * m
+
+    def meanings(self, inputs: Sequence[str], outputs: Sequence[str]) -> list[str]:
+        return [
+            *(f"{y} per {u}" for y in outputs for u in inputs),
+            *(f"{y} at u = 0" for y in outputs),
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         """What a file holds of the model."""

@@ -12,15 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import axis_names, numbers, table, whole_number
 from jaxcal.extras import needs
-from jaxcal.models.model import as_commands, as_parameters
-from jaxcal.models.uncertainty import Prior
+from jaxcal.models.model import Model, as_commands, as_parameters
 
 __all__ = ["FromJax"]
 
 Array = NDArray[np.float64]
 
 
-class FromJax:
+class FromJax(Model):
     """``y = f(u, theta)`` of one command; values and derivatives in float64 by JAX.
 
     The first call with a number of commands compiles f for it; the caller's JAX
@@ -33,6 +32,9 @@ class FromJax:
         names: of the parameters; t1, t2, ... when not given.
         num_inputs: n; that of the first commands when not given.
     """
+
+    names: tuple[str, ...]
+    nominal: Array
 
     def __init__(
         self,
@@ -47,7 +49,7 @@ class FromJax:
         self.nominal = numbers("nominal", nominal)
         if self.nominal.ndim != 1 or not len(self.nominal):
             raise ValueError(f"nominal must have shape (p,), got {self.nominal.shape}")
-        p = self.num_parameters = len(self.nominal)
+        p = len(self.nominal)
         given = tuple(f"t{i + 1}" for i in range(p)) if names is None else names
         self.names = axis_names("names", given, "t", p)
         self._num_inputs: int | None = None
@@ -88,10 +90,6 @@ class FromJax:
     ) -> Array:
         """(N, q, n)."""
         return self._run(2, commands, parameters)
-
-    def default_prior(self) -> Prior:
-        """Nothing is known beforehand."""
-        return Prior(np.inf)
 
     def to_dict(self) -> dict[str, Any]:
         """The function itself cannot be written."""

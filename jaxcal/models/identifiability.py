@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import one_of, require_kind, table
 from jaxcal.information.blocks import triangle
 from jaxcal.information.singular import SINGULAR, exact_zeros, flat, significant
-from jaxcal.models.model import Model, derivative, facts, require_model
+from jaxcal.models.model import Model, as_model, derivative
 from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["Direction", "Identifiability", "identifiability", "unknown"]
@@ -87,7 +87,7 @@ def identifiability(
     commands = table("candidates", candidates)
     if not len(commands):
         raise ValueError("candidates must hold at least one row, got none")
-    require_model(model)
+    model = as_model(model)
     require_kind("noise", noise, Noise)
     require_kind("prior", prior, Prior)
     known = None if prior is None else prior.resolve(model)
@@ -107,7 +107,7 @@ def identifiability(
     elif parameters is None:
         held = model.default_prior().fixed
         asked &= ~np.isin(model.names, list(held))
-    rows = np.vstack([rows, facts(model, mean)[1]])
+    rows = np.vstack([rows, model.facts(mean)[1]])
     if parameters is not None:
         parameters = [parameters] if isinstance(parameters, str) else parameters
         for name in parameters:

@@ -12,15 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import axis_names, numbers, whole_number
 from jaxcal.models.formula import input_names, parse
-from jaxcal.models.model import as_commands, as_parameters
-from jaxcal.models.uncertainty import Prior
+from jaxcal.models.model import Model, as_commands, as_parameters
 
 __all__ = ["Linear", "Polynomial"]
 
 Array = NDArray[np.float64]
 
 
-class Linear:
+class Linear(Model):
     """``y_i = sum of theta_ij f_j(u)``: m outputs, each a sum of the same r features.
 
     Parameters are named by the terms, output by output: "1", "x", "x:y"; with several
@@ -34,6 +33,9 @@ class Linear:
             default x, y, z or u1, u2, ... as the formula has them.
         terms: names of the r features of a function; f1, f2, ... when not given.
     """
+
+    num_inputs: int
+    num_outputs: int
 
     def __init__(
         self,
@@ -79,11 +81,6 @@ class Linear:
         if not self.terms:
             raise ValueError(f"features must hold at least one term, got {features!r}")
 
-    @property
-    def num_parameters(self) -> int:
-        """m r."""
-        return self.num_outputs * len(self.terms)
-
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
         if self.num_outputs == 1:
@@ -119,10 +116,6 @@ class Linear:
         coefficients = as_parameters(self, parameters).reshape(self.num_outputs, -1)
         slopes = self._slopes(as_commands(self, commands))
         return np.einsum("mr,nri->nmi", coefficients, slopes)
-
-    def default_prior(self) -> Prior:
-        """Nothing is known beforehand."""
-        return Prior(np.inf)
 
     def to_dict(self) -> dict[str, Any]:
         """A function cannot be written: its dict names the terms only."""

@@ -1,84 +1,282 @@
-"""What every model answers: ``y = f(u; theta)``, its derivatives, names and prior.
+"""``Model``: what comes out of a command, ``y = f(u; theta)``, and what follows.
 
-``predict``, ``derivative`` and ``facts`` ask it and check the answer.
+A model gives its names, outputs and derivatives; everything else that ``select`` and
+``identify`` ask has a default here. ``as_model`` gives the defaults to an object that
+is not of this class; ``predict`` and ``derivative`` ask a model and check the answer.
 """
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+import abc
+import functools
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, in_words
-from jaxcal.models.uncertainty import Prior
+from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = [
+    "ErrorGroups",
     "Model",
     "as_commands",
+    "as_model",
     "as_parameters",
     "by_name",
     "derivative",
-    "facts",
     "predict",
-    "require_model",
 ]
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
 
 
-@runtime_checkable
-class Model(Protocol):
+class ErrorGroups(NamedTuple):
+    """Parameters whose prior has one unknown scale: ``Prior.sized()``."""
+
+    members: NDArray[np.int64]  # (p,) the group of each parameter from 0, -1 of none
+    medians: Array  # (G,) of the factor of each group, before measuring
+    spreads: Array  # (G,) the factor that is one standard deviation of it
+
+
+class Model(abc.ABC):
     """n commands, p parameters, q outputs; everything is float64 in the caller's units.
 
+    A model of one's own has ``names``, ``nominal``, ``num_inputs``, ``num_outputs``,
+    ``predict``, ``jacobian`` and ``command_jacobian``; the rest has defaults.
     ``parameters=None`` stands for ``nominal`` in every method.
     """
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """p names of the parameters."""
+    if TYPE_CHECKING:  # attributes or properties of every model
 
-    @property
-    def nominal(self) -> Array:
-        """(p,) parameters of the machine as it was designed."""
+        @property
+        def names(self) -> tuple[str, ...]:
+            """p names of the parameters."""
 
-    @property
-    def num_inputs(self) -> int:
-        """n."""
+        @property
+        def nominal(self) -> Array:
+            """(p,) parameters of the machine as it was designed."""
 
-    @property
-    def num_outputs(self) -> int:
-        """q."""
+        @property
+        def num_inputs(self) -> int:
+            """n."""
 
-    @property
-    def num_parameters(self) -> int:
-        """p."""
+        @property
+        def num_outputs(self) -> int:
+            """q."""
 
+    # -- f and its derivatives ---------------------------------------------------------
+
+    @abc.abstractmethod
     def predict(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
         """Outputs (N, q) at commands (N, n)."""
 
+    @abc.abstractmethod
     def jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
         """(N, q, p) derivative of the outputs by the parameters."""
 
+    @abc.abstractmethod
     def command_jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
         """(N, q, n) derivative of the outputs by the commands."""
 
-    def default_prior(self) -> Prior:
-        """What is known before measuring; infinite std where nothing is."""
+    # -- names -------------------------------------------------------------------------
+
+    @functools.cached_property  # which an attribute may replace
+    def num_parameters(self) -> int:
+        """p."""
+        return len(self.names)
+
+    @functools.cached_property
+    def inputs(self) -> tuple[str, ...]:
+        """n names of the columns of the commands; () where they have none."""
+        return ()
+
+    @property
+    def title(self) -> str:
+        """The model in the first line of a calibration's summary."""
+        return f"of {type(self).__name__}"
+
+    def units_for(self, command_unit: str, measured_unit: str) -> tuple[str, ...]:
+        """p units of the parameters, "" where not known, for these of the commands."""
+        return tuple(getattr(self, "units", ("",) * len(self.names)))
+
+    def meanings(self, inputs: Sequence[str], outputs: Sequence[str]) -> list[str]:
+        """p meanings of the parameters in a summary; [] where the names tell."""
+        return []
 
     def to_dict(self) -> dict[str, Any]:
         """JSON with a ``kind``; :func:`jaxcal.models.from_dict` reads it."""
+        return {"kind": type(self).__name__}
+
+    # -- what is known before measuring ------------------------------------------------
+
+    def default_prior(self) -> Prior:
+        """Infinite standard deviations where nothing is known."""
+        return Prior(np.inf)
+
+    def default_noise(self) -> Noise | None:
+        """The usual noise of a reading; None where nothing is known."""
+        return None
+
+    def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
+        """What is known besides the prior, as readings that need no command.
+
+        Returns:
+            (F,) how far off it is and (F, p) its derivative, in standard deviations.
+        """
+        return np.zeros(0), np.zeros((0, len(self.names)))
+
+    def error_groups(self) -> ErrorGroups | None:
+        """The scales that ``Prior.sized()`` takes from the readings; None without."""
+        return None
+
+    # -- the commands and readings of a fit or a choice --------------------------------
+
+    def prepared(self, commands: Array, measured: Array | None = None) -> Model:
+        """This model where the commands (and readings) show that its sensor stands.
+
+        Raises:
+            ValueError: no such machine can take the commands, or give the readings; it
+                says which.
+        """
+        self.require_commands(commands)
+        return self
+
+    def require_commands(self, commands: Array) -> None:
+        """Refuse commands (N, n) that the machine cannot take, naming one."""
+        return
+
+    def distinct(self, commands: Array, measured: Array) -> Rows:
+        """(K,) the rows that count; the same contact written twice counts once."""
+        return np.arange(len(commands))
+
+    # -- linear models -----------------------------------------------------------------
+
+    @property
+    def multiplicity(self) -> int:
+        """m where ``blocks`` hold a regressor that all outputs share, else 0."""
+        return 0
+
+    def blocks(self, commands: ArrayLike) -> Array:
+        """(..., N, 1, r) information of each output by itself, with unit noise."""
+        raise NotImplementedError("the outputs of this model share no regressor")
+
+    def affine(self, parameters: Array) -> tuple[Array, Array] | None:
+        """A (m, n) and b (m,) of a model ``y = A u + b``; None for any other."""
+        return None
+
+    # -- what no parameter explains ----------------------------------------------------
+
+    @property
+    def misfit_std(self) -> float:
+        """Standard deviation of a reading by what ``with_misfit()`` does not hold."""
+        return 0.0
+
+    @property
+    def fits_misfit(self) -> bool:
+        """Whether without a prior the parameters of ``with_misfit()`` are fitted."""
+        return False
+
+    def with_misfit(self) -> Model:
+        """This model with more parameters, which come last: what the others leave."""
+        return self
+
+    # -- a calibrated machine ----------------------------------------------------------
+
+    @property
+    def placed(self) -> tuple[str, ...]:
+        """Names of the parameters of what stands around the machine."""
+        return ()
+
+    @property
+    def relative(self) -> bool:
+        """Whether readings are relative to the commands, as the turns of a pose."""
+        return False
+
+    def targets(
+        self, desired: Array, start: Array | None
+    ) -> Callable[[Array, Rows], Array]:
+        """What to reach, at commands, for ``Calibration.command_for``.
+
+        Args:
+            desired: (P, q) wanted outputs.
+            start: (P, n) where each search begins, if that was given.
+
+        Returns:
+            f(commands (R, n), rows (R,)) -> (R, q), what the machine answers at the
+            commands if it reaches the ``rows`` of ``desired``.
+        """
+        return lambda commands, rows: desired[rows]
+
+    def verdict(self, fit: Any) -> Any:
+        """Whether a :class:`jaxcal.Calibration` of this model can be trusted.
+
+        Returns:
+            Printed, the reasons; ``good`` if it may be used. None where the model has
+            nothing to say.
+        """
+        return None
+
+    def calibrated(self, parameters: ArrayLike) -> Model:
+        """The machine whose nominal is this one's with ``parameters``."""
+        raise self._no_arm()
+
+    def write(
+        self, form: str, path: Any, parameters: ArrayLike, *, force: bool = False
+    ) -> str:
+        """Write the machine with ``parameters`` in a form that its controller reads."""
+        raise self._no_arm()
+
+    def _no_arm(self) -> ValueError:
+        return ValueError(f"the model must be an arm, got {type(self).__name__}")
 
 
-def require_model(model: Any) -> None:
-    """Refuse a class, and what has not the methods of a model."""
-    methods = ("predict", "jacobian", "command_jacobian", "default_prior")
+class _Wrapped(Model):
+    """A model of another class, with the defaults for what it has not."""
+
+    def __init__(self, own: Any) -> None:
+        self._own = own
+
+    def __getattribute__(self, name: str) -> Any:
+        if not name.startswith("_"):
+            try:
+                return getattr(object.__getattribute__(self, "_own"), name)
+            except AttributeError:
+                pass
+        return object.__getattribute__(self, name)
+
+    @property
+    def title(self) -> str:
+        return f"of {type(self._own).__name__}"
+
+    def _no_arm(self) -> ValueError:
+        return ValueError(f"the model must be an arm, got {type(self._own).__name__}")
+
+    def predict(self, *given: Any) -> Array:
+        return np.asarray(self._own.predict(*given))
+
+    def jacobian(self, *given: Any) -> Array:
+        return np.asarray(self._own.jacobian(*given))
+
+    def command_jacobian(self, *given: Any) -> Array:
+        return np.asarray(self._own.command_jacobian(*given))
+
+
+def as_model(model: Any) -> Model:
+    """``model`` itself, or with the defaults of :class:`Model` if it is another object.
+
+    Raises:
+        ValueError: it is a class, or lacks a method that has no default.
+    """
+    methods = ("predict", "jacobian", "command_jacobian")
     missing = [name for name in methods if not callable(getattr(model, name, None))]
     if missing or isinstance(model, type):
         got = repr(model) if isinstance(model, type) else type(model).__name__
@@ -87,6 +285,7 @@ def require_model(model: Any) -> None:
             f"jaxcal.models.Model, got {got}"
             + (f" without {missing[0]}" if missing else "")
         )
+    return model if isinstance(model, Model) else _Wrapped(model)
 
 
 def as_commands(model: Any, commands: ArrayLike) -> Array:
@@ -162,14 +361,6 @@ def derivative(
             f"for the command {in_words(commands[row])}"
         )
     return found
-
-
-def facts(model: Model, parameters: Array) -> tuple[Array, Array]:
-    """What a model knows besides the prior: (F,) off, (F, P) derivative, whitened."""
-    if not hasattr(model, "facts"):
-        return np.zeros(0), np.zeros((0, len(parameters)))
-    off, rows = model.facts(parameters)
-    return np.asarray(off), np.asarray(rows)
 
 
 def _require_shape(method: str, found: Array, shape: tuple[int, ...]) -> None:

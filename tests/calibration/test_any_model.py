@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import json
 import pathlib
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from scipy import optimize
 
+import jaxcal
 from jaxcal.calibration import Calibration, identify
 from jaxcal.models import (
     Affine,
     FromJax,
     Linear,
+    Model,
     Noise,
     Polynomial,
     Pose,
     Prior,
     SerialChain,
+    identifiability,
 )
 
 
@@ -601,3 +604,76 @@ def test_noise_is_that_of_a_measurement_of_weight_one(noise_std) -> None:
         plain.predict_std([[0.5]], new_measurement=True),
         rtol=1e-3,
     )
+
+
+class Line(Model):
+    """y = a + b u with all hooks that ``identify`` and ``select`` ask."""
+
+    names = ("a", "b")
+    nominal = np.zeros(2)
+    num_inputs = num_outputs = 1
+
+    def predict(self, commands, parameters=None):
+        theta = self.nominal if parameters is None else parameters
+        return self.jacobian(commands) @ np.asarray(theta)
+
+    def jacobian(self, commands, parameters=None):
+        return np.stack([np.ones_like(commands), commands], axis=-1)
+
+    def command_jacobian(self, commands, parameters=None):
+        return np.full((len(commands), 1, 1), parameters[1])
+
+    def default_noise(self):
+        return Noise(std=0.5)
+
+    def require_commands(self, commands):
+        if (commands < 0.0).any():
+            raise ValueError("commands must not be negative")
+
+    def verdict(self, fit):
+        return None if fit.noise_std is None else Good(bool(fit.noise_std[0] < 1.0))
+
+    @property
+    def placed(self):
+        return ("a",)
+
+
+class Good(NamedTuple):
+    good: bool
+
+
+def test_a_model_of_ones_own_answers_for_itself():
+    commands = np.arange(6.0)[:, None]
+    measured = 1.0 + 2.0 * commands + 0.1 * np.cos(9.0 * commands)
+    calibration = identify(commands, measured, model=Line())
+    assert calibration.verdict.good
+    with pytest.warns(UserWarning, match="good=False"):
+        identify(commands, measured + 9.0 * np.cos(9.0 * commands), model=Line())
+    with pytest.raises(ValueError, match="must not be negative"):
+        identify(-commands, measured, model=Line())
+    with pytest.raises(ValueError, match="must not be negative"):
+        jaxcal.select(-commands, 2, model=Line())
+    with pytest.raises(ValueError, match="must not be negative"):
+        calibration.check(-commands, measured)
+    # A line that is set up anew may be shifted as a whole.
+    moved = measured + 5.0
+    assert calibration.check(commands, moved).says == "does not hold"
+    anew = calibration.check(commands, moved, placed_anew=True, tolerance=9.0)
+    assert anew.says == "holds"
+    with pytest.raises(ValueError, match="must be an arm, got Line"):
+        calibration.to_urdf("line.urdf")
+
+
+def test_seven_names_are_a_model():
+    class Least:  # not derived from Model
+        names, nominal, num_inputs, num_outputs = Line.names, Line.nominal, 1, 1
+        predict, jacobian = Line.predict, Line.jacobian
+        command_jacobian = Line.command_jacobian
+
+    commands = np.arange(6.0)[:, None]
+    measured = 1.0 + 2.0 * commands + 0.1 * np.cos(9.0 * commands)
+    least, line = (identify(commands, measured, model=m) for m in (Least(), Line()))
+    assert least.verdict is None and "of Least" in least.summary()
+    np.testing.assert_allclose(least.estimate, line.estimate, atol=1e-9)
+    assert jaxcal.select(commands, 2, model=Least()).log_det > 0.0
+    assert identifiability(Least(), commands).rank == 2

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, axis_names, in_words, numbers, one_of
 from jaxcal.files import atomic_write
-from jaxcal.models.model import as_commands, as_parameters
+from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
 from jaxcal.models.sensors import SENSORS, Pose, Position, Sensor, Several
 from jaxcal.models.serial.arguments import (
     joint_numbers,
@@ -40,13 +40,17 @@ _WAVES, _WAVE = ("sin", "cos", "sin2", "cos2"), 0.045  # of gears; degrees
 _MOUNTING, _MOUNTING_ANGLE = 0.1, 1.7
 # Of the arm's length: positions so far off are in another frame; so alike, of this arm.
 _NEAR, _ALIKE = 0.2, 0.05
+# How large the errors of a group are beside the prior's, beforehand: lengths, turns of
+# the axes, zeros of the joints, compliance, harmonics. Most arms have little misfit and
+# some have much.
+_SIZES, _SIZES_SPREAD = (1.0, 1.0, 1.0, 1.0, 0.1), (6.0, 6.0, 6.0, 6.0, 10.0)
 _BEYOND = 2.0  # degrees beyond a limit, or percent of a slide's stroke
 # Farther away, or turned by more than 37 degrees (a cosine), no fit of poses finds it.
 _AWAY, _ASIDE = 1.5, 0.8
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class SerialChain(Arm):
+class SerialChain(Arm, Model):
     """n joints; commands and angles in degrees, lengths as in the table.
 
     A row of the table is ``Rz(theta + u) Tz(d) Tx(a) Rx(alpha) Ry(beta)`` in the
@@ -249,6 +253,11 @@ class SerialChain(Arm):
         """What harmonics leave of the misfit, which a choice counts as noise."""
         return self.sensor.misfit * self.length
 
+    @property
+    def fits_misfit(self) -> bool:
+        # Of a URDF file what is written back is what is predicted, without harmonics.
+        return bool(self.sensor.misfit) and self.source is None
+
     def postures(
         self,
         count: int,
@@ -282,7 +291,7 @@ class SerialChain(Arm):
 
         return postures(self, count, seed, near, allowed)
 
-    def require_postures(self, commands: Array) -> None:
+    def require_commands(self, commands: Array) -> None:
         """Refuse radians for degrees, and joints far beyond their limits."""
         low, high = self.limits.T
         units = np.array(self.command_units)
@@ -304,6 +313,38 @@ class SerialChain(Arm):
                 f"{', '.join(self.joint_names)}? Where the file's limits are wrong, "
                 "give limits={name: (low, high)}, --limits"
             )
+
+    def prepared(self, commands: Array, measured: Array | None = None) -> Self:
+        """This arm with its sensor where commands (and readings) put it.
+
+        Raises:
+            ValueError: readings in another unit, of another arm or place, radians for
+                degrees, joints beyond their limits.
+        """
+        from jaxcal.models.serial.plausible import (
+            require_readings,
+            require_sockets,
+            warn_of_radians,
+        )
+
+        if measured is None:
+            arm = self.located(commands)
+            arm.require_commands(commands)
+            warn_of_radians(arm, commands)
+            return arm
+        for part in self.of_each_sensor(commands, measured):
+            require_readings(*part)
+        self.require_commands(commands)
+        arm = self.located(commands, measured)
+        for part in arm.of_each_sensor(commands, measured):
+            require_sockets(*part)
+        return arm
+
+    def distinct(self, commands: Array, measured: Array) -> NDArray[np.intp]:
+        """(K,) the rows that count: contacts written twice count once."""
+        if not self.sensor.zeros or measured.any():
+            return np.arange(len(commands))
+        return np.sort(np.unique(commands, axis=0, return_index=True)[1])
 
     def at_rest(
         self,
@@ -658,6 +699,49 @@ class SerialChain(Arm):
             fixed=self.sensor.unseen(self),
             by_data=self.sensor.sizes_prior,
         )
+
+    def error_groups(self) -> ErrorGroups:
+        """Lengths, turns of the axes, zeros of the joints, compliance, harmonics."""
+        members = np.full(len(self.names), -1)
+        members[: self.table.size].reshape(-1, 5)[:] = [0, 1, 0, 2, 1]
+        members[np.flatnonzero(np.array(self.units) == "deg per torque")] = 3
+        members[len(members) - self.waves.size :] = 4
+        return ErrorGroups(members, np.array(_SIZES), np.array(_SIZES_SPREAD))
+
+    @property
+    def placed(self) -> tuple[str, ...]:
+        """The sensor's own parameters."""
+        return self.sensor.names
+
+    @property
+    def relative(self) -> bool:
+        """The turns of a pose are from the nominal orientation at the command."""
+        return isinstance(self.sensor, Pose)
+
+    def targets(
+        self, desired: Array, start: Array | None
+    ) -> Callable[[Array, NDArray[np.intp]], Array]:
+        """Of a pose its turns from the nominal orientation at any command."""
+        if not self.relative:
+            return super().targets(desired, start)
+        if start is None:
+            raise ValueError(
+                "start must be given for an arm's pose: the joints at whose nominal "
+                "orientation desired is a turn, as rotation_vectors(start, R) makes it"
+            )
+        turned = self.rotations(start, desired[:, 3:])
+
+        def goal(commands: Array, rows: NDArray[np.intp]) -> Array:
+            turns = self.rotation_vectors(commands, turned[rows])
+            return np.hstack([desired[rows, :3], turns])
+
+        return goal
+
+    def verdict(self, fit: Any) -> Any:
+        """:class:`jaxcal.models.serial.verdict.Verdict` of a calibration."""
+        from jaxcal.models.serial.verdict import verdict
+
+        return verdict(fit)
 
     def to_dict(self) -> dict[str, Any]:
         """What a file holds of the model."""

@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import array_of, numbers, require_kind
 from jaxcal.information.blocks import coarseness
 from jaxcal.models.affine import Affine
-from jaxcal.models.model import Model, by_name, require_model
-from jaxcal.models.serial import SerialChain
+from jaxcal.models.model import Model, as_model, by_name
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.criteria import wanted
 from jaxcal.selection.problem.making import (
@@ -62,23 +61,22 @@ class Asked:
         names: Sequence[str] | None = None,
     ) -> None:
         if model is not None:
-            require_model(model)
+            model = as_model(model)
         require_kind("prior", prior, Prior)
         candidates = by_name(model, candidates)
         array = filled("candidates", candidates, "M", "n")
         self.model = Affine(array.shape[1], array.shape[1]) if model is None else model
-        if isinstance(model, Affine) and array.shape[1] != model.num_inputs:
+        if self.model.multiplicity and array.shape[1] != self.model.num_inputs:
             raise ValueError(
-                f"candidates must have shape (M, {model.num_inputs}) for this model, "
-                f"got {array.shape}"
+                f"candidates must have shape (M, {self.model.num_inputs}) for this "
+                f"model, got {array.shape}"
             )
         self.available = check_available(available, array.shape[:1])
         self.candidates = usable_numbers("candidates", array, self.available)
         self.candidates.flags.writeable = False
         self._blocks: Array | None = None
         self._coarse = coarseness(candidates)
-        if noise is None and hasattr(model, "default_noise"):
-            noise = model.default_noise()  # type: ignore[union-attr]  # it has one
+        noise = self.model.default_noise() if noise is None else noise
         self._set_rules(prior, noise, measured, required, max_replicates)
         self.names, self.axes = _labels(candidates, names)
 
@@ -144,7 +142,7 @@ class Asked:
                 model and blocks, else I.
             region: of I, where it is given by its letter.
         """
-        default = "I" if self.model and not isinstance(self.model, Affine) else "D"
+        default = "I" if self.model and not self.model.multiplicity else "D"
         asked = wanted(criterion, region, default)
         source = self.source(asked.by_name, asked.of_region)
         raw, root = source.blocks(), source.root
@@ -171,11 +169,10 @@ class Asked:
             return Given(self._blocks, self.prior, self.noise)
         model, candidates, prior = self.model, self.candidates, self.prior
         assert model is not None and candidates is not None
-        if not of_parameters and isinstance(model, Affine):
-            if shares_regressor(model, prior, self.noise):
-                return Shared(model, candidates, self.noise)
+        if not of_parameters and shares_regressor(model, prior, self.noise):
+            return Shared(model, candidates, self.noise)
         misfit = 0.0
-        if of_predictions and prior is None and isinstance(model, SerialChain):
+        if of_predictions and prior is None:
             misfit = model.misfit_std
             model = model.with_misfit() if misfit else model
         return Modelled(model, candidates, self.available, prior, self.noise, misfit)

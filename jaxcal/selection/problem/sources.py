@@ -13,18 +13,15 @@ A source answers, of candidates (M, n) of which some are available:
 from __future__ import annotations
 
 import dataclasses
-import warnings
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, numbers
 from jaxcal.information.blocks import prior_root
-from jaxcal.models.affine import Affine
 from jaxcal.models.identifiability import identifiability
-from jaxcal.models.model import Model, derivative, facts
-from jaxcal.models.serial import SerialChain
+from jaxcal.models.model import Model, derivative
 from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["Given", "Modelled", "Shared", "Source", "shares_regressor"]
@@ -57,7 +54,7 @@ class Source(Protocol):
 
 def shares_regressor(model: Model, prior: Prior | None, noise: Noise | None) -> bool:
     """Is one block [u, 1] / std, counted once per output, all there is to know?"""
-    if not isinstance(model, Affine):
+    if not model.multiplicity:
         return False
     if noise is not None:
         more = noise.covariance is not None or noise.command_std is not None
@@ -70,13 +67,13 @@ def shares_regressor(model: Model, prior: Prior | None, noise: Noise | None) -> 
 
 
 class Shared(Source):
-    """The affine model where all outputs share one regressor [u, 1] / std."""
+    """A model where all outputs share one regressor, as [u, 1], / std."""
 
-    def __init__(self, model: Affine, candidates: Array, noise: Noise | None) -> None:
+    def __init__(self, model: Model, candidates: Array, noise: Noise | None) -> None:
         self._model, self._candidates = model, candidates
         self._std = 1.0 if noise is None or noise.std is None else float(noise.std)  # type: ignore[arg-type]  # one number
         self.times = model.multiplicity
-        self.root = np.zeros((0, model.num_inputs + 1))
+        self.root = np.zeros((0, model.blocks(candidates[:1]).shape[-1]))
 
     def blocks(self) -> Array:
         return self._model.blocks(self._candidates) / self._std
@@ -130,10 +127,7 @@ class Modelled(Source):
         noise: Noise | None,
         misfit: float = 0.0,
     ) -> None:
-        if isinstance(model, SerialChain):  # whose sensor may stand somewhere
-            model = model.located(candidates[available])
-            model.require_postures(candidates[available])
-            _warn_of_radians(model, candidates[available])
+        model = model.prepared(candidates[available])
         self._model, self._candidates, self._available = model, candidates, available
         self._noise = Noise() if noise is None else noise
         # Readings are off by what no parameter explains; a prediction is no reading.
@@ -144,7 +138,7 @@ class Modelled(Source):
         pairs = zip(model.names, known.free, strict=True)
         self.names = tuple(name for name, free in pairs if free)
         self._precision = known.precision[np.ix_(known.free, known.free)]
-        besides = facts(model, known.mean)[1][:, known.free]
+        besides = model.facts(known.mean)[1][:, known.free]
         self.root = prior_root(self._precision + besides.T @ besides)
 
     @property
@@ -220,15 +214,3 @@ def _weighted(white: Array, jacobian: Array) -> Array:
     if white.strides[0] == 0 and (white[0] == np.diag(scale)).all():
         return jacobian * scale[:, None]
     return white @ jacobian
-
-
-def _warn_of_radians(arm: Any, candidates: Array) -> None:
-    """Postures of an arm that all lie within one turn, had they been radians."""
-    turning = np.array(arm.command_units) == "deg"
-    largest = np.abs(candidates[:, : arm.num_joints][:, turning]).max(initial=0.0)
-    if 0.0 < largest < 2.0 * np.pi:
-        warnings.warn(
-            f"no joint of any candidate is over {largest:.3g}, and joints are in "
-            "degrees; use numpy.degrees where these are radians",
-            stacklevel=2,
-        )

@@ -7,19 +7,20 @@ with predicted covariance S and noise R the residual r becomes ``R (R - S)^-1 r`
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.fit import Fit
 from jaxcal.information.singular import depends
-from jaxcal.models import SerialChain
 from jaxcal.models.sensors import Placed, Pose, Position, Socket
 from jaxcal.models.sensors.sensor import hats
 
 __all__ = ["Verdict", "verdict"]
 
 Array = NDArray[np.float64]
+Chain = Any  # a Chain, whose module imports this one
+Fit = Any  # a jaxcal.Calibration, whose package imports this one
 
 _SCATTER = 3.0  # times the sensor's usual noise: the model does not explain that
 _UNLIKELY = 1e-4  # p-value of lack of fit
@@ -79,16 +80,14 @@ class Verdict:
         return "\n".join([*lines, *self.reasons])
 
 
-def verdict(calibration: Fit) -> Verdict | None:
-    """Of an arm: does its model explain the readings, does it help, what is wrong.
+def verdict(calibration: Fit) -> Verdict:
+    """Does its model explain the readings, does it help, what is wrong.
 
     Held-out errors with an interval beside those of the nominal arm, the scatter
     against the sensor's usual noise, and by name: outliers, contacts of another socket,
-    a socket that was moved, parameters far from what was known. None for other models.
+    a socket that was moved, parameters far from what was known.
     """
     model = calibration.model
-    if not isinstance(model, SerialChain):
-        return None
     if calibration.noise_std is None:
         why = calibration.no_noise("intervals and no verdict")
         return Verdict(
@@ -193,7 +192,7 @@ def _far(calibration: Fit) -> list[str]:
     ]
 
 
-def _other_tip(calibration: Fit, model: SerialChain) -> list[str]:
+def _other_tip(calibration: Fit, model: Chain) -> list[str]:
     """A tip far from where the arm's description has it, if a prior allowed that."""
     if not model.sensor.zeros:
         return []
@@ -212,7 +211,7 @@ def _other_tip(calibration: Fit, model: SerialChain) -> list[str]:
     ]
 
 
-def _other_links(calibration: Fit, model: SerialChain) -> list[str]:
+def _other_links(calibration: Fit, model: Chain) -> list[str]:
     """Lengths and zeros far from the arm's description, if a prior allowed that."""
     names, units = np.array(model.names), np.array(model.units)
     off = np.abs(calibration.parameters - model.nominal)
@@ -241,7 +240,7 @@ def _other_links(calibration: Fit, model: SerialChain) -> list[str]:
     return found
 
 
-def _anywhere(calibration: Fit, model: SerialChain, commands: Array) -> float:
+def _anywhere(calibration: Fit, model: Chain, commands: Array) -> float:
     """Standard deviation of the tip's position at postures of any kind.
 
     Beside a shift and a turn of the whole arm, which contacts do not show. NaN of
@@ -273,7 +272,7 @@ def _anywhere(calibration: Fit, model: SerialChain, commands: Array) -> float:
     return float(np.sqrt(((moves @ covariance) * moves).sum() / _DRAWN))
 
 
-def _exchanged(calibration: Fit, model: SerialChain) -> list[str]:
+def _exchanged(calibration: Fit, model: Chain) -> list[str]:
     """Sockets that were found where others were said to be."""
     sensor = model.sensor
     if not isinstance(sensor, Socket) or sensor.places is None:
@@ -289,7 +288,7 @@ def _exchanged(calibration: Fit, model: SerialChain) -> list[str]:
     ]
 
 
-def _groups(model: SerialChain, commands: Array) -> list[NDArray[np.intp]]:
+def _groups(model: Chain, commands: Array) -> list[NDArray[np.intp]]:
     """Rows of each socket, plane or anchor, in the order of measuring."""
     if not isinstance(model.sensor, Placed):
         return []
@@ -298,7 +297,7 @@ def _groups(model: SerialChain, commands: Array) -> list[NDArray[np.intp]]:
 
 
 def _moved(
-    model: SerialChain, commands: Array, residuals: Array, names: NDArray[np.intp]
+    model: Chain, commands: Array, residuals: Array, names: NDArray[np.intp]
 ) -> list[str]:
     """Sockets and planes whose first and last contacts lie apart."""
     found = []
@@ -337,7 +336,7 @@ def _split(values: Array) -> tuple[float, int, float, float]:
 
 
 def _swapped(
-    calibration: Fit, model: SerialChain, used: NDArray[np.intp], explains: bool
+    calibration: Fit, model: Chain, used: NDArray[np.intp], explains: bool
 ) -> dict[int, int]:
     """Outliers that fit another socket or plane, as if their column were wrong."""
     sensor = model.sensor

@@ -1,0 +1,100 @@
+"""Commands and readings that no arm like this one can take or give, refused by name."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.checks import in_words
+from jaxcal.models.sensors import Pose, Position, Socket
+
+__all__ = ["require_readings", "require_sockets", "warn_of_radians"]
+
+Array = NDArray[np.float64]
+Chain = Any  # a SerialChain, whose module imports this one
+
+_NOMINAL = 0.1  # of its length: no arm is so far off, tip included, before it is fitted
+_APART = 0.2  # of it: what two sockets may seem to be off their distance
+_OTHER_UNIT = 0.01  # of it: so far off and tenfold, a distance is in another unit
+
+
+def require_readings(arm: Chain, commands: Array, measured: Array) -> None:
+    """Refuse millimetres for metres, radians for degrees: an arm is not off tenfold."""
+    if not isinstance(arm.sensor, Position | Pose):
+        return
+    spread = []
+    for points in (measured[:, :3], arm.predict(commands)[:, :3]):
+        apart = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+        spread.append(float(np.median(apart)))
+    if max(spread) > max(10.0 * min(spread), 0.01 * arm.length):
+        raise ValueError(
+            "measured must be in the unit of the model's lengths and commands in "
+            f"degrees: measured positions spread over {spread[0]:g}, those predicted "
+            f"over {spread[1]:g}"
+        )
+
+
+def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
+    """Refuse contacts that no arm near the nominal one can have made."""
+    if not isinstance(arm.sensor, Socket):
+        return
+    which = arm.sensor.of_rows(commands[:, arm.num_joints :])
+    joints = commands[:, : arm.num_joints]
+    _, first, groups = np.unique(joints, axis=0, return_index=True, return_inverse=True)
+    for row in np.flatnonzero(which != which[first][groups.ravel()])[:1]:
+        raise ValueError(
+            f"a posture must have the ball in one socket, but row {row} is row "
+            f"{first[groups.ravel()[row]]} with another socket: rows of the other file?"
+        )
+    if measured.any():  # offsets that were measured, as in a simulation, are of any tip
+        return
+    points = arm.calibrated(arm.nominal).predict(joints)
+    most, middles = _NOMINAL * arm.length, {}
+    for i in np.unique(which):
+        rows = np.flatnonzero(which == i)
+        middles[i] = np.median(points[rows], axis=0)
+        far = np.linalg.norm(points[rows] - middles[i], axis=1)
+        if len(rows) > 2 and np.median(far) > most:
+            raise ValueError(
+                f"contacts of socket {i} must be at one point within {most:.2g}, but "
+                f"the arm as described scatters by {np.median(far):.2g} there: a wrong "
+                "tip, unit, sign or order of columns, or rows of another place?"
+            )
+        lost = rows[far > most + 4.0 * np.median(far)]
+        if lost.size:
+            raise ValueError(
+                f"contacts of socket {i} must be at one point within {most:.2g}, but "
+                f"rows {in_words(lost)} are {far.max():.2g} from the others there: "
+                "rows of another place?"
+            )
+    for one, other, distance, _ in arm.sensor.distances:
+        missing = {int(one), int(other)} - set(middles)
+        if missing:
+            raise ValueError(
+                f"commands must have contacts of socket {missing.pop()}, whose "
+                "distance from another is given"
+            )
+        found = float(np.linalg.norm(middles[int(one)] - middles[int(other)]))
+        off = abs(found - distance) / arm.length
+        unit = off > _OTHER_UNIT and not 0.1 < found / distance < 10.0
+        if off > _APART or unit:
+            raise ValueError(
+                f"sockets {int(one)} and {int(other)} must be {distance:g} apart, but "
+                f"the arm as described puts them {found:.3g} apart: rows of another "
+                "place or another unit?"
+            )
+
+
+def warn_of_radians(arm: Chain, candidates: Array) -> None:
+    """Postures of an arm that all lie within one turn, had they been radians."""
+    turning = np.array(arm.command_units) == "deg"
+    largest = np.abs(candidates[:, : arm.num_joints][:, turning]).max(initial=0.0)
+    if 0.0 < largest < 2.0 * np.pi:
+        warnings.warn(
+            f"no joint of any candidate is over {largest:.3g}, and joints are in "
+            "degrees; use numpy.degrees where these are radians",
+            stacklevel=2,
+        )
