@@ -10,8 +10,10 @@ function makes the value of a text. An underscore at the end is no part of a nam
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import inspect
+import logging
 import math
 import pathlib
 import re
@@ -20,7 +22,15 @@ import typing
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal, NoReturn, TypeVar
 
-__all__ = ["Parser", "exit_code", "number_type", "refused", "several", "values_of"]
+__all__ = [
+    "Parser",
+    "exit_code",
+    "number_type",
+    "refused",
+    "several",
+    "told",
+    "values_of",
+]
 
 T = TypeVar("T")
 _METAVARS = {int: "N", float: "X", pathlib.Path: "FILE"}
@@ -126,6 +136,18 @@ def _add(
     names = [f"-{name}", long] if len(name) == 1 else [long]
     more |= {"dest": name, "help": text.replace("%", "%%")}
     parser.add_argument(*names if option else (), **more)
+
+
+@contextlib.contextmanager
+def told() -> Iterator[None]:
+    """What jaxcal logs inside the block is shown on standard error."""
+    log, shown = logging.getLogger("jaxcal"), logging.StreamHandler()
+    log.setLevel(logging.INFO)
+    log.addHandler(shown)
+    try:
+        yield
+    finally:
+        log.removeHandler(shown)
 
 
 def refused(program: str, error: Exception) -> int:

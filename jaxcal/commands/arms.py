@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arguments import several
-from jaxcal.commands.tables import Table
+from jaxcal.csvtable import COMMANDS, Table
 from jaxcal.models import Model, SerialChain, from_dict
+from jaxcal.models.linear import input_letters
 from jaxcal.models.sensors import SENSORS, Placed, Socket
 
 __all__ = ["ArmOptions", "ModelPath", "in_degrees"]
@@ -111,15 +112,44 @@ class ArmOptions:
             raise ValueError("options of an arm need --model FILE.urdf")
         return None if path is None else _read_model(path)
 
+    def columns(
+        self,
+        model: Any,
+        table: Table,
+        chosen: str | None = None,
+        option: str = "--columns",
+        but: Sequence[str] = (),
+    ) -> tuple[str, ...]:
+        """The columns of the commands: those of the model's inputs where it has names.
+
+        Args:
+            model: None for an affine one.
+            table: whose columns they are.
+            chosen: by ``option``.
+            option: its name.
+            but: columns that hold something else.
+        """
+        inputs = tuple(getattr(model, "inputs", ()))
+        if not inputs:
+            return table.commands(chosen, option, but)
+        letters = inputs == input_letters(len(inputs))
+        if letters and table.headed and not {*inputs} & {*table.bare(COMMANDS)}:
+            # x, y, z of a polynomial are places: the table's columns in their order.
+            names = table.commands(chosen, option, but)
+            if len(names) == len(inputs):
+                table.say(inputs, names, "in their order")
+                return names
+        return table.named(inputs, COMMANDS, chosen=chosen, option=option)
+
     def commands(
         self,
         model: Any,
         table: Table,
-        inputs: Sequence[str],
+        columns: Sequence[str],
         used: NDArray[np.bool_] | None = None,
     ) -> Array:
         """(N, n) the columns of the commands, an arm's joints in degrees."""
-        commands = table.columns(inputs, used)
+        commands = table.columns(columns, used)
         return in_degrees(model, commands) if self.radians else commands
 
 

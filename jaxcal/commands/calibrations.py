@@ -19,10 +19,10 @@ from jaxcal.commands.questions import Numbers
 from jaxcal.commands.tables import (
     Output,
     TablePath,
-    read_table,
     write_json,
     write_rows,
 )
+from jaxcal.csvtable import COMMANDS, MEASURED, read_table
 from jaxcal.extras import needs
 from jaxcal.models import SerialChain
 from jaxcal.models.sensors import SENSORS, Placed
@@ -69,7 +69,7 @@ def postures(
     arm = of_arm.read(model, reached, near if placed else None)
     header, done = (*arm.joint_names, *arm.sensor.inputs), None
     if reached is not None:
-        done = of_arm.commands(arm, reached, header)
+        done = of_arm.commands(arm, reached, reached.named(header, COMMANDS))
         arm.require_commands(done)
         arm = arm.located(done)
     left = k - (0 if done is None else len(done))
@@ -126,23 +126,22 @@ def identify(
     table, as_urdf = read_table(file), out.lower().endswith(".urdf")
     machine: Any = of_arm.machine(model, table)
     if (model or "").lower().endswith(".urdf"):
-        names = table.inputs(inputs) if inputs else machine.inputs
+        names = of_arm.columns(machine, table, inputs, "--inputs")
         commands = of_arm.commands(machine, table, names)
         known = machine.sensor.outputs
         if machine.sensor.zeros:  # a contact needs no columns of readings
             measured = np.zeros((len(commands), len(known)))
         else:
-            if outputs or set(known) - set(table.names):
-                known = table.outputs(outputs)
+            known = table.named(known, MEASURED, chosen=outputs, option="--outputs")
             measured = table.columns(known)
         if as_urdf and os.path.exists(out) and not force:
             raise ValueError(f"{out} is there already; --force writes over it")
     else:
         if as_urdf:
             raise ValueError("--out FILE.urdf needs --model FILE.urdf")
-        known, names = table.outputs(outputs), table.inputs(inputs)
-        if not inputs:
-            names = tuple(n for n in names if n not in (*known, weights))
+        known = table.outputs(outputs)
+        other = (*known, weights or "")
+        names = of_arm.columns(machine, table, inputs, "--inputs", other)
         if both := sorted({*names} & {*known}):
             raise ValueError(f"--inputs and --outputs must differ, both hold {both[0]}")
         commands, measured = table.columns(names), table.columns(known)
@@ -188,7 +187,9 @@ def predict(
 ) -> None:
     """Where a calibrated machine goes for given commands."""
     found = Calibration.load(calibration)
-    commands = _given(file, columns, found.input_names)
+    table, unit = read_table(file), found.command_unit
+    names = table.named(found.input_names, COMMANDS, chosen=columns, unit=unit)
+    commands = table.columns(names)
     if radians:
         if not isinstance(found.model, SerialChain):
             raise ValueError("--radians is of arms")
@@ -220,27 +221,15 @@ def command(
     A command beyond its limits is refused; --clip moves it onto the limit instead.
     """
     found = Calibration.load(calibration)
-    desired = _given(file, columns, found.output_names)
+    table, unit = read_table(file), found.measured_unit
+    names = table.named(found.output_names, MEASURED, chosen=columns, unit=unit)
+    desired = table.columns(names)
     if clip and not limits:
         raise ValueError("--clip needs --limits")
     if limits and len(limits) == 1:
         limits = limits * found.num_inputs
     commands = found.command_for(desired, limits=limits or None, clip=clip)
     _emit(output, found.input_names, commands)
-
-
-def _given(file: str, chosen: str | None, known: tuple[str, ...]) -> Array:
-    """Columns chosen; else the calibration's own, else all, if they are as many."""
-    table = read_table(file)
-    columns = table.inputs(chosen) if chosen else table.names
-    if not chosen and set(known) <= set(table.names):
-        columns = known
-    if len(columns) != len(known):
-        raise ValueError(
-            f"{table.source}: {len(known)} columns are needed ({', '.join(known)}), "
-            f"got {len(columns)} ({', '.join(columns)}); name them with --columns"
-        )
-    return table.columns(columns)
 
 
 def _emit(output: Output, names: Sequence[str], values: Array) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
-from jaxcal.arguments import Parser, refused, several, values_of
+from jaxcal.arguments import Parser, refused, several, told, values_of
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder, write_text
 
@@ -220,7 +220,8 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
         options.command = [*command, *given]
         if not of_task and options.stream is not None:
             kept = "finished parts are kept; the same command goes on"
-        made.function(options)
+        with told():
+            made.function(options)
     except KeyboardInterrupt as stop:
         terminated = isinstance(stop, _Terminated)
         how = "terminated" if terminated else "interrupted"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import inspect
-import logging
 import os
 import platform
 import re
@@ -12,7 +11,7 @@ import sys
 import warnings
 from typing import Annotated
 
-from jaxcal.arguments import Parser, refused, values_of
+from jaxcal.arguments import Parser, refused, told, values_of
 from jaxcal.checks import aligned
 from jaxcal.extras import MissingExtraError
 
@@ -61,11 +60,8 @@ def main(argv: list[str] | None = None) -> int:
         module = importlib.import_module(f"jaxcal.commands.{given[0]}")
         return int(module.main(given[1:], prog=f"jaxcal {given[0]}"))
     arguments = _parser(given).parse_args(given)
-    log, shown = logging.getLogger("jaxcal"), logging.StreamHandler()
-    log.setLevel(logging.INFO)
-    log.addHandler(shown)
     try:
-        with warnings.catch_warnings():
+        with told(), warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = lambda warning, *_: print(
                 f"jaxcal {arguments.command}: warning:",
@@ -81,8 +77,6 @@ def main(argv: list[str] | None = None) -> int:
         return 130
     except (ValueError, OSError, MissingExtraError) as error:
         return refused(f"jaxcal {arguments.command}", error)
-    finally:
-        log.removeHandler(shown)
     return 0
 
 

@@ -6,10 +6,12 @@ import dataclasses
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaxcal.arguments import several
 from jaxcal.commands.arms import ArmOptions, ModelPath
-from jaxcal.commands.tables import Output, Table, TablePath, read_table
+from jaxcal.commands.tables import Output, TablePath
+from jaxcal.csvtable import Table, read_table
 from jaxcal.information.singular import require_excited
 from jaxcal.models import Affine, Noise
 from jaxcal.selection import Design, Selection
@@ -38,8 +40,7 @@ class Asked:
     def design(self, table: Table, of_arm: ArmOptions) -> Design:
         """Of these candidates."""
         model, mask = of_arm.machine(self.model, table), table.available()
-        names = getattr(model, "inputs", ()) if self.columns is None else ()
-        names = tuple(names) or table.inputs(self.columns)
+        names = of_arm.columns(model, table, self.columns)
         candidates = of_arm.commands(model, table, names, mask)
         if self.outputs is not None:
             if model is not None:
@@ -150,10 +151,7 @@ def score(
                 f"--subset must be a file, got {subset!r}; rows by their numbers are "
                 f"--indices {subset}"
             )
-        column = read_table(subset).columns(["index"])[:, 0]
-        if not (column == column.round()).all():
-            raise ValueError(f"{subset}: index must hold whole numbers")
-        rows = column.astype(int)
+        rows = _rows_of(read_table(subset), table)
     selection = asked.design(table, of_arm).score(
         rows, judged.by(), reference=reference, time_limit=time_limit
     )
@@ -193,6 +191,33 @@ def plan(
     if not output.written(header, rows, dataclasses.asdict(result)):
         print(result.table())
         print(f"measure rows {', '.join(str(i) for i in result.indices)}")
+
+
+def _rows_of(subset: Table, table: Table) -> NDArray[np.int64]:
+    """(k,) rows of the table, by the column ``index`` of what ``select`` wrote.
+
+    Raises:
+        ValueError: the numbers beside it are not those of the table's row.
+    """
+    column = subset.columns(["index"])[:, 0]
+    for line, number in zip(subset.lines, column, strict=True):
+        if not (number == round(number) and 0 <= number < len(table)):
+            raise ValueError(
+                f"{subset.source}: line {line}, index must be a row of {table.source}, "
+                f"0 to {len(table) - 1}, got {number:g}"
+            )
+    rows = column.astype(np.int64)
+    shared = [name for name in table.names if name in subset.names and name != "index"]
+    if not subset.headed or not shared:
+        return rows
+    given, held = subset.columns(shared), table.columns(shared)[rows]
+    for row, place in np.argwhere(~np.isclose(given, held, rtol=1e-9, atol=0.0)):
+        raise ValueError(
+            f"{subset.source}: line {subset.lines[row]}, column {shared[place]!r} is "
+            f"{given[row, place]:g}, row {rows[row]} of {table.source} has "
+            f"{held[row, place]:g}: it is not a choice from this table"
+        )
+    return rows
 
 
 def _one_or_all(values: list[float]) -> float | list[float]:

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from jaxcal.arguments import refused
+from jaxcal.arguments import refused, told
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder
 from jaxcal.learning.runtime import cache, processes
@@ -51,7 +51,8 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
         try:
             with needs("policy", "training"):
                 from jaxcal.commands.train_arguments import parser
-            return _run(parser(prog).parse_args(given))
+            with told():
+                return _run(parser(prog).parse_args(given))
         except (ValueError, OSError, MissingExtraError) as error:
             return refused(prog, error)
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.tasks import registry
 from jaxcal.arguments import Parser, number_type
-from jaxcal.commands.tables import read_table
+from jaxcal.csvtable import read_table
 from jaxcal.learning.config import StreamsConfig
 from jaxcal.learning.environments.task import GivenCandidates
 from jaxcal.learning.runtime import processes
@@ -201,7 +201,7 @@ def candidates_of(path: str) -> GivenCandidates:
     else:
         table = read_table(path)
         mask = table.available()
-        values = table.columns(table.inputs(None), mask)[None]
+        values = table.columns(table.commands(None, option=None), mask)[None]
         available = None if mask is None else mask[None]
     used = values if available is None else values[available]
     used = used.reshape(-1, used.shape[-1])

@@ -5,13 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from jaxcal.checks import axis_letter
-from jaxcal.evaluation.csv_rows import read_columns
+from jaxcal.csvtable import COMMANDS, MEASURED, Table, parse
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.files import atomic_write
 
@@ -56,59 +56,58 @@ def save_csv(
         text.detach()
 
 
-def read_csv(data: bytes) -> dict[str, Any]:
-    """The fields of a ``Dataset``."""
-    names, lines, table = read_columns(data, _columns)
-    if not lines:
-        raise ValueError("no candidates below the header")
-    labels = table[:, :2]
-    for row, place in np.argwhere((labels % 1 != 0) | (np.abs(labels) > 2.0**53)):
+def read_csv(source: str, data: bytes) -> dict[str, Any]:
+    """The fields of a ``Dataset``; ``source`` is the file's name in errors."""
+    table = parse(source, data)
+    names = _columns(table)
+    values = table.columns(names)
+    for row, place in np.argwhere(
+        (values[:, :2] % 1 != 0) | (abs(values[:, :2]) > 2.0**53)
+    ):
         raise ValueError(
-            f'line {lines[row]}: "{names[place]}" must be a whole number of at most '
-            f"2^53, got {labels[row, place]:g}"
+            f"{source}: line {table.lines[row]}, {names[place]} must be a whole number "
+            f"of at most 2^53, got {values[row, place]:g}"
         )
-    order = np.lexsort(labels.T[::-1])
-    labels = labels[order]
+    order = np.lexsort(values[:, 1::-1].T)
+    labels = values[order, :2]
     for place in np.flatnonzero((labels[1:] == labels[:-1]).all(axis=1)):
-        first, again = (lines[row] for row in order[place : place + 2])
+        first, again = (table.lines[row] for row in order[place : place + 2])
         raise ValueError(
-            f"line {again}: candidate {labels[place, 1]:.0f} of episode "
+            f"{source}: line {again}: candidate {labels[place, 1]:.0f} of episode "
             f"{labels[place, 0]:.0f} was already given in line {first}"
         )
     episodes, counts = np.unique(labels[:, 0], return_counts=True)
     for other in np.flatnonzero(counts != counts[0]):
         raise ValueError(
-            f"every episode must have as many candidates: episode {episodes[0]:.0f} "
-            f"has {counts[0]}, episode {episodes[other]:.0f} has {counts[other]}"
+            f"{source}: every episode must have as many candidates: episode "
+            f"{episodes[0]:.0f} has {counts[0]}, episode {episodes[other]:.0f} has "
+            f"{counts[other]}"
         )
-    sorted_table = table[order].reshape(len(episodes), counts[0], len(names))
-    u, y, free = (
+    shape = len(episodes), counts[0]
+    in_order = values[order].reshape(*shape, len(names))
+    u, y = (
         [i for i, name in enumerate(names) if name.startswith(start)]
-        for start in ("u_", "y_", _MASK)
+        for start in (COMMANDS, MEASURED)
     )
-    fields: dict[str, Any] = {"candidates": sorted_table[..., u]}
+    fields: dict[str, Any] = {"candidates": in_order[..., u]}
     if y:
-        fields["measured"] = sorted_table[..., y]
-    if free:
-        for row in np.flatnonzero(~np.isin(table[:, free[0]], (0, 1))):
-            raise ValueError(
-                f'line {lines[row]}: "{_MASK}" must be 0 or 1, got '
-                f"{table[row, free[0]]:g}"
-            )
-        fields["available"] = sorted_table[..., free[0]] == 1.0
+        fields["measured"] = in_order[..., y]
+    if (mask := table.available()) is not None:
+        fields["available"] = mask[order].reshape(shape)
     return fields
 
 
-def _columns(header: Sequence[str]) -> list[str]:
+def _columns(table: Table) -> list[str]:
     """All of them, the labels first."""
+    source, header = table.source, table.header
     for name in _LABELS:
-        if name not in header:
-            raise ValueError(f'column "{name}" is missing, found {",".join(header)}')
-    if not any(name.startswith("u_") for name in header):
-        raise ValueError('no input column ("u_x", ...) in the header')
+        if name not in header or not table.headed:
+            raise ValueError(
+                f"{source}: column {name!r} is missing; columns: {', '.join(header)}"
+            )
+    if not any(name.startswith(COMMANDS) for name in header):
+        raise ValueError(f"{source}: no column of commands, u_x say, in the header")
     for name in header:
-        if name not in (*_LABELS, _MASK) and not name.startswith(("u_", "y_")):
-            raise ValueError(f'unknown column "{name}"')
-        if header.count(name) > 1:
-            raise ValueError(f'column "{name}" comes twice')
-    return [*_LABELS, *(name for name in header if name not in _LABELS)]
+        if name not in (*_LABELS, _MASK) and not name.startswith((COMMANDS, MEASURED)):
+            raise ValueError(f"{source}: unknown column {name!r}")
+    return [*_LABELS, *(name for name in header if name not in (*_LABELS, _MASK))]

@@ -37,18 +37,16 @@ def load_dataset(path: str | os.PathLike[str]) -> Dataset:
         ValueError: naming the file and the key, row or line at fault.
     """
     file = pathlib.Path(path)
-    data = file.read_bytes()
+    data, ending = file.read_bytes(), file.suffix.lower()
+    sha256 = hashlib.sha256(data).hexdigest()
+    if ending == ".csv":  # its errors name the file
+        return Dataset(file.name, sha256=sha256, **read_csv(os.fspath(path), data))
     try:
         if not data:
             raise ValueError("the file is empty")
-        if file.suffix.lower() == ".npz":
-            fields = _read_npz(data)
-        elif file.suffix.lower() == ".csv":
-            fields = read_csv(data)
-        else:
+        if ending != ".npz":
             raise ValueError("a dataset must be a .npz or .csv file")
-        sha256 = hashlib.sha256(data).hexdigest()
-        return Dataset(name=file.name, sha256=sha256, **fields)
+        return Dataset(file.name, sha256=sha256, **_read_npz(data))
     except ValueError as error:
         raise ValueError(f"{os.fspath(path)}: {error}") from None
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from jaxcal.evaluation.csv_rows import read_rows
+from jaxcal.csvtable import read_table
 from jaxcal.plots.style import COLOURS, panels
 
 __all__ = ["last_rewards", "read_metrics", "training_curves"]
@@ -86,22 +86,11 @@ def read_metrics(path: pathlib.Path) -> dict[str, Array]:
         OSError: it cannot be read.
         ValueError: it cannot be understood, naming the line or column.
     """
-    try:
-        header, rows = read_rows(path.read_bytes())
-        if not rows:
-            raise ValueError("no update is recorded yet")
-        for name in ("episodes", "reward_mean"):
-            if name not in header:
-                raise ValueError(f'column "{name}" is missing')
-        values = []
-        for line, row in rows:
-            try:
-                values.append([float(cell) if cell.strip() else np.nan for cell in row])
-            except ValueError:
-                raise ValueError(f"line {line}: not a number") from None
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    return dict(zip(header, np.array(values).T, strict=True))
+    table = read_table(str(path))
+    for name in ("episodes", "reward_mean", *table.labels):
+        if name not in table.names:
+            table.columns([name])  # says that it is missing, or no number
+    return dict(zip(table.names, table.values.T, strict=True))
 
 
 def last_rewards(folder: pathlib.Path, metrics: dict[str, Array]) -> tuple[Array, str]:

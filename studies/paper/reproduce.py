@@ -128,7 +128,7 @@ def _files(
     progress: Progress,
 ) -> dict[str, bytes]:
     """Everything to write, by path below the folder; the page last."""
-    from jaxcal.evaluation.csv_rows import csv_text
+    from jaxcal.csvtable import csv_text
     from jaxcal.plots.style import as_files
     from studies.paper.exhibits.page import json_document, page
 

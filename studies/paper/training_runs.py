@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arguments import Parser, exit_code, values_of
-from jaxcal.evaluation.csv_rows import csv_text
+from jaxcal.csvtable import csv_text
 from jaxcal.files import require_writable_folder, write_text
 
 Array = NDArray[np.float64]

@@ -172,7 +172,7 @@ FLAT[1, :, 2] = 1.0
         (["--dataset", "{tmp}/none.npz"], "none.npz: No such file"),
         (["--dataset", "{tmp}/torn.npz"], "torn.npz: not a .npz file, or a truncated"),
         (["--dataset", "{tmp}/key.npz"], 'key "candidates" is missing'),
-        (["--dataset", "{tmp}/bad.csv"], 'bad.csv: line 2: "u_y" must be a number'),
+        (["--dataset", "{tmp}/bad.csv"], "bad.csv: line 2, column 'u_y' must hold"),
         (["--dataset", "{tmp}/flat.npz"], "flat.npz: in set 1: .* lie in one plane"),
         (["--checkpoint", "x", "--methods", "exact"], "no policy is among --methods"),
         (["--run", "{tmp}"], "holds no metrics.csv"),

@@ -513,11 +513,11 @@ def test_labels_of_a_long_run_are_not_cut_off(tmp_path: pathlib.Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "no update is recorded"),
-        ("episodes,reward_mean\n", "no update is recorded"),
-        ("episodes,reward\n1,2\n", 'column "reward_mean" is missing'),
-        ("episodes,reward_mean\n1,2\n3\n", "line 3: 1 cells, 2 in the header"),
-        ("episodes,reward_mean\n1,x\n", "line 2: not a number"),
+        ("", "the table is empty"),
+        ("episodes,reward_mean\n", "no rows below the header"),
+        ("episodes,reward\n1,2\n", "there is no column 'reward_mean'"),
+        ("episodes,reward_mean\n1,2\n3\n", "line 3 has 1 cells, the first has 2"),
+        ("episodes,reward_mean\n1,x\n", "line 2, column 'reward_mean' .* got 'x'"),
     ],
 )
 def test_bad_metrics_are_named(tmp_path: pathlib.Path, text: str, message: str) -> None:

@@ -384,9 +384,9 @@ def test_help_teaches() -> None:
         (["--seed", "-1"], "--seed: must be a whole number of at least 0"),
         (["--data", "{tmp}/none"], "--data must be a folder"),
         (["--data", "{tmp}"], "dataset5.csv: No such file"),
-        (["--data", "{tmp}/bad"], 'column "u_deg_pitch" is missing'),
+        (["--data", "{tmp}/bad"], "there is no column 'u_deg_pitch'"),
         (["--out", "{tmp}/file"], "is not a folder"),
-        (["--studies", "{tmp}/torn"], 'column "reward_mean" is missing'),
+        (["--studies", "{tmp}/torn"], "there is no column 'reward_mean'"),
         (["--fast"], "unrecognized arguments: --fast"),
     ],
 )

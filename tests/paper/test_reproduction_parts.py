@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from jaxcal.calibration.identify import identify
-from jaxcal.evaluation.csv_rows import csv_text
+from jaxcal.csvtable import csv_text
 from jaxcal.evaluation.parameters import least_squares, predict
 from jaxcal.plots import as_bytes
 from studies.paper.exhibits.devices import Device

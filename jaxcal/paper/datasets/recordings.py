@@ -17,14 +17,13 @@ import hashlib
 import json
 import os
 import pathlib
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges
-from jaxcal.evaluation.csv_rows import read_columns
+from jaxcal.csvtable import parse
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.paper.constants import AXES, EPISODES, NUM_CANDIDATES, RANGES
 
@@ -87,38 +86,21 @@ def read_pool(
     file = pathlib.Path(path)
     data = file.read_bytes()
     ranges = _ranges_beside(file)
-    try:
-        _, lines, values = read_columns(data, _wanted, _is_posture)
-        if not lines:
-            raise ValueError("no postures below the header")
-        unit = ranges.normalise(values[:, :3])
-        for row in np.flatnonzero(((unit < 0.0) | (unit > 1.0)).any(axis=1)):
-            low, high = ranges.low.tolist(), ranges.high.tolist()
-            raise ValueError(
-                f"posture {row + 1} is commanded {values[row, :3].tolist()} deg, "
-                f"outside the ranges {low} to {high}; name wider ones as "
-                f'"ranges_deg" in {file.with_suffix(".json").name}'
-            )
-    except ValueError as error:
-        raise ValueError(f"{os.fspath(path)}: {error}") from None
+    table = parse(os.fspath(path), data)
+    # Not the zero posture, which a session visits again to measure its drift.
+    roles = np.array(table.labels.get("role", [""] * len(table)))
+    used = roles != "reference"
+    columns = [f"{what}_deg_{axis}" for what in "uy" for axis in AXES]
+    values = table.columns(columns, used)[used]
+    unit = ranges.normalise(values[:, :3])
+    for row in np.flatnonzero(((unit < 0.0) | (unit > 1.0)).any(axis=1)):
+        low, high = ranges.low.tolist(), ranges.high.tolist()
+        raise ValueError(
+            f"{table.source}: posture {row + 1} is commanded "
+            f"{values[row, :3].tolist()} deg, outside the ranges {low} to {high}; name "
+            f'wider ones as "ranges_deg" in {file.with_suffix(".json").name}'
+        )
     return values[:, :3], values[:, 3:], ranges, hashlib.sha256(data).hexdigest()
-
-
-def _wanted(header: list[str]) -> list[str]:
-    """The columns of commands and readings."""
-    if not header:
-        raise ValueError("the file is empty")
-    names = [f"{what}_deg_{axis}" for what in "uy" for axis in AXES]
-    for name in names:
-        if header.count(name) != 1:
-            how = "missing" if name not in header else "there twice"
-            raise ValueError(f'column "{name}" is {how}')
-    return names
-
-
-def _is_posture(cells: Mapping[str, str]) -> bool:
-    """Not the zero posture, which a session visits again to measure its drift."""
-    return cells.get("role") != "reference"
 
 
 def _ranges_beside(recording: pathlib.Path) -> JointRanges:

@@ -7,7 +7,7 @@ import io
 import numpy as np
 import pytest
 
-from jaxcal.commands.tables import read_table
+from jaxcal.csvtable import read_table
 
 
 def written(tmp_path, text, name="table.csv"):
@@ -21,7 +21,7 @@ def test_csv_keeps_names_numbers_and_text(tmp_path):
     assert table.names == ("a", "b")
     assert table.labels == {"pose": ["left", "right"]}
     np.testing.assert_array_equal(table.values, [[1, 2.5], [3, -400]])
-    assert table.inputs(None) == ("a", "b")
+    assert table.commands(None) == ("a", "b")
     np.testing.assert_array_equal(table.columns(["b", "a"]), [[2.5, 1], [-400, 3]])
 
 
@@ -37,7 +37,7 @@ def test_columns_by_their_prefix_and_availability(tmp_path):
     table = read_table(
         written(tmp_path, "u_1,y_1,available,u_2\n1,7,1,2\n3,8,0,\n"),
     )
-    assert table.inputs(None) == ("u_1", "u_2")
+    assert table.commands(None) == ("u_1", "u_2")
     assert table.outputs(None) == ("y_1",)
     np.testing.assert_array_equal(table.available(), [True, False])
     assert np.isnan(table.columns(["u_2"], table.available())[1, 0])
@@ -66,7 +66,9 @@ def test_damaged_tables_are_refused(tmp_path, text, message):
 
 def test_refusals_name_the_column(tmp_path):
     table = read_table(written(tmp_path, "a,b\n1,x\n2,3\n"))
-    with pytest.raises(ValueError, match="column 'b' must hold numbers, got 'x'"):
+    with pytest.raises(
+        ValueError, match="line 2, column 'b' must hold a number, got 'x'"
+    ):
         table.columns(["b"])
     with pytest.raises(ValueError, match="no column 'c'; columns: a"):
         table.columns(["c"])
