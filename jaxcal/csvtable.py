@@ -29,6 +29,7 @@ __all__ = [
     "Table",
     "columns_by_name",
     "csv_text",
+    "names_of",
     "of_frame",
     "parse",
     "read_table",
@@ -316,24 +317,29 @@ def _bare(name: str, prefix: str, unit: str) -> str:
     return name
 
 
+def names_of(frame: Any) -> tuple[str, ...]:
+    """Names of the columns of a data frame; () of what has none."""
+    header = tuple(getattr(frame, "columns", ()))
+    return header if all(isinstance(name, str) for name in header) else ()
+
+
 def of_frame(argument: str, frame: Any, wanted: Sequence[str], prefix: str) -> Any:
     """Of a data frame the columns that are wanted, by name; anything else as given.
 
     Raises:
         ValueError: a name is missing, or could be either of two.
     """
-    header = list(getattr(frame, "columns", ()))
-    if not header or not all(isinstance(name, str) for name in header):
+    header = names_of(frame)
+    if not header:
         return frame
     try:
         found = columns_by_name(wanted, header, prefix)
     except ValueError as error:
         raise ValueError(f"{argument}: {error}") from None
     if None in found:
-        missing = wanted[found.index(None)]
         raise ValueError(
-            f"{argument} must have the columns {', '.join(wanted)}, {missing!r} is "
-            f"missing, got {', '.join(header)}"
+            f"{argument} must have the columns {', '.join(wanted)}, "
+            f"{wanted[found.index(None)]!r} is missing (columns: {', '.join(header)})"
         )
     return frame[found]
 

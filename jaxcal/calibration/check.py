@@ -77,6 +77,7 @@ def check(
     commands = _postures(calibration, "commands", commands)
     shape = len(commands), calibration.num_outputs
     rule = ": as many rows as commands"
+    measured = calibration.by_name("measured", measured)
     measured = array_of("measured", measured, *shape, rule=rule)
     model = calibration.model
     distinct = model.distinct(commands, measured)
@@ -142,6 +143,7 @@ def check(
 
 def _postures(calibration: Fit, name: str, given: ArrayLike) -> Array:
     """(N, n) commands that the calibration's machine can take."""
+    given = calibration.by_name(name, given)
     rows = array_of(name, given, "N", calibration.num_inputs)
     if not len(rows):
         raise ValueError(f"{name} must hold at least one row, got none")

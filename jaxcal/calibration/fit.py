@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, numbers
+from jaxcal.csvtable import COMMANDS, MEASURED, of_frame
 from jaxcal.information.singular import depends
 from jaxcal.models.identifiability import Identifiability, identifiability
 from jaxcal.models.model import Model, derivative, predict
@@ -275,12 +276,19 @@ class Fit:
         return np.asarray(self.unidentified[:, : len(self.parameters)].any(axis=0))
 
     def points(self, name: str, values: ArrayLike, width: int) -> Array:
-        points = numbers(name, values)
+        """(..., width) commands, or outputs; of a data frame by name."""
+        points = numbers(name, self.by_name(name, values))
         if points.ndim < 1 or points.shape[-1] != width:
             raise ValueError(
                 f"{name} must have shape (..., {width}), got {points.shape}"
             )
         return points
+
+    def by_name(self, name: str, values: ArrayLike) -> Any:
+        """Of a data frame the calibration's columns in its order; else as given."""
+        if name in ("desired", "measured"):
+            return of_frame(name, values, self.output_names, MEASURED)
+        return of_frame(name, values, self.input_names, COMMANDS)
 
     def require_noise(self, what: str) -> Array:
         if self.noise_std is None:

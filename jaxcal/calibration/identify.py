@@ -28,6 +28,7 @@ from jaxcal.checks import (
     require_none,
     table,
 )
+from jaxcal.csvtable import names_of
 from jaxcal.information.singular import require_excited
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, by_name
@@ -84,7 +85,8 @@ def identify(
         loss: "gaussian" is least squares; "student" (4 degrees of freedom, of a
             measurement as a whole) gives outliers little weight. "student" when not
             given, but least squares where the closed form applies.
-        input_names: n names; u_x, u_y, u_z or u_1 ... u_n when not given.
+        input_names: n names; those of a data frame, else u_x, u_y, u_z or u_1 ... u_n,
+            when not given.
         output_names: m names, likewise y_x or y_1.
         command_unit: stored with the result.
         measured_unit: stored with the result.
@@ -99,6 +101,8 @@ def identify(
             a direction unexcited, naming that direction.
     """
     commands = by_name(model, commands)
+    input_names = input_names or names_of(commands) or None
+    output_names = output_names or names_of(measured) or None
     commands = table("commands", commands)
     rule = ": as many rows as commands"
     measured = table("measured", measured)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, in_words
+from jaxcal.csvtable import COMMANDS, of_frame
 from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = [
@@ -305,16 +306,8 @@ def as_parameters(model: Model, parameters: ArrayLike | None) -> Array:
 
 def by_name(model: Any, commands: Any) -> Any:
     """Of a data frame the columns that the model names, in its order; else as given."""
-    inputs = getattr(model, "inputs", ()) if hasattr(commands, "columns") else ()
-    if not inputs:
-        return commands
-    missing = [name for name in inputs if name not in commands.columns]
-    if missing:
-        raise ValueError(
-            f"commands must have the columns {', '.join(inputs)}, "
-            f"{missing[0]!r} is missing"
-        )
-    return commands[list(inputs)]
+    inputs = getattr(model, "inputs", ())
+    return of_frame("commands", commands, inputs, COMMANDS) if inputs else commands
 
 
 def predict(

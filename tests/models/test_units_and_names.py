@@ -60,3 +60,39 @@ def test_columns_of_a_data_frame_are_taken_by_name() -> None:
     np.testing.assert_allclose(found.parameters, [1, 2, 3, 4])
     with pytest.raises(ValueError, match="'x' is missing"):
         jaxcal.select(frame.rename(columns={"x": "a"}), 5, "greedy", model=model)
+
+
+def test_a_calibration_takes_data_frames_by_name() -> None:
+    pandas = pytest.importorskip("pandas")
+    rng = np.random.default_rng(1)
+    u = pandas.DataFrame(rng.uniform(-9, 9, (9, 3)), columns=["pitch", "yaw", "roll"])
+    slopes, bias = {"pitch": 0.4, "yaw": 0.7, "roll": 0.9}, {"pitch": 3.0, "yaw": -5.0}
+    y = pandas.DataFrame({f"y_{a}": slopes[a] * u[a] + bias[a] for a in bias})
+    found = jaxcal.identify(u, y)
+    assert found.input_names == ("pitch", "yaw", "roll")
+    assert found.output_names == ("y_pitch", "y_yaw")
+    turned = u[["roll", "pitch", "yaw"]].add_prefix("u_").assign(note=1.0)
+    np.testing.assert_allclose(found.predict(turned), y.to_numpy(), atol=1e-12)
+    found = jaxcal.identify(u[["pitch", "yaw"]], y, noise_std=0.1)
+    back = found.command_for(y[["y_yaw", "y_pitch"]])
+    np.testing.assert_allclose(back, u[["pitch", "yaw"]], atol=1e-12)
+    assert found.check(u[["yaw", "pitch"]], y[["y_yaw", "y_pitch"]]).p_value > 0.99
+    off = y.rename(columns={"y_yaw": "y_jaw"})
+    with pytest.raises(ValueError, match=r"desired must have .* 'y_yaw' is missing"):
+        found.command_for(off)
+
+
+def test_what_was_measured_is_taken_by_the_candidates_names() -> None:
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame(
+        np.random.default_rng(2).uniform(-9, 9, (20, 2)) * [1.0, 50.0],
+        columns=["pitch", "yaw"],
+    )
+    measured = frame.iloc[:2] * 3.0
+    picks = [
+        jaxcal.select(frame, 2, "greedy", measured=given).indices.tolist()
+        for given in (measured, measured[["yaw", "pitch"]], measured.to_numpy())
+    ]
+    assert picks[0] == picks[1] == picks[2]
+    with pytest.raises(ValueError, match=r"measured must have .* 'yaw' is missing"):
+        jaxcal.select(frame, 2, measured=measured.rename(columns={"yaw": "roll"}))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, numbers, require_kind
+from jaxcal.csvtable import COMMANDS, names_of, of_frame
 from jaxcal.information.blocks import coarseness
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, as_model, by_name
@@ -64,6 +65,8 @@ class Asked:
             model = as_model(model)
         require_kind("prior", prior, Prior)
         candidates = by_name(model, candidates)
+        if header := names_of(candidates):
+            measured = of_frame("measured", measured, header, COMMANDS)
         array = filled("candidates", candidates, "M", "n")
         self.model = Affine(array.shape[1], array.shape[1]) if model is None else model
         if self.model.multiplicity and array.shape[1] != self.model.num_inputs:
