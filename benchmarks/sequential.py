@@ -121,7 +121,7 @@ def session(task: Any, key: jax.Array) -> tuple[Episodes, jax.Array, jax.Array]:
             belief.update(task, design, outcome, key_update),
             task.spend(at, design, outcome),
         )
-        alive = ~at.over
+        alive = ~task.over(at)
         carry = jax.tree.map(lambda old, new: jnp.where(alive, new, old), carry, after)
         return carry, (design, outcome, gain, alive)
 

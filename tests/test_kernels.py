@@ -60,7 +60,6 @@ import gc
 gc.disable()
 import numpy as np
 import jaxcal
-from jaxcal.adaptive.kernel import backwards
 from jaxcal.selection.policy.kernel import look_ahead
 
 rng = np.random.default_rng(0)
@@ -68,7 +67,6 @@ rows, blocks = rng.random((2000, 3)), rng.normal(size=(300, 3, 12))
 sphere = rng.normal(size=(2000, 9))
 sphere /= np.linalg.norm(sphere, axis=1)[:, None]
 y, active = rng.normal(size=(8, 60_000)), np.ones(60_000, bool)
-ones, many = np.ones((2, 2), int), np.ones((3000, 2, 2), int)
 calls = {
     "exchange of rows": lambda: jaxcal.select(rows, 9, "exchange", restarts=10**7),
     "exchange of blocks": lambda: jaxcal.select(
@@ -87,7 +85,6 @@ calls = {
     "fastest": lambda: jaxcal.Design(rows[:200]).fastest(
         10, jaxcal.Motion(1, 2), least_efficiency=0.7, method="exact", time_limit=300
     ),
-    "backwards": lambda: backwards(many, 0.5 * many, ones, ones, ones, ones, 400, 200),
     "look-ahead": lambda: look_ahead(
         y, active, True, 40, False, None, np.empty((4, 60_000))
     ),

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from numpy.typing import NDArray
+from scipy import special
 
 from jaxcal.adaptive.grid import GridBelief, GridTask
-from jaxcal.adaptive.kernel import backwards
 from jaxcal.adaptive.session import Options, Session
 from jaxcal.checks import seconds as checked_seconds
 
@@ -126,11 +126,7 @@ def solve(task: GridTask, tick: float) -> Optimum:
             f"task must have at most {_MOST_STATES:,} states for dynamic programming, "
             f"got {size:,}: use fewer cells or a longer tick"
         )
-    values, chosen = backwards(
-        after, chance, travel, extra,
-        np.asarray(task.place_after, np.int64), np.asarray(task.uses, np.int64),
-        ticks, uses,
-    )  # fmt: skip
+    values, chosen = _backwards(task, after, chance, travel, extra, ticks, uses)
     codes = np.random.default_rng(0).integers(2**32, size=len(prior), dtype=np.uint32)
     sums = (sets * codes).sum(axis=1, dtype=np.uint32)
     ascending = np.argsort(sums)
@@ -142,6 +138,53 @@ def solve(task: GridTask, tick: float) -> Optimum:
         tick=tick,
     )
     return Optimum(values[:, :, int(task.place), 0], tick, task, decider)
+
+
+def _backwards(
+    task: GridTask,
+    after: NDArray[np.int64],
+    chance: Array,
+    travel: NDArray[np.int64],
+    extra: NDArray[np.int64],
+    ticks: int,
+    uses: int,
+) -> tuple[NDArray[np.float32], NDArray[np.int16]]:
+    """Nats still to gain in every state (ticks + 1, uses + 1, P, B), and the best
+    measurement there.
+
+    Args:
+        task: its uses, places and whether its budget may be overrun.
+        after: (B, A, Y) the belief after outcome y of measurement a.
+        chance: (B, A, Y) of that outcome.
+        travel: (P, A) ticks to a from each place, at least 1.
+        extra: (A, Y) ticks more.
+        ticks, uses: of the longest session and of the largest budget.
+    """
+    taken, places = np.asarray(task.uses), np.asarray(task.place_after)
+    gains = special.entr(chance).sum(axis=2)  # (B, A)
+    shape = (ticks + 1, uses + 1, len(travel), len(after))
+    values, chosen = np.zeros(shape, np.float32), np.zeros(shape, np.int16)
+    possible = chance.any(axis=0)
+    most_extra = np.where(possible, extra, 0).max(axis=1)
+    most_uses = np.where(possible, taken, 0).max(axis=1)
+    e = np.arange(uses + 1)[:, None]
+    for t in range(1, ticks + 1):
+        for a in np.flatnonzero(gains.any(axis=0)):
+            total = np.broadcast_to(gains[:, a], shape[1:]).copy()
+            for y in np.flatnonzero(possible[a]):
+                left, more = t - travel[:, a] - extra[a, y], e - taken[a, y]
+                going = (left > 0) & (more > 0)
+                then = values[np.maximum(left, 0), np.maximum(more, 0), places[a, y]][
+                    ..., after[:, a, y]
+                ]
+                total += np.where(going[..., None], chance[:, a, y] * then, 0.0)
+            paid: Any = e > 0
+            if not task.overrun:
+                paid = (t >= travel[:, a] + most_extra[a]) & (e >= max(most_uses[a], 1))
+            better = paid[..., None] & (total > values[t])
+            values[t] = np.where(better, total, values[t])
+            chosen[t][better] = a
+    return values, chosen
 
 
 def _ticks(name: str, values: Array, tick: float) -> NDArray[np.int64]:

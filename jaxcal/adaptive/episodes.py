@@ -81,7 +81,7 @@ def _played(task: Task, decider: Decider, keys: jax.Array) -> Episodes:
             belief.update(task, design, outcome, key_update),
             task.spend(session, design, outcome),
         )
-        alive = ~session.over
+        alive = ~task.over(session) & options.allowed.any()
         after = jax.tree.map(
             lambda old, new: jnp.where(alive, new, old), (belief, session), after
         )
@@ -100,7 +100,8 @@ def _played(task: Task, decider: Decider, keys: jax.Array) -> Episodes:
 
         blank = jax.eval_shape(going, carry)[1]
         # Nothing is computed once every session is over.
-        return jax.lax.cond(carry[1].over.all(), nothing, going, carry)
+        ended = jax.vmap(task.over)(carry[1])
+        return jax.lax.cond(ended.all(), nothing, going, carry)
 
     (belief, _), seen = jax.lax.scan(step, (prior, begun), steps)
     designs, outcomes, gains, alive = jax.tree.map(

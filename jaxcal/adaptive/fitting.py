@@ -112,7 +112,7 @@ class _Task:
         chosen = np.full((count, horizon), -1, np.int32)
         tree(
             task.likelihood, task.travel, task.extra, task.uses, task.place_after,
-            np.ones(len(task.likelihood)), *decider.constants(), horizon,
+            *task.limits, np.ones(len(task.likelihood)), *decider.constants(), horizon,
             decider.effort,
         ).play(
             np.array(task.prior, np.float32), int(task.place),

@@ -11,7 +11,7 @@ import numpy as np
 from flax import struct
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.adaptive.session import Options, Session
+from jaxcal.adaptive.session import Options, Session, pays
 from jaxcal.checks import in_words, numbers, whole_number
 
 __all__ = ["GridBelief", "GridTask"]
@@ -19,6 +19,7 @@ __all__ = ["GridBelief", "GridTask"]
 Array = NDArray[np.float64]
 
 _SMALL = 1e-30  # probability whose logarithm is still finite in float32
+_NO_LIMIT = 1e30  # seconds, uses
 
 
 @struct.dataclass
@@ -132,6 +133,8 @@ class GridTask:
     place_after: jax.Array  # (A, Y) int32
     extra: jax.Array  # (A, Y) seconds that an outcome costs
     uses: jax.Array  # (A, Y) int32 that an outcome takes of a countable resource
+    most_extra: jax.Array  # (A,) largest ``extra`` of an outcome that is possible
+    most_uses: jax.Array  # (A,) int32 likewise
     seconds: jax.Array  # (2,) budget of a session, uniform between the two
     num_uses: jax.Array  # (E,) int32 equally likely budgets
     place: jax.Array  # () int32 at the start
@@ -139,6 +142,7 @@ class GridTask:
     num_groups: int = struct.field(pytree_node=False)
     shape: tuple[int, ...] = struct.field(pytree_node=False)  # of theta as a grid
     horizon: int = struct.field(pytree_node=False)
+    overrun: bool = struct.field(pytree_node=False)  # the last one may cost too much
     theta_names: tuple[str, ...] = struct.field(pytree_node=False)
     design_names: tuple[str, ...] = struct.field(pytree_node=False)
 
@@ -158,6 +162,7 @@ class GridTask:
         seconds: float | tuple[float, float] = np.inf,
         num_uses: int | Sequence[int] = 1,
         horizon: int,
+        overrun: bool = False,
         theta_names: Sequence[str] = (),
         design_names: Sequence[str] = (),
     ) -> GridTask:
@@ -181,82 +186,33 @@ class GridTask:
             seconds: budget of a session, or (least, most) to draw it from.
             num_uses: uses that end a session, or the list it is drawn from.
             horizon: measurements after which a session ends in any case.
+            overrun: True: a measurement may begin while any time and uses are left, so
+                the last one may cost more than there is. By default one whose dearest
+                possible outcome cannot be paid may not be made, and a session in which
+                none can is over.
 
         Raises:
             ValueError: naming the table, the rule and the value.
         """
         at, grid = _columns("designs", designs), _columns("theta", theta)
-        count, size = len(at), len(grid)
-        given = likelihood(at, grid) if callable(likelihood) else likelihood
-        table = numbers("likelihood", given)
-        if table.ndim != 3 or table.shape[::2] != (count, size):
-            raise ValueError(
-                f"likelihood must have shape ({count}, Y, {size}), got {table.shape}"
-            )
-        if (table < 0.0).any():
-            raise ValueError(f"likelihood must be at least 0, got {table.min():g}")
-        total = table.sum(axis=1)
-        if (bad := np.argwhere(np.abs(total - 1.0) > 1e-6)).size:
-            a, s = bad[0]
-            raise ValueError(
-                "likelihood must sum to 1 over the outcomes, got "
-                f"{total[a, s]:.9g} for design {in_words(at[a])} and theta "
-                f"{in_words(grid[s])}"
-            )
-        table = table / total[:, None]
-        weights = np.full(size, 1.0) if prior is None else numbers("prior", prior)
-        if weights.shape != (size,) or (weights < 0.0).any() or not weights.sum() > 0.0:
-            raise ValueError(
-                f"prior must hold {size} weights, none below 0 and one above, "
-                f"got shape {weights.shape}, least {weights.min():g}"
-            )
-        times = numbers("travel", travel)
-        if times.ndim < 2:
-            times = np.broadcast_to(times, (count + 1, count))
-        if times.ndim != 2 or times.shape[1] != count or len(times) < count:
-            raise ValueError(
-                f"travel must be a number, ({count},) or (P, {count}) with at least "
-                f"{count} places, got shape {times.shape}"
-            )
-        shape = (count, table.shape[1])
-        more, used = _table("extra", extra, shape), _table("uses", uses, shape)
-        for name, values in (("travel", times), ("extra", more), ("uses", used)):
-            if (values < 0.0).any():
-                raise ValueError(f"{name} must be at least 0, got {values.min():g}")
+        count = len(at)
+        table = _probabilities(likelihood, at, grid)
+        weights = _weights(prior, len(grid))
+        times = _times(travel, count)
+        shape = table.shape[:2]
+        more, used = _costs("extra", extra, shape), _costs("uses", uses, shape)
         itself = np.arange(count)[:, None]
         after = _table(
             "place_after", itself if place_after is None else place_after, shape
         )
         first = len(times) - 1 if place is None else place
-        for name, values in (("place_after", after), ("place", np.asarray(first))):
-            if (
-                (values % 1 != 0).any()
-                or values.min() < 0
-                or values.max() >= len(times)
-            ):
-                raise ValueError(
-                    f"{name} must hold places in [0, {len(times)}), "
-                    f"got {values.min():g} to {values.max():g}"
-                )
-        budget = numbers("seconds", seconds, finite=False)
-        budget = np.broadcast_to(budget, 2)
-        if not 0.0 < budget[0] <= budget[1]:
-            raise ValueError(
-                f"seconds must be above 0, or (least, most), got {in_words(budget)}"
-            )
-        ends = np.atleast_1d(numbers("num_uses", num_uses))
-        if ends.ndim != 1 or (ends < 1).any() or (ends % 1 != 0).any():
-            raise ValueError(
-                f"num_uses must be whole numbers of at least 1, got {in_words(ends)}"
-            )
-        alike = np.zeros(count, int) if groups is None else np.asarray(groups)
-        if alike.shape != (count,) or alike.min() < 0 or (alike % 1 != 0).any():
-            raise ValueError(
-                f"groups must hold {count} whole numbers from 0, got {in_words(alike)}"
-            )
+        _require_places("place_after", after, len(times))
+        _require_places("place", np.asarray(first), len(times))
+        group = _groups(groups, count)
         lengths = _grid(grid)
         parts, order = _split(table, lengths)
-        return GridTask(
+        possible = (table.astype(np.float32) > 0.0)[..., weights > 0.0].any(axis=-1)
+        task = GridTask(
             theta=_single(grid),
             prior=_single(weights / weights.sum()),
             designs=_single(at),
@@ -267,16 +223,21 @@ class GridTask:
             place_after=_whole(after),
             extra=_single(more),
             uses=_whole(used),
-            seconds=_single(budget),
-            num_uses=_whole(ends),
+            most_extra=_single(np.where(possible, more, 0.0).max(axis=1)),
+            most_uses=_whole(np.where(possible, used, 0.0).max(axis=1)),
+            seconds=_single(_seconds(seconds)),
+            num_uses=_whole(_ends(num_uses)),
             place=_whole(first),
-            groups=_whole(alike),
-            num_groups=int(alike.max()) + 1,
+            groups=_whole(group),
+            num_groups=int(group.max()) + 1,
             shape=lengths,
             horizon=whole_number("horizon", horizon, 1),
+            overrun=bool(overrun),
             theta_names=_names("theta_names", theta_names, "theta", grid.shape[1]),
             design_names=_names("design_names", design_names, "u", at.shape[1]),
         )
+        _require_affordable(task)
+        return task
 
     def by_design(self, of_parts: Sequence[jax.Array]) -> jax.Array:
         """(A, ...) values in the order of designs, from those of parts (A', ...)."""
@@ -307,15 +268,36 @@ class GridTask:
         )
 
     def options(
-        self, belief: GridBelief, session: Session, key: jax.Array | None = None
+        self,
+        belief: GridBelief | None,
+        session: Session,
+        key: jax.Array | None = None,
     ) -> Options:
-        """All designs, always."""
-        count = len(self.designs)
+        """All designs; allowed are those that what is left pays for."""
         return Options(
-            designs=jnp.arange(count),
+            designs=jnp.arange(len(self.designs)),
             seconds=self.travel[session.place],
-            allowed=jnp.ones(count, bool),
+            allowed=self.payable(session),
         )
+
+    def payable(self, session: Session) -> jax.Array:
+        """(A,) bool: what is left pays for the measurement, whatever its outcome."""
+        extra, uses = self.limits
+        cost = self.travel[session.place] + extra
+        return pays(session.seconds, cost) & (uses <= session.uses)
+
+    def over(self, session: Session) -> jax.Array:
+        """() bool: nothing is left, or nothing that it pays for."""
+        ended = session.spent | (session.made >= self.horizon)
+        return ended | ~self.options(None, session).allowed.any()
+
+    @property
+    def limits(self) -> tuple[jax.Array, jax.Array]:
+        """(A,) extra seconds and (A,) uses for which something must be left."""
+        most = self.most_extra, self.most_uses.astype(jnp.float32)
+        if not self.overrun:
+            return most
+        return jnp.full_like(most[0], -_NO_LIMIT), jnp.full_like(most[1], -_NO_LIMIT)
 
     def measure(self, truth: jax.Array, design: jax.Array, key: jax.Array) -> jax.Array:
         """() int32 outcome, drawn."""
@@ -345,6 +327,119 @@ class GridTask:
     ) -> jax.Array:
         """() log probability, or density, of an outcome."""
         return jnp.log(self.likelihood[design, outcome, truth] + _SMALL)
+
+
+def _probabilities(
+    likelihood: ArrayLike | Callable[[Array, Array], ArrayLike], at: Array, grid: Array
+) -> Array:
+    """(A, Y, S) probabilities that sum to 1 over the outcomes."""
+    given = likelihood(at, grid) if callable(likelihood) else likelihood
+    table = numbers("likelihood", given)
+    if table.ndim != 3 or table.shape[::2] != (len(at), len(grid)):
+        raise ValueError(
+            f"likelihood must have shape ({len(at)}, Y, {len(grid)}), got {table.shape}"
+        )
+    if (table < 0.0).any():
+        raise ValueError(f"likelihood must be at least 0, got {table.min():g}")
+    total = table.sum(axis=1)
+    if (bad := np.argwhere(np.abs(total - 1.0) > 1e-6)).size:
+        a, s = bad[0]
+        raise ValueError(
+            "likelihood must sum to 1 over the outcomes, got "
+            f"{total[a, s]:.9g} for design {in_words(at[a])} and theta "
+            f"{in_words(grid[s])}"
+        )
+    return table / total[:, None]
+
+
+def _weights(prior: ArrayLike | None, size: int) -> Array:
+    """(S,) prior weights, not normalised."""
+    weights = np.full(size, 1.0) if prior is None else numbers("prior", prior)
+    if weights.shape != (size,) or (weights < 0.0).any() or not weights.sum() > 0.0:
+        raise ValueError(
+            f"prior must hold {size} weights, none below 0 and one above, "
+            f"got shape {weights.shape}, least {weights.min():g}"
+        )
+    return weights
+
+
+def _times(travel: ArrayLike, count: int) -> Array:
+    """(P, A) seconds from each place to each design, at least 0."""
+    times = numbers("travel", travel)
+    if times.ndim < 2:
+        times = np.broadcast_to(times, (count + 1, count))
+    if times.ndim != 2 or times.shape[1] != count or len(times) < count:
+        raise ValueError(
+            f"travel must be a number, ({count},) or (P, {count}) with at least "
+            f"{count} places, got shape {times.shape}"
+        )
+    return _not_negative("travel", times)
+
+
+def _costs(name: str, values: ArrayLike, shape: tuple[int, int]) -> Array:
+    """(A, Y) costs of outcomes, at least 0."""
+    return _not_negative(name, _table(name, values, shape))
+
+
+def _not_negative(name: str, values: Array) -> Array:
+    if (values < 0.0).any():
+        raise ValueError(f"{name} must be at least 0, got {values.min():g}")
+    return values
+
+
+def _require_places(name: str, values: Array, count: int) -> None:
+    if (values % 1 != 0).any() or values.min() < 0 or values.max() >= count:
+        raise ValueError(
+            f"{name} must hold places in [0, {count}), "
+            f"got {values.min():g} to {values.max():g}"
+        )
+
+
+def _seconds(seconds: float | tuple[float, float]) -> Array:
+    """(2,) least and largest budget of time."""
+    budget = np.broadcast_to(numbers("seconds", seconds, finite=False), 2)
+    if not 0.0 < budget[0] <= budget[1]:
+        raise ValueError(
+            f"seconds must be above 0, or (least, most), got {in_words(budget)}"
+        )
+    return budget
+
+
+def _ends(num_uses: int | Sequence[int]) -> Array:
+    """(E,) equally likely budgets of uses."""
+    ends = np.atleast_1d(numbers("num_uses", num_uses))
+    if ends.ndim != 1 or (ends < 1).any() or (ends % 1 != 0).any():
+        raise ValueError(
+            f"num_uses must be whole numbers of at least 1, got {in_words(ends)}"
+        )
+    return ends
+
+
+def _groups(groups: ArrayLike | None, count: int) -> NDArray[np.int64]:
+    """(A,) the group of each design."""
+    group = np.zeros(count, int) if groups is None else np.asarray(groups)
+    if group.shape != (count,) or group.min() < 0 or (group % 1 != 0).any():
+        raise ValueError(
+            f"groups must hold {count} whole numbers from 0, got {in_words(group)}"
+        )
+    return group
+
+
+def _require_affordable(task: GridTask) -> None:
+    """The smallest budget must pay for a first measurement."""
+    if task.overrun:
+        return
+    seconds, uses = float(task.seconds[0]), int(np.min(task.num_uses))
+    cost = np.asarray(task.travel)[int(task.place)] + np.asarray(task.most_extra)
+    needs = np.asarray(task.most_uses)
+    if not (np.asarray(pays(seconds, cost)) & (needs <= uses)).any():
+        cheapest = int(np.lexsort((cost, needs > uses))[0])
+        raise ValueError(
+            "seconds and num_uses must pay for a first measurement, whatever its "
+            f"outcome: the cheapest, design {cheapest}, takes up to "
+            f"{cost[cheapest]:g} s and {needs[cheapest]} uses, of {seconds:g} s and "
+            f"{uses}; overrun=True lets the last one cost more"
+        )
 
 
 def _grid(theta: Array) -> tuple[int, ...]:

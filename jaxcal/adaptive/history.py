@@ -107,11 +107,12 @@ def replay(
             raise ValueError(
                 f"{where} must be a pair (design, outcome), got {entry!r}"
             ) from None
-        if bool(session.over):
+        if bool(session.spent):
             raise ValueError(
                 f"{where} was measured after the budget was spent: {_left(session)}"
             )
         entries.append(checked(task, belief, session, design, outcome, where))
+        _require_paid(task, session, entries[-1][0], where)
         key = step_keys(seed, number).update
         belief, session = after(task, belief, session, *entries[-1], key)
         if any(np.isnan(leaf).any() for leaf in _floats(belief)):
@@ -119,6 +120,17 @@ def replay(
                 f"{where}: outcome {outcome!r} cannot follow what was measured before"
             )
     return belief, session, entries
+
+
+def _require_paid(task: Task, session: Session, design: Any, where: str) -> None:
+    """Refuse a measurement that the budget could not pay."""
+    if isinstance(task, GridTask) and not task.payable(session)[design]:
+        cost = task.travel[session.place, design] + task.most_extra[design]
+        raise ValueError(
+            f"{where} takes up to {float(cost):.6g} s and "
+            f"{int(task.most_uses[design])} uses: {_left(session)}; a task made with "
+            "overrun=True may spend more"
+        )
 
 
 @jax.jit

@@ -43,7 +43,9 @@ class Ahead:
             functools.partial(_chosen, task.horizon, self.effort),
             jax.ShapeDtypeStruct((), jnp.int32),
             *(task.likelihood, task.travel, task.extra, task.uses, task.place_after),
-            *(options.allowed, jnp.stack(constants), hints, belief.weights),
+            # What cannot be paid now the tree finds, and what cannot later.
+            *(*task.limits, options.allowed | ~task.payable(session)),
+            *(jnp.stack(constants), hints, belief.weights),
             *(session.place, session.seconds, session.uses, session.made),
             vmap_method="expand_dims",
         )
@@ -58,8 +60,8 @@ class Ahead:
 
 AHEAD = Ahead()
 
-_TABLES = 8  # arrays of the task come first, then those of the session
-_DIMENSIONS = (3, 2, 2, 2, 2, 1, 1, 2, 1, 0, 0, 0, 0)
+_TABLES = 10  # arrays of the task come first, then those of the session
+_DIMENSIONS = (3, 2, 2, 2, 2, 1, 1, 1, 1, 2, 1, 0, 0, 0, 0)
 
 
 def _chosen(horizon: int, effort: float, *arrays: Any) -> Any:
@@ -75,16 +77,13 @@ def _chosen(horizon: int, effort: float, *arrays: Any) -> Any:
     ]
     chosen = np.empty(batch, np.int32)
     for index in np.ndindex(tasks):  # one iteration per task
-        table, travel, extra, uses, after, allowed, constants, hints = (
+        tables = [
             array[
                 tuple(min(i, n - 1) for i, n in zip(index, array.shape, strict=False))
             ]
             for array in given[:_TABLES]
-        )
-        searched = tree(
-            table, travel, extra, uses, after, allowed, constants, hints, horizon,
-            effort,
-        )  # fmt: skip
+        ]
+        searched = tree(*tables, horizon=horizon, effort=effort)
         at = tuple(
             slice(None) if n == 1 else i for i, n in zip(index, tasks, strict=True)
         )
@@ -100,13 +99,15 @@ def _chosen(horizon: int, effort: float, *arrays: Any) -> Any:
 
 def tree(
     likelihood: Any, travel: Any, extra: Any, uses: Any, place_after: Any,
-    allowed: Any, constants: Any, hints: Any, horizon: int, effort: float,
+    most_extra: Any, most_uses: Any, allowed: Any, constants: Any, hints: Any,
+    horizon: int, effort: float,
 ) -> Tree:  # fmt: skip
-    """The kernel's object from tables as ``GridTask`` has them."""
+    """The kernel's object from tables as ``GridTask`` and its ``limits`` have them."""
     return Tree(
         _single(likelihood), _single(travel), _single(np.transpose(extra)),
         _single(np.transpose(uses)), np.array(place_after, np.int32),
-        _single(allowed), horizon, constants, _single(hints), effort,
+        _single(most_extra), _single(most_uses), _single(allowed),
+        horizon, constants, _single(hints), effort,
     )  # fmt: skip
 
 
@@ -152,7 +153,7 @@ class TwoStep:
                 follow = task.options(then, left, keys[2])
                 gains, prices = self.base.judged(task, then, left, follow, keys[3])
                 chosen = best(log_score(gains, prices), follow)
-                going = ~(left.over | (left.made >= task.horizon))
+                going = ~task.over(left)
                 # The price counts also where the session is over: no bonus for ending.
                 return going * gains[chosen], prices[chosen]
 
@@ -226,8 +227,7 @@ class Rollouts:
 
         def going(carry: Any) -> jax.Array:
             _, session, _, number = carry
-            over = session.over | (session.made >= task.horizon)
-            return ~over & (number < self.depth)
+            return ~task.over(session) & (number < self.depth)
 
         def step(carry: Any) -> Any:
             belief, session, total, number = carry

@@ -165,7 +165,7 @@ def _proposal(
     beyond: tuple[str, ...],
 ) -> Proposal:
     number = int(session.made)
-    if bool(session.over) or number >= task.horizon:
+    if bool(task.over(session)):
         return Proposal(None, None, 0.0, 0.0, 0.0, number, belief, session, beyond)
     keys = step_keys(seed, number)
     design, gain, took, uses, any_left = _choose(task, decider, belief, session, keys)

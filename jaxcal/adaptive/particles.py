@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxcal.adaptive.session import Options, Session
+from jaxcal.adaptive.session import Options, Session, pays
 from jaxcal.checks import in_words, numbers, whole_number
 
 __all__ = ["Model", "ParticleBelief", "ParticleTask", "log_mean", "systematic"]
@@ -361,6 +361,10 @@ class ParticleTask:
         )
         return belief, dataclasses.replace(whole, place=place, seconds=self.seconds)
 
+    def over(self, session: Session) -> jax.Array:
+        """() bool: no time or no measurements are left."""
+        return session.spent | (session.made >= self.horizon)
+
     def options(
         self, belief: ParticleBelief, session: Session, key: jax.Array
     ) -> Options:
@@ -371,7 +375,7 @@ class ParticleTask:
             jax.vmap(self.model.unknowns)(z), session, key_designs, self.num_candidates
         )
         cost = jax.vmap(lambda design: self.model.cost(session, design))(designs)
-        return Options(designs, cost, cost <= session.seconds)
+        return Options(designs, cost, pays(session.seconds, cost))
 
     def measure(self, truth: jax.Array, design: Any, key: jax.Array) -> jax.Array:
         """() an outcome, drawn."""

@@ -109,8 +109,8 @@ class Tree:
     """A task, the constants of ``Ahead`` and the work space of one path."""
 
     def __init__(
-        self, likelihood, travel, extra, uses, place_after, allowed, horizon,
-        constants, hints, effort,
+        self, likelihood, travel, extra, uses, place_after, most_extra, most_uses,
+        allowed, horizon, constants, hints, effort,
     ):  # fmt: skip
         # As in GridTask, but for extra and uses, (Y, A). Hints are (N, A), the last for
         # the Nth measurement and all that follow.
@@ -122,11 +122,15 @@ class Tree:
         self.time, use, self.a, b, self.haste, self.doubt = constants
         e = np.arange(1.0, _USES + 1)
         self.use_of = use * e ** (b - 1.0)
-        self.travel, self.extra, self.uses, self.allowed, self.hints = (
+        (
+            self.travel, self.extra, self.uses, self.most_extra, self.most_uses,
+            self.allowed, self.hints,
+        ) = (
             np.pad(table, [(0, 0)] * (table.ndim - 1) + [(0, more)])
-            for table in (travel, extra, uses, allowed, hints * allowed)
-        )
-        self.closed = np.float32(1e9) * (1 - np.pad(allowed, (0, more)))
+            for table in (
+                travel, extra, uses, most_extra, most_uses, allowed, hints * allowed,
+            )
+        )  # fmt: skip
         # Of each state L of all outcomes but the first, then the sum of L log L.
         noise = likelihood * np.log(np.where(likelihood > 0.0, likelihood, 1.0))
         rows = [*likelihood.transpose(1, 2, 0)[1:], noise.sum(axis=1).T]
@@ -142,8 +146,8 @@ class Tree:
         self.which = np.zeros((levels, states + 3), np.int32)
         self.weights = np.zeros((levels, states + 3), np.float32)
         self.sums, self.rest = np.zeros((2, levels, self.wide), np.float32)
-        four = np.zeros((4, levels, self.designs), np.float32)
-        self.gains, self.scores, self.seconds, self.needs = four
+        five = np.zeros((5, levels, self.designs), np.float32)
+        self.gains, self.scores, self.seconds, self.needs, self.open = five
         self.guess = np.zeros(levels)
         self.belief = np.zeros(states, np.float32)
 
@@ -164,7 +168,8 @@ class Tree:
                 late(cython.address(watch))
                 now.place, now.seconds = place[i], seconds[i]
                 now.uses, now.made = uses[i], made[i]
-                chosen[i] = self._best(cython.address(beliefs[i, 0]), now)
+                a = self._best(cython.address(beliefs[i, 0]), now)
+                chosen[i] = a if a > 0 else 0
 
     def play(
         self,
@@ -195,6 +200,8 @@ class Tree:
                 while now.seconds > 0.0 and now.uses > 0 and now.made < self.horizon:
                     late(cython.address(watch))
                     a = self._best(belief, now)
+                    if a < 0:
+                        break
                     chosen[i, now.made] = a
                     gains[i, now.made] = self.gains[0, a]
                     y: cython.int = 0
@@ -215,7 +222,7 @@ class Tree:
                     now.made += 1
 
     def _best(self, belief, now):
-        """Of the largest tree that ``effort`` suffices for."""
+        """The choice of the largest tree within ``effort``; -1: nothing can be paid."""
         states = self.likelihood.shape[2]
         n: cython.int = 0
         p: cython.float = 0.0
@@ -235,6 +242,8 @@ class Tree:
         self.width = cython.address(self.widths[0, _DEPTH])  # 0
         best: cython.int = 0
         self._value(0, p, now, entropy, cython.address(best))
+        if self.scores[0, best] == 0.0:
+            return -1
         if now.made + 1 >= self.horizon:
             return best
         spent = self.work
@@ -294,6 +303,8 @@ class Tree:
         price = self._propose(level, p, now, best)
         first: cython.int = best[0]
         value: cython.double = -1.0
+        if scores[first] == 0.0:  # nothing can be paid
+            return 0.0
         if now.made + 1 >= self.horizon:  # nothing follows: no price counts
             for a in range(self.designs):
                 if scores[a] > 0.0 and gains[a] > value:
@@ -343,14 +354,26 @@ class Tree:
         needs = cython.address(self.needs[level, 0])
         travel = cython.address(self.travel[now.place, 0])
         allowed = cython.address(self.allowed[0])
-        closed = cython.address(self.closed[0])
+        most_extra = cython.address(self.most_extra[0])
+        most_uses = cython.address(self.most_uses[0])
+        open = cython.address(self.open[level, 0])
         hints = cython.address(self.hints[min(now.made, self.hints.shape[0] - 1), 0])
         share: cython.float = 1.0 / p
         tiny: cython.float = 1e-12
         nothing: cython.float = 1e-9
         zero: cython.float = 0.0
+        one: cython.float = 1.0
+        closed: cython.float = 1e9
+        rounding: cython.float = 0.9999  # as ``session.pays``
+        seconds_left: cython.float = now.seconds
+        uses_left: cython.float = now.uses
         # One array is written in each loop: more, and the compiler doubts that they are
         # apart.
+        for a in range(designs):
+            cost = rounding * (travel[a] + most_extra[a])
+            open[a] = allowed[a] if cost <= seconds_left else zero
+        for a in range(designs):
+            open[a] = open[a] if most_uses[a] <= uses_left else zero
         for a in range(designs):
             gains[a] = sums[(outcomes - 1) * designs + a]
         for a in range(designs):
@@ -379,9 +402,9 @@ class Tree:
             s = travel[a] + seconds[a] * share
             seconds[a] = s if s > nothing else nothing
         for a in range(designs):
-            scores[a] = allowed[a] * (gains[a] * share + nothing) / seconds[a]
+            scores[a] = open[a] * (gains[a] * share + nothing) / seconds[a]
         for a in range(designs):
-            needs[a] = needs[a] * share + closed[a]
+            needs[a] = needs[a] * share + closed * (one - open[a])
         always = -_largest(needs, designs, -1.0)
         e: cython.int = max(now.uses, 1)
         n: cython.double = fmax(self.horizon - now.made, 1.0)
@@ -400,7 +423,8 @@ class Tree:
             s = seconds[a] if seconds[a] < end else end
             u = needs[a] - always
             u = u if u < last else last
-            scores[a] = hints[a] * (gains[a] + least) / (fixed + time * s + use * u)
+            price = fixed + time * s + use * u
+            scores[a] = open[a] * hints[a] * (gains[a] + least) / price
         self.work += _EACH * self.wide + _NODE
         best[0] = _argmax(scores, designs)
         return (gains[best[0]] + least) / fmax(scores[best[0]], 1e-30)

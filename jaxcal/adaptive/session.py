@@ -14,7 +14,9 @@ from typing import Any, Protocol
 import jax
 from flax import struct
 
-__all__ = ["Belief", "Decider", "Options", "Session", "Task"]
+__all__ = ["Belief", "Decider", "Options", "Session", "Task", "pays"]
+
+_ROUNDING = 1e-4  # of a cost: sums of float32 may miss the budget by less
 
 
 @struct.dataclass
@@ -27,9 +29,14 @@ class Session:
     made: jax.Array  # () int32 measurements made
 
     @property
-    def over(self) -> jax.Array:
-        """() bool: time or uses are spent. A measurement begins while any are left."""
+    def spent(self) -> jax.Array:
+        """() bool: no time or no uses are left."""
         return (self.seconds <= 0.0) | (self.uses <= 0)
+
+
+def pays(seconds: Any, cost: Any) -> Any:
+    """(...) bool: a cost fits into the seconds that are left."""
+    return (1.0 - _ROUNDING) * cost <= seconds
 
 
 @struct.dataclass
@@ -83,8 +90,11 @@ class Task(Protocol):
     def begin(self, key: jax.Array) -> tuple[Any, Session]:
         """The belief and the state at the start of a session."""
 
+    def over(self, session: Session) -> jax.Array:
+        """() bool: the session has ended, or nothing that may follow can be paid."""
+
     def options(self, belief: Any, session: Session, key: jax.Array) -> Options:
-        """What may be measured next."""
+        """What may be measured next; what the budget cannot pay is not allowed."""
 
     def measure(self, truth: Any, design: Any, key: jax.Array) -> Any:
         """An outcome, drawn."""

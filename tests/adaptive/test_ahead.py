@@ -25,7 +25,12 @@ WHOLE = Ahead(effort=1e9)
 
 
 def values(task, weights, place, seconds, uses, made):
-    """(A,) nats of a measurement and the best of all that may follow, by recursion."""
+    """(A,) nats of a measurement and the best of all that may follow, by recursion.
+
+    Without overrun, one of which some outcome cannot be paid is worth nothing.
+    """
+    if seconds <= 0 or uses <= 0 or made >= task.horizon:
+        return np.zeros(len(task.designs))
     table = np.asarray(task.likelihood, np.float64)
     chances = table @ weights
     gains = (
@@ -34,16 +39,18 @@ def values(task, weights, place, seconds, uses, made):
     for a, y in np.ndindex(chances.shape):
         left = seconds - float(task.travel[place, a]) - float(task.extra[a, y])
         more = uses - int(task.uses[a, y])
-        if chances[a, y] > 0 and left > 0 and more > 0 and made + 1 < task.horizon:
+        if table[a, y].any() and not task.overrun and (left < -1e-4 or more < 0):
+            gains[a] = -np.inf
+        if chances[a, y] > 0:
             then = weights * table[a, y] / chances[a, y]
             at = int(task.place_after[a, y])
             gains[a] += (
                 chances[a, y] * values(task, then, at, left, more, made + 1).max()
             )
-    return gains
+    return np.maximum(gains, 0.0)
 
 
-def random_task(seed, designs, outcomes, horizon):
+def random_task(seed, designs, outcomes, horizon, overrun):
     """Noise, travel, extra seconds and uses of all sizes; 8 values of theta."""
     rng = np.random.default_rng(seed)
     return GridTask.make(
@@ -53,19 +60,20 @@ def random_task(seed, designs, outcomes, horizon):
         travel=rng.uniform(0.2, 2.0, (designs + 1, designs)),
         extra=rng.uniform(0.0, 1.0, (designs, outcomes)),
         uses=rng.integers(0, 2, (designs, outcomes)),
-        seconds=rng.uniform(1.0, 6.0), num_uses=int(rng.integers(1, 4)),
-        horizon=horizon,
+        seconds=rng.uniform(1.0, 6.0) + 1.5 * (not overrun),
+        num_uses=int(rng.integers(1, 4)), horizon=horizon, overrun=overrun,
     )  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("designs", "outcomes", "horizon"), [(6, 2, 2), (4, 3, 2), (6, 2, 1), (2, 2, 4)]
 )
+@pytest.mark.parametrize("overrun", [True, False])
 def test_what_ends_within_the_tree_is_decided_as_by_all_trees(
-    designs, outcomes, horizon
+    designs, outcomes, horizon, overrun
 ):
     for seed in range(4):
-        task = random_task(seed, designs, outcomes, horizon)
+        task = random_task(seed, designs, outcomes, horizon, overrun)
         belief, session = task.begin(jax.random.key(0))
         chosen = int(choose(task, WHOLE, belief, session))
         weights = np.asarray(task.prior, np.float64)

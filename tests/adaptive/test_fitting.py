@@ -15,10 +15,12 @@ from jaxcal.adaptive.rules import SHARES, Gain
 from jaxcal.adaptive.tasks.knee import knee
 
 
-@pytest.fixture(scope="module")
-def task():
+@pytest.fixture(scope="module", params=[True, False], ids=["overrun", "hard"])
+def task(request):
     limits = Limits(64, 24, 3, measurements=8)
-    return jax.device_get(draw(21, "thresholds", "time+uses", limits))
+    return jax.device_get(
+        draw(21, "thresholds", "time+uses", limits, overrun=request.param)
+    )
 
 
 def of(task):

@@ -80,7 +80,7 @@ def value_of_first(task, rule, belief, weights, session, first):
         if after.sum() < 1e-12:
             continue
         left = task.spend(session, first, y)
-        if not bool(left.over):
+        if not bool(task.over(left)):
             then = belief.update(task, first, y)
             options = task.options(then, left)
             follow = int(_choose(task, rule, then, left, options))

@@ -130,8 +130,8 @@ def test_a_closed_loop_measures_until_the_budget_is_spent(sharp):
     asked = []
     finished = run(sharp, PRICED, device((0.4, 0.7), asked))
     assert [int(design) for design, _ in finished.history] == asked
-    assert bool(finished.session.over)
-    assert not bool(replay_of(sharp, finished.history[:-1]).over)
+    assert bool(sharp.over(finished.session))
+    assert not bool(sharp.over(replay_of(sharp, finished.history[:-1])))
     best = np.asarray(sharp.theta)[np.asarray(finished.belief.weights) > 0]
     assert (np.abs(best - (5 / 12, 9 / 12)) < 1e-6).all(axis=1).any()
 

@@ -37,6 +37,7 @@ def draw(
     structure: str | None = None,
     budget: str | None = None,
     limits: Limits = Limits(),  # noqa: B008  # frozen
+    overrun: bool = True,
 ) -> GridTask:
     """One task of the family; the same arguments give the same task.
 
@@ -45,6 +46,7 @@ def draw(
         structure: of ``TRAINED_ON`` or ``HELD_OUT``; one of ``TRAINED_ON`` when None.
         budget: of ``BUDGETS``; drawn when None, time and uses together most often.
         limits: largest sizes of the task.
+        overrun: the last measurement may cost more than what is left.
 
     Raises:
         ValueError: no such structure or budget.
@@ -104,6 +106,7 @@ def draw(
         seconds=seconds,
         num_uses=ends,
         horizon=number,
+        overrun=overrun,
     )
 
 

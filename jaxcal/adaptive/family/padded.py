@@ -33,11 +33,15 @@ class Padded(GridTask):
     first: jax.Array  # () int32 initial ``Session.made``: padded less own horizon
 
     def options(
-        self, belief: GridBelief, session: Session, key: jax.Array | None = None
+        self,
+        belief: GridBelief | None,
+        session: Session,
+        key: jax.Array | None = None,
     ) -> Options:
-        """The task's own designs."""
+        """The task's own designs that what is left pays for."""
         every = super().options(belief, session, key)
-        return every.replace(allowed=self.allowed)  # type: ignore[attr-defined]  # flax
+        allowed = every.allowed & self.allowed
+        return every.replace(allowed=allowed)  # type: ignore[attr-defined]  # flax
 
     def session(self, seconds: object, uses: object) -> Session:
         """A session with this budget; ``made`` counts from ``first`` to ``horizon``."""
@@ -106,6 +110,8 @@ def pad(task: GridTask, limits: Limits) -> Padded:
         place_after=larger(after.astype(np.int32), designs, outcomes),
         extra=larger(task.extra, designs, outcomes),
         uses=larger(task.uses, designs, outcomes),
+        most_extra=larger(task.most_extra, designs),
+        most_uses=larger(task.most_uses, designs),
         seconds=np.asarray(task.seconds),
         num_uses=np.resize(ends, 60).astype(np.int32),
         place=start.astype(np.int32),
@@ -113,6 +119,7 @@ def pad(task: GridTask, limits: Limits) -> Padded:
         num_groups=limits.groups,
         shape=(limits.states,),
         horizon=limits.measurements,
+        overrun=task.overrun,
         theta_names=(),
         design_names=(),
         allowed=np.arange(designs) < count,

@@ -81,8 +81,7 @@ class Sessions:
         def after(outcome: jax.Array) -> tuple[State, jax.Array]:
             then = belief.update(made, design, outcome, key_update)
             left = made.spend(state.session, design, outcome)
-            ended = left.over | (left.made >= made.horizon)
-            return State(state.truth, then, left), ended
+            return State(state.truth, then, left), made.over(left)
 
         states, ended = jax.vmap(after)(outcomes)
         return Step(

@@ -36,6 +36,7 @@ def knee(
     travel_s: float = 2.0,
     change_s: float = 2.0,
     reset_s: float = 1.0,
+    overrun: bool = True,
 ) -> GridTask:
     """The task.
 
@@ -51,6 +52,8 @@ def knee(
         travel_s: seconds over the full range.
         change_s: seconds to change to another joint, at its u = 0.
         reset_s: seconds after a trip.
+        overrun: a test may begin while any time is left; False: only where the time
+            left pays for it and for a trip.
     """
     tau = (np.arange(cells) + 0.5) / cells
     theta = np.stack(np.meshgrid(*[tau] * joints, indexing="ij"), axis=-1)
@@ -81,6 +84,7 @@ def knee(
         seconds=seconds,
         num_uses=trips,
         horizon=_horizon(seconds, test_s),
+        overrun=overrun,
         theta_names=[f"tau{i + 1}" for i in range(joints)],
         design_names=["joint", "u"],
     )
