@@ -25,10 +25,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.sequential.sequence import optimise
 from jaxcal.adaptive.estimates import estimates
 from jaxcal.adaptive.grid import GridBelief, GridTask
 from jaxcal.adaptive.rules import Gain, Random
-from jaxcal.adaptive.static import optimise
 from jaxcal.adaptive.tasks.backlash import backlash, dead_zone
 from jaxcal.adaptive.tasks.breakaway import Cautious, breakaway
 

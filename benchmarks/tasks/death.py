@@ -57,5 +57,5 @@ ENTRY = Entry(
     death_process,
     about="an infection rate, from how many are infected when",
     rules=FREE,
-    methods=("random", "static", "gain"),
+    methods=("random", "gain"),
 )

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxcal.adaptive.fitting import fit, outside
+from jaxcal.adaptive.fit_ahead import fit, outside
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.history import (
     History,
@@ -43,7 +43,7 @@ class Proposal:
     number: int  # measurements made before it
     belief: Any
     session: Session  # what is left
-    outside: tuple[str, ...]  # see ``fitting.outside``; empty where a decider was given
+    outside: tuple[str, ...]  # ``fit_ahead.outside``; empty where a decider was given
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,8 +71,8 @@ def next_measurement(
         history: (design, outcome) of each measurement in order. A design is an index of
             ``task.designs`` (a whole number) or its coordinates.
         decider: when not given, the largest expected gain; where time or uses count,
-            what ``fitting.fit`` finds for the task and this budget, in some seconds at
-            the first call.
+            what ``fit_ahead.fit`` finds for the task and this budget, in some seconds
+            at the first call.
         seconds: budget of the whole session; the task's when not given.
         uses: budget of the countable resource, likewise.
         seed: of random draws; the same arguments give the same proposal.

@@ -173,7 +173,7 @@ class Shares(Rule):
 
 
 SHARES = Shares(1.4, 1.8, 0.2, -0.7)
-"""Rounded from a search over tasks of the family such as ``benchmarks/families.py
+"""Rounded from a search over drawn tasks, as ``python -m benchmarks.sequential.families
 --tune`` makes."""
 
 

@@ -78,7 +78,7 @@ examples:
 """
 
 
-_DECIDERS = "random,gain,rate,shares,ahead,two_step,policy"
+_DECIDERS = "random,gain,rate,shares,ahead,policy"
 _TUNED = "priced,state"  # where the task brings their constants
 
 _TASK_DESCRIPTION = """\
@@ -96,7 +96,7 @@ tasks:
 
 examples:
   {program} --task knee
-  {program} --task knee --methods state,rollouts,policy --episodes 512
+  {program} --task knee --methods state,ahead,policy --episodes 512
   {program} --task knee --with sigma=0.05 cells=16 --retune --json out.json
 """
 
@@ -148,9 +148,6 @@ class TaskOptions(Outputs):
         int | None, "sessions; 4096, fewer where a task takes long", (2,)
     ] = None
     seed: Annotated[int, "of the sessions", "S", (0,)] = 0
-    rollouts: Annotated[
-        int, "simulations of each candidate of the method rollouts", (1,)
-    ] = 16
     retune: Annotated[bool, "tune the rules on this task; else as they ship"] = False
 
 
@@ -437,7 +434,6 @@ def _run_task(options: TaskOptions) -> None:
             checkpoint=options.checkpoint,
             episodes=options.episodes or entry.episodes,
             seed=options.seed,
-            rollouts=options.rollouts,
             retune=options.retune,
             progress=progress,
         )

@@ -13,11 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.adaptive import static
 from jaxcal.adaptive.episodes import Comparison, compare
-from jaxcal.adaptive.fitting import fit, outside
+from jaxcal.adaptive.fit_ahead import fit, outside
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.lookahead import AHEAD, Rollouts, TwoStep
+from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.policy import run as policies
 from jaxcal.adaptive.rules import (
     SHARES,
@@ -35,21 +34,17 @@ __all__ = ["METHODS", "Result", "evaluate", "seconds_a_choice"]
 
 METHODS = {
     "random": "any measurement",
-    "static": "one sequence for all sessions, optimised over the prior",
     "gain": "the largest expected information gain (EIG)",
     "rate": "the largest EIG a second",
     "shares": "EIG per share of time, uses and number left; its constants are fixed",
     "ahead": "shares, over a tree of the next measurements, fitted to the task first",
     "priced": "EIG per price of time and uses, its constants tuned",
     "state": "the same with prices that follow what is left, tuned",
-    "two_step": "state, or shares where that is not tuned, over two measurements",
-    "rollouts": "simulation of the same rule to the end, common random numbers",
     "policy": "the network that corrects the state rule",
 }
 _GENERATIONS = 20  # of tuning
-_STATIC = 16  # entries of a static sequence; few sessions last longer
 _TIMED = 128  # sessions on which a choice is timed
-_BATCH = {"rollouts": 64, "two_step": 256}  # sessions at once, for the memory
+_BATCH = 1024  # sessions at once
 
 Progress = Callable[[str, int, int], None]
 
@@ -78,7 +73,6 @@ def evaluate(
     checkpoint: str | None = None,
     episodes: int = 4096,
     seed: int = 0,
-    rollouts: int = 16,
     retune: bool = False,
     progress: Progress = lambda what, done, of: None,
 ) -> Result:
@@ -90,7 +84,6 @@ def evaluate(
         checkpoint: of the policy; the one that ships when None.
         episodes: sessions.
         seed: of the sessions.
-        rollouts: simulations of each candidate of the method ``rollouts``.
         retune: tune the rules on this task instead of taking the constants that ship.
         progress: told what is done.
 
@@ -102,41 +95,26 @@ def evaluate(
         if method not in METHODS:
             raise ValueError(f"methods must be of {', '.join(METHODS)}, got {method!r}")
     task = jax.tree.map(jnp.asarray, entry.make(**options))
-    if "static" in methods and not isinstance(task, GridTask):
-        raise ValueError(
-            f"methods must not have static for {name}: a sequence is chosen from a "
-            "table of designs, and this task proposes its own from the belief"
-        )
     trained = policies.load(checkpoint) if "policy" in methods else None
     needed = [m for m in ("priced", "state") if m in methods]
-    if {"two_step", "rollouts"} & set(methods) and (retune or "state" in entry.rules):
-        needed = sorted({*needed, "state"})
     rules = _rules(entry, task, needed, retune, seed, progress)
     found, seconds = [], []
     for method in methods:
-        if method == "static":
-            decider: Any = static.optimise(
-                task,
-                length=min(task.horizon, _STATIC),
-                sweeps=1,
-                seed=seed + 1,
-                report=lambda done, of, nats: progress("optimising static", done, of),
-            )
-        elif method == "policy":
+        if method == "policy":
             assert trained is not None  # loaded above
-            decider = trained.decider
+            decider: Any = trained.decider
         elif method == "ahead" and isinstance(task, GridTask):
             progress("fitting ahead", 0, 1)
             decider = fit(task, seed=seed + 1).decider  # other sessions than judge it
         else:
-            decider = _decider(method, rules, rollouts)
+            decider = _decider(method, rules)
         decider = jax.tree.map(jnp.asarray, decider)
         played = compare(
             task,
             {method: decider},
             episodes,
             seed,
-            batch=_BATCH.get(method, 1024),
+            batch=_BATCH,
             progress=lambda done, method=method: progress(method, done, episodes),  # type: ignore[misc]  # default binds the loop's value
         )
         found.append(played)
@@ -195,18 +173,12 @@ def _rules(
     return found
 
 
-def _decider(method: str, rules: Mapping[str, Scored], rollouts: int) -> Any:
+def _decider(method: str, rules: Mapping[str, Scored]) -> Any:
     simple = {
         "random": Random(), "gain": Gain(), "rate": GainRate(), "shares": SHARES,
         "ahead": AHEAD,
     }  # fmt: skip
-    if method in simple:
-        return simple[method]
-    if method == "two_step":
-        return TwoStep(rules.get("state", SHARES))
-    if method == "rollouts":
-        return Rollouts(rules.get("state", SHARES), rollouts=rollouts)
-    return rules[method]
+    return simple[method] if method in simple else rules[method]
 
 
 @jax.jit

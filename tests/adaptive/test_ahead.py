@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy import special
 
-from jaxcal.adaptive.dynamic import solve
+from benchmarks.sequential.family.draws import draw
+from benchmarks.sequential.family.padded import pad, stack
+from benchmarks.sequential.family.structures import Limits
+from benchmarks.sequential.optimum import solve
 from jaxcal.adaptive.episodes import compare
-from jaxcal.adaptive.family.draws import draw
-from jaxcal.adaptive.family.padded import pad, stack
-from jaxcal.adaptive.family.structures import Limits
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import Ahead
 from jaxcal.adaptive.rules import SHARES, log_score

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxcal.adaptive import next_measurement, play, run
-from jaxcal.adaptive.fitting import fit
+from jaxcal.adaptive.fit_ahead import fit
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.policy.network import Policy, initial

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from benchmarks.sequential.deciders import Rollouts, TwoStep
+from benchmarks.sequential.sequence import Static
 from jaxcal.adaptive.grid import GridBelief, GridTask
-from jaxcal.adaptive.lookahead import Rollouts, TwoStep
 from jaxcal.adaptive.policy.network import Policy, initial
 from jaxcal.adaptive.rules import Gain, GainRate, Priced, Random, StateRule
-from jaxcal.adaptive.static import Static
 
 RULE = StateRule(0.1, 1.0, 1.0)
 

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.sequential.family.draws import BUDGETS, draw
+from benchmarks.sequential.family.padded import SHAPE, batch, pad, stack
+from benchmarks.sequential.family.structures import HELD_OUT, TRAINED_ON, Limits
 from jaxcal.adaptive import next_measurement, play
-from jaxcal.adaptive.family.draws import BUDGETS, draw
-from jaxcal.adaptive.family.padded import SHAPE, batch, pad, stack
-from jaxcal.adaptive.family.structures import HELD_OUT, TRAINED_ON, Limits
-from jaxcal.adaptive.fitting import fit
+from jaxcal.adaptive.fit_ahead import fit
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.rules import SHARES, Gain, Random
 from jaxcal.adaptive.tasks.knee import knee

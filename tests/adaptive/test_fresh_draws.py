@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.sequential.deciders import TwoStep
 from jaxcal.adaptive.episodes import play
-from jaxcal.adaptive.lookahead import TwoStep
 from jaxcal.adaptive.loop import next_measurement
 from jaxcal.adaptive.rules import Gain, Priced
 from jaxcal.adaptive.tasks import registry

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxcal.adaptive.dynamic import solve
+from benchmarks.sequential.optimum import solve
 from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.rules import Gain, GainRate, Random

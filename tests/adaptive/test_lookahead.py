@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxcal.adaptive import static
+from benchmarks.sequential import sequence
+from benchmarks.sequential.deciders import Rollouts, TwoStep
 from jaxcal.adaptive.episodes import compare, play
-from jaxcal.adaptive.lookahead import Rollouts, TwoStep
 from jaxcal.adaptive.rules import Priced, shortlist
 from jaxcal.adaptive.session import Options
 from jaxcal.adaptive.tasks.knee import STATE_RULE, knee
@@ -132,10 +132,10 @@ def test_rollouts_are_better_than_their_base():
 def test_a_static_sequence_is_as_good_as_the_best_of_all():
     task = knee(4, sigma=0.05, seconds=4.0, trips=1)
     keys = jax.random.split(jax.random.key(5), 256)
-    found = static.optimise(task, length=3, episodes=256, starts=8, seed=5)
+    found = sequence.optimise(task, length=3, episodes=256, starts=8, seed=5)
 
     def nats(sequence):
-        return float(play(task, static.Static(np.array(sequence)), keys).gain.mean())
+        return float(play(task, sequence.Static(np.array(sequence)), keys).gain.mean())
 
     every = [nats((a, b, c)) for a in range(6) for b in range(6) for c in range(6)]
     assert nats(found.sequence) == pytest.approx(max(every), rel=0.02)
@@ -157,7 +157,7 @@ def test_bad_sizes_of_a_search_are_refused():
     with pytest.raises(ValueError, match="elite must be between 1 and population = 4"):
         tune(TASK, STATE_RULE, population=4, elite=4)
     with pytest.raises(ValueError, match="length must be"):
-        static.optimise(TASK, length=0)
+        sequence.optimise(TASK, length=0)
 
 
 pytestmark = pytest.mark.slow  # minutes together

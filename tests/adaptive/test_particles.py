@@ -11,11 +11,11 @@ import pytest
 from flax import struct
 from scipy import integrate, special, stats
 
+from benchmarks.sequential.bounds import sace, spce
 from benchmarks.tasks.ces import CES, ces
 from benchmarks.tasks.hyperbolic import Hyperbolic
 from benchmarks.tasks.location import LocationFinding
 from benchmarks.tasks.prey import make_prey
-from jaxcal.adaptive.bounds import sace, spce
 from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.particles import ParticleTask, systematic
 from jaxcal.adaptive.rules import SHARES, Gain, GainRate, Random

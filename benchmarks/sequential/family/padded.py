@@ -10,8 +10,8 @@ import numpy as np
 from flax import struct
 from numpy.typing import ArrayLike
 
-from jaxcal.adaptive.family.draws import draw
-from jaxcal.adaptive.family.structures import Limits
+from benchmarks.sequential.family.draws import draw
+from benchmarks.sequential.family.structures import Limits
 from jaxcal.adaptive.grid import GridBelief, GridTask, Part
 from jaxcal.adaptive.session import Options, Session
 

@@ -4,11 +4,11 @@ import jax
 import numpy as np
 import pytest
 
-from jaxcal.adaptive import fitting, next_measurement
+from benchmarks.sequential.family.draws import draw
+from benchmarks.sequential.family.structures import Limits
+from jaxcal.adaptive import fit_ahead, next_measurement
 from jaxcal.adaptive.episodes import compare
-from jaxcal.adaptive.family.draws import draw
-from jaxcal.adaptive.family.structures import Limits
-from jaxcal.adaptive.fitting import fit, outside
+from jaxcal.adaptive.fit_ahead import fit, outside
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.rules import SHARES, Gain
@@ -24,7 +24,9 @@ def task(request):
 
 
 def of(task):
-    return fitting._Task("", task, np.asarray(task.seconds), np.asarray(task.num_uses))
+    return fit_ahead._Task(
+        "", task, np.asarray(task.seconds), np.asarray(task.num_uses)
+    )
 
 
 def test_the_kernels_sessions_are_those_of_the_other_simulator(task):
@@ -43,7 +45,7 @@ def test_the_kernels_sessions_are_those_of_the_other_simulator(task):
 
 def test_the_same_task_and_budget_have_the_same_constants(task):
     one, same = fit(task, 9.0, 1), fit(task, 9.0, 1)
-    fitting._fit.cache_clear()
+    fit_ahead._fit.cache_clear()
     again = fit(task, 9.0, 1)
     assert one is same
     assert one.nats == again.nats and one.more == again.more
@@ -58,10 +60,10 @@ def test_the_rule_decides_where_the_tree_loses(task, monkeypatch):
         nats = 1.0 + (decider.effort == 0.0) + 0.1 * rng.random((count, 1))
         return nats, np.zeros((count, 1), np.int32)
 
-    monkeypatch.setattr(fitting._Task, "play", play)
-    fitting._fit.cache_clear()
+    monkeypatch.setattr(fit_ahead._Task, "play", play)
+    fit_ahead._fit.cache_clear()
     found = fit(task)
-    fitting._fit.cache_clear()
+    fit_ahead._fit.cache_clear()
     assert found.decider is SHARES and found.more == 0.0 and found.nats > 1.9
 
 

@@ -1,6 +1,6 @@
 """One policy on tasks it was not trained on, and with a belief that is wrong.
 
-    python benchmarks/adaptive_transfer.py [--checkpoint DIR] [--episodes 4096]
+    python -m benchmarks.sequential.transfer [--checkpoint DIR] [--episodes 4096]
         [--seed 0] [--parts small table other wrong rollouts] [--small DIR]
         [--json FILE]
 
@@ -38,10 +38,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcal.adaptive.dynamic import solve
+from benchmarks.sequential.deciders import Rollouts
+from benchmarks.sequential.optimum import solve
 from jaxcal.adaptive.episodes import compare
 from jaxcal.adaptive.grid import GridBelief, GridTask
-from jaxcal.adaptive.lookahead import Rollouts
 from jaxcal.adaptive.policy import run
 from jaxcal.adaptive.rules import Gain, GainRate, best
 from jaxcal.adaptive.tasks.knee import PRICED, STATE_RULE, knee

@@ -1,12 +1,12 @@
 """``ahead`` and other deciders on twenty families of tasks.
 
-    python benchmarks/families.py [--episodes 4096] [--seed 0] [--families 0 1 ...]
-        [--methods NAME ...] [--keep DIR] [--json FILE]
-    python benchmarks/families.py --optimum
-    python benchmarks/families.py --tune
+    python -m benchmarks.sequential.families [--episodes 4096] [--seed 0]
+        [--families 0 1 ...] [--methods NAME ...] [--keep DIR] [--json FILE]
+    python -m benchmarks.sequential.families --optimum
+    python -m benchmarks.sequential.families --tune
 
-A family is a task drawn by ``jaxcal.adaptive.family`` from a held-out structure: the
-constants of ``shares`` and how ``ahead`` is fitted were found on other structures.
+A family is a task drawn by ``benchmarks.sequential.family`` from a held-out structure:
+the constants of ``shares`` and how ``ahead`` is fitted were found on other structures.
 Every method plays the same sessions of it; on other sessions ``priced`` and ``state``
 are tuned on it first, 20 generations each, and ``ahead`` is fitted. ``two_step`` and
 ``rollouts`` follow ``shares`` and play fewer, as ``deep`` does: ``ahead`` not fitted,
@@ -36,15 +36,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.adaptive_transfer import arrays, shown
-from jaxcal.adaptive.dynamic import solve
+from benchmarks.sequential.deciders import Rollouts, TwoStep
+from benchmarks.sequential.family.draws import draw
+from benchmarks.sequential.family.padded import batch
+from benchmarks.sequential.family.structures import HELD_OUT, Limits
+from benchmarks.sequential.optimum import solve
+from benchmarks.sequential.transfer import arrays, shown
 from jaxcal.adaptive.episodes import compare, play
-from jaxcal.adaptive.family.draws import draw
-from jaxcal.adaptive.family.padded import batch
-from jaxcal.adaptive.family.structures import HELD_OUT, Limits
-from jaxcal.adaptive.fitting import fit
+from jaxcal.adaptive.fit_ahead import fit
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.lookahead import AHEAD, Ahead, Rollouts, TwoStep
+from jaxcal.adaptive.lookahead import AHEAD, Ahead
 from jaxcal.adaptive.rules import (
     SHARES,
     Gain,

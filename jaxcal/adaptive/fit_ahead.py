@@ -21,7 +21,6 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.adaptive.family.structures import Limits
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.journal import fingerprint
 from jaxcal.adaptive.lookahead import AHEAD, Ahead, tree
@@ -41,7 +40,10 @@ _MOST, _LEAST = 512, 16  # sessions of one estimate
 _OF_ALL, _POWER = 8.0, 0.25  # pseudo-counts of the mean share; hint = (A share)^.25
 _HASTE = 0.3  # start of its search where time is not limited
 
-_SHOWN = Limits(states=1024, designs=48, outcomes=4, measurements=32)
+_MEASURED = {
+    "states": 1024, "designs": 48, "outcomes": 4, "uses": 5, "measurements": 32,
+    "groups": 4,
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,9 +67,9 @@ def outside(task: Any) -> tuple[str, ...]:
         "measurements": task.horizon, "groups": task.num_groups,
     }  # fmt: skip
     return tuple(
-        f"{size:,} {name}: measured up to {getattr(_SHOWN, name):,}"
+        f"{size:,} {name}: measured up to {_MEASURED[name]:,}"
         for name, size in sizes.items()
-        if size > getattr(_SHOWN, name)
+        if size > _MEASURED[name]
     )
 
 

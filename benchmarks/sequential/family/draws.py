@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from jaxcal.adaptive.family.structures import (
+from benchmarks.sequential.family.structures import (
     HELD_OUT,
     TRAINED_ON,
     Limits,

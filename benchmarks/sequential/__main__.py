@@ -1,6 +1,6 @@
 """Public tasks of sequential design: a compiled look-ahead beside published figures.
 
-    python benchmarks/sequential.py [--only ROW ...] [--episodes N] [--seed S]
+    python -m benchmarks.sequential [--only ROW ...] [--episodes N] [--seed S]
         [--json FILE]
 
 Every row plays N sessions in which each measurement is the candidate of the largest
@@ -31,12 +31,12 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from benchmarks.sequential.bounds import sace
 from benchmarks.tasks.ces import ces
 from benchmarks.tasks.death import death_process
 from benchmarks.tasks.hyperbolic import hyperbolic
 from benchmarks.tasks.location import LocationFinding, location_finding
 from benchmarks.tasks.prey import prey
-from jaxcal.adaptive.bounds import sace
 from jaxcal.adaptive.episodes import Episodes
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.particles import ParticleTask

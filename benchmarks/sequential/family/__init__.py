@@ -1,8 +1,8 @@
 """A family of tasks drawn at random, to compare deciders on more than one task."""
 
-from jaxcal.adaptive.family.draws import BUDGETS, draw
-from jaxcal.adaptive.family.padded import SHAPE, Padded, batch, pad, stack
-from jaxcal.adaptive.family.structures import HELD_OUT, TRAINED_ON, Limits
+from benchmarks.sequential.family.draws import BUDGETS, draw
+from benchmarks.sequential.family.padded import SHAPE, Padded, batch, pad, stack
+from benchmarks.sequential.family.structures import HELD_OUT, TRAINED_ON, Limits
 
 __all__ = [
     "BUDGETS",

@@ -1,0 +1,1 @@
+"""Sequential measurement: published tasks, a family of tasks, what only compares."""
