@@ -23,10 +23,21 @@ PUBLIC = (
     "jaxcal.selection",
     "jaxcal.calibration",
     "jaxcal.adaptive",
+    "jaxcal.learning",
     "jaxcal.candidates",
     "jaxcal.evaluation",
     "jaxcal.plots",
 )
+FIRST = {  # what a page begins with; the rest follows in the order of the alphabet
+    "jaxcal": ("select", "Design", "Selection", "identify", "Calibration"),
+    "jaxcal.calibration": ("identify", "Calibration"),
+    "jaxcal.selection": ("select", "Design", "Selection"),
+    "jaxcal.models": ("Affine", "Linear", "Polynomial", "SerialChain", "FromJax"),
+    "jaxcal.learning": (
+        *("make_train", "preset", "reset", "step", "observe", "start"),
+        *("SelectionConfig", "SelectionState", "Task", "Postures", "Network"),
+    ),
+}
 CONSTANTS = (str, int, float, tuple, dict)  # documented where they are defined
 
 
@@ -57,7 +68,8 @@ def api_page(module_name: str) -> str:
     """The page of one public module: every name of its ``__all__``."""
     module = importlib.import_module(module_name)
     lines = [f"# {module_name}", "", inspect.getdoc(module) or "", ""]
-    for name in module.__all__:
+    first = FIRST.get(module_name, ())
+    for name in (*first, *(name for name in module.__all__ if name not in first)):
         value = getattr(module, name)
         if isinstance(value, CONSTANTS):
             shown = ", ".join(f"`{each}`" for each in value)

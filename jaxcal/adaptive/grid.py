@@ -118,7 +118,7 @@ class Part:
 
 @struct.dataclass
 class GridTask:
-    """S values of theta, A designs, Y outcomes, P places; made by :func:`make`.
+    """S values of theta, A designs, Y outcomes, P places; made by ``make``.
 
     A design is an index in [0, A), an outcome one in [0, Y), the truth one in [0, S).
     """

@@ -101,7 +101,7 @@ def run(
     """Propose, measure, update, until the budget is spent.
 
     Args:
-        task, decider, seconds, uses, seed: as in :func:`next_measurement`.
+        task, decider, seconds, uses, seed: as in ``next_measurement``.
         measure: makes the measurement and returns its outcome; whatever it raises ends
             the loop, and what was measured before is in the journal.
         journal: file of the session. Where it is there the session goes on as if it had

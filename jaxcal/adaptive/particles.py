@@ -1,6 +1,6 @@
 """Tasks of continuous unknowns, and their belief: particles.
 
-The unknowns of a :class:`Model` are functions of d independent standard normal
+The unknowns of a ``Model`` are functions of d independent standard normal
 coordinates z, so every prior is N(0, I) and information, which no change of coordinates
 alters, is that of the unknowns themselves.
 """

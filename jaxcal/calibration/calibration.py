@@ -29,7 +29,7 @@ class Calibration(Fit):
     """The identified map from commands u (n inputs) to outputs y (m of them).
 
     ``y = f(u; theta)`` with the most probable p parameters; printed, they come with
-    their intervals. ``identify`` makes it; see :class:`Fit` for its fields.
+    their intervals. ``identify`` makes it; see ``Fit`` for its fields.
     """
 
     def __repr__(self) -> str:
@@ -110,7 +110,7 @@ class Calibration(Fit):
     @functools.cached_property
     def verdict(self) -> Any:
         """What the model says of this calibration, of an arm a
-        :class:`jaxcal.models.serial.verdict.Verdict`; None of most models."""
+        ``jaxcal.models.serial.verdict.Verdict``; None of most models."""
         return self.model.verdict(self)
 
     # -- an arm, written back ----------------------------------------------------------
@@ -121,7 +121,7 @@ class Calibration(Fit):
         return self.whole.calibrated(self.estimate)
 
     def to_urdf(self, path: str | os.PathLike[str], *, force: bool = False) -> str:
-        """The arm's own file, corrected; see :meth:`jaxcal.models.SerialChain.write`.
+        """The arm's own file, corrected; see ``jaxcal.models.SerialChain.write``.
 
         Returns the tip link.
         """

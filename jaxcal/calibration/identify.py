@@ -67,7 +67,7 @@ def identify(
     Args:
         commands: (N, n) what the device was told, in any unit.
         measured: (N, m) what it reached, in any unit.
-        model: of :mod:`jaxcal.models`, or any object with its methods; affine when not
+        model: of ``jaxcal.models``, or any object with its methods; affine when not
             given.
         prior: what is known beforehand; ``model.default_prior()`` when not given.
         noise: of readings and commands; ``command_std`` makes the commands unknowns of

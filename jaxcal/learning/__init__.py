@@ -1,17 +1,123 @@
-"""Training: the pure algorithm in ``core``, environments, policies and runs."""
+"""Posture selection as an environment in JAX, and the training of policies for it.
+
+``reset``, ``step`` and ``observe`` are pure functions of one episode; ``jax.vmap``
+makes a batch. ``make_train`` gives a whole training as one pure function. A network, a
+reward or another environment of one's own is a ``Learner``: ``Postures`` plays episodes
+of a ``Task`` with a ``Network``. Names load on first use, since inference without JAX
+imports this package too.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import importlib
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["make_train"]
+if TYPE_CHECKING:
+    from jaxcal.learning.config import EpisodesConfig, StreamsConfig
+    from jaxcal.learning.core.network import Network, mask_logits
+    from jaxcal.learning.core.postures import Episode, Postures
+    from jaxcal.learning.core.ppo import Learner
+    from jaxcal.learning.core.streams import Streams
+    from jaxcal.learning.environments.brax_env import SelectionEnv, wrap_fresh
+    from jaxcal.learning.environments.selection import (
+        SelectionConfig,
+        SelectionState,
+        observe,
+        reset,
+        start,
+        step,
+    )
+    from jaxcal.learning.environments.task import Task
+    from jaxcal.learning.policies.networks import NetworkConfig
+    from jaxcal.learning.training.config import TrainConfig
+    from jaxcal.learning.training.presets import load as preset
+
+__all__ = [
+    "Episode",
+    "EpisodesConfig",
+    "Learner",
+    "Network",
+    "NetworkConfig",
+    "Postures",
+    "SelectionConfig",
+    "SelectionEnv",
+    "SelectionState",
+    "Streams",
+    "StreamsConfig",
+    "Task",
+    "TrainConfig",
+    "make_train",
+    "mask_logits",
+    "observe",
+    "preset",
+    "reset",
+    "start",
+    "step",
+    "wrap_fresh",
+]
+
+_HOME = {
+    "config": ("EpisodesConfig", "StreamsConfig"),
+    "core.network": ("Network", "mask_logits"),
+    "core.postures": ("Episode", "Postures"),
+    "core.ppo": ("Learner",),
+    "core.streams": ("Streams",),
+    "environments.brax_env": ("SelectionEnv", "wrap_fresh"),
+    "environments.selection": (
+        *("SelectionConfig", "SelectionState", "observe", "reset", "start", "step"),
+    ),
+    "environments.task": ("Task",),
+    "policies.networks": ("NetworkConfig",),
+    "training.config": ("TrainConfig",),
+    "training.presets": ("preset",),
+}
 
 
-def make_train(config: Any) -> Any:
-    """A whole training as one pure function; see ``core.ppo.make_train``.
+def __getattr__(name: str) -> Any:
+    for module, names in _HOME.items():
+        if name in names:
+            home = importlib.import_module(f"jaxcal.learning.{module}")
+            return getattr(home, "load" if name == "preset" else name)
+    raise AttributeError(f"module 'jaxcal.learning' has no attribute {name!r}")
 
-    JAX is imported here, because inference without JAX imports this package too.
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def make_train(config: TrainConfig | Learner | str) -> Any:
+    """A whole training as one pure function, to be jitted, scanned or vmapped.
+
+    ``train = make_train("compact")``, then ``weights, metrics =
+    jax.jit(train)(jax.random.key(0))``; ``jax.vmap(train)`` of several keys trains them
+    side by side.
+
+    Args:
+        config: the name of a preset, a ``TrainConfig``, or any object with ``ppo`` and
+            ``learners``, of which update u trains number u modulo theirs; or one
+            learner, such as ``Postures(ppo, task, network)``.
+
+    Returns:
+        ``train(key, *given)`` -> the averaged weights, and metrics with a leading axis
+        of ``config.ppo.num_updates``. ``given``: none for postures, the arrays of a
+        task for streams.
+
+    Raises:
+        ValueError: it is none of these, or no preset has the name.
     """
+    from types import SimpleNamespace
+
     from jaxcal.learning.core import ppo
 
+    if isinstance(config, str):
+        from jaxcal.learning.training import presets
+
+        return ppo.make_train(presets.load(config))
+    if all(hasattr(config, name) for name in ("config", "gather", "loss")):
+        return ppo.make_train(SimpleNamespace(ppo=config.config, learners=(config,)))
+    if not all(hasattr(config, name) for name in ("ppo", "learners")):
+        raise ValueError(
+            "config must be a preset's name, a TrainConfig or a learner, got "
+            f"{type(config).__name__}"
+        )
     return ppo.make_train(config)

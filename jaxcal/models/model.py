@@ -114,7 +114,7 @@ class Model(abc.ABC):
         return []
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON with a ``kind``; :func:`jaxcal.models.from_dict` reads it."""
+        """JSON with a ``kind``; ``jaxcal.models.from_dict`` reads it."""
         return {"kind": type(self).__name__}
 
     # -- what is known before measuring ------------------------------------------------
@@ -218,7 +218,7 @@ class Model(abc.ABC):
         return lambda commands, rows: desired[rows]
 
     def verdict(self, fit: Any) -> Any:
-        """Whether a :class:`jaxcal.Calibration` of this model can be trusted.
+        """Whether a ``jaxcal.Calibration`` of this model can be trusted.
 
         Returns:
             Printed, the reasons; ``good`` if it may be used. None where the model has
@@ -272,7 +272,7 @@ class _Wrapped(Model):
 
 
 def as_model(model: Any) -> Model:
-    """``model`` itself, or with the defaults of :class:`Model` if it is another object.
+    """``model`` itself, or with the defaults of ``Model`` if it is another object.
 
     Raises:
         ValueError: it is a class, or lacks a method that has no default.

@@ -45,7 +45,7 @@ class Prior:
         mean: likewise; the model's nominal value where it is left out.
         fixed: names of parameters held at the mean, out of the identification.
         by_data: of an arm, the sizes of the errors are taken from the readings; see
-            :meth:`sized`.
+            ``sized``.
     """
 
     std: Named

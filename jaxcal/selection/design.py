@@ -112,7 +112,7 @@ class Design(Planned, Travelled):
 
         Args:
             indices: (k,) the subset; repeated entries are replicates.
-            criterion: as in :meth:`select`.
+            criterion: as in ``select``.
             reference: what ``bound`` and ``efficiency`` are measured against, "bound"
                 (the cheapest bound, computed when read) or "exact" (the optimum).
             time_limit: seconds for the optimum, 10 when not given.
@@ -243,12 +243,12 @@ def select(
         k: candidates to choose; the fewest that identify when not given.
         method: "auto", "exact", "exchange", "greedy", "random" or "policy".
         blocks: (M, q, p) instead of candidates and model, as in
-            :meth:`Design.from_blocks`; ``prior`` is then a (p, p) precision.
+            ``Design.from_blocks``; ``prior`` is then a (p, p) precision.
         model, prior, noise, measured, available, required, max_replicates, names: of
-            the problem, see :class:`Design`.
-        criterion, region: what is best, see :meth:`Design.select`.
+            the problem, see ``Design``.
+        criterion, region: what is best, see ``Design.select``.
         options: seed, restarts, time_limit, best, least_efficiency, checkpoint,
-            decoding, num: those that the method reads, see :meth:`Design.select`.
+            decoding, num: those that the method reads, see ``Design.select``.
 
     Returns:
         The selection; never a singular one.

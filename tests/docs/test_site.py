@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import importlib
+import inspect
 import os
 import pathlib
+import re
 import shutil
 import subprocess
 import sys
@@ -58,6 +62,47 @@ def site(tmp_path_factory):
         cwd=ROOT, check=True, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
     )  # fmt: skip
     return folder
+
+
+def public(value: type) -> set[str]:
+    """Methods, properties and fields of a class that its page must show."""
+    kinds = types.FunctionType, property, functools.cached_property, classmethod
+    shown = {
+        name
+        for base in value.__mro__
+        if base.__module__.startswith("jaxcal")
+        for name, member in vars(base).items()
+        if isinstance(member, kinds)
+        and getattr(member, "__module__", "jaxcal").startswith("jaxcal")
+    }
+    if dataclasses.is_dataclass(value):
+        of_flax = ("parent", "name") if hasattr(value, "apply") else ()
+        named = {field.name for field in dataclasses.fields(value)}
+        shown |= named.difference(of_flax)
+    return {name for name in shown if not name.startswith("_")}
+
+
+@pytest.mark.slow
+def test_every_public_method_and_field_is_on_its_page(site, hooks):
+    for module_name in hooks.PUBLIC:
+        module = importlib.import_module(module_name)
+        page = (site / "reference" / f"{module_name}.html").read_text()
+        assert not re.search(r":(class|func|meth|mod):", page), module_name
+        for name in module.__all__:
+            value = getattr(module, name)
+            if not inspect.isclass(value):
+                continue
+            path = f"{value.__module__}.{value.__name__}"
+            missing = {m for m in public(value) if f'id="{path}.{m}"' not in page}
+            assert not missing, (path, missing)
+    page = (site / "reference" / "jaxcal.html").read_text()
+    assert page.index('id="jaxcal.selection.design.select"') < page.index(
+        'id="jaxcal.selection.criteria.As"'
+    )
+    for name in ("command_for", "save", "check", "verification", "verdict", "loss"):
+        assert f'id="jaxcal.calibration.calibration.Calibration.{name}"' in page
+    for name in ("plan", "fastest", "pareto"):
+        assert f'id="jaxcal.selection.design.Design.{name}"' in page
 
 
 @pytest.fixture

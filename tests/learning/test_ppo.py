@@ -12,6 +12,7 @@ import numpy as np
 import optax
 import pytest
 
+import jaxcal.learning
 from jaxcal.learning.config import EpisodesConfig, StreamsConfig
 from jaxcal.learning.core import network as networks
 from jaxcal.learning.core import ppo
@@ -385,3 +386,17 @@ def test_a_bad_configuration_is_named(values, named):
 def test_a_bad_seed_is_named():
     with pytest.raises(ValueError, match="seed must be 0 or more, got -1"):
         TrainConfig(seed=-1)
+
+
+def test_a_training_is_asked_for_by_name_by_configuration_or_by_learner():
+    config = jaxcal.learning.preset("compact")
+    wanted = jax.eval_shape(ppo.make_train(config), jax.random.key(0))
+    for asked in ("compact", config, config.learners[0]):
+        train = jaxcal.learning.make_train(asked)
+        assert jax.eval_shape(train, jax.random.key(0)) == wanted
+    with pytest.raises(ValueError, match=r"preset must be one of .*, got 'small'"):
+        jaxcal.learning.make_train("small")
+    with pytest.raises(ValueError, match=r"a TrainConfig or a learner, got int"):
+        jaxcal.learning.make_train(4)
+    for name in jaxcal.learning.__all__:
+        assert getattr(jaxcal.learning, name) is not None

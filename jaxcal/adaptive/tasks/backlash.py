@@ -74,7 +74,7 @@ def backlash(
 ) -> GridTask:
     """The task: theta = (width, offset), design = (posture, direction).
 
-    An outcome is the bin, of :func:`backlash_bins`, of the reading less the signed
+    An outcome is the bin, of ``backlash_bins``, of the reading less the signed
     posture. All angles are in one unit, such as degrees.
 
     Args:
@@ -170,7 +170,7 @@ def dead_zone(
             the reference, for an instrument of unknown zero. Plain readings when None.
         num_postures: commands, evenly spaced.
         sigma: noise of a reading.
-        bin_width: of the outcomes, of :func:`dead_zone_bins`.
+        bin_width: of the outcomes, of ``dead_zone_bins``.
         outliers: share of readings that carry no information.
         measurements: that end a session.
     """

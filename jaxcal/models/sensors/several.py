@@ -24,7 +24,7 @@ class Several(Sensor):
     """Readings of some sensors, each in units of its own noise.
 
     Commands have the column ``sensor``, which says of each row which one read it, and
-    then the columns of all of them (0 where they are another's); :meth:`rows` makes
+    then the columns of all of them (0 where they are another's); ``rows`` makes
     such tables. The first is at the tool; where the others are on it are parameters of
     their own, known as a tool is.
 

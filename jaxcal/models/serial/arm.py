@@ -110,7 +110,7 @@ class Arm:
     def rotations(self, commands: ArrayLike, vectors: ArrayLike) -> Array:
         """Rotation matrices (N, 3, 3) of turns from nominal (N, 3) in degrees.
 
-        The inverse of :meth:`rotation_vectors`.
+        The inverse of ``rotation_vectors``.
         """
         from scipy.spatial.transform import Rotation
 

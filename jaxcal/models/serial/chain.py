@@ -66,7 +66,7 @@ class SerialChain(Arm, Model):
     asked for, always last. The turns of base and tool are relative to their nominal
     rotation. Commands are the joints, then the columns that the sensor asks for.
 
-    Made by :meth:`from_dh` and :meth:`from_urdf`.
+    Made by ``from_dh`` and ``from_urdf``.
     """
 
     @classmethod
@@ -217,7 +217,7 @@ class SerialChain(Arm, Model):
             limits: least and greatest command of joints, by name, instead of the
                 file's.
             options: ``gears``, ``compliance``, ``loads``, ``gravity`` of
-                :meth:`from_dh`.
+                ``from_dh``.
         """
         # scipy.spatial and the XML parser take half a second to load.
         from jaxcal.models.serial.urdf import read_urdf
@@ -680,7 +680,7 @@ class SerialChain(Arm, Model):
         """Loose knowledge of any arm, by the length of its links; see the constants.
 
         What the sensor cannot see is held; of contacts and positions the scales of
-        the groups are taken from the readings (:meth:`Prior.sized`).
+        the groups are taken from the readings (``Prior.sized``).
         """
         length = self.length or np.inf  # axes of unknown stroke alone
         joint = [_LENGTH * length, _TWIST, _LENGTH * length, _ZERO, _TWIST]
@@ -738,7 +738,7 @@ class SerialChain(Arm, Model):
         return goal
 
     def verdict(self, fit: Any) -> Any:
-        """:class:`jaxcal.models.serial.verdict.Verdict` of a calibration."""
+        """``jaxcal.models.serial.verdict.Verdict`` of a calibration."""
         from jaxcal.models.serial.verdict import verdict
 
         return verdict(fit)

@@ -33,7 +33,7 @@ def postures(
     near: ArrayLike | None,
     allowed: Callable[[Array], bool] | None,
 ) -> Array:
-    """See :meth:`jaxcal.models.SerialChain.postures`."""
+    """See ``jaxcal.models.SerialChain.postures``."""
     whole_number("count", count, 1)
     if isinstance(arm.sensor, Several):
         raise ValueError(

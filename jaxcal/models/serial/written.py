@@ -61,7 +61,7 @@ class _Part(NamedTuple):
 
 
 def written(form: str, nominal: Arm, calibrated: Arm) -> tuple[str, str]:
-    """The text of a form of :meth:`SerialChain.write`, and the tip link, if any."""
+    """The text of a form of ``SerialChain.write``, and the tip link, if any."""
     one_of("form", form, ("urdf", "dh", "ur"))
     if form == "urdf":
         return _urdf_text(nominal, calibrated)

@@ -1,7 +1,7 @@
 """The proven optimum, by whichever proof is cheaper.
 
 k = n + 1 affine postures: the absolute determinant is convex in each posture, so only
-vertices of the convex hull matter, and :mod:`jaxcal.selection.exact.volume` finds the
+vertices of the convex hull matter, and ``jaxcal.selection.exact.volume`` finds the
 largest volume. Everything else (more postures, blocks, priors, other criteria, many
 runners-up) goes to branch and bound, started from the exchange. The runner-up need not
 lie on the hull, so ``best`` > 1 does without it.

@@ -1,6 +1,6 @@
 """Largest volume |det| of q vectors out of many.
 
-The compiled search of :mod:`jaxcal.selection.exact.volume_kernel` visits only subsets
+The compiled search of ``jaxcal.selection.exact.volume_kernel`` visits only subsets
 that may be among the largest. Where there are many, it starts from a large volume, and
 in a metric in which its bounds are sharp.
 """

@@ -125,10 +125,10 @@ class Travelled(Asked):
         Each point is the fastest run more efficient than the point before it.
 
         Args:
-            k, motion: as in :meth:`fastest`.
+            k, motion: as in ``fastest``.
             least_efficiency: where to cut the front off, in (0, 1].
             options: start, method, seed and time_limit (for each point) of
-                :meth:`fastest`.
+                ``fastest``.
         """
         least = share("least_efficiency", least_efficiency)
         asked = {"start": None, "method": None, "time_limit": 60.0, "seed": 0}

@@ -1,6 +1,6 @@
 """``Asked``: what may be measured and what is known, checked; it makes problems of it.
 
-:class:`jaxcal.Design` adds the questions.
+``jaxcal.Design`` adds the questions.
 """
 
 from __future__ import annotations

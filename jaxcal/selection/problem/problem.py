@@ -2,7 +2,7 @@
 
 Solvers read whitened information blocks: candidate i adds ``B_i.T @ B_i`` to the
 prior's precision, and with everything available measured at once the sum is the
-identity (see :mod:`jaxcal.information.blocks`). A solver that reads nothing else picks
+identity (see ``jaxcal.information.blocks``). A solver that reads nothing else picks
 the same candidates in pulses, degrees or [0, 1]. The criterion is carried into the same
 coordinates. Postures of the affine model are blocks [u, 1] that count once per output.
 """

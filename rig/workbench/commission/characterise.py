@@ -6,7 +6,7 @@ the readings at one place that is reached from either side. Then the dead zone, 
 from below, so that the play shifts all alike: the difference of the readings on its two
 sides. Then the breakaway: steps from rest, on in the direction in which the axis came,
 so that no play enters; there every step follows from the last, by a belief of
-:mod:`jaxcal.adaptive`.
+``jaxcal.adaptive``.
 
 Ways are degrees of the axis's commands from where it stood, upwards.
 """
