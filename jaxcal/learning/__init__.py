@@ -85,7 +85,7 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
-def make_train(config: TrainConfig | Learner | str) -> Any:
+def make_train(config: Any) -> Any:
     """A whole training as one pure function, to be jitted, scanned or vmapped.
 
     ``train = make_train("compact")``, then ``weights, metrics =
