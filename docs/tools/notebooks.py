@@ -26,8 +26,12 @@ def made(name: str) -> nbformat.NotebookNode:
     cells = [v4.new_markdown_cell(_plain(pieces[0]))]
     for language, code, words in zip(*(pieces[i::3] for i in (1, 2, 3)), strict=True):
         lines = code.rstrip().splitlines()
-        shell = [f"!{line}" for line in lines] if language == "bash" else lines
-        cells.append(v4.new_code_cell("\n".join(shell)))
+        if language == "bash":
+            lines = [f"!{line}" for line in lines]
+        elif language == "text":  # what was printed; a command follows a dollar
+            lines = [f"!{line[2:]}" for line in lines if line.startswith("$ ")]
+        if lines:
+            cells.append(v4.new_code_cell("\n".join(lines)))
         if words.strip():
             cells.append(v4.new_markdown_cell(_plain(words)))
     for number, cell in enumerate(cells):

@@ -72,10 +72,26 @@ def test_the_blocks_of_a_page_run_in_their_order(page, tmp_path, monkeypatch, ca
                 capture_output=True, text=True, check=False,
             )  # fmt: skip
             assert done.returncode == 0, done.stdout + done.stderr
+            printed += done.stdout
         elif language == "text":
             shown.append(text)
-    if page.name in ("models.md", "arms.md"):
-        assert shown == [printed]
+            for line in re.findall(r"^\$ .*\n", text, re.M):
+                done = subprocess.run(
+                    ["bash", "-c", line[2:]], env={**os.environ, "PATH": path},
+                    capture_output=True, text=True, check=False,
+                )  # fmt: skip
+                printed += line + done.stdout + done.stderr
+    if page.name in ("models.md", "arms.md", "arm.md", "candidates.md"):
+        assert lines_of("".join(shown)) == lines_of(printed)
+
+
+def lines_of(text: str) -> list[str]:
+    """What is printed, less the time that a selection took, to nine digits."""
+    return [
+        re.sub(r"(\d\.\d{8})\d+", r"\1", line.rstrip())
+        for line in text.splitlines()
+        if line.strip() and not line.startswith("time ")
+    ]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
