@@ -226,7 +226,8 @@ def pooled(problem: Problem, share: float) -> Problem:
     """The problem with ``share`` of K average candidates as a further prior."""
     flat = problem.blocks.reshape(-1, problem.num_regressors)
     known = share * problem.k / len(problem.blocks) * flat.T @ flat
-    return dataclasses.replace(problem, prior=problem.prior + known)
+    white = problem.white._replace(prior=problem.prior + known)
+    return dataclasses.replace(problem, white=white)
 
 
 def look_ahead(problem: Problem, width: int = 8) -> tuple[Indices, float]:

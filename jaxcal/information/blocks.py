@@ -7,19 +7,24 @@ readings, p parameters. A prior of precision P comes as a root (r, p) with
 Columns that are the same in every block (the ones that multiply a bias) are used to
 centre the other columns: a linear map of the parameters with determinant one, exact to
 the last place of the numbers given, so encoder pulses far from zero keep their digits.
+
+Columns are first divided by powers of two where they could over- or underflow, which is
+exact. A row far from all others (1e7 beside 1) must not hide what distinguishes these:
+columns with such rows are centred where rows are densest and made orthogonal first, so
+that the other rows keep their digits.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal import compiled
 from jaxcal.information.singular import (
     SINGULAR,
     null_directions,
+    power_of_two,
     rank_rule,
     significant,
 )
@@ -41,10 +46,126 @@ Mask = NDArray[np.bool_]
 
 _EPS = float(np.finfo(np.float64).eps)
 _LOSS = 1e-9  # of orthogonality that whitened rows may have
+_CLEAR = 1e6  # share of its digits that a column may lose by centring
+_SMALL = 1e-100  # numbers below and above its inverse are divided by powers of two
+_FAR = 1e5  # times the distance of neighbours: such a row hides what these differ by
+_UNTHREADED = 240_000  # multiplications up to which BLAS starts no threads
 
 
-def _kernel() -> Any:
-    return compiled.kernel("jaxcal.information.kernel")
+class _Centred(NamedTuple):
+    """Rows of blocks and prior, less what is the same in every block of a set."""
+
+    rows: Array  # (S, M q + r, p) ``(B - B @ shift) / scale``
+    largest: Array  # (S, p) largest entry of each column of B / scale
+    scale: Array | None  # (S, p) powers of two; None: all 1
+    shift: Array | None  # (S, p, p), of columns divided by ``scale``; None: zero
+    far: Mask | None  # (S,) whether a row is far from the others; None: not looked at
+
+
+def _centred(
+    blocks: Array, usable: Mask | None, root: Array, look: bool = False
+) -> _Centred:
+    """Blocks (S, M, q, p), zero where not ``usable`` (S, M), and ``root``, centred.
+
+    ``look`` whether rows are far from the others.
+    """
+    sets, count, q, p = blocks.shape
+    largest = np.abs(blocks).max(axis=(1, 2), initial=0.0)
+    if len(root):
+        largest = np.maximum(largest, np.abs(root).max(axis=0))
+    scale = None
+    if not _SMALL < largest.min() <= largest.max() < 1.0 / _SMALL:
+        scale = power_of_two(largest)
+        blocks, largest = blocks / scale[:, None, None], largest / scale
+        root = root / scale[:, None]
+    first, masked = blocks[:, :1], usable is not None and not usable.all()
+    if masked:
+        assert usable is not None
+        first = blocks[np.arange(sets), usable.argmax(axis=1)][:, None]
+        blocks = np.where(usable[..., None, None], blocks, first)
+    same = (blocks == first).all(axis=1)  # (S, q, p)
+    if q > 1:
+        same = same.all(axis=1, keepdims=True)
+    far = where_far = None
+    if look:
+        dense, where_far = _far(blocks, largest)
+        where_far &= ~same
+        far = where_far.any(axis=(1, 2))
+    shift, constant = None, first[:, 0] * same
+    if constant.any():
+        total = blocks.sum(axis=1)
+        if masked:
+            assert usable is not None
+            missing = count - usable.sum(axis=1)[:, None, None]
+            total = (total - missing * first[:, 0]) / np.maximum(count - missing, 1)
+        else:
+            total /= count
+        if far is not None and far.any():
+            total = np.where(where_far, dense, total)
+        centre = total * ~same
+        if q == 1:
+            size = (constant * constant).sum(axis=2, keepdims=True)
+            if sets > 1:
+                size[size == 0.0] = 1.0
+            shift = np.matrix_transpose(constant) / size * centre
+            if sets > 1:
+                centre = constant @ shift  # of sets without constants it is zero
+        else:
+            shift = np.linalg.pinv(constant) @ centre
+            centre = constant @ shift
+        blocks = blocks - centre[:, None]
+    if masked:
+        blocks = np.where(usable[..., None, None], blocks, 0.0)  # type: ignore[index]
+    rows = blocks.reshape(sets, count * q, p)
+    if len(root):
+        known = root if shift is None else root - root @ shift
+        rows = np.concatenate([rows, np.broadcast_to(known, (sets, *known.shape[-2:]))],
+                              axis=1)  # fmt: skip
+    return _Centred(rows, largest, scale, shift, far)
+
+
+def _far(blocks: Array, largest: Array) -> tuple[Array, Mask]:
+    """Where entries of (S, M, q, p) are densest, (S, q, p), and whether some are far.
+
+    By the smallest distance between a few neighbours that is not zero.
+    """
+    count = blocks.shape[1]
+    few = min(1 + count.bit_length() // 6, count - 1)
+    ordered = np.sort(blocks, axis=1)
+    apart = ordered[:, few:] - ordered[:, : count - few]
+    if not apart.shape[1] or not few:
+        return ordered[:, 0], np.zeros(ordered[:, 0].shape, dtype=np.bool_)
+    far = (largest[:, None, None] > _FAR * apart) & (apart > 0.0)
+    if not far.any():
+        return ordered[:, 0], far[:, 0]
+    at = np.where(apart > 0.0, apart, np.inf).argmin(axis=1)[:, None]
+    return np.take_along_axis(ordered, at, axis=1)[:, 0], far.any(axis=1)
+
+
+def _parts(rows: Array) -> Array:
+    """(..., parts, R, p) of (..., N, p), filled with zeros: BLAS starts no threads."""
+    *sets, count, p = rows.shape
+    part = max(1, _UNTHREADED // (p * p))
+    empty = np.zeros((*sets, -count % part, p))
+    return np.concatenate([rows, empty], axis=-2).reshape(*sets, -1, part, p)
+
+
+def _times(rows: Array, matrix: Array) -> Array:
+    """``rows @ matrix`` of (..., N, p) and (..., p, p)."""
+    if rows[..., 0].size * matrix.shape[-1] ** 2 <= _UNTHREADED:
+        return np.asarray(rows @ matrix)
+    product = _parts(rows) @ matrix[..., None, :, :]
+    return product.reshape(*rows.shape[:-2], -1, rows.shape[-1])[
+        ..., : rows.shape[-2], :
+    ]
+
+
+def _gram(rows: Array) -> Array:
+    """``rows.T @ rows`` (..., p, p)."""
+    if rows[..., 0].size * rows.shape[-1] ** 2 <= _UNTHREADED:
+        return np.asarray(np.matrix_transpose(rows) @ rows)
+    parts = _parts(rows)
+    return np.asarray((np.matrix_transpose(parts) @ parts).sum(axis=-3))
 
 
 def triangle(rows: Array) -> Array:
@@ -110,11 +231,17 @@ def rank_of_blocks(
     Returns:
         (S,) of both.
     """
-    rows, largest, _ = _kernel().centred(blocks, None, root)
-    if size is None:
-        return rank_rule(rows, largest, blocks.shape[1])
-    largest = np.maximum(largest, size)
-    return rank_rule(rows, largest, blocks.shape[1], computed=True)
+    centred = _centred(blocks, None, root)
+    largest = centred.largest
+    scale = centred.scale
+    if size is not None:
+        largest = np.maximum(largest, size if scale is None else size / scale)
+    ranks, log_det = rank_rule(
+        centred.rows, largest, blocks.shape[1], computed=size is not None
+    )
+    if scale is not None:
+        log_det += 2.0 * np.log(scale).sum(axis=1)
+    return ranks, log_det
 
 
 def largest_rank(blocks: Array) -> int:
@@ -142,8 +269,12 @@ def missing_directions(
     blocks: Array, root: Array, coarse: float = 1.0, computed: bool = False
 ) -> list[Array]:
     """Directions (p,) that neither blocks (N, q, p) nor the prior say anything of."""
-    rows, largest, _ = _kernel().centred(blocks[None], None, root)
-    return null_directions(rows[0], coarse * largest[0], computed)
+    centred = _centred(blocks[None], None, root)
+    null = null_directions(centred.rows[0], coarse * centred.largest[0], computed)
+    if centred.scale is None:
+        return null
+    back = centred.scale[0].min() / centred.scale[0]
+    return [direction * back for direction in null]
 
 
 def coarseness(given: object) -> float:
@@ -163,6 +294,13 @@ class Whitened(NamedTuple):
     triangle: Array  # (p, p): whitened blocks times it are the centred raw ones
     size: Array | None  # (p,) of what computed blocks are rounded by, or None
     log_scale: float  # log det of unwhitened less whitened information
+    shift: Array | None  # (p, p): raw blocks less them times it are centred
+    inverse: Array  # (p, p): centred blocks times it are whitened
+
+    def of(self, rows: Array) -> Array:
+        """Other rows (..., p) of the caller's numbers in these coordinates."""
+        centred = rows if self.shift is None else rows - rows @ self.shift
+        return np.asarray(centred @ self.inverse)
 
 
 def whiten(
@@ -179,8 +317,11 @@ def whiten(
     ``B_i R^-1``, and log det of any selection is its whitened log det plus log det T. A
     linear map of the parameters rotates the whitened blocks and nothing else.
 
+    R is Cholesky's factor of ``rows.T @ rows``, the cheapest; where columns are nearly
+    dependent, or rows far apart, that of rotations.
+
     Args:
-        blocks: (S, M, q, p) of S sets.
+        blocks: (S, M, q, p) of S sets, zero where not usable.
         usable: (S, M) which count.
         root: (r, p) of the prior precision.
         coarse: how many times coarser than float64 the numbers are, for the rule of
@@ -190,33 +331,119 @@ def whiten(
     Returns:
         One of every set, read-only; None where T is singular.
     """
-    rows, largest, shift, white, back, basis, log_scale, lost = _kernel().whitened(
-        blocks, usable.view(np.uint8), root, coarse
-    )
     sets, num, q, p = blocks.shape
-    for n in range(sets):
-        if lost[n] <= _LOSS:
-            continue
-        # Columns are nearly dependent: by rotations, twice.
-        one, size = rows[n : n + 1], coarse * largest[n : n + 1]
-        if rank_rule(one, size, num, computed)[0][0] < p:
-            continue
-        scale = np.linalg.norm(rows[n], axis=0)
-        first = triangle(rows[n] / scale)
-        once = np.linalg.inv(first) / scale[:, None]
-        second = triangle(rows[n] @ once)
-        once = once @ np.linalg.inv(second)
-        back[n], white[n] = second @ first * scale, rows[n] @ once
-        basis[n] = once - shift[n] @ once
-        log_scale[n] = 2.0 * float(np.log(np.abs(np.diagonal(back[n]))).sum())
-        lost[n] = 0.0
-    prior = np.zeros((sets, p, p))
-    if len(root):
-        known, white = white[:, num * q :], white[:, : num * q]
-        prior = known.transpose(0, 2, 1) @ known
-    parts = (white.reshape(blocks.shape), prior, basis, back)
-    for part in (*parts, largest):
+    centred = _centred(blocks, usable, root, look=True)
+    rows, largest, scale = centred.rows, coarse * centred.largest, centred.scale
+    assert centred.far is not None
+    inverse, back, log_det, good = _cholesky_factors(rows, largest, centred.far)
+    white = _times(rows, inverse)
+    singular = [False] * sets
+    for n in () if good.all() else np.flatnonzero(~good):
+        ranks, _ = rank_rule(rows[n : n + 1], largest[n : n + 1], num, computed)
+        singular[n] = ranks[0] < p
+        if not singular[n]:
+            inverse[n], back[n], white[n] = _by_rotations(rows[n], bool(centred.far[n]))
+            log_det[n] = 2.0 * np.linalg.slogdet(back[n])[1]
+    prior = _gram(white[:, num * q :]) if len(root) else np.zeros((sets, p, p))
+    sizes = _sizes(blocks, centred) if computed else None
+    shift, basis = centred.shift, inverse
+    if shift is not None:
+        basis = inverse - shift @ inverse
+    if scale is not None:
+        log_det += 2.0 * np.log(scale).sum(axis=1)
+        basis, inverse = basis / scale[..., None], inverse / scale[..., None]
+        back = back * scale[:, None]
+        shift = None if shift is None else shift / scale[..., None] * scale[:, None]
+    white = white[:, : num * q].reshape(blocks.shape)
+    for part in (white, prior, basis, back):
         part.flags.writeable = False
-    size = largest if computed else [None] * sets
-    found = map(Whitened, *parts, size, log_scale)
-    return [one if lost[n] <= _LOSS else None for n, one in enumerate(found)]
+    return [
+        None
+        if singular[n]
+        else Whitened(
+            white[n],
+            prior[n],
+            basis[n],
+            back[n],
+            None if sizes is None else sizes[n],
+            value,
+            None if shift is None else shift[n],
+            inverse[n],
+        )
+        for n, value in enumerate(log_det.tolist())
+    ]
+
+
+def _cholesky_factors(
+    rows: Array, largest: Array, far: Mask
+) -> tuple[Array, Array, Array, Mask]:
+    """Inverse(R), R, log det of ``R.T R = rows.T rows``, and which can be trusted.
+
+    Of S sets of rows (S, N, p), by Cholesky's factor in units of the columns' lengths.
+    """
+    gram, p = _gram(rows), rows.shape[2]
+    scale = np.sqrt(np.diagonal(gram, axis1=1, axis2=2))
+    good = (scale * _CLEAR > largest).all(axis=1) & ~far
+    if not good.all():
+        gram[~good], scale[~good] = np.eye(p), 1.0
+    unit = gram / (scale[..., None] * scale[:, None])
+    try:
+        lower = np.linalg.cholesky(unit)
+    except np.linalg.LinAlgError:
+        lower = np.broadcast_to(np.eye(p), unit.shape).copy()
+        for n in np.flatnonzero(good):
+            try:
+                lower[n] = np.linalg.cholesky(unit[n])
+            except np.linalg.LinAlgError:
+                good[n] = False
+    diagonal = np.diagonal(lower, axis1=1, axis2=2)
+    inverse = np.matrix_transpose(np.linalg.inv(lower))
+    good &= (inverse * inverse).sum(axis=(1, 2)) <= _LOSS / _EPS
+    back = np.matrix_transpose(lower) * scale[:, None]
+    log_det = 2.0 * np.log(scale * diagonal).sum(axis=1)
+    return inverse / scale[..., None], back, log_det, good
+
+
+def _by_rotations(rows: Array, far: bool) -> tuple[Array, Array, Array]:
+    """Inverse(R), R and ``rows @ inverse(R)``, by rotations, twice.
+
+    Columns with rows ``far`` from the others come first, and these rows, so that the
+    others keep their digits; what is left of rounding becomes zero.
+    """
+    p = rows.shape[1]
+    order, sorted_rows = np.arange(p), rows
+    if far:
+        size = np.abs(rows)
+        middle = np.median(size, axis=0)
+        apart = size.max(axis=0) / np.where(middle > 0.0, middle, np.inf)
+        order = np.argsort(-np.where(middle > 0.0, apart, np.inf), kind="stable")
+        sorted_rows = rows[np.argsort(-size.max(axis=1), kind="stable")]
+    scale = np.linalg.norm(rows, axis=0)[order]
+    first = triangle(sorted_rows[:, order] / scale)
+    inverse = np.linalg.inv(first) / scale[:, None]
+    second = triangle(sorted_rows[:, order] @ inverse)
+    inverse = inverse @ np.linalg.inv(second)
+    all_inverse, back = np.empty((p, p)), np.empty((p, p))
+    all_inverse[order], back[:, order] = inverse, second @ first * scale
+    white = _times(rows, all_inverse)
+    if far:
+        noise = 4.0 * _EPS * _times(np.abs(rows), np.abs(all_inverse))
+        white[np.abs(white) <= noise] = 0.0
+    return all_inverse, back, white
+
+
+def _sizes(blocks: Array, centred: _Centred) -> Array:
+    """(S, p) of what the blocks were computed beside: the largest entries.
+
+    A row that is far from the others, as x = 1e7 beside 1, is rounded more than these.
+    """
+    largest = centred.largest * (1.0 if centred.scale is None else centred.scale)
+    for n in np.flatnonzero(centred.far):  # type: ignore[arg-type]  # looked at
+        size = np.abs(blocks[n]).reshape(-1, blocks.shape[3])
+        real = np.where(size > SINGULAR * size.max(axis=0), size, np.nan)
+        usual = np.where(largest[n] > 0.0, largest[n], 1.0)
+        some = ~np.isnan(real).all(axis=0)
+        usual[some] = np.nanmedian(real[:, some], axis=0)
+        beside = np.maximum((size / usual).max(axis=1) / 100.0, 1.0)
+        largest[n] = (size / beside[:, None]).max(axis=0)
+    return np.asarray(largest)

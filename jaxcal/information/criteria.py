@@ -64,14 +64,14 @@ def criteria(blocks: Array, root: Array, region: Array, times: int) -> Criteria:
     Args:
         blocks: (N, q, p) measured.
         root: (r, p) of the prior precision, r = 0 without one.
-        region: (R, q, p) where predictions are wanted, for I and G.
+        region: (R, m, p) where predictions are wanted, for I and G.
         times: m, how often the eigenvalues of the information count.
     """
     p = blocks.shape[2]
     s = np.linalg.svd(np.concatenate([blocks.reshape(-1, p), root]), compute_uv=False)
     white = whiten(blocks[None], np.ones((1, len(blocks)), dtype=np.bool_), root)[0]
     assert white is not None
-    variance = ((region @ white.basis) ** 2).sum(axis=-1)
+    variance = (white.of(region) ** 2).sum(axis=-1)
     geometric_mean = float(np.exp(rank_of_blocks(blocks[None], root)[1][0] / (2 * p)))
     return Criteria(
         D=geometric_mean**2,

@@ -129,9 +129,8 @@ cdef inline double factor(
 ) noexcept nogil:
     """Log det of a positive definite matrix (p, p), and its inverse; -inf where singular.
 
-    Singular is where a parameter's variance is 1e13 times that with all others known,
-    or, of whitened information, 1e13 times that with everything measured. ``lower`` is
-    filled with H, ``H.T @ H`` the inverse.
+    Singular is where a parameter's variance is 1e13 times that with all others known:
+    in the matrix's own scale. ``lower`` is filled with H, ``H.T @ H`` the inverse.
     """
     cdef int a, b, c
     cdef double weight, value = cholesky(matrix, lower, p, 0.0)
@@ -146,7 +145,7 @@ cdef inline double factor(
             for b in range(a + 1):
                 inverse[a * p + b] += weight * lower[c * p + b]
     for a in range(p):
-        if not inverse[a * p + a] * max(matrix[a * p + a], 1.0) < 1e13:
+        if not inverse[a * p + a] * matrix[a * p + a] < 1e13:
             return -INFINITY
         for b in range(a):
             inverse[b * p + a] = inverse[a * p + b]

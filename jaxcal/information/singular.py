@@ -19,8 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal import compiled
-
 __all__ = [
     "SINGULAR",
     "depends",
@@ -29,6 +27,7 @@ __all__ = [
     "exact_zeros",
     "flat",
     "null_directions",
+    "power_of_two",
     "rank_rule",
     "require_excited",
     "significant",
@@ -39,19 +38,40 @@ Mask = NDArray[np.bool_]
 
 SINGULAR = 1e-10  # share of the largest singular value
 _EPS = float(np.finfo(np.float64).eps)
+_TINY = float(np.finfo(np.float64).tiny)
 _FLAT = 64.0 * _EPS  # of the size of what a number was computed from
 _NONE = 1e-7  # of the largest entry of a direction: its rounding where it nearly exists
 _SURE = 1e5  # times the tolerance: pivots above it leave no doubt of the rank
 
 
-def _scaled(
+def power_of_two(size: NDArray[Any]) -> Array:
+    """The power of two at or below each of ``size``, 1 for 0: an exact unit."""
+    exponent = np.clip(np.frexp(size)[1] - 1, -1000, 1000)
+    return np.asarray(np.ldexp(1.0, np.where(size > 0.0, exponent, 0)))
+
+
+def _lengths(
     columns: Array, largest: Array, count: int, computed: bool
-) -> tuple[Array, list[float], list[float], Array]:
-    kernel = compiled.kernel("jaxcal.information.kernel")
-    norms, rounding, least, value = kernel.scaled(columns, largest, count)
-    if computed:
-        rounding = [max(share, SINGULAR) for share in rounding]
-    return norms, rounding, least, value
+) -> tuple[Array, Array]:
+    """Lengths of columns (S, R, p), and the share of each set that is rounding.
+
+    Args:
+        columns: of entries near 1 before they were centred.
+        largest: (S, p) these entries.
+        count: rows that rounding errors add up over.
+        computed: the columns are rounded themselves.
+
+    Returns:
+        (S, p), zero where a column is rounding, and (S,).
+    """
+    resolution = _EPS * max(count, 1)
+    lengths = np.sqrt((columns * columns).sum(axis=1))
+    beside = largest / np.maximum(lengths, _TINY)
+    if not beside.max() < 1.0 / resolution:
+        lengths[beside >= 1.0 / resolution] = 0.0
+        beside[lengths == 0.0] = 0.0
+    rounding = resolution * beside.max(axis=1, initial=8.0)
+    return lengths, np.maximum(rounding, SINGULAR) if computed else rounding
 
 
 def rank_rule(
@@ -71,14 +91,23 @@ def rank_rule(
     Returns:
         (S,) ranks, and (S,) natural log det, -inf where the rank is below p.
     """
-    p, count = columns.shape[2], count or columns.shape[1]
-    norms, rounding, least, value = _scaled(columns, largest, count, computed)
+    num_rows, p = columns.shape[1:]
+    lengths, rounding = _lengths(columns, largest, count or num_rows, computed)
     ranks = [p] * len(columns)
-    for n, share in enumerate(rounding):
-        if least[n] <= _SURE * share:  # distances of columns are cheaper
-            unit = columns[n] / np.where(norms[n] > 0.0, norms[n], np.inf)
-            ranks[n] = int((np.linalg.svd(unit, compute_uv=False) > share).sum())
-            value[n] = value[n] if ranks[n] == p else -np.inf
+    still = lengths == 0.0
+    unit = columns / np.where(still, np.inf, lengths)[:, None]
+    if num_rows < p:
+        distances = np.zeros((len(columns), p))
+    else:  # of each column to the span of those before it: cheaper than the rank
+        factor = np.linalg.qr(unit, mode="r")
+        distances = np.abs(np.diagonal(factor, axis1=1, axis2=2))
+    value = 2.0 * np.log(np.maximum(distances * lengths, _TINY)).sum(axis=1)
+    unsure = distances.min(axis=1) <= _SURE * rounding
+    for n in np.flatnonzero(unsure) if unsure.any() else ():
+        singular_values = np.linalg.svd(unit[n], compute_uv=False)
+        ranks[n] = int((singular_values > rounding[n]).sum())
+        if ranks[n] < p:
+            value[n] = -np.inf
     return ranks, value
 
 
@@ -89,9 +118,10 @@ def null_directions(
 
     Axes that no row moves come first, then a basis of the rest of the null space.
     """
-    columns, p = np.ascontiguousarray(columns), columns.shape[1]
-    found = _scaled(columns[None], largest[None], len(columns), computed)
-    norms, rounding = found[0][0], found[1][0]
+    p, scale = columns.shape[1], power_of_two(largest)
+    columns, largest = columns / scale, largest / scale
+    lengths, shares = _lengths(columns[None], largest[None], len(columns), computed)
+    norms, rounding = lengths[0], shares[0]
     still = norms == 0.0
     unit = columns / np.where(still, np.inf, norms)
     unit = np.pad(unit, ((0, max(0, p - len(unit))), (0, 0)))
@@ -102,7 +132,7 @@ def null_directions(
         basis, size, _ = np.linalg.svd(free.T, full_matrices=False)
         for vector in exact_zeros(basis.T[size > 0.5]):
             direction = np.zeros(p)
-            direction[~still] = vector / norms[~still]
+            direction[~still] = vector / norms[~still] * (scale.min() / scale[~still])
             null.append(direction)
     return null
 
@@ -181,6 +211,7 @@ def directions_in_words(text: str, null: list[Array], names: tuple[str, ...]) ->
 
 def direction_in_words(vector: Array, names: tuple[str, ...]) -> str:
     """A direction in the named axes, largest component positive, unit length."""
+    vector = vector / np.abs(vector).max()
     vector = vector / np.linalg.norm(vector)
     size = np.abs(vector)
     vector = vector * np.sign(vector[(size > (1.0 - 1e-9) * size.max()).argmax()])

@@ -31,8 +31,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import one_of
-from jaxcal.information.blocks import Whitened
-from jaxcal.information.singular import significant
+from jaxcal.information.blocks import Whitened, triangle
+from jaxcal.information.singular import power_of_two, significant
 
 __all__ = [
     "CRITERIA",
@@ -58,6 +58,26 @@ class Criterion:
     root: Array  # C (s, p), of full row rank; square for "least"
     times: int = 1  # how often log det V or trace V counts: outputs of equal blocks
     offset: float = 0.0  # added to phi of "det" where C was changed by a factor
+    unit: float = 1.0  # V in the caller's units is this times V, of "trace" and "least"
+
+    @classmethod
+    def scaled(cls, name: str, kind: str, root: Array, times: int) -> Criterion:
+        """Of combinations C in any units: their size goes into ``unit`` or ``offset``.
+
+        So that values are near 1, whatever the caller's units; by powers of two, which
+        is exact.
+        """
+        largest = np.abs(root).max(axis=1, keepdims=True, initial=0.0)
+        if kind == "det":
+            size = power_of_two(largest)
+            offset = -2.0 * float(np.log(size).sum())
+            return cls(name, kind, root / size, times, offset=offset)
+        size = power_of_two(largest.max(axis=0, initial=0.0))
+        root = root / size
+        rest = power_of_two(np.linalg.norm(root, keepdims=True)[0])
+        unit = float(size[0] * rest[0])
+        with np.errstate(over="ignore", under="ignore"):  # asked for where it is used
+            return cls(name, kind, root / rest, times, unit=float(np.square(unit)))
 
     @property
     def larger_is_better(self) -> bool:
@@ -79,7 +99,9 @@ class Criterion:
         """The value as the caller reads it."""
         if self.kind == "det":
             return self.times * (phi + self.offset)
-        return -self.times * phi if self.kind == "trace" else phi
+        if self.kind == "trace":
+            return -self.times * self.unit * phi
+        return phi / self.unit
 
     def efficiency(self, value: float, bound: float) -> float:
         """Share in (0, 1] of the best possible, of reported values."""
@@ -103,10 +125,14 @@ class Criterion:
 
     def _half(self, information: Array) -> tuple[Array, NDArray[np.bool_]]:
         """H (..., s, p) with ``H @ H.T = V``, and where M is not singular."""
-        values, vectors = np.linalg.eigh(information)
+        size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
+        size = np.where(size > 0.0, size, 1.0)
+        unit = information / (size[..., None] * size[..., None, :])
+        values, vectors = np.linalg.eigh(unit)
         regular = significant(values, squares=True)[..., 0]
         scale = np.where(regular[..., None], values, 1.0)
-        return self.root @ vectors / np.sqrt(scale)[..., None, :], regular
+        root = self.root / size[..., None, :]
+        return root @ vectors / np.sqrt(scale)[..., None, :], regular
 
 
 class Coordinates(NamedTuple):
@@ -144,7 +170,7 @@ class Wanted:
     def criterion(self, at: Coordinates) -> Criterion:
         """The criterion of one problem."""
         times = 1 if self.per_output else at.times
-        return Criterion(self.name, self.kind, self.root(at), times)
+        return Criterion.scaled(self.name, self.kind, self.root(at), times)
 
 
 class D(Wanted):
@@ -154,8 +180,9 @@ class D(Wanted):
 
     def criterion(self, at: Coordinates) -> Criterion:
         return Criterion(
-            self.name, self.kind, _identity(len(at.basis)), at.times, at.white.log_scale
-        )
+            self.name, self.kind, _identity(len(at.basis)), at.times,
+            offset=at.white.log_scale,
+        )  # fmt: skip
 
 
 @functools.cache
@@ -192,14 +219,19 @@ class I(Wanted):  # noqa: E742 - the criterion's own name in the literature
         self.region = region
 
     def root(self, at: Coordinates) -> Array:
+        p = len(at.basis)
+        if at.region is None and not at.white.prior.any():
+            return _identity(p) / np.sqrt(at.readings)
         if at.region is None:
-            mean = (np.eye(len(at.basis)) - at.white.prior) / at.readings
+            rows, count = at.white.blocks.reshape(-1, p), at.readings
         else:
-            rows = (at.region @ at.basis).reshape(-1, len(at.basis))
-            mean = rows.T @ rows / len(rows)
-        size, vectors = np.linalg.eigh(mean)
-        keep = significant(size, squares=True)
-        return np.asarray(np.sqrt(size[keep])[:, None] * vectors.T[keep])
+            rows = at.white.of(at.region).reshape(-1, p)
+            count = len(rows)
+        # No squares: what a prior alone knows may be small here.
+        size, right = np.linalg.svd(triangle(rows))[1:]
+        keep = size > 0.0 if at.region is None else significant(size)
+        right = right[: len(size)]
+        return np.asarray(size[keep, None] * right[keep] / np.sqrt(count))
 
 
 class _OfSome(Wanted):

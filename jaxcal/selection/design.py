@@ -136,6 +136,11 @@ class Design(Planned, Travelled):
         masked = ~self.available[subset]
         require_none(masked, subset, "indices must be available", ", which is masked")
         problem = self.problem(len(subset), criterion)
+        left = problem.required[~np.isin(problem.required, subset)]
+        if len(left):
+            raise ValueError(
+                f"indices must hold every required candidate, got no {left[0]}"
+            )
         repeats = int(np.unique(subset, return_counts=True)[1].max())
         if repeats > problem.max_replicates:
             raise ValueError(
@@ -180,6 +185,12 @@ class Design(Planned, Travelled):
             raise ValueError(
                 f"{name} must give an invertible information matrix, but that of "
                 f"{indices.tolist()}{what} is singular{self._why_singular(indices)}"
+            )
+        least = problem.criterion.kind == "least"
+        if not np.isfinite(value) or (least and not value > 0.0):
+            raise ValueError(
+                f"criterion {problem.criterion.name} must be a number in double "
+                f"precision, got {value} in these units; give the commands in others"
             )
         subsets = [Subset(indices, value, log_det)]
         if len(found.alternatives) > 1:

@@ -97,7 +97,7 @@ class Selection:
     def criteria(self) -> Criteria:
         """D, A, I, E, G and O1 to O5; I and G over the available candidates."""
         problem = self.problem
-        chosen, region = problem.raw[self.indices], problem.raw[problem.available]
+        chosen, region = problem.raw[self.indices], problem.readings[problem.available]
         return criteria(chosen, problem.root, region, problem.multiplicity)
 
     def to_dict(self) -> dict[str, Any]:

@@ -70,12 +70,16 @@ def branch_and_bound(
     num_blocks, q, p = blocks.shape
     low, high, counts = np.array([lower, upper, start], dtype=np.float64)
     kind, root, scale, shift = _near_one(blocks, prior, criterion, start)
+    everything = prior + np.einsum("m,mqa,mqb->ab", upper, blocks, blocks)
+    trivial = (float(criterion.value(everything)) - shift) / scale
+    near = {"trace": -0.5, "least": 2.0}  # of values near 1: an efficiency of a half
+    useful = min(trivial, near.get(criterion.kind, np.inf))
     best_counts, best_values = np.zeros((best, num_blocks)), np.full(best, -np.inf)
     search = compiled.kernel("jaxcal.selection.exact.kernel").Search(
-        kind, blocks, prior, root, start.sum(), largest_rank(blocks), best_counts,
-        best_values,
+        kind, blocks, prior, root, start.sum(), largest_rank(blocks), useful,
+        best_counts, best_values,
     )  # fmt: skip
-    search.offer(low, high, counts)
+    search.offer(low, high, counts, _left(deadline))
     nodes, bounds = np.empty((64, 3, num_blocks)), np.full(64, np.inf)
     nodes[0] = low, high, counts
     good = (0.0, np.inf) if root_only else (0.0, -np.inf)
@@ -88,14 +92,14 @@ def branch_and_bound(
             room = np.empty((len(bounds), 3, num_blocks))
             nodes = np.concatenate([nodes, room])
             bounds = np.concatenate([bounds, np.full(len(bounds), np.inf)])
-        left = np.inf if deadline is None else deadline - time.perf_counter()
         size, more, going = search.run(
             nodes, bounds, size, TOLERANCE, max(256, _MEMORY // (24 * num_blocks)),
-            max(1, tries - done), left, *good,
+            max(1, tries - done), _left(deadline), *good,
         )  # fmt: skip
         done += more
     if size:
         bound = max(bounds[:size].max(), best_values[0])
+        bound = min(bound, trivial)
     found = np.isfinite(best_values)
     return BranchResult(
         best_counts[found].astype(np.int64),
@@ -104,6 +108,11 @@ def branch_and_bound(
         done,
         size == 0,
     )
+
+
+def _left(deadline: float | None) -> float:
+    """Seconds until ``deadline``."""
+    return np.inf if deadline is None else deadline - time.perf_counter()
 
 
 def _near_one(

@@ -116,14 +116,17 @@ def solve_exact(
         cheap = math.comb(len(pool), free) <= _CHEAP
         if best == 1 or cheap:
             if enough and not cheap:  # the relaxation may do without
-                start = np.sort(exchange_indices(problem, restarts, seed, deadline))
-                found = _found(problem, [start], best, relaxed(problem, start), 1)
+                start = np.sort(
+                    exchange_indices(problem, restarts, seed, _half(deadline))
+                )
+                bound = relaxed(problem, start, deadline)
+                found = _found(problem, [start], best, bound, 1)
                 assert found.value is not None and found.bound is not None
                 if problem.criterion.efficiency(found.value, found.bound) >= enough:
                     return dataclasses.replace(found, seed=seed, restarts=restarts)
             found = _enumerate(problem, pool, best, deadline)
             return dataclasses.replace(found, seed=seed, restarts=restarts)
-    start = exchange_indices(problem, restarts, seed, deadline)
+    start = exchange_indices(problem, restarts, seed, _half(deadline))
     keep, first = _groups(problem, merge=best == 1)
     counts = np.bincount(start, minlength=len(problem.blocks))
     low, high, begun = (
@@ -147,6 +150,11 @@ def solve_exact(
     return dataclasses.replace(found, seed=seed, restarts=restarts)
 
 
+def _half(deadline: float | None) -> float | None:
+    """When half of the time is over: a bound takes time as well."""
+    return None if deadline is None else (time.perf_counter() + deadline) / 2.0
+
+
 def upper_bound(problem: Problem) -> float:
     """The value that no selection betters: the optimum if cheap, or the relaxation's.
 
@@ -163,7 +171,7 @@ def upper_bound(problem: Problem) -> float:
     return float(problem.criterion.reported(bound))
 
 
-def relaxed(problem: Problem, start: Indices) -> float:
+def relaxed(problem: Problem, start: Indices, deadline: float | None = None) -> float:
     """Upper bound on phi of the criterion, from a selection (k,) to climb from."""
     keep = np.flatnonzero(problem.available)
     counts = np.bincount(start, minlength=len(problem.blocks))
@@ -174,6 +182,7 @@ def relaxed(problem: Problem, start: Indices) -> float:
         problem.lower[keep],
         problem.upper[keep],
         counts[keep],
+        deadline=deadline,
         root_only=True,
     ).bound
 

@@ -7,6 +7,7 @@ cdef class Search:
     cdef int q, p, s
     cdef Py_ssize_t count  # M
     cdef double k
+    cdef double useful  # a bound above it is sharpened although the time is over
     cdef double[:, ::1] best_counts  # (best, M)
     cdef double[::1] best_values  # (best,)
     cdef double[::1] room  # which holds all that is a pointer below
@@ -45,6 +46,7 @@ cdef class Search:
     cdef double constant  # of the bounds by rank
     cdef double mu
     cdef double shares  # sum of 1 / (1 + l) over the places
+    cdef double linear  # the bound by the leverages where the climb ended
     cdef double base  # what the linear gain is added to for a bound
     cdef double cut  # the multiplier of the bound
     cdef double* leverage  # (M,)
@@ -72,6 +74,7 @@ cdef class Search:
     cdef Py_ssize_t _lay_out(self, double* room) noexcept
     cdef void _sum(self, const double* low, const double* counts, const double* start, double* gram) noexcept nogil
     cdef double _evaluate(self, int kind) noexcept nogil
+    cdef double _rounded(self, double share) noexcept nogil
     cdef double _covariance(self, bint det, double* root, int s, double* gradient) noexcept nogil
     cdef double _weakest(self) noexcept nogil
     cdef double _shared_out(self, int kind) noexcept nogil

@@ -81,6 +81,7 @@ _EPS = cython.declare(cython.double, 2.0**-52)
 _SOLVED = cython.declare(cython.double, 1e-11)  # a bound this near the value is solved
 _CLOSE = cython.declare(cython.double, 0.05)  # share of the way to the goal left open
 _MAX_STEPS = cython.declare(cython.int, 80)
+_LATEST = cython.declare(cython.int, 30)  # steps to a useful bound, time or not
 _FRACTIONAL = cython.declare(cython.int, 400)  # counts that a Newton step moves at most
 _RIDGE = cython.declare(cython.double, 1e-10)  # share of the largest curvature
 _ROUNDING = cython.declare(cython.double, 1e-12)  # of a count that is whole
@@ -99,13 +100,16 @@ class Search:
     ``kernel.pxd`` says what each attribute is.
     """
 
-    def __init__(self, kind, blocks, prior, root, k, rank, best_counts, best_values):
+    def __init__(
+        self, kind, blocks, prior, root, k, rank, useful, best_counts, best_values
+    ):
         # Arrays are C-contiguous float64; the best (best, M) and (best,) are written.
         # (A docstring here would be a global symbol of C, of which a module that holds
         # its code twice has two.)
         self.count, self.q, self.p = blocks.shape
         self.kind, self.k, self.rank, self.s = kind, k, rank, len(root)
         self.best_counts, self.best_values = best_counts, best_values
+        self.useful = useful
         self.most_moved = min(self.count, _FRACTIONAL + 2 * self.p + 4)
         self.whole = np.empty(3 + 5 * self.p, dtype=np.intc)
         self.which, self.free = np.empty((2, self.most_moved), dtype=np.intp)
@@ -187,6 +191,9 @@ class Search:
         else:
             value = 0.0
         self.base = value
+        if kind < _E:
+            share = -value if kind == _TRACE else p if kind == _D else self.s
+            self.base += self._rounded(share)
         if kind >= _E:
             value += self._weakest() if kind == _E else self._shared_out(kind)
             self._bends()
@@ -194,6 +201,20 @@ class Search:
                 for a in range(p * p):
                     self.gradient[a] += self.other[a]
         return value
+
+    def _rounded(self, share):
+        """What makes a bound true where G is rounded and trace(G M) not ``share``.
+
+        -log det G + trace(G M) - p bounds log det M whatever G is, and
+        ``trace(Y M Y.T - 2 C Y.T)`` -trace(C W C.T) whatever Y is, with G = Y.T Y.
+        """
+        total: cython.double = 0.0
+        size: cython.double = 0.0
+        for a in range(self.p * self.p):
+            part = self.gradient[a] * self.gram[a]
+            total += part
+            size += fabs(part)
+        return max(total - share, 0.0) + 8.0 * _EPS * size
 
     def _covariance(self, det, root, s, gradient):
         """Value of Ds and the traces by C (s, p), W being there, and their gradient."""
@@ -670,6 +691,7 @@ class Search:
             value = self._at(kind, low, c)
             if not value > -INFINITY:
                 return value
+        sharpest: cython.double = INFINITY
         bound: cython.double = INFINITY
         after: cython.double = value
         tunes = _TUNES
@@ -678,9 +700,14 @@ class Search:
             self._leverages()
             gain = self._linear_gain(low, high, c)
             bound = self.base + gain
+            if not bound > -INFINITY:  # rounding left no number
+                bound = INFINITY
+            self.linear = bound
+            sharpest = min(sharpest, bound)
             if bound <= goal or step == _MAX_STEPS - 1:
                 break
-            if late(cython.address(self.watch)):
+            over: cython.bint = late(cython.address(self.watch))
+            if over and (step >= _LATEST or sharpest <= self.useful):
                 break
             solved: cython.bint = bound - value <= max(_SOLVED, share * (value - goal))
             changed: cython.bint = False
@@ -725,7 +752,7 @@ class Search:
             if not after > value:
                 break
             value = after
-        return bound
+        return sharpest
 
     # --- branching ------------------------------------------------------------------
 
@@ -756,21 +783,26 @@ class Search:
         low: cython.double[::1],
         high: cython.double[::1],
         counts: cython.double[::1],
+        seconds: cython.double,
     ):
         """Offer a selection and, where several are wanted, all one swap away from it.
 
         Args:
             low, high, counts: (M,) float64 bounds and counts, as they were afterwards.
+            seconds: after which no more swaps are offered.
         """
-        self.watch = begin(INFINITY)
+        self.watch = begin(seconds)
         chosen = cython.address(counts[0])
         self._offer(chosen)
         i: cython.Py_ssize_t
         j: cython.Py_ssize_t
         for i in range(self.count if self.best_values.shape[0] > 1 else 0):
-            late(cython.address(self.watch))
+            if not counts[i] > low[i]:
+                continue
             for j in range(self.count):
-                if i != j and counts[i] > low[i] and counts[j] < high[j]:
+                if i != j and counts[j] < high[j]:
+                    if late(cython.address(self.watch)):
+                        return
                     counts[i] -= 1.0
                     counts[j] += 1.0
                     self._offer(chosen)
@@ -856,7 +888,7 @@ class Search:
         bound[0] = self._relax(self._kind_of(low), low, high, c, goal, share)
         if bound[0] <= goal:
             return -1
-        room = bound[0] - goal
+        room = self.linear - goal
         total_low: cython.double = 0.0
         total_high: cython.double = 0.0
         for i in range(self.count):

@@ -20,6 +20,8 @@ cdef class Climber:
     cdef const unsigned char[::1] usable  # (M,) which may be chosen
     cdef Py_ssize_t cap, available  # how often each of them may be, and their number
     cdef Py_ssize_t[::1] counts  # (M,)
+    cdef Py_ssize_t[::1] times  # (M,) in a sum of many replicates
+    cdef Py_ssize_t[::1] tried  # (M,) swaps made when a candidate was last tried
     cdef double* closed  # (groups WIDE,), inf where it may not be chosen once more
     cdef Py_ssize_t[::1] chosen  # (k,), the required first
     cdef double* known  # (p, p) what counts beside the chosen
@@ -74,6 +76,7 @@ cdef class Climber:
     cdef void _cross(self, Py_ssize_t c, int m, int r) noexcept nogil
     cdef void _swaps(self, Py_ssize_t c) noexcept nogil
     cdef int _grow(self, Py_ssize_t size, double share) except -1 nogil
+    cdef void _fill(self, Py_ssize_t size) noexcept nogil
     cdef double _finish(self, bint climbs) except? -2.0 nogil
     cdef double _climb(self, bint least) except? -2.0 nogil
     cdef Py_ssize_t _replacement(self, Py_ssize_t out, double rise) noexcept nogil

@@ -220,6 +220,7 @@ class Climber:
         self.usable, self.available = usable, np.count_nonzero(usable)
         self.cap, self.counts = cap, np.zeros(count, dtype=np.intp)
         self.chosen = np.zeros(k, dtype=np.intp)
+        self.times, self.tried = np.zeros((2, count), dtype=np.intp)
         for r in range(len(required)):
             self.chosen[r] = required[r]
         self.whole = np.empty(3 + 5 * p, dtype=np.intc)
@@ -375,9 +376,21 @@ class Climber:
     def _sum(self, size, skipped):
         """Information of the first ``size`` chosen but one, into ``gram``."""
         copy(self.gram, self.known, self.p * self.p)
+        count = self.times.shape[0]
+        if size <= count:
+            for c in range(size):
+                if c != skipped:
+                    self._add(self.chosen[c])
+            return
+        for i in range(count):  # many replicates
+            self.times[i] = 0
         for c in range(size):
             if c != skipped:
-                self._add(self.chosen[c])
+                self.times[self.chosen[c]] += 1
+        for i in range(count):
+            if self.times[i] > 0:
+                add(self.gram, self.times[i], cython.address(self.blocks[i, 0, 0]),
+                    self.q, self.p)  # fmt: skip
 
     def _add(self, i):
         """Add candidate i to ``gram``."""
@@ -572,7 +585,9 @@ class Climber:
         self._evaluate(size, self.now)
         self._refresh()
         while True:
-            self._late()
+            if self._late():
+                self._fill(size)
+                return 0
             best: cython.Py_ssize_t = -1
             most: cython.double = -INFINITY
             for c in range(self.groups):
@@ -580,6 +595,10 @@ class Climber:
                 j = _best_of(alone, self.closed + c * WIDE, most)
                 if j >= 0:
                     best, most = c * WIDE + j, alone[j]
+            if best < 0:  # no gain is a number: whichever may be chosen
+                best = 0
+                while self.closed[best] > 0.0:
+                    best += 1
             self.chosen[size] = best
             self._count(best, 1)
             size += 1
@@ -587,6 +606,16 @@ class Climber:
                 return 0
             self._evaluate(size, self.trial)
             self._carry(best, -1)
+
+    def _fill(self, size):
+        """Complete the first ``size`` chosen, each candidate in turn: time is over."""
+        i: cython.Py_ssize_t = 0
+        while size < self.k:
+            if self.closed[i] == 0.0:
+                self.chosen[size] = i
+                self._count(i, 1)
+                size += 1
+            i = i + 1 if i + 1 < self.counts.shape[0] else 0
 
     def _finish(self, climbs):
         """phi of the chosen, climbed; swaps may mend a singular start.
@@ -620,12 +649,17 @@ class Climber:
         if not least:
             self._refresh()
         position, since, swaps = self.fixed, 0, 0
+        for i in range(self.tried.shape[0]):
+            self.tried[i] = -1
         while since < k - self.fixed and swaps < _MOST_SWAPS * k:
             if late(cython.address(self.watch)) if least else self._late():
                 break
             at, out, after = position, self.chosen[position], value
             since += 1
             position = position + 1 if position + 1 < k else self.fixed
+            if self.tried[out] == swaps:  # another measurement of the same
+                continue
+            self.tried[out] = swaps
             rise = _IMPROVES * max(1.0, fabs(value))
             if least:
                 after *= 1.0 + _LIFTS

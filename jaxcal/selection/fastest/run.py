@@ -207,7 +207,7 @@ class _Search:
         None where the search finds no subset with that determinant.
         """
         begun, problem, optimum = time.perf_counter(), self.problem, self.optimum
-        m, scale = problem.multiplicity, problem.log_scale
+        m, scale = problem.multiplicity, problem.white.log_scale
         # Whitened. The optimum itself must meet its own value; a bound that is not the
         # optimum asks too much of a subset, never too little.
         assert optimum.bound is not None

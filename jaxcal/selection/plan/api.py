@@ -201,7 +201,7 @@ class Planned(Asked):
                 k=k,
                 indices=last,
                 standard_error=unit * np.sqrt(variance),
-                least_error=unit * np.sqrt(min(bound_of(k), variance.max())),
+                least_error=unit * np.sqrt(max(min(bound_of(k), variance.max()), 0.0)),
             )
             rows.append(row)
             if chosen is None and variance.max() <= _ENOUGH:
@@ -287,7 +287,7 @@ def _request(
         where = problem.candidates[problem.available] if region is None else region
         rows = source.at("region", where, False)
     elif region is None:
-        rows = problem.raw[problem.available]
+        rows = problem.readings[problem.available]
     else:
         rows = array_of("region", region, "R", "m", len(names))
     if of_parameters:
@@ -305,7 +305,7 @@ def _request(
         unit = noise_std * scale
     elif model is None:
         noise_std = np.ones(m)
-    points = rows @ problem.basis / scale[:, None]
+    points = problem.white.of(rows) / scale[:, None]
     if criterion == "I" and len(points) > points.shape[2]:  # fewer rows, the same mean
         root = np.linalg.qr(np.moveaxis(points, 1, 0))[1]
         points = np.moveaxis(root, 0, 1) * np.sqrt(root.shape[1] / len(points))

@@ -169,7 +169,7 @@ def make_problem(
         candidates: (M, n), where there are any.
         model: what made blocks of them.
     """
-    readings = int(np.count_nonzero(available)) * raw.shape[1]
+    readings, count = raw, int(np.count_nonzero(available)) * raw.shape[1]
     if raw.shape[1] > raw.shape[2]:  # as much information in p rows, at q^3 less cost
         raw = np.asarray(np.linalg.qr(raw, mode="r"))
     k = _check_k(k, raw, available, root, regressors=not names)
@@ -195,13 +195,12 @@ def make_problem(
             + directions_in_words(" say nothing of the direction{} ", null, names)
             + "; give prior, a precision of what is known of them"
         )
-    at = Coordinates(white, names, readings, region, times)
+    at = Coordinates(white, names, count, region, times)
     problem = Problem(
-        white.blocks, white.prior, k, available, forced, cap, wanted.criterion(at),
-        times, white.log_scale, raw, white.basis, root, white.triangle, white.size,
-        candidates, model,
+        white, k, available, forced, cap, wanted.criterion(at), times, raw, readings,
+        root, candidates, model,
     )  # fmt: skip
-    for each in (raw, root, available, forced):
+    for each in (raw, readings, root, available, forced):
         each.flags.writeable = False
     if len(forced):
         _check_required_rank(problem)

@@ -10,12 +10,13 @@ coordinates. Postures of the affine model are blocks [u, 1] that count once per 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.information.blocks import rank_of_blocks
+from jaxcal.information.blocks import Whitened, rank_of_blocks
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model
 from jaxcal.selection.criteria import Criterion
@@ -37,22 +38,28 @@ class Problem:
     All arrays are the problem's own and cannot be written to.
     """
 
-    blocks: Array  # (M, q, p) whitened information blocks, zero where not available
-    prior: Array  # (p, p) precision known beforehand, in the same coordinates
+    white: Whitened  # blocks and prior in coordinates where all of them are I
     k: int  # candidates to choose
     available: Mask  # (M,) True where a candidate may be chosen
     required: Indices  # (r,) candidates that must be chosen, r <= k
     max_replicates: int  # how often one candidate may be chosen
     criterion: Criterion  # in the same coordinates
     multiplicity: int  # how often log det of the blocks counts
-    log_scale: float  # log det of unwhitened less whitened information, of any choice
-    raw: Array  # (M, q, p) blocks in the caller's numbers
-    basis: Array  # (p, p) raw blocks times it are whitened
+    raw: Array  # (M, q, p) blocks in the caller's numbers, at most p readings each
+    readings: Array  # (M, Q, p) these with every reading, as ``raw`` where q is Q
     root: Array  # (r, p) root of the caller's prior precision, with what was measured
-    triangle: Array  # (p, p) whitened blocks times it are the centred raw ones
-    size: Array | None  # (p,) of what computed blocks are rounded by, or None
     candidates: Array | None = None  # (M, n) in the caller's unit, where there are any
     model: Model | None = None  # what made blocks of the candidates
+
+    @functools.cached_property
+    def blocks(self) -> Array:
+        """(M, q, p) whitened information blocks, zero where not available."""
+        return self.white.blocks
+
+    @functools.cached_property
+    def prior(self) -> Array:
+        """(p, p) precision known beforehand, in the same coordinates."""
+        return self.white.prior
 
     @property
     def rows(self) -> Array:
@@ -108,7 +115,7 @@ class Problem:
     def held_rank(self) -> int:
         """Rank of what is known with the required candidates."""
         rows = self.blocks[self.required].reshape(-1, self.num_regressors)
-        rows = np.concatenate([rows, self.root @ self.basis])
+        rows = np.concatenate([rows, self.white.of(self.root)])
         return int(significant(np.linalg.svd(rows, compute_uv=False)).sum())
 
     def uncertainty(self, indices: Indices) -> float:
@@ -122,20 +129,24 @@ class Problem:
         """
         p = self.num_regressors
         rows = self.blocks[indices].reshape(-1, p)
-        least, largest = np.linalg.eigvalsh(rows.T @ rows + self.prior)[[0, -1]]
+        information = rows.T @ rows + self.prior
+        unit = np.sqrt(np.diagonal(information))  # a selection's own scale
+        if not unit.all():
+            return np.inf
+        least, largest = np.linalg.eigvalsh(information / unit / unit[:, None])[[0, -1]]
         if not least > 0.0:
             return np.inf
-        size = np.abs(rows @ self.triangle)
-        if self.size is not None:
-            size += self.size
-        error = _EPS * p * (size @ np.abs(np.linalg.inv(self.triangle)))
-        of_blocks = 2.0 * np.linalg.norm(error) / np.sqrt(least)
+        size = np.abs(rows @ self.white.triangle)
+        if self.white.size is not None:
+            size += self.white.size
+        error = _EPS * p * (size @ np.abs(np.linalg.inv(self.white.triangle)))
+        of_blocks = 2.0 * np.linalg.norm(error / unit) / np.sqrt(least)
         return float(of_blocks + _EPS * len(rows) * largest / least)
 
     def log_det(self, indices: Indices) -> float:
         """log det S of a subset, natural, in the caller's units; -inf if singular."""
         blocks = self.raw[np.asarray(indices)[None]]
-        found = rank_of_blocks(blocks, self.root, self.size)[1][0]
+        found = rank_of_blocks(blocks, self.root, self.white.size)[1][0]
         return self.multiplicity * float(found)
 
 
@@ -159,12 +170,12 @@ def log_dets(problems: Sequence[Problem], indices: Indices) -> Array:
     """(R,) log det S of a subset (R, k) of each, of one model; -inf if singular."""
     raw = np.array([one.raw[i] for one, i in zip(problems, indices, strict=True)])
     first = problems[0]
-    return first.multiplicity * rank_of_blocks(raw, first.root, first.size)[1]
+    return first.multiplicity * rank_of_blocks(raw, first.root, first.white.size)[1]
 
 
 def values(problem: Problem, indices: Indices) -> tuple[Array, Array]:
     """Reported value of the criterion, and log det S, of subsets (R, k): (R,) each."""
-    log_det = rank_of_blocks(problem.raw[indices], problem.root, problem.size)[1]
+    log_det = rank_of_blocks(problem.raw[indices], problem.root, problem.white.size)[1]
     log_det *= problem.multiplicity
     criterion = problem.criterion
     if criterion.name == "D":

@@ -1,0 +1,166 @@
+"""Units change nothing but units, and far rows hide nothing of the others."""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+
+import exactly
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxcal
+from jaxcal import Noise
+from jaxcal.models import Polynomial
+
+EXTREMES = pathlib.Path(__file__).parent / "extremes.py"
+
+
+def asked(name):
+    """As and Ds of the constant."""
+    return {"As": jaxcal.As(["1"]), "Ds": jaxcal.Ds(["1"])}.get(name, name)
+
+
+def share(value, best, name):
+    """How far apart two values are."""
+    size = max(1.0, abs(best)) if name in ("D", "Ds") else abs(best)
+    return (value - best) / size
+
+
+@pytest.mark.parametrize("far", [1e4, 3e7, 1e9, 1e12])
+@pytest.mark.parametrize("name", ["D", "A", "I", "E", "As", "Ds"])
+def test_a_far_row_hides_no_better_selection(name, far):
+    """The proven value is that of brute force in exact fractions."""
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        x = np.unique(rng.integers(-5, 6, size=7)).astype(float)
+        x = np.append(x, [far, -0.7 * far] if seed % 3 == 0 else [-far])
+        rows, k = np.stack([np.ones(len(x)), x], axis=1), 2 + seed % 2
+        best = exactly.best_choice(name, rows, k, [0])
+        design = jaxcal.Design(x[:, None], Polynomial(1, 1))
+        found = design.select(k, asked(name), "exact")
+        assert abs(share(found.value, best, name)) < 1e-9
+        sign = 1.0 if name in ("D", "E", "Ds") else -1.0
+        assert sign * share(found.bound, best, name) > -1e-9
+        assert found.proven or far > 1e11
+
+
+@pytest.mark.parametrize("name", ["D", "A", "I", "As", "Ds"])
+def test_a_far_row_of_a_quadratic_hides_no_better_selection(name):
+    x = np.array([-2.0, -1.0, 0.0, 1.0, 2.0, 3000.0])
+    rows = np.stack([np.ones(6), x, x**2], axis=1)
+    best = exactly.best_choice(name, rows, 3, [0])
+    design = jaxcal.Design(x[:, None], Polynomial(2, 1))
+    found = design.select(3, asked(name), "exact")
+    assert found.proven
+    assert abs(share(found.value, best, name)) < 1e-9
+
+
+def test_a_selection_without_the_far_row_has_its_eigenvalue():
+    x = np.array([1e4, -2.0, 1.0, 1.0, -1.0])
+    scored = jaxcal.Design(x[:, None], Polynomial(1, 1)).score([1, 2, 4], "E")
+    assert scored.value == pytest.approx(2.0, rel=1e-8)
+    assert scored.criteria.A == pytest.approx(1 / 2 + 1 / 7, rel=1e-8)
+
+
+powers = st.integers(-12, 12).map(lambda exponent: 10.0**exponent)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6), powers, powers, st.sampled_from(["D", "I", "As", "Ds"]))
+def test_units_of_commands_and_noise_change_only_units(seed, unit, std, name):
+    x = np.random.default_rng(seed).uniform(-1.0, 1.0, (12, 1))
+    plain = jaxcal.Design(x, Polynomial(2, 1)).select(4, asked(name), "exact")
+    design = jaxcal.Design(x * unit, Polynomial(2, 1), noise=Noise(std=std))
+    other = design.select(4, asked(name), "exact")
+    assert other.proven == plain.proven
+    back = design.score(plain.indices, asked(name))
+    if name in ("D", "Ds"):
+        assert back.value == pytest.approx(other.value, abs=1e-8)
+        count = 3 if name == "D" else 1
+        slopes = 2.0 * np.log(unit) * (3 if name == "D" else 0)
+        expected = plain.value + slopes - 2.0 * count * np.log(std)
+        assert other.value == pytest.approx(expected, abs=1e-8)
+    else:
+        assert back.value == pytest.approx(other.value, rel=1e-8)
+        assert other.value == pytest.approx(plain.value * std**2, rel=1e-8)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6), st.lists(powers, min_size=3, max_size=3), powers)
+def test_units_of_parameters_and_prior_change_only_units(seed, units, std):
+    rng = np.random.default_rng(seed)
+    blocks, root = rng.normal(size=(9, 2, 3)), rng.normal(size=(1, 3))
+    plain = jaxcal.Design.from_blocks(blocks, prior=root.T @ root)
+    scale = np.array(units)
+    prior = (root * scale).T @ (root * scale) / std**2
+    other = jaxcal.Design.from_blocks(
+        blocks * scale, prior=prior, noise=Noise(std=std), max_replicates=2
+    )
+    plain.max_replicates = 2
+    found, same = other.select(2, "D", "exact"), plain.select(2, "D", "exact")
+    expected = same.value + 2.0 * np.log(scale / std).sum()
+    assert found.value == pytest.approx(expected, abs=1e-8)
+    means = [each.select(2, "I", "exact").value for each in (other, plain)]
+    assert means[0] == pytest.approx(means[1] * std**2, rel=1e-8)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10**6), powers, powers)
+def test_units_change_no_plan(seed, unit, std):
+    u = np.random.default_rng(seed).uniform(-1.0, 1.0, (8, 2))
+    plain = jaxcal.Design(u, Polynomial(1, 2)).plan(1.0, 1.0)
+    other = jaxcal.Design(u * unit, Polynomial(1, 2)).plan(std, std)
+    assert other.k == plain.k
+    assert other.smallest_proven == plain.smallest_proven
+    np.testing.assert_allclose(other.standard_error, plain.standard_error * std)
+
+
+def test_a_mean_variance_beside_a_weak_prior_is_that_of_exact_fractions():
+    """What only the prior knows is large, and must not be lost in rounding."""
+    rng = np.random.default_rng(0)
+    for weak in (1.0, 1e-4, 1e-8, 1e-12):
+        rows = np.round(rng.uniform(-1, 1, (7, 3)), 3)
+        rows[:, 2] *= 2.0**-24
+        prior = np.diag([0.0, 0.0, weak])
+        found = jaxcal.select(blocks=rows[:, None], prior=prior, k=3, criterion="I")
+        exact = exactly.fractions(rows)
+        total = exactly.information(
+            [exact[i] for i in found.indices], exactly.fractions(prior)
+        )
+        expected = exactly.worth("I", total, region=exact)
+        assert found.value == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_score_without_a_required_candidate_is_refused(rng):
+    design = jaxcal.Design(rng.random((8, 2)), required=[3])
+    with pytest.raises(ValueError, match=r"every required candidate, got no 3$"):
+        design.score([0, 1, 2])
+
+
+@pytest.mark.parametrize("name", ["A", "E"])
+def test_what_double_precision_cannot_hold_is_refused_by_name(name):
+    u = np.random.default_rng(0).random((12, 2)) * 1e-155
+    with pytest.raises(ValueError, match=f"criterion {name} must be a number in doub"):
+        jaxcal.select(u, criterion=name)
+    assert jaxcal.select(u).proven
+
+
+@pytest.mark.slow  # two minutes
+def test_no_kernel_writes_outside_its_arrays():
+    tool = shutil.which("valgrind")
+    if tool is None:
+        pytest.skip("valgrind is not there")
+    done = subprocess.run(
+        [tool, "--error-exitcode=9", "--undef-value-errors=no", "--quiet",
+         sys.executable, str(EXTREMES)],
+        env={**os.environ, "PYTHONMALLOC": "malloc", "OPENBLAS_NUM_THREADS": "1"},
+        capture_output=True, text=True, timeout=1800, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert done.stdout.endswith("end\n")
