@@ -86,11 +86,11 @@ def _centred(
     same = (blocks == first).all(axis=1)  # (S, q, p)
     if q > 1:
         same = same.all(axis=1, keepdims=True)
-    far = where_far = None
+    dense, where_far, far = first[:, 0], np.zeros_like(same), None
     if look:
         dense, where_far = _far(blocks, largest)
         where_far &= ~same
-        far = where_far.any(axis=(1, 2))
+        far = np.asarray(where_far.any(axis=(1, 2)))
     shift, constant = None, first[:, 0] * same
     if constant.any():
         total = blocks.sum(axis=1)
@@ -107,7 +107,7 @@ def _centred(
             size = (constant * constant).sum(axis=2, keepdims=True)
             if sets > 1:
                 size[size == 0.0] = 1.0
-            shift = np.matrix_transpose(constant) / size * centre
+            shift = constant.transpose(0, 2, 1) / size * centre
             if sets > 1:
                 centre = constant @ shift  # of sets without constants it is zero
         else:
@@ -137,9 +137,9 @@ def _far(blocks: Array, largest: Array) -> tuple[Array, Mask]:
         return ordered[:, 0], np.zeros(ordered[:, 0].shape, dtype=np.bool_)
     far = (largest[:, None, None] > _FAR * apart) & (apart > 0.0)
     if not far.any():
-        return ordered[:, 0], far[:, 0]
+        return ordered[:, 0], np.asarray(far[:, 0])
     at = np.where(apart > 0.0, apart, np.inf).argmin(axis=1)[:, None]
-    return np.take_along_axis(ordered, at, axis=1)[:, 0], far.any(axis=1)
+    return np.take_along_axis(ordered, at, axis=1)[:, 0], np.asarray(far.any(axis=1))
 
 
 def _parts(rows: Array) -> Array:
@@ -382,11 +382,11 @@ def _cholesky_factors(
     Of S sets of rows (S, N, p), by Cholesky's factor in units of the columns' lengths.
     """
     gram, p = _gram(rows), rows.shape[2]
-    scale = np.sqrt(np.diagonal(gram, axis1=1, axis2=2))
+    scale = np.sqrt(gram.diagonal(axis1=1, axis2=2))
     good = (scale * _CLEAR > largest).all(axis=1) & ~far
     if not good.all():
         gram[~good], scale[~good] = np.eye(p), 1.0
-    unit = gram / (scale[..., None] * scale[:, None])
+    unit = gram / (scale[:, :, None] * scale[:, None])
     try:
         lower = np.linalg.cholesky(unit)
     except np.linalg.LinAlgError:
@@ -396,12 +396,12 @@ def _cholesky_factors(
                 lower[n] = np.linalg.cholesky(unit[n])
             except np.linalg.LinAlgError:
                 good[n] = False
-    diagonal = np.diagonal(lower, axis1=1, axis2=2)
-    inverse = np.matrix_transpose(np.linalg.inv(lower))
+    inverse = np.linalg.inv(lower).transpose(0, 2, 1)
     good &= (inverse * inverse).sum(axis=(1, 2)) <= _LOSS / _EPS
-    back = np.matrix_transpose(lower) * scale[:, None]
-    log_det = 2.0 * np.log(scale * diagonal).sum(axis=1)
-    return inverse / scale[..., None], back, log_det, good
+    lengths = scale * lower.diagonal(axis1=1, axis2=2)
+    log_det = 2.0 * np.log(lengths).sum(axis=1)
+    back = lower.transpose(0, 2, 1) * scale[:, None]
+    return inverse / scale[:, :, None], back, log_det, good
 
 
 def _by_rotations(rows: Array, far: bool) -> tuple[Array, Array, Array]:

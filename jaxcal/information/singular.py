@@ -94,13 +94,14 @@ def rank_rule(
     num_rows, p = columns.shape[1:]
     lengths, rounding = _lengths(columns, largest, count or num_rows, computed)
     ranks = [p] * len(columns)
-    still = lengths == 0.0
-    unit = columns / np.where(still, np.inf, lengths)[:, None]
+    unit = columns / np.maximum(lengths, _TINY)[:, None]
+    if not lengths.all():  # what is rounding is no column
+        unit *= (lengths > 0.0)[:, None]
     if num_rows < p:
         distances = np.zeros((len(columns), p))
     else:  # of each column to the span of those before it: cheaper than the rank
-        factor = np.linalg.qr(unit, mode="r")
-        distances = np.abs(np.diagonal(factor, axis1=1, axis2=2))
+        factor: Array = np.linalg.qr(unit, mode="r")  # type: ignore[assignment]  # R alone
+        distances = np.abs(factor.diagonal(axis1=1, axis2=2))
     value = 2.0 * np.log(np.maximum(distances * lengths, _TINY)).sum(axis=1)
     unsure = distances.min(axis=1) <= _SURE * rounding
     for n in np.flatnonzero(unsure) if unsure.any() else ():

@@ -74,7 +74,7 @@ class Criterion:
             return cls(name, kind, root / size, times, offset=offset)
         size = power_of_two(largest.max(axis=0, initial=0.0))
         root = root / size
-        rest = power_of_two(np.linalg.norm(root, keepdims=True)[0])
+        rest = power_of_two(np.sqrt((root * root).sum(keepdims=True))[0])
         unit = float(size[0] * rest[0])
         with np.errstate(over="ignore", under="ignore"):  # asked for where it is used
             return cls(name, kind, root / rest, times, unit=float(np.square(unit)))

@@ -119,8 +119,8 @@ def solve_exact(
                 start = np.sort(
                     exchange_indices(problem, restarts, seed, _half(deadline))
                 )
-                bound = relaxed(problem, start, deadline)
-                found = _found(problem, [start], best, bound, 1)
+                root_bound = relaxed(problem, start, deadline)
+                found = _found(problem, [start], best, root_bound, 1)
                 assert found.value is not None and found.bound is not None
                 if problem.criterion.efficiency(found.value, found.bound) >= enough:
                     return dataclasses.replace(found, seed=seed, restarts=restarts)
