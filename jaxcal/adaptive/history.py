@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.particles import ParticleBelief
+from jaxcal.adaptive.particles import ParticleBelief, outcome_shape
 from jaxcal.adaptive.session import Session, Task
 from jaxcal.checks import in_words, numbers, whole_number
 from jaxcal.checks import seconds as checked_seconds
@@ -178,8 +178,11 @@ def checked(
             )
         return design, jnp.int32(found)
     values = numbers(f"{where}: outcome", outcome)
-    if values.shape:
-        raise ValueError(f"{where}: outcome must have shape (), got {values.shape}")
+    shape = outcome_shape(belief.model)
+    if values.shape != shape:
+        raise ValueError(
+            f"{where}: outcome must have shape {shape}, got {values.shape}"
+        )
     answer = jnp.asarray(values, jnp.float32)
     support = belief.model.support
     if support is not None and not (answer == support).any():

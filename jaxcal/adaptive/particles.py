@@ -14,11 +14,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from numpy.typing import ArrayLike
 
+from jaxcal.adaptive.model_task import Draw, candidates_of
 from jaxcal.adaptive.session import Options, Session, pays
 from jaxcal.checks import in_words, numbers, whole_number
+from jaxcal.models import Noise, Prior
 
-__all__ = ["Model", "ParticleBelief", "ParticleTask", "log_mean", "systematic"]
+__all__ = [
+    "Model",
+    "ParticleBelief",
+    "ParticleTask",
+    "log_mean",
+    "outcome_shape",
+    "systematic",
+]
 
 _FLOOR = -1e6  # least log likelihood, of impossible outcomes
 _ENOUGH = 0.5  # effective share of the particles below which they are moved
@@ -26,10 +36,16 @@ _HALVINGS = 10  # bisections for a temperature
 _STEPS = 40  # temperatures that one outcome may take
 _FEW = 8  # outcomes per design that a two-step look-ahead follows
 _AT_ONCE = 2**25  # log probabilities that sessions played at once may hold
+_DESIGNS = 512  # whose gains are computed at once
 
 
 class Model(Protocol):
-    """What is measured: a pytree with these methods, for one z and one design each."""
+    """What is measured: a pytree with these methods, for one z and one design each.
+
+    An outcome is a number. Where it is an array, the model says so by an attribute
+    ``outcome_shape``; where its designs are the rows of a table (A, e), by their index,
+    it has the table as ``commands``.
+    """
 
     @property
     def dim(self) -> int:
@@ -71,7 +87,7 @@ class ParticleBelief:
     log_weight: jax.Array  # (N,) logs of weights that sum to one
     log_likelihood: jax.Array  # (N,) of the measurements made
     designs: Any  # leaves (T, ...)
-    answers: jax.Array  # (T,) their outcomes
+    answers: jax.Array  # (T, ...) their outcomes
     made: jax.Array  # () int32 measurements made
     log_evidence: jax.Array  # () estimated log density of the measurements made
     model: Model
@@ -136,9 +152,14 @@ class ParticleBelief:
         count = task.num_contrasts
         unknowns = jax.vmap(self.model.unknowns)(self.draws(count, key_draws))
         keys = jax.random.split(key_noise, count)
-        return jax.vmap(lambda design: _gain(self.model, unknowns, design, keys))(
-            options.designs
-        )
+
+        def gain(design: Any) -> jax.Array:
+            return _gain(self.model, unknowns, design, keys)
+
+        if len(options.seconds) > _DESIGNS:
+            of_all: jax.Array = jax.lax.map(gain, options.designs, batch_size=_DESIGNS)
+            return of_all
+        return jax.vmap(gain)(options.designs)
 
     def gain(self, task: ParticleTask, design: Any, key: jax.Array) -> jax.Array:
         """() nats of one design: ``gains`` of it alone, by draws of its own."""
@@ -321,6 +342,58 @@ class ParticleTask:
         _check(task)
         return task
 
+    @staticmethod
+    def of(
+        model: Any,
+        prior: Prior | Draw | None,
+        noise: Noise | None,
+        candidates: ArrayLike,
+        *,
+        measurements: int,
+        seconds: float = float("inf"),
+        cost: ArrayLike = 0.0,
+        particles: int = 600,
+        contrasts: int = 100,
+        moves: int = 3,
+    ) -> ParticleTask:
+        """A model of ``jaxcal.models``, measured at one of its candidates at a time.
+
+        A design is a row of ``candidates``, by its index, and may be measured again.
+        Where the model is linear in its parameters and the prior normal, nothing
+        depends on the readings: ``jaxcal.select`` chooses as well beforehand.
+
+        Args:
+            model: any, or an object with ``predict``, ``jacobian``,
+                ``command_jacobian``.
+            prior: normal and finite; or a function, written with ``jax.numpy``, of p
+                independent standard normal numbers that returns the parameters. The
+                model's own when None.
+            noise: of a reading (q,); the model's usual one when None.
+            candidates: (M, n) commands.
+            measurements: of a session.
+            seconds: budget of a session, in what ``cost`` counts.
+            cost: of a measurement: a number or (M,).
+            particles, contrasts, moves: as of ``make``.
+
+        Raises:
+            ValueError: naming the argument, the rule and the value.
+        """
+        given = candidates_of(model, prior, noise, candidates, cost)
+        return ParticleTask.make(
+            given,
+            measurements,
+            seconds=seconds,
+            particles=particles,
+            candidates=len(given.commands),
+            contrasts=contrasts,
+            moves=moves,
+        )
+
+    @property
+    def designs(self) -> jax.Array | None:
+        """(A, e) the table of designs; None where they are proposed."""
+        return getattr(self.model, "commands", None)
+
     @property
     def batch(self) -> int:
         """Sessions that are played at once, for the memory that their gains take."""
@@ -354,7 +427,7 @@ class ParticleTask:
             designs=jax.tree.map(
                 lambda leaf: jnp.zeros((self.horizon, *leaf.shape), leaf.dtype), place
             ),
-            answers=jnp.zeros(self.horizon),
+            answers=jnp.zeros((self.horizon, *outcome_shape(self.model))),
             made=jnp.int32(0),
             log_evidence=jnp.zeros(()),
             model=self.model,
@@ -411,15 +484,16 @@ def _check(task: ParticleTask) -> None:
     cost, outcomes, own, total = jax.device_get(_tried(task))
     if not (cost >= 0.0).all():
         raise ValueError(f"model.cost must be at least 0, got {in_words(cost)}")
-    if outcomes.shape != own.shape or own.ndim != 1:
+    shape = outcome_shape(task.model)
+    if outcomes.shape[1:] != shape or own.ndim != 1:
         raise ValueError(
-            "model.sample and model.log_prob must give one number each, got shapes "
-            f"{outcomes.shape[1:]} and {own.shape[1:]}"
+            f"model.sample must give shape {shape} and model.log_prob a number, got "
+            f"shapes {outcomes.shape[1:]} and {own.shape[1:]}"
         )
     if not (own > _FLOOR).all():
         raise ValueError(
             "model.log_prob must be finite for what model.sample draws, got "
-            f"{own.min():g} for the outcome {outcomes[own.argmin()]:g}"
+            f"{own.min():g} for the outcome {in_words(outcomes[own.argmin()])}"
         )
     if (np.abs(total - 1.0) > 1e-3).any():
         worst = total[np.abs(total - 1.0).argmax()]
@@ -445,6 +519,11 @@ def _tried(task: ParticleTask) -> tuple[jax.Array, ...]:
         return options.seconds, outcomes, own, jnp.ones(1)
     each = jax.vmap(lambda p: jax.vmap(lambda y: model.log_prob(p, y))(model.support))
     return options.seconds, outcomes, own, jnp.exp(each(predictions)).sum(axis=-1)
+
+
+def outcome_shape(model: Model) -> tuple[int, ...]:
+    """Shape of an outcome; () of a number."""
+    return tuple(getattr(model, "outcome_shape", ()))
 
 
 def systematic(log_weight: jax.Array, count: int, key: jax.Array) -> jax.Array:

@@ -108,9 +108,10 @@ def see(
 
 def _along(task: Any, count: int) -> jax.Array:
     """(A,) the last column of a task's designs, from 0 to 1; 0 without a table."""
-    if not hasattr(task, "designs"):
+    designs = getattr(task, "designs", None)
+    if designs is None:
         return jnp.zeros(count)
-    u = task.designs[:, -1]
+    u = designs[:, -1]
     return (u - u.min()) / jnp.maximum(u.max() - u.min(), 1e-9)
 
 
