@@ -10,16 +10,19 @@ from jaxcal.extras import needs
 
 with needs("policy", "jaxcal.adaptive"):
     from jaxcal.adaptive.episodes import compare, play
+    from jaxcal.adaptive.estimates import estimates
     from jaxcal.adaptive.grid import GridBelief, GridTask
-    from jaxcal.adaptive.loop import next_measurement, run
+    from jaxcal.adaptive.loop import Loop, next_measurement, run
     from jaxcal.adaptive.particles import ParticleBelief, ParticleTask
 
 __all__ = [
     "GridBelief",
     "GridTask",
+    "Loop",
     "ParticleBelief",
     "ParticleTask",
     "compare",
+    "estimates",
     "next_measurement",
     "play",
     "run",

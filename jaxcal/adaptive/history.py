@@ -22,7 +22,7 @@ __all__ = [
     "StepKeys",
     "after",
     "begin",
-    "checked",
+    "checked_entry",
     "from_leaves",
     "replay",
     "step_keys",
@@ -111,8 +111,7 @@ def replay(
             raise ValueError(
                 f"{where} was measured after the budget was spent: {_left(session)}"
             )
-        entries.append(checked(task, belief, session, design, outcome, where))
-        _require_paid(task, session, entries[-1][0], where)
+        entries.append(checked_entry(task, belief, session, design, outcome, where))
         key = step_keys(seed, number).update
         belief, session = after(task, belief, session, *entries[-1], key)
         if any(np.isnan(leaf).any() for leaf in _floats(belief)):
@@ -120,6 +119,19 @@ def replay(
                 f"{where}: outcome {outcome!r} cannot follow what was measured before"
             )
     return belief, session, entries
+
+
+def checked_entry(
+    task: Task, belief: Any, session: Session, design: Any, outcome: Any, where: str
+) -> tuple[Any, Any]:
+    """Design and outcome as the task has them, of a measurement that can be paid.
+
+    Raises:
+        ValueError: naming the entry, the rule and the value.
+    """
+    entry = _checked(task, belief, session, design, outcome, where)
+    _require_paid(task, session, entry[0], where)
+    return entry
 
 
 def _require_paid(task: Task, session: Session, design: Any, where: str) -> None:
@@ -144,7 +156,7 @@ def after(
     )
 
 
-def checked(
+def _checked(
     task: Task, belief: Any, session: Session, design: Any, outcome: Any, where: str
 ) -> tuple[Any, Any]:
     """Design and outcome as the task has them.

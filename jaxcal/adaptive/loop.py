@@ -18,7 +18,7 @@ from jaxcal.adaptive.history import (
     StepKeys,
     after,
     begin,
-    checked,
+    checked_entry,
     from_leaves,
     replay,
     step_keys,
@@ -28,7 +28,7 @@ from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.rules import Gain
 from jaxcal.adaptive.session import Decider, Session, Task
 
-__all__ = ["Finished", "Proposal", "next_measurement", "run"]
+__all__ = ["Finished", "Loop", "Proposal", "next_measurement", "run"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,39 +112,108 @@ def run(
         ValueError: the journal is of another task, decider or budget; an outcome is not
             one of the task's, or cannot follow what was measured before.
     """
-    belief, session = begin(task, seconds, uses, seed)
-    header = {
-        "task": fingerprint(task),
-        "decider": fingerprint(decider),
-        "seconds": _budget(float(session.seconds)),
-        "uses": int(session.uses),
-        "seed": seed,
-    }
-    beyond = outside(task) if decider is None else ()
-    decider = _default(task, session) if decider is None else decider
-    file = None if journal is None else Journal(journal, header)
-    try:
-        kept = [] if file is None else file.entries
-        made = [
-            (from_leaves(task, belief, session, each["design"]), each["outcome"])
-            for each in kept
-        ]
-        belief, session, entries = replay(task, made, belief, session, seed)
+    with Loop(
+        task, decider, journal=journal, seconds=seconds, uses=uses, seed=seed
+    ) as loop:
         while True:
-            proposal = _proposal(task, decider, belief, session, seed, beyond)
+            proposal = loop.suggest()
             if proposal.design is None or enough(proposal):
-                return Finished(entries, belief, session)
-            outcome = measure(proposal)
-            where = f"measurement {proposal.number}"
-            entry = checked(task, belief, session, proposal.design, outcome, where)
-            if file is not None:
-                file.append(design=_leaves(entry[0]), outcome=_leaves(entry[1])[0])
-            key = step_keys(seed, proposal.number).update
-            belief, session = after(task, belief, session, *entry, key)
-            entries.append(entry)
-    finally:
-        if file is not None:
-            file.close()
+                return Finished(loop.history, loop.belief, loop.session)
+            loop.observed(measure(proposal))
+
+
+class Loop:
+    """A session step by step, for a program that has its own loop; see :func:`run`.
+
+    Args:
+        task, decider, journal, seconds, uses, seed: as of :func:`run`.
+
+    Raises:
+        ValueError: as :func:`run`.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        decider: Decider | None = None,
+        *,
+        journal: str | os.PathLike[str] | None = None,
+        seconds: float | None = None,
+        uses: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.task, self._seed = task, seed
+        belief, session = begin(task, seconds, uses, seed)
+        header = {
+            "task": fingerprint(task),
+            "decider": fingerprint(decider),
+            "seconds": _budget(float(session.seconds)),
+            "uses": int(session.uses),
+            "seed": seed,
+        }
+        self._outside = outside(task) if decider is None else ()
+        self._decider = _default(task, session) if decider is None else decider
+        self._journal = None if journal is None else Journal(journal, header)
+        try:
+            lines = [] if self._journal is None else self._journal.entries
+            made = [
+                (from_leaves(task, belief, session, line["design"]), line["outcome"])
+                for line in lines
+            ]
+            self.belief, self.session, self.history = replay(
+                task, made, belief, session, seed
+            )
+        except BaseException:
+            self.close()
+            raise
+        self._proposal: Proposal | None = None
+
+    def suggest(self) -> Proposal:
+        """What to measure next; its design is None where the session is over."""
+        if self._proposal is None:
+            self._proposal = _proposal(
+                self.task, self._decider, self.belief, self.session, self._seed,
+                self._outside,
+            )  # fmt: skip
+        return self._proposal
+
+    def observed(self, outcome: Any, design: Any = None) -> None:
+        """Take an outcome: of what was suggested, or of another design that was made.
+
+        It is in the journal when this returns.
+
+        Raises:
+            ValueError: the session is over, or the design or the outcome cannot be.
+        """
+        number = int(self.session.made)
+        if design is None:
+            design = self.suggest().design
+        if design is None or bool(self.task.over(self.session)):
+            raise ValueError(f"measurement {number}: the session is over")
+        entry = checked_entry(
+            self.task, self.belief, self.session, design, outcome,
+            f"measurement {number}",
+        )  # fmt: skip
+        if self._journal is not None:
+            leaves = _leaves(entry[0])
+            self._journal.append(design=leaves, outcome=_leaves(entry[1])[0])
+        key = step_keys(self._seed, number).update
+        self.belief, self.session = after(
+            self.task, self.belief, self.session, *entry, key
+        )
+        self.history.append(entry)
+        self._proposal = None
+
+    def close(self) -> None:
+        """Let another process write the journal."""
+        if self._journal is not None:
+            self._journal.close()
+
+    def __enter__(self) -> Loop:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def _default(task: Task, session: Session) -> Decider:

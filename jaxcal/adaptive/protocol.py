@@ -1,0 +1,162 @@
+"""A closed loop for other programs: a JSON object per line, each with an answer.
+
+    {"do": "suggest"}
+    {"number": 3, "design": 12, "coordinates": [2.7], "gain": 0.31, "seconds": 1.0, ...}
+    {"do": "observed", "outcome": 0.42}
+    {"number": 4}
+    {"do": "state"}
+    {"number": 4, "over": false, "seconds": 16.0, "uses": 20, "entropy": 1.9,
+     "unknowns": {"centre": {"mean": 2.71, "low": 2.65, "high": 2.77}}}
+
+``number`` counts measurements. ``observed`` takes the outcome of what was suggested;
+with a ``design``, an index or coordinates, that of another one; with a ``number`` it
+is refused unless that measurement is the next, so a program that does not know whether
+its last line arrived sends it again. What is wrong is answered by ``{"error": ...}``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import socket
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+
+from jaxcal.adaptive.estimates import estimates
+from jaxcal.adaptive.loop import Loop
+
+__all__ = ["answers", "listen"]
+
+_FIELDS = {
+    "suggest": set(),
+    "observed": {"outcome", "design", "number"},
+    "state": set(),
+}
+
+
+def answers(loop: Loop, lines: Iterable[str]) -> Iterator[str]:
+    """The answer to each line, with its newline; empty lines have none.
+
+    Args:
+        loop: the session. An outcome is in its journal before it is answered.
+        lines: of requests, as a file gives them.
+    """
+    for line in lines:
+        if line.strip():
+            try:
+                answer = _answer(loop, line)
+            except ValueError as error:
+                answer = {"error": " ".join(str(error).split())}
+            yield json.dumps(answer, allow_nan=False) + "\n"
+
+
+def listen(loop: Loop, path: str | os.PathLike[str]) -> None:
+    """Answer on a local socket, one connection after the other, until interrupted.
+
+    Args:
+        loop: the session.
+        path: of the socket; removed at the end. One that nobody answers is replaced.
+
+    Raises:
+        ValueError: another process answers there.
+        OSError: there can be no socket at ``path``.
+    """
+    name = os.fspath(path)
+    with socket.socket(socket.AF_UNIX) as server:
+        if os.path.exists(name):
+            with socket.socket(socket.AF_UNIX) as other:
+                if other.connect_ex(name) == 0:
+                    raise ValueError(f"{name}: another session answers there")
+            os.unlink(name)
+        server.bind(name)
+        try:
+            server.listen(1)
+            while True:
+                connection, _ = server.accept()
+                with connection, connection.makefile("rw", encoding="utf-8") as file:
+                    try:
+                        for answer in answers(loop, file):
+                            file.write(answer)
+                            file.flush()
+                    except (BrokenPipeError, ConnectionResetError):
+                        continue
+        finally:
+            os.unlink(name)
+
+
+def _answer(loop: Loop, line: str) -> dict[str, Any]:
+    try:
+        request = json.loads(line)
+    except ValueError as error:
+        raise ValueError(
+            f"a request must be a JSON object in a line: {error}"
+        ) from None
+    task = request.get("do") if isinstance(request, dict) else None
+    if task not in _FIELDS:
+        known = ", ".join(_FIELDS)
+        raise ValueError(f"do must be one of {known}, got {line.strip()[:80]}")
+    if more := set(request) - {"do"} - _FIELDS[task]:
+        raise ValueError(f"{task} has no {min(more)!r}")
+    number = int(loop.session.made)
+    if task == "suggest":
+        return _suggested(loop)
+    if task == "state":
+        return _state(loop)
+    if "outcome" not in request:
+        raise ValueError("observed needs the outcome")
+    if request.get("number", number) != number:
+        raise ValueError(
+            f"number must be {number}, the measurement that comes next, got "
+            f"{request['number']!r}"
+        )
+    loop.observed(request["outcome"], request.get("design"))
+    return {"number": number + 1}
+
+
+def _suggested(loop: Loop) -> dict[str, Any]:
+    proposal = loop.suggest()
+    if proposal.design is None:
+        return {"number": proposal.number, "over": True}
+    return {
+        "number": proposal.number,
+        "design": _plain(proposal.design),
+        "coordinates": _plain(proposal.coordinates),
+        "gain": proposal.gain,
+        "seconds": proposal.seconds,
+        "uses": proposal.uses,
+    }
+
+
+def _state(loop: Loop) -> dict[str, Any]:
+    session = loop.session
+    named = hasattr(loop.task, "theta_names") or hasattr(loop.belief.model, "names")
+    return {
+        "number": int(session.made),
+        "over": bool(loop.task.over(session)),
+        "seconds": _finite(session.seconds),
+        "uses": int(session.uses),
+        "entropy": _finite(loop.belief.entropy()),
+        "unknowns": {
+            name: {"mean": one.mean, "low": one.low, "high": one.high}
+            for name, one in estimates(loop.task, loop.belief).items()
+        }
+        if named
+        else {},
+    }
+
+
+def _finite(value: Any) -> float | None:
+    """A number, or null where there is none."""
+    return float(value) if math.isfinite(value) else None
+
+
+def _plain(value: Any) -> Any:
+    """Numbers and lists of them."""
+    if isinstance(value, dict):
+        return {name: _plain(part) for name, part in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(part) for part in value]
+    return np.asarray(value).tolist()

@@ -1,0 +1,48 @@
+"""``jaxcal loop``: a closed loop that another program drives."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+from jaxcal.extras import needs
+
+__all__ = ["loop"]
+
+
+def loop(
+    task: Annotated[str, "a task's name, or a Python file that defines ENTRY"],
+    *,
+    journal: Annotated[Path | None, "kept here; there already, it goes on"] = None,
+    socket: Annotated[Path | None, "answer on a local socket, not on a pipe"] = None,
+    with_: Annotated[tuple[str, ...], "options of the task", "OPTION=VALUE"] = (),
+    seconds: Annotated[float | None, "budget; the task's", (0.0,)] = None,
+    uses: Annotated[int | None, "budget of what is countable; the task's", (1,)] = None,
+    seed: Annotated[int, "of random draws", "S", (0,)] = 0,
+) -> None:
+    """Suggest measurements and take outcomes, as JSON in lines, for other programs.
+
+    example:
+      $ jaxcal loop peak.py --journal session.jsonl
+      {"do": "suggest"}
+      {"number": 0, "design": 15, "coordinates": [3.05], "gain": 0.055, ...}
+      {"do": "observed", "outcome": 0.42}
+      {"number": 1}
+      {"do": "state"}
+
+    Each outcome is in the journal before it is answered; killed and started again, the
+    session goes on.
+    """
+    with needs("policy", "loop"):
+        from jaxcal.adaptive.loop import Loop
+        from jaxcal.adaptive.protocol import answers, listen
+        from jaxcal.adaptive.tasks import registry
+    entry = registry.load(task)
+    made = entry.make(**registry.options_from(entry, with_))
+    with Loop(made, journal=journal, seconds=seconds, uses=uses, seed=seed) as session:
+        if socket is not None:
+            listen(session, socket)
+        for answer in answers(session, iter(sys.stdin.readline, "")):
+            sys.stdout.write(answer)
+            sys.stdout.flush()
