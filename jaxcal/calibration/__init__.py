@@ -6,7 +6,8 @@ model itself; ``estimate`` (from arguments to the fit) and ``solve`` (the search
 other one.
 """
 
+from jaxcal.calibration.budget import Budget, Source
 from jaxcal.calibration.calibration import Calibration
 from jaxcal.calibration.identify import identify
 
-__all__ = ["Calibration", "identify"]
+__all__ = ["Budget", "Calibration", "Source", "identify"]

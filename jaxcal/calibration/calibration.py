@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration import file
+from jaxcal.calibration.budget import budget
 from jaxcal.calibration.check import check, verification
 from jaxcal.calibration.estimate import fit_model
 from jaxcal.calibration.file import save, to_dict
@@ -37,6 +38,7 @@ class Calibration(Fit):
 
     command_for = command_for
     check = check
+    budget = budget
     verification = verification
     to_dict = to_dict
     save = save

@@ -109,13 +109,18 @@ class Fit:
         """
         if self.joint_covariance is None:
             return None
+        p, turn = len(self.names), self.to_parameters
+        return turn @ self.joint_covariance[:p, :p] @ turn.T
+
+    @property
+    def to_parameters(self) -> Array:
+        """(p, p) from the coordinates of ``joint_covariance`` to ``parameters``."""
         p, n, m = len(self.names), self.num_inputs, self.num_outputs
-        if self.centre is None:
-            return self.joint_covariance[:p, :p]
-        # b = (the outputs at the centre) - A centre
-        to_bias = np.eye(p)
-        to_bias[m * n :, : m * n] = -np.kron(np.eye(m), self.centre)
-        return to_bias @ self.joint_covariance @ to_bias.T
+        turn = np.eye(p)
+        if self.centre is not None:
+            # b = (the outputs at the centre) - A centre
+            turn[m * n :, : m * n] = -np.kron(np.eye(m), self.centre)
+        return turn
 
     @property
     def standard_errors(self) -> Array | None:

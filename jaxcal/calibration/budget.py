@@ -1,0 +1,296 @@
+"""The uncertainty budget of a calibration, as the GUM asks for it.
+
+Contributions to the standard uncertainty of every parameter, or of every predicted
+output: the noise of the readings, what was known before (the prior), what the model
+cannot follow (misfit), and sources that the user states, such as the zero of the
+machine and the certificate of the reference instrument. Source: JCGM 100:2008, 5.1
+(combination), G.4 (Welch-Satterthwaite) and G.6 (expanded uncertainty).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.calibration.fit import Fit
+from jaxcal.checks import aligned, array_of, one_or_each
+from jaxcal.information.singular import depends
+
+__all__ = ["Budget", "Source", "budget"]
+
+Array = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """A cause of error that all readings share, which their scatter does not show.
+
+    Type B. Errors of the outputs are taken as independent of one another.
+
+    Args:
+        name: in the budget, such as "laser tracker, certificate 1234".
+        offset: () or (m,) standard uncertainty of an offset of every reading, in the
+            measured unit: a zero, say.
+        scale: () or (m,) relative standard uncertainty of the scale of the readings.
+        dof: degrees of freedom of these; infinite where they are taken as known.
+
+    Raises:
+        ValueError: nothing is stated, or a value is negative.
+    """
+
+    name: str
+    offset: ArrayLike = 0.0
+    scale: ArrayLike = 0.0
+    dof: float = np.inf
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise ValueError(f"name must be text, got {self.name!r}")
+        sizes = [np.asarray(self.offset, float), np.asarray(self.scale, float)]
+        if any(not np.isfinite(size).all() or (size < 0.0).any() for size in sizes):
+            raise ValueError(
+                f"offset and scale of {self.name} must be 0 or more, got "
+                f"{self.offset} and {self.scale}"
+            )
+        if not any(size.any() for size in sizes):
+            raise ValueError(f"{self.name} must state an offset or a scale, got 0")
+        if not self.dof > 0.0:
+            raise ValueError(f"dof of {self.name} must be positive, got {self.dof}")
+
+    @classmethod
+    def certificate(
+        cls,
+        name: str,
+        expanded: ArrayLike,
+        *,
+        coverage_factor: float = 2.0,
+        dof: float = np.inf,
+    ) -> Source:
+        """An offset from a certificate's expanded uncertainty U and its factor k.
+
+        Args:
+            name: of the instrument.
+            expanded: () or (m,) U, in the measured unit.
+            coverage_factor: k of the certificate; 2 where it states "k = 2".
+            dof: effective degrees of freedom, where the certificate states them.
+        """
+        if not coverage_factor > 0.0:
+            raise ValueError(f"coverage_factor must be positive, got {coverage_factor}")
+        return cls(name, np.asarray(expanded, float) / coverage_factor, dof=dof)
+
+
+@dataclasses.dataclass(frozen=True)
+class Budget:
+    """Contributions to R results from S sources; printed, a table."""
+
+    names: tuple[str, ...]  # R: parameters, or outputs at commands
+    values: Array  # (R,)
+    sources: tuple[str, ...]  # S
+    source_dof: Array  # (S,) degrees of freedom; inf where taken as known
+    contributions: Array  # (R, S) standard uncertainties
+    confidence: float  # of the expanded uncertainty
+    unit: str  # of the values where they share one, else ""
+
+    @property
+    def combined(self) -> Array:
+        """(R,) combined standard uncertainty."""
+        return np.sqrt((self.contributions**2).sum(axis=1))
+
+    @property
+    def dof(self) -> Array:
+        """(R,) effective degrees of freedom by Welch and Satterthwaite."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            terms = self.contributions**4 / self.source_dof
+            found = self.combined**4 / terms.sum(axis=1)
+        return np.where(np.isnan(found), np.inf, found)
+
+    @property
+    def coverage_factor(self) -> Array:
+        """(R,) Student's t of the effective degrees of freedom."""
+        from scipy import special
+
+        upper, dof = 0.5 + 0.5 * self.confidence, self.dof
+        known = np.isinf(dof)
+        factor = special.stdtrit(np.where(known, 1.0, dof), upper)
+        return np.where(known, special.ndtri(upper), factor)
+
+    @property
+    def expanded(self) -> Array:
+        """(R,) half-width of the interval of ``confidence``: k times combined."""
+        return self.coverage_factor * self.combined
+
+    def rows(self) -> list[list[str]]:
+        """Cells of the table, its head first."""
+        head = ["", "value", *self.sources, "combined", "dof", "k"]
+        head.append(f"U ({self.confidence:.3g})")
+        columns = zip(
+            self.names, self.values, self.contributions, self.combined, self.dof,
+            self.coverage_factor, self.expanded, strict=True,
+        )  # fmt: skip
+        return [head] + [
+            [
+                name,
+                f"{value:.6g}",
+                *(f"{part:.3g}" for part in parts),
+                f"{combined:.3g}",
+                "inf" if dof > 1e6 else f"{dof:.3g}",
+                f"{factor:.3g}",
+                f"{expanded:.3g}",
+            ]
+            for name, value, parts, combined, dof, factor, expanded in columns
+        ]
+
+    def __str__(self) -> str:
+        unit = f", {self.unit}" if self.unit else ""
+        title = f"Uncertainty budget: standard uncertainties{unit}"
+        return "\n".join([title, *(f"  {line}" for line in aligned(self.rows()))])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values; infinite ones are None."""
+
+        def plain(values: Array) -> list[Any]:
+            return [float(v) if np.isfinite(v) else None for v in values]
+
+        return {
+            "confidence": self.confidence,
+            "unit": self.unit,
+            "sources": [
+                {"name": name, "dof": dof}
+                for name, dof in zip(
+                    self.sources, plain(self.source_dof), strict=True
+                )
+            ],
+            "results": [
+                {
+                    "name": name,
+                    "value": float(value),
+                    "contributions": plain(parts),
+                    "combined": combined,
+                    "dof": dof,
+                    "coverage_factor": float(factor),
+                    "expanded": expanded,
+                }
+                for name, value, parts, combined, dof, factor, expanded in zip(
+                    self.names, self.values, self.contributions, plain(self.combined),
+                    plain(self.dof), self.coverage_factor, plain(self.expanded),
+                    strict=True,
+                )
+            ],
+        }  # fmt: skip
+
+
+def budget(
+    calibration: Fit,
+    commands: ArrayLike | None = None,
+    *,
+    sources: Sequence[Source] = (),
+    confidence: float = 0.95,
+) -> Budget:
+    """The uncertainty budget of the parameters, or of the outputs at commands.
+
+    Without ``sources`` the combined uncertainty is that of ``standard_errors`` and of
+    ``predict_std``. A source reaches a result as the fit lets it: an offset of the
+    readings moves b of an affine model by itself, and A not at all.
+
+    Args:
+        calibration: with a known or an estimated noise.
+        commands: (N, n), of which the true outputs are predicted; the parameters when
+            not given.
+        sources: what the scatter of the readings does not show: zero, certificate.
+        confidence: of the expanded uncertainty, in (0, 1).
+
+    Raises:
+        ValueError: the noise is unknown, or an argument is wrong, by name.
+    """
+    calibration.require_noise("uncertainty budget")
+    if not 0.0 < array_of("confidence", confidence) < 1.0:
+        raise ValueError(f"confidence must be in (0, 1), got {confidence}")
+    if wrong := [one for one in sources if not isinstance(one, Source)]:
+        raise ValueError(
+            f"sources must hold jaxcal.calibration.Source, got {wrong[0]!r}"
+        )
+    p, covariance = len(calibration.names), np.asarray(calibration.joint_covariance)
+    prior = calibration.prior_precision * (calibration.free > 0.0)
+    if commands is None:
+        slopes = np.eye(p, len(covariance))  # of the results by all parameters
+        slopes[:, :p] = calibration.to_parameters
+        names, values, unit = calibration.names, calibration.parameters, ""
+    else:
+        points = calibration.points("commands", commands, calibration.num_inputs)
+        points = points.reshape(-1, calibration.num_inputs)
+        slopes = calibration.linear(points)[0]
+        width = slopes.shape[-1]
+        slopes = slopes.reshape(-1, width)
+        covariance, prior = covariance[:width, :width], prior[:width]
+        outputs = calibration.output_names
+        names = tuple(f"{y} at row {i}" for i in range(len(points)) for y in outputs)
+        values, unit = calibration.predict(points).ravel(), calibration.measured_unit
+    by = slopes @ covariance
+    total = np.maximum((by * slopes).sum(axis=1), 0.0)
+    before, misfit = (by[:, :p] ** 2) @ prior[:p], (by[:, p:] ** 2) @ prior[p:]
+    noise = np.maximum(total - before - misfit, 0.0)
+    if calibration.unidentified is not None:
+        lost = calibration.unidentified[:, : slopes.shape[-1]]
+        noise = np.where(depends(slopes, lost), np.inf, noise)
+    parts = {"noise": (noise, calibration.noise_dof or np.inf)}
+    if before.any():
+        parts["known before"] = before, np.inf
+    if misfit.any():
+        parts["misfit"] = misfit, np.inf
+    gain = _gain(calibration, slopes.shape[-1]) if sources else None
+    for source in sources:
+        if source.name in parts:
+            raise ValueError(f"sources must have names of their own: {source.name!r}")
+        parts[source.name] = _squares(calibration, source, slopes, gain), source.dof
+    contributions = np.sqrt(np.stack([square for square, _ in parts.values()], 1))
+    finite = np.where(np.isfinite(contributions), contributions, 0.0)
+    least = 1e-9 * finite.max(axis=1, keepdims=True)  # below is rounding
+    return Budget(
+        names=names,
+        values=np.asarray(values),
+        sources=tuple(parts),
+        source_dof=np.array([float(dof) for _, dof in parts.values()]),
+        contributions=np.where(contributions > least, contributions, 0.0),
+        confidence=float(confidence),
+        unit=unit,
+    )
+
+
+def _gain(calibration: Fit, width: int) -> Array:
+    """(P, N, m) how far the parameters move with each reading, to first order."""
+    given = calibration.estimated_commands
+    at = calibration.commands if given is None else given
+    slopes = calibration.linear(at)[0][..., :width]
+    free = calibration.free[:width] > 0.0
+    slopes = slopes * free
+    weight = calibration.loss_weights[:, None] / np.maximum(
+        calibration.require_noise("budget") ** 2, 1e-300
+    )
+    rows = slopes * np.sqrt(weight)[..., None]
+    rows = rows.reshape(-1, width)
+    known = np.sqrt(calibration.prior_precision[:width] * free)
+    whole = np.concatenate([rows, np.diag(known)])
+    size = np.sqrt((whole**2).sum(axis=0))
+    size[size == 0.0] = 1.0
+    inverse = np.linalg.pinv(whole / size)[:, : len(rows)] / size[:, None]
+    return np.asarray(inverse.reshape(width, *weight.shape) * np.sqrt(weight))
+
+
+def _squares(calibration: Fit, source: Source, slopes: Array, gain: Any) -> Array:
+    """(R,) variances of the results by one source."""
+    m = calibration.num_outputs
+    measured = calibration.residuals + calibration.predict(calibration.commands)
+    moved = np.zeros(len(slopes))
+    for name, shape in (("offset", np.ones_like(measured)), ("scale", measured)):
+        value = getattr(source, name)
+        if not np.any(value):
+            continue
+        size = one_or_each(f"{name} of {source.name}", value, m)
+        # Of each output by itself: (R, m).
+        moves = slopes @ np.einsum("pnm,nm->pm", gain, shape * size)
+        moved = moved + (moves**2).sum(axis=1)
+    return moved
