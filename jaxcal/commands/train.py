@@ -10,6 +10,7 @@ import argparse
 import contextlib
 import dataclasses
 import datetime
+import math
 import pathlib
 import signal
 import sys
@@ -41,8 +42,8 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
     """Run.
 
     Returns:
-        0 when trained or stopped on request, 2 when something given was wrong, 3 where
-        another process of the job was lost.
+        0 when trained or stopped on request, 1 where the training diverged, 2 when
+        something given was wrong, 3 where another process of the job was lost.
     """
     given = list(sys.argv[1:] if argv is None else argv)
 
@@ -68,8 +69,8 @@ def _run(arguments: argparse.Namespace) -> int:
     out = pathlib.Path(arguments.out or f"runs/{named}")
     if arguments.export and not arguments.export.endswith(".npz"):
         raise ValueError(f"--export must be a file NAME.npz, got {arguments.export}")
-    if (seeds := _num_seeds(arguments, out)) > 1:
-        devices.a_device_for_each_core(seeds)
+    if (runs := _num_runs(arguments, out)) > 1:
+        devices.a_device_for_each_core(runs)
     configuration = _task_configuration if arguments.task else _configuration
     config: Any = devices.on_first(lambda: configuration(arguments, out))
     stop = _stop_on_signals()
@@ -79,7 +80,13 @@ def _run(arguments: argparse.Namespace) -> int:
         brax_ppo.train(config, out, lambda line: print(line, flush=True))
         done = config.ppo.num_updates
     else:
-        done = _train(config, arguments, out, stop)
+        from jaxcal.learning.training.run import DivergedError
+
+        try:
+            done = _train(config, arguments, out, stop)
+        except DivergedError as error:
+            print(f"train: {error}", file=sys.stderr)
+            return 1
     if not devices.is_first():
         return 0
     task = f" --task {arguments.task}" if arguments.task else ""
@@ -127,7 +134,7 @@ def _train(
         from jaxcal.selection.batch import fixed_validation, teacher
 
         rows = config.ppo.rows_per_minibatch
-        mesh = devices.make_mesh(rows, arguments.devices, config.num_seeds)
+        mesh = devices.make_mesh(rows, arguments.devices, config.num_runs)
         schema, unit, columns = checkpoint.SCHEMA, "episodes", _POSTURES
         introduction = _introduction(config, out, devices.describe(mesh))
         more = {"validation": None, "teacher": teacher}
@@ -146,21 +153,24 @@ def _train(
         **more,
     )
     if first:
-        _compare_seeds(out, config, trainer.MEASURED, schema)
-    return int(np.ravel(state.num_updates)[0])
+        _compare_runs(out, config, trainer.MEASURED, schema)
+    return int(np.max(state.num_updates))
 
 
-def _num_seeds(arguments: argparse.Namespace, out: pathlib.Path) -> int:
-    """Of the run to begin or to go on with; what is wrong is refused later."""
-    if not arguments.resume:
-        return arguments.num_seeds or 1
-    from jaxcal.adaptive.policy.run import SCHEMA
-    from jaxcal.learning.training import checkpoint
+def _num_runs(arguments: argparse.Namespace, out: pathlib.Path) -> int:
+    """Side by side, of what to begin or to go on with; what is wrong is refused later."""
+    from jaxcal.learning.config import runs_of
 
-    schema = SCHEMA if arguments.task else checkpoint.SCHEMA
-    with contextlib.suppress(checkpoint.CheckpointError):
-        return int(checkpoint.read_meta(out, schema)[1]["num_seeds"])
-    return 1
+    seeds, sweep = arguments.num_seeds or 1, arguments.sweep
+    if arguments.resume:
+        from jaxcal.adaptive.policy.run import SCHEMA
+        from jaxcal.learning.training import checkpoint
+
+        schema = SCHEMA if arguments.task else checkpoint.SCHEMA
+        with contextlib.suppress(checkpoint.CheckpointError):
+            meta = checkpoint.read_meta(out, schema)[1]
+            seeds, sweep = meta["num_seeds"], meta.get("sweep", ())
+    return len(runs_of(0, seeds, sweep))
 
 
 # -- what to train ---------------------------------------------------------------------
@@ -179,7 +189,7 @@ def _configuration(arguments: argparse.Namespace, out: pathlib.Path) -> TrainCon
     if arguments.trainer == "brax":
         config = _for_brax(config, arguments, given)
     if arguments.resume:
-        _refuse_with_resume(given, out)
+        _refuse_with_resume(given | _swept(arguments), out)
         config = TrainConfig.from_meta(checkpoint.read_meta(out)[1])
         held = config.tasks[0].given
         if held != candidates:  # they are compared by their digest
@@ -195,9 +205,10 @@ def _configuration(arguments: argparse.Namespace, out: pathlib.Path) -> TrainCon
         config = presets.with_values(config, given)
     else:
         config = trained_on(config, candidates, given)
-    if config.num_seeds > 1 and arguments.no_validation:
+    config = dataclasses.replace(config, sweep=arguments.sweep)
+    if config.num_runs > 1 and arguments.no_validation:
         raise ValueError(
-            "--seeds needs the validation by which the best is known: leave "
+            "--seeds and --sweep need the validation by which the best is known: leave "
             "--no-validation out"
         )
     require_writable_folder(out)
@@ -215,7 +226,7 @@ def _for_brax(
     with needs("study", "--trainer brax"):
         from jaxcal.learning.training import brax_ppo
 
-    for name in ("resume", "num_seeds"):
+    for name in ("resume", "num_seeds", "sweep"):
         if getattr(arguments, name):
             raise ValueError(f"{flag_of(name)} works with --trainer jaxcal only")
     if jax.process_count() > 1:
@@ -245,7 +256,7 @@ def _task_configuration(
     given = values_of(arguments, task=True)
     if arguments.resume:
         more = {"with": arguments.with_} if arguments.with_ else {}
-        _refuse_with_resume(given | more, out)
+        _refuse_with_resume(given | more | _swept(arguments), out)
         _, meta = checkpoint.read_meta(out, run.SCHEMA)
         config = PolicyConfig.from_meta(meta)
         if config.task != arguments.task:
@@ -266,7 +277,8 @@ def _task_configuration(
     require_writable_folder(out)
     base = entry.rules.get("state") or _tuned(entry, options[0])
     config = PolicyConfig(task=arguments.task, base=base, options=options, **own)
-    return dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **ppo))
+    changed = dataclasses.replace(config.ppo, **ppo)
+    return dataclasses.replace(config, ppo=changed, sweep=arguments.sweep)
 
 
 def _tuned(entry: Entry, options: Mapping[str, Any]) -> StateRule:
@@ -276,6 +288,10 @@ def _tuned(entry: Entry, options: Mapping[str, Any]) -> StateRule:
 
     print("tuning the rule that the policy begins as ...", flush=True)
     return tune(entry.make(**options), StateRule(), episodes=1024, seed=1)
+
+
+def _swept(arguments: argparse.Namespace) -> dict[str, Any]:
+    return {"sweep": arguments.sweep} if arguments.sweep else {}
 
 
 def _refuse_with_resume(given: Mapping[str, Any], out: pathlib.Path) -> None:
@@ -308,6 +324,8 @@ def _introduction(config: TrainConfig, out: pathlib.Path, devices: str) -> str:
     task, seed = config.tasks[0], f"seed {config.seed}"
     if config.num_seeds > 1:
         seed = f"seeds {config.seed} to {config.seed + config.num_seeds - 1}"
+    for name, values in config.sweep:
+        seed += f", {name} " + " ".join(f"{value:g}" for value in values)
     env = task.environment
     given = f" from {task.given.name}" if task.given else ""
     return (
@@ -354,34 +372,46 @@ def _show(report: Report, measured: tuple[str, ...]) -> None:
     print(
         f"{report.update:9,d} {report.played:10,d} {report.per_second:6,.0f} "
         f"{_clock(report.seconds):>9} {_clock(report.eta):>9} "
-        + (f"{reward:8.4f} " if reward is not None else " imitate ")
+        + (" imitate " if reward is None else f"{_or_dash(reward, '.4f'):>8} ")
         + " ".join(cells),
         flush=True,
     )
 
 
-def _compare_seeds(
+def _or_dash(value: float, form: str) -> str:
+    """A number; a dash where no session ended, so that there is none."""
+    return "-" if math.isnan(value) else format(value, form)
+
+
+def _compare_runs(
     out: pathlib.Path, config: Any, measured: tuple[str, ...], schema: str
 ) -> None:
-    """What every seed reached, where they were several."""
+    """What every seed reached with every swept value, where they were several."""
     import numpy as np
 
+    from jaxcal.learning.config import runs_of
     from jaxcal.learning.training import checkpoint
 
-    if config.num_seeds == 1:
+    if config.num_runs == 1:
         return
     progress = checkpoint.read_meta(out, schema)[1]["progress"]
     values = np.array([[each[name] for name in measured] for each in progress["seeds"]])
     if not len(values):
         return
-    print("     seed " + " ".join(f"{name:>16}" for name in measured))
-    for number, row in enumerate(values):
-        best = "  best" if number == progress["best"] else ""
+    runs = runs_of(config.seed, config.num_seeds, config.sweep)
+    names, best = runs[0], progress["best"]
+    wide = {name: max(len(name), 9) for name in names}
+    print(" ".join(f"{n:>{wide[n]}}" for n in names) + "".join(f"{n:>17}" for n in measured))
+    for number, (run, row) in enumerate(zip(runs, values, strict=True)):
         print(
-            f"{config.seed + number:9d} " + " ".join(f"{x:16.4f}" for x in row) + best
+            " ".join(f"{run[n]:{wide[n]}g}" for n in names)
+            + "".join(f"{x:17.4f}" for x in row)
+            + ("  best" if number == best else "")
         )
+    if config.sweep:
+        return
     for name, row in (("mean", values.mean(0)), ("spread", values.std(0, ddof=1))):
-        print(f"{name:>9} " + " ".join(f"{x:16.4f}" for x in row))
+        print(f"{name:>9}" + "".join(f"{x:17.4f}" for x in row))
 
 
 def _clock(seconds: float) -> str:

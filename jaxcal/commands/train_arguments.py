@@ -15,7 +15,7 @@ from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.tasks import registry
 from jaxcal.arguments import Parser, number_type
 from jaxcal.csvtable import read_table
-from jaxcal.learning.config import StreamsConfig
+from jaxcal.learning.config import TRACED, StreamsConfig
 from jaxcal.learning.environments.task import GivenCandidates
 from jaxcal.learning.runtime import processes
 from jaxcal.learning.settings import settings_of
@@ -51,6 +51,7 @@ more examples:
   {program} --task knee            the next measurement from what the last answered
   {program} --task knee --with cells=16 sigma=0.05
   {program} --seeds 8              eight runs side by side: mean, spread and the best
+  {program} --sweep learning_rate=1e-3,3e-3 entropy_start=0.01,0.02   one table of four
   {program} --resume --out runs/compact      go on where a run stopped
   {program} --preset general --export checkpoints/default.npz   what ships
   {program} --trainer brax --episodes 50000  the same task, brax's own PPO
@@ -130,7 +131,24 @@ def parser(prog: str) -> Parser:
                 group.add_argument(
                     flag, type=kind, metavar=metavar, help=line, dest=field.name
                 )
+    out.add_argument(
+        "--sweep", nargs="+", type=_swept, default=(), metavar="NAME=X,Y",
+        help="values side by side, every combination for every seed, in one table: "
+        f"of {', '.join(TRACED)}",
+    )  # fmt: skip
     return out
+
+
+def _swept(text: str) -> tuple[str, tuple[float, ...]]:
+    name, _, values = text.partition("=")
+    number = number_type(float)
+    try:
+        held = tuple(number(value) for value in values.split(","))
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(
+            f"must be NAME=X,Y with numbers, got {text!r}"
+        ) from error
+    return name.replace("-", "_"), held
 
 
 def values_of(arguments: argparse.Namespace, task: bool) -> dict[str, Any]:

@@ -4,11 +4,39 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from typing import ClassVar
+import itertools
+from collections.abc import Sequence
+from typing import Any, ClassVar
 
 from jaxcal.learning.settings import require, setting
 
-__all__ = ["EpisodesConfig", "PPOConfig", "StreamsConfig"]
+__all__ = ["TRACED", "EpisodesConfig", "PPOConfig", "StreamsConfig", "Sweep", "runs_of"]
+
+TRACED = (
+    "learning_rate", "final_learning_rate", "clip_range", "value_coefficient",
+    "value_error_limit", "entropy_start", "entropy_end", "discount", "gae_lambda",
+    "advantage_limit", "max_grad_norm", "average_decay",
+)  # fmt: skip
+"""Fields of ``PPOConfig`` that a run may have as arrays, other than its configuration's:
+runs that differ in them are one program."""
+
+_NOT_NEGATIVE = (
+    "final_learning_rate", "warmup_updates", "value_coefficient", "entropy_start",
+    "entropy_end", "advantage_limit",
+)  # fmt: skip
+
+Sweep = tuple[tuple[str, tuple[float, ...]], ...]
+"""Values of fields in ``TRACED``; every combination is a run for each seed."""
+
+
+def runs_of(seed: int, num_seeds: int, sweep: Sequence[Any]) -> list[dict[str, Any]]:
+    """``seed`` and the swept values of each run that is trained side by side."""
+    names, values = [name for name, _ in sweep], [values for _, values in sweep]
+    return [
+        {"seed": seed + number} | dict(zip(names, held, strict=True))
+        for held in itertools.product(*values)
+        for number in range(num_seeds)
+    ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +77,17 @@ class PPOConfig(abc.ABC):
         require(self, "positive", lambda v: v > 0, *positive)
         require(self, "in [0, 1]", lambda v: 0.0 <= v <= 1.0, "discount", "gae_lambda")
         require(self, "in [0, 1)", lambda v: 0.0 <= v < 1.0, "average_decay")
+        require(self, "0 or more", lambda v: v >= 0, *_NOT_NEGATIVE)
+
+    def require_sweep(self, sweep: Sweep) -> None:
+        """Refuse a sweep of what cannot be swept, or of values that break a rule."""
+        for name, values in sweep:
+            if name not in TRACED:
+                known = ", ".join(TRACED)
+                raise ValueError(f"sweep must be of {known}, got {name}")
+            for value in values:
+                changed: dict[str, Any] = {name: value}
+                dataclasses.replace(self, **changed)
 
     def require_whole(self, total: str, each: str) -> None:
         """Refuse a ``total`` that is not a multiple of ``each`` x num_minibatches."""

@@ -66,7 +66,8 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
     rows = (tmp_path / "metrics.csv").read_text().splitlines()
     assert rows[0] == (
         "update,decisions,seconds,reward_mean,choices,entropy,policy_loss,value_loss,"
-        "kl,learning_rate,nats,nats_over_base"
+        "kl,kl_after,clip_fraction,explained_variance,grad_norm,learning_rate,nats,"
+        "nats_over_base"
     )
     assert len(rows) == 5
 
@@ -76,8 +77,8 @@ def test_the_run_trains_what_the_pure_function_does_and_tasks_are_arguments(tmp_
     one = dataclasses.replace(CONFIG, options=CONFIG.options[:1])
     state = run.train(one, tmp_path)
     train = jax.jit(make_train(one))
-    average, metrics = train(jax.random.key(0), run.exercises(one)[0])
-    for a, b in zip(leaves(average), leaves(state.average), strict=True):
+    pure, metrics = train(jax.random.key(0), run.exercises(one)[0])
+    for a, b in zip(leaves(pure.average), leaves(state.average), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
     assert metrics["reward_mean"].shape == (4,)
     train(jax.random.key(1), run.exercises(CONFIG)[1])

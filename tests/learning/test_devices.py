@@ -84,7 +84,7 @@ params = learner.init(jax.random.key(0))
 
 def play(params, data, mesh):
     keys = jax.random.split(jax.random.wrap_key_data(data), config.rows_per_update)
-    return learner.gather(params, ppo.placed(keys, mesh, "sets"))[0]
+    return learner.gather(params, ppo.placed(learner.begin(keys), mesh, "sets"))[0]
 
 data = jax.random.key_data(jax.random.key(1))
 with jax.disable_jit():
@@ -144,8 +144,8 @@ def test_a_mesh_takes_the_devices_asked_for_and_names_what_does_not_divide() -> 
                 return str(error)
         out["many"] = error(lambda: devices.make_mesh(64, 9))
         out["odd"] = error(lambda: devices.make_mesh(12))
-        out["seeds"] = devices.make_mesh(7, num_seeds=16).axis_names
-        out["odd seeds"] = error(lambda: devices.make_mesh(16, num_seeds=6))
+        out["seeds"] = devices.make_mesh(7, num_runs=16).axis_names
+        out["odd seeds"] = error(lambda: devices.make_mesh(16, num_runs=6))
         devices.make_mesh(presets.load("paper").ppo.rows_per_minibatch)
         """,
     )
@@ -211,7 +211,7 @@ def test_seeds_on_devices_of_their_own_are_what_they_are_side_by_side() -> None:
         keys = jax.random.split(jax.random.key(5), 4)
         begin = jax.jit(jax.vmap(lambda key: ppo.begin(config, learner, key)))
         ends = []
-        for mesh in (None, devices.make_mesh(16, num_devices=2, num_seeds=4)):
+        for mesh in (None, devices.make_mesh(16, num_devices=2, num_runs=4)):
             state = devices.replicate(begin(keys), mesh)
             update = training.updates(config, learner, mesh, 2, 4)
             ends.append(update(state, jnp.int32(2)))

@@ -106,12 +106,13 @@ def test_lessons_share_no_key_with_the_weights_and_the_updates():
         jax.random.key_data(jax.random.split(key)[1]),
         jax.random.key_data(jax.random.fold_in(key, 1)),
     )
-    weights, played, _ = jax.random.split(key, 3)
+    weights, updates, _ = jax.random.split(key, 3)
     begun = jax.jit(lambda key: ppo.begin(PPO, LEARNER, key))(key)
-    assert np.array_equal(begun.key, jax.random.key_data(played))
+    order, rows = jax.random.split(updates)
+    assert np.array_equal(begun.key, jax.random.key_data(order))
     for index in range(3):
         drawn = imitation.draw(LEARNER, brute_force, key_of(index))
-        for used in (weights, played):
+        for used in (weights, updates, order, rows):
             sets, _ = imitation._drawn(jax.random.split(used, 4)[0], 64, TASK)
             assert not np.array_equal(sets, drawn.candidates)
 
@@ -120,7 +121,7 @@ def test_lessons_share_no_key_with_the_weights_and_the_updates():
 def measured(params, lesson):
     learner = imitation.Imitation(LEARNER)
     keys = jax.random.split(jax.random.key(0), len(lesson.best))
-    attempt, _ = learner.gather(params, keys, lesson)
+    attempt, _, _ = learner.gather(params, learner.begin(keys, lesson), lesson)
     return learner.loss(params, attempt, jnp.int32(0))
 
 

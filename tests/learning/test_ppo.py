@@ -144,7 +144,8 @@ def test_a_gradient_step_is_that_of_optax(rng, size):
     )
     state, theirs = chain.init(params), params
     for _ in range(2):
-        ours = ppo.descend(config, ours, grads)
+        ours, norm = ppo.descend(config, ours, grads)
+        np.testing.assert_allclose(norm, optax.tree.norm(grads), rtol=1e-6)
         changes, state = chain.update(grads, state, theirs)
         theirs = optax.apply_updates(theirs, changes)
     for name in params:
@@ -170,9 +171,9 @@ def test_the_first_minibatch_sees_the_probabilities_that_played(kind, n, k):
     @jax.jit
     def play(params):
         keys = jax.random.split(jax.random.key(1), config.rows_per_update)
-        return learner.gather(params, keys)
+        return learner.gather(params, learner.begin(keys))[0]
 
-    played, _ = play(params)
+    played = play(params)
     _, metrics = jax.jit(learner.loss)(params, played, jnp.int32(0))
     assert abs(float(metrics["kl"])) < 1e-6
 
@@ -244,6 +245,7 @@ class Probe:
     tasks: tuple[Pick, ...] = (Pick(),)
     seed: int = 3
     num_seeds: int = 1
+    sweep: tuple = ()
     validate_every: float = 15.0
     save_every: float = 60.0
 
@@ -259,12 +261,12 @@ PROBE = Probe(dataclasses.replace(TINY, learning_rate=0.3, entropy_start=0.0))
 
 
 def test_value_and_policy_are_learned_in_a_probe_environment():
-    average, metrics = jax.jit(ppo.make_train(PROBE))(jax.random.key(0))
+    state, metrics = jax.jit(ppo.make_train(PROBE))(jax.random.key(0))
     rewards = metrics["reward_mean"]
     assert metrics["rewards"].shape == (40, 64)
     # At random 1/2; the largest of six uniform numbers is 6/7 on average.
     assert abs(rewards[0] - 0.5) < 0.1 and np.mean(rewards[-5:]) > 0.75
-    assert abs(float(average["value"]) - np.mean(rewards[-5:])) < 0.1
+    assert abs(float(state.average["value"]) - np.mean(rewards[-5:])) < 0.1
 
 
 def test_training_maps_over_seeds():
@@ -272,18 +274,19 @@ def test_training_maps_over_seeds():
     train = ppo.make_train(PROBE)
     keys = jax.random.split(jax.random.key(5), 3)
     several, _ = jax.jit(jax.vmap(train))(keys)
-    assert len(set(np.asarray(several["slope"]).tolist())) == 3
+    slopes = several.average["slope"]
+    assert len(set(np.asarray(slopes).tolist())) == 3
     alone, _ = jax.jit(train)(keys[1])
-    np.testing.assert_allclose(several["slope"][1], alone["slope"], rtol=1e-4)
+    np.testing.assert_allclose(slopes[1], alone.average["slope"], rtol=1e-4)
 
 
 def test_a_run_trains_what_the_pure_function_does(tmp_path):
     """Also where two tasks take turns."""
     config = Probe(PROBE.ppo, (Pick(), Pick(payment=0.5)))
-    average, metrics = jax.jit(ppo.make_train(config))(jax.random.key(3))
+    pure, metrics = jax.jit(ppo.make_train(config))(jax.random.key(3))
     recipe = Recipe(config, ((),), "probe", (), (), validate=None)
     state = run(recipe, tmp_path)
-    for one, other in zip(*map(jax.tree.leaves, (average, state.average)), strict=True):
+    for one, other in zip(*map(jax.tree.leaves, (pure.average, state.average)), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-5)
     rows = np.genfromtxt(tmp_path / "metrics.csv", delimiter=",", names=True)
     np.testing.assert_allclose(metrics["reward_mean"], rows["reward_mean"], atol=1e-6)
@@ -361,7 +364,7 @@ def test_the_averaged_weights_owe_nothing_to_the_initial_ones(rng):
     data, seen = jnp.asarray(rng.normal(size=(4, 3)), jnp.float32), []
     for _ in range(4):
         grads = jax.grad(lambda w: ((w[None] - data) ** 2).sum())(state.params["w"])
-        state = ppo.descend(config, state, {"w": grads})
+        state, _ = ppo.descend(config, state, {"w": grads})
         seen.append(np.asarray(state.params["w"], np.float64))
         ages = 0.9 ** np.arange(len(seen))[::-1]
         expected = ages @ np.stack(seen) / ages.sum()

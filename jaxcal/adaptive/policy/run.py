@@ -91,7 +91,7 @@ def train(
         OSError: the folder cannot be written.
     """
     rows = config.ppo.rows_per_minibatch
-    mesh = devices.make_mesh(rows, num_devices, config.num_seeds)
+    mesh = devices.make_mesh(rows, num_devices, config.num_runs)
     given = exercises(config)
     keys = jax.random.split(jax.random.key(_FRESH), _VALIDATED)
     task, base = given[0].task, given[0].base

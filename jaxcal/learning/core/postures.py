@@ -17,7 +17,14 @@ from flax import struct
 
 from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.core.network import Network, decode, encode, initial
-from jaxcal.learning.core.ppo import Batch, Metrics, advantages, normalised, surrogate
+from jaxcal.learning.core.ppo import (
+    Batch,
+    Metrics,
+    advantages,
+    explained_variance,
+    normalised,
+    surrogate,
+)
 
 __all__ = ["Episode", "Postures"]
 
@@ -72,22 +79,38 @@ class Postures:
         m, n = jax.eval_shape(self.task.reset, key).candidates.shape
         return initial(self.network, key, m, n, self.task.num_decisions)
 
-    def gather(self, params: Any, keys: jax.Array) -> tuple[Batch, Metrics]:
-        """Play ``episodes_per_set`` episodes on a fresh set for each of the keys (B,).
+    def having(self, config: EpisodesConfig) -> Postures:
+        """The same with another configuration."""
+        return dataclasses.replace(self, config=config)
+
+    def begin(self, keys: jax.Array) -> jax.Array:
+        """(B, 2) uint32, data of the keys of the rows, of which (B,) are the first."""
+        return jax.random.key_data(keys)
+
+    def gather(
+        self, params: Any, playing: jax.Array
+    ) -> tuple[Batch, jax.Array, Metrics]:
+        """Play ``episodes_per_set`` episodes on a fresh set in each row.
 
         Returns:
-            What was played, rows of decisions (T, G); metrics: scalars, and ``rewards``
-            (B G,).
+            What was played, rows of decisions (T, G); the keys of the next update;
+            metrics: scalars, and ``rewards`` (B G,).
         """
+        keys = jax.vmap(jax.random.split)(jax.random.wrap_key_data(playing))
         play = jax.vmap(self._play, in_axes=(None, 0))
-        batch, reward, log_det = play(params, keys)  # (B, G) each
+        batch, value, reward, log_det = play(params, keys[:, 0])  # (B, G) the last two
         metrics = {
             "rewards": reward.ravel(),
             "reward_mean": reward.mean(),
             "reward_std": reward.std(),
             "log_det_mean": log_det.mean(),
+            "explained_variance": explained_variance(batch.target, value),
         }
-        return normalised(self.config, batch), metrics
+        return (
+            normalised(self.config, batch),
+            jax.random.key_data(keys[:, 1]),
+            metrics,
+        )
 
     def loss(
         self, params: Any, experience: Batch, done: jax.Array
@@ -111,8 +134,8 @@ class Postures:
         logits, value = scored
         return logits, value * self.task.value_scale
 
-    def _play(self, params: Any, key: jax.Array) -> tuple[Batch, jax.Array, jax.Array]:
-        """One row; (G,) rewards, (G,) outcomes."""
+    def _play(self, params: Any, key: jax.Array) -> tuple[Any, ...]:
+        """A ``Batch`` of one row; its (T, G) values; (G,) rewards, (G,) outcomes."""
         task, network = self.task, self.network
         learned = task.num_decisions - network.num_unlearned
         key_set, key_actions = jax.random.split(key)
@@ -165,7 +188,8 @@ class Postures:
             advantage=advantage[:learned],
             target=target[:learned],
         )
-        return batch, played["reward"].sum(0), jax.vmap(task.outcome)(state)
+        value, reward = played["value"][:learned], played["reward"].sum(0)
+        return batch, value, reward, jax.vmap(task.outcome)(state)
 
     def _advantages_and_targets(self, played: Metrics) -> tuple[jax.Array, jax.Array]:
         """Advantages and value targets of every decision, (K, G) each.

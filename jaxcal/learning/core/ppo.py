@@ -1,8 +1,9 @@
 """Proximal policy optimisation: loss, advantages, optimiser, update, training.
 
     train = make_train(config)
-    weights, metrics = jax.jit(train)(jax.random.key(0))
+    state, metrics = jax.jit(train)(jax.random.key(0))  # state.average: the policy
     jax.vmap(train)(jax.random.split(jax.random.key(0), 8))  # eight runs, one program
+    jax.vmap(lambda rate: train(key, learning_rate=rate))(rates)  # as many rates
 
 A ``Learner`` plays and scores: ``postures`` has that of episodes of a fixed number of
 choices, ``streams`` that of sessions of any length. Everything here is pure;
@@ -13,6 +14,7 @@ Sources: Schulman et al. 2017 (clipped surrogate), 2016 (advantages).
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from collections.abc import Callable
@@ -24,7 +26,7 @@ import optax
 from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jaxcal.learning.config import PPOConfig
+from jaxcal.learning.config import TRACED, PPOConfig
 
 __all__ = [
     "Batch",
@@ -33,6 +35,7 @@ __all__ = [
     "TrainState",
     "advantages",
     "begin",
+    "explained_variance",
     "make_train",
     "make_update",
     "normalised",
@@ -54,11 +57,23 @@ class Learner(Protocol):
     def __hash__(self) -> int:
         """Hashable, as a static argument of ``jit``."""
 
+    def having(self, config: Any) -> Learner:
+        """The same with another configuration, of which ``TRACED`` may be arrays."""
+
     def init(self, key: jax.Array, *given: Any) -> Any:
         """Parameters before training."""
 
-    def gather(self, params: Any, keys: jax.Array, *given: Any) -> tuple[Any, Metrics]:
-        """Play one row of experience per key (B,): leaves (B, ...), and metrics."""
+    def begin(self, keys: jax.Array, *given: Any) -> Any:
+        """What goes on from update to update, of rows that begin with keys (B,)."""
+
+    def gather(
+        self, params: Any, playing: Any, *given: Any
+    ) -> tuple[Any, Any, Metrics]:
+        """Play a row of experience for each of ``playing``, leaves (B, ...).
+
+        Returns:
+            Rows, leaves (B, ...); what goes on from there; metrics.
+        """
 
     def loss(
         self, params: Any, experience: Any, done: jax.Array
@@ -118,6 +133,11 @@ def normalised(config: PPOConfig, batch: Batch) -> Batch:
     return dataclasses.replace(batch, advantage=jnp.clip(scaled, -limit, limit))
 
 
+def explained_variance(target: jax.Array, value: jax.Array) -> jax.Array:
+    """() share of the targets' variance that the values explain; at most 1."""
+    return 1.0 - (target - value).var() / jnp.maximum(target.var(), 1e-12)
+
+
 def surrogate(
     config: PPOConfig,
     logits: jax.Array,
@@ -149,6 +169,7 @@ def surrogate(
         "value_loss": error.mean(),
         "entropy": -(jnp.exp(log_probs) * log_probs).sum(-1).mean(),
         "kl": (ratio - 1.0 - log_ratio).mean(),
+        "clip_fraction": (jnp.abs(ratio - 1.0) > config.clip_range).mean(),
     }
     share = jnp.minimum(done / config.num_updates, 1.0)
     bonus = (1.0 - share) * config.entropy_start + share * config.entropy_end
@@ -165,13 +186,24 @@ class TrainState:
     opt_state: Any  # of Adam
     key: jax.Array  # (2,) uint32, data of the PRNG key of the next update
     num_updates: jax.Array  # () int32, updates made
+    playing: Any = ()  # leaves (B, ...): what the learner goes on from
+    values: Metrics = struct.field(default_factory=dict)  # () of names in ``TRACED``
 
 
 def begin(
-    config: PPOConfig, learner: Learner, key: jax.Array, *given: Any
+    config: PPOConfig, learner: Learner, key: jax.Array, *given: Any, **values: Any
 ) -> TrainState:
-    """The state before the first update, from the key of a run."""
+    """The state before the first update, from the key of a run.
+
+    Args:
+        config, learner, given: as for ``make_update``.
+        key: () PRNG key.
+        values: () arrays by names in ``TRACED``, in place of the configuration's.
+    """
+    if unknown := sorted(set(values) - set(TRACED)):
+        raise ValueError(f"values must be of {', '.join(TRACED)}, got {unknown[0]}")
     key_weights, key_updates = jax.random.split(key)
+    key_updates, key_rows = jax.random.split(key_updates)
     params = learner.init(key_weights, *given)
     return TrainState(
         params=params,
@@ -179,19 +211,35 @@ def begin(
         opt_state=optimiser(config).init(params),
         key=jax.random.key_data(key_updates),
         num_updates=jnp.zeros((), jnp.int32),
+        playing=learner.begin(
+            jax.random.split(key_rows, config.rows_per_update), *given
+        ),
+        values={name: jnp.asarray(value, float) for name, value in values.items()},
     )
+
+
+def _having(config: PPOConfig, values: Metrics) -> PPOConfig:
+    """The configuration with other values, which are not checked: they may be traced."""
+    changed = copy.copy(config)
+    for name, value in values.items():
+        object.__setattr__(changed, name, value)
+    return changed
 
 
 def schedule(config: PPOConfig) -> optax.Schedule:
     """Learning rate by gradient step: linear warm-up, then cosine decay."""
-    steps = config.steps_per_update
-    return optax.warmup_cosine_decay_schedule(
-        init_value=config.learning_rate / 10,
-        peak_value=config.learning_rate,
-        warmup_steps=max(config.warmup_updates, 1) * steps,
-        decay_steps=max(config.num_updates, config.warmup_updates + 1) * steps,
-        end_value=config.final_learning_rate,
-    )
+    each = config.steps_per_update
+    warm = max(config.warmup_updates, 1) * each
+    steps = max(config.num_updates, config.warmup_updates + 1) * each - warm
+    peak, last = config.learning_rate, config.final_learning_rate
+
+    def rate(step: jax.typing.ArrayLike) -> jax.Array:
+        rise = 0.1 + 0.9 * jnp.asarray(step) / warm
+        turn = jnp.pi * jnp.clip((jnp.asarray(step) - warm) / steps, 0.0, 1.0)
+        fall = last + (peak - last) * 0.5 * (1.0 + jnp.cos(turn))
+        return jnp.where(jnp.asarray(step) < warm, peak * rise, fall)
+
+    return rate
 
 
 def optimiser(config: PPOConfig) -> optax.GradientTransformation:
@@ -199,8 +247,14 @@ def optimiser(config: PPOConfig) -> optax.GradientTransformation:
     return optax.adam(schedule(config), eps=1e-5)
 
 
-def descend(config: PPOConfig, state: TrainState, grads: Any) -> TrainState:
-    """One gradient step: clipped by the global norm, Adam, averaged weights."""
+def descend(
+    config: PPOConfig, state: TrainState, grads: Any
+) -> tuple[TrainState, jax.Array]:
+    """One gradient step: clipped by the global norm, Adam, averaged weights.
+
+    Returns:
+        The next state, and the () norm before clipping.
+    """
     # One factor: optax divides each gradient by the norm, which XLA does not fuse with
     # Adam's moments (that takes 7 to 14 % of an update of the paper's network).
     norm = jnp.sqrt(sum(jnp.vdot(grad, grad) for grad in jax.tree.leaves(grads)))
@@ -213,7 +267,8 @@ def descend(config: PPOConfig, state: TrainState, grads: Any) -> TrainState:
     decay, count = config.average_decay, opt_state[0].count
     share = (1.0 - decay) / (1.0 - decay**count)
     average = optax.incremental_update(params, state.average, share)
-    return TrainState(params, average, opt_state, state.key, state.num_updates)
+    changed = {"params": params, "average": average, "opt_state": opt_state}
+    return dataclasses.replace(state, **changed), norm
 
 
 def placed(tree: Any, mesh: Mesh | None, *axes: str) -> Any:
@@ -229,9 +284,10 @@ def make_update(
 ) -> Callable[..., tuple[TrainState, Metrics]]:
     """One update: play, then epochs of minibatches; pure, not compiled.
 
-    On a mesh every device plays some of the rows; all rows are then copied to every
-    device, so that a minibatch can hold any of them, as on a single device. A device
-    computes the gradient of its part of each minibatch.
+    On a mesh every device plays some of the rows and keeps them: of each minibatch it
+    draws an equal part from its own, and gradients alone are summed over the devices.
+
+    An update in which a loss or a gradient is not finite leaves the state as it was.
 
     Args:
         config: the optimisation.
@@ -242,35 +298,76 @@ def make_update(
         (state, *given) -> the next state and metrics.
     """
     whole = mesh is not None or jax.default_backend() != "cpu"
+    blocks = 1 if mesh is None else mesh.size
 
-    def update(state: TrainState, *given: Any) -> tuple[TrainState, Metrics]:
-        key = jax.random.wrap_key_data(state.key)
-        key, key_rows, key_epochs = jax.random.split(key, 3)
-        keys = jax.random.split(key_rows, config.rows_per_update)
-        rows, played = learner.gather(state.params, placed(keys, mesh, "sets"), *given)
-        rows = placed(rows, mesh)
+    def update(before: TrainState, *given: Any) -> tuple[TrainState, Metrics]:
+        own = _having(config, before.values)
+        trained = learner.having(own)
+        key = jax.random.wrap_key_data(before.key)
+        key, key_epochs = jax.random.split(key)
+        playing = placed(before.playing, mesh, "sets")
+        rows, playing, played = trained.gather(before.params, playing, *given)
+        per_block = len(jax.tree.leaves(rows)[0]) // blocks
 
-        def step(state: TrainState, index: jax.Array) -> tuple[TrainState, Metrics]:
-            def gradient(part: jax.Array) -> tuple[Any, Metrics]:
-                cut = placed(jax.tree.map(lambda leaf: leaf[part], rows), mesh, "sets")
-                of_loss = jax.grad(learner.loss, has_aux=True)
-                return of_loss(state.params, cut, state.num_updates)
+        def cut(leaf: jax.Array) -> jax.Array:  # (blocks, per_block, ...)
+            return leaf.reshape(blocks, per_block, *leaf.shape[1:])
+
+        rows = placed(jax.tree.map(cut, rows), mesh, "sets")
+
+        def mean(function: Callable[[Any], Any], index: jax.Array) -> Any:
+            """Of a function of rows, those of each block at ``index`` (blocks, n)."""
+
+            def of_part(part: jax.Array) -> Any:
+                pick = jax.vmap(lambda leaf, number: leaf[number])
+                some = jax.tree.map(lambda leaf: pick(leaf, part), rows)
+                some = placed(some, mesh, "sets")
+                return function(
+                    jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), some)
+                )
 
             # A slice's arrays stay in a core's cache: faster than all rows at once.
-            size = len(index) if whole else math.gcd(len(index), config.slice_rows)
-            found = jax.lax.map(gradient, index.reshape(-1, size))
-            grads, metrics = jax.tree.map(lambda leaf: leaf.mean(0), found)
-            return descend(config, state, grads), metrics
+            number = index.shape[1]
+            size = number if whole else math.gcd(number, own.slice_rows)
+            parts = index.reshape(blocks, -1, size).swapaxes(0, 1)
+            return jax.tree.map(lambda x: x.mean(0), jax.lax.map(of_part, parts))
+
+        def step(state: TrainState, index: jax.Array) -> tuple[TrainState, Metrics]:
+            def gradient(some: Any) -> tuple[Any, Metrics]:
+                of_loss = jax.grad(trained.loss, has_aux=True)
+                return of_loss(state.params, some, state.num_updates)
+
+            grads, metrics = mean(gradient, index)
+            state, norm = descend(own, state, grads)
+            return state, metrics | {"grad_norm": norm}
 
         def epoch(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
-            order = jax.random.permutation(key, len(jax.tree.leaves(rows)[0]))
-            return jax.lax.scan(step, state, order.reshape(config.num_minibatches, -1))
+            keys = jax.random.split(key, blocks)
+            order = jax.vmap(jax.random.permutation, (0, None))(keys, per_block)
+            parts = order.reshape(blocks, own.num_minibatches, -1).swapaxes(0, 1)
+            return jax.lax.scan(step, state, parts)
 
-        keys = jax.random.split(key_epochs, config.num_epochs)
-        state, losses = jax.lax.scan(epoch, state, keys)
-        later = {"key": jax.random.key_data(key), "num_updates": state.num_updates + 1}
-        state = dataclasses.replace(state, **later)
-        return placed((state, played | jax.tree.map(jnp.mean, losses)), mesh)
+        keys = jax.random.split(key_epochs, own.num_epochs)
+        state, losses = jax.lax.scan(epoch, before, keys)
+        losses = jax.tree.map(jnp.mean, losses)
+        if "kl" in losses:  # of a minibatch, by the weights that the update ends with
+            some = jnp.arange(per_block // own.num_minibatches)
+            losses["kl_after"] = mean(
+                lambda rows: trained.loss(state.params, rows, state.num_updates)[1],
+                jnp.broadcast_to(some, (blocks, len(some))),
+            )["kl"]
+        rate = schedule(own)((before.num_updates + 1) * own.steps_per_update)
+        fine = jnp.isfinite(jnp.stack(jax.tree.leaves(losses))).all()
+        after = dataclasses.replace(
+            state,
+            key=jax.random.key_data(key),
+            num_updates=before.num_updates + 1,
+            playing=playing,
+        )
+        keep = jax.tree.map(lambda new, old: jnp.where(fine, new, old), after, before)
+        playing = placed(keep.playing, mesh, "sets")
+        metrics = played | losses | {"learning_rate": rate}
+        keep, metrics = placed((dataclasses.replace(keep, playing=()), metrics), mesh)
+        return dataclasses.replace(keep, playing=playing), metrics
 
     return update
 
@@ -283,20 +380,27 @@ def make_train(config: Any) -> Callable[..., tuple[Any, Metrics]]:
             it reads ``ppo`` and ``learners``: update u trains number u modulo theirs.
 
     Returns:
-        ``train(key, *given)`` -> the averaged weights, and metrics with a leading axis
-        of ``config.ppo.num_updates``. ``given``: none for postures, the arrays of a
-        task for streams.
+        ``train(key, *given, **values)`` -> the last state, whose ``average`` is the
+        policy, and metrics with a leading axis of ``config.ppo.num_updates``. ``given``:
+        none for postures, the arrays of a task for streams. ``values``: () arrays by
+        names in ``TRACED``, in place of the configuration's.
+
+    Raises:
+        ValueError: the configuration imitates a teacher.
     """
+    if imitated := getattr(config, "num_imitated", 0):
+        raise ValueError(
+            f"imitation must be 0, got a share with {imitated} updates: its teacher "
+            "works on the host; training.postures.train has it, or set imitation=0"
+        )
     learners = config.learners
     each = [make_update(config.ppo, learner) for learner in learners]
 
-    def train(key: jax.Array, *given: Any) -> tuple[Any, Metrics]:
+    def train(key: jax.Array, *given: Any, **values: Any) -> tuple[TrainState, Metrics]:
         def update(state: TrainState, number: jax.Array) -> tuple[TrainState, Metrics]:
             return jax.lax.switch(number % len(each), each, state, *given)
 
-        state = begin(config.ppo, learners[0], key, *given)
-        numbers = jnp.arange(config.ppo.num_updates)
-        state, metrics = jax.lax.scan(update, state, numbers)
-        return state.average, metrics
+        state = begin(config.ppo, learners[0], key, *given, **values)
+        return jax.lax.scan(update, state, jnp.arange(config.ppo.num_updates))
 
     return train

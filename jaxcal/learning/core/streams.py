@@ -1,7 +1,8 @@
 """Streams: sessions of any length played one after another, as experience for PPO.
 
-An update plays B streams of T decisions, however long the sessions in them are. The
-value after a decision is the expectation over its possible outcomes, not the value of
+An update plays T further decisions of B streams, however long the sessions in them are:
+where a stream is cut, the next update goes on, and the value of that state closes the
+advantages. The value after a decision is the expectation over its possible outcomes, not the value of
 the outcome that was drawn: the advantages have the same expectation without the
 randomness of outcomes, which is most of their variance.
 
@@ -20,9 +21,16 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxcal.learning.config import StreamsConfig
-from jaxcal.learning.core.ppo import Batch, Metrics, advantages, normalised, surrogate
+from jaxcal.learning.core.ppo import (
+    Batch,
+    Metrics,
+    advantages,
+    explained_variance,
+    normalised,
+    surrogate,
+)
 
-__all__ = ["Environment", "Step", "Streams"]
+__all__ = ["Environment", "Step", "Stream", "Streams"]
 
 
 @struct.dataclass
@@ -51,6 +59,16 @@ class Environment(Protocol):
         """Take the option with index ``action``, () int32, of those in ``seen``."""
 
 
+@struct.dataclass
+class Stream:
+    """Where a stream goes on: in the middle of a session."""
+
+    key: jax.Array  # (2,) uint32, data of the key of the next decision
+    state: Any  # of the environment
+    reward: jax.Array  # () received in this session so far
+    choices: jax.Array  # () float, decisions made in it
+
+
 @dataclasses.dataclass(frozen=True)
 class Streams:
     """The learner of sessions of the task it is given."""
@@ -59,20 +77,41 @@ class Streams:
     environment: Environment
     network: nn.Module  # of what is observed: masked logits (..., A), values (...)
 
+    def having(self, config: StreamsConfig) -> Streams:
+        """The same with another configuration."""
+        return dataclasses.replace(self, config=config)
+
     def init(self, key: jax.Array, task: Any) -> Any:
         """Parameters before training."""
         state = self.environment.reset(task, key)
         return self.network.init(key, self.environment.observe(task, state, key))
 
-    def gather(self, params: Any, keys: jax.Array, task: Any) -> tuple[Batch, Metrics]:
-        """Play a stream with each of the keys (B,)."""
+    def begin(self, keys: jax.Array, task: Any) -> Stream:
+        """Streams that begin with a new session, for each of the keys (B,)."""
+
+        def one(key: jax.Array) -> Stream:
+            key_reset, key = jax.random.split(key)
+            state = self.environment.reset(task, key_reset)
+            return Stream(jax.random.key_data(key), state, jnp.zeros(()), jnp.zeros(()))
+
+        return jax.vmap(one)(keys)
+
+    def gather(
+        self, params: Any, playing: Stream, task: Any
+    ) -> tuple[Batch, Stream, Metrics]:
+        """Play ``stream_length`` further decisions of each stream.
+
+        The metrics are means over the sessions that ended in them; NaN where none did.
+        """
         play = jax.vmap(self._play, in_axes=(None, 0, None))
-        batch, reward, ended = play(params, keys, task)  # the last two (B, T + 1)
+        batch, value, playing, ended = play(params, playing, task)
+        over, reward, choices = (x.sum() for x in ended)
         metrics = {
-            "reward_mean": reward.sum() / jnp.maximum(ended.sum(), 1.0),
-            "choices": 1.0 / jnp.maximum(ended.mean(), 1e-6),
+            "reward_mean": reward / over,
+            "choices": choices / over,
+            "explained_variance": explained_variance(batch.target, value),
         }
-        return normalised(self.config, batch), metrics
+        return normalised(self.config, batch), playing, metrics
 
     def loss(
         self, params: Any, experience: Batch, done: jax.Array
@@ -82,21 +121,24 @@ class Streams:
         return surrogate(self.config, logits, value, experience, done)
 
     def _play(
-        self, params: Any, key: jax.Array, task: Any
-    ) -> tuple[Batch, jax.Array, jax.Array]:
-        """A row of T decisions; (T + 1,) rewards; (T + 1,) 1.0 where a session ended.
-        Decision T + 1 is played for the value that follows decision T."""
+        self, params: Any, stream: Stream, task: Any
+    ) -> tuple[Batch, jax.Array, Stream, tuple[jax.Array, ...]]:
+        """A row of T decisions; (T,) values; the stream from there; and (T,) each: 1.0
+        where a session ended, and the reward and the choices of the one that did."""
         environment = self.environment
 
         def score(state: Any, key: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
             seen = environment.observe(task, state, key)
             return seen, *cast(Any, self.network.apply(params, seen))
 
-        def decide(state: Any, key: jax.Array) -> tuple[Any, dict[str, Any]]:
-            key_seen, key_action, key_step, key_next = jax.random.split(key, 4)
-            seen, logits, value = score(state, key_seen)
+        def keys_of(stream: Stream) -> jax.Array:
+            return jax.random.split(jax.random.wrap_key_data(stream.key), 5)
+
+        def decide(stream: Stream, _: None) -> tuple[Stream, dict[str, Any]]:
+            key_seen, key_action, key_step, key_reset, key = keys_of(stream)
+            seen, logits, value = score(stream.state, key_seen)
             action = jax.random.categorical(key_action, logits).astype(jnp.int32)
-            step = environment.step(task, state, seen, action, key_step)
+            step = environment.step(task, stream.state, seen, action, key_step)
             happened, number = step.happened, len(step.chance)
 
             # The drawn state is valued at the next decision, only the others here.
@@ -108,30 +150,36 @@ class Streams:
                 values = jnp.where(step.ended[elsewhere], 0.0, values)
                 others = step.chance[elsewhere] @ values
             ended = step.ended[happened]
-            state = jax.tree.map(
-                lambda fresh, after: jnp.where(ended, fresh, after[happened]),
-                environment.reset(task, key_next),
-                step.states,
+            reward, choices = stream.reward + step.reward, stream.choices + 1.0
+            over = ended.astype(value.dtype)
+            after = Stream(
+                key=jax.random.key_data(key),
+                state=jax.tree.map(
+                    lambda fresh, after: jnp.where(ended, fresh, after[happened]),
+                    environment.reset(task, key_reset),
+                    step.states,
+                ),
+                reward=(1.0 - over) * reward,
+                choices=(1.0 - over) * choices,
             )
-            return state, {
+            return after, {
                 "seen": seen,
                 "action": action,
                 "log_prob": jax.nn.log_softmax(logits)[action],
                 "value": value,
                 "reward": step.reward,
-                "ended": ended.astype(value.dtype),
                 "chance": step.chance[happened],
                 "others": others,
+                "ended": (over, over * reward, over * choices),
             }
 
-        key_reset, key_steps = jax.random.split(key)
-        keys = jax.random.split(key_steps, self.config.stream_length + 1)
-        every = jax.lax.scan(decide, environment.reset(task, key_reset), keys)[1]
-        row = jax.tree.map(lambda leaf: leaf[:-1], every)
-        goes_on = 1.0 - row["ended"]
-        following = row["chance"] * goes_on * every["value"][1:] + row["others"]
-        reward, value = row["reward"], row["value"]
-        advantage = advantages(self.config, reward, value, following, goes_on)
+        stream, row = jax.lax.scan(decide, stream, length=self.config.stream_length)
+        # A stream is cut where it may: the value of where it goes on follows.
+        last = score(stream.state, keys_of(stream)[0])[2]
+        value, goes_on = row["value"], 1.0 - row["ended"][0]
+        then = jnp.concatenate([value[1:], last[None]])
+        following = row["chance"] * goes_on * then + row["others"]
+        advantage = advantages(self.config, row["reward"], value, following, goes_on)
         batch = Batch(
             seen=row["seen"],
             action=row["action"],
@@ -139,4 +187,4 @@ class Streams:
             advantage=advantage,
             target=advantage + value,
         )
-        return batch, every["reward"], every["ended"]
+        return batch, value, stream, row["ended"]

@@ -38,7 +38,7 @@ T = TypeVar("T")
 
 
 def make_mesh(
-    rows: int, num_devices: int | None = None, num_seeds: int = 1
+    rows: int, num_devices: int | None = None, num_runs: int = 1
 ) -> Mesh | None:
     """All devices of the job on the axis ``sets``, or ``seeds`` if several are trained;
     None for one device.
@@ -46,7 +46,7 @@ def make_mesh(
     Args:
         rows: sets or streams of a minibatch.
         num_devices: devices of each process; all when None.
-        num_seeds: runs side by side.
+        num_runs: trained side by side: seeds, swept values.
 
     Raises:
         ValueError: a process has fewer, or they do not divide the rows or seeds evenly.
@@ -65,19 +65,19 @@ def make_mesh(
         "episodes_per_update / (episodes_per_set x num_minibatches), the sets of a "
         "minibatch (of a task decisions_per_update / (stream_length x num_minibatches))"
     )
-    if num_seeds > 1:
-        shared, what, change = num_seeds, "--seeds", ""
+    if num_runs > 1:
+        shared, what, change = num_runs, "--seeds (times the values of --sweep)", ""
     if shared % len(chosen):
         fewer = max(n for n in range(1, len(chosen)) if shared % n == 0)
         raise ValueError(
             f"{what} must be a multiple of the {len(chosen)} devices, got {shared}; "
             f"{change}use {fewer} devices (--devices {fewer})"
         )
-    return Mesh(np.asarray(chosen), ("seeds" if num_seeds > 1 else "sets",))
+    return Mesh(np.asarray(chosen), ("seeds" if num_runs > 1 else "sets",))
 
 
-def a_device_for_each_core(num_seeds: int) -> None:
-    """Make CPU cores devices of JAX: the largest number that divides ``num_seeds``.
+def a_device_for_each_core(num_runs: int) -> None:
+    """Make CPU cores devices of JAX: the largest number that divides ``num_runs``.
 
     Each core then trains its seeds independently. Does nothing where JAX is initialised
     or ``XLA_FLAGS`` sets the number of devices.
@@ -85,7 +85,7 @@ def a_device_for_each_core(num_seeds: int) -> None:
     if "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
     cores = range(1, (os.cpu_count() or 1) + 1)
-    number = max(core for core in cores if num_seeds % core == 0)
+    number = max(core for core in cores if num_runs % core == 0)
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", number)
 

@@ -25,6 +25,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from jaxcal.extras import versions
+from jaxcal.learning.config import runs_of
 from jaxcal.learning.core.network import Network, initial
 from jaxcal.learning.core.ppo import TrainState
 from jaxcal.learning.policies.compact import build
@@ -118,9 +119,18 @@ def save(
 
 
 def _rest(state: TrainState) -> dict[str, Any]:
-    """Leaves of a state other than the averaged weights."""
-    names = ("params", "opt_state", "key", "num_updates")
-    return {name: getattr(state, name) for name in names}
+    """Leaves of a state other than the averaged weights; of typed keys their data."""
+    names = ("params", "opt_state", "key", "num_updates", "playing", "values")
+
+    def plain(leaf: Any) -> Any:
+        return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+    held = {name: jax.tree.map(plain, getattr(state, name)) for name in names}
+    return {name: tree for name, tree in held.items() if jax.tree.leaves(tree)}
+
+
+def _is_key(leaf: Any) -> bool:
+    return bool(jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key))
 
 
 class _TolerantLoop(asyncio.SelectorEventLoop):
@@ -237,7 +247,7 @@ def read(path: pathlib.Path, meta: dict[str, Any], like: Any) -> Any:
         CheckpointError: they are damaged, of other shapes or not finite.
     """
     what = "read: its weights are damaged or do not fit its network"
-    seeds = meta.get("num_seeds", 1)
+    runs = len(runs_of(0, meta.get("num_seeds", 1), meta.get("sweep", ())))
     if path.is_file():
         arrays = weights.read(path).arrays
         params = jax.tree.map(jax.numpy.asarray, weights.nested(arrays))
@@ -247,11 +257,11 @@ def read(path: pathlib.Path, meta: dict[str, Any], like: Any) -> Any:
         )
         if held != wanted:
             raise CheckpointError(f"checkpoint {path} cannot be {what}")
-    elif seeds == 1:
+    elif runs == 1:
         params = _read(path / "policy", like, what)
     else:
         several = jax.tree.map(
-            lambda leaf: jax.ShapeDtypeStruct((seeds, *leaf.shape), leaf.dtype), like
+            lambda leaf: jax.ShapeDtypeStruct((runs, *leaf.shape), leaf.dtype), like
         )
         best = meta["progress"]["best"]
         params = jax.tree.map(
@@ -286,4 +296,11 @@ def restore(
     what = "resumed: its training state is damaged or of another configuration"
     average = _read(path / "policy", fresh.average, what)
     rest = _read(path / "state", _rest(fresh), what)
+
+    def typed(leaf: Any, like: Any) -> Any:
+        if not _is_key(like):
+            return leaf
+        return jax.random.wrap_key_data(leaf, impl=jax.random.key_impl(like))
+
+    rest["playing"] = jax.tree.map(typed, rest["playing"], fresh.playing)
     return TrainState(average=average, **rest), meta

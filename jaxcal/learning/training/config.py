@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import field
 from typing import Any
 
-from jaxcal.learning.config import EpisodesConfig
+from jaxcal.learning.config import EpisodesConfig, Sweep, runs_of
 from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.compact import build
@@ -31,6 +31,7 @@ class TrainConfig:
     )
     seed: int = setting(0, "of everything random")
     num_seeds: int = setting(1, "runs side by side: seed, seed + 1, ...")
+    sweep: Sweep = ()  # side by side too: every combination, for every seed
     validate_every: float = 15.0  # seconds between validations
     save_every: float = 60.0  # seconds between checkpoints
     about: str = ""  # one line for --help, of a preset
@@ -39,6 +40,12 @@ class TrainConfig:
         require(self, "0 or more", lambda v: v >= 0, "seed")
         require(self, "at least 1", lambda v: v >= 1, "num_seeds")
         require(self, "in [0, 1]", lambda v: 0.0 <= v <= 1.0, "imitation")
+        self.ppo.require_sweep(self.sweep)
+
+    @property
+    def num_runs(self) -> int:
+        """Runs side by side: seeds times swept values."""
+        return len(runs_of(self.seed, self.num_seeds, self.sweep))
 
     @property
     def num_imitated(self) -> int:
@@ -57,6 +64,7 @@ class TrainConfig:
             **{name: getattr(self, name) for name in _PLAIN},
             "network": dataclasses.asdict(self.network),
             "ppo": dataclasses.asdict(self.ppo),
+            "sweep": [[name, list(values)] for name, values in self.sweep],
             "tasks": [task.as_meta() for task in self.tasks],
         }
 
@@ -67,5 +75,6 @@ class TrainConfig:
             **{name: meta[name] for name in _PLAIN},
             network=NetworkConfig(**meta["network"]),
             ppo=EpisodesConfig(**meta["ppo"]),
+            sweep=tuple((name, tuple(values)) for name, values in meta.get("sweep", ())),
             tasks=tuple(Task.from_meta(task) for task in meta["tasks"]),
         )

@@ -21,6 +21,7 @@ import numpy as np
 import optax
 from flax import struct
 
+from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.core.network import decode, encode, mask_logits
 from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.core.ppo import Metrics
@@ -115,13 +116,21 @@ class Imitation:
 
     postures: Postures
 
+    def having(self, config: EpisodesConfig) -> Imitation:
+        """The same with another configuration."""
+        return Imitation(self.postures.having(config))
+
     def init(self, key: jax.Array, lesson: Lesson) -> Any:
         """Parameters before training."""
         return self.postures.init(key)
 
+    def begin(self, keys: jax.Array, lesson: Lesson) -> Any:
+        """As of ``postures``; a lesson reads none of it."""
+        return self.postures.begin(keys)
+
     def gather(
-        self, params: Any, keys: jax.Array, lesson: Lesson
-    ) -> tuple[Attempt, Metrics]:
+        self, params: Any, playing: Any, lesson: Lesson
+    ) -> tuple[Attempt, Any, Metrics]:
         """Play the lesson: each choice is the policy's likeliest wanted posture."""
         task, network = self.postures.task, self.postures.network
         features = network.candidate_features(lesson.candidates, lesson.available)
@@ -150,7 +159,7 @@ class Imitation:
             weight=counted / jnp.maximum(counted.mean(), 1e-6),
             best=lesson.best,
         )
-        return attempt, {}
+        return attempt, playing, {}
 
     def loss(
         self, params: Any, experience: Attempt, done: jax.Array

@@ -87,7 +87,7 @@ def train(
         OSError: the folder cannot be written.
     """
     rows = config.ppo.rows_per_minibatch
-    mesh = devices.make_mesh(rows, num_devices, config.num_seeds)
+    mesh = devices.make_mesh(rows, num_devices, config.num_runs)
     learners = config.learners
     network, k = learners[0].network, config.tasks[0].num_decisions
     last = config.ppo.num_updates if num_updates is None else num_updates

@@ -1,7 +1,7 @@
 """The loop of a training run: files, resume, validation, progress, devices.
 
-A run folder holds ``metrics.csv`` (a row per update; means over seeds), ``seeds.csv``
-(with several seeds: every validation of each), ``last_rewards.npy`` (the rewards of the
+A run folder holds ``metrics.csv`` (a row per update; means over the runs side by side),
+``seeds.csv`` (of several: every validation of each), ``last_rewards.npy`` (the rewards of the
 last 1,000 episodes of the first task) and ``checkpoint/``. The loop is on the host,
 over calls of several updates each, so that progress is printed while it runs and a
 signal stops it between two calls.
@@ -25,19 +25,26 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxcal.files import atomic_write, write_text
-from jaxcal.learning.config import PPOConfig
+from jaxcal.learning.config import PPOConfig, runs_of
 from jaxcal.learning.core import ppo
 from jaxcal.learning.core.ppo import Learner, TrainState
 from jaxcal.learning.runtime import devices
 from jaxcal.learning.runtime.processes import collective
 from jaxcal.learning.training import checkpoint
 
-__all__ = ["Recipe", "Report", "run", "updates"]
+__all__ = ["DivergedError", "Recipe", "Report", "run", "updates"]
 
-_LOSSES = ("entropy", "policy_loss", "value_loss", "kl", "learning_rate")
+_LOSSES = (
+    "entropy", "policy_loss", "value_loss", "kl", "kl_after", "clip_fraction",
+    "explained_variance", "grad_norm", "learning_rate",
+)  # fmt: skip
 _LAST = 1000  # episodes whose rewards are kept
 _UPDATES = 16  # updates in one call
 _CALL_SECONDS = 2.0  # of one call: what a signal waits for
+
+
+class DivergedError(ArithmeticError):
+    """A loss or a gradient is not finite; the last finite state is saved."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,17 +66,33 @@ class Recipe:
         """Learners of the run; update u trains number u modulo theirs."""
         return tuple(self.config.learners)
 
+    @functools.cached_property
+    def runs(self) -> list[dict[str, Any]]:
+        """Seed and swept values of each run side by side."""
+        config = self.config
+        return runs_of(config.seed, config.num_seeds, config.sweep)
+
     def init(self) -> TrainState:
-        """The state before the first update, from the seeds alone."""
-        first, number = self.config.seed, self.config.num_seeds
+        """The state before the first update, from seeds and swept values alone.
 
-        def begin(key: jax.Array) -> TrainState:
-            learner, given = self.learners[0], self.given[0]
-            state: TrainState = _begun(self.config.ppo, learner, key, *given)
-            return state
+        ``playing`` is a tuple: what goes on with each of ``given``.
+        """
 
-        keys = [jax.random.key(seed) for seed in range(first, first + number)]
-        return begin(keys[0]) if number == 1 else jax.vmap(begin)(jnp.stack(keys))
+        def begin(key: jax.Array, values: dict[str, jax.Array]) -> TrainState:
+            ppo, learner = self.config.ppo, self.learners[0]
+            each = [_begun(ppo, learner, key, *given, **values) for given in self.given]
+            return dataclasses.replace(each[0], playing=tuple(s.playing for s in each))
+
+        keys = jnp.stack([jax.random.key(run["seed"]) for run in self.runs])
+        swept = [name for name, _ in self.config.sweep]
+        values = {
+            name: jnp.array([run[name] for run in self.runs], jnp.float32)
+            for name in swept
+        }
+        if len(self.runs) == 1:
+            return begin(keys[0], {name: value[0] for name, value in values.items()})
+        state: TrainState = jax.vmap(begin)(keys, values)
+        return state
 
 
 # One program for every seed; eager, it would compile two hundred small ones.
@@ -138,7 +161,7 @@ def updates(
 
     def call(state: TrainState, count: jax.Array, *given: Any) -> Any:
         if not spread:
-            return several(state, count, given)
+            return ppo.placed(several(state, count, given), mesh)
         own, all_of = PartitionSpec("seeds"), PartitionSpec()
         on_each = jax.shard_map(
             several,
@@ -175,6 +198,7 @@ def run(
 
     Raises:
         CheckpointError: nothing to resume from, or damaged.
+        DivergedError: a loss is not finite, in every run; the state before is saved.
         OSError: the folder cannot be written.
     """
     last = recipe.config.ppo.num_updates if num_updates is None else num_updates
@@ -182,17 +206,23 @@ def run(
     state, before, recent = devices.on_first(lambda: _begin(root, recipe, resume))
     if mesh is not None:
         state = devices.replicate(state, mesh)
-    done = int(np.ravel(devices.local(state.num_updates))[0])
-    seeds = recipe.config.num_seeds if recipe.config.num_seeds > 1 else 0
-    count, timed = 1, False
+    done = int(np.max(devices.local(state.num_updates)))
+    seeds = len(recipe.runs) if len(recipe.runs) > 1 else 0
+    count, timed, broken = 1, False, ""
+    held = list(state.playing)
+
+    def whole(state: TrainState) -> TrainState:
+        return dataclasses.replace(state, playing=tuple(held))
+
     with contextlib.ExitStack() as stack:
         recorder = None
         if devices.is_first():
             recorder = _Recorder(root, recipe, report, last, before, done, recent)
             stack.enter_context(contextlib.closing(recorder))
-        while done < last and not devices.any_process(should_stop()):
+        while done < last and not broken and not devices.any_process(should_stop()):
             begun = time.perf_counter()
-            at_most, given = _UPDATES, recipe.given[done % len(recipe.given)]
+            which = done % len(recipe.given)
+            at_most, given = _UPDATES, recipe.given[which]
             learner = recipe.learners[done % len(recipe.learners)]
             if done < recipe.num_imitated:
                 assert recipe.imitate is not None  # there are updates that imitate
@@ -202,20 +232,38 @@ def run(
                 at_most = 1  # the next update has another program or other arrays
             count = min(count, at_most, last - done)
             update = updates(recipe.config.ppo, learner, mesh, at_most, seeds)
+            state = dataclasses.replace(state, playing=held[which])
             with collective():
                 state, found = update(state, np.int32(count), *given)
                 # One transfer for all that these updates measured.
-                rows = jax.device_get(devices.local(found))
+                rows, made = jax.device_get(devices.local((found, state.num_updates)))
+            held[which] = state.playing
             first, done = done, done + count
+            if made.max() < done:  # every run has kept its last finite state
+                broken = _broken(rows, int(made.max()) - first, int(made.max()))
+                done = int(made.max())
+                count = done - first + 1  # rows, that of the broken update included
             if recorder is not None:
-                recorder.note(state, first, count, rows)
+                recorder.note(whole(state), first, count, rows, save=not broken)
             each = (time.perf_counter() - begun) / count
             # The first call also compiled, so the second is of one update too.
             fit = int(_CALL_SECONDS / each) if timed else 1
             count, timed = devices.on_first(functools.partial(max, fit, 1)), True
     if recorder is not None:
-        recorder.save(state, done)
-    return state
+        recorder.save(whole(state), done)
+    if broken:
+        raise DivergedError(broken)
+    return whole(state)
+
+
+def _broken(rows: Mapping[str, Any], number: int, made: int) -> str:
+    """What is not finite in row ``number``, and what to do."""
+    values = {name: float(np.mean(rows[name][number])) for name in _LOSSES if name in rows}
+    name, value = next((n, v) for n, v in values.items() if not np.isfinite(v))
+    return (
+        f"diverged: {name} is {value} in update {made + 1}; the state of update {made} "
+        "is saved: begin anew with a smaller learning rate"
+    )
 
 
 @dataclasses.dataclass
@@ -236,20 +284,24 @@ class _Recorder:
         self._columns = (*first, *recipe.columns, *_LOSSES, *recipe.measured)
         self._rows = _table(self.root / "metrics.csv", self.reported, self._columns)
         self._seeds: TextIO | None = None
-        self._seed_columns = ("update", "seed", *recipe.measured)
-        if recipe.config.num_seeds > 1:
+        self._seed_columns = ("update", *recipe.runs[0], *recipe.measured)
+        if len(recipe.runs) > 1:
             path = self.root / "seeds.csv"
             self._seeds = _table(path, self.reported, self._seed_columns)
-        self._begun = self._validated = self._saved = time.perf_counter()
-        self._noted = self._begun
+        self._begun = self._validated = time.perf_counter()
+        self._noted, self._saved = self._begun, -np.inf  # soon after the beginning too
         self._each: list[dict[str, float]] = []  # of every seed, at the last validation
 
     def note(
-        self, state: TrainState, first: int, count: int, found: Mapping[str, Any]
+        self,
+        state: TrainState,
+        first: int,
+        count: int,
+        found: Mapping[str, Any],
+        save: bool = True,
     ) -> None:
         """Record the metrics of ``count`` updates; validate and save when due."""
         recipe, config, now = self.recipe, self.recipe.config, time.perf_counter()
-        schedule = ppo.schedule(config.ppo)
         for number in range(count):
             rewards = found["rewards"][number] if "rewards" in found else ()
             if (first + number) % len(recipe.learners) == 0:
@@ -258,19 +310,18 @@ class _Recorder:
             at = self._noted + (now - self._noted) * (number + 1) / count
             done = first + number + 1
             row: dict[str, float] = {
-                name: float(np.mean(values[number])) for name, values in found.items()
+                name: _mean(values[number]) for name, values in found.items()
             }
             row |= {
                 "update": done,
                 config.ppo.unit: done * config.ppo.played_per_update,
                 "seconds": self._seconds(at),
-                "learning_rate": float(schedule(done * config.ppo.steps_per_update)),
             }
             if number == count - 1:
                 self._validate(state, row)
             _add(self._rows, self._columns, row)
         self._noted = now
-        if now - self._saved > config.save_every:
+        if save and now - self._saved > config.save_every:
             self._saved = now
             self.save(state, first + count)
 
@@ -283,15 +334,15 @@ class _Recorder:
             return
         spread: dict[str, float] = {}
         if recipe.validate is not None:
-            averages = _of_each_seed(devices.local(state.average), config.num_seeds)
+            averages = _of_each(devices.local(state.average), len(recipe.runs))
             self._each = [recipe.validate(average) for average in averages]
             for name in self._each[0]:
                 values = [each[name] for each in self._each]
                 row[name] = float(np.mean(values))
                 spread[name] = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
             if self._seeds is not None:
-                for number, each in enumerate(self._each):
-                    own = {"update": done, "seed": config.seed + number} | each
+                for run, each in zip(recipe.runs, self._each, strict=True):
+                    own = {"update": done} | run | each
                     _add(self._seeds, self._seed_columns, own)
         rate = (done - self.reported) / max(now - self._validated, 1e-9)
         self._validated, self.reported = time.perf_counter(), done
@@ -321,7 +372,7 @@ class _Recorder:
             "seconds": self._seconds(time.perf_counter()),
             "device": jax.devices()[0].device_kind,
         }
-        if config.num_seeds > 1:
+        if len(recipe.runs) > 1:
             scores = [each[recipe.measured[0]] for each in self._each]
             progress["best"] = int(np.argmax(scores)) if scores else 0
             progress["seeds"] = self._each
@@ -351,13 +402,16 @@ def _begin(
     return state, float(meta["progress"]["seconds"]), recent
 
 
-def _of_each_seed(tree: Any, num_seeds: int) -> list[Any]:
-    if num_seeds == 1:
+def _mean(values: Any) -> float:
+    """Of those that are finite: a run that diverged is NaN from then on."""
+    finite = np.ravel(values)[np.isfinite(np.ravel(values))]
+    return float(finite.mean()) if len(finite) else np.nan
+
+
+def _of_each(tree: Any, runs: int) -> list[Any]:
+    if runs == 1:
         return [tree]
-    return [
-        jax.tree.map(lambda leaf, seed=seed: leaf[seed], tree)
-        for seed in range(num_seeds)
-    ]
+    return [jax.tree.map(lambda leaf, run=run: leaf[run], tree) for run in range(runs)]
 
 
 def _table(path: pathlib.Path, done: int, columns: Sequence[str]) -> TextIO:
@@ -375,6 +429,7 @@ def _table(path: pathlib.Path, done: int, columns: Sequence[str]) -> TextIO:
 
 
 def _add(file: TextIO, columns: Sequence[str], row: Mapping[str, float]) -> None:
-    """Write a row and flush it; what is not measured is empty."""
-    csv.DictWriter(file, columns, extrasaction="ignore").writerow(row)
+    """Write a row and flush it; what is not measured, or NaN, is empty."""
+    held = {name: value for name, value in row.items() if not np.isnan(value)}
+    csv.DictWriter(file, columns, extrasaction="ignore").writerow(held)
     file.flush()
