@@ -37,6 +37,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcal.commands.train_solvers import teacher
 from jaxcal.extras import versions
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.information.regression import log_det_information
@@ -54,7 +55,6 @@ from jaxcal.learning.runtime import cache
 from jaxcal.learning.training import postures as training
 from jaxcal.learning.training import presets
 from jaxcal.selection import exact_batch, greedy_batch, select
-from jaxcal.selection.batch import teacher
 from jaxcal.selection.policy import select_batch
 
 HIT = 1e-9

@@ -1,70 +1,21 @@
 """A task of sequential measurement as a ``brax.envs.base.Env``; this loads brax.
 
-``learning.environments.brax_env.wrap_fresh`` makes the batch and draws a new session
-for every episode.
+``learning.brax.wrap_fresh`` makes the batch and draws a new session for every episode.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-from flax import struct
-
-from jaxcal.adaptive.policy.features import Seen
-from jaxcal.adaptive.policy.sessions import Exercise, Sessions, State
+from jaxcal.adaptive.environment import TaskEnv
 from jaxcal.adaptive.rules import Scored
 from jaxcal.learning.environments.brax_env import EpisodeEnv
 
 __all__ = ["SequentialEnv"]
 
 
-@struct.dataclass
-class _Episode(State):
-    seen: Seen
-    key: jax.Array  # of what comes next
-
-
 class SequentialEnv(EpisodeEnv):
-    """Sessions of a task.
-
-    Observation: (C (F + 2),) features, log score and validity of the shortlist. Action:
-    () int32, a place in the shortlist; an invalid one counts as the first. Reward:
-    expected information gain of the measurement, nats. End: time or uses are spent, or
-    ``task.horizon`` measurements are made.
-    """
-
-    metric = "gain"
+    """Sessions of a task; arguments as of ``TaskEnv``."""
 
     def __init__(self, task: Any, base: Scored, per_group: int = 8) -> None:
-        self._given, self._sessions = Exercise(task, base), Sessions(per_group)
-
-    def begin(self, key: jax.Array) -> _Episode:
-        key_state, key = jax.random.split(key)
-        return self._seen(self._sessions.reset(self._given, key_state), key)
-
-    def observe(self, episode: _Episode) -> jax.Array:
-        seen = episode.seen
-        parts = seen.features, jnp.maximum(seen.log_score, -10.0), seen.valid
-        return jnp.concatenate([part.astype(jnp.float32).ravel() for part in parts])
-
-    def advance(self, episode: _Episode, action: jax.Array) -> tuple[Any, ...]:
-        seen = episode.seen
-        key_step, key = jax.random.split(episode.key)
-        action = jnp.where(seen.valid[action], action, 0)
-        step = self._sessions.step(self._given, episode, seen, action, key_step)
-        now, done = jax.tree.map(
-            lambda leaf: leaf[step.happened], (step.states, step.ended)
-        )
-        return self._seen(now, key), step.reward, done, step.reward
-
-    def _seen(self, state: State, key: jax.Array) -> _Episode:
-        key_seen, key = jax.random.split(key)
-        seen = self._sessions.observe(self._given, state, key_seen)
-        return _Episode(state.truth, state.belief, state.session, seen, key)
-
-    @property
-    def action_size(self) -> int:
-        key = jax.random.PRNGKey(0)  # legacy uint32, as brax uses
-        return len(jax.eval_shape(self.begin, key).seen.index)
+        super().__init__(TaskEnv(task, base, per_group))

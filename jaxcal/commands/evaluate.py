@@ -28,6 +28,8 @@ __all__ = ["main", "parser"]
 EXIT_INTERRUPTED = 130
 EXIT_TERMINATED = 143
 
+_POOLED = 1000  # episodes drawn of one table
+
 _DESCRIPTION = """\
 Let every method choose K postures in every episode of a dataset, and compare the
 determinant of the information matrix S with that of the best choice there is (S*).
@@ -324,6 +326,8 @@ def _whole(
 
 def _dataset(name: str, options: Options, progress: Progress) -> Dataset:
     """The first episodes of one of the paper's datasets, or of a file."""
+    from jaxcal.commands.pools import draw_sets, holds_sets
+    from jaxcal.evaluation.dataset import Dataset
     from jaxcal.evaluation.dataset_files import load_dataset
     from jaxcal.paper.constants import EPISODES
 
@@ -344,6 +348,9 @@ def _dataset(name: str, options: Options, progress: Progress) -> Dataset:
             f"--dataset must be one of {', '.join(EPISODES)} or a .npz or .csv file, "
             f"got {name!r}"
         )
+    if not holds_sets(name):
+        sets = draw_sets(name, options.episodes or _POOLED, options.seed)
+        return Dataset(name=Path(name).name, candidates=sets, seed=options.seed)
     dataset = load_dataset(name)
     return dataset if options.episodes is None else dataset.part(0, options.episodes)
 

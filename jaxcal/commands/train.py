@@ -129,9 +129,9 @@ def _train(
         schema, unit, columns = trainer.SCHEMA, "decisions", _TASK
         introduction = f"task {config.task}, seed {config.seed}; run folder {out}"
     else:
+        from jaxcal.commands.train_solvers import fixed_validation, teacher
         from jaxcal.learning.training import checkpoint
         from jaxcal.learning.training import postures as trainer
-        from jaxcal.selection.batch import fixed_validation, teacher
 
         rows = config.ppo.rows_per_minibatch
         mesh = devices.make_mesh(rows, arguments.devices, config.num_runs)
@@ -158,7 +158,7 @@ def _train(
 
 
 def _num_runs(arguments: argparse.Namespace, out: pathlib.Path) -> int:
-    """Side by side, of what to begin or to go on with; what is wrong is refused later."""
+    """Of what to begin or to go on with; what is wrong is refused later."""
     from jaxcal.learning.config import runs_of
 
     seeds, sweep = arguments.num_seeds or 1, arguments.sweep
@@ -401,7 +401,10 @@ def _compare_runs(
     runs = runs_of(config.seed, config.num_seeds, config.sweep)
     names, best = runs[0], progress["best"]
     wide = {name: max(len(name), 9) for name in names}
-    print(" ".join(f"{n:>{wide[n]}}" for n in names) + "".join(f"{n:>17}" for n in measured))
+    print(
+        " ".join(f"{n:>{wide[n]}}" for n in names)
+        + "".join(f"{n:>17}" for n in measured)
+    )
     for number, (run, row) in enumerate(zip(runs, values, strict=True)):
         print(
             " ".join(f"{run[n]:{wide[n]}g}" for n in names)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import hashlib
 import pathlib
 import textwrap
 from typing import Annotated, Any, Literal
@@ -14,7 +13,7 @@ import numpy as np
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.tasks import registry
 from jaxcal.arguments import Parser, number_type
-from jaxcal.csvtable import read_table
+from jaxcal.commands.pools import holds_sets, read_pool
 from jaxcal.learning.config import TRACED, StreamsConfig
 from jaxcal.learning.environments.task import GivenCandidates
 from jaxcal.learning.runtime import processes
@@ -213,14 +212,12 @@ def candidates_of(path: str) -> GivenCandidates:
     """
     from jaxcal.evaluation.dataset_files import load_dataset
 
-    if _holds_sets(path):
+    if holds_sets(path):
         dataset = load_dataset(path)
         values, available = dataset.candidates, dataset.available
     else:
-        table = read_table(path)
-        mask = table.available()
-        values = table.columns(table.commands(None, option=None), mask)[None]
-        available = None if mask is None else mask[None]
+        rows, mask = read_pool(path)
+        values, available = rows[None], None if mask is None else mask[None]
     used = values if available is None else values[available]
     used = used.reshape(-1, used.shape[-1])
     low, high = used.min(axis=0), used.max(axis=0)
@@ -231,18 +228,9 @@ def candidates_of(path: str) -> GivenCandidates:
         )
     return GivenCandidates(
         name=pathlib.Path(path).name,
-        sha256=hashlib.sha256(pathlib.Path(path).read_bytes()).hexdigest(),
         values=((values - low) / (high - low)).astype(np.float32),
         available=available,
     )
-
-
-def _holds_sets(path: str) -> bool:
-    """Whether a file holds episodes of candidates, in the format of datasets."""
-    if path.lower().endswith(".npz"):
-        return True
-    with open(path, encoding="utf-8-sig", errors="replace") as file:
-        return "episode" in [cell.strip() for cell in file.readline().split(",")]
 
 
 def trained_on(

@@ -1,7 +1,7 @@
 """Posture selection as an environment in JAX, and the training of policies for it.
 
 ``reset``, ``step`` and ``observe`` are pure functions of one episode; ``jax.vmap``
-makes a batch. ``make_train`` gives a whole training as one pure function. A network, a
+makes a batch; ``PosturesEnv`` has them as gymnax users write them. ``make_train`` gives a whole training as one pure function. A network, a
 reward or another environment of one's own is a ``Learner``: ``Postures`` plays episodes
 of a ``Task`` with a ``Network``. Names load on first use, since inference without JAX
 imports this package too.
@@ -13,12 +13,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jaxcal.learning.brax import brax_networks, repaired
     from jaxcal.learning.config import EpisodesConfig, StreamsConfig
     from jaxcal.learning.core.network import Network, mask_logits
     from jaxcal.learning.core.postures import Episode, Postures
     from jaxcal.learning.core.ppo import Learner
-    from jaxcal.learning.core.streams import Streams
+    from jaxcal.learning.core.streams import Environment, Step, Streams
     from jaxcal.learning.environments.brax_env import SelectionEnv, wrap_fresh
+    from jaxcal.learning.environments.functional import FunctionalEnv, PosturesEnv
     from jaxcal.learning.environments.selection import (
         SelectionConfig,
         SelectionState,
@@ -33,23 +35,29 @@ if TYPE_CHECKING:
     from jaxcal.learning.training.presets import load as preset
 
 __all__ = [
+    "Environment",
     "Episode",
     "EpisodesConfig",
+    "FunctionalEnv",
     "Learner",
     "Network",
     "NetworkConfig",
     "Postures",
+    "PosturesEnv",
     "SelectionConfig",
     "SelectionEnv",
     "SelectionState",
+    "Step",
     "Streams",
     "StreamsConfig",
     "Task",
     "TrainConfig",
+    "brax_networks",
     "make_train",
     "mask_logits",
     "observe",
     "preset",
+    "repaired",
     "reset",
     "start",
     "step",
@@ -57,12 +65,14 @@ __all__ = [
 ]
 
 _HOME = {
+    "brax": ("brax_networks", "repaired"),
     "config": ("EpisodesConfig", "StreamsConfig"),
     "core.network": ("Network", "mask_logits"),
     "core.postures": ("Episode", "Postures"),
     "core.ppo": ("Learner",),
-    "core.streams": ("Streams",),
+    "core.streams": ("Environment", "Step", "Streams"),
     "environments.brax_env": ("SelectionEnv", "wrap_fresh"),
+    "environments.functional": ("FunctionalEnv", "PosturesEnv"),
     "environments.selection": (
         *("SelectionConfig", "SelectionState", "observe", "reset", "start", "step"),
     ),
@@ -88,9 +98,9 @@ def __dir__() -> list[str]:
 def make_train(config: Any) -> Any:
     """A whole training as one pure function, to be jitted, scanned or vmapped.
 
-    ``train = make_train("compact")``, then ``weights, metrics =
-    jax.jit(train)(jax.random.key(0))``; ``jax.vmap(train)`` of several keys trains them
-    side by side.
+    ``train = make_train("compact")``, then ``state, metrics =
+    jax.jit(train)(jax.random.key(0))``; ``state.average`` is the policy. ``jax.vmap`` of
+    it trains several keys, or learning rates, side by side.
 
     Args:
         config: the name of a preset, a ``TrainConfig``, or any object with ``ppo`` and
@@ -98,12 +108,15 @@ def make_train(config: Any) -> Any:
             learner, such as ``Postures(ppo, task, network)``.
 
     Returns:
-        ``train(key, *given)`` -> the averaged weights, and metrics with a leading axis
-        of ``config.ppo.num_updates``. ``given``: none for postures, the arrays of a
-        task for streams.
+        ``train(key, *given, **values)`` -> the last state, whose ``average`` are the
+        weights of the policy, and metrics with a leading axis of
+        ``config.ppo.num_updates``. ``given``: none for postures, the arrays of a task
+        for streams. ``values``: arrays in place of the configuration's learning rate,
+        entropy bonus, clipping and others (``learning.config.TRACED``).
 
     Raises:
-        ValueError: it is none of these, or no preset has the name.
+        ValueError: it is none of these, no preset has the name, or it imitates a
+            teacher.
     """
     from types import SimpleNamespace
 

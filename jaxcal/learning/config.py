@@ -17,8 +17,8 @@ TRACED = (
     "value_error_limit", "entropy_start", "entropy_end", "discount", "gae_lambda",
     "advantage_limit", "max_grad_norm", "average_decay",
 )  # fmt: skip
-"""Fields of ``PPOConfig`` that a run may have as arrays, other than its configuration's:
-runs that differ in them are one program."""
+"""Fields of ``PPOConfig`` that a run may have as arrays, other than its
+configuration's: runs that differ in them are one program."""
 
 _NOT_NEGATIVE = (
     "final_learning_rate", "warmup_updates", "value_coefficient", "entropy_start",

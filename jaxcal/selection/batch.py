@@ -1,4 +1,4 @@
-"""The solvers over many candidate sets at once, for evaluation and training.
+"""The solvers over many candidate sets at once.
 
 The solvers take candidates (B, M, n) and k, and by keyword ``available`` (B, M) bool,
 ``required`` (B, r), ``max_replicates`` and ``num_outputs`` as ``select`` does.
@@ -11,7 +11,7 @@ import os
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,20 +23,12 @@ from jaxcal.selection.problem import Found, Problem, log_dets, make_problems
 from jaxcal.selection.result import BatchSelection
 from jaxcal.selection.solvers import checked_seed, random_indices
 
-if TYPE_CHECKING:
-    from jaxcal.learning.training.config import TrainConfig
-    from jaxcal.learning.training.postures import Validation
-
 __all__ = [
     "exact_batch",
     "exchange_batch",
-    "fixed_validation",
     "greedy_batch",
     "random_batch",
-    "teacher",
 ]
-
-_VALIDATED = 500  # sets that a training run is measured on
 
 
 def random_batch(
@@ -126,45 +118,3 @@ def _solved(
         method=method,
         seconds=time.perf_counter() - start,
     )
-
-
-def fixed_validation(config: TrainConfig) -> Validation:
-    """500 sets as the first task has them, and their optima.
-
-    Uniform ones, never trained on, that depend on M and n only, so runs with other
-    seeds or networks are measured on the same ones. Where the user gave candidates, 500
-    draws of those.
-    """
-    from jaxcal.learning.training.postures import Validation
-
-    task = config.tasks[0]
-    env = task.environment
-    if task.given is not None:
-        import jax
-
-        states = jax.vmap(task.reset)(
-            jax.random.split(jax.random.key(20261121), _VALIDATED)
-        )
-        given = np.asarray(states.candidates, np.float64)
-        free = np.asarray(states.available)
-        found = exact_batch(given, env.num_selected, available=free, num_outputs=1)
-        return Validation(given, np.asarray(found.log_det), env.num_outputs, free)
-    rng = np.random.default_rng([20261121, env.num_candidates, env.num_inputs])
-    sets = rng.uniform(size=(_VALIDATED, env.num_candidates, env.num_inputs))
-    best = exact_batch(sets, env.num_selected, num_outputs=1).log_det
-    return Validation(sets, np.asarray(best), env.num_outputs)
-
-
-def teacher(
-    candidates: np.ndarray, available: np.ndarray, given: np.ndarray, k: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """The best postures of every set, as ``imitation.Teacher`` wants them.
-
-    The proven optimum where k is the number of regressors. Above it, what Fedorov
-    exchange finds from its default restarts: almost always optimal, and in a time that
-    does not depend on the shape of the candidates, as that of a proof does.
-    """
-    required = given if given.shape[1] else None
-    solve = exact_batch if k == candidates.shape[2] + 1 else exchange_batch
-    found = solve(candidates, k, available=available, required=required, num_outputs=1)
-    return found.indices, found.log_det

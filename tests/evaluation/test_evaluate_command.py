@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from jaxcal.commands import evaluate as command
+from jaxcal.commands import pools
 from jaxcal.evaluation import figures, stream
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import save_csv, save_npz
@@ -50,6 +51,26 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> Done:
     except SystemExit as leaving:
         code = int(str(leaving.code))
     return Done(code, *capsys.readouterr())
+
+
+def test_a_table_is_a_pool_that_episodes_draw_from(tmp_path, capsys) -> None:
+    """As ``train.py --candidates`` has it; only available rows are drawn."""
+    rows = np.random.default_rng(0).uniform(-30.0, 30.0, (70, 2))
+    free = np.arange(70) % 7 != 0
+    lines = [f"{a},{b},{int(ok)}" for (a, b), ok in zip(rows, free, strict=True)]
+    path = tmp_path / "mine.csv"
+    path.write_text("\n".join(["pitch,yaw,available", *lines]) + "\n")
+    out = tmp_path / "out.json"
+    flags = ("--methods", "greedy,exact", "--k", 3, "--episodes", 5, "--indices")
+    done = call(capsys, "--dataset", path, *flags, "--json", out, "--quiet")
+    assert done.returncode == 0, done.stderr
+    (result,) = json.loads(out.read_text())["results"]
+    assert result["dataset"]["episodes"] == 5
+    assert len(result["methods"]["exact"]["indices"]) == 5
+    sets = pools.draw_sets(str(path), 5, 0)
+    drawn = {tuple(row) for row in sets.reshape(-1, 2)}
+    assert drawn <= {tuple(row) for row in rows[free]} and len(drawn) > 50
+    assert all(len({tuple(row) for row in one}) == 50 for one in sets)
 
 
 def test_the_json_says_what_the_full_matrices_say(tmp_path: pathlib.Path) -> None:

@@ -51,6 +51,18 @@ def test_reset_after_done_draws_new_candidates_and_nothing_is_truncated():
 
 
 @pytest.mark.slow
+def test_a_script_of_a_brax_user_trains_postures_and_a_task():
+    """As the example has it; random postures reach -1.9, the optimum is -0.35."""
+    import brax_ppo
+
+    before, after = brax_ppo.postures(40_000)
+    assert before < -1.0 and after > before + 0.5
+    before, after = brax_ppo.task(40_000)
+    assert np.isfinite(before) and after > before - 0.1  # begins as the base rule
+    assert not hasattr(jax, "device_put_replicated") or jax.__version__ < "0.10"
+
+
+@pytest.mark.slow
 def test_braxs_own_ppo_trains_it(tmp_path):
     from jaxcal.learning.training import brax_ppo
 

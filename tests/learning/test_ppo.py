@@ -286,7 +286,9 @@ def test_a_run_trains_what_the_pure_function_does(tmp_path):
     pure, metrics = jax.jit(ppo.make_train(config))(jax.random.key(3))
     recipe = Recipe(config, ((),), "probe", (), (), validate=None)
     state = run(recipe, tmp_path)
-    for one, other in zip(*map(jax.tree.leaves, (pure.average, state.average)), strict=True):
+    for one, other in zip(
+        *map(jax.tree.leaves, (pure.average, state.average)), strict=True
+    ):
         np.testing.assert_allclose(one, other, atol=1e-5)
     rows = np.genfromtxt(tmp_path / "metrics.csv", delimiter=",", names=True)
     np.testing.assert_allclose(metrics["reward_mean"], rows["reward_mean"], atol=1e-6)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import csv
 import dataclasses
+import functools
 import json
 import pathlib
 import shutil
@@ -22,7 +23,7 @@ from jaxcal.commands import train as command
 from jaxcal.commands import train_arguments
 from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.environments.task import Task
+from jaxcal.learning.environments.task import GivenCandidates, Task
 from jaxcal.learning.policies.compact import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
@@ -95,7 +96,8 @@ def test_metrics_have_the_columns_that_figures_read(finished):
     header = (folder / "metrics.csv").read_text().splitlines()[0]
     assert header == (
         "update,episodes,seconds,reward_mean,reward_std,log_det_mean,entropy,"
-        "policy_loss,value_loss,kl,learning_rate,ratio_to_exact,hit_rate"
+        "policy_loss,value_loss,kl,kl_after,clip_fraction,explained_variance,grad_norm,"
+        "learning_rate,ratio_to_exact,hit_rate"
     )
 
 
@@ -206,7 +208,8 @@ def test_a_save_writes_nothing_twice(finished):
     assert {path.name for path in step.iterdir() if path.is_dir()} == {
         *("policy", "state", "meta")
     }
-    held = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
+    rows = dataclasses.replace(state, playing=())  # and a key for each row
+    held = sum(leaf.nbytes for leaf in jax.tree.leaves(rows))
     weights = sum(leaf.nbytes for leaf in jax.tree.leaves(state.average))
     assert held < 4 * weights + 100
     assert "average" not in (step / "state" / "_METADATA").read_text()
@@ -410,7 +413,7 @@ BRAX = ["--trainer", "brax"]
         (["--candidates", "nowhere.csv"], "nowhere.csv"),
         (["--export", "folder"], "--export must be a file NAME.npz, got folder"),
         (["--num-selected=2", "--num-inputs=1"], "num_selected must be at least 3"),
-        (["--seeds", "2", "--no-validation"], "--seeds needs the validation"),
+        (["--seeds", "2", "--no-validation"], "--seeds and --sweep need the valid"),
         (["--updates", "2"], "preset compact does not read --updates"),
         (["--task", "knee", "--episodes", "9"], "knee does not read --episodes"),
         (["--task", "nee"], "task must be one of"),
@@ -438,7 +441,7 @@ def test_brax_saves_what_it_used_and_keeps_what_is_asked_for():
 def test_help_says_what_every_number_is(capsys):
     assert train("--help") == 0
     text = capsys.readouterr().out
-    for name in presets.field_names() - {"num_episodes", "num_seeds"}:
+    for name in presets.field_names() - {"num_episodes", "num_seeds"} | {"sweep"}:
         assert f"--{name.replace('_', '-')}" in text
     assert "what to try first" in text
     assert "passes over what an update has played [2]" in " ".join(text.split())
@@ -466,6 +469,25 @@ def test_one_trains_on_ones_own_pool_and_resumes_with_it(tmp_path, rng, capsys):
     assert "give the same file" in capsys.readouterr().err
     assert train("--candidates", pool, "--out", tmp_path / "b") == 2
     assert "num_candidates = 50 available candidates" in capsys.readouterr().err
+
+
+def test_two_pools_are_two_also_where_nobody_names_their_digest(rng):
+    one, two = (
+        GivenCandidates("mine", rng.uniform(size=(1, 60, 3)).astype(np.float32))
+        for _ in range(2)
+    )
+    assert one != two and one == GivenCandidates("other name", one.values.copy())
+    tasks = [Task(given=pool) for pool in (one, two)]
+    sets = [np.asarray(drawn(task, jax.random.key(0))) for task in tasks]
+    for pool, found in zip((one, two), sets, strict=True):
+        assert {*map(tuple, found)} <= {*map(tuple, pool.values[0])}
+    with pytest.raises(ValueError, match="by values or sha256, got neither"):
+        GivenCandidates("mine")
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def drawn(task, key):
+    return task.reset(key).candidates
 
 
 def test_ones_own_sets_are_drawn_as_they_are(tmp_path, rng, key):

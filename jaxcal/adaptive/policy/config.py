@@ -101,6 +101,8 @@ class PolicyConfig:
             ppo=StreamsConfig(**meta["ppo"]),
             seed=meta["seed"],
             num_seeds=meta["num_seeds"],
-            sweep=tuple((name, tuple(values)) for name, values in meta.get("sweep", ())),
+            sweep=tuple(
+                (name, tuple(values)) for name, values in meta.get("sweep", ())
+            ),
             **meta["network"],
         )

@@ -219,7 +219,7 @@ def begin(
 
 
 def _having(config: PPOConfig, values: Metrics) -> PPOConfig:
-    """The configuration with other values, which are not checked: they may be traced."""
+    """The configuration with other values, unchecked: they may be traced."""
     changed = copy.copy(config)
     for name, value in values.items():
         object.__setattr__(changed, name, value)
@@ -381,9 +381,9 @@ def make_train(config: Any) -> Callable[..., tuple[Any, Metrics]]:
 
     Returns:
         ``train(key, *given, **values)`` -> the last state, whose ``average`` is the
-        policy, and metrics with a leading axis of ``config.ppo.num_updates``. ``given``:
-        none for postures, the arrays of a task for streams. ``values``: () arrays by
-        names in ``TRACED``, in place of the configuration's.
+        policy, and metrics with a leading axis of ``num_updates``. ``given``: none for
+        postures, the arrays of a task for streams. ``values``: () arrays by names in
+        ``TRACED``, in place of the configuration's.
 
     Raises:
         ValueError: the configuration imitates a teacher.
@@ -393,14 +393,14 @@ def make_train(config: Any) -> Callable[..., tuple[Any, Metrics]]:
             f"imitation must be 0, got a share with {imitated} updates: its teacher "
             "works on the host; training.postures.train has it, or set imitation=0"
         )
-    learners = config.learners
-    each = [make_update(config.ppo, learner) for learner in learners]
+    learners, own = config.learners, config.ppo
+    each = [make_update(own, learner) for learner in learners]
 
     def train(key: jax.Array, *given: Any, **values: Any) -> tuple[TrainState, Metrics]:
         def update(state: TrainState, number: jax.Array) -> tuple[TrainState, Metrics]:
             return jax.lax.switch(number % len(each), each, state, *given)
 
-        state = begin(config.ppo, learners[0], key, *given, **values)
-        return jax.lax.scan(update, state, jnp.arange(config.ppo.num_updates))
+        state = begin(own, learners[0], key, *given, **values)
+        return jax.lax.scan(update, state, jnp.arange(own.num_updates))
 
     return train

@@ -1,10 +1,10 @@
 """Streams: sessions of any length played one after another, as experience for PPO.
 
-An update plays T further decisions of B streams, however long the sessions in them are:
-where a stream is cut, the next update goes on, and the value of that state closes the
-advantages. The value after a decision is the expectation over its possible outcomes, not the value of
-the outcome that was drawn: the advantages have the same expectation without the
-randomness of outcomes, which is most of their variance.
+An update plays T further decisions of B streams, however long the sessions in them are.
+Where a stream is cut, the next update goes on; the value of that state closes the
+advantages. The value after a decision is the expectation over its possible outcomes,
+not the value of the outcome that was drawn: the advantages have the same expectation
+without the randomness of outcomes, which is most of their variance.
 
 The task is an argument of the environment's functions, as arrays: another task of the
 same shapes compiles nothing.
@@ -42,6 +42,17 @@ class Step:
     ended: jax.Array  # (Y,) bool, whether the session ends in that state
     chance: jax.Array  # (Y,) probabilities; [1.0] if only the drawn state is known
     happened: jax.Array  # () int32, index of the state that was drawn
+
+    @staticmethod
+    def known(state: Any, reward: Any, ended: jax.Array) -> Step:
+        """Of an environment that knows the state that follows and no other."""
+        return Step(
+            reward=jnp.asarray(reward, float),
+            states=jax.tree.map(lambda leaf: leaf[None], state),
+            ended=ended[None],
+            chance=jnp.ones(1),
+            happened=jnp.int32(0),
+        )
 
 
 class Environment(Protocol):

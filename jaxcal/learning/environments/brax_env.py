@@ -7,96 +7,71 @@
 
 from __future__ import annotations
 
-import abc
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State, Wrapper
 from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 
-from jaxcal.learning.environments import selection as environment
+from jaxcal.learning.environments.functional import FunctionalEnv, PosturesEnv
 from jaxcal.learning.environments.selection import Candidates, SelectionConfig
+from jaxcal.learning.policies.networks import NetworkConfig
 
 __all__ = ["EpisodeEnv", "SelectionEnv", "wrap_fresh"]
 
 
-class EpisodeEnv(Env, abc.ABC):
-    """One episode as a brax environment; brax's wrappers make the batch."""
+class EpisodeEnv(Env):
+    """Episodes of ``env`` as a brax environment; brax's wrappers make the batch."""
 
-    metric: ClassVar[str]  # name of the number that ``advance`` returns last
     backend = "jaxcal"
 
-    @abc.abstractmethod
-    def begin(self, key: jax.Array) -> Any:
-        """A new episode, which carries a ``key`` of its own."""
-
-    @abc.abstractmethod
-    def observe(self, episode: Any) -> jax.Array:
-        """(observation_size,) input of a policy."""
-
-    @abc.abstractmethod
-    def advance(self, episode: Any, action: jax.Array) -> tuple[Any, ...]:
-        """The episode after the step, () reward, () bool done, () metric."""
+    def __init__(self, env: FunctionalEnv) -> None:
+        self.functional = env
 
     def reset(self, rng: jax.Array) -> State:
         """A new episode; ``rng`` is a legacy uint32 key, which brax's wrappers need."""
-        episode, zero = self.begin(rng), jnp.zeros(())
+        episode, zero = self.functional.begin(rng), jnp.zeros(())
         return State(
             pipeline_state=episode,
-            obs=self.observe(episode),
+            obs=self.functional.observe(episode),
             reward=zero,
             done=zero,
-            metrics={self.metric: zero},
+            metrics={self.functional.metric: zero},
             info={},
         )
 
     def step(self, state: State, action: jax.Array) -> State:
         """Take one step."""
-        after, reward, done, metric = self.advance(state.pipeline_state, action)
+        env = self.functional
+        after, reward, done, metric = env.advance(state.pipeline_state, action)
         return state.replace(
             pipeline_state=after,
-            obs=self.observe(after),
+            obs=env.observe(after),
             reward=reward,
             done=done.astype(jnp.float32),
-            metrics=state.metrics | {self.metric: metric},
+            metrics=state.metrics | {env.metric: metric},
         )
 
     @property
     def observation_size(self) -> int:
-        key = jax.random.PRNGKey(0)  # legacy uint32, as brax uses
-        return int(jax.eval_shape(self.reset, key).obs.shape[-1])
-
-
-class SelectionEnv(EpisodeEnv):
-    """Postures.
-
-    Observation: (n M + M + 2 n + 4,) of ``environment.observe``, the paper's 210.
-    Action: () int32, an available candidate. Reward and end: as
-    ``jaxcal.learning.environments.selection``. Metric ``log_det``: the unscaled reward.
-    """
-
-    metric = "log_det"
-
-    def __init__(
-        self, config: SelectionConfig | None = None, draw: Candidates | None = None
-    ) -> None:
-        self.config = SelectionConfig() if config is None else config
-        self._draw = draw
-
-    def begin(self, key: jax.Array) -> Any:
-        return environment.reset(key, self.config, self._draw)
-
-    def observe(self, episode: Any) -> jax.Array:
-        return environment.observe(episode, self.config)
-
-    def advance(self, episode: Any, action: jax.Array) -> tuple[Any, ...]:
-        after, reward, done = environment.step(episode, action, self.config)
-        return after, reward, done, reward / self.config.reward_scale
+        return self.functional.observation_size
 
     @property
     def action_size(self) -> int:
-        return self.config.num_candidates
+        return self.functional.num_actions
+
+
+class SelectionEnv(EpisodeEnv):
+    """Postures; arguments as of ``PosturesEnv``."""
+
+    def __init__(
+        self,
+        config: SelectionConfig | None = None,
+        draw: Candidates | None = None,
+        net: NetworkConfig | None = None,
+    ) -> None:
+        super().__init__(PosturesEnv(config, draw, net))
 
 
 class _FreshReset(Wrapper):

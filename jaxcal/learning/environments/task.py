@@ -7,6 +7,7 @@ another class with these methods.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from dataclasses import field
 from typing import Any
 
@@ -25,14 +26,30 @@ __all__ = ["GivenCandidates", "Task"]
 
 @dataclasses.dataclass(frozen=True)
 class GivenCandidates:
-    """The user's own candidates; a checkpoint holds their digest, not the values."""
+    """The user's own candidates; a checkpoint holds their digest, not the values.
+
+    Two are equal where their digests are.
+    """
 
     name: str = field(compare=False)  # of the file, for messages
-    sha256: str  # of the file
     # (B, M, n) sets, or (1, N, n): a pool that every episode draws its M from. None
     # where only the digest is known.
     values: np.ndarray | None = field(default=None, compare=False, repr=False)
     available: np.ndarray | None = field(default=None, compare=False, repr=False)
+    sha256: str = ""  # of values and available; computed where they are given
+
+    def __post_init__(self) -> None:
+        if self.values is not None:
+            digest = hashlib.sha256()
+            for array in (self.values, self.available):
+                if array is not None:
+                    digest.update(f"{array.dtype.str} {array.shape}\n".encode())
+                    digest.update(np.ascontiguousarray(array).tobytes())
+            object.__setattr__(self, "sha256", digest.hexdigest())
+        elif not self.sha256:
+            raise ValueError(
+                "candidates must be given by values or sha256, got neither"
+            )
 
     def source(self, config: SelectionConfig) -> Candidates:
         """key -> the candidates of an episode, from the file's values."""

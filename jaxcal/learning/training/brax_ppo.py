@@ -7,25 +7,17 @@ observation and nothing else; it is masked by the availability in that observati
 from __future__ import annotations
 
 import dataclasses
-import functools
 import pathlib
 import time
-import types
 from collections.abc import Callable, Collection
 from typing import Any
-from unittest import mock
 
 import jax
-import jax.numpy as jnp
-from brax.training import distribution
 from brax.training.agents.ppo import train as brax_train
-from brax.training.agents.ppo.networks import PPONetworks
-from brax.training.networks import FeedForwardNetwork
 
-from jaxcal.learning.core.network import initial
-from jaxcal.learning.environments.brax_env import SelectionEnv, wrap_fresh
+from jaxcal.learning.brax import brax_networks, repaired, wrap_fresh
+from jaxcal.learning.environments.brax_env import SelectionEnv
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.policies.compact import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.settings import settings_of
 from jaxcal.learning.training import checkpoint
@@ -65,53 +57,6 @@ def require_read(given: Collection[str]) -> None:
         raise ValueError(f"--trainer brax does not read {flags}: leave it out")
 
 
-class _MaskedCategorical(distribution.ParametricDistribution):
-    """brax's distribution interface over logits that the network has masked."""
-
-    def create_dist(self, parameters: jax.Array) -> Any:
-        log_probs = jax.nn.log_softmax(parameters)
-        entropy = -(jnp.exp(log_probs) * log_probs).sum(-1)
-
-        def log_prob(x: jax.Array) -> jax.Array:
-            one = jax.nn.one_hot(x.astype(jnp.int32), log_probs.shape[-1])
-            return (one * log_probs).sum(-1)
-
-        return types.SimpleNamespace(
-            sample=lambda seed: jax.random.categorical(seed, log_probs),
-            mode=lambda: jnp.argmax(log_probs, axis=-1),
-            log_prob=log_prob,
-            entropy=lambda: entropy,
-            # brax's loss logs these two of every distribution.
-            loc=jnp.exp(log_probs).max(-1),
-            scale=entropy,
-        )
-
-
-def _networks(env: SelectionConfig, config: NetworkConfig) -> PPONetworks:
-    """A network read from the observation, for the policy and the value."""
-    network, m, n = build(config), env.num_candidates, env.num_inputs
-
-    def read(part: int) -> FeedForwardNetwork:
-        def apply(_: Any, params: Any, observation: jax.Array) -> Any:
-            weights, method = {"params": params}, "from_observation"
-            return network.apply(weights, observation, m, n, method=method)[part]
-
-        begin = functools.partial(initial, network, m=m, n=n, k=env.num_selected)
-        return FeedForwardNetwork(init=begin, apply=apply)
-
-    identity = distribution.IdentityPostprocessor()
-    actions = _MaskedCategorical(m, identity, event_ndims=0, reparametrizable=False)
-    return PPONetworks(read(0), read(1), actions)
-
-
-def _replicated(tree: Any, devices: list[Any]) -> Any:
-    """``jax.device_put_replicated``, which brax 0.14.2 calls and jax 0.10 removed.
-
-    google/brax issue 671: fixed on its main branch, not in its newest release.
-    """
-    return jax.tree.map(lambda leaf: jnp.stack([leaf] * len(devices)), tree)
-
-
 def train(
     config: TrainConfig,
     folder: str | pathlib.Path,
@@ -141,12 +86,12 @@ def train(
         say(f"{steps:10,d} decisions  {seconds:7.1f} s  mean log det S {log_det:.3f}")
 
     say("brax is compiling (about half a minute) ...")
-    repaired = mock.patch.object(jax, "device_put_replicated", _replicated, create=True)
-    with repaired, jax.numpy_rank_promotion("allow"):
+    environment = SelectionEnv(env, task.draw, config.network)
+    with repaired():
         _, params, _ = brax_train.train(
-            environment=SelectionEnv(env, task.draw),
+            environment=environment,
             wrap_env_fn=wrap_fresh,
-            network_factory=lambda *_, **__: _networks(env, config.network),
+            network_factory=brax_networks(environment),
             progress_fn=progress,
             **given,
         )
@@ -161,4 +106,5 @@ def train(
             "device": jax.devices()[0].device_kind,
         },
     }
-    checkpoint.save(pathlib.Path(folder) / "checkpoint", episodes, params[1], meta)
+    policy = params[1]["params"]["network"]
+    checkpoint.save(pathlib.Path(folder) / "checkpoint", episodes, policy, meta)

@@ -75,6 +75,8 @@ class TrainConfig:
             **{name: meta[name] for name in _PLAIN},
             network=NetworkConfig(**meta["network"]),
             ppo=EpisodesConfig(**meta["ppo"]),
-            sweep=tuple((name, tuple(values)) for name, values in meta.get("sweep", ())),
+            sweep=tuple(
+                (name, tuple(values)) for name, values in meta.get("sweep", ())
+            ),
             tasks=tuple(Task.from_meta(task) for task in meta["tasks"]),
         )

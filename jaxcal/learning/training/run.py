@@ -1,10 +1,10 @@
 """The loop of a training run: files, resume, validation, progress, devices.
 
-A run folder holds ``metrics.csv`` (a row per update; means over the runs side by side),
-``seeds.csv`` (of several: every validation of each), ``last_rewards.npy`` (the rewards of the
-last 1,000 episodes of the first task) and ``checkpoint/``. The loop is on the host,
-over calls of several updates each, so that progress is printed while it runs and a
-signal stops it between two calls.
+A run folder holds ``metrics.csv`` (a row per update; means over runs side by side),
+``seeds.csv`` (of several: every validation of each), ``last_rewards.npy`` (the rewards
+of the last 1,000 episodes of the first task) and ``checkpoint/``. The loop is on the
+host, over calls of several updates each, so that progress is printed while it runs and
+a signal stops it between two calls.
 """
 
 from __future__ import annotations
@@ -258,8 +258,11 @@ def run(
 
 def _broken(rows: Mapping[str, Any], number: int, made: int) -> str:
     """What is not finite in row ``number``, and what to do."""
-    values = {name: float(np.mean(rows[name][number])) for name in _LOSSES if name in rows}
-    name, value = next((n, v) for n, v in values.items() if not np.isfinite(v))
+    losses = ("policy_loss", "value_loss", *_LOSSES)  # what to name first
+    values = [
+        (name, float(np.mean(rows[name][number]))) for name in losses if name in rows
+    ]
+    name, value = next((n, v) for n, v in values if not np.isfinite(v))
     return (
         f"diverged: {name} is {value} in update {made + 1}; the state of update {made} "
         "is saved: begin anew with a smaller learning rate"

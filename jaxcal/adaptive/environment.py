@@ -1,0 +1,92 @@
+"""A task of sequential measurement for loops of one's own, as gymnax has them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxcal.adaptive.policy.features import NUM_FEATURES, Seen
+from jaxcal.adaptive.policy.network import Network
+from jaxcal.adaptive.policy.sessions import Exercise, Sessions, State
+from jaxcal.adaptive.rules import Scored
+from jaxcal.learning.environments.functional import FunctionalEnv
+
+__all__ = ["TaskEnv"]
+
+
+@struct.dataclass
+class _Episode(State):
+    seen: Seen
+    key: jax.Array  # of what comes next
+
+
+class TaskEnv(FunctionalEnv):
+    """Sessions of a task.
+
+    Observation: (C (F + 2),) features, log score and validity of the shortlist. Action:
+    () int32, a place in the shortlist; an invalid one counts as the first. Reward:
+    expected information gain of the measurement, nats. End: time or uses are spent, or
+    ``task.horizon`` measurements are made.
+    """
+
+    metric = "gain"
+
+    def __init__(self, task: Any, base: Scored, per_group: int = 8) -> None:
+        self._given, self._sessions = Exercise(task, base), Sessions(per_group)
+
+    def begin(self, key: jax.Array) -> _Episode:
+        key_state, key = jax.random.split(key)
+        return self._seen(self._sessions.reset(self._given, key_state), key)
+
+    def observe(self, episode: _Episode) -> jax.Array:
+        seen = episode.seen
+        parts = seen.features, jnp.maximum(seen.log_score, -10.0), seen.valid
+        return jnp.concatenate([part.astype(jnp.float32).ravel() for part in parts])
+
+    def advance(self, episode: _Episode, action: jax.Array) -> tuple[Any, ...]:
+        seen = episode.seen
+        key_step, key = jax.random.split(episode.key)
+        action = jnp.where(seen.valid[action], action, 0)
+        step = self._sessions.step(self._given, episode, seen, action, key_step)
+        now, done = jax.tree.map(
+            lambda leaf: leaf[step.happened], (step.states, step.ended)
+        )
+        return self._seen(now, key), step.reward, done, step.reward
+
+    def network(self, width: int = 64) -> nn.Module:
+        """That of a policy: it begins as the base rule."""
+        return _FromObservation(self.num_actions, width)
+
+    def _seen(self, state: State, key: jax.Array) -> _Episode:
+        key_seen, key = jax.random.split(key)
+        seen = self._sessions.observe(self._given, state, key_seen)
+        return _Episode(state.truth, state.belief, state.session, seen, key)
+
+    def available(self, episode: _Episode) -> jax.Array:
+        return episode.seen.valid
+
+
+class _FromObservation(nn.Module):
+    """The network of a policy, whose input is what ``SequentialEnv`` observes."""
+
+    options: int
+    width: int
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> Any:
+        c, end = self.options, self.options * NUM_FEATURES
+        shape = (*observation.shape[:-1], c, NUM_FEATURES)
+        index = jnp.arange(c)
+        return Network(self.width)(
+            Seen(
+                index=index,
+                designs=index,
+                features=observation[..., :end].reshape(shape),
+                log_score=observation[..., end : end + c],
+                valid=observation[..., end + c :] > 0.5,
+            )
+        )

@@ -1,0 +1,64 @@
+"""Environments for loops of one's own: resets, masks, and what they pay."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxcal.adaptive.environment import TaskEnv
+from jaxcal.adaptive.tasks.knee import STATE_RULE, knee
+from jaxcal.learning import PosturesEnv
+from jaxcal.learning.environments.selection import SelectionConfig
+
+
+def play(env, batch, steps, seed=0):
+    """Observations, masks before, actions, rewards, done of a random policy, (S, B)."""
+    key = jax.random.key(seed)
+    obs, state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, batch))
+    mask = jax.vmap(env.available)(state)
+    step = jax.jit(jax.vmap(env.step))
+    kept = []
+    for _ in range(steps):
+        key, key_action, key_step = jax.random.split(key, 3)
+        action = jax.random.categorical(key_action, jnp.where(mask, 0.0, -1e9))
+        before = np.asarray(obs), np.asarray(mask), np.asarray(action)
+        obs, state, reward, done, info = step(
+            jax.random.split(key_step, batch), state, action
+        )
+        mask = info["action_mask"]
+        kept.append((*before, np.asarray(reward), np.asarray(done), info))
+    return kept
+
+
+def test_postures_pay_the_log_det_of_what_is_chosen_and_begin_anew():
+    env = PosturesEnv(SelectionConfig(num_candidates=9))
+    assert env.num_actions == 9 and env.observation_size == 4 * 9 + 10
+    kept = play(env, 3, 8)
+    assert [bool(row[4].all()) for row in kept] == [False] * 3 + [True] + [
+        False
+    ] * 3 + [True]
+    for first in (0, 4):
+        for episode in range(3):
+            sets = kept[first][0][episode, :27].reshape(9, 3).astype(np.float64)
+            chosen = [kept[first + t][2][episode] for t in range(4)]
+            assert len(set(chosen)) == 4
+            z = np.column_stack([sets[chosen], np.ones(4)])
+            paid = 0.3 * np.linalg.slogdet(z.T @ z)[1]
+            assert kept[first + 3][3][episode] == pytest.approx(paid, abs=1e-3)
+            last = kept[first + 3][5]
+            assert last["log_det"][episode] == pytest.approx(10 * paid, abs=1e-2)
+            assert last["action_mask"][episode].all()  # of the episode that begins
+    assert not np.array_equal(kept[0][0], kept[4][0])
+
+
+def test_sessions_of_a_task_end_and_begin_anew():
+    env = TaskEnv(knee(cells=4, sigma=0.05, seconds=(5.0, 9.0)), STATE_RULE, 2)
+    kept = play(env, 4, 12)
+    assert kept[0][0].shape == (4, env.observation_size)
+    assert all(mask[np.arange(4), action].all() for _, mask, action, *_ in kept)
+    rewards = np.stack([row[3] for row in kept])
+    assert (rewards >= -1e-6).all() and rewards.max() > 0.01
+    assert np.stack([row[4] for row in kept]).any()
+    assert set(kept[0][5]) == {"action_mask", "gain"}
