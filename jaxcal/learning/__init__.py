@@ -1,10 +1,11 @@
 """Posture selection as an environment in JAX, and the training of policies for it.
 
 ``reset``, ``step`` and ``observe`` are pure functions of one episode; ``jax.vmap``
-makes a batch; ``PosturesEnv`` has them as gymnax users write them. ``make_train`` gives a whole training as one pure function. A network, a
-reward or another environment of one's own is a ``Learner``: ``Postures`` plays episodes
-of a ``Task`` with a ``Network``. Names load on first use, since inference without JAX
-imports this package too.
+makes a batch; ``PosturesEnv`` has them as gymnax users write them. ``make_train`` gives
+a whole training as one pure function. A network, a reward or another environment of
+one's own is a ``Learner``: ``Postures`` plays episodes of a ``Task`` with a
+``Network``, ``Streams`` sessions of an ``Environment``. Names load on first use, since
+inference without JAX imports this package too.
 """
 
 from __future__ import annotations
@@ -99,8 +100,8 @@ def make_train(config: Any) -> Any:
     """A whole training as one pure function, to be jitted, scanned or vmapped.
 
     ``train = make_train("compact")``, then ``state, metrics =
-    jax.jit(train)(jax.random.key(0))``; ``state.average`` is the policy. ``jax.vmap`` of
-    it trains several keys, or learning rates, side by side.
+    jax.jit(train)(jax.random.key(0))``; ``state.average`` is the policy. ``jax.vmap``
+    of it trains several keys, or learning rates, side by side.
 
     Args:
         config: the name of a preset, a ``TrainConfig``, or any object with ``ppo`` and
