@@ -95,11 +95,15 @@ def kernels() -> list[pathlib.Path]:
     ]
 
 
-class _Build:
-    """Compiles into the packages under a folder."""
+def build() -> list[pathlib.Path]:
+    """Compile what is older than its source; all modules, relative to the checkout."""
+    return _Build()()
 
-    def __init__(self, into: pathlib.Path):
-        self.into = into
+
+class _Build:
+    """Compiles kernels beside their sources."""
+
+    def __init__(self) -> None:
         self.work = ROOT / "build" / "kernels" / sys.implementation.cache_tag
         found = compiler()
         self.zig = found is None
@@ -118,7 +122,7 @@ class _Build:
         self.changed = max(path.stat().st_mtime for path in common)
 
     def __call__(self) -> list[pathlib.Path]:
-        """Compile what is older than its source; all modules, relative to ``into``."""
+        """Compile what is older than its source; all modules."""
         sources = [None, *kernels()]
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             return list(pool.map(self._module, sources))
@@ -127,7 +131,7 @@ class _Build:
         """The module of a kernel; with None, of what all of them share."""
         plain = source.with_suffix("") if source else pathlib.Path(*SHARED.split("."))
         target = plain.with_name(plain.name + sysconfig.get_config_var("EXT_SUFFIX"))
-        module = self.into / target
+        module = ROOT / target
         changed = self.changed
         if source:
             changed = max(changed, (ROOT / source).stat().st_mtime)
@@ -188,18 +192,16 @@ class KernelHook(BuildHookInterface):
         return [] if compiler() else ["ziglang>=0.15,<1"]
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Beside their sources for an editable install, else for the wheel alone."""
+        """Beside their sources, also for a wheel: Python started in a checkout imports
+        the package that lies there, however jaxcal was installed."""
         if self.target_name != "wheel":
             return
         build_data["pure_python"] = False
         build_data["infer_tag"] = True
-        if version == "editable":
-            _Build(ROOT)()
-            return
-        into = ROOT / "build" / "lib" / f"{sys.implementation.cache_tag}"
-        for module in _Build(into)():
-            build_data["force_include"][str(into / module)] = str(module)
+        for module in build():
+            if version != "editable":
+                build_data["force_include"][str(ROOT / module)] = str(module)
 
 
 if __name__ == "__main__":
-    _Build(ROOT)()
+    build()

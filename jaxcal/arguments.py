@@ -22,6 +22,8 @@ import typing
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal, NoReturn, TypeVar
 
+from jaxcal.extras import typed
+
 __all__ = [
     "Parser",
     "exit_code",
@@ -29,6 +31,7 @@ __all__ = [
     "refused",
     "several",
     "told",
+    "typed_line",
     "values_of",
 ]
 
@@ -148,6 +151,20 @@ def told() -> Iterator[None]:
         yield
     finally:
         log.removeHandler(shown)
+
+
+def typed_line(program: str) -> str:
+    """``train.py`` or ``jaxcal train`` as it is typed in this shell.
+
+    A script is where the one that runs is.
+    """
+    name, *more = program.split()
+    if not name.endswith(".py"):
+        return " ".join([typed(name), *more])
+    running = pathlib.Path(sys.argv[0])
+    scripts = ("train.py", "evaluate.py")
+    folder = running.parent if running.name in scripts else pathlib.Path()
+    return f"{typed('python')} {folder / name}"
 
 
 def refused(program: str, error: Exception) -> int:

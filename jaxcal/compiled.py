@@ -54,7 +54,8 @@ def check(package: pathlib.Path) -> None:
         package: folder of a package in a checkout; an installed one holds no sources.
 
     Raises:
-        ImportError: a kernel was never compiled for this Python.
+        ImportError: a kernel was never compiled for this Python: neither ``pip install
+        .`` nor ``pip install -e .`` was run with it in this checkout.
     """
     missing, older = [], []
     for folder, _, names in os.walk(package):
@@ -70,7 +71,8 @@ def check(package: pathlib.Path) -> None:
     for some, what in ((missing, "not compiled"), (older, "changed since compiled")):
         if some:
             files = ", ".join(os.path.relpath(path, package.parent) for path in some)
-            said = f"{what}: {files}; run: pip install --no-deps -e {package.parent}"
+            run = f"run: {sys.executable} -m pip install"
             if some is missing:
-                raise ImportError(said)
+                raise ImportError(f"{what}: {files}; {run} -e {package.parent}")
+            said = f"{what}: {files}; {run} --no-deps -e {package.parent}"
             print(f"jaxcal: {said}", file=sys.stderr)

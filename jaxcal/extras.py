@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
+import json
+import os
+import pathlib
 import platform
+import shutil
+import sys
+import urllib.parse
 from collections.abc import Iterator
 
-__all__ = ["MissingExtraError", "needs", "versions"]
+__all__ = ["MissingExtraError", "install", "needs", "typed", "versions"]
 
 _COMPUTE = ("jaxcal", "numpy", "scipy", "jax", "jaxlib", "flax", "optax")
 
@@ -21,7 +27,7 @@ def needs(extra: str, purpose: str) -> Iterator[None]:
     """Imports inside the block belong to an extra of jaxcal.
 
     Args:
-        extra: "live", "models", "policy", "rig", "ros" or "study".
+        extra: "live", "models", "plots", "policy", "rig", "ros" or "study".
         purpose: what needs it, as the subject of a sentence: ``'method="policy"'``.
 
     Raises:
@@ -29,15 +35,60 @@ def needs(extra: str, purpose: str) -> Iterator[None]:
     """
     try:
         yield
-    except ModuleNotFoundError as error:
+    except (ModuleNotFoundError, MissingExtraError) as error:
         package = (error.name or "").partition(".")[0]
         if package in ("", "jaxcal", "rig"):
             raise
         raise MissingExtraError(
-            f"{purpose} needs {package}, which is not installed: "
-            f"pip install 'jaxcal[{extra}]'",
+            f"{purpose} needs {package}, which is not installed: {install(extra)}",
             name=error.name,
         ) from error
+
+
+def typed(program: str) -> str:
+    """A program of this Python's environment as it is typed here.
+
+    Its name where the shell finds it, else its path: ``python``, ``.venv/bin/jaxcal``.
+    """
+    beside = pathlib.Path(sys.executable)
+    if program != "python":
+        beside = beside.with_name(program)
+        if not beside.exists():
+            return program
+    if (there := shutil.which(program)) and pathlib.Path(there) == beside:
+        return program
+    return _as_typed(beside)
+
+
+def install(extra: str) -> str:
+    """The command that installs an extra of jaxcal into this Python."""
+    source, editable = _source()
+    flag = " -e" if editable else ""
+    return f"{typed('python')} -m pip install{flag} '{source}[{extra}]'"
+
+
+def _source() -> tuple[str, bool]:
+    """From where jaxcal was installed, and whether so that changes show."""
+    folder = pathlib.Path(__file__).parents[1]
+    described = "{}"
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        found = importlib.metadata.distribution("jaxcal").read_text("direct_url.json")
+        described = found or described
+    origin = json.loads(described)
+    editable = bool(origin.get("dir_info", {}).get("editable"))
+    if not (folder / "pyproject.toml").exists():  # installed, not a checkout
+        if "dir_info" not in origin:
+            return "jaxcal", False
+        url = urllib.parse.urlsplit(origin["url"])
+        folder = pathlib.Path(urllib.parse.unquote(url.path))
+    return _as_typed(folder), editable
+
+
+def _as_typed(path: pathlib.Path) -> str:
+    """A path, relative to the working directory where it lies within."""
+    with contextlib.suppress(OSError, ValueError):
+        return os.fspath(path.relative_to(pathlib.Path.cwd()))
+    return os.fspath(path)
 
 
 def versions() -> dict[str, str]:

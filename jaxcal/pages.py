@@ -180,7 +180,7 @@ def render(page: Page) -> str:
 @functools.cache
 def _template() -> Any:
     """The page's template; compiling it takes a quarter of a second."""
-    with needs("study", "an HTML report"):
+    with needs("plots", "an HTML report"):
         import jinja2
 
     environment = jinja2.Environment(

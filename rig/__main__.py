@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from jaxcal.arguments import values_of
+from jaxcal.extras import install
 from rig.commands import make_parser
 from rig.core.faults import EXIT_BAD_INPUT, EXIT_FAULT, EXIT_INTERRUPTED, told
 from rig.journal.errors import JournalError
@@ -24,8 +25,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         for name in NEEDED + OTHERS * (command != "stop"):
             if importlib.util.find_spec(name) is None:
-                install = "which is not installed: pip install 'jaxcal[rig]'"
-                raise ModuleNotFoundError(f"{command} needs {name}, {install}")
+                raise ModuleNotFoundError(
+                    f"{command} needs {name}, which is not installed: {install('rig')}"
+                )
         code = EXIT_FAULT if command == "stop" else EXIT_BAD_INPUT
         code = args.function(**values_of(args))
         return code

@@ -46,10 +46,10 @@ CASES = {
     "": (
         HEAVY,
         [
-            (["jaxcal", "train"], 2, "pip install 'jaxcal[policy]'"),
-            (["jaxcal-rig", "calibrate", "--simulate"], 2, "pip install 'jaxcal[rig]'"),
-            (["jaxcal", "evaluate"], 2, "pip install 'jaxcal["),
-            (["python", "-c", FORMULA], 0, "pip install 'jaxcal[models]'"),
+            (["jaxcal", "train"], 2, "[policy]'"),
+            (["jaxcal-rig", "calibrate", "--simulate"], 2, "[rig]'"),
+            (["jaxcal", "evaluate", "--episodes", "5"], 0, "dataset2"),
+            (["python", "-c", FORMULA], 0, "[models]'"),
         ],
     ),
     "models": (
@@ -62,12 +62,16 @@ CASES = {
             (["jaxcal", "train", "--episodes", "2048", "--out", "run"], 0, "saved run"),
         ],
     ),
+    "plots": (
+        ("jax", "flax", "brax", "mujoco", "pymodbus"),
+        [(["python", "-c", "import jaxcal.plots, jinja2"], 0, "")],
+    ),
     "rig": (
-        ("jax", "flax", "brax", "mujoco", "matplotlib"),
+        ("jax", "flax", "brax", "mujoco"),
         [(["jaxcal-rig", "calibrate", "--simulate"], 0, "")],
     ),
     "live": (
-        ("jax", "flax", "brax", "mujoco", "matplotlib"),
+        ("jax", "flax", "brax", "mujoco"),
         [(["jaxcal", "doctor"], 0, "nicegui")],
     ),
     "docs": (HEAVY, [(["mkdocs", "--version"], 0, "mkdocs")]),
@@ -90,6 +94,24 @@ def wheel(tmp_path_factory):
     build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w"]
     subprocess.run([*build, str(folder), str(ROOT)], check=True)
     return next(folder.glob("jaxcal-*.whl"))
+
+
+def test_python_in_the_checkout_works_after_a_plain_install(tmp_path):
+    """It imports the package that lies there, which needs kernels of its own."""
+    checkout, python = tmp_path / "jaxcal", tmp_path / "env" / "bin" / "python"
+    subprocess.run(["git", "clone", "-q", str(ROOT), str(checkout)], check=True)
+    subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "env")], check=True)
+    for words, code, expected in (
+        (["-m", "pip", "install", "-q", "."], 0, ""),
+        (["-c", SELECT + "print(jaxcal.__file__)"], 0, str(checkout)),
+        (["evaluate.py", "--episodes", "5"], 0, "dataset2"),
+        (["train.py"], 2, "/env/bin/python -m pip install '.[policy]'"),
+    ):
+        done = subprocess.run(
+            [python, *words], cwd=checkout, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == code, done.stdout + done.stderr
+        assert expected in done.stdout + done.stderr
 
 
 @pytest.mark.parametrize("extra", CASES)

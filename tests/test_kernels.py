@@ -41,7 +41,7 @@ def test_one_line_names_a_kernel_older_than_its_source(package, capsys):
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "package/some_kernel.py" in said
-    assert f"pip install --no-deps -e {package.parent}" in said
+    assert f"{sys.executable} -m pip install --no-deps -e {package.parent}" in said
 
 
 def test_a_kernel_that_was_never_compiled_is_an_error(package):

@@ -1,4 +1,4 @@
-"""Progress: silent for short tasks, plain lines in a log, a bar on a terminal."""
+"""Progress: silent for short tasks, plain lines in a log, a line on a terminal."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def run(progress: Progress, now: list[float]) -> None:
 def test_progress_is_silent_at_first_and_says_what_is_left(now: list[float]) -> None:
     stream = io.StringIO()
     run(Progress(stream), now)
-    assert stream.getvalue() == "exact: 250 of 1,000, 01:30 left\n"
+    assert stream.getvalue() == "exact: 250 of 1,000, 0:01:30 left\n"
 
 
 def test_a_new_task_starts_its_own_clock(now: list[float]) -> None:
@@ -44,7 +44,7 @@ def test_a_new_task_starts_its_own_clock(now: list[float]) -> None:
     progress("greedy", 0, 10)
     now[0] = 43.0
     progress("greedy", 5, 10)
-    assert stream.getvalue().splitlines()[1:] == ["greedy: 5 of 10, 00:12 left"]
+    assert stream.getvalue().splitlines()[1:] == ["greedy: 5 of 10, 0:00:12 left"]
 
 
 @pytest.mark.parametrize("stream", [io.StringIO(), Terminal()])
@@ -53,12 +53,15 @@ def test_quiet_shows_nothing(now: list[float], stream: io.StringIO) -> None:
     assert stream.getvalue() == ""
 
 
-def test_a_bar_is_taken_off_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_line_is_taken_off_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("jaxcal.progress._SILENT", 0.0)
     stream = Terminal()
     progress = Progress(stream)
     progress("exact", 0, 1000)
     progress("exact", 600, 1000)
     progress.clear()
-    assert "exact:" in stream.getvalue() and "/1000" in stream.getvalue()
-    assert stream.getvalue().rstrip(" ").endswith("\r")
+    assert "exact: 600 of 1,000" in stream.getvalue()
+    assert stream.getvalue().endswith("\r\x1b[K")
+    written = stream.getvalue()
+    progress.clear()
+    assert stream.getvalue() == written

@@ -82,7 +82,7 @@ def postures(
     plan = offered[chosen]
     plan = plan[arm.in_turn(plan)]
     if picture:
-        with needs("study", "--picture"):
+        with needs("plots", "--picture"):
             from matplotlib.figure import Figure
 
         from jaxcal import plots

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
-from jaxcal.arguments import Parser, refused, several, told, values_of
+from jaxcal.arguments import Parser, refused, several, told, typed_line, values_of
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder, write_text
 
@@ -119,7 +119,7 @@ class Outputs:
                 raise ValueError(f"--json must be a file, {self.json} is a folder")
             require_writable_folder(self.json.parent)
         if self.report is not None:
-            with needs("study", "--report"):
+            with needs("plots", "--report"):
                 importlib.import_module("jinja2")
                 importlib.import_module("matplotlib")
             require_writable_folder(self.report)
@@ -214,7 +214,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
     of_task = any(word.partition("=")[0] == "--task" for word in given)
     kept, before = "nothing was written", signal.signal(signal.SIGTERM, _terminate)
     try:
-        made = parser(prog, " ".join(command), of_task).parse_args(given)
+        made = parser(prog, typed_line(prog), of_task).parse_args(given)
         options = values_of(made)["options"]
         options.command = [*command, *given]
         if not of_task and options.stream is not None:
@@ -239,6 +239,9 @@ def parser(prog: str, typed: str, of_task: bool = False) -> Parser:
         more = _EPILOG.format(program=typed)
         return Parser(prog=prog, description=_DESCRIPTION, epilog=more).of(_run)
     with needs("policy", "--task"):
+        from jaxcal.learning.runtime import cache
+
+        cache.keep_compiled_programs()  # before JAX is loaded
         from jaxcal.adaptive.tasks import registry
         from jaxcal.evaluation.sequential import METHODS
 
@@ -262,10 +265,9 @@ def _terminate(number: int, frame: object) -> NoReturn:
 
 
 def _run(options: Options) -> None:
-    with needs("study", "evaluate"):
-        from jaxcal.progress import Progress
     from jaxcal.evaluation.methods import DEFAULT_METHODS, POLICIES, check_methods
     from jaxcal.evaluation.report import json_document, text_table, write_report
+    from jaxcal.progress import Progress
 
     asked = DEFAULT_METHODS if options.methods is None else options.methods
     methods = check_methods(asked)
@@ -415,7 +417,6 @@ def _run_folders(given: Sequence[Path], checkpoints: list[str | None]) -> list[P
 def _run_task(options: TaskOptions) -> None:
     from jaxcal.adaptive.tasks import registry
     from jaxcal.evaluation import sequential, sequential_report
-    from jaxcal.learning.runtime import cache
     from jaxcal.progress import Progress
 
     options.require_writable()
@@ -430,7 +431,6 @@ def _run_task(options: TaskOptions) -> None:
             raise ValueError("--checkpoint is given, but policy is not among --methods")
         methods.append("policy")
     chosen = registry.options_from(entry, options.with_)
-    cache.keep_compiled_programs()
     progress = Progress(quiet=options.quiet)
     try:
         result = sequential.evaluate(

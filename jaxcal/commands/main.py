@@ -13,7 +13,7 @@ from typing import Annotated
 
 from jaxcal.arguments import Parser, refused, told, values_of
 from jaxcal.checks import aligned
-from jaxcal.extras import MissingExtraError
+from jaxcal.extras import MissingExtraError, install
 
 __all__ = ["COMMANDS", "main"]
 
@@ -112,11 +112,9 @@ def doctor(*, json: Annotated[bool, "print JSON"] = False) -> None:
         "cores": str(os.cpu_count()),
         "jaxcal": _version("jaxcal", "a checkout that is not installed"),
     }
-    for line in importlib.metadata.requires("jaxcal") or []:
-        asked = re.match(r"([\w.-]+)(?:.*extra == ['\"](\w+)['\"])?", line)
-        if asked and asked[2] not in _OTHERS:
-            extra = f": pip install 'jaxcal[{asked[2]}]'" if asked[2] else ""
-            found.setdefault(asked[1], _version(asked[1], f"not installed{extra}"))
+    for package, extra in _required().items():
+        more = f": {install(extra)}" if extra else ""
+        found[package] = _version(package, f"not installed{more}")
     found["devices"] = _devices()
     cache = "JAX_COMPILATION_CACHE_DIR"
     found[cache] = os.environ.get(cache, "not set")
@@ -124,6 +122,20 @@ def doctor(*, json: Annotated[bool, "print JSON"] = False) -> None:
         write_json("", found)
         return
     print("\n".join(aligned([*found.items()], left=True)))
+
+
+def _required() -> dict[str, str]:
+    """Packages, and the smallest extra that brings each; "" of those always there."""
+    wanted: dict[str, list[str]] = {}
+    for line in importlib.metadata.requires("jaxcal") or []:
+        asked = re.match(r"([\w.-]+)(?:.*extra == ['\"](\w+)['\"])?", line)
+        if asked and asked[2] not in _OTHERS and asked[1] != "jaxcal":
+            wanted.setdefault(asked[2] or "", []).append(asked[1])
+    found: dict[str, str] = {}
+    for extra in sorted(wanted, key=lambda name: (name != "", len(wanted[name]))):
+        for package in wanted[extra]:
+            found.setdefault(package, extra)
+    return found
 
 
 def _version(package: str, missing: str) -> str:

@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from jaxcal.arguments import refused, told
+from jaxcal.arguments import refused, told, typed_line
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder
 from jaxcal.learning.runtime import cache, processes
@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
             with needs("policy", "training"):
                 from jaxcal.commands.train_arguments import parser
             with told():
-                return _run(parser(prog).parse_args(given))
+                return _run(parser(prog).parse_args(given), prog)
         except (ValueError, OSError, MissingExtraError) as error:
             return refused(prog, error)
 
@@ -61,11 +61,12 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
     return processes.run_job(prog, given, alone, advice)
 
 
-def _run(arguments: argparse.Namespace) -> int:
+def _run(arguments: argparse.Namespace, prog: str) -> int:
     """Train, say how it went; of several processes the first speaks for all."""
+    from jaxcal.commands.train_arguments import preset_of
     from jaxcal.learning.runtime import devices
 
-    named = pathlib.Path(arguments.task or arguments.preset).stem
+    named = pathlib.Path(arguments.task or preset_of(arguments)).stem
     out = pathlib.Path(arguments.out or f"runs/{named}")
     if arguments.export and not arguments.export.endswith(".npz"):
         raise ValueError(f"--export must be a file NAME.npz, got {arguments.export}")
@@ -93,12 +94,12 @@ def _run(arguments: argparse.Namespace) -> int:
     if done < config.ppo.num_updates:
         print(
             f"stopped at update {done} of {config.ppo.num_updates} and saved; go on: "
-            f"python train.py{task} --resume --out {out}"
+            f"{typed_line(prog)}{task} --resume --out {out}"
         )
         return 0
     print(
-        f"saved {out}/checkpoint; measure it: python evaluate.py{task} "
-        f"--checkpoint {out}"
+        f"saved {out}/checkpoint; measure it: "
+        f"{typed_line(prog.replace('train', 'evaluate'))}{task} --checkpoint {out}"
     )
     if arguments.export:
         from jaxcal.adaptive.policy import run
@@ -178,14 +179,19 @@ def _num_runs(arguments: argparse.Namespace, out: pathlib.Path) -> int:
 
 def _configuration(arguments: argparse.Namespace, out: pathlib.Path) -> TrainConfig:
     """Of postures: from the flags, or from the run to go on with."""
-    from jaxcal.commands.train_arguments import candidates_of, trained_on, values_of
+    from jaxcal.commands.train_arguments import (
+        candidates_of,
+        preset_of,
+        trained_on,
+        values_of,
+    )
     from jaxcal.learning.training import checkpoint, presets
     from jaxcal.learning.training.config import TrainConfig
 
     given = values_of(arguments, task=False)
     path = arguments.candidates
     candidates = candidates_of(path) if path else None
-    config = presets.load(arguments.preset)
+    config = presets.load(preset_of(arguments))
     if arguments.trainer == "brax":
         config = _for_brax(config, arguments, given)
     if arguments.resume:
@@ -308,7 +314,8 @@ def _refuse_to_overwrite(out: pathlib.Path) -> None:
     steps = out / "checkpoint"
     if steps.is_dir() and any(steps.iterdir()):
         raise ValueError(
-            f"--out {out} already holds a run: go on with --resume, or name another"
+            f"--out {out} already holds a run: go on with --resume, or name another, "
+            f"--out {out}_2 say"
         )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.tasks import registry
-from jaxcal.arguments import Parser, number_type
+from jaxcal.arguments import Parser, number_type, typed_line
 from jaxcal.commands.pools import holds_sets, read_pool
 from jaxcal.learning.config import TRACED, StreamsConfig
 from jaxcal.learning.environments.task import GivenCandidates
@@ -26,6 +26,7 @@ __all__ = [
     "candidates_of",
     "flag_of",
     "parser",
+    "preset_of",
     "trained_on",
     "values_of",
 ]
@@ -40,25 +41,26 @@ tasks, of sequential measurement:
 
 what to try first:
   {program}                        the compact policy, a few minutes on a laptop
-  {program} --episodes 20000       the same in half a minute, 0.993 of the optimum
-  {program} --num-selected 6       another number of postures
-  {program} --candidates mine.csv  your own machine's postures
+  {program} --episodes 20000 --out runs/brief   half a minute, 0.993 of the optimum
+  {program} --num-selected 6 --out runs/six     another number of postures
+  {program} --candidates mine.csv --out runs/mine   your own machine's postures
   then --imitation 0.5 --initial-trust 4 --initial-actor 0.05 --close-up, which adds
   most where more than n + 1 postures are chosen. Other numbers rarely need a change.
 
 more examples:
   {program} --task knee            the next measurement from what the last answered
-  {program} --task knee --with cells=16 sigma=0.05
-  {program} --seeds 8              eight runs side by side: mean, spread and the best
-  {program} --sweep learning_rate=1e-3,3e-3 entropy_start=0.01,0.02   one table of four
+  {program} --task knee --with cells=16 sigma=0.05 --out runs/knee_16
+  {program} --seeds 8 --out runs/seeds   eight runs side by side: mean, spread, best
+  {program} --sweep learning_rate=1e-3,3e-3 entropy_start=0.01,0.02 --out runs/sweep
+                                   one table of four
   {program} --resume --out runs/compact      go on where a run stopped
   {program} --preset general --export checkpoints/default.npz   what ships
   {program} --trainer brax --episodes 50000  the same task, brax's own PPO
   srun {program}                             all tasks of a SLURM job step
   {program} --coordinator host0:4711 --num-processes 2 --process-id 0   and 1
 
-A run folder holds metrics.csv, TensorBoard events and checkpoint/; measure it with
-  python evaluate.py --checkpoint runs/compact
+A run folder holds metrics.csv and checkpoint/; measure it with
+  {evaluate} --checkpoint runs/compact
 Ctrl-C saves and stops; --resume then continues bit for bit (on the same CPU).
 All devices of all processes share each update: docs/scaling.md."""
 
@@ -70,7 +72,7 @@ _NAMES = {"num_episodes": "episodes", "num_updates": "updates", "num_seeds": "se
 class Options:
     """What is trained and where it is kept."""
 
-    preset: Annotated[str, "of postures, see below", "NAME"] = "compact"
+    preset: Annotated[str | None, "of postures, see below [compact]", "NAME"] = None
     task: Annotated[str | None, "of sequential measurement, see below", "NAME"] = None
     with_: Annotated[tuple[str, ...], "options of the task", "OPTION=VALUE"] = ()
     out: Annotated[str | None, "run folder [runs/PRESET or runs/TASK]", "DIR"] = None
@@ -100,13 +102,17 @@ def flag_of(name: str) -> str:
 
 def parser(prog: str) -> Parser:
     """All flags; ``prog`` is what was typed, "train.py" or "jaxcal train"."""
-    program = f"python {prog}" if prog.endswith(".py") else prog
     out = Parser(
         prog=prog,
         usage="%(prog)s [--preset NAME | --task NAME] [--out DIR] [flags below]",
         description="Train a policy, and save it with all it needs: one that selects "
         "postures, or with --task one that picks the next measurement.",
-        epilog=_EPILOG.format(program=program, presets=_abouts(), tasks=_tasks()),
+        epilog=_EPILOG.format(
+            program=typed_line(prog),
+            evaluate=typed_line(prog.replace("train", "evaluate")),
+            presets=_abouts(),
+            tasks=_tasks(),
+        ),
     ).of(Options)
     processes.add_arguments(out)
     postures = {f.name: f for part in presets.PARTS.values() for f in settings_of(part)}
@@ -150,6 +156,11 @@ def _swept(text: str) -> tuple[str, tuple[float, ...]]:
     return name.replace("-", "_"), held
 
 
+def preset_of(arguments: argparse.Namespace) -> str:
+    """That which was given; else the smallest."""
+    return arguments.preset or "compact"
+
+
 def values_of(arguments: argparse.Namespace, task: bool) -> dict[str, Any]:
     """The fields of a configuration that were given: name to value.
 
@@ -166,13 +177,14 @@ def values_of(arguments: argparse.Namespace, task: bool) -> dict[str, Any]:
     }
     unread = {flag_of(name) for name in set(given) - read}
     if task:
+        unread |= {"--preset"} if arguments.preset else set()
         unread |= {"--candidates"} if arguments.candidates else set()
         unread |= {"--trainer"} if arguments.trainer != "jaxcal" else set()
         unread |= {"--no-validation"} if arguments.no_validation else set()
     elif arguments.with_:
         unread.add("--with")
     if unread:
-        who = f"--task {arguments.task}" if task else f"preset {arguments.preset}"
+        who = f"--task {arguments.task}" if task else f"preset {preset_of(arguments)}"
         raise ValueError(f"{who} does not read {', '.join(sorted(unread))}: leave out")
     return given
 

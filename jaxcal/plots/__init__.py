@@ -5,7 +5,7 @@
 
 from jaxcal.extras import needs
 
-with needs("study", "jaxcal.plots"):
+with needs("plots", "jaxcal.plots"):
     from jaxcal.plots.arm import postures
     from jaxcal.plots.curves import against_count, pareto, plan
     from jaxcal.plots.errors import before_after, residuals

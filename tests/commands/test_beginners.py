@@ -126,7 +126,7 @@ def test_a_negative_value_after_a_blank(folder, monkeypatch, capsys):
 
 @pytest.mark.parametrize(
     ("imported", "missing", "extra"),
-    [("jaxcal.plots", "matplotlib", "study"), ("jaxcal.adaptive", "jax", "policy")],
+    [("jaxcal.plots", "matplotlib", "plots"), ("jaxcal.adaptive", "jax", "policy")],
 )
 def test_an_import_names_its_extra(imported, missing, extra):
     code = f"import sys; sys.modules[{missing!r}] = None; import {imported}"
@@ -134,7 +134,8 @@ def test_an_import_names_its_extra(imported, missing, extra):
         [sys.executable, "-c", code], capture_output=True, text=True, check=False
     )
     wanted = f"{imported} needs {missing}, which is not installed: "
-    assert f"{wanted}pip install 'jaxcal[{extra}]'" in done.stderr
+    (line,) = [x for x in done.stderr.splitlines() if wanted in x]
+    assert line.endswith(f"[{extra}]'")
 
 
 def test_radians_are_named(folder, monkeypatch, capsys):

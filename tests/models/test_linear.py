@@ -204,5 +204,5 @@ def test_without_formulaic_the_command_is_named(monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", refuse)
     assert Polynomial(2, 1).names == ("1", "x", "x^2")
-    with pytest.raises(MissingExtraError, match=r"pip install 'jaxcal\[models\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install .*\[models\]'"):
         Linear("x")

@@ -273,7 +273,8 @@ def test_a_page_without_a_viewer_ends(tmp_path):
 def test_without_the_extra_a_session_says_so_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(live.importlib.util, "find_spec", lambda name: None)
     line = live.start(tmp_path)
-    assert line == "no live page: nicegui is not installed: pip install 'jaxcal[live]'"
+    assert line.startswith("no live page: nicegui is not installed: ")
+    assert line.endswith("[live]'")
     assert not list(tmp_path.iterdir())
 
 

@@ -62,7 +62,7 @@ def locate(checkpoint: str | pathlib.Path | None) -> pathlib.Path:
     if path.is_file():
         return path
     if not path.is_dir():
-        hint = " (train one with: python train.py)" if checkpoint is None else ""
+        hint = " (train one with: jaxcal train)" if checkpoint is None else ""
         raise CheckpointError(f"checkpoint {path} does not exist{hint}")
     folder = path / "checkpoint" if (path / "checkpoint").is_dir() else path
     steps = [p for p in folder.iterdir() if p.name.isdigit() and p.is_dir()]

@@ -16,6 +16,8 @@ import sys
 import time
 from typing import Any
 
+from jaxcal.extras import install
+
 HOST, PORT = "127.0.0.1", 8642  # the usual port; where it is taken, any free one
 LOG = "live.log"
 SERVER = "rig.workbench.live.server"
@@ -37,7 +39,7 @@ def start(folder: pathlib.Path) -> str:
     words go to ``live.log`` in the run's folder.
     """
     if importlib.util.find_spec("nicegui") is None:
-        return "no live page: nicegui is not installed: pip install 'jaxcal[live]'"
+        return f"no live page: nicegui is not installed: {install('live')}"
     try:
         sock, line = listen()
         with sock, (folder / LOG).open("ab") as log:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxcal.extras import install
 from jaxcal.pages import Code, Figure, Page, Section, Table, Text, write_page
 from rig.config import AXIS_NAMES
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE
@@ -133,7 +134,7 @@ def drawn(
 
         from jaxcal.plots import as_bytes
     except ModuleNotFoundError:
-        missing = "no figure: matplotlib is not installed (pip install 'jaxcal[study]')"
+        missing = f"no figure: matplotlib is not installed ({install('plots')})"
         return Text(f"{alt}: {missing}", "note")
     figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
     draw(figure, data)
