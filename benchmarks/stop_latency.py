@@ -68,7 +68,7 @@ def session(transport: str, dead: bool, rng: random.Random) -> float:
             emit=lambda event, **fields: None,
             journal=SimpleNamespace(records=[]),
         )
-        checked: Any = SimpleNamespace(missing=lambda config: None)
+        checked: Any = SimpleNamespace(missing=lambda *_: None, state=lambda _: None)
         with Signals() as signals:
             device = Device(served, run, checked, signals)
             with device.imu as imu, device.bus:

@@ -135,6 +135,7 @@ class Session(Target):
     arm: Annotated[bool, "arm without prompting"] = False
     reset_alarms: Annotated[bool, "before arming"] = False
     zero: Annotated[bool, "the device stands in its zero posture"] = False
+    use: Annotated[bool, "goto: a calibration whose session said not to"] = False
     live: Annotated[bool, "show it as a page in the browser"] = False
 
 
@@ -221,10 +222,6 @@ def jog(
 
 def characterise(axis: Axis, *, given: Step) -> int:
     """measure play, dead zone and breakaway of one axis"""
-    from jaxcal.extras import needs
-
-    with needs("policy", "characterise"):
-        import jax  # noqa: F401  # before anything moves
     return _step(given, "SIGN_CHECKED", "characterise", NAMES.index(axis))
 
 
@@ -319,6 +316,12 @@ def resume(run: RunPath, *, given: Session) -> int:
             f"{run} was made with a real device, and resuming it moves that. Leave out "
             "--simulate, or begin a simulated run"
         )
+    events = [record["event"] for record in _records(run)]
+    if events[-1] == "end" and "armed" in events:
+        raise Refused(
+            f"{run} is finished: nothing is left to go on with. Begin a new run; "
+            f"`jaxcal-rig report {run}` writes its report again"
+        )
     return _run(given, "resume", config, start, run)
 
 
@@ -350,13 +353,13 @@ def _run(
     start: dict[str, Any],
     folder: Path | None = None,
 ) -> int:
-    from rig.journal import SIGN_CHECKED, BusLock, DeviceRecord, new_run_folder
+    from rig.journal import STOP_PROVED, BusLock, DeviceRecord, new_run_folder
     from rig.workbench.commission import steps
     from rig.workbench.outputs.console import listen
     from rig.workbench.run import Run, run_safely
 
     real = start["simulated"] is None
-    procedure, kept_zero = _procedure(start, config)
+    procedure, kept_zero, doubts = _procedure(start, config)
     with contextlib.ExitStack() as stack:
         simulator, text = None, config.text
         if not real:
@@ -371,7 +374,7 @@ def _run(
             folder = new_run_folder(given.out or Path(config.output), start["mode"])
             (folder / "rig.toml").write_text(text, encoding="utf-8")
         if simulator is not None:
-            record = steps.commissioned(folder / "device.json", config, SIGN_CHECKED)
+            record = steps.commissioned(folder / "device.json", config, STOP_PROVED)
         lock.tell(run=str(folder.resolve()))
         run = Run(
             config,
@@ -387,9 +390,9 @@ def _run(
             dry_run=given.dry_run,
         )
         listen(run)
-        if simulator is None:
-            run.confirm = functools.partial(_confirm, given)
-        else:
+        run.confirm = functools.partial(_confirm, given, doubts)
+        if simulator is not None:
+            run.simulated = True
             run.listeners.append(simulator.hear)
         if given.live:
             from rig.workbench import live
@@ -400,34 +403,43 @@ def _run(
 
 def _procedure(
     start: dict[str, Any], config: RigConfig
-) -> tuple[Callable[[Run], int], KeptZero | None]:
-    """What a session does, and the zero posture that it must find."""
+) -> tuple[Callable[[Run], int], KeptZero | None, list[str]]:
+    """What a session does, the zero posture that it must find, and why the calibration
+    that it moves by is not to be used."""
     from rig.workbench.procedures import calibrate, checking
 
     mode, inputs = start["mode"], start["inputs"]
     if mode == "calibrate":
-        return calibrate.calibrate, None
+        return calibrate.calibrate, None, []
     if mode == "collect":
-        return lambda run: checking.collect(run, inputs["count"]), None
+        return lambda run: checking.collect(run, inputs["count"]), None, []
     found, kept = checking.load_calibration(
         Path(inputs["calibration"]), config, start["simulated"] is not None
     )
     if mode == "verify":
-        return lambda run: checking.verify(run, found, inputs["count"]), kept
-    return lambda run: checking.goto(run, found, inputs["to"]), kept
+        return lambda run: checking.verify(run, found, inputs["count"]), kept, []
+    doubts = checking.doubts(found)
+    return lambda run: checking.goto(run, found, inputs["to"]), kept, doubts
 
 
-def _confirm(given: Session, session: Run) -> None:
-    """Ask for what --arm and --zero would have confirmed."""
+def _confirm(given: Session, doubts: list[str], session: Run) -> None:
+    """Ask for what --arm, --zero and --use would have confirmed."""
     from rig.workbench.commission.operator import Operator
 
     takes_zero = not session.journal.events("zero") and session.zero_at is None
-    questions = {
-        "arm": "the device will move; its way is clear, no patient is attached, the "
-        "emergency stop is at hand"
-    }
-    if takes_zero and session.config.session.zero == "here":
-        questions["zero"] = "the device stands in its zero posture"
+    questions = {}
+    if doubts:
+        questions["use"] = (
+            f"the session that made this calibration said not to use it: "
+            f"{' and '.join(doubts)}"
+        )
+    if not session.simulated:
+        questions["arm"] = (
+            "the device will move; its way is clear, no patient is attached, the "
+            "emergency stop is at hand"
+        )
+        if takes_zero and session.config.session.zero == "here":
+            questions["zero"] = "the device stands in its zero posture"
     for word, text in questions.items():
         if not getattr(given, word):
             Operator(say=_say, option=f"--{word}").confirm(text, word)

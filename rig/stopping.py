@@ -57,8 +57,9 @@ class Target:
         if self.holder is None:
             return
         freed = self.lock.freed(ASK_S - (time.monotonic() - self.since))
-        if not freed and self._stand:
-            freed = self.lock.freed(END_S)
+        if not freed and self._stand:  # it looks whether they stay
+            stand_s = (read_armed(self.lock.armed_path) or {}).get("stand_s", 0.0)
+            freed = self.lock.freed(END_S + stand_s)
         if not freed:
             _say("it has not stopped its drives in time: it is killed now")
             with contextlib.suppress(OSError, Refused):
@@ -109,7 +110,7 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
         results: list[UnitStop] = []
         faults: list[Fault] = []
         with ThreadPoolExecutor(len(found)) as pool:
-            jobs = [pool.submit(_stop_units, target, path) for target in found]
+            jobs = [pool.submit(_stop_units, target, path, True) for target in found]
             for job in as_completed(jobs):
                 try:
                     results += job.result()
@@ -120,6 +121,7 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
             raise faults[0]
         for fault in faults:
             _say(str(fault))
+        _tell_others([target.lock.armed_path for target in found])
         good = all(each.acknowledged and each.standing for each in results)
         return EXIT_OK if good and not faults else EXIT_FAULT
 
@@ -158,20 +160,38 @@ def _targets(path: pathlib.Path, given: bool) -> tuple[list[Target], str]:
     return [Target(armed["bus"]) for armed in moving or left], fault
 
 
+def _tell_others(stopped: list[pathlib.Path]) -> None:
+    """Say which other devices sessions of this user have armed on this computer."""
+    for path in armed_files():
+        armed = read_armed(path)
+        if path in stopped or armed is None or armed["standing"]:
+            continue
+        target = Target(armed["bus"])
+        holder = target.lock.holder()
+        device = f", {armed['device']}" if "device" in armed else ""
+        _say(
+            f"NOT stopped, another device: {target.lock.where}{device} is armed"
+            + (f" and {held_by(holder)}" if holder else ", by a session that is gone")
+            + ". `jaxcal-rig stop` in its folder stops it"
+        )
+
+
 def _say(text: str) -> None:
     """Print; a terminal that is gone does not end a stop."""
     with contextlib.suppress(OSError):
         print(text, flush=True)
 
 
-def _stop_units(target: Target, path: pathlib.Path | None) -> list[UnitStop]:
+def _stop_units(
+    target: Target, path: pathlib.Path | None, stay: bool = False
+) -> list[UnitStop]:
     """Stop the drives that were armed last, else those of the configuration file.
 
-    Who was asked to is waited for first.
+    Who was asked to is waited for first. ``stay``: look whether they stay, too.
     """
+    from rig.core import stop
     from rig.core.bus import Bus, BusError
     from rig.core.drive import Drive
-    from rig.core.stop import stop_all
 
     target.end()
     settings, silence_s, axes = _drives(target.armed, path)
@@ -186,7 +206,12 @@ def _stop_units(target: Target, path: pathlib.Path | None) -> list[UnitStop]:
         except BusError as error:
             raise BusError(f"{NOTHING}: {error}", LAST_RESORT) from None
         with bus:
-            results = stop_all([Drive(bus, axis) for axis in axes])
+            drives = [Drive(bus, axis) for axis in axes]
+            results = stop.stop_all(drives)
+            named = ", ".join(f"{axis.name} (unit {axis.unit})" for axis in axes)
+            _say(f"stopping {named} on {target.lock.where}")
+            for text in stop.stay(drives, results, stop.stand_s(drives) * stay):
+                _say(f"WARNING: {text}, and was stopped again")
         if all(result.standing for result in results):
             target.lock.stood()
         return results

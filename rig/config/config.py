@@ -65,11 +65,16 @@ def _flat(data: Any, at: str = "") -> dict[str, Any]:
     return flat
 
 
+# Parts of a map that turn counts into places, and that say how a drive is stopped.
+PLACES = ("word_order", "units", "position", "move")
+STOPS = ("status", "stop", "broadcast_stop", "hold", "restart_s", "comm_timeout")
+
+
 @functools.cache
-def _places(register_map: str) -> str:
-    """Digest of the part of a map's text that turns counts into places."""
+def _digest(register_map: str, names: tuple[str, ...]) -> str:
+    """Digest of parts of a map's text."""
     data = tomllib.loads(register_map)
-    parts = [data.get(name) for name in ("word_order", "units", "position", "move")]
+    parts = [data.get(name) for name in names]
     text = json.dumps(parts, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
@@ -185,12 +190,19 @@ class RigConfig(Section):
         found: dict[str, Any] = {}
         for axis in self.axes:
             scale = axis.model_dump(include={*Scale.model_fields, "unit", "rotates"})
-            family = f"{axis.map.name} ({_places(axis.map.text)})"
+            family = f"{axis.map.name} ({_digest(axis.map.text, PLACES)})"
             values = {"map": family, **scale}
             found |= {f"axes.{axis.name}.{name}": values[name] for name in values}
         found["mechanism.order"] = self.mechanism.order
         imu = self.imu.model_dump(mode="json", include=set(PHONE))
         return found | {f"imu.{name}": imu[name] for name in PHONE}
+
+    def stop_fingerprint(self) -> dict[str, str]:
+        """Key to digest of what says how each drive is stopped, and stands."""
+        return {
+            f"axes.{axis.name}.map, how it is stopped": _digest(axis.map.text, STOPS)
+            for axis in self.axes
+        }
 
     def broken_rules(self) -> Iterator[str]:
         motion, session = self.motion, self.session
@@ -198,6 +210,13 @@ class RigConfig(Section):
         overshoot = motion.approach_overshoot_deg
         if session.k >= session.candidates:
             yield f"session.k: must be under candidates ({session.candidates})"
+        middle = self.axes[self.letters.index(self.mechanism.order[1])]
+        if middle.min_deg <= -90.0 or middle.max_deg >= 90.0:
+            yield (
+                f"axes.{middle.name}: min_deg and max_deg must lie between -90 and 90: "
+                "no phone reads the middle one of mechanism.order elsewhere; got "
+                f"{middle.min_deg:g} and {middle.max_deg:g}"
+            )
         for axis, (low, high) in zip(self.axes, self.ranges, strict=True):
             at, span = f"axes.{axis.name}", f"session.{axis.name}_range_deg"
             if axis.speed_deg_s > motion.max_speed_deg_s:

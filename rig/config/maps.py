@@ -273,6 +273,15 @@ class RegisterMap(Section):
         "`trigger` is the last word"
     )
     stop: Writes = key("`write`: frames of the quick stop; torque must stay on")
+    hold: Writes | None = key(
+        "`write` with `position`: the target that the drive holds becomes the place "
+        "where it stands, so that nothing is left to go on to after a stop",
+        None,
+    )
+    restart_s: float = key(
+        "after a stop a drive may go on by itself within this time: it is looked at "
+        "for so long", 2.0, 2.0, 60,
+    )  # fmt: skip
     broadcast_stop: bool = key("every unit of a serial line obeys its stop to 0", False)
     enable: Writes | None = key("`write`: switch the power stage on", None)
     alarm_reset: Writes | None = key("`write`: reset an alarm", None)

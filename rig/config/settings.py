@@ -113,6 +113,12 @@ class ImuSettings(Section):
                 yield f"allow: must hold IP addresses, got {address!r}"
         if self.format == "sensorlogger" and self.transport != "listen":
             yield "transport: must be listen: Sensor Logger pushes its messages"
+        angles = self.quaternion_columns or self.columns
+        if len(set(angles)) < len(angles):
+            which = "quaternion_columns" if self.quaternion_columns else "columns"
+            yield f"{which}: must differ, got {list(angles)}"
+        if self.format != "sensorlogger" and self.stamp_column in angles:
+            yield f"stamp_column: {self.stamp_column} is also one of the angles"
         named = (*self.columns, *(self.quaternion_columns or ()), self.stamp_column)
         if self.column_count and max(named) >= self.column_count:
             yield f"column_count: {self.column_count} is too few for the columns named"

@@ -24,13 +24,21 @@ from rig.core.bus import Bus, BusError, Rejected
 from rig.core.drive import Drive, Status
 from rig.core.faults import LimitError, MotionFault, Requests, StopRequested
 from rig.core.phone import Imu
-from rig.core.proof import Proof
+from rig.core.proof import Proof, Turns
 from rig.core.stop import Stopper
-from rig.journal import DeviceRecord, Record, RunFolder
+from rig.journal import SIGN_CHECKED, DeviceRecord, Record, RunFolder
 
 LOOK_S = 0.002  # between two looks for a reading
 OVERDUE_S = 0.3  # of a stop that was asked for and that no loop has answered
 TICK_S = 0.05  # of the heartbeat
+
+
+class Pace(NamedTuple):
+    """How fast a drive was in its longest move so far."""
+
+    way_deg: float
+    asked_deg_s: float
+    seen_deg_s: float  # at least
 
 
 class Posture(NamedTuple):
@@ -216,7 +224,15 @@ class Device:
         self.drives = [Drive(self.bus, axis) for axis in config.axes]
         self.stopper = Stopper(self.drives, run.emit)
         self.requests = requests or Requests()
-        self.proof = Proof(config.axes, record.missing(config) is None, simulated)
+        self.simulated = simulated
+        turns, checked = Turns.of(record), not record.missing(config, SIGN_CHECKED)
+        gains = turns.gains if turns and checked else [None] * len(config.axes)
+        self.proof = Proof(config.axes, checked, simulated, gains)
+        self.shown = False  # each axis has turned the phone as `axes` saw it
+        self.paces: dict[str, Pace] = {}  # by axis
+        self.last_move: tuple[str, Pulses, Pulses] | None = None  # label, from, to
+        self.rest: Pulses | None = None  # where it arrived,
+        self.targets: list[int | None] = []  # and the drives' target registers then
         self.armed = self.pausing = False
         self.moves = 0  # frames that moved a drive
         self.arrived = 0.0  # monotonic time of the last arrival
@@ -272,6 +288,30 @@ class Device:
                 f"{axis.name} stands at {status.position} pulses, outside its limits "
                 f"{axis.min_pulses}..{axis.max_pulses}. Run `jaxcal-rig home`"
             )
+
+    def check_untouched(self, here: Pulses) -> None:
+        """Nobody else has moved or stopped a drive since the last arrival.
+
+        Raises:
+            MotionFault: its position, or the target that it holds, is another.
+        """
+        tolerance = self.config.motion.position_tolerance_deg
+        for drive, at, was in zip(self.drives, here, self.rest or here, strict=True):
+            if abs(at - was) > drive.axis.pulses_within(tolerance):
+                raise MotionFault(
+                    f"{drive.axis.name} stands at {drive.axis.to_deg(at):.3f} deg and "
+                    f"was left at {drive.axis.to_deg(was):.3f}: something else moved it"
+                )
+        for drive, held in zip(self.drives, self.targets, strict=bool(self.targets)):
+            if held is not None and drive.held() not in (None, held):
+                raise MotionFault(
+                    f"the target of {drive.axis.name} was written since it arrived: "
+                    "another controller moved or stopped the drives"
+                )
+
+    def untrack(self) -> None:
+        """A move begins, or was cut short: where the drives stand is no arrival."""
+        self.rest, self.targets = None, []
 
     def guard(self, moving: bool = False) -> None:
         """The loop is alive; raise StopRequested where a stop was asked for."""

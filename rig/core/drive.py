@@ -15,6 +15,8 @@ from rig.core.faults import LimitError, MotionFault
 POLL_S = 0.05
 PASSING = (5, 6, 8, 10, 11)  # exceptions: acknowledge, busy, CRC; silence at a gateway
 START_S = 0.2  # a drive that has taken a move shows it within this time
+STILL_COUNTS = 2  # between two readings of a position that flickers by one count
+LOOKS = 4  # for two readings that agree
 HOME = 2**30  # a count that no drive shows when it is switched on
 
 
@@ -24,7 +26,8 @@ class Status:
 
     word: int
     position: int  # pulses
-    time: float  # monotonic seconds
+    asked: float  # monotonic seconds before it was asked, ...
+    time: float  # ... and once it had answered
     enabled: bool
     done: bool
     moving: bool
@@ -70,17 +73,32 @@ class Drive:
         """
         if retries is None:
             retries = 2 * self.bus.settings.read_retries + 1
-        status = self.axis.map.status
+        status, asked = self.axis.map.status, time.monotonic()
         word = self.read(status, retries)
         count = self.read(self.axis.map.position, retries)
         if self._origin is None:
             self._origin = HOME if count > HOME // 2 else 0
         position, flags = count - self._origin, status.flags(word)
-        self.last = Status(word, position, time.monotonic(), **flags)
+        self.last = Status(word, position, asked, time.monotonic(), **flags)
         return self.last
 
+    def standing(self, retries: int | None = None) -> Status:
+        """Status of a drive that stands: two readings of its position that agree.
+
+        One reading may be mangled and look whole. Where no two agree it is the last.
+        """
+        new = self.last is None
+        status = self.status(retries)
+        for _ in range(LOOKS):
+            before, status = status, self.status(retries)
+            if abs(status.position - before.position) <= STILL_COUNTS:
+                break
+            if new:  # or the mangled one has told the origin
+                self.forget_origin()
+        return status
+
     def sound(self) -> Status:
-        """Status; MotionFault where the fault bit is set."""
+        """Status; MotionFault where the fault bit is set, or the power stage is off."""
         status = self.status()
         if status.fault:
             text = ""
@@ -90,6 +108,11 @@ class Drive:
             raise MotionFault(
                 f"{self.axis.name}: {text}. The drive has stopped itself. Find the "
                 "cause in its manual, then go on with --reset-alarms"
+            )
+        if not status.enabled:
+            raise MotionFault(
+                f"the power stage of {self.axis.name} was switched off while armed. "
+                "Look for an emergency stop, STO, its supply or another controller"
             )
         return status
 
@@ -143,10 +166,8 @@ class Drive:
 
     def _target(self) -> int | None:
         """The target that the drive holds; None where it cannot be read."""
-        if read := self.axis.map.target:
-            with contextlib.suppress(Rejected):
-                return self.read(read) - self.origin
-        return None
+        held = self.held()
+        return None if held is None else held - self.origin
 
     def mirror_limits(self) -> None:
         """Write the axis's soft limits into the drive, as far as it can count."""
@@ -159,6 +180,17 @@ class Drive:
     def stop(self) -> None:
         """Quick stop; torque stays on."""
         self.write(self.axis.map.stop)
+
+    def hold(self, pulses: int) -> None:
+        """Make a place where it stands the target that it holds, without a move."""
+        self.write(self.axis.map.hold, position=pulses + self.origin)
+
+    def held(self) -> int | None:
+        """The target register as it reads, None where it cannot be read."""
+        read = self.axis.map.target
+        with contextlib.suppress(Rejected):
+            return self.read(read) if read else None
+        return None
 
     def write(self, table: Writes | None, **values: int) -> None:
         """Send the frames of one of the map's tables; none where the map lacks it.

@@ -45,6 +45,16 @@ class NotFollowing(MotionFault):
         super().__init__(text)
 
 
+class EndedShort(MotionFault):
+    """A drive stands off its target and says that it is done: somebody stopped it, or
+    it reached a limit of its own."""
+
+    def __init__(self, text: str, axis: str, pulses: int) -> None:
+        self.axis = axis
+        self.pulses = pulses  # where it stands
+        super().__init__(text)
+
+
 class Unreachable(RuntimeError):
     """The device is sound but cannot get there: leave this posture out."""
 

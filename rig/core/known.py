@@ -73,7 +73,7 @@ def _exchanged(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
 
 def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
     """Why the drive's pulses may no longer mean the place that they meant."""
-    axis, status = drive.axis, drive.status()
+    axis, status = drive.axis, drive.standing()
     pulses, homed = record.left()
     left = pulses.get(axis.name, status.position)
     if axis.map.absolute_encoder:
@@ -115,7 +115,7 @@ def leave(drives: Sequence[Drive], record: DeviceRecord) -> None:
     for drive in drives:
         try:
             with drive.bus.urgent():  # also after a stop, when nothing else is sent
-                status = drive.status(retries=0)
+                status = drive.standing(retries=0)
                 alarm = drive.alarm() or "no code given" if status.fault else ""
         except BusError:
             positions.append(None)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from typing import NamedTuple
 
-from rig.config.axis import Pulses
+from rig.config.axis import Axis, Pulses
 from rig.core.bus import BusError, Rejected
-from rig.core.device import Device, Posture, approach, check_plan
-from rig.core.drive import START_S, Drive, Status, refusal
-from rig.core.faults import MotionFault, Unreachable
-from rig.core.stop import STILL_COUNTS
+from rig.core.device import Device, Pace, Posture, approach, check_plan
+from rig.core.drive import START_S, STILL_COUNTS, Drive, Status, refusal
+from rig.core.faults import EndedShort, MotionFault, Unreachable
 
 DEADLINE_FACTOR, DEADLINE_SLACK_S = 2.0, 2.0  # of a move's computed time, and more
 FOLLOWING_DEG = 3.0  # a drive may leave its way by
+TOO_FAST = 1.6  # times the speed that is asked for: more is a fault
+SPAN_S = 0.5  # over which a speed is taken, or from the start of the move
 LAG_S = 0.1  # of the phone behind a move that is longer than those before
 
 
@@ -30,7 +32,8 @@ def move(device: Device, posture: Posture) -> Standing:
 
     Raises:
         LimitError: the target leaves the limits; nothing was sent.
-        Unreachable: a drive refused the target or ended short of it.
+        Unreachable: a drive refused the target.
+        EndedShort: a drive ended short of it.
         MotionFault, BusError, ImuError, StopRequested: stop everything.
     """
     if not device.armed:
@@ -50,6 +53,7 @@ def _piece(device: Device, goal: Pulses, label: str) -> bool:
     connection, attitude = device.imu.connections, device.attitude(device.arrived)
     starts = device.statuses()
     here = tuple(start.position for start in starts)
+    device.check_untouched(here)
     way = config.to_deg(goal) - config.to_deg(here)
     steps = math.ceil(float(abs(way).max()) / config.motion.max_step_deg - 1e-9)
     end = goal
@@ -58,22 +62,27 @@ def _piece(device: Device, goal: Pulses, label: str) -> bool:
     end = proof.begin(device.imu, attitude, here, end)
     for index, drive in enumerate(device.drives):
         drive.axis = proof.paced(index, end[index] - here[index])
+    device.untrack()  # until it arrives
+    device.last_move = label, here, end
     device.heartbeat.feed(moving=True)
     try:
-        for drive, start, pulses in zip(device.drives, starts, end, strict=True):
+        for index, (drive, pulses) in enumerate(zip(device.drives, end, strict=True)):
+            start = starts[index]
             device.guard(moving=True)
             if start.position == pulses and start.done:
                 continue
             device.moves += 1
             device.emit(
                 "command", number=device.moves, label=label, axis=drive.axis.name,
-                pulses=pulses,
+                pulses=pulses, start=start.position,
             )  # fmt: skip
+            starts[index] = dataclasses.replace(start, asked=time.monotonic())
             _send(device, drive, start, pulses)
-        _watch(device, here, end, connection)
+        _watch(device, starts, end, connection)
     finally:
         device.heartbeat.feed(moving=False)
     device.arrived = time.monotonic()
+    device.rest, device.targets = end, [drive.held() for drive in device.drives]
     if proof.grows(here, end) and connection == device.imu.connections:
         proof.saw(here, end, device.attitude(device.arrived + LAG_S))
     return end == goal
@@ -106,27 +115,35 @@ def _send(device: Device, drive: Drive, start: Status, pulses: int) -> None:
             device.guard(moving=True)  # no move once a stop was asked for
 
 
-def _watch(device: Device, here: Pulses, target: Pulses, connection: int) -> None:
+def _watch(
+    device: Device, starts: list[Status], target: Pulses, connection: int
+) -> None:
     """Poll until all three stand on their targets, or something is wrong."""
     motion, begun, most_s = device.config.motion, time.monotonic(), 0.0
+    here = tuple(start.position for start in starts)
     for drive, a, b in zip(device.drives, here, target, strict=True):
         speed, accel = drive.axis.drive_motion
         most_s = max(most_s, abs(drive.axis.to_deg(b - a)) / speed + speed / accel)
     most_s = DEADLINE_FACTOR * most_s + DEADLINE_SLACK_S
     last = [(position, begun) for position in here]
+    seen = [[start] for start in starts]
     while True:
         device.guard(moving=True)
-        arrived = 0
+        late = []
         for index, drive in enumerate(device.drives):
             axis, goal, start = drive.axis, target[index], here[index]
             status = drive.sound()
+            seen[index].append(status)
+            _check_speed(device, axis, seen[index])
             tolerance = axis.pulses_within(motion.position_tolerance_deg)
             if abs(status.position - goal) <= tolerance:
                 # A short move ends within the tolerance before it has begun.
                 half = 2 * abs(status.position - start) >= abs(goal - start)
                 begins = not half and status.time - begun < START_S
-                arrived += status.done and not status.moving and not begins
+                if not status.done or status.moving or begins:
+                    late.append(axis.name)
                 continue
+            late.append(axis.name)
             begin, end, angle = map(axis.to_deg, (start, goal, status.position))
             low, high = min(begin, end) - FOLLOWING_DEG, max(begin, end) + FOLLOWING_DEG
             if not low <= angle <= high:
@@ -141,24 +158,52 @@ def _watch(device: Device, here: Pulses, target: Pulses, connection: int) -> Non
                 left = abs(end - angle)
                 moved = abs(status.position - start) > tolerance
                 if status.done and not status.moving and moved:
-                    raise Unreachable(
-                        f"{axis.name} ended {left:.3f} deg short of its target"
-                    )
+                    raise EndedShort(
+                        f"{axis.name} ended {left:.3f} deg short of its target, at "
+                        f"{angle:.3f} deg, and its drive says that it is done. Look "
+                        "who stopped it: another controller, an emergency stop that "
+                        "was released, a limit of the drive itself",
+                        axis.name, status.position,
+                    )  # fmt: skip
                 raise MotionFault(
                     f"{axis.name} does not follow: it stands {left:.3f} deg from "
                     f"its target for {stood:.2f} s (limit motion.stall_s = "
                     f"{motion.stall_s:g}). Look for an obstacle, a loose coupling, "
                     "or a drive that is not enabled"
                 )
-        if arrived == len(device.drives):
+        if not late:
             return
         if time.monotonic() > begun + most_s:
             raise MotionFault(
-                f"the move took longer than its deadline, {most_s:.2f} s. Check the "
-                "drives' speed and load"
+                f"{', '.join(late)} does not follow: the move took longer than its "
+                f"deadline, {most_s:.2f} s. Check the drives' speed and load"
             )
         _check_attitude(device, connection)
         time.sleep(motion.poll_s)
+
+
+def _check_speed(device: Device, axis: Axis, seen: list[Status]) -> None:
+    """A drive is no faster than it was told to be.
+
+    It was where it was at some time after it was asked and before it answered, so that
+    a slow reply makes no speed.
+    """
+    (first, *_, last), asked = seen, axis.drive_motion[0]
+    marks = [s for s in seen[1:-1] if last.time - s.asked > SPAN_S]
+    ways = [
+        (abs(axis.to_deg(last.position - s.position)), last.time - s.asked)
+        for s in (first, *marks[-1:])
+    ]
+    speed = max(way / seconds for way, seconds in ways)
+    before, way = device.paces.get(axis.name), ways[0][0]
+    if before is None or way > before.way_deg:
+        device.paces[axis.name] = Pace(way, asked, speed)
+    if speed > TOO_FAST * asked and not device.simulated:
+        raise MotionFault(
+            f"{axis.name} moves at {speed:.3g} deg/s or faster, and was told to move "
+            f"at {asked:.3g}: the drive does not take its speed. Check `units` and "
+            f"`move` of the map {axis.map.name}, pulses_per_rev and reduction"
+        )
 
 
 def _check_attitude(device: Device, connection: int) -> None:

@@ -8,8 +8,8 @@ the phone as far as it may, by what it was seen to turn for each pulse. Nothing 
 seen in a unit that is not proved, allows UNSEEN_MOTOR_DEG of the motor and no more.
 
 An axis that was checked with this same file (SIGN_CHECKED) has its gearing, direction
-and the phone's unit from there. In a new session it still begins with SHOWN_DEG of its
-joint, and grows while the phone turns no further than the axes are moved.
+and the phone's unit from there. In a new session it still begins with FIRST_DEG of its
+joint, and grows while the phone turns no further than `axes` saw it turn.
 
 `motion` asks before every frame that moves, and looks after it; there is no other way.
 """
@@ -18,18 +18,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from rig.config import RigConfig
 from rig.config.axis import Axis, Pulses
 from rig.config.settings import ImuSettings
 from rig.core.attitude import Array, angle_between_deg, matrix_to_euler
 from rig.core.faults import MotionFault
 from rig.core.phone import Imu
+from rig.journal import SIGN_CHECKED, DeviceRecord
 
 FIRST_MOTOR_DEG = 0.36
 UNSEEN_MOTOR_DEG = 36.0
-SHOWN_DEG = 1.0  # of a checked joint, in its first move of a session
+FIRST_DEG = 0.25  # of a checked joint, in its first move of a session
 GROWTH = 4.0  # play of a third of a move can hide it
 LOOK_S = 0.5  # time that a move takes at least, of which little is known
 SLOW_DEG_S = 5.0  # of the joint, once the phone has shown what a pulse turns
@@ -37,6 +41,7 @@ NOISE_DEG = 0.1  # of the phone, just after a move
 ALLOWED_DEG = 9.0  # that the phone may turn from where an unproved device began
 TOO_FAR = 2.0  # times what checked axes are moved, and MARGIN_DEG: more is a fault
 MARGIN_DEG = 1.0
+SAME = 4 / 3, 0.3  # likewise where it is known what `axes` saw, of one axis alone
 SEEN_SHARE = 0.1  # of a checked axis's move must be seen, or the moves do not grow
 BLIND = (
     "The phone has shown no turn: look for a loose coupling, a stream that does not "
@@ -48,6 +53,37 @@ NO_UNIT = (
 )
 RADIANS = 180.0 / math.pi
 LARGEST_RAD = 2.0 * math.pi + 0.1  # no larger number is an angle in radians
+
+
+class Turns(NamedTuple):
+    """Turns of the phone, in its own frame, for a commanded degree of each axis."""
+
+    pulses: Array  # (3,) where they were measured
+    deg: Array  # (3, 3) columns, rotation vectors in degrees
+
+    @classmethod
+    def of(cls, record: DeviceRecord) -> Turns | None:
+        """As `axes` saw them; None where the record does not say."""
+        told = (record.state(SIGN_CHECKED) or {}).get("turns")
+        return told and cls(np.array(told["pulses"]), np.array(told["deg"]))
+
+    @property
+    def gains(self) -> list[float]:
+        """Degrees of the phone for a commanded one of each axis."""
+        return [float(size) for size in np.linalg.norm(self.deg, axis=0)]
+
+    def at(self, config: RigConfig, pulses: Pulses) -> Array:
+        """The same columns where the device counts other pulses.
+
+        In the phone's frame a joint's axis turns with the joints that it carries.
+        """
+        turns, away = self.deg.copy(), config.to_deg(np.subtract(pulses, self.pulses))
+        chain = [config.letters.index(letter) for letter in config.mechanism.order]
+        for place, joint in enumerate(chain):
+            for inner in chain[place + 1 :]:
+                turn = Rotation.from_rotvec(self.deg[:, inner] * away[inner], True)
+                turns[:, joint] = turn.inv().apply(turns[:, joint])
+        return turns
 
 
 def unit_proved(imu: ImuSettings, attitude: Array) -> bool:
@@ -65,8 +101,15 @@ def unit_proved(imu: ImuSettings, attitude: Array) -> bool:
 class Reach:
     """What one axis may be sent, in pulses, by the moves so far."""
 
-    def __init__(self, axis: Axis, factor: float = 1.0, checked: bool = False) -> None:
+    def __init__(
+        self,
+        axis: Axis,
+        factor: float = 1.0,
+        checked: bool = False,
+        gain: float | None = None,
+    ) -> None:
         self.axis = axis
+        self.gain = gain  # degrees of the phone for a commanded one, as `axes` saw
         self.checked = checked
         self.factor = factor  # RADIANS where the phone's unit is not proved
         self.seen = checked  # the phone has turned, in a unit that is proved
@@ -74,8 +117,8 @@ class Reach:
         # most in that move.
         self.longest = self.deg_per_pulse = 0.0
         if checked:
-            self.deg_per_pulse = 1.0 / abs(axis.pulses_per_deg)
-            self.longest = SHOWN_DEG / self.deg_per_pulse / GROWTH
+            self.deg_per_pulse = (gain or 1.0) / abs(axis.pulses_per_deg)
+            self.longest = FIRST_DEG * abs(axis.pulses_per_deg) / GROWTH
 
     def pulses(self, wanted: float, most_deg: float = math.inf) -> int:
         """Pulses, at least 1, of the next move towards a wanted count.
@@ -142,11 +185,19 @@ class Proof:
     """What is proved of the three axes of a device that is armed."""
 
     def __init__(
-        self, axes: Sequence[Axis], checked: bool, simulated: bool = False
+        self,
+        axes: Sequence[Axis],
+        checked: bool,
+        simulated: bool = False,
+        gains: Sequence[float | None] = (None, None, None),
     ) -> None:
         self.axes = axes
-        self.reaches = [Reach(axis, checked=checked) for axis in axes]
+        self.reaches = [
+            Reach(axis, checked=checked, gain=gain)
+            for axis, gain in zip(axes, gains, strict=True)
+        ]
         self._paced = not simulated  # what is not real need not be slow
+        self.ceiling_deg_s: float | None = None  # of the speed of every axis
         self._near: tuple[Array, float] | None = None
         self._start: Pulses | None = None  # where the unproved axes began
         self._unit_seen = False  # whether the phone's is proved was looked at
@@ -196,8 +247,10 @@ class Proof:
         if share < 1.0:
             each = zip(here, goal, strict=True)
             goal = tuple(a + round((b - a) * share) for a, b in each)
-        ways = zip(self.axes, here, goal, strict=True)
-        way = sum(abs(axis.to_deg(b - a)) for axis, a, b in ways)
+        ways = zip(self.reaches, here, goal, strict=True)
+        way = sum(
+            abs(reach.axis.to_deg(b - a)) * (reach.gain or 1.0) for reach, a, b in ways
+        )
         connection, world = self._heading
         same = imu.connections == connection and imu.world is world
         if unproved:
@@ -212,7 +265,8 @@ class Proof:
     def paced(self, index: int, pulses: int) -> Axis:
         """An axis at the speed at which it may move by so many pulses."""
         reach = self.reaches[index]
-        return reach.paced(pulses) if self._paced else reach.axis
+        axis = reach.paced(pulses) if self._paced else reach.axis
+        return slowed(axis, self.ceiling_deg_s) if self.ceiling_deg_s else axis
 
     def grows(self, here: Pulses, end: Pulses) -> bool:
         """A move is longer than those before: the phone must be looked at after it."""
@@ -237,9 +291,24 @@ class Proof:
         """The phone once the move from here has ended."""
         self.watch(attitude)
         turned = angle_between_deg(self._before, attitude)
+        alone = [i for i in range(len(here)) if here[i] != end[i]]
+        if len(alone) == 1:
+            self._compare(alone[0], abs(end[alone[0]] - here[alone[0]]), turned)
         for reach, a, b in zip(self.reaches, here, end, strict=True):
             if a != b:
                 reach.saw(abs(b - a), turned, NOISE_DEG)
+
+    def _compare(self, index: int, pulses: int, turned_deg: float) -> None:
+        """A move of one checked axis turned the phone no further than `axes` saw."""
+        reach, (most, margin) = self.reaches[index], SAME
+        expected = pulses * reach.deg_per_pulse
+        if reach.checked and reach.gain and turned_deg > most * expected + margin:
+            raise MotionFault(
+                f"{reach.axis.name} turned the phone by {turned_deg:.2f} deg in a move "
+                f"that turned it by {expected:.2f} when `axes` looked: its drive, its "
+                "setting or its gearbox was exchanged. Correct it, then run "
+                "`jaxcal-rig axes`"
+            )
 
 
 def slowed(axis: Axis, speed_deg_s: float | None = None) -> Axis:

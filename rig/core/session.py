@@ -24,14 +24,24 @@ from rig.core import known
 from rig.core.attitude import Array, angle_between_deg, frame_at
 from rig.core.device import Device, Posture, check_plan
 from rig.core.drive import Drive
-from rig.core.faults import MotionFault, NotFollowing, Requests, Unreachable, ending
+from rig.core.faults import (
+    EndedShort,
+    MotionFault,
+    NotFollowing,
+    Requests,
+    Unreachable,
+    ending,
+)
+from rig.core.joints import show
 from rig.core.measure import measure, zeroed
 from rig.core.motion import Standing, move
+from rig.core.phone import ImuError
 from rig.journal import ZEROED, BusLock, DeviceRecord, Record, RunFolder
 
 STREAM_WAIT_S = 60.0  # time to start the app on the phone
 LEAST_TURN_DEG = 0.05  # of the phone's heading: less is its noise
 ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
+SAME_PLACE_DEG = 0.5  # two places where an axis ended short of one target
 Check = Callable[[RigConfig, Sequence[Drive], DeviceRecord], None]
 Beside = Callable[[Device], contextlib.AbstractContextManager[Any]]
 
@@ -95,6 +105,31 @@ def open_device(
                 if all(result.standing for result in results):  # `stop` waits for it
                     gone = run.journal.records[0].get("simulated") is not None
                     lock.stood(forget=gone)
+                if reason and not all(r.standing for r in device.stopper.stay()):
+                    lock.leave(config)
+                if reason and device.last_move:
+                    device.emit("last_move", **_last_move(device))
+
+
+def _last_move(device: Device) -> Record:
+    """What moved last, from where to where, and where drives and phone are now."""
+    assert device.last_move is not None
+    config, (label, start, end) = device.config, device.last_move
+    stands = [result.position for result in device.stopper.results]
+    phone = None
+    with contextlib.suppress(ImuError):
+        if device.oriented and device.frame:
+            phone = device.frame.angles(device.imu.latest().matrix).round(3).tolist()
+    return {
+        "label": label,
+        "from_deg": config.to_deg(start).round(3).tolist(),
+        "to_deg": config.to_deg(end).round(3).tolist(),
+        "drives_deg": [
+            None if at is None else round(axis.to_deg(at), 3)
+            for axis, at in zip(config.axes, stands, strict=True)
+        ],
+        "phone_deg": phone,
+    }
 
 
 def _close(device: Device) -> None:
@@ -130,12 +165,16 @@ def take_zero(
     if zeros := run.journal.events("zero"):
         before = Posture("reference", tuple(zeros[-1]["pulses"]))
         if run.postures():
+            show(device)
             attitude = np.array(zeros[-1]["attitude"])
             zeroed(device, frame_at(config, attitude), before)
             return _check_reference(device, before)
         at = at or before.pulses
     elif at is None and config.session.zero == "drive":
         at = (0, 0, 0)
+    moves = at is not None or config.motion.approach_overshoot_deg > 0
+    if moves:  # or the zero is measured first, where the device was put
+        show(device)
     device.emit("phase", phase="zeroing")
     zero = Posture("zero", at or device.positions())
     standing = Standing(device, zero)
@@ -151,6 +190,8 @@ def take_zero(
     attitude = np.array(found["attitude"])
     _compare_zero(device, zero.pulses, attitude, kept)
     device.emit("zero", sync=True, **found)
+    zeroed(device, frame_at(config, attitude), zero)
+    show(device)
     zeroed(device, frame_at(config, attitude), zero)
 
 
@@ -228,6 +269,7 @@ def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
     if name in (measured := run.postures()):
         return measured[name]
     if any(record["name"] == name for record in run.journal.events("unreachable")):
+        _check_lost(device)
         return None
     device.requests.check_pause()
     device.emit("visit", name=name, pulses=list(posture.pulses))
@@ -240,13 +282,57 @@ def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
         if fault.suspects:
             device.emit("void", sync=True, names=fault.suspects)
         raise
+    except EndedShort as fault:
+        ended = {"name": name, "axis": fault.axis, "pulses": fault.pulses}
+        twice = _ended_there(device, ended)
+        device.emit("ended_short", sync=True, **ended)
+        if not twice:  # going on is typed
+            raise
+        _leave_out(device, name, f"{fault}. It ended there before")
+        return None
     except Unreachable as reason:
-        results = device.stopper.stop(str(reason), latch=False)
-        if not all(result.standing for result in results):
-            raise MotionFault(f"{reason}, and not all drives stand") from None
-        device.emit("unreachable", sync=True, name=name, reason=str(reason))
+        _leave_out(device, name, str(reason))
         return None
     device.emit("phase", phase="saving")
     record = device.emit("posture", sync=True, name=name, **found, **fields)
     device.requests.check_pause()
     return record
+
+
+def _ended_there(device: Device, ended: Record) -> bool:
+    """The same axis ended short at the same place before, on the way to a posture."""
+    axis = next(axis for axis in device.config.axes if axis.name == ended["axis"])
+    return any(
+        (record["name"], record["axis"]) == (ended["name"], ended["axis"])
+        and abs(record["pulses"] - ended["pulses"])
+        <= axis.pulses_within(SAME_PLACE_DEG)
+        for record in device.run.journal.events("ended_short")
+    )
+
+
+def _leave_out(device: Device, name: str, reason: str) -> None:
+    """Go on without a posture that is out of reach, once all drives stand.
+
+    Raises:
+        MotionFault: they do not, or that is one more than may be.
+    """
+    results = device.stopper.stop(reason, latch=False)
+    if not all(r.standing for r in results) or not all(
+        r.standing for r in device.stopper.stay()
+    ):
+        raise MotionFault(f"{reason}, and not all drives stand")
+    device.untrack()
+    device.emit("unreachable", sync=True, name=name, reason=reason)
+    _check_lost(device)
+
+
+def _check_lost(device: Device) -> None:
+    """No more postures are out of reach than may be."""
+    most = device.config.session.max_unreachable
+    lost = {record["name"] for record in device.run.journal.events("unreachable")}
+    if len(lost) > most:
+        raise MotionFault(
+            f"{len(lost)} postures are out of reach, more than session.max_unreachable "
+            f"({most}). Narrow session.*_range_deg to what the device reaches, and "
+            "begin a new run"
+        )

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rig.core.bus import Bus
-from rig.core.drive import Drive
+from rig.core.drive import STILL_COUNTS, Drive
 from rig.core.faults import EXIT_FAULT, StopRequested
 
 ROUNDS = 3  # times a stop is sent to a unit that does not acknowledge
@@ -24,7 +24,8 @@ QUICK_S = 0.05  # for a reply in the first round, besides the time of the frames
 FRAME_BITS = 2 * 24 * 11  # of a stop and its reply on a serial line, at most
 VERIFY_S = 3.0  # for all units together to come to rest
 POLL_S = 0.02
-STILL_COUNTS = 2  # between two readings of a position that flickers by one count
+LOOK_S = 0.1  # between two looks at drives that stand
+WENT_ON_S = 0.5  # a drive that took longer to stand is said to have gone on
 
 
 @dataclasses.dataclass
@@ -36,6 +37,7 @@ class UnitStop:
     acknowledged: bool = False  # the drive answered the stop
     standing: bool = False  # its status says so, and its position holds still
     detail: str = ""
+    position: int | None = None  # pulses, as last read
 
     def __str__(self) -> str:
         state = "acknowledged" if self.acknowledged else "NOT acknowledged"
@@ -64,7 +66,7 @@ def stop_all(drives: list[Drive]) -> list[UnitStop]:
     bus, pairs = drives[0].bus, list(zip(drives, results, strict=True))
     with bus.urgent():
         with bus.urgent(_quick_s(bus)):
-            _broadcast(drives)
+            broadcast(drives)
             _send(pairs)
         for _ in range(ROUNDS - 1):
             _send(pairs)
@@ -80,11 +82,17 @@ def _responsive_first(pairs: Pairs) -> Pairs:
     return sorted(pairs, key=lambda pair: pair[0].axis.unit in pair[0].bus.silent)
 
 
-def _broadcast(drives: list[Drive]) -> None:
-    """One frame for all of a serial line, where all are of a family that takes it."""
+def takes_broadcast(drives: list[Drive]) -> bool:
+    """Whether one frame stops all: a serial line, and all of a family that takes it."""
     bus, family = drives[0].bus, drives[0].axis.map
     alike = all(drive.axis.map.stop == family.stop for drive in drives)
-    if bus.settings.transport != "tcp" and alike and family.broadcast_stop:
+    return bus.settings.transport != "tcp" and alike and family.broadcast_stop
+
+
+def broadcast(drives: list[Drive]) -> None:
+    """Stop all by one frame, where they take it."""
+    bus, family = drives[0].bus, drives[0].axis.map
+    if takes_broadcast(drives):
         with contextlib.suppress(Exception):  # an extra: each gets its own as well
             for frame in family.stop.write:
                 words = frame.registers(family.word_order)
@@ -104,7 +112,8 @@ def _send(pairs: Pairs) -> None:
 
 def _verify(pairs: Pairs) -> None:
     """Poll until each stands; one that answers again is told to stop once more."""
-    end = time.monotonic() + VERIFY_S
+    begun = time.monotonic()
+    end = begun + VERIFY_S
     before: dict[str, int] = {}
     while moving := [pair for pair in pairs if not pair[1].standing]:
         for drive, result in _responsive_first(moving):
@@ -120,12 +129,61 @@ def _verify(pairs: Pairs) -> None:
             last = before.get(result.axis)
             still = last is not None and abs(status.position - last) <= STILL_COUNTS
             result.standing = still and not status.moving
-            before[result.axis] = status.position
+            before[result.axis] = result.position = status.position
             if result.standing and result.acknowledged:
-                result.detail = "alarm" if status.fault else ""
+                gone = time.monotonic() - begun
+                late = f"it went on for {gone:.1f} s" * (gone > WENT_ON_S)
+                result.detail = "alarm" if status.fault else late
         if time.monotonic() > end:
             return
         time.sleep(POLL_S)
+
+
+def stay(drives: list[Drive], results: list[UnitStop], seconds: float) -> list[str]:
+    """Look whether drives that stand go on by themselves; one that does is stopped.
+
+    Where the map can, what they stand at becomes their target first. A drive without
+    power may sink; that is no restart.
+
+    Returns:
+        What went on, in words. ``results`` are of the end of the look.
+    """
+    pairs = list(zip(drives, results, strict=True))
+    words: list[str] = []
+    for _ in range(ROUNDS):
+        standing = [pair for pair in pairs if pair[1].standing]
+        for drive, result in standing:
+            with contextlib.suppress(Exception), drive.bus.urgent():
+                drive.hold(result.position or 0)
+        again = _restarted(standing, time.monotonic() + seconds)
+        if not again:
+            break
+        words += [f"{result.axis} went on by itself after its stop" for result in again]
+        for new, result in zip(stop_all(drives), results, strict=True):
+            vars(result).update(vars(new))
+    return words
+
+
+def _restarted(pairs: Pairs, end: float) -> list[UnitStop]:
+    """Of drives that stood those that move again before a time."""
+    while time.monotonic() < end:
+        time.sleep(LOOK_S)
+        moved = []
+        for drive, result in pairs:
+            with contextlib.suppress(Exception), drive.bus.urgent():
+                status = drive.standing()
+                powered = status.enabled and not status.fault
+                way = abs(status.position - (result.position or 0))
+                if powered and (status.moving or way > STILL_COUNTS):
+                    moved.append(result)
+        if moved:
+            return moved
+    return []
+
+
+def stand_s(drives: list[Drive]) -> float:
+    """How long drives that stand are looked at."""
+    return max(drive.axis.map.restart_s for drive in drives)
 
 
 class Stopper:
@@ -146,6 +204,14 @@ class Stopper:
             self.results = stop_all(self.drives)
             units = [dataclasses.asdict(result) for result in self.results]
             self._emit("stop", reason=reason, units=units)
+            return self.results
+
+    def stay(self) -> list[UnitStop]:
+        """After a stop for a reason: look whether the drives stay where they stand."""
+        with self._lock:
+            words = stay(self.drives, self.results, stand_s(self.drives))
+            units = [dataclasses.asdict(result) for result in self.results]
+            self._emit("stayed", went_on=words, units=units)
             return self.results
 
     def check(self) -> None:

@@ -8,6 +8,7 @@ from rig.journal.device import (
     IDENTIFIED,
     SIGN_CHECKED,
     STATES,
+    STOP_PROVED,
     ZEROED,
     DeviceRecord,
 )
@@ -25,7 +26,7 @@ from rig.journal.run import (
 )
 
 __all__ = [
-    "HOMED", "IDENTIFIED", "JOURNAL", "SIGN_CHECKED", "STATES", "ZEROED", "BusLock",
-    "DeviceRecord", "Journal", "JournalError", "Record", "Refused", "RunFolder",
-    "is_written", "measured_postures", "new_run_folder", "read_journal",
+    "HOMED", "IDENTIFIED", "JOURNAL", "SIGN_CHECKED", "STATES", "STOP_PROVED",
+    "ZEROED", "BusLock", "DeviceRecord", "Journal", "JournalError", "Record", "Refused",
+    "RunFolder", "is_written", "measured_postures", "new_run_folder", "read_journal",
 ]  # fmt: skip

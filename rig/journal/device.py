@@ -2,7 +2,8 @@
 
 A device is trusted in steps: IDENTIFIED (these drives answer at these units), HOMED
 (the pulses mean a place), SIGN_CHECKED (each axis turns the joint it is named after,
-the way and about as far as it is told), ZEROED (the zero posture's attitude is known).
+the way and about as far as it is told), STOP_PROVED (every way to stop them was tried
+in a slow move, and stopped it), ZEROED (the zero posture's attitude is known).
 ARMED lives in a running process only. No step stands without those before it. A
 session needs all but the last, which it reaches itself before it measures.
 """
@@ -22,12 +23,13 @@ if TYPE_CHECKING:
     from rig.config import RigConfig
 
 IDENTIFIED, HOMED = "IDENTIFIED", "HOMED"
-SIGN_CHECKED, ZEROED = "SIGN_CHECKED", "ZEROED"
-STATES = (IDENTIFIED, HOMED, SIGN_CHECKED, ZEROED)
+SIGN_CHECKED, STOP_PROVED, ZEROED = "SIGN_CHECKED", "STOP_PROVED", "ZEROED"
+STATES = (IDENTIFIED, HOMED, SIGN_CHECKED, STOP_PROVED, ZEROED)
 COMMANDS = {
     IDENTIFIED: "scan",
     HOMED: "home",
     SIGN_CHECKED: "axes",
+    STOP_PROVED: "axes",
     ZEROED: "zero",
 }  # that reach a state
 
@@ -96,7 +98,7 @@ class DeviceRecord:
         self._states[name] = {
             "time": _now(),
             "evidence": evidence,
-            "fingerprint": config.device_fingerprint(),
+            "fingerprint": _fingerprint(name, config),
         }
         self._voided.pop(name, None)
         if name == HOMED:
@@ -110,12 +112,13 @@ class DeviceRecord:
                 self._voided[lost] = {"time": _now(), "reason": reason}
         self.save()
 
-    def missing(self, config: RigConfig, through: str = SIGN_CHECKED) -> str | None:
+    def missing(self, config: RigConfig, through: str = STOP_PROVED) -> str | None:
         """What keeps the states up to ``through`` from standing, and what to do."""
         needed = STATES[: STATES.index(through) + 1]
         for number, name in enumerate(needed):
             if (reason := self._fault(name, config)) is not None:
-                words = [f"`jaxcal-rig {COMMANDS[each]}`" for each in needed[number:]]
+                commands = dict.fromkeys(COMMANDS[each] for each in needed[number:])
+                words = [f"`jaxcal-rig {command}`" for command in commands]
                 return (
                     f"the device is not {name}: {reason}. Run {', then '.join(words)} "
                     f"(`jaxcal-rig setup` does all). Record: {self.path}"
@@ -129,7 +132,7 @@ class DeviceRecord:
         if known is None:
             lost = self._voided.get(name)
             return lost["reason"] if lost else "it never was"
-        then, now = known["fingerprint"], config.device_fingerprint()
+        then, now = known["fingerprint"], _fingerprint(name, config)
         if name in (IDENTIFIED, HOMED):  # pulses: no gearing, direction or phone in it
             drives = (".unit", ".map")
             then, now = (
@@ -161,6 +164,12 @@ class DeviceRecord:
         and did not say afterwards where it stands; and names of the axes whose drives
         said then that they are homed."""
         return self._left.get("pulses", {}), self._left.get("homed", [])
+
+
+def _fingerprint(name: str, config: RigConfig) -> dict[str, Any]:
+    """What of a configuration may not change while a state stands."""
+    stops = config.stop_fingerprint() if name == STOP_PROVED else {}
+    return config.device_fingerprint() | stops
 
 
 def _now() -> str:

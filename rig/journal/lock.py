@@ -130,6 +130,8 @@ class BusLock:
             "bus": config.bus.model_dump(),
             "silence_s": config.silence_s,
             "standing": False,
+            "device": str(config.device_path.resolve()),
+            "stand_s": max(axis.map.restart_s for axis in config.axes),
             "drives": [
                 {"name": axis.name, "unit": axis.unit, "map": axis.map.text}
                 for axis in config.axes

@@ -93,6 +93,8 @@ class Journal:
                 raise JournalError(f"{path}: a running session is writing it")
             self.records, self._size = _parse(path.read_bytes(), path)
             os.ftruncate(self._fd, self._size)
+            last = self.records[-1]["time"] if self.records else 0.0
+            self._clock = max(time.time(), last) - time.monotonic()
         except BaseException:
             self.close()
             raise
@@ -104,7 +106,8 @@ class Journal:
             JournalError: the disk is full or gone; the journal keeps its whole lines.
         """
         with self._lock:
-            now = round(time.time(), 4)
+            # A wall clock that is set meanwhile must not exchange two visits.
+            now = round(self._clock + time.monotonic(), 4)
             record = {"seq": len(self.records), "time": now, "event": event, **fields}
             line = json.dumps(record, allow_nan=False, separators=(",", ":")) + "\n"
             data = line.encode()

@@ -76,6 +76,8 @@ class SimDrive:
         self._set_to = 0  # what it was told to count at its origin
         self._enables = self._clears = math.inf  # when what was asked for is done
         self._comm_timeout = math.inf
+        self._resumes = math.inf  # when it goes on after a stop, as some drives do
+        self._resumed = self.target  # and where to
         places: list[Read | Write] = [*self.map.identity.values()]
         for _, value in self.map:
             places += [value] if isinstance(value, Read) else []
@@ -95,9 +97,13 @@ class SimDrive:
             self.enabled, self._enables = True, math.inf
         if now >= self._clears:
             self.alarm, self._clears = 0, math.inf
+        if now >= self._resumes and self.enabled and not self.alarm:
+            self._resumes = math.inf
+            self._move(self._resumed, self._speed, self._accel)
         watched = self.moving or self.truth.idle_watchdog
         lost = self._last_frame + self._comm_timeout
-        if watched and now > lost and not self._stopping and not self.alarm:
+        deaf = self._faults.take("watch_ignored", self._number)
+        if watched and now > lost and not (self._stopping or self.alarm or deaf):
             self._integrate(lost)
             self.comm_stops += 1
             self.alarm = COMM_ALARM
@@ -148,6 +154,24 @@ class SimDrive:
         self.advance()
         self.alarm, self.done, self._stopping = code, False, self.moving
 
+    @property
+    def travels(self) -> bool:
+        """It is in the middle of a move."""
+        self.advance()
+        return self.moving and not self._stopping and abs(self.velocity) > 0.0
+
+    def halt(self) -> None:
+        """Fault: another controller stops it; it says that it is done."""
+        self.advance()
+        self._stopping, self.done = self.moving, True
+
+    def cut(self, seconds: float) -> None:
+        """Fault: its power stage is off for a time, without an alarm."""
+        self.advance()
+        self.velocity, self.moving, self._stopping = 0.0, False, False
+        self.enabled, self.done = False, True
+        self._enables = time.monotonic() + seconds
+
     def find_origin(self) -> None:
         """Count from the motor's origin again, as homing ends."""
         self.position -= self.offset
@@ -184,7 +208,7 @@ class SimDrive:
         pairs = [bits for bits, holds in zip(named, on, strict=True) if bits and holds]
         return sum({1 << bit for bits in pairs for bit in bits.set})
 
-    def write(self, address: int, words: list[int]) -> None:
+    def write(self, address: int, words: list[int], broadcast: bool = False) -> None:
         """Write holding registers, and do what they mean."""
         self.advance()
         self._last_frame = time.monotonic()
@@ -204,7 +228,8 @@ class SimDrive:
                 self._registers = before
                 raise
         elif table := next((n for n in obey if self._begins(n, address, words)), None):
-            obey[table]()
+            if table != "stop" or not self._ignores_stop(broadcast):
+                obey[table]()
             self.advance()
         elif m.comm_timeout and address == m.comm_timeout.write[0].address:
             counts = self._value(m.comm_timeout, "timeout")
@@ -230,9 +255,17 @@ class SimDrive:
         words = [self._registers[address + i] for i in range(registers_of(kind))]
         return decode(words, kind, self.map.word_order)
 
-    def _stop(self) -> None:
+    def _ignores_stop(self, broadcast: bool) -> bool:
         self.stops.append(time.monotonic())
+        kinds = ("stop_ignored", *(("unit_stop_ignored",) if not broadcast else ()))
+        return any(self._faults.take(kind, self._number) for kind in kinds)
+
+    def _stop(self) -> None:
+        moved, goal, self._resumes = self.moving, self.target, math.inf
         self._stopping, self.target = self.moving, round(self.position)
+        if moved and (fault := self._faults.take("stop_resumes", self._number)):
+            seconds = 1.0 if fault.seconds is None else fault.seconds
+            self._resumes, self._resumed = time.monotonic() + seconds, goal
 
     def _reset(self) -> None:
         self._clears = time.monotonic() + self.truth.reset_delay_s
@@ -261,6 +294,9 @@ class SimDrive:
         speed *= per_rev if m.units.speed == "rev_per_s" else 1.0
         accel *= 1.0 if m.units.accel == "pulse_per_s2" else per_rev
         target = self._value(m.move, "position")
+        if fault := self._faults.take("fast_drive", self._number):
+            speed *= fault.factor or 20.0
+            accel *= (fault.factor or 20.0) ** 2
         if not self.travel[0] <= target - self._set_to <= self.travel[1]:
             raise DriveException(ILLEGAL_VALUE)
         self._move(target, speed, accel)

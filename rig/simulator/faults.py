@@ -1,4 +1,4 @@
-"""Faults on demand: ``kind@when,count=N,axis=NAME,seconds=S,share=P``."""
+"""Faults on demand: ``kind@when,count=N,axis=NAME,seconds=S,share=P,factor=F``."""
 
 from __future__ import annotations
 
@@ -22,6 +22,15 @@ KINDS = {
     "alarm": "the drive faults and stops itself",
     "stuck_axis": "the motor stands although it is told to move",
     "slipping_axis": "the motor turns, the joint does not",
+    "halted": "another controller quick-stops a drive that moves",
+    "sto": "the power stage is off for `seconds` (1.05), without an alarm",
+    "stop_ignored": "the drive acknowledges its stop and goes on",
+    "unit_stop_ignored": "likewise, but a broadcast stops it",
+    "watch_ignored": "the drive does not act on its communication timeout",
+    "stop_resumes": "`seconds` (1) after a stop the drive goes on to its target",
+    "fast_drive": "the drive moves `factor` (20) times as fast as told",
+    "regeared": "the joint turns `factor` (2) times as far as before",
+    "phone_turned": "the phone was turned by 10 deg about the vertical",
     "imu_gap": "the phone is silent for `seconds` (1)",
     "imu_disconnect": "the phone's connection drops and comes back",
     "imu_garbage": "bytes of noise between and inside the phone's lines",
@@ -34,6 +43,8 @@ KINDS = {
     "imu_reorder": "the phone's lines come out of order",
 }
 
+OF_EVENT = ("delayed_reply", "sto", "stop_resumes")
+
 
 @dataclasses.dataclass
 class FaultSpec:
@@ -43,17 +54,19 @@ class FaultSpec:
     axis: int | None = None  # None: any
     seconds: float | None = None  # length of a gap or delay
     share: float = 0.03  # of frames that are spoilt
+    factor: float | None = None  # of a speed or a gearing
     begun: float | None = None  # by the monotonic clock; None: it waits
 
 
 def parse_fault(text: str) -> FaultSpec:
-    """Read ``kind[@phase][,count=N][,axis=NAME][,seconds=S][,share=P]``."""
+    """Read ``kind[@phase][,count=N][,axis=NAME][,seconds=S][,share=P][,factor=F]``."""
     head, *options = text.split(",")
     kind, _, when = head.partition("@")
     if kind not in KINDS:
         raise ValueError(f"unknown fault {kind!r}: have {', '.join(KINDS)}")
     found: dict[str, Any] = {}
     readers: dict[str, Any] = {"count": int, "seconds": float, "share": float}
+    readers["factor"] = float
     readers["axis"] = AXIS_NAMES.index
     try:
         if when:
@@ -64,7 +77,7 @@ def parse_fault(text: str) -> FaultSpec:
     except (KeyError, ValueError):
         raise ValueError(
             f"fault {text!r}: after @ comes one of {', '.join(PHASES)}; "
-            "options are count=N, seconds=S, share=P, axis=NAME of "
+            "options are count=N, seconds=S, share=P, factor=F, axis=NAME of "
             f"{', '.join(AXIS_NAMES)}"
         ) from None
     return FaultSpec(kind, **found)
@@ -106,8 +119,8 @@ class FaultInjector:
                     axis is not None and spec.axis not in (None, axis)
                 ):
                     continue
-                # The seconds of a delayed reply are its delay.
-                lasts = spec.seconds if kind != "delayed_reply" else None
+                # Of these the seconds are those of each event.
+                lasts = spec.seconds if kind not in OF_EVENT else None
                 over = spec.begun is None or (
                     lasts is not None and now > spec.begun + lasts
                 )

@@ -32,6 +32,7 @@ class Plant:
         self._rng = np.random.default_rng(truth.seed)
         self._matrix = np.array(truth.matrix)
         self._bias = np.array(truth.bias)
+        self._geared = [(1.0, 0.0)] * 3  # degrees of each motor: factor and offset
         self._drive_deg = self._commanded()
         self._loose = self._drive_deg.copy()  # behind the play
         self.slip = np.zeros(3)
@@ -43,10 +44,21 @@ class Plant:
     def _commanded(self) -> Array:
         """(3,) degrees by which the motors turn the joints."""
         turned = [
-            (drive.position - drive.offset) / drive.pulses_per_deg
-            for drive in self._drives
+            factor * (drive.position - drive.offset) / drive.pulses_per_deg + offset
+            for drive, (factor, offset) in zip(self._drives, self._geared, strict=True)
         ]
         return (np.array(turned) * self.truth.signs)[list(self.truth.swapped)]
+
+    def regear(self, axis: int, factor: float) -> None:
+        """Fault: from here on a joint turns so many times as far as before."""
+        drive, (before, offset) = self._drives[axis], self._geared[axis]
+        at = (drive.position - drive.offset) / drive.pulses_per_deg
+        self._geared[axis] = before * factor, offset + before * (1.0 - factor) * at
+
+    def turn_phone(self, angle_deg: float) -> None:
+        """Fault: the phone is turned on its holder, about its own vertical axis."""
+        turn = euler_to_matrix([angle_deg, 0.0, 0.0], "ZYX")
+        self._mounting = self._mounting @ turn
 
     def joints(self) -> Array:
         """(3,) joint angles in degrees now.
@@ -56,6 +68,13 @@ class Plant:
         """
         for drive in self._drives:
             drive.advance()
+        for axis in range(3):
+            if fault := self._faults.take("regeared", axis):
+                fault.count = 0
+                self.regear(axis, fault.factor or 2.0)
+        if fault := self._faults.take("phone_turned"):
+            fault.count = 0
+            self.turn_phone(10.0)
         now = self._commanded()
         for axis in range(3):
             if self._faults.take("slipping_axis", axis):

@@ -150,7 +150,7 @@ class ModbusServer:
             for each, drive in self.drives.items():
                 dead = faults.take("dead_drive", self._axis[each])
                 if drive.map.broadcast_stop and not dead:
-                    self._execute(drive, pdu)
+                    self._execute(drive, pdu, broadcast=True)
         axis = self._axis.get(unit)
         if axis is None or any(
             faults.take(kind, axis) for kind in ("dead_drive", "lost_request")
@@ -175,7 +175,7 @@ class ModbusServer:
             noise = self._random.randbytes(self._random.randint(1, 6))
         return noise, reply, self._spoils(axis)
 
-    def _execute(self, drive: SimDrive, pdu: bytes) -> bytes:
+    def _execute(self, drive: SimDrive, pdu: bytes, broadcast: bool = False) -> bytes:
         function, data = pdu[0], pdu[1:]
         try:
             with self.lock:
@@ -187,13 +187,15 @@ class ModbusServer:
                     return struct.pack(f">BB{count}H", 3, 2 * count, *words)
                 if function == 6 and len(data) == 4:
                     address, value = struct.unpack(">HH", data)
-                    drive.write(address, [value])
+                    drive.write(address, [value], broadcast)
                     return pdu
                 if function == 16 and len(data) >= 7:
                     address, count, size = struct.unpack(">HHB", data[:5])
                     if size != 2 * count or len(data) != 5 + size:
                         raise DriveException(3)
-                    drive.write(address, [*struct.unpack(f">{count}H", data[5:])])
+                    drive.write(
+                        address, [*struct.unpack(f">{count}H", data[5:])], broadcast
+                    )
                     return pdu[:5]
                 raise DriveException(1)
         except DriveException as error:

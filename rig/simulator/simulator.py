@@ -89,6 +89,10 @@ class Simulator:
             for axis, drive in enumerate(self.drives):
                 if not drive.alarm and self.faults.take("alarm", axis):
                     drive.raise_alarm(0x30)
+                if drive.travels and self.faults.take("halted", axis):
+                    drive.halt()
+                if drive.travels and (fault := self.faults.take("sto", axis)):
+                    drive.cut(1.05 if fault.seconds is None else fault.seconds)
 
     def _attitude(self) -> Array:
         self._alarms()

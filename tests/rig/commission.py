@@ -3,7 +3,9 @@
 import contextlib
 import socket
 
+import numpy as np
 from harness import SPEEDUP, Simulator, fast_config
+from scipy.spatial.transform import Rotation
 
 from rig.__main__ import main
 from rig.config import AXIS_NAMES
@@ -61,3 +63,22 @@ def quick_text(bus, port):
     text = new_text(parse_bus(bus), axes, "hyperimu", port)
     values = dict(setting(value) for value in QUICK)
     return set_values(text, values | {"axes.yaw.direction": -1})
+
+
+def turns(sim, config):
+    """Turns of the phone for a degree of each axis, by the mechanism's own formula."""
+    matrix, bias = np.array(sim.truth.matrix), np.array(sim.truth.bias)
+    at = np.array([(d.position - d.offset) / d.pulses_per_deg for d in sim.drives])
+
+    def attitude(motors):
+        joints = matrix @ motors + bias
+        order = config.mechanism.order
+        sequence = [joints[config.letters.index(letter)] for letter in order]
+        return Rotation.from_euler(order, sequence, degrees=True)
+
+    columns = [
+        (attitude(at).inv() * attitude(at + step)).as_rotvec(degrees=True)
+        for step in np.eye(3)
+    ]
+    pulses = [drive.position for drive in sim.drives]
+    return {"pulses": pulses, "deg": np.transpose(columns).tolist()}

@@ -5,8 +5,8 @@ from commission import device, quick_text
 
 from rig.config import load_config
 from rig.core import proof
-from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
-from rig.workbench.commission import steps
+from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, STOP_PROVED, DeviceRecord
+from rig.workbench.commission import steps, stops
 
 
 @pytest.fixture
@@ -16,6 +16,7 @@ def at(tmp_path, monkeypatch):
     monkeypatch.setattr(steps, "WATCH_S", 0.3)
     monkeypatch.setattr(proof, "SLOW_DEG_S", 400.0)
     monkeypatch.setattr(proof, "LOOK_S", 0.01)
+    monkeypatch.setattr(stops, "SPEED_DEG_S", 10.0)
     return tmp_path
 
 
@@ -26,6 +27,6 @@ def commissioned(at):
         (at / "rig.toml").write_text(quick_text(bus, port))
         config = load_config("rig.toml")
         record = DeviceRecord.load(config.device_path)
-        for state in (IDENTIFIED, HOMED, SIGN_CHECKED):
+        for state in (IDENTIFIED, HOMED, SIGN_CHECKED, STOP_PROVED):
             record.reach(state, config)
         yield sim

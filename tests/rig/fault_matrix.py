@@ -22,6 +22,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from commission import turns
 from harness import (
     ENTERED,
     HASTY,
@@ -41,7 +42,14 @@ from harness import (
 from rig.config import RigConfig, parse_config
 from rig.core.bus import Bus
 from rig.core.drive import Drive
-from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord, read_journal
+from rig.journal import (
+    HOMED,
+    IDENTIFIED,
+    SIGN_CHECKED,
+    STOP_PROVED,
+    DeviceRecord,
+    read_journal,
+)
 from rig.journal.errors import Refused
 from rig.simulator import Truth, parse_fault
 from rig.workbench.commission.operator import Operator
@@ -87,6 +95,9 @@ VARIED: dict[str, tuple[str, str, dict[str, str], tuple[str, ...]]] = {
     "late_reply_rtu": ("delayed_reply,count=3,seconds=0.11", "rtu", PAIRS, PHASES),
     "imu_new_heading": ("imu_disconnect,count=1", "tcp", {}, PHASES),
     "imu_400_strangers": ("", "tcp", PUSHING, ("zeroing", "measuring")),
+    "drives_halted": ("halted,count=3", "tcp", {}, ("moving",)),
+    "drive_halted": ("halted,axis=roll,count=1", "tcp", {}, ("moving",)),
+    "sto": ("sto,count=3", "tcp", {}, ("moving",)),
     "other_controller": ("", "tcp", {}, ("moving", "settling", "measuring", "saving")),
 }
 TURNED_DEG = 25.0  # of the phone's heading, when it comes back
@@ -118,6 +129,18 @@ UNPROVED = {
     "imu_radians_reduction_times_25": (25.0, "imu_radians"),
     ENTER: (1.0, ""),
 }
+# What changed since the axes were checked: found when a session begins.
+CHANGED = (
+    "regeared,axis=pitch,factor=2",
+    "regeared,axis=yaw,factor=3",
+    "regeared,axis=roll,factor=5",
+    "regeared,axis=roll,factor=0.33",
+    "phone_turned",
+    "fast_drive,axis=yaw",
+)
+CHANGED_DEG = 5.0  # that a joint may be moved before that is found
+# How drives do not stop, found when the axes are checked.
+UNSTOPPED = ("stop_ignored", "stop_ignored,axis=yaw", "stop_resumes,seconds=0.02")
 # Refused before anything moves: what is no proof of this device.
 UNKNOWN = ("pushed_while_off", "simulated_calibration")
 MOST_DEG = 6.0  # that a joint may be moved before it is found
@@ -213,6 +236,8 @@ def run_cell(
         return _host_cell(fault, phase, truth, folder)
     if fault in UNKNOWN:
         return _unknown_cell(fault, folder)
+    if fault in CHANGED:
+        return _changed_cell(fault, folder)
     if phase == "start":
         return _start_cell(fault, truth, folder)
     if phase == "overnight":
@@ -321,6 +346,7 @@ def _unknown_cell(fault: str, folder: pathlib.Path) -> Outcome:
         identify(place)
         assert go_home(place, here=True) == 0, said
         record.reach(SIGN_CHECKED, served)
+        record.reach(STOP_PROVED, served)
         before = sim.executions()
         if fault == "pushed_while_off":
             for drive, axis in zip(sim.drives, served.axes, strict=True):
@@ -369,9 +395,44 @@ def _start_cell(fault: str, truth: np.ndarray, folder: pathlib.Path) -> Outcome:
     return Outcome(fault, "start", code, 0, reason, 0.0, refused=True)
 
 
+def _changed_cell(fault: str, folder: pathlib.Path) -> Outcome:
+    """A session of a device that is not as it was when its axes were checked."""
+    said: list[str] = []
+    folder.mkdir(parents=True)
+    with simulator(fast_config(), noise_deg=0.005) as sim:
+        served = sim.start()
+        record = DeviceRecord(folder / "device.json")
+        for state in (IDENTIFIED, HOMED):
+            record.reach(state, served)
+        record.reach(SIGN_CHECKED, served, turns=turns(sim, served))
+        record.reach(STOP_PROVED, served)
+        sim.faults.add(parse_fault(fault))
+        far = _watch_joints(sim)
+        code = session(served, folder, sim, said, record=record)
+        reason = next((s for s in said if s.startswith("fault:")), "")
+        assert code == 3, (code, said[-12:])
+        assert far.max() < CHANGED_DEG, f"a joint went {far.max():.1f} deg"
+        check_invariants(folder, sim, alive=True, deaf=False)
+    assert not (folder / "calibration.json").exists()
+    return Outcome(fault, "start", code, 0, reason, 0.0, refused=True)
+
+
+def _watch_joints(sim: Simulator) -> np.ndarray:
+    """(3,) degrees that the joints have gone, kept up while the phone looks."""
+    start, far = sim.plant.joints(), np.zeros(3)
+    attitude = sim.plant.attitude
+
+    def watched() -> np.ndarray:
+        far[:] = np.maximum(far, np.abs(sim.plant.joints() - start))
+        return attitude()
+
+    sim.plant.attitude = watched  # type: ignore[method-assign]
+    return far
+
+
 def _axes_cell(fault: str, folder: pathlib.Path) -> Outcome:
     """The check of the axes of a device that is not as the file says."""
-    factor, kind = UNPROVED[fault]
+    factor, kind = UNPROVED.get(fault, (1.0, fault))
     folder.mkdir(parents=True)
     said: list[str] = []
     faults = [parse_fault(kind)] if kind else []
@@ -387,14 +448,7 @@ def _axes_cell(fault: str, folder: pathlib.Path) -> Outcome:
             record.reach(state, wrong)
         operator = Operator(yes=fault != ENTER, read=lambda _: "", say=said.append)
         place = Place(wrong, record, operator, listeners=(sim.answer,))
-        start, far = sim.plant.joints(), np.zeros(3)
-        attitude = sim.plant.attitude
-
-        def watched() -> np.ndarray:
-            far[:] = np.maximum(far, np.abs(sim.plant.joints() - start))
-            return attitude()
-
-        sim.plant.attitude = watched  # type: ignore[method-assign]
+        far = _watch_joints(sim)
         try:
             code = check_the_axes(place)
         except Refused as error:
@@ -402,7 +456,8 @@ def _axes_cell(fault: str, folder: pathlib.Path) -> Outcome:
             assert sim.executions() == [[], [], []], "refused, but something moved"
     assert (code == 2) == (fault == ENTER) and code in (1, 2, 3), (code, said[-12:])
     assert far.max() < MOST_DEG, f"a joint went {far.max():.1f} deg"
-    assert record.state(SIGN_CHECKED) is None
+    proof = STOP_PROVED if fault in UNSTOPPED else SIGN_CHECKED
+    assert record.state(proof) is None
     reason = next((s for s in said if s.startswith("fault:")), "")
     found = next((s.strip() for s in said if ".reduction = " in s), "")
     return Outcome(
@@ -561,7 +616,8 @@ def cells() -> list[tuple[str, str]]:
     host += [(fault, p) for fault, phases in HOST_PHASES.items() for p in phases]
     started = [(fault, "start") for fault in (*REAL, *MISTAKES)]
     started += [(fault, "start") for fault in UNKNOWN]
-    started += [(fault, "axes") for fault in UNPROVED]
+    started += [(fault, "start") for fault in CHANGED]
+    started += [(fault, "axes") for fault in (*UNPROVED, *UNSTOPPED)]
     return simulated + host + started + [(fault, "overnight") for fault in OVERNIGHT]
 
 
@@ -620,7 +676,13 @@ def table(outcomes: list[Outcome]) -> str:
         "is common to both, so it is found by what the drives do. `pushed_while_off`: "
         "drives without a homed bit, switched off and pushed by 10 degrees. "
         "`simulated_calibration`: `goto` with a calibration that was made with "
-        "`--simulate`.",
+        "`--simulate`. `drives_halted`, `drive_halted`: another controller stops drives"
+        " in a move, and they say that they are done; `sto`: their power is off "
+        "for a second, without an alarm. `regeared`, `phone_turned`, `fast_drive` at "
+        "*start*: a joint's gearing, the phone's place on its holder or a speed "
+        f"is not as `axes` saw it; no joint goes {CHANGED_DEG:g} degrees. "
+        "`stop_ignored`, `stop_resumes`: the drives acknowledge their stop and go on, "
+        "or go on later; the device is not STOP_PROVED.",
         "",
         "| fault | " + " | ".join(COLUMNS) + " |",
         "|---" * (len(COLUMNS) + 1) + "|",

@@ -20,8 +20,8 @@ import numpy as np
 from rig import simulator as simulators
 from rig.config import RigConfig, parse_config
 from rig.config.config import EXAMPLES
-from rig.core import stop
-from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
+from rig.core import motion, stop
+from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, STOP_PROVED, DeviceRecord
 from rig.journal.lock import BusLock
 from rig.signals import Signals
 from rig.simulator import Truth
@@ -32,6 +32,8 @@ from rig.workbench.run import Run, run_safely
 
 # A simulated drive stands within 0.1 s; for a dead one the whole time is waited.
 stop.VERIFY_S = 0.6
+stop.stand_s = lambda drives: 0.05
+motion.TOO_FAST *= 3.0  # as fast as the simulated drives are
 
 RATE_HZ = 250.0
 SPEEDUP = 3.0  # of the drives over what the configuration says of them
@@ -96,7 +98,7 @@ def commissioned(
         record.left_at()
         for drive in sim.drives if sim else ():
             drive.alarm = 0
-    for name in (IDENTIFIED, HOMED, SIGN_CHECKED):
+    for name in (IDENTIFIED, HOMED, SIGN_CHECKED, STOP_PROVED):
         if record.state(name) is None:
             record.reach(name, config)
     return record

@@ -10,7 +10,7 @@ import time
 
 import pytest
 from fault_matrix import _free_port
-from harness import SPEEDUP, Simulator, commissioned, fast_config, fast_text, simulator
+from harness import Simulator, commissioned, fast_config, fast_text, simulator
 
 from rig.journal import read_journal
 from rig.simulator import Truth
@@ -105,9 +105,7 @@ def test_one_that_is_ended_on_the_way_stands_and_begins_anew(tmp_path, number):
     Where they then stand was not noted, so they must be homed again.
     """
     port = _free_port()
-    with Simulator(
-        fast_config(), Truth(noise_deg=0.005), rate_hz=250.0, speedup=SPEEDUP
-    ) as sim:
+    with Simulator(fast_config(), Truth(noise_deg=0.005), rate_hz=250.0) as sim:
         bus = sim.start().bus
         text = fast_text({"port = 5020": f"port = {bus.port}",
                           "port = 2055": f"port = {port}"})  # fmt: skip

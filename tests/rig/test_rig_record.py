@@ -8,7 +8,15 @@ from harness import fast_config
 from rig.config import parse_config
 from rig.config.config import differences
 from rig.core.faults import Refused
-from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, STATES, ZEROED, DeviceRecord
+from rig.journal import (
+    HOMED,
+    IDENTIFIED,
+    SIGN_CHECKED,
+    STATES,
+    STOP_PROVED,
+    ZEROED,
+    DeviceRecord,
+)
 
 CONFIG = fast_config()
 
@@ -60,6 +68,7 @@ def test_other_evidence_makes_what_was_built_on_it_void(record):
     record.reach(HOMED, CONFIG, word="somewhere else")
     assert "HOMED was reached again" in record.missing(CONFIG)
     record.reach(SIGN_CHECKED, CONFIG)
+    record.reach(STOP_PROVED, CONFIG)
     assert record.missing(CONFIG) is None
 
 

@@ -33,6 +33,7 @@ from rig.journal import (
     HOMED,
     IDENTIFIED,
     SIGN_CHECKED,
+    STOP_PROVED,
     ZEROED,
     DeviceRecord,
     read_journal,
@@ -389,7 +390,7 @@ def test_a_drive_without_a_word_on_its_gearing_is_not_asked_for_it(tmp_path):
 # States
 
 
-@pytest.mark.parametrize("lost", [IDENTIFIED, HOMED, SIGN_CHECKED])
+@pytest.mark.parametrize("lost", [IDENTIFIED, HOMED, SIGN_CHECKED, STOP_PROVED])
 def test_sessions_need_the_states_and_say_which_command_reaches_them(
     lost, calibrated, tmp_path, capsys
 ):
@@ -426,6 +427,7 @@ def test_another_drive_is_another_device(tmp_path):
         run = make_run(served, tmp_path / "b", "collect", said.append, record=record)
         record.reach(HOMED, served)
         record.reach(SIGN_CHECKED, served)
+        record.reach(STOP_PROVED, served)
         assert run_safely(run, lambda r: collect(r, 1)) == 2
     assert "yaw: another drive (peak_current_tenth_A: 45" in said[-1]
     assert DeviceRecord.load(record.path).state(IDENTIFIED) is None

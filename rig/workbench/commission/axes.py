@@ -19,12 +19,14 @@ from rig.workbench.commission.findings import (
     find,
     lines,
     proposals,
+    rates_of,
     ratios_of,
     require_gearing,
     require_unit,
     stand_at,
     turn,
 )
+from rig.workbench.commission.stops import prove_stops
 from rig.workbench.run import Run
 
 REACH_DEG = 3.0  # each way
@@ -41,7 +43,8 @@ SEEN_SIGMA = 6.0
 def check_axes(run: Run, device: Device) -> list[Change]:
     """Move, measure and say what is found; the corrections that follow from it.
 
-    Where nothing is to be corrected the device is SIGN_CHECKED.
+    Where nothing is to be corrected the device is SIGN_CHECKED, and once every way to
+    stop it has been tried, STOP_PROVED.
     """
     stands = measure_axes(run, device)
     found = find(run.config, stands)
@@ -56,11 +59,22 @@ def check_axes(run: Run, device: Device) -> list[Change]:
         "phone_turned_deg": round(found.turned_deg, 2),
         "run": run.folder.name,
     }
+    scales = np.array([axis.pulses_per_deg for axis in run.config.axes])
+    turns = {
+        "pulses": stands["start"].pulses.tolist(),
+        "deg": (rates_of(stands) * scales).round(6).tolist(),
+    }
     run.emit("axes", sync=True, **evidence, changes=[str(change) for change in changes])
     run.say(*lines(run.config, found))
+    for name, pace in device.paces.items():
+        run.say(
+            f"  {name}: {pace.seen_deg_s:.3g} deg/s at least, {pace.asked_deg_s:.3g} "
+            "asked"
+        )
     if not changes:
-        run.record.reach(SIGN_CHECKED, run.config, **evidence)
+        run.record.reach(SIGN_CHECKED, run.config, **evidence, turns=turns)
         run.say("each unit turns its own joint, the right way and about as far as told")
+        prove_stops(run, device)
     return changes
 
 

@@ -5,8 +5,7 @@ any other. The play comes first, away from where a dead zone may be: the differe
 the readings at one place that is reached from either side. Then the dead zone, always
 from below, so that the play shifts all alike: the difference of the readings on its two
 sides. Then the breakaway: steps from rest, on in the direction in which the axis came,
-so that no play enters; there every step follows from the last, by a belief of
-``jaxcal.adaptive``.
+so that no play enters; there every step follows from the last.
 
 Ways are degrees of the axis's commands from where it stood, upwards.
 """
@@ -14,18 +13,10 @@ Ways are degrees of the axis's commands from where it stood, upwards.
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
 
 import numpy as np
 from scipy import special
 
-from jaxcal.adaptive.estimates import Estimate, estimates
-from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.loop import next_measurement
-from jaxcal.adaptive.tasks.breakaway import Cautious, breakaway
 from rig.config import AXIS_NAMES
 from rig.core.attitude import mean_rotation
 from rig.core.device import Device, Posture
@@ -33,6 +24,7 @@ from rig.core.faults import MotionFault, Refused
 from rig.core.motion import move
 from rig.core.proof import ALLOWED_DEG
 from rig.workbench.commission.axes import ROOM_DEG, SEEN_DEG
+from rig.workbench.commission.breakaway import Breakaway, Estimate
 from rig.workbench.commission.findings import Stand, stand_at, turn
 from rig.workbench.run import Run
 
@@ -51,7 +43,6 @@ OVERSHOOT_DEG = 0.1  # by which a step may exceed the threshold
 RISK = 0.05  # that it exceeds it by more
 MOST_STEPS = 40
 LEAST_SIGMA_DEG = 0.002  # of a reading: finer is not believed
-T = TypeVar("T")
 
 
 class Probe:
@@ -154,35 +145,22 @@ class Probe:
         """Steps up and down that the joint does not answer."""
         per_deg = abs(self.scale.pulses_per_deg)
         least = math.ceil(STEP_DEG * per_deg) / per_deg
-        decider = Cautious(OVERSHOOT_DEG, RISK)
-        task = self.meanwhile(lambda: _step_task(2.0**0.5 * sigma, least))
-        history: list[tuple[int, int]] = []
-        while True:
-            proposal = self.meanwhile(lambda: next_measurement(task, history, decider))
-            found = estimates(task, proposal.belief, LEVEL)
-            up, down = found["up"], found["down"]
-            if proposal.design is None or max(up.width, down.width) <= ENOUGH_DEG:
+        belief = Breakaway(least, STEPS, 2.0**0.5 * sigma, least / 2.5)
+        for count in range(1, MOST_STEPS + 2):
+            up, down = (belief.estimate(side, LEVEL) for side in (0, 1))
+            if count > MOST_STEPS or max(up.width, down.width) <= ENOUGH_DEG:
                 break
-            label = f"{self.name}:up:{len(history) + 1}"
-            step, direction = (float(each) for each in proposal.coordinates)
+            side, number = belief.propose(OVERSHOOT_DEG, RISK)
+            step, direction = float(belief.steps[number]), 1.0 - 2.0 * side
+            label = f"{self.name}:up:{count}"
             before = self.stand(label, BASE_DEG - direction * FAR_DEG, BASE_DEG)
             after = self.stand(f"{label}:on", BASE_DEG + direction * step)
             way = (self.read(after) - self.read(before)) * direction
-            history.append((proposal.design, int(way > step / 2.0)))
+            belief.saw(side, number, way > step / 2.0)
         for each in (up, down):
             if each.high > (STEPS - 0.5) * least:
                 raise self.too_much("breakaway", each.mean, STEPS * least)
         return up, down
-
-    def meanwhile(self, function: Callable[[], T]) -> T:
-        """What a function computes, while the standing device stays under guard."""
-        with ThreadPoolExecutor(1) as pool:
-            result = pool.submit(function)
-            while not result.done():
-                self.device.guard()
-                self.device.statuses()
-                time.sleep(self.run.config.motion.poll_s)
-            return result.result()
 
     def too_much(self, what: str, deg: float, most: float) -> MotionFault:
         """What says that more was found than is looked for."""
@@ -199,7 +177,6 @@ def characterise(run: Run, device: Device, axis: int) -> None:
         Refused: the axis stands too near to a limit; nothing was moved.
         MotionFault: it does not turn the phone, or has more than is looked for.
     """
-    next_measurement(_step_task(0.01, STEP_DEG), [(0, 0)], Cautious())  # compiles it
     probe = Probe(run, device, axis)
     play, sigma = probe.play()
     zone = probe.zone(play.mean, sigma)
@@ -236,9 +213,3 @@ def _mean(values: list[float], sigma: float) -> Estimate:
     half = float(special.stdtrit(len(values) - 1, 0.5 + LEVEL / 2)) * spread
     mean = max(0.0, float(np.mean(values)))
     return Estimate(mean, max(0.0, mean - half), mean + half)
-
-
-def _step_task(sigma: float, least: float) -> GridTask:
-    return breakaway(
-        STEPS * least, STEPS, sigma=sigma, spread=least / 2.5, measurements=MOST_STEPS
-    )

@@ -12,7 +12,7 @@ from jaxcal.files import write_text
 from rig.config import AXIS_NAMES, RigConfig, load_config, parse_config
 from rig.config.axis import DEFAULT_ROTATES
 from rig.core.faults import EXIT_OK, Refused
-from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED
+from rig.journal import HOMED, IDENTIFIED, STOP_PROVED, ZEROED
 from rig.workbench.commission import steps
 from rig.workbench.commission.home import can_home
 from rig.workbench.commission.operator import Operator
@@ -177,7 +177,7 @@ def go(place: steps.Place, given: Given) -> int:
             return code
         say("7 limits")
         _ask_limits(place)
-    if record.missing(place.config, SIGN_CHECKED):
+    if record.missing(place.config, STOP_PROVED):
         say("8 axes")
         if code := steps.axes(place):
             return code

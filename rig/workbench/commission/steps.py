@@ -215,7 +215,7 @@ def jog(place: Place, axis: int, way_deg: float) -> int:
 
 def characterise(place: Place, axis: int) -> int:
     """Measure play, dead zone and breakaway of an axis."""
-    from rig.workbench.commission import characterise as measured  # loads JAX
+    from rig.workbench.commission import characterise as measured
 
     name, most = AXIS_NAMES[axis], measured.BASE_DEG + measured.FAR_DEG
     place.operator.confirm(

@@ -18,6 +18,7 @@ from rig.workbench.identification.fit import (
     pairs,
     uncertainty,
 )
+from rig.workbench.outputs.words import recalibrate
 
 USUAL = (1 / 3, 3.0)  # degrees of a joint for one commanded; outside it is told
 SIGNIFICANT = 3.0  # standard deviations, of a drift
@@ -26,7 +27,10 @@ STRAIGHT = 0.25  # of a drift: what a line leaves of it, and it is still linear
 
 
 def conclude(
-    config: RigConfig, records: list[Record], notes: dict[str, Any]
+    config: RigConfig,
+    records: list[Record],
+    notes: dict[str, Any],
+    compensated: bool = True,
 ) -> tuple[Any, dict[str, Any]]:
     """The calibration, with ``notes`` in its file, and what its summary says of it.
 
@@ -34,13 +38,14 @@ def conclude(
         config: of the device.
         records: of the run's journal: the zero, the pairs held out, the postures.
         notes: for the calibration's file.
+        compensated: the held-out targets were, by this very calibration.
     """
     last = {record["event"]: record for record in records}
     zero, held = last["zero"], last.get("held_out", {"pairs": []})["pairs"]
     frame = frame_at(config, np.array(zero["attitude"]))
     postures = measured_postures(records)
     references = [r for r in postures.values() if r["role"] == "reference"]
-    visits = sorted([zero, *references], key=lambda record: record["time"])
+    visits = sorted([zero, *references], key=lambda record: record["seq"])
     drift = estimate_drift(visits, frame, config.session.drift_limit_deg)
     if drift and drift["corrected"]:
         turn = drift["turn_deg_per_min"]
@@ -55,11 +60,16 @@ def conclude(
         "device": config.device_fingerprint(),
         "postures": [record["name"] for record in chosen],
     }
+    if not compensated:
+        errors.pop("after", None)
+    judged = {**errors, "drift": drift}
+    reasons = recalibrate(judged, config.session.verify_limit_deg)
     notes |= shared | {
         "mechanism_order": config.mechanism.order,
         "approach_overshoot_deg": config.motion.approach_overshoot_deg,
         "noise_from": limits["basis"],
         "drift_corrected": bool(drift and drift["corrected"]),
+        "verdict": {"good": not reasons, "reasons": reasons},
     }
     noise = np.maximum(1e-9, limits["noise_std_deg"])
     calibration = identify(chosen, noise, notes, zero_share)

@@ -119,13 +119,11 @@ def refit(
     changed = {key: [old[key], value] for key, value in new.items()}
     records = reread(held, then, now)
     notes = {"refit_of": folder.name, "simulated": start["simulated"] is not None}
-    calibration, summary = conclude(now, records, notes)
+    calibration, summary = conclude(now, records, notes, compensated=not changed)
     try:
         warnings = check_matrix(calibration.matrix)
     except MotionFault as fault:
         raise Refused(f"nothing was written: read like this, {fault}") from None
-    if changed:
-        summary.pop("after", None)  # compensated by another calibration than this
     summary |= {
         "mode": "refit",
         "refit_of": folder.name,

@@ -17,6 +17,7 @@ STALE_S = 1.0
 NONE = (None, None, None)  # of three axes, where nothing is known
 PHASES = {
     "opening": "Waiting for drives and phone",
+    "showing": "Looking at each axis",
     "zeroing": "Taking the zero",
     "moving": "Moving to {}",
     "settling": "Waiting until {} is quiet",

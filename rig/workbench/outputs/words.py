@@ -36,6 +36,32 @@ def _comm_restored(record: Record) -> str:
     )
 
 
+def _shown(record: Record) -> str:
+    return (
+        f"  {record['axis']}: {record['ratio']:.3f} deg of the phone for a degree, "
+        f"{record['before']:.3f} at `axes`; {record['speed_deg_s']:.3g} deg/s at least"
+    )
+
+
+def _stayed(record: Record) -> str:
+    lines = [f"WARNING: {text}, and was stopped again" for text in record["went_on"]]
+    units = [f"  {UnitStop(**unit)}" for unit in record["units"]]
+    return "\n".join(lines + units if lines else [])
+
+
+def _last_move(record: Record) -> str:
+    """What moved last, from where to where, and what drives and phone say now."""
+    ways = []
+    for i, name in enumerate(AXIS_NAMES):
+        begin, end = record["from_deg"][i], record["to_deg"][i]
+        if begin != end:
+            drive, phone = record["drives_deg"][i], record["phone_deg"]
+            seen = "its drive does not answer" if drive is None else f"now {drive:.2f}"
+            seen += "" if phone is None else f", phone {phone[i]:.2f}"
+            ways.append(f"{name} from {begin:.2f} to {end:.2f} deg ({seen})")
+    return f"moved last, to {record['label']}: {'; '.join(ways) or 'no axis'}"
+
+
 def _stop(record: Record) -> str:
     units = "".join(f"\n  {UnitStop(**unit)}" for unit in record["units"])
     return f"stop: {record['reason'] or 'end of run'}{units}"
@@ -55,7 +81,8 @@ SENTENCES: dict[str, str | Callable[[Record], str]] = {
     "void": lambda r: f"  withdrawn, to be measured again: {', '.join(r['names'])}",
     "replan": lambda r: (
         "  the postures that are left were selected again: log det "
-        f"{r['choice']['log_det']:.4f}"
+        f"{r['choice']['log_det']:.4f}; visits of candidates "
+        f"{', '.join(map(str, r['choice']['indices']))}"
     ),
     "pausing": "pausing after this posture; another Ctrl-C stops at once",
     "lost_reply": lambda r: (
@@ -65,6 +92,9 @@ SENTENCES: dict[str, str | Callable[[Record], str]] = {
     "unreachable": "  {name} is out of reach: {reason}",
     "comm_restored": _comm_restored,
     "stop": _stop,
+    "stayed": _stayed,
+    "last_move": _last_move,
+    "shown": _shown,
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,7 @@ def _plan(run: Run) -> tuple[Array, Choice]:
         )
         candidates = draw_candidates(config)
         choice = choose(config, config.to_deg(candidates))
+        choice = _ordered(run, choice, candidates, config.to_deg(run.zero_pulses))
         return {
             "candidates": candidates.tolist(),
             "choice": dataclasses.asdict(choice),
@@ -69,12 +71,18 @@ def _plan(run: Run) -> tuple[Array, Choice]:
 
     record = run.remember("plan", make)
     candidates, choice = np.array(record["candidates"]), Choice(**record["choice"])
-    start = config.to_deg(run.zero_pulses)
-    chosen = np.array(choice.indices)
-    order = chosen[travel_order(config, config.to_deg(candidates[chosen]), start)]
-    shown = dataclasses.replace(choice, indices=tuple(order.tolist()))
-    run.say(*plan_lines(config, shown, candidates, start))
+    run.say(*plan_lines(config, choice, candidates, config.to_deg(run.zero_pulses)))
     return candidates, choice
+
+
+def _ordered(
+    run: Run, choice: Choice, candidates: Array, here: Array, done: Sequence[int] = ()
+) -> Choice:
+    """A choice in the order of its visits, from (3,) degrees; done ones first."""
+    left = np.array([i for i in choice.indices if i not in done], dtype=int)
+    points = run.config.to_deg(candidates[left])
+    queue = left[travel_order(run.config, points, here)].tolist()
+    return dataclasses.replace(choice, indices=(*done, *queue))
 
 
 def _visit_chosen(run: Run, device: Device, candidates: Array, choice: Choice) -> None:
@@ -85,8 +93,7 @@ def _visit_chosen(run: Run, device: Device, candidates: Array, choice: Choice) -
     here = config.to_deg(run.zero_pulses)
     plans = iter(run.journal.events("replan"))
     while True:
-        left = np.array([i for i in choice.indices if i not in done], dtype=int)
-        queue = left[travel_order(config, degrees[left], here)].tolist()
+        queue = [index for index in choice.indices if index not in done]
         run.emit("queue", names=[f"select:{index}" for index in queue])
         for index in queue:
             posture = Posture(f"select:{index}", tuple(candidates[index].tolist()))
@@ -97,16 +104,10 @@ def _visit_chosen(run: Run, device: Device, candidates: Array, choice: Choice) -
         else:
             return
         available[index] = False
-        lost = int((~available).sum())
-        if lost > config.session.max_unreachable:
-            raise MotionFault(
-                f"{lost} postures are out of reach, more than session.max_unreachable "
-                f"({config.session.max_unreachable}). Narrow session.*_range_deg to "
-                "what the device reaches, and begin a new run"
-            )
         plan = next(plans, None)
         if plan is None:
             choice = choose(config, degrees, available, tuple(done))
+            choice = _ordered(run, choice, candidates, here, done)
             plan = run.emit("replan", sync=True, choice=dataclasses.asdict(choice))
         choice = Choice(**plan["choice"])
 

@@ -1,0 +1,83 @@
+"""What a degree of each axis turns of the phone: as `axes` saw it, and as it is now.
+
+A gearbox, a drive or its setting may have been exchanged since, or the phone turned on
+its holder. So a session begins with small moves of one axis after the other, each of
+which must turn the phone as `axes` saw: as far within a third, about the same axis.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rig.core.attitude import Array
+from rig.core.device import Device, Posture
+from rig.core.faults import MotionFault
+from rig.core.measure import measure
+from rig.core.motion import move
+from rig.core.proof import Turns
+from rig.journal import SIGN_CHECKED
+
+SHOWN_DEG = 3.0  # that each axis is moved, from a third of it to the whole
+RATIO = (2 / 3, 4 / 3)  # of what `axes` saw
+ASIDE_DEG = 4.0  # between the axes of two turns, and ...
+SURE_SIGMA = 4.0  # ... of what the noise of the readings makes
+
+
+def show(device: Device) -> None:
+    """Each axis by itself turns the phone as `axes` saw it, or SIGN_CHECKED is void.
+
+    Raises:
+        MotionFault: it does not, or it moves too fast.
+    """
+    turns, config, start = Turns.of(device.record), device.config, device.positions()
+    if turns is None or device.shown:
+        return
+    device.emit("phase", phase="showing")
+    expected = turns.at(config, start)
+    for j, axis in enumerate(config.axes):
+        here = axis.to_deg(start[j])
+        middle = (axis.min_deg + axis.max_deg) / 2.0  # a limit may be why it is here
+        room = axis.max_deg - here if here <= middle else axis.min_deg - here
+        way = min(max(room, -SHOWN_DEG), SHOWN_DEG)
+        # Over the first third its play is taken up.
+        near, far = (axis.to_pulses(here + share * way) for share in (1 / 3, 1.0))
+        seen = []
+        for pulses in (near, far):
+            place = tuple(pulses if i == j else p for i, p in enumerate(start))
+            posture = Posture(f"shown:{axis.name}", place)
+            seen.append(measure(move(device, posture)))
+        attitudes = [np.array(each["attitude"]) for each in seen]
+        moved = Rotation.from_matrix(attitudes[0].T @ attitudes[1])
+        turn = moved.as_rotvec(degrees=True) / axis.to_deg(far - near)
+        noise = max(max(each["std_deg"]) / each["samples"] ** 0.5 for each in seen)
+        _compare(device, j, turn, expected[:, j], noise / abs(axis.to_deg(far - near)))
+        move(device, Posture("shown", start))
+    device.shown = True
+
+
+def _compare(device: Device, j: int, turn: Array, then: Array, noise: float) -> None:
+    """(3,) turns for a degree of axis j, now and at `axes`; the noise of each part."""
+    size, before = float(np.linalg.norm(turn)), float(np.linalg.norm(then))
+    share, axis = size / before, device.config.axes[j]
+    aside = np.degrees(np.arctan2(np.linalg.norm(np.cross(turn, then)), turn @ then))
+    device.emit(
+        "shown", sync=True, axis=axis.name, ratio=round(size, 4),
+        before=round(before, 4), aside_deg=round(float(aside), 2),
+        speed_deg_s=round(device.paces[axis.name].seen_deg_s, 2),
+    )  # fmt: skip
+    fault = ""
+    if not RATIO[0] <= share <= RATIO[1]:
+        fault = (
+            f"{axis.name} turned the phone by {size:.3g} deg for a degree commanded, "
+            f"and by {before:.3g} when `axes` looked: its drive, its setting or its "
+            "gearbox was exchanged, or the coupling slips"
+        )
+    elif aside > ASIDE_DEG + np.degrees(SURE_SIGMA * noise / before):
+        fault = (
+            f"{axis.name} turned the phone about an axis {aside:.1f} deg from where "
+            "`axes` saw it: the phone or its holder was turned since"
+        )
+    if fault:
+        device.record.void(SIGN_CHECKED, fault)
+        raise MotionFault(f"{fault}. Correct it, then run `jaxcal-rig axes`")

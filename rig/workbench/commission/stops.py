@@ -1,0 +1,226 @@
+"""Every way that the software has to stop the drives, tried in a slow move.
+
+The three axes move together, 3 degrees either side of where they stood, and are stopped
+on the way: by the frame to each unit, by the broadcast where the map has one, and by
+the drives' own watch of the line where they have one. Each must stand short of its
+target, by its drive and by the phone, and must stay there.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from rig.config.axis import Pulses
+from rig.core import stop
+from rig.core.attitude import angle_between_deg
+from rig.core.device import Device, Posture
+from rig.core.drive import STILL_COUNTS, Drive, Status
+from rig.core.faults import MotionFault
+from rig.core.motion import move
+from rig.journal import STOP_PROVED
+from rig.workbench.run import Run
+
+REACH_DEG = 3.0  # either side
+SPEED_DEG_S = 5.0
+BEGIN, LATE = 0.3, 0.6  # share of the way at which a stop is sent, and the latest
+SHORT = 0.1  # share of the way that must be left
+TRIES = 4  # each half as fast, where the stop came late
+STAND_S = 3.0
+SILENCE_S = 0.5  # besides the drives' own timeout
+TURNED_DEG = 0.3  # of the phone, while the drives stand
+
+
+class _OnTheWay(Exception):
+    """All axes have gone a share of their way."""
+
+
+def prove_stops(run: Run, device: Device) -> None:
+    """Try each way to stop; the device is STOP_PROVED.
+
+    Raises:
+        MotionFault: an axis went on, or moved again.
+    """
+    start, evidence = device.positions(), {}
+    offsets = [axis.to_pulses(REACH_DEG) for axis in run.config.axes]
+    low = tuple(int(p) for p in np.subtract(start, offsets))
+    high = tuple(int(p) for p in np.add(start, offsets))
+    timeout_s = max(run.config.comm_timeouts_s.values(), default=0.0)
+    ways: dict[str, tuple[Callable[[], None], float]] = {
+        "the stop of each unit": (lambda: _stop_units(device), SPEED_DEG_S)
+    }
+    if stop.takes_broadcast(device.drives):
+        ways["the broadcast stop"] = (
+            lambda: stop.broadcast(device.drives),
+            SPEED_DEG_S,
+        )
+    if timeout_s:
+        left_deg = (1.0 - LATE - SHORT) * 2 * REACH_DEG
+        slow = min(SPEED_DEG_S, left_deg / (timeout_s + SILENCE_S))
+        silent = timeout_s + SILENCE_S
+        ways["their watch of the line"] = (lambda: _be_silent(device, silent), slow)
+    for name, (act, speed) in ways.items():
+        evidence[name] = _prove(run, device, name, act, speed, low, high)
+    device.proof.ceiling_deg_s = None
+    move(device, Posture("back", start))
+    run.emit("stop_proved", sync=True, ways=evidence)
+    run.record.reach(STOP_PROVED, run.config, ways=evidence, run=run.folder.name)
+    run.say(f"the drives stop, and stay: {', '.join(evidence)}")
+
+
+def _prove(
+    run: Run,
+    device: Device,
+    name: str,
+    act: Callable[[], None],
+    speed_deg_s: float,
+    low: Pulses,
+    high: Pulses,
+) -> dict[str, float]:
+    """Stop a move from low to high; degrees that each axis went on after its stop."""
+    for number in range(TRIES):
+        device.proof.ceiling_deg_s = None
+        move(device, Posture("stop:from", low))
+        device.proof.ceiling_deg_s = speed_deg_s / 2**number
+        places = _go(device, low, high)
+        if max(_shares(device, low, high, places)) <= LATE:
+            break
+        _wait_until_still(device)  # it may end
+        device.untrack()
+    else:
+        raise MotionFault(
+            "no move is slow enough to be stopped on its way: bus and computer take "
+            "too long between two looks at the drives"
+        )
+    act()
+    statuses = _wait_until_still(device)
+    at = [status.position for status in statuses]
+    gone = _shares(device, low, high, at)
+    names = [axis.name for axis in run.config.axes]
+    went_on = [n for n, share in zip(names, gone, strict=True) if share > 1.0 - SHORT]
+    seen = device.attitude(time.monotonic())
+    after = _look(device, statuses)
+    moved = [
+        name
+        for name, status, then in zip(names, after, at, strict=True)
+        if abs(status.position - then) > STILL_COUNTS and status.enabled
+    ]
+    turned = angle_between_deg(seen, device.attitude(time.monotonic()))
+    _reset_alarms(run, device, name)
+    device.untrack()
+    if went_on:
+        raise MotionFault(
+            f"{', '.join(went_on)} went on to the target after {name}: this program "
+            "cannot stop it. Correct [stop], broadcast_stop or [comm_timeout] of the "
+            "map; until then the emergency stop alone stops the device"
+        )
+    if moved or turned > TURNED_DEG:
+        raise MotionFault(
+            f"{', '.join(moved) or 'the phone'} moved again after {name} (the phone "
+            f"turned by {turned:.2f} deg). Set the drive so that it does not go on by "
+            "itself after a stop"
+        )
+    pairs = zip(run.config.axes, places, at, strict=True)
+    after_deg = {str(axis.name): round(axis.to_deg(b - a), 3) for axis, a, b in pairs}
+    run.say(
+        f"  {name}: stood after "
+        + ", ".join(f"{axis} {abs(deg):.2f}" for axis, deg in after_deg.items())
+        + f" deg, and {stop.stand_s(device.drives):g} s later"
+    )
+    return after_deg
+
+
+def _go(device: Device, low: Pulses, high: Pulses) -> list[int]:
+    """Begin to move; where the drives are once all have gone BEGIN of their way."""
+
+    def look() -> None:
+        places = [_last(drive).position for drive in device.drives]
+        if min(_shares(device, low, high, places)) >= BEGIN:
+            raise _OnTheWay
+
+    device.meanwhile = look
+    try:
+        move(device, Posture("stop:to", high))
+    except _OnTheWay:
+        pass
+    finally:
+        device.meanwhile = lambda: None
+    return [_last(drive).position for drive in device.drives]
+
+
+def _last(drive: Drive) -> Status:
+    assert drive.last is not None  # it moves
+    return drive.last
+
+
+def _shares(
+    device: Device, low: Pulses, high: Pulses, at: Sequence[int]
+) -> list[float]:
+    """Shares of the way that the axes have gone."""
+    return [(p - a) / (b - a) for a, b, p in zip(low, high, at, strict=True)]
+
+
+def _stop_units(device: Device) -> None:
+    for drive in device.drives:
+        drive.stop()
+
+
+def _be_silent(device: Device, seconds: float) -> None:
+    """Send nothing, while this program is well."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        device.requests.check_stop()
+        device.heartbeat.feed(moving=True)
+        time.sleep(0.02)
+    device.heartbeat.feed(moving=False)
+
+
+def _wait_until_still(device: Device) -> list[Status]:
+    """Statuses of all drives once they stand, or STAND_S later."""
+    end = time.monotonic() + STAND_S
+    before = [drive.status() for drive in device.drives]
+    while True:
+        device.guard()
+        time.sleep(stop.POLL_S)
+        now = [drive.status() for drive in device.drives]
+        still = all(
+            not b.moving and abs(b.position - a.position) <= STILL_COUNTS
+            for a, b in zip(before, now, strict=True)
+        )
+        if still or time.monotonic() > end:
+            return now
+        before = now
+
+
+def _look(device: Device, statuses: list[Status]) -> list[Status]:
+    """Of drives that stand, after the time within which one might go on."""
+    for drive, status in zip(device.drives, statuses, strict=True):
+        drive.hold(status.position)
+    end = time.monotonic() + stop.stand_s(device.drives)
+    while time.monotonic() < end:
+        device.guard()
+        now = [drive.standing() for drive in device.drives]
+        if any(status.moving for status in now):
+            return _wait_until_still(device)
+        time.sleep(stop.LOOK_S)
+    return [drive.standing() for drive in device.drives]
+
+
+def _reset_alarms(run: Run, device: Device, name: str) -> None:
+    """Of drives that raise one when they stop themselves."""
+    for drive in device.drives:
+        if not drive.status().fault:
+            continue
+        reset = drive.axis.map.alarm_reset
+        if not reset or drive.bring(reset, lambda status: not status.fault).fault:
+            raise MotionFault(
+                f"{drive.axis.name} stays in alarm after {name}: {drive.alarm()}. "
+                "Reset it, then run `jaxcal-rig axes` again"
+            )
+        run.say(f"  {drive.axis.name}: its alarm after {name} was reset")
+        if not drive.bring(
+            drive.axis.map.enable, lambda status: status.enabled
+        ).enabled:
+            raise MotionFault(f"{drive.axis.name} does not enable after {name}")
