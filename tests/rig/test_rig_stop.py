@@ -233,7 +233,7 @@ def running_session(sim, tmp_path):
     sim.start_phone(port)
     end = time.monotonic() + 60
     while not any(drive.moving for drive in sim.drives):
-        assert time.monotonic() < end and child.poll() is None, said
+        assert time.monotonic() < end and child.poll() is None, "".join(said)
         time.sleep(0.01)
     try:
         yield child
