@@ -18,6 +18,12 @@ Array = NDArray[np.float64]
 _POWER = 0.8
 _KNOWN = 1e9  # degrees of freedom of noise that was given
 _SWEEPS = 20  # of swaps, at most
+_UNITS = {  # factors between units that are mistaken for each other
+    1000.0: "metres for millimetres",
+    0.001: "millimetres for metres",
+    180.0 / np.pi: "radians for degrees",
+    np.pi / 180.0: "degrees for radians",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +36,7 @@ class Check:
     drift: dict[str, float]  # smallest change of each parameter seen with power 0.8
     unseen: tuple[str, ...]  # parameters whose drift by ``tolerance`` could hide
     tolerance: float  # root mean square of the outputs' change that matters
+    unit: str = ""  # of the tolerance, where the calibration has one
 
     def __str__(self) -> str:
         text = (
@@ -37,12 +44,18 @@ class Check:
             if self.says != "cannot be told"
             else ("whether the calibration holds cannot be told")
         )
+        change = f"{self.tolerance:.3g} {self.unit}".strip()
         text += (
-            f" (p = {self.p_value:.3g}, false alarms 5 %); a change by "
-            f"{self.tolerance:.3g} is seen with {self.power:.0%} on average"
+            f" (p = {self.p_value:.3g}, false alarms 5 %); a change by {change} is "
+            f"seen with {self.power:.0%} on average"
         )
         if self.says == "cannot be told":
-            text += f", and could hide in {', '.join(self.unseen)}"
+            text += (
+                f", and could hide in {', '.join(self.unseen)}; measure more: "
+                "calibration.verification(candidates, k) says where"
+            )
+        if self.says == "does not hold":
+            text += "; calibrate again"
         return text
 
 
@@ -86,7 +99,9 @@ def check(
     theta = calibration.parameters
     slopes = np.asarray(model.jacobian(commands, theta))
     p = slopes.shape[-1]
-    off = (measured - calibration.predict(commands)).ravel()
+    predicted = calibration.predict(commands)
+    _require_unit(calibration, measured, predicted, noise)
+    off = (measured - predicted).ravel()
     rows = slopes.reshape(-1, p)
 
     def spread(misfit: bool) -> Array:
@@ -138,7 +153,38 @@ def check(
         drift={names[i]: float(size[i]) for i in np.flatnonzero(free)},
         unseen=tuple(names[i] for i in np.flatnonzero(hidden)),
         tolerance=tolerance,
+        unit=calibration.measured_unit,
     )
+
+
+def _require_unit(
+    calibration: Fit, measured: Array, predicted: Array, noise: Array
+) -> None:
+    """Refuse readings that fit when they are taken as being in another unit."""
+    rms = np.sqrt(((measured - predicted) ** 2).mean(axis=0))
+    far = rms > 10.0 * noise
+    for factor, what in _UNITS.items():
+        rest = _size(factor * measured[:, far] - predicted[:, far])
+        size = _size(predicted[:, far])
+        if far.any() and rest < min(
+            0.2 * size, 0.05 * _size(measured[:, far] - predicted[:, far])
+        ):
+            unit = (
+                f" ({calibration.measured_unit})" if calibration.measured_unit else ""
+            )
+            columns = [
+                y for y, f in zip(calibration.output_names, far, strict=True) if f
+            ]
+            raise ValueError(
+                f"measured must be in the calibration's unit{unit}: "
+                f"{', '.join(columns)} fit when multiplied by {factor:.6g}; "
+                f"are they {what}?"
+            )
+
+
+def _size(values: Array) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
 
 
 def _postures(calibration: Fit, name: str, given: ArrayLike) -> Array:

@@ -161,3 +161,25 @@ def test_bad_input_is_named(given, message):
     options = dict(zip(("tolerance", "placed_anew"), rest, strict=False))
     with pytest.raises(ValueError, match=message):
         FOUND.check(commands, measured, **options)
+
+
+@pytest.mark.parametrize("factor", [1000.0, 0.001, 57.29577951, 0.01745329252])
+def test_readings_in_another_unit_are_named(factor):
+    rng = np.random.default_rng(5)
+    u = rng.uniform(-20.0, 20.0, (30, 3))
+    y = u @ np.diag([0.4, 0.7, 0.9]) + 3.0 + rng.normal(0.0, 0.01, (30, 3))
+    found = jaxcal.identify(u, y, measured_unit="mm")
+    with pytest.raises(
+        ValueError, match=r"calibration's unit \(mm\): y_x, y_y, y_z fit"
+    ):
+        found.check(u[:5], factor * y[:5])
+    mixed = y[:5] * [1.0, 1.0, factor]  # of one output alone
+    with pytest.raises(ValueError, match=r"calibration's unit \(mm\): y_z fit when"):
+        found.check(u[:5], mixed)
+    assert " mm is seen with" in str(found.check(u[:5], y[:5]))
+    # Far off, but by no unit: a verdict, not a refusal.
+    said = str(found.check(u[:5], y[:5] + 300.0))
+    assert said.startswith("the calibration does not hold")
+    assert said.endswith("; calibrate again")
+    rng.shuffle(y)
+    assert found.check(u[:5], 900.0 * y[:5]).says == "does not hold"
