@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
-import functools
 import pathlib
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from jaxcal.arguments import Parser
@@ -17,11 +16,8 @@ from rig.core.faults import EXIT_FAULT, EXIT_OK, EXIT_RECALIBRATE, Refused
 
 if TYPE_CHECKING:
     from rig.config import RigConfig
-    from rig.core.known import KeptZero
-    from rig.journal import Record
     from rig.simulator import Simulator
     from rig.workbench.commission.steps import Place
-    from rig.workbench.run import Run
 
 
 def _axes(text: str) -> list[str]:
@@ -310,19 +306,21 @@ def goto(
 
 def resume(run: RunPath, *, given: Session) -> int:
     """go on with a run that was paused, stopped or killed"""
-    config, start = _recorded(run, given.config)
+    from rig.workbench.sessions import recorded, records_of, run_session
+
+    config, start = recorded(run, given.config)
     if given.simulate and start["simulated"] is None:
         raise Refused(
             f"{run} was made with a real device, and resuming it moves that. Leave out "
             "--simulate, or begin a simulated run"
         )
-    events = [record["event"] for record in _records(run)]
+    events = [record["event"] for record in records_of(run)]
     if events[-1] == "end" and "armed" in events:
         raise Refused(
             f"{run} is finished: nothing is left to go on with. Begin a new run; "
             f"`jaxcal-rig report {run}` writes its report again"
         )
-    return _run(given, "resume", config, start, run)
+    return run_session(given, "resume", config, start, run)
 
 
 def _session(
@@ -333,6 +331,8 @@ def _session(
     to: tuple[float, ...] | None = None,
 ) -> int:
     """Run a new session; returns the exit code."""
+    from rig.workbench.sessions import run_session
+
     if count is not None and count < 1:
         raise Refused(f"--count must be at least 1, got {count}")
     saved = None if calibration is None else str(calibration.resolve())
@@ -343,143 +343,7 @@ def _session(
         "simulated": given.simulation if given.simulate else None,
         "maps_from": str((given.config or Path()).resolve().parent),
     }
-    return _run(given, mode, config, start)
-
-
-def _run(
-    given: Session,
-    command: str,
-    config: RigConfig,
-    start: dict[str, Any],
-    folder: Path | None = None,
-) -> int:
-    from rig.journal import STOP_PROVED, BusLock, DeviceRecord, new_run_folder
-    from rig.workbench.commission import steps
-    from rig.workbench.outputs.console import listen
-    from rig.workbench.run import Run, run_safely
-
-    real = start["simulated"] is None
-    procedure, kept_zero, doubts = _procedure(start, config)
-    with contextlib.ExitStack() as stack:
-        simulator, text = None, config.text
-        if not real:
-            simulator = given.simulator(config, start["simulated"])
-            config = stack.enter_context(simulator).start()
-        lock, record = BusLock(config.bus), DeviceRecord.load(config.device_path)
-        if not given.dry_run:
-            stack.enter_context(lock.acquire(command))
-            if real and (lack := record.missing(config)):
-                raise Refused(lack)
-        if folder is None:
-            folder = new_run_folder(given.out or Path(config.output), start["mode"])
-            (folder / "rig.toml").write_text(text, encoding="utf-8")
-        if simulator is not None:
-            record = steps.commissioned(folder / "device.json", config, STOP_PROVED)
-        lock.tell(run=str(folder.resolve()))
-        run = Run(
-            config,
-            folder,
-            start["mode"],
-            _say,
-            start={key: start[key] for key in ("simulated", "inputs", "maps_from")},
-            reset_alarms=given.reset_alarms,
-            record=record,
-            # With --zero the operator put the device into its zero posture.
-            zero_at=kept_zero.pulses if kept_zero and not given.zero else None,
-            kept_zero=kept_zero,
-            dry_run=given.dry_run,
-        )
-        listen(run)
-        run.confirm = functools.partial(_confirm, given, doubts)
-        if simulator is not None:
-            run.simulated = True
-            run.listeners.append(simulator.hear)
-        if given.live:
-            from rig.workbench import live
-
-            run.say(live.start(folder))
-        return run_safely(run, procedure)
-
-
-def _procedure(
-    start: dict[str, Any], config: RigConfig
-) -> tuple[Callable[[Run], int], KeptZero | None, list[str]]:
-    """What a session does, the zero posture that it must find, and why the calibration
-    that it moves by is not to be used."""
-    from rig.workbench.procedures import calibrate, checking
-
-    mode, inputs = start["mode"], start["inputs"]
-    if mode == "calibrate":
-        return calibrate.calibrate, None, []
-    if mode == "collect":
-        return lambda run: checking.collect(run, inputs["count"]), None, []
-    found, kept = checking.load_calibration(
-        Path(inputs["calibration"]), config, start["simulated"] is not None
-    )
-    if mode == "verify":
-        return lambda run: checking.verify(run, found, inputs["count"]), kept, []
-    doubts = checking.doubts(found)
-    return lambda run: checking.goto(run, found, inputs["to"]), kept, doubts
-
-
-def _confirm(given: Session, doubts: list[str], session: Run) -> None:
-    """Ask for what --arm, --zero and --use would have confirmed."""
-    from rig.workbench.commission.operator import Operator
-
-    takes_zero = not session.journal.events("zero") and session.zero_at is None
-    questions = {}
-    if doubts:
-        questions["use"] = (
-            f"the session that made this calibration said not to use it: "
-            f"{' and '.join(doubts)}"
-        )
-    if not session.simulated:
-        questions["arm"] = (
-            "the device will move; its way is clear, no patient is attached, the "
-            "emergency stop is at hand"
-        )
-        if takes_zero and session.config.session.zero == "here":
-            questions["zero"] = "the device stands in its zero posture"
-    for word, text in questions.items():
-        if not getattr(given, word):
-            Operator(say=_say, option=f"--{word}").confirm(text, word)
-
-
-def _recorded(run: Path, config: Path | None = None) -> tuple[RigConfig, Record]:
-    """Configuration and start of a run that is resumed or identified anew."""
-    from rig.config import load_config, parse_config
-
-    start = _records(run)[0]
-    if start["mode"] == "refit":
-        source = start["inputs"]["run"]
-        raise Refused(f"{run} is a refit of {source}; give that run instead")
-    if start["mode"] not in ("calibrate", "collect", "verify", "goto"):
-        raise Refused(f"{run} is a step of commissioning: run it again instead")
-    if config is not None:
-        return load_config(config), start
-    text = (run / "rig.toml").read_text(encoding="utf-8")
-    return parse_config(text, Path(start["maps_from"]), str(run)), start
-
-
-def _records(run: Path) -> list[Record]:
-    """The journal of a run; Refused where its folder holds none, or a damaged one."""
-    from rig.journal import JOURNAL, JournalError, read_journal
-    from rig.journal.run import SCHEMA
-
-    if not (run / JOURNAL).is_file():
-        raise Refused(f"{run} is not the folder of a run: it holds no {JOURNAL}")
-    try:
-        records = read_journal(run / JOURNAL)
-    except JournalError as error:
-        raise Refused(str(error)) from None
-    if not records or records[0]["event"] != "start":
-        raise Refused(f"{run} is not the folder of a run: its journal has no start")
-    if records[0].get("schema") != SCHEMA:
-        raise Refused(
-            f"{run} was written by an earlier version of jaxcal, whose runs are not "
-            "read. Make a new one"
-        )
-    return records
+    return run_session(given, mode, config, start)
 
 
 # Of the device, and of runs
@@ -572,8 +436,9 @@ def refit(
 ) -> int:
     """identify a recorded calibration anew"""
     from rig.workbench.identification.refit import refit as identify_anew
+    from rig.workbench.sessions import recorded, records_of
 
-    then, start = _recorded(run)
+    then, start = recorded(run)
     if start["mode"] != "calibrate":
         raise Refused(f"{run} is a {start['mode']} run; refit takes a calibration")
     wanted = {
@@ -582,14 +447,15 @@ def refit(
         "imu.signs": signs,
         "imu.mounting_deg": mounting,
     }
-    return identify_anew(run, _records(run), then, wanted, print)
+    return identify_anew(run, records_of(run), then, wanted, print)
 
 
 def report(run: RunPath) -> int:
     """write report.html of any run, also unfinished"""
     from rig.workbench.outputs.report import write_report
+    from rig.workbench.sessions import records_of
 
-    print(write_report(run, _records(run)))
+    print(write_report(run, records_of(run)))
     return EXIT_OK
 
 
@@ -602,8 +468,9 @@ def export(
     """print the inverse map of a calibration for a controller"""
     from jaxcal.files import write_text
     from rig.workbench.outputs.export import LANGUAGES, load_inverse
+    from rig.workbench.sessions import records_of
 
-    inverse = load_inverse(run, _records(run))
+    inverse = load_inverse(run, records_of(run))
     for text in inverse["warnings"]:
         print(f"WARNING: {text}", file=sys.stderr)
     text = LANGUAGES[to](inverse)

@@ -169,7 +169,7 @@ def _watch(
                     f"{axis.name} does not follow: it stands {left:.3f} deg from "
                     f"its target for {stood:.2f} s (limit motion.stall_s = "
                     f"{motion.stall_s:g}). Look for an obstacle, a loose coupling, "
-                    "or a drive that is not enabled"
+                    "a drive that is not enabled, or whoever stopped it"
                 )
         if not late:
             return

@@ -10,7 +10,7 @@ from rig.config import AXIS_NAMES
 from rig.core.faults import EXIT_RECALIBRATE
 from rig.core.stop import UnitStop
 from rig.workbench.outputs.state import ACTIVE, SESSIONS, Posture, Record, RunState
-from rig.workbench.outputs.words import error_text, summary_lines
+from rig.workbench.outputs.words import error_text, event_lines, summary_lines
 
 SHOWN = 40  # rows of a long queue
 STALE_S = 1.0
@@ -83,7 +83,9 @@ def trouble(state: RunState, running: bool, folder: str) -> list[str]:
         ]
     elif ended is not None and ended["event"] != "end":
         units = stop["units"] if stop else []
-        lines += [ended.get("reason", ""), *(str(UnitStop(**u)) for u in units)]
+        moved = event_lines(state.last_move) if state.last_move else []
+        lines += [ended.get("reason", ""), *moved]
+        lines += [str(UnitStop(**u)) for u in units]
         lines += [go_on] if ended["event"] != "refused" else []
     elif ended is None and stop is not None and stop["reason"]:
         lines.append(f"Stopped: {stop['reason']}")
