@@ -232,6 +232,9 @@ def budget(
     by = slopes @ covariance
     total = np.maximum((by * slopes).sum(axis=1), 0.0)
     before, misfit = (by[:, :p] ** 2) @ prior[:p], (by[:, p:] ** 2) @ prior[p:]
+    # Sizes of the errors that are estimates widen what was known before.
+    share = total / np.maximum(before + misfit, np.maximum(total, 1e-300))
+    before, misfit = share * before, share * misfit
     noise = np.maximum(total - before - misfit, 0.0)
     if calibration.unidentified is not None:
         lost = calibration.unidentified[:, : slopes.shape[-1]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import os
 import warnings
@@ -125,46 +126,60 @@ class Calibration(Fit):
     def to_urdf(self, path: str | os.PathLike[str], *, force: bool = False) -> str:
         """The arm's own file, corrected; see ``jaxcal.models.SerialChain.write``.
 
+        Files have stiff joints and round gears: what was found of compliance and
+        harmonics is not in them, and the rest is fitted again without it. A warning
+        says how far off the file is then.
+
         Returns the tip link.
         """
-        return self.model.write("urdf", path, self.parameters, force=force)
+        return self.model.write("urdf", path, self._for_file(), force=force)
 
     def to_dh(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """The DH table as CSV, fitted without harmonics.
-
-        A warning says how far that moves what is predicted.
-        """
-        self.model.write("dh", path, self._of_table(), force=force)
+        """The DH table as CSV, likewise."""
+        self.model.write("dh", path, self._for_file(), force=force)
 
     def to_ur_kinematics(
         self, path: str | os.PathLike[str], *, force: bool = False
     ) -> None:
         """Universal Robots' kinematics file, likewise."""
-        self.model.write("ur", path, self._of_table(), force=force)
+        self.model.write("ur", path, self._for_file(), force=force)
 
-    def _of_table(self) -> Array:
-        """(p,) for a file, which holds no harmonics: fitted without them."""
-        if not self.estimate[len(self.names) :].any():
-            return self.parameters
-        found = fit_model(
+    def _for_file(self) -> Array:
+        """(p,) for a file: fitted without what no file holds, which is zero."""
+        plain, parameters = self.model.writable(), np.array(self.parameters)
+        kept = np.isin(self.names, plain.names)
+        if kept.all() and not self.estimate[len(self.names) :].any():
+            return parameters
+        fields = fit_model(
             self.commands,
             self.residuals + self.predict(self.commands),
             (self.loss_weights > 0.0).astype(np.float64),
-            model=self.model,
-            prior=self.model.default_prior(),
+            model=plain,
+            prior=plain.default_prior(),
             noise=Noise(std=self.noise_std) if self.noise_known else None,
             loss=self.loss,
             common_noise=None,
-        )["estimate"]
-        moved = self.predict(self.commands) - self.model.predict(self.commands, found)
+        )
+        again = dataclasses.replace(self, **fields)
+        parameters[kept], parameters[~kept] = again.parameters, 0.0
         unit = f" {self.measured_unit}" if self.measured_unit else ""
+        moved = self.predict(self.commands) - again.predict(self.commands)
+        told = (
+            "its predictions at the measured postures are "
+            f"{np.linalg.norm(moved, axis=1).mean():.3g}{unit} from the calibration's "
+            "on average"
+        )
+        if again.noise_std is not None and self.noise_std is not None:
+            told += (
+                f"; held-out error {again.verdict.held_out:.3g}{unit}, of the "
+                f"calibration {self.verdict.held_out:.3g}"
+            )
         warnings.warn(
-            "harmonics left out of the file: its predictions at the measured postures "
-            f"are {np.linalg.norm(moved, axis=1).mean():.3g}{unit} from the "
-            "calibration's on average",
+            "the file has stiff joints and round gears and was fitted without "
+            f"{'compliance and ' if not kept.all() else ''}harmonics: {told}",
             stacklevel=3,
         )
-        return np.asarray(found)
+        return parameters
 
     # -- from a file -------------------------------------------------------------------
 

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 
 _POWER = 0.8
 _KNOWN = 1e9  # degrees of freedom of noise that was given
+_DRIFT = 10.0  # standard deviations of the prior: no parameter drifts by more
 _SWEEPS = 20  # of swaps, at most
 _UNITS = {  # factors between units that are mistaken for each other
     1000.0: "metres for millimetres",
@@ -77,7 +78,9 @@ def check(
         commands: (N, n).
         measured: (N, m) readings there.
         tolerance: how far, root mean square over the calibration's commands, the
-            outputs may drift; three times the noise when not given.
+            outputs may drift, in the unit of the first (an output of another noise
+            counts in noise). When not given three times the standard deviation of these
+            measurements: the noise and what the calibration does not know.
         placed_anew: of an arm, what its sensor reads (sockets, planes, anchors) stands
             elsewhere than at the calibration.
 
@@ -138,7 +141,9 @@ def check(
     seen = np.sqrt((by**2).sum(axis=0))
     with np.errstate(divide="ignore"):
         size = np.sqrt(needed) / seen  # infinite where nothing shows it
-    change, tolerance = _changes(calibration, calibration.commands, tolerance)
+    if tolerance is None:
+        tolerance = _tolerance(calibration, commands)
+    change = _changes(calibration, calibration.commands, tolerance)
     judged = free & np.isfinite(change)
     hidden = judged & (size > change)
     power = _mean_power(freedom, dof, (change[judged] * seen[judged]) ** 2, least)
@@ -197,22 +202,35 @@ def _postures(calibration: Fit, name: str, given: ArrayLike) -> Array:
     return rows
 
 
-def _changes(
-    calibration: Fit, where: Array, tolerance: float | None
-) -> tuple[Array, float]:
-    """(p,) what each parameter may change by, infinite of no effect; the tolerance.
+def _scale(calibration: Fit) -> Array:
+    """(m,) of the outputs, in which they are compared: 1, or their usual noise."""
+    usual, ones = calibration.model.default_noise(), np.ones(calibration.num_outputs)
+    std = ones if usual is None else ones * np.asarray(usual.std)
+    return np.asarray(std / std[0])
 
-    Then the outputs at ``where`` (R, n) change by the tolerance, root mean square.
+
+def _tolerance(calibration: Fit, where: Array) -> float:
+    """Three standard deviations of a measurement at ``where`` (R, n)."""
+    std = calibration.predict_std(where, new_measurement=True) / _scale(calibration)
+    noise = np.asarray(calibration.noise_std) / _scale(calibration)
+    std = np.where(np.isfinite(std), std, noise)
+    return float(3.0 * np.sqrt((std**2).sum(axis=1).mean()))
+
+
+def _changes(calibration: Fit, where: Array, tolerance: float) -> Array:
+    """(p,) what each parameter may change by, infinite where that is far.
+
+    Then the outputs at ``where`` (R, n) change by the tolerance, root mean square. Far
+    is ten standard deviations of the prior: no machine drifts so.
     """
-    if tolerance is None:
-        tolerance = float(
-            3.0 * np.sqrt(np.mean(np.asarray(calibration.noise_std) ** 2))
-        )
     if not numbers("tolerance", tolerance) > 0.0:
         raise ValueError(f"tolerance must be positive, got {tolerance}")
     slopes = np.asarray(calibration.model.jacobian(where, calibration.parameters))
+    slopes = slopes / _scale(calibration)[:, None]
     with np.errstate(divide="ignore"):
-        return tolerance / np.sqrt((slopes**2).sum(axis=1).mean(axis=0)), tolerance
+        change = tolerance / np.sqrt((slopes**2).sum(axis=1).mean(axis=0))
+        most = _DRIFT / np.sqrt(calibration.prior_precision[: len(change)])
+    return np.where(change > most, np.inf, change)
 
 
 def _mean_power(freedom: int, dof: float, shifts: Array, least: float = 1.0) -> Array:
@@ -261,7 +279,9 @@ def verification(
     white = np.linalg.inv(np.linalg.cholesky(spread)) @ slopes
     seen = (white**2).sum(axis=1)  # (M, p) by a drift of one
     where = calibration.commands if region is None else table("region", region)
-    change, _ = _changes(calibration, where, tolerance)
+    if tolerance is None:
+        tolerance = _tolerance(calibration, where)
+    change = _changes(calibration, where, tolerance)
     judged = (calibration.free[: len(change)] > 0.0) & np.isfinite(change)
     shifts = seen[:, judged] * change[judged] ** 2  # noncentralities of one posture
     q, dof = slopes.shape[1], calibration.noise_dof or _KNOWN

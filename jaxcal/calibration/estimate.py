@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.sizes import Sizes, group_sizes, of_sizes
+from jaxcal.calibration.sizes import Sizes, group_sizes, misfit_size, of_sizes
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
 from jaxcal.checks import array_of, one_of, require_kind
 from jaxcal.information.blocks import triangle
@@ -20,6 +20,10 @@ from jaxcal.models.uncertainty import Noise, Prior
 __all__ = ["fit_model", "require_fitting"]
 
 Array = NDArray[np.float64]
+
+# Of -2 log likelihood, what misfit must gain where readings of one place do not tell
+# how it goes on elsewhere.
+_TOLD = 20.0
 
 
 def require_fitting(model: Any, commands: Array, measured: Array) -> Model:
@@ -94,15 +98,25 @@ def fit_model(
         student=loss == "student",
     )
     sizes: Sizes | None = None
+    times = 1.0
     if prior.by_data and (asked or not spread.any()):
         if whole.error_groups() is None or spread.any():
             raise ValueError("Prior.sized() is of arms, without command_std")
-        found, stated = solve(task, rough=True), task
-        for last in (False, True):
-            sizes = group_sizes(stated, found, sizes)
-            scaled = stated.precision / sizes.factors**2
-            task = dataclasses.replace(task, precision=scaled)
-            found = solve(task, found, rough=not last)
+        found, sizes, scaled = _sized(task)
+        if bent is not whole:
+            gain, times = misfit_size(bent, task, found, sizes)
+            if gain > _TOLD:
+                whole = bent
+                resolved = bent.default_prior().resolve(bent)
+                task = dataclasses.replace(
+                    task,
+                    model=bent,
+                    mean=resolved.mean,
+                    precision=np.diagonal(resolved.precision),
+                    free=resolved.free,
+                )
+                found, sizes, scaled = _sized(task)
+        task = scaled
     else:
         found = solve(task)
     if common_noise is None and _levels_differ(task, found):
@@ -116,8 +130,20 @@ def fit_model(
         if sizes is not None:
             fields["joint_covariance"] += of_sizes(task, found, sizes)
         if bent is not whole:
-            fields |= _misfit(bent, task, found, fields, within)
+            fields |= _misfit(bent, task, found, fields, within, times)
     return fields | {"model": model, "loss": loss}
+
+
+def _sized(task: Task) -> tuple[Solution, Sizes, Task]:
+    """The fit with sizes from the readings, these, and the task with them."""
+    found, scaled = solve(task, rough=True), task
+    sizes: Sizes | None = None
+    for last in (False, True):
+        sizes = group_sizes(task, found, sizes)
+        scaled = dataclasses.replace(task, precision=task.precision / sizes.factors**2)
+        found = solve(scaled, found, rough=not last)
+    assert sizes is not None
+    return found, sizes, scaled
 
 
 def _noise_of(
@@ -157,12 +183,12 @@ def _misfit(
     found: Solution,
     fields: dict[str, Any],
     within: Array,
+    times: float,
 ) -> dict[str, Any]:
     """The fields with harmonics that were not fitted, but may be there.
 
     They bend what was fitted and go on where nothing was measured, so predictions err
-    by more than the noise explains. Their size is the default prior's times the
-    scatter of the readings over the sensor's usual noise.
+    by more than the noise explains.
 
     Args:
         bent: the arm with them.
@@ -170,10 +196,9 @@ def _misfit(
         found: its solution.
         fields: of it, with the covariance (P, P) that is returned.
         within: (P, P) covariance of the parameters by the noise alone.
+        times: their size, of the default prior's.
     """
     count = len(bent.names) - len(task.mean)
-    usual = bent.default_noise() or Noise(1.0)
-    times = np.sqrt(np.mean((fields["noise_std"] / np.asarray(usual.std)) ** 2))
     std = times * np.asarray(bent.default_prior().std)[-count:]
     none = np.zeros(count)
     theta = np.concatenate([found.parameters, none])

@@ -55,6 +55,7 @@ def identify(
     command_unit: str = "",
     measured_unit: str = "",
     notes: Mapping[str, Any] | None = None,
+    accuracy: float | None = None,
 ) -> Calibration:
     """The parameters of ``y = f(u; theta)`` that the measurements make most probable.
 
@@ -91,6 +92,9 @@ def identify(
         command_unit: stored with the result.
         measured_unit: stored with the result.
         notes: anything JSON can hold, stored under ``provenance["notes"]``.
+        accuracy: held-out error that is enough, in the measured unit, which the verdict
+            of an arm judges by; stored in ``provenance``. When not given, by whether
+            the noise explains the readings, or the nominal machine is far worse.
 
     Returns:
         The calibration; its covariance is None where the noise is unknown: nothing was
@@ -143,6 +147,10 @@ def identify(
         "measured_unit": measured_unit,
         "provenance": _provenance(commands, measured, weight, notes),
     }
+    if accuracy is not None:
+        if not array_of("accuracy", accuracy) > 0.0:
+            raise ValueError(f"accuracy must be positive, got {accuracy}")
+        about["provenance"]["accuracy"] = float(accuracy)
     affine = model is None
     if model is not None:
         model = require_fitting(model, commands, measured)

@@ -10,6 +10,9 @@ Sources: MacKay, 1992; Bishop, Pattern Recognition and Machine Learning, 3.5.
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -18,14 +21,15 @@ from numpy.typing import NDArray
 from jaxcal.calibration.solve import Solution, Task
 from jaxcal.information.blocks import triangle, without
 from jaxcal.information.singular import significant
-from jaxcal.models.model import derivative
+from jaxcal.models.model import ErrorGroups, Model, derivative
 
-__all__ = ["Sizes", "group_sizes", "of_sizes"]
+__all__ = ["Sizes", "group_sizes", "misfit_size", "of_sizes"]
 
 Array = NDArray[np.float64]
 
 _LEVEL = 3.0  # factor of one standard deviation of the level, beforehand
 _MOST = 5.0  # of a logarithm
+_TRIED = np.array([-5.0, -4.0, -3.0, -2.0, -1.2, -0.4, 0.4, 1.2])  # likewise
 _SCORES = 100  # steps of Fisher's scoring, at most
 
 
@@ -50,42 +54,8 @@ def group_sizes(task: Task, found: Solution, before: Sizes | None) -> Sizes:
     of_model = task.model.error_groups()
     assert of_model is not None
     groups, num_groups = of_model.members, len(of_model.medians)
-    middle = np.log(np.append(of_model.medians, 1.0))
-    wide = np.log(np.append(of_model.spreads, _LEVEL))
-    rows, right = _reduced(task, found)
-    sized = groups[task.free & (task.precision > 0.0)]
-    count, width = len(right), rows.shape[1]
-    # All that the readings say is in a triangle; the rest of them is noise alone.
-    factor = triangle(np.column_stack([rows, right]))
-    top = min(width, len(factor))
-    rest = float((factor[top:, width] ** 2).sum())
-    rows, right = factor[:top, :width], factor[:top, width]
-    member = sized == np.arange(num_groups)[:, None]  # (groups, s)
-
-    def cost(logs: Array) -> tuple[float, Array, Array]:
-        """-2 log marginal likelihood with what is thought of the factors.
-
-        Its slope and what its curvature is expected to be beside it.
-        """
-        scaled = rows * np.exp(logs[:-1] @ member)
-        level = np.exp(2.0 * logs[-1])
-        inverse = np.linalg.inv(scaled @ scaled.T + level * np.eye(top))
-        white, seen = inverse @ right, inverse @ scaled
-        spread = member @ (seen * scaled).sum(axis=0)
-        alone = (count - top) * 2.0 * logs[-1] + rest / level
-        value = right @ white + alone - np.linalg.slogdet(inverse)[1]
-        slope = np.append(
-            spread - member @ (white @ scaled) ** 2,
-            level * (np.trace(inverse) - white @ white) + count - top - rest / level,
-        )
-        curve = np.diag(wide**-2.0)
-        curve[:-1, :-1] += 2.0 * member @ (scaled.T @ seen) ** 2 @ member.T
-        curve[-1, :-1] = curve[:-1, -1] = 2.0 * level * member @ (seen**2).sum(axis=0)
-        curve[-1, -1] += 2.0 * (level**2 * (inverse**2).sum() + count - top)
-        off = (logs - middle) / wide
-        value = float(value + off @ off)
-        return value, 2.0 * (slope + off / wide), 2.0 * curve
-
+    middle, wide = _thought(of_model)
+    cost = _evidence(task, found, of_model)
     # A level that is known floats too: misfit beyond it is no size of the errors.
     best = middle if before is None else before.logs
     least, slope, curve = cost(best)
@@ -113,11 +83,103 @@ def group_sizes(task: Task, found: Solution, before: Sizes | None) -> Sizes:
     return Sizes(best, factors, groups, inside[:num_groups, :num_groups])
 
 
+def _thought(groups: ErrorGroups) -> tuple[Array, Array]:
+    """(G + 1,) of the logarithms beforehand: the middle, and a standard deviation."""
+    wide = np.log(np.append(groups.spreads, _LEVEL))
+    return np.log(np.append(groups.medians, 1.0)), wide
+
+
+def _evidence(
+    task: Task, found: Solution, groups: ErrorGroups
+) -> Callable[[Array], tuple[float, Array, Array]]:
+    """-2 log marginal likelihood of the logarithms (G + 1,), with slope and curve."""
+    middle, wide = _thought(groups)
+    rows, right = _reduced(task, found)
+    sized = groups.members[task.free & (task.precision > 0.0)]
+    count, width = len(right), rows.shape[1]
+    # All that the readings say is in a triangle; the rest of them is noise alone.
+    factor = triangle(np.column_stack([rows, right]))
+    top = min(width, len(factor))
+    rest = float((factor[top:, width] ** 2).sum())
+    rows, right = factor[:top, :width], factor[:top, width]
+    member = sized == np.arange(len(groups.medians))[:, None]  # (groups, s)
+
+    def cost(logs: Array) -> tuple[float, Array, Array]:
+        """-2 log marginal likelihood with what is thought of the factors.
+
+        Its slope and what its curvature is expected to be beside it.
+        """
+        scaled = rows * np.exp(logs[:-1] @ member)
+        level = np.exp(2.0 * logs[-1])
+        inverse = np.linalg.inv(scaled @ scaled.T + level * np.eye(top))
+        white, seen = inverse @ right, inverse @ scaled
+        spread = member @ (seen * scaled).sum(axis=0)
+        alone = (count - top) * 2.0 * logs[-1] + rest / level
+        value = right @ white + alone - np.linalg.slogdet(inverse)[1]
+        slope = np.append(
+            spread - member @ (white @ scaled) ** 2,
+            level * (np.trace(inverse) - white @ white) + count - top - rest / level,
+        )
+        curve = np.diag(wide**-2.0)
+        curve[:-1, :-1] += 2.0 * member @ (scaled.T @ seen) ** 2 @ member.T
+        curve[-1, :-1] = curve[:-1, -1] = 2.0 * level * member @ (seen**2).sum(axis=0)
+        curve[-1, -1] += 2.0 * (level**2 * (inverse**2).sum() + count - top)
+        off = (logs - middle) / wide
+        value = float(value + off @ off)
+        return value, 2.0 * (slope + off / wide), 2.0 * curve
+
+    return cost
+
+
+def misfit_size(
+    bent: Model, task: Task, found: Solution, sizes: Sizes
+) -> tuple[float, float]:
+    """What misfit that was not fitted would gain, and how large it is.
+
+    Args:
+        bent: the model with it: its last parameters, the last of its groups.
+        task: without it, with the prior that the factors are of.
+        found: its solution.
+        sizes: of it.
+
+    Returns:
+        How much less -2 log marginal likelihood is at best with it, and the root of its
+        mean squared factor.
+    """
+    more = len(bent.names) - len(task.mean)
+    std, groups = np.asarray(bent.default_prior().std)[-more:], bent.error_groups()
+    assert groups is not None
+    beside = copy.copy(found)
+    beside.parameters = np.append(found.parameters, np.zeros(more))
+    whole = dataclasses.replace(
+        task,
+        model=bent,
+        mean=np.append(task.mean, np.zeros(more)),
+        precision=np.append(task.precision, std**-2.0),
+        free=np.append(task.free, np.ones(more, dtype=np.bool_)),
+    )
+    cost = _evidence(whole, beside, groups)
+    middle, wide = _thought(groups)
+    logs, least = sizes.logs.copy(), np.zeros(len(_TRIED))
+    rest = np.flatnonzero(np.arange(len(logs)) != len(logs) - 2)
+    for k, tried in enumerate(_TRIED):
+        logs[-2] = tried
+        for _ in range(2):  # steps of the other sizes
+            _, slope, curve = cost(logs)
+            step = np.linalg.solve(curve[np.ix_(rest, rest)], slope[rest])
+            logs[rest] = np.clip(logs[rest] - np.clip(step, -1.0, 1.0), -_MOST, _MOST)
+        least[k] = cost(logs)[0]
+    shares = np.exp(-0.5 * (least - least.min()))
+    square = float(shares @ np.exp(2.0 * _TRIED) / shares.sum())
+    gains = least - ((_TRIED - middle[-2]) / wide[-2]) ** 2
+    return float(gains[0] - gains.min()), float(np.sqrt(square))
+
+
 def of_sizes(task: Task, found: Solution, sizes: Sizes) -> Array:
     """(P, P) what the sizes, which are estimates too, add to the covariance.
 
-    Along each axis of their covariance, one standard deviation either way, the mean
-    and the covariance of the parameters are averaged; the model is linear.
+    Mean and covariance of the parameters are averaged over the sizes; the model is
+    linear.
     """
     free = task.free
     groups = sizes.groups[free]
@@ -140,12 +202,22 @@ def of_sizes(task: Task, found: Solution, sizes: Sizes) -> Array:
         inverse = np.linalg.inv(gram + np.diag(scale**2 * precision * factor)) - none
         return inverse @ right, inverse
 
-    values, axes = np.linalg.eigh(sizes.covariance)
-    middle, spread = at(np.zeros(len(values)))[1], np.zeros_like(gram)
-    for axis in (np.sqrt(np.maximum(values, 0.0)) * axes).T:
-        (first, one), (last, other) = at(axis), at(-axis)
-        spread += 0.5 * (one + other) - middle
-        spread += 0.25 * np.outer(first - last, first - last)
+    # The logarithm of a size has a long upper tail where few errors show it: its mean
+    # is above the most probable one, by its variance, less where the prior sets it.
+    of_model = task.model.error_groups()
+    assert of_model is not None
+    variance = np.diagonal(sizes.covariance)
+    skew = variance * (1.0 - variance / _thought(of_model)[1][:-1] ** 2)
+    skew = np.where(of_model.medians < 1.0, 0.0, skew)  # of what may not be there
+    wider = np.sqrt(1.0 + 2.0 * skew)
+    values, axes = np.linalg.eigh(wider[:, None] * sizes.covariance * wider)
+    nodes = np.sqrt(3.0 * np.maximum(values, 0.0)) * axes  # of Gauss and Hermite
+    first, least = at(np.zeros(len(values)))
+    spread = np.zeros_like(gram)
+    shares = [1.0 - len(values) / 3.0, *[1.0 / 6.0] * 2 * len(values)]
+    for share, node in zip(shares, [0.0 * skew, *nodes.T, *-nodes.T], strict=True):
+        mean, covariance = at(skew + node)
+        spread += share * (covariance - least + np.outer(mean - first, mean - first))
     values, axes = np.linalg.eigh(spread)
     spread = (np.maximum(values, 0.0) * axes) @ axes.T
     result = np.zeros((len(free), len(free)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import pathlib
 from collections.abc import Sequence
@@ -25,7 +26,7 @@ from jaxcal.commands.tables import (
 from jaxcal.csvtable import COMMANDS, MEASURED, read_table
 from jaxcal.extras import needs
 from jaxcal.models import SerialChain
-from jaxcal.models.sensors import SENSORS, Placed
+from jaxcal.models.sensors import SENSORS, Board, Placed
 from jaxcal.selection import select
 
 __all__ = ["command", "identify", "postures", "predict"]
@@ -50,6 +51,40 @@ def postures(
         "and the sensor's",
         "FILE",
     ] = None,
+    camera: Annotated[
+        list[float] | None,
+        "of --sensor board: width,height,fx,fy,cx,cy in pixels, or degrees of view "
+        "horizontal,vertical: the board is in the picture",
+        several(float, "numbers"),
+    ] = None,
+    board: Annotated[
+        list[float] | None,
+        "width,height of the board from the corner that its pose is of",
+        several(float, "numbers"),
+    ] = None,
+    away: Annotated[
+        list[float] | None,
+        "least,greatest distance of the camera from the board",
+        several(float, "numbers"),
+    ] = None,
+    tilt: Annotated[float, "degrees that the board may be turned from the camera"] = 45,
+    side: Annotated[
+        str | None,
+        "where the board's z axis points from its printed side",
+        ["+z", "-z"],
+    ] = None,
+    floor: Annotated[float | None, "height that no joint is below"] = None,
+    approach: Annotated[
+        list[float] | None,
+        "direction in which the tool comes, and the degrees about it: 0,0,-1,60",
+        several(float, "numbers"),
+    ] = None,
+    clear: Annotated[
+        list[list[float]] | None,
+        "a plane (normal, offset) or box (least x,y,z, greatest) that links stay away "
+        "from, as spheres along lines between the joints; once for each",
+        several(float, "numbers"),
+    ] = None,
     count: Annotated[int, "postures to choose from"] = 300,
     seed: Annotated[int, "of these"] = 0,
     picture: Annotated[
@@ -61,8 +96,8 @@ def postures(
 
     Postures are made within the joint limits, where the sensor reads, and chosen for
     the predictions of the calibrated arm. With --measured the rest of the K is chosen
-    beside what was reached, which shows where sockets and planes are, too. Collisions
-    are not looked at.
+    beside what was reached, which shows where sockets, planes and boards are, too.
+    Collisions are looked at as far as --floor, --approach and --clear say.
     """
     reached = None if measured is None else read_table(measured)
     placed = issubclass(SENSORS[of_arm.sensor], Placed)
@@ -77,7 +112,23 @@ def postures(
         reason = f"-k must be more than the {k - left} that were reached"
         raise ValueError(f"{reason}, got {k}")
     targets = None if placed else near
-    offered = arm.postures(count, seed=seed, near=targets)
+    if board is not None:
+        seen = arm.sensor
+        if not isinstance(seen, Board) or len(board) != 2:
+            raise ValueError("--board WIDTH,HEIGHT is of --sensor board")
+        arm = arm.measured_with(dataclasses.replace(seen, extent=(board[0], board[1])))
+    offered = arm.postures(
+        count,
+        seed=seed,
+        near=targets,
+        camera=camera,
+        distance=away,
+        tilt=tilt,
+        side=side,
+        floor=floor,
+        approach=approach,
+        clear=clear or (),
+    )
     chosen = select(offered, left, "exchange", model=arm, measured=done).indices
     plan = offered[chosen]
     plan = plan[arm.in_turn(plan)]
@@ -114,7 +165,12 @@ def identify(
         "save the calibration (.json), or of an arm the corrected file (.urdf)",
         "FILE",
     ] = "",
-    force: Annotated[bool, "write a .urdf over another, or from a bad fit"] = False,
+    accuracy: Annotated[
+        float | None,
+        "of an arm, the held-out error that is enough, in the measured unit",
+    ] = None,
+    overwrite: Annotated[bool, "write the .urdf over a file that is there"] = False,
+    unproven: Annotated[bool, "write the .urdf of a fit that is not good"] = False,
     json: Annotated[bool, "print JSON"] = False,
 ) -> None:
     """Fit a model to measurements and save the calibration.
@@ -134,8 +190,8 @@ def identify(
         else:
             known = table.named(known, MEASURED, chosen=outputs, option="--outputs")
             measured = table.columns(known)
-        if as_urdf and os.path.exists(out) and not force:
-            raise ValueError(f"{out} is there already; --force writes over it")
+        if as_urdf and os.path.exists(out) and not overwrite:
+            raise ValueError(f"{out} is there already; --overwrite writes over it")
     else:
         if as_urdf:
             raise ValueError("--out FILE.urdf needs --model FILE.urdf")
@@ -155,14 +211,15 @@ def identify(
         output_names=known,
         command_unit=command_unit,
         measured_unit=measured_unit,
+        accuracy=accuracy,
     )
     told, saved = calibration.verdict, f"saved {out}"
-    if as_urdf and told and not told.good and not force:
+    if as_urdf and told and not told.good and not unproven:
         raise ValueError(
-            f"{out} is not written, --force writes it all the same:\n{told}"
+            f"{out} is not written, --unproven writes it all the same:\n{told}"
         )
     if as_urdf:
-        saved += f", tip link {calibration.to_urdf(out, force=force)}"
+        saved += f", tip link {calibration.to_urdf(out, force=overwrite)}"
     elif out:
         calibration.save(out)
     if json:

@@ -230,6 +230,10 @@ class Model(abc.ABC):
         """The machine whose nominal is this one's with ``parameters``."""
         raise self._no_arm()
 
+    def writable(self) -> Model:
+        """This model without the parameters that no file of :meth:`write` holds."""
+        return self
+
     def write(
         self, form: str, path: Any, parameters: ArrayLike, *, force: bool = False
     ) -> str:

@@ -118,6 +118,15 @@ def test_one_loose_contact_is_named_and_no_file_is_written(tmp_path, capsys):
     flags += ["--sensor", "socket", "--distance", "0,1,0.05,0.0001", "--out", str(out)]
     assert main(flags) == 2
     assert "measurement 20 is" in capsys.readouterr().err and not out.exists()
+    # To write over a file is one thing, to accept a bad fit another.
+    out.write_text("a good file", encoding="utf-8")
+    assert main([*flags, "--unproven"]) == 2
+    assert "--overwrite writes over it" in capsys.readouterr().err
+    assert main([*flags, "--overwrite"]) == 2
+    assert "--unproven writes it" in capsys.readouterr().err
+    assert out.read_text(encoding="utf-8") == "a good file"
+    assert main([*flags, "--overwrite", "--unproven"]) in (0, None)
+    assert out.read_text(encoding="utf-8").startswith("<?xml")
 
 
 def test_exchanged_sockets_are_named_where_their_places_were_given():
@@ -235,7 +244,59 @@ def test_another_tip_within_the_prior_is_named(name, off):
     assert len(said) == 1 and far == pytest.approx(0.01, rel=0.05)
     clean = _fit(name, *place).verdict
     assert not [why for why in clean.reasons if "another tip" in why]
-    assert clean.good and not found.verdict.clean
+    # Contacts show where the tip is: the file was wrong, and the calibration is right.
+    assert clean.good and found.verdict.good and "contradict" not in str(found.verdict)
+    tool = found.arm.tool[:3, 3] - _fit(name, *place).arm.tool[:3, 3]
+    assert np.linalg.norm(tool) < 2e-4
+
+
+@pytest.mark.parametrize("apart", [0.03, 0.045, 0.048, 0.052, 0.06])
+def test_a_distance_that_contacts_contradict_is_named(apart):
+    arm = contacts.arm("panda_1").measured_with(
+        Socket(2, distances=[(0, 1, apart, 1e-4)])
+    )
+    with pytest.warns(UserWarning, match="measure that distance again"):
+        found = jaxcal.identify(np.column_stack(PLACE), np.zeros((62, 3)), model=arm)
+    said = " ".join(found.verdict.reasons)
+    free = float(re.search(r"lengths say (\S+) \+-", said)[1])
+    assert not found.verdict.good and abs(free - 0.05) < 0.2 * abs(apart - 0.05) + 5e-4
+
+
+def test_a_column_that_never_changes_is_named():
+    joints = PLACE[0].copy()
+    joints[:, 6] = 0.0
+    with pytest.warns(UserWarning, match="panda_joint7 is 0 in all 62 measurements"):
+        assert not _fit("panda_1", joints, PLACE[1]).verdict.good
+    joints = PLACE[0].copy()
+    joints[:, 2] = 0.0
+    with pytest.raises(ValueError, match="panda_joint3 never changes"):
+        _fit("panda_1", joints, PLACE[1])
+
+
+def test_degrees_that_were_converted_again_are_named():
+    with pytest.raises(ValueError, match=r"leave out np\.degrees, --radians"):
+        _fit("panda_1", np.degrees(PLACE[0]), PLACE[1])
+
+
+def test_loud_readings_are_judged_by_the_nominal_arm_or_what_was_asked():
+    """A servo arm whose joints have .3 degrees of play."""
+    arm, rng = ur5(), np.random.default_rng(0)
+    std = np.asarray(arm.default_prior().std)
+    truth = arm.nominal + 3.0 * std * rng.normal(size=len(std))
+    joints = rng.uniform(-120.0, 120.0, (60, 6))
+    measured = arm.predict(joints + rng.uniform(-0.15, 0.15, (60, 6)), truth)
+    found = jaxcal.identify(joints, measured, model=arm)
+    assert not found.verdict.explains and found.verdict.good
+    assert "their noise, or what no parameter explains" in str(found.verdict)
+    for accuracy, good in ((10.0, True), (0.5, False)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            asked = jaxcal.identify(joints, measured, model=arm, accuracy=accuracy)
+        assert asked.verdict.good == good
+        again = jaxcal.Calibration.from_dict(asked.to_dict())
+        assert again.verdict.good == good
+    with pytest.raises(ValueError, match="accuracy must be positive"):
+        jaxcal.identify(joints, measured, model=arm, accuracy=0.0)
 
 
 def test_a_wrong_tip_is_named():
@@ -267,14 +328,14 @@ def _moved(arm, joints, row, off):
     return joints
 
 
-def _told(arm, joints, sockets):
-    """Reasons of a verdict that is not good."""
+def _told(arm, joints, sockets, good=False):
+    """Reasons of a verdict that is not good, or of any."""
     commands = np.column_stack([joints, sockets])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         zeros = np.zeros((len(joints), 3))
         verdict = jaxcal.identify(commands, zeros, model=arm).verdict
-    return "" if verdict.good else "\n".join(verdict.reasons)
+    return "" if verdict.good and not good else "\n".join(verdict.reasons)
 
 
 @pytest.mark.slow
@@ -303,7 +364,7 @@ def test_wrong_contacts_of_every_place_are_told_by_name(name, count):
                 tool = arm.tool.copy()
                 tool[axis, 3] += off
                 wrong_tip = dataclasses.replace(arm, tool=tool)
-                assert "is it another tip?" in _told(wrong_tip, joints, sockets)
+                assert "is it another tip?" in _told(wrong_tip, joints, sockets, True)
         for _ in range(4):
             row, off = rng.integers(len(rows)), rng.normal(size=3)
             loose = _moved(arm, joints, row, 0.01 * off / np.linalg.norm(off))

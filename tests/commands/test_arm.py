@@ -43,8 +43,8 @@ def test_contacts_become_a_calibrated_file(files, capsys):
         spread[name] = np.linalg.norm(np.vstack(off), axis=1).mean()
     assert spread["calibrated"] < 0.001 < 0.005 < spread["nominal"]
     assert _run(files, "--radians", "--out", str(out)) == 2
-    assert "--force" in capsys.readouterr().err
-    assert _run(files, "--radians", "--force", "--out", str(out)) in (0, None)
+    assert "--overwrite" in capsys.readouterr().err
+    assert _run(files, "--radians", "--overwrite", "--out", str(out)) in (0, None)
 
 
 @pytest.mark.parametrize(

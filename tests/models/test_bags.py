@@ -35,6 +35,23 @@ def test_postures_at_rest_are_found_and_moves_are_not():
     assert len(at_rest(times[:10], joints[:10], 0.5, 0.05)) == 0
 
 
+@pytest.mark.parametrize("rate", [50, 250, 1000])
+@pytest.mark.parametrize("spread", [0.0, 0.002, 0.03, 0.1])
+def test_encoders_that_jitter_still_rest(spread, rate):
+    """Eight rests of a second; moves of .6 degrees a second are none, but of noise."""
+    rng = np.random.default_rng(0)
+    slow = 0.6 if spread < 0.1 else 6.0
+    postures = np.cumsum(slow * rng.uniform(1.0, 1.7, (8, 7)), axis=0)
+    moves = [postures[0]] * rate
+    for one, two in itertools.pairwise(postures):
+        moves += [*np.linspace(one, two, rate), *[two] * rate]
+    joints = np.array(moves)
+    joints = joints + spread * rng.normal(size=joints.shape)
+    found = at_rest(np.arange(len(joints)) / rate, joints, 0.5, None)
+    assert len(found) == 8
+    np.testing.assert_allclose(found, postures, atol=0.03 + 0.6 * spread)
+
+
 @pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
 def test_a_bag_is_read_by_the_names_of_the_joints(plugin, tmp_path):
     pytest.importorskip("rosbags")

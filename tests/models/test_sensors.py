@@ -567,7 +567,8 @@ def test_views_of_a_board_weigh_by_their_covariance():
     spread = np.diag([1.0, 1.0, 4.0, 0.1, 0.1, 0.02]) ** 2
     covariance = np.array([spread * (1.0 + i) for i in range(len(JOINTS))])
     zeros = np.zeros((len(JOINTS), 6))
-    options = {"model": model, "loss": "gaussian", "prior": model.default_prior()}
+    stated = dataclasses.replace(model.default_prior(), by_data=False)
+    options = {"model": model, "loss": "gaussian", "prior": stated}
     without = jaxcal.identify(
         commands[1:],
         zeros[1:],

@@ -40,12 +40,18 @@ class Board(Sensor):
         place: (4, 4) of the other in the measuring frame; found when not given.
         corners: (C, 3) of the board in its own frame, in its plane z = 0.
         camera: focal lengths and centre in pixels (fx, fy, cx, cy).
+        side: 1 where the board's z axis points to cameras that see it, -1 where it
+            points away; 0 is not known, views tell.
+        extent: width and height of the board from the origin of its pose, for postures
+            from which all of it is seen; that of ``corners`` where they are given.
     """
 
     moves: str = "camera"
     place: Array | None = None
     corners: Array | None = None
     camera: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    side: float = 0.0
+    extent: tuple[float, float] = (0.0, 0.0)
 
     kind = "board"
     tool = ("x", "y", "z", "rx", "ry", "rz")
@@ -74,6 +80,14 @@ class Board(Sensor):
             )
         object.__setattr__(self, "corners", corners)
         object.__setattr__(self, "camera", tuple(camera.tolist()))
+
+    @property
+    def outline(self) -> Array:
+        """(C, 3) points of the board that a picture must hold."""
+        if self.corners is not None:
+            return self.corners
+        width, height = self.extent
+        return np.array([[x, y, 0.0] for x in (0.0, width) for y in (0.0, height)])
 
     @property
     def zeros(self) -> bool:  # type: ignore[override]  # of a pose
@@ -187,7 +201,9 @@ class Board(Sensor):
                 "views must turn the tip about two axes at least: with these the board "
                 "and the camera cannot be told apart"
             )
-        return dataclasses.replace(self, place=place), new
+        towards = -np.einsum("nij,ni->nj", turn, shift)[:, 2]  # z of the camera, in it
+        side = float(np.sign(np.median(towards)))
+        return dataclasses.replace(self, place=place, side=side), new
 
     def _poses(self, pixels: Array) -> tuple[Array, Array]:
         """Rotations (N, 3, 3) and places (N, 3) of the board (Zhang, 2000)."""

@@ -20,7 +20,6 @@ class Position(Sensor):
 
     kind = "position"
     outputs = ("x", "y", "z")
-    sizes_prior = True
     misfit = 3e-4
 
     def usual_noise(self, length: float) -> ArrayLike:

@@ -88,10 +88,9 @@ class Sensor(abc.ABC):
     kind: ClassVar[str]  # in files and for the command line
     tool: ClassVar[tuple[str, ...]] = ("x", "y", "z")  # what of the tool it sees
     zeros: ClassVar[bool] = False  # what is measured is always zero
-    sizes_prior: ClassVar[bool] = False  # shown to be better with Prior.sized()
     compliant: ClassVar[bool] = False  # shown to be better with joints that yield
-    # And with their harmonics, as misfit; what it leaves, by the arm's length.
-    misfit: ClassVar[float] = 0.0
+    local: ClassVar[bool] = False  # of few places: harmonics are fitted if they gain
+    misfit: ClassVar[float] = 0.0  # what they leave, by the arm's length, in a choice
 
     @property
     def inputs(self) -> tuple[str, ...]:

@@ -36,7 +36,7 @@ class Socket(Placed):
     kind = "socket"
     outputs = ("off x", "off y", "off z")
     zeros = True
-    sizes_prior = True
+    local = True
     compliant = True
     axes = ("x", "y", "z")
     axis_units = ("length",) * 3

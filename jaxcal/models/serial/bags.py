@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from jaxcal.extras import needs
 
-__all__ = ["at_rest", "joint_states"]
+__all__ = ["at_rest", "jitter", "joint_states"]
 
 Array = NDArray[np.float64]
 
+_WITHIN = 0.05  # degrees in which a resting joint stays
+_JITTER = 8.0  # standard deviations: no reading of a joint at rest is farther apart
 _STATES = "sensor_msgs/msg/JointState"
 
 
@@ -50,25 +52,51 @@ def joint_states(
     return np.array(times), np.array(rows)
 
 
+def jitter(joints: Array) -> Array:
+    """(J,) standard deviation of what a resting joint reads, of joints (T, J).
+
+    From second differences, in which a steady motion leaves nothing; the median, so
+    that a third of the recording may be jerks.
+    """
+    if len(joints) < 3:
+        return np.zeros(joints.shape[1])
+    second = joints[2:] - 2.0 * joints[1:-1] + joints[:-2]
+    return np.asarray(np.median(np.abs(second), axis=0) / (0.6745 * np.sqrt(6.0)))
+
+
 def at_rest(
-    times: Array, joints: Array, seconds: float, within: float
+    times: Array, joints: Array, seconds: float, within: float | None
 ) -> NDArray[np.float64]:
     """(N, J) means of the stretches of ``seconds`` or more that stay ``within``.
 
-    A stretch at the posture of the one before is the same rest.
+    When not given that is 0.05, or eight times what the joint jitters by if that is
+    more; the first and the last third of a stretch then agree to 0.05 and the noise of
+    their means, so a slow motion is no rest. A stretch at the posture of the one before
+    is the same rest.
     """
+    noise = jitter(joints)
+    most = np.full(joints.shape[1], _WITHIN if within is None else within)
+    if within is None:
+        most = np.maximum(most, _JITTER * noise)
     found: list[Array] = []
     first = 0
     low, high = joints[0], joints[0]
     for i in range(1, len(joints) + 1):
         if i < len(joints):
             wider = np.minimum(low, joints[i]), np.maximum(high, joints[i])
-            if (wider[1] - wider[0] <= within).all():
+            if (wider[1] - wider[0] <= most).all():
                 low, high = wider
                 continue
         if times[i - 1] - times[first] >= seconds:
-            mean = joints[first:i].mean(axis=0)
-            if not found or (np.abs(mean - found[-1]) > 2.0 * within).any():
+            stretch = joints[first:i]
+            third = -(-len(stretch) // 3)
+            drift = stretch[-third:].mean(axis=0) - stretch[:third].mean(axis=0)
+            still = (
+                within is not None
+                or (np.abs(drift) <= _WITHIN + 4.0 * noise * np.sqrt(2.0 / third)).all()
+            )
+            mean = stretch.mean(axis=0)
+            if still and not (found and (np.abs(mean - found[-1]) <= 2.0 * most).all()):
                 found.append(mean)
         if i < len(joints):
             first, low, high = i, joints[i], joints[i]

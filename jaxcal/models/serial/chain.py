@@ -44,6 +44,7 @@ _NEAR, _ALIKE = 0.2, 0.05
 # the axes, zeros of the joints, compliance, harmonics. Most arms have little misfit and
 # some have much.
 _SIZES, _SIZES_SPREAD = (1.0, 1.0, 1.0, 1.0, 0.1), (6.0, 6.0, 6.0, 6.0, 10.0)
+_BEYOND_TURNS = 20.0  # degrees: as radians, more turns than a joint makes
 _BEYOND = 2.0  # degrees beyond a limit, or percent of a slide's stroke
 # Farther away, or turned by more than 37 degrees (a cosine), no fit of poses finds it.
 _AWAY, _ASIDE = 1.5, 0.8
@@ -255,8 +256,7 @@ class SerialChain(Arm, Model):
 
     @property
     def fits_misfit(self) -> bool:
-        # Of a URDF file what is written back is what is predicted, without harmonics.
-        return bool(self.sensor.misfit) and self.source is None
+        return not self.sensor.local
 
     def postures(
         self,
@@ -265,6 +265,14 @@ class SerialChain(Arm, Model):
         seed: int = 0,
         near: ArrayLike | None = None,
         allowed: Callable[[NDArray[np.float64]], bool] | None = None,
+        camera: ArrayLike | None = None,
+        distance: Sequence[float] | None = None,
+        tilt: float = 45.0,
+        side: str | None = None,
+        floor: float | None = None,
+        approach: ArrayLike | None = None,
+        clear: Sequence[ArrayLike] = (),
+        radius: float | None = None,
     ) -> Array:
         """Postures that can be measured, to choose from.
 
@@ -280,16 +288,46 @@ class SerialChain(Arm, Model):
                 the sensor has no places; rows (x, y, z, radius), one of which the tip
                 must be near, for a sensor that reads everywhere; nothing for a board.
             allowed: says of joints (J,) whether they may be taken (collisions).
+            camera: of a board, (width, height, fx, fy, cx, cy) in pixels, or a field of
+                view in degrees (horizontal, vertical): every corner is in the picture,
+                with a focal length that is known to a tenth.
+            distance: least and greatest, of the board's middle from that camera; such
+                that the board fills 25 to 80 % of the picture when not given.
+            tilt: degrees that the board's face may be turned from the camera.
+            side: "+z", the printed side is where the board's z axis points, or "-z";
+                known of a board that was found from views, else from either side.
+            floor: height (z in the measuring frame) that no joint is below.
+            approach: direction (x, y, z) in which the tool comes, from the last joint
+                to the tip, and the degrees about it that are allowed (60).
+            clear: planes (normal, offset) whose other side, and boxes (least x, y, z,
+                greatest), that the arm does not touch: spheres along straight lines
+                between the joints, no shapes of the links. The first link and the tip
+                are not looked at, nor is the arm against itself.
+            radius: of the spheres; 4 % of the arm's length when not given.
 
         Returns:
             (count, n) commands with the sensor's columns, in an order of little travel.
 
         Raises:
-            ValueError: there are not so many; the message says what became of the rest.
+            ValueError: there are not so many, or a socket is reached by none; the
+                message says what became of the rest.
         """
-        from jaxcal.models.serial.postures import postures
+        from jaxcal.models.serial.postures import Room, View, postures
 
-        return postures(self, count, seed, near, allowed)
+        view = None
+        if camera is not None:
+            view = View.of(camera, distance, tilt, side)
+        elif distance is not None or side is not None:
+            raise ValueError("distance and side need camera=")
+        room = None
+        if floor is not None or approach is not None or len(clear):
+            room = Room.of(floor, approach, clear, radius)
+        return postures(self, count, seed, near, allowed, view, room)
+
+    def tip_axis(self, commands: ArrayLike) -> Array:
+        """(N, 3) the tip's z axis in the measuring frame, of the nominal arm."""
+        frame = self._chain(as_commands(self, commands), self.nominal)[0]
+        return np.ascontiguousarray(frame[2].T)
 
     def require_commands(self, commands: Array) -> None:
         """Refuse radians for degrees, and joints far beyond their limits."""
@@ -302,6 +340,13 @@ class SerialChain(Arm, Model):
             raise ValueError(
                 f"commands must be in degrees, got angles of at most {largest:.3g}, "
                 "which look like radians: np.degrees(commands), --radians"
+            )
+        twice = np.degrees(_BEYOND_TURNS)
+        if largest > twice and self.num_joints > 2:
+            raise ValueError(
+                f"commands must be in degrees, got angles of {largest:.6g}, which look "
+                "like degrees that were converted from radians: leave out np.degrees, "
+                "--radians"
             )
         slack = np.where(units == "deg", _BEYOND, 0.01 * _BEYOND * (high - low))
         far = np.argwhere((joints < low - slack) | (joints > high + slack))
@@ -351,7 +396,7 @@ class SerialChain(Arm, Model):
         path: str | os.PathLike[str],
         *,
         seconds: float = 0.5,
-        within: float = 0.05,
+        within: float | None = None,
     ) -> Array:
         """Postures (N, J) at which a recorded arm stood still, in their order.
 
@@ -359,15 +404,25 @@ class SerialChain(Arm, Model):
             path: rosbag2 folder (SQLite or MCAP) with joint states, joints by name in
                 any order. Needs the extra ``ros``.
             seconds: of rest, at least.
-            within: degrees (or units of length) in which a resting joint stays.
+            within: degrees (or units of length) in which a resting joint stays. When
+                not given 0.05, or eight times what the joint's readings jitter by.
+
+        Raises:
+            ValueError: the arm never stood still; it says how the joints jitter.
         """
-        from jaxcal.models.serial.bags import at_rest, joint_states
+        from jaxcal.models.serial.bags import at_rest, jitter, joint_states
 
         times, joints = joint_states(path, self.joint_names)
         turns = np.array(self.command_units) == "deg"
-        return at_rest(
-            times, np.where(turns, np.degrees(joints), joints), seconds, within
-        )
+        joints = np.where(turns, np.degrees(joints), joints)
+        rests = at_rest(times, joints, seconds, within)
+        if not len(rests):
+            raise ValueError(
+                f"{os.fspath(path)} must hold {seconds:g} s of rest: the joints jitter "
+                f"by {in_words(jitter(joints).round(4))}; seconds= and within= say "
+                "what is a rest"
+            )
+        return rests
 
     def in_turn(self, commands: ArrayLike) -> NDArray[np.int64]:
         """(N,) the commands' rows in an order of little travel, socket after socket."""
@@ -407,6 +462,18 @@ class SerialChain(Arm, Model):
             yields=np.array(compliance),
             waves=np.array(waves),
             sensor=sensor or Position(),
+        )
+
+    def writable(self) -> Self:
+        """This arm with stiff joints and round gears, as files have them."""
+        if not self.compliance and not self.harmonics:
+            return self
+        return dataclasses.replace(
+            self,
+            compliance=(),
+            yields=np.zeros(0),
+            harmonics=(),
+            waves=np.zeros((0, 4)),
         )
 
     def write(
@@ -697,7 +764,7 @@ class SerialChain(Arm, Model):
                 *[_WAVE] * self.waves.size,
             ],
             fixed=self.sensor.unseen(self),
-            by_data=self.sensor.sizes_prior,
+            by_data=True,
         )
 
     def error_groups(self) -> ErrorGroups:

@@ -14,6 +14,7 @@ from jaxcal.models.sensors import Pose, Position, Socket
 __all__ = ["require_readings", "require_sockets", "warn_of_radians"]
 
 Array = NDArray[np.float64]
+_OTHER_ARM = "a wrong tip, unit, sign or order of columns, or rows of another place?"
 Chain = Any  # a SerialChain, whose module imports this one
 
 _NOMINAL = 0.1  # of its length: no arm is so far off, tip included, before it is fitted
@@ -53,6 +54,9 @@ def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
         return
     points = arm.calibrated(arm.nominal).predict(joints)
     most, middles = _NOMINAL * arm.length, {}
+    constant = np.flatnonzero((joints == joints[0]).all(axis=0))
+    still = ", ".join(arm.joint_names[i] for i in constant)
+    still = still and f"{still} never changes, was it recorded?"
     for i in np.unique(which):
         rows = np.flatnonzero(which == i)
         middles[i] = np.median(points[rows], axis=0)
@@ -60,8 +64,8 @@ def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
         if len(rows) > 2 and np.median(far) > most:
             raise ValueError(
                 f"contacts of socket {i} must be at one point within {most:.2g}, but "
-                f"the arm as described scatters by {np.median(far):.2g} there: a wrong "
-                "tip, unit, sign or order of columns, or rows of another place?"
+                f"the arm as described scatters by {np.median(far):.2g} there: "
+                + (still or _OTHER_ARM)
             )
         lost = rows[far > most + 4.0 * np.median(far)]
         if lost.size:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers, whole_number
+from jaxcal.checks import array_of, in_words, numbers, whole_number
 from jaxcal.models.sensors import Board, Placed, Plane, Several, Socket
 
-__all__ = ["in_turn", "postures"]
+__all__ = ["Room", "View", "in_turn", "postures"]
 
 Array = NDArray[np.float64]
 Chain = Any  # a SerialChain, whose module imports this one
@@ -24,6 +24,140 @@ _VAIN = 8  # batches in which nothing is found: there is nothing
 _REACHED = 1e-7  # of the arm's length
 _APART = 2.0  # degrees (of a slide: percent of its stroke) between two postures
 _VIEW = np.cos(np.radians(25.0))  # of the board from the camera's axis, and its face
+_FOCAL = 1.12  # times: focal lengths are known to a tenth, and arms are off
+_EDGE = 0.02  # of the picture's width, that the board stays away from its edge
+_FILLED = (0.25, 0.8)  # of the picture's width by the board, where no distance is given
+_SIDES = {"+z": 1.0, "-z": -1.0}
+_THICK = 0.04  # radius of an arm's links by its length
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """What a camera must see of a board for its picture to be of use."""
+
+    camera: Array  # (6,) width, height, fx, fy, cx, cy
+    distance: tuple[float, float] | None  # of the board's middle from the camera
+    tilt: float  # degrees, between the board's face and the way to the camera
+    side: float  # 1: seen from where the board's z points, -1 from behind, 0 either
+
+    @classmethod
+    def of(
+        cls,
+        camera: ArrayLike,
+        distance: Sequence[float] | None,
+        tilt: float,
+        side: str | None,
+    ) -> View:
+        """From (width, height, fx, fy, cx, cy), or a field of view in degrees (2,)."""
+        given = numbers("camera", camera)
+        if given.shape == (2,) and (given > 0.0).all() and (given < 180.0).all():
+            wide = 2.0 * np.tan(np.radians(given) / 2.0)
+            given = np.array([*wide, 1.0, 1.0, *(wide / 2.0)])
+        if given.shape != (6,) or not (given[:4] > 0.0).all():
+            raise ValueError(
+                "camera must be (width, height, fx, fy, cx, cy) in pixels or a field "
+                f"of view in degrees (horizontal, vertical), got {in_words(given)}"
+            )
+        if not 0.0 < numbers("tilt", tilt) < 90.0:
+            raise ValueError(f"tilt must be in (0, 90) degrees, got {tilt}")
+        if side is not None and side not in _SIDES:
+            raise ValueError(f"side must be '+z' or '-z', got {side!r}")
+        ends = None
+        if distance is not None:
+            low, high = array_of("distance", distance, 2).tolist()
+            if not 0.0 < low < high:
+                raise ValueError(
+                    f"distance must be (least, greatest), positive, got {distance}"
+                )
+            ends = (low, high)
+        return cls(given, ends, float(tilt), _SIDES.get(side or "", 0.0))
+
+
+@dataclasses.dataclass(frozen=True)
+class Room:
+    """Where an arm may be: simple, spheres along straight lines between its joints."""
+
+    floor: float | None  # height that no joint behind the first is below
+    approach: Array | None  # (4,) direction in which the tool comes, degrees about it
+    planes: Array  # (P, 4) normal, offset: spheres stay where normal . x > offset
+    boxes: Array  # (B, 6) least x, y, z, then greatest: spheres stay outside
+    radius: float | None  # of the spheres
+
+    @classmethod
+    def of(
+        cls,
+        floor: float | None,
+        approach: ArrayLike | None,
+        clear: Sequence[ArrayLike],
+        radius: float | None,
+    ) -> Room:
+        """Checked; the cone of an approach without its angle is 60 degrees."""
+        cone = None
+        if approach is not None:
+            cone = numbers("approach", approach)
+            cone = np.append(cone, 60.0) if cone.shape == (3,) else cone
+            size = np.linalg.norm(cone[:3])
+            if cone.shape != (4,) or not (size > 0.0 and 0.0 < cone[3] <= 180.0):
+                raise ValueError(
+                    "approach must be a direction (x, y, z) and the degrees about it "
+                    f"that are allowed, got {in_words(numbers('approach', approach))}"
+                )
+            cone = np.append(cone[:3] / size, cone[3])
+        things: dict[int, list[Array]] = {4: [], 6: []}
+        for one in clear:
+            row = numbers("clear", one)
+            if row.shape not in ((4,), (6,)):
+                raise ValueError(
+                    "clear must hold planes (normal, offset) of 4 numbers and boxes "
+                    f"(least x, y, z, greatest) of 6, got {in_words(row)}"
+                )
+            things[len(row)].append(row)
+        for row in things[4]:
+            row /= np.linalg.norm(row[:3])
+        planes, boxes = (np.array(rows).reshape(-1, n) for n, rows in things.items())
+        height = None if floor is None else float(numbers("floor", floor))
+        return cls(height, cone, planes, boxes, radius)
+
+    def reasons(self, arm: Chain, commands: Array) -> Array:
+        """(N,) why a posture is not possible, "" where it is."""
+        points = arm.skeleton(commands)
+        why = np.full(len(points), "", dtype=object)
+        if len(self.planes) or len(self.boxes):
+            why[self._touches(arm, points)] = "are not clear"
+        if self.approach is not None:
+            way = points[:, -1] - points[:, -2]
+            size = np.linalg.norm(way, axis=1, keepdims=True)
+            axis = arm.tip_axis(commands)
+            way = np.where(
+                size > 0.01 * (arm.length or 1.0), way / (size + 1e-300), axis
+            )
+            least = np.cos(np.radians(self.approach[3]))
+            why[way @ self.approach[:3] < least] = "do not come as approach says"
+        if self.floor is not None:
+            why[(points[:, 2:-1, 2] < self.floor).any(axis=1)] = "are below the floor"
+        return why
+
+    def _touches(self, arm: Chain, points: Array) -> Array:
+        """(N,) whether a sphere on a link, but the first and the tip's, touches."""
+        radius = self.radius or _THICK * arm.length
+        steps = max(2, int(np.ceil(arm.length / max(radius, 1e-9) / 4.0)))
+        share = np.linspace(0.0, 1.0, steps)[:, None]
+        starts, ends = points[:, 2:-1, None], points[:, 3:, None]
+        ends = (
+            starts
+            + (ends - starts)
+            * np.where(np.arange(ends.shape[1]) == ends.shape[1] - 1, 0.7, 1.0)[
+                :, None, None
+            ]
+        )  # the tip's end touches
+        balls = (starts + share * (ends - starts)).reshape(len(points), -1, 3)
+        near = np.zeros(balls.shape[:2], dtype=bool)
+        for plane in self.planes:
+            near |= balls @ plane[:3] - plane[3] < radius
+        for box in self.boxes:
+            outside = np.maximum(box[:3] - balls, balls - box[3:]).clip(0.0)
+            near |= np.linalg.norm(outside, axis=-1) < radius
+        return np.asarray(near.any(axis=1))
 
 
 def postures(
@@ -32,9 +166,13 @@ def postures(
     seed: int,
     near: ArrayLike | None,
     allowed: Callable[[Array], bool] | None,
+    view: View | None = None,
+    room: Room | None = None,
 ) -> Array:
     """See ``jaxcal.models.SerialChain.postures``."""
     whole_number("count", count, 1)
+    if view is not None and not isinstance(arm.sensor, Board):
+        raise ValueError("camera is of an arm with sensor=Board(...)")
     if isinstance(arm.sensor, Several):
         raise ValueError(
             "postures are of one sensor at a time: arm.measured_with(sensor).postures()"
@@ -50,8 +188,11 @@ def postures(
     found = np.zeros((0, arm.num_inputs))
     lost: Counter[str] = Counter()
     tried = 0
+    num_places = arm.sensor.count if isinstance(arm.sensor, Placed) else 1
+    reached = np.zeros(num_places, dtype=int)
+    refused: list[Counter[str]] = [Counter() for _ in reached]
     for batch in range(_ROUNDS):
-        if batch == _VAIN and not len(found):
+        if batch == _VAIN and not reached.all():
             break
         size = max(2 * (count - len(found)), 64)
         if len(found):  # more where few were any good: a board is seldom in view
@@ -61,9 +202,22 @@ def postures(
         labels = np.zeros((size, len(arm.sensor.inputs)))
         if isinstance(arm.sensor, Placed) and arm.sensor.count > 1:
             labels[:, 0] = (len(found) + np.arange(size)) % arm.sensor.count
-        trial, reason = _reach(arm, np.hstack([starts, labels]), low, high, targets)
-        for row, why in zip(trial, reason, strict=True):
+        commands = np.hstack([starts, labels])
+        if view is not None:
+            trial, reason = _pictured(arm, commands, low, high, view, rng)
+        else:
+            trial, reason = _reach(arm, commands, low, high, targets)
+        if room is not None:
+            reason = [
+                a or b for a, b in zip(reason, room.reasons(arm, trial), strict=True)
+            ]
+        which = (
+            labels[:, 0].astype(int) if num_places > 1 else 0 * starts[:, 0].astype(int)
+        )
+        for row, why, place in zip(trial, reason, which, strict=True):
             joints = row[: arm.num_joints]
+            if len(found) == count and reached[place]:
+                continue  # enough; of the other places one posture is looked for
             if not why:
                 apart = np.abs((found[:, : arm.num_joints] - joints) / unit)
                 if len(found) and apart.max(axis=1).min() < _APART:
@@ -72,10 +226,22 @@ def postures(
                     why = "are not allowed"
             if why:
                 lost[why] += 1
+                refused[place][why] += 1
                 continue
-            found = np.vstack([found, row])
-            if len(found) == count:
-                return found[in_turn(found, arm.num_joints)]
+            reached[place] += 1
+            if len(found) < count:
+                found = np.vstack([found, row])
+        if len(found) == count and reached.all():
+            return found[in_turn(found, arm.num_joints)]
+    for place in np.flatnonzero(reached == 0)[:1] if num_places > 1 else ():
+        where = ""
+        if arm.sensor.places is not None:
+            where = f" at {in_words(arm.sensor.places[place])}"
+        why = ", ".join(f"{n} {why}" for why, n in refused[place].most_common())
+        raise ValueError(
+            f"{arm.sensor.kind} {place}{where} must be reached by a posture: of "
+            f"{refused[place].total()} postures tried {why}"
+        )
     reasons = ", ".join(f"{number} {why}" for why, number in lost.most_common())
     raise ValueError(
         f"count must be at most {len(found)} here, got {count}: of {tried} postures "
@@ -184,6 +350,96 @@ def _in_view(arm: Chain, commands: Array) -> tuple[Array, list[str]]:
     reasons = np.where(turned, "", "see the board too much from the side")
     reasons = np.where(ahead, reasons, "do not have the board before the camera")
     return commands, reasons.tolist()
+
+
+def _pictured(
+    arm: Chain, commands: Array, low: Array, high: Array, view: View, rng: Any
+) -> tuple[Array, list[str]]:
+    """Postures from which the whole board is in the picture, from random views.
+
+    The board's pose in the camera is drawn, joints that give it are looked for from the
+    random starts, and what they really see is judged.
+    """
+    from scipy.spatial.transform import Rotation
+
+    sensor, j, count = arm.sensor, arm.num_joints, len(commands)
+    points = sensor.outline
+    middle = points.mean(axis=0)
+    width, height, fx, fy, cx, cy = view.camera
+    size = 2.0 * np.linalg.norm(points - middle, axis=1).max()
+    ends = view.distance
+    if ends is None and size > 0.0:
+        small, large = _FILLED
+        ends = fx * size / (large * width), fx * size / (small * width)
+    if ends is None:
+        raise ValueError(
+            "distance must be given, (least, greatest) from the camera to the board, "
+            "where Board has neither corners nor extent"
+        )
+    far = rng.uniform(*ends, count)
+    aim = rng.uniform(0.25, 0.75, (count, 2)) * [width, height]
+    centre = np.column_stack([(aim - [cx, cy]) / [fx, fy], np.ones(count)])
+    centre *= (far / np.linalg.norm(centre, axis=1))[:, None]
+    # A board that faces the camera, turned about its axis, then tilted.
+    known = view.side or sensor.side
+    side = np.full(count, known) if known else rng.choice([-1.0, 1.0], count)
+    facing = Rotation.from_rotvec(
+        np.where(side[:, None] > 0.0, [np.pi, 0.0, 0.0], [0.0, 0.0, 0.0])
+    )
+    spin = Rotation.from_rotvec(
+        rng.uniform(-np.pi, np.pi, count)[:, None] * [0, 0, 1.0]
+    )
+    about = rng.uniform(-np.pi, np.pi, count)
+    angle = np.radians(view.tilt) * np.sqrt(rng.random(count)) * 0.95
+    lean = np.column_stack([np.cos(about), np.sin(about), 0.0 * about])
+    turn = Rotation.from_rotvec(angle[:, None] * lean) * spin * facing
+    shift = centre - turn.apply(np.tile(middle, (count, 1)))
+    posed = arm.measured_with(dataclasses.replace(sensor, corners=None))
+    wanted = np.hstack([commands[:, :j], shift, turn.as_rotvec(degrees=True)])
+    commands = np.hstack([_solved(posed, wanted, low, high)[:, :j], commands[:, j:]])
+    seen = posed.predict(np.hstack([commands[:, :j], np.zeros((count, 6))]))
+    if sensor.corners is None:
+        commands = np.hstack([commands[:, :j], seen])
+    rotation = Rotation.from_rotvec(seen[:, 3:], degrees=True).as_matrix()
+    spots = points @ np.matrix_transpose(rotation) + seen[:, None, :3]
+    deep = np.maximum(spots[..., 2], 1e-9)
+    u = _FOCAL * fx * spots[..., 0] / deep
+    v = _FOCAL * fy * spots[..., 1] / deep
+    edge = _EDGE * width
+    inside = (u > edge - cx) & (u < width - edge - cx) & (v > edge - cy)
+    inside &= (v < height - edge - cy) & (spots[..., 2] > 0.0)
+    there = spots.mean(axis=1)
+    away = np.linalg.norm(there, axis=1)
+    face = (rotation[:, :, 2] * -there).sum(axis=1) / np.maximum(away, 1e-9)
+    why = np.full(count, "", dtype=object)
+    flat = np.abs(face) < np.cos(np.radians(view.tilt))
+    why[flat] = "see the board too much from the side"
+    why[(away < ends[0]) | (away > ends[1])] = "are too near or too far"
+    why[~inside.all(axis=1)] = "do not have the whole board in the picture"
+    if known:
+        why[face * side <= 0.0] = "see the board from behind"
+    return commands, why.tolist()
+
+
+def _solved(arm: Chain, commands: Array, low: Array, high: Array) -> Array:
+    """Commands after damped steps towards readings of zero, in degrees and lengths."""
+    j, commands = arm.num_joints, commands.copy()
+    scale = np.minimum(high - low, 360.0)
+    unit = np.array([1.0 / (arm.length or 1.0)] * 3 + [np.radians(1.0)] * 3)
+    for _ in range(_STEPS // 2):
+        off = arm.predict(commands) * unit
+        going = np.linalg.norm(off, axis=1) > 1e-2
+        if not going.any():
+            break
+        slopes = arm.command_jacobian(commands[going])[..., :j] * scale
+        slopes = slopes * unit[:, None]
+        gram = slopes @ np.matrix_transpose(slopes) + 1e-3 * np.eye(6)
+        step = np.linalg.solve(gram, -off[going][..., None])
+        step = (np.matrix_transpose(slopes) @ step)[..., 0]
+        step *= 0.15 / np.maximum(np.abs(step).max(axis=1, keepdims=True), 0.15)
+        at = commands[going, :j] + step * scale
+        commands[going, :j] = np.clip(at, low, high)
+    return commands
 
 
 def in_turn(found: Array, joints: int) -> NDArray[np.int64]:

@@ -30,6 +30,12 @@ _SHUFFLES = 400
 _FEW = 4  # contacts: fewer that lie apart are outliers, not a socket that was moved
 _LOOSE = 7.0  # standard deviations: no scatter, a reading of something else
 _SPARSE = 12  # measurements: so few have no outlier that is scatter
+_LITTLE = 1.0 / 3.0  # of the nominal error: so little left is worth having anyway
+_SURE = 4.0  # standard deviations: a tip that is found so well is there
+_APART = 4.0  # standard deviations between a distance and what contacts say of it
+_ALONE = 1e-4  # of what is known of a distance: nothing but that it was given
+_SHORT = 1e-3  # of the arm's length: what no parameter explains may be so much
+_STILL = 8  # measurements in which a joint that is used has moved
 _TIP = 0.004  # of the arm's length: tools are built nearer to their description
 _LINK = 0.02  # likewise; without a known distance an arm may shrink to fit contacts
 _ZERO = 10.0  # degrees: no zero of a joint is set so badly
@@ -44,17 +50,26 @@ class Verdict:
     # None where there are too few measurements to tell.
     explains: bool | None  # the scatter of the readings is what the noise can be
     helps: bool | None  # held-out errors are smaller than those of the nominal machine
-    clean: bool | None  # no reading is of another socket, far from the fit, tip or arm
+    clean: bool | None  # no reading contradicts the others, nor the arm its description
     held_out: float  # mean held-out error of a measurement, in the readings' unit
     interval: tuple[float, float]  # 95 % of that mean
     nominal: float  # mean error of the nominal machine
     anywhere: float  # standard deviation within the limits; NaN where not known
     reasons: tuple[str, ...]
+    accuracy: float | None = None  # that was asked for
 
     @property
     def good(self) -> bool:
-        """It may be used."""
-        return bool(self.explains and self.helps and self.clean)
+        """It may be used.
+
+        Held-out errors are below the accuracy asked for. Where none was, it is better
+        than the nominal machine, and the noise explains the scatter or what is left is
+        a third of the nominal error.
+        """
+        if self.accuracy is not None:
+            return bool(self.clean and self.interval[1] <= self.accuracy)
+        enough = self.explains or self.interval[1] < _LITTLE * self.nominal
+        return bool(self.clean and self.helps and enough)
 
     def __str__(self) -> str:
         if self.explains is None:
@@ -69,14 +84,14 @@ class Verdict:
                 f"anywhere within its limits {self.anywhere:.3g} (standard deviation, "
                 "beside a displacement of the whole arm)"
             )
+        if self.accuracy is not None and not self.interval[1] <= self.accuracy:
+            lines.append(f"not the accuracy that was asked for, {self.accuracy:g}")
         if not self.explains:
-            lines.append("this model does not explain these readings")
+            lines.append("this model does not explain these readings by its noise")
         if self.helps is None:
             lines.append("whether it is better than the nominal machine is not sure")
         elif not self.helps:
             lines.append("it is no better than the nominal machine")
-        if not self.clean:
-            lines.append("some readings contradict the others")
         return "\n".join([*lines, *self.reasons])
 
 
@@ -121,21 +136,28 @@ def verdict(calibration: Fit) -> Verdict:
         if model.sensor.zeros and same.any():
             reasons.append(f"measurement {left} is {used[same][0]} again, counted once")
     right = ~np.isin(used, list(swapped))
-    reasons += _moved(model, commands[right], residuals[right], used[right])
     exchanged = _exchanged(calibration, model)
-    other_arm = _other_tip(calibration, model) + _other_links(calibration, model)
-    reasons += exchanged + _far(calibration) + other_arm
+    moved = _moved(model, commands[right], residuals[right], used[right])
     limit = _LOOSE if len(used) > _SPARSE else 0.0
     loose = (calibration.distance[list(calibration.outliers)] > limit**2).any()
+    if swapped or exchanged or loose:
+        reasons.insert(0, "some readings contradict the others")
+    tip, doubtful = _other_tip(calibration, model)
+    other_arm = _other_links(calibration, model)
+    other_arm = other_arm or _other_distances(calibration, model)
+    still, unused = _still(model, commands)
+    reasons += moved + exchanged + _far(calibration) + tip + other_arm + still
+    doubtful |= bool(swapped or exchanged or loose or other_arm or unused)
     return Verdict(
         explains=explains,
         helps=True if mean < nominal else None if mean - half < nominal else False,
-        clean=not (swapped or exchanged or loose or other_arm),
+        clean=not (doubtful or (moved and not explains)),
         held_out=mean,
         interval=(max(mean - half, 0.0), mean + half),
         nominal=nominal,
         anywhere=_anywhere(calibration, model, commands),
         reasons=tuple(reasons),
+        accuracy=calibration.provenance.get("accuracy"),
     )
 
 
@@ -175,7 +197,7 @@ def _scattered(calibration: Fit, usual: Array) -> tuple[bool, list[str]]:
     largest = float(noise[(noise / usual).argmax()])
     return False, [
         f"the readings scatter by {largest:.3g}, {times:.3g} times what this sensor "
-        "usually does"
+        "usually does: their noise, or what no parameter explains"
     ]
 
 
@@ -192,23 +214,67 @@ def _far(calibration: Fit) -> list[str]:
     ]
 
 
-def _other_tip(calibration: Fit, model: Chain) -> list[str]:
-    """A tip far from where the arm's description has it, if a prior allowed that."""
+def _other_tip(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
+    """A tip far from where the arm's description has it, and whether that is in doubt.
+
+    It is not where the readings show it to a quarter of that, within what the prior
+    allowed: then the description is wrong, or it is of another tool, and the
+    calibration has the tip where it is.
+    """
     if not model.sensor.zeros:
-        return []
+        return [], False
     names = calibration.names
     if "tool rx" in names:  # where a camera or board is on the tip is asked for
-        return []
+        return [], False
     at = [names.index(f"tool {axis}") for axis in "xyz" if f"tool {axis}" in names]
     moved = calibration.parameters[at] - model.nominal[at]
     variance = moved @ np.asarray(calibration.covariance)[np.ix_(at, at)] @ moved
     far = float(np.linalg.norm(moved))
     if far**2 - 2.0 * np.sqrt(variance) <= _TIP * model.length * far:
-        return []
+        return [], False
+    std = float(np.sqrt(variance)) / far
+    allowed = 2.0 / np.sqrt(calibration.prior_precision[at].max() + 1e-300)
     return [
         f"the tip is {far:.3g} from where the arm's description has it "
-        f"(tool {', '.join(f'{each:.3g}' for each in moved)}): is it another tip?"
+        f"(tool {', '.join(f'{each:.3g}' for each in moved)}), known to {std:.2g}: is "
+        "it another tip?"
+    ], bool(far < _SURE * std or far > allowed)
+
+
+def _other_distances(calibration: Fit, model: Chain) -> list[str]:
+    """Distances that were given and that the contacts contradict."""
+    known = getattr(model.sensor, "distances", ())
+    if not len(known):
+        return []
+    off, rows = model.facts(calibration.parameters)
+    spread = rows @ np.asarray(calibration.covariance)
+    share = np.minimum((spread * rows).sum(axis=1), 1.0 - 1e-9)
+    said = []
+    for (first, second, distance, std), left, h in zip(known, off, share, strict=True):
+        free = distance - std * left / (1.0 - h)  # fitted without it, to first order
+        sure = abs(left) > _APART * np.sqrt(1.0 - h) and h < 1.0 - _ALONE
+        if not sure or abs(free - distance) < _SHORT * model.length:
+            continue
+        said.append(
+            f"sockets {first:.0f} and {second:.0f} are given as {distance:g} apart, "
+            f"but the contacts and the arm's lengths say {free:.4g} +- "
+            f"{std * np.sqrt(h / (1.0 - h)):.2g}: measure that distance again"
+        )
+    return said
+
+
+def _still(model: Chain, commands: Array) -> tuple[list[str], bool]:
+    """Joints' columns that never change, and whether one may not be recorded."""
+    joints = commands[:, : model.num_joints]
+    if len(joints) < _STILL:
+        return [], False
+    still = np.flatnonzero((joints == joints[0]).all(axis=0))
+    said = [
+        f"{model.joint_names[i]} is {joints[0, i]:g} in all {len(joints)} "
+        "measurements: was it recorded? What is said of it is the prior's"
+        for i in still
     ]
+    return said, bool((joints[0, still] == 0.0).any())
 
 
 def _other_links(calibration: Fit, model: Chain) -> list[str]:
@@ -219,11 +285,8 @@ def _other_links(calibration: Fit, model: Chain) -> list[str]:
     sure = np.where(np.isfinite(std), off - 2.0 * std, 0.0)[: model.table.size]
     lengths = units[: model.table.size] == "length"
     most = np.full(model.table.size, _LINK * model.length)
-    if not model.sensor.sizes_prior:  # the prior is as stated
-        known = np.sqrt(calibration.prior_precision[: model.table.size])
-        most = np.minimum(_FAR / np.maximum(known, 1e-300), most)
     found = []
-    if model.sensor.zeros or not model.sensor.sizes_prior:
+    if not isinstance(model.sensor, Position):
         far = np.flatnonzero(lengths & (sure > most))
         if far.size:
             found.append(

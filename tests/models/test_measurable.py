@@ -1,0 +1,136 @@
+"""Postures that can be measured: looked at by projections and lines of this file."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxcal.models import Board, SerialChain, Socket
+
+from .arms import CONTACTS, ur5
+
+NEAR = [[-400.0, 200.0, 50.0], [-400.0, 250.0, 50.0]]
+CORNERS = np.array([[30.0 * x, 30.0 * y, 0.0] for x in range(6) for y in range(5)])
+CAMERA = (1280.0, 960.0, 900.0, 900.0, 640.0, 480.0)
+PLACE = np.eye(4)
+PLACE[:3, 3] = [-550.0, 100.0, 0.0]
+MOUNT = np.eye(4)
+MOUNT[:3, :3] = Rotation.from_euler("zx", [180.0, 8.0], degrees=True).as_matrix()
+MOUNT[:3, 3] = [20.0, -60.0, 45.0]
+
+
+def _frames(arm, joints, parameters):
+    """(N, 4, 4) of the tip, by the table's matrices written out."""
+    rows = parameters[: arm.table.size].reshape(-1, 5)
+    frames = np.repeat(np.eye(4)[None], len(joints), axis=0)
+    for (a, alpha, d, theta, beta), angle in zip(rows, joints.T, strict=True):
+        link = np.repeat(np.eye(4)[None], len(joints), axis=0)
+        turn = Rotation.from_euler("z", angle[:, None] + theta, degrees=True)
+        bend = Rotation.from_euler("XY", [alpha, beta], degrees=True).as_matrix()
+        link[:, :3, :3] = turn.as_matrix() @ bend
+        link[:, :3, 3] = turn.apply([a, 0.0, d])
+        frames = frames @ link
+    return frames @ arm.tool
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("side", ["+z", "-z"])
+def test_views_hold_the_whole_board_from_its_printed_side(side, seed):
+    """By a camera whose focal length is off by a tenth, on an arm that is off."""
+    sensor = Board("camera", PLACE, CORNERS, CAMERA[2:])
+    arm = ur5(sensor=sensor)
+    arm = SerialChain.from_dh(arm.table, tool=MOUNT, sensor=sensor)
+    joints = arm.postures(40, seed=seed, camera=CAMERA, side=side, tilt=40.0)
+    rng, truth = np.random.default_rng(seed), arm.nominal.copy()
+    std = np.asarray(arm.default_prior().std)[: arm.table.size]
+    truth[: arm.table.size] += std * rng.normal(size=len(std))
+    seen = np.linalg.inv(_frames(arm, joints, truth)) @ PLACE
+    spots = CORNERS @ np.matrix_transpose(seen[:, :3, :3]) + seen[:, None, :3, 3]
+    for times in (0.9, 1.1):
+        pixels = times * 900.0 * spots[..., :2] / spots[..., 2:] + [640.0, 480.0]
+        inside = (spots[..., 2] > 0.0) & (pixels > 0.0).all(axis=-1)
+        inside &= (pixels < [1280.0, 960.0]).all(axis=-1)
+        assert inside.all(axis=1).mean() >= 0.95
+    towards = -(seen[:, :3, 2] * seen[:, :3, 3]).sum(axis=1)
+    sign = 1.0 if side == "+z" else -1.0
+    assert (sign * towards > 0.0).all()
+
+
+def test_the_printed_side_is_known_from_views():
+    exact = SerialChain.from_dh(
+        ur5().table, tool=MOUNT, sensor=Board("camera", PLACE, CORNERS, CAMERA[2:])
+    )
+    joints = exact.postures(5, camera=CAMERA, side="-z", seed=1)
+    unknown = exact.measured_with(Board("camera", None, CORNERS, CAMERA[2:]))
+    found = unknown.located(joints, exact.predict(joints))
+    assert found.sensor.side == -1.0
+    more = found.postures(10, camera=(70.0, 55.0), distance=(200.0, 700.0))
+    seen = np.linalg.inv(_frames(exact, more, exact.nominal)) @ PLACE
+    assert ((seen[:, :3, 2] * seen[:, :3, 3]).sum(axis=1) > 0.0).all()
+
+
+def test_contacts_on_a_table_come_from_above_it():
+    arm = ur5(sensor=Socket(2))
+    plain = arm.postures(60, near=NEAR)
+    safe = arm.postures(60, near=NEAR, floor=0.0, approach=(0, 0, -1, 60))
+
+    def heights(commands):
+        """(N, 5) heights of the ends of links 2 to 5, and how steep the tool comes."""
+        tips = [
+            _frames(_cut(arm, n), commands[:, :n], _cut(arm, n).nominal)
+            for n in (2, 3, 4, 5)
+        ]
+        whole = _frames(arm, commands[:, :6], arm.nominal)
+        way = whole[:, :3, 3] - tips[-1][:, :3, 3]
+        low = np.min([frame[:, 2, 3] for frame in tips], axis=0)
+        return low, way[:, 2] / np.linalg.norm(way, axis=1)
+
+    low, steep = heights(plain)
+    assert (low < 0.0).mean() > 0.3 and (steep > 0.0).mean() > 0.3
+    low, steep = heights(safe)
+    assert (low > -1e-6).all() and (steep < -0.49).all()
+
+
+def _cut(arm, links):
+    """The first links alone."""
+    return SerialChain.from_dh(arm.table[:links])
+
+
+def test_links_stay_clear_of_boxes():
+    arm = ur5(sensor=Socket(1))
+    box = (-300.0, -150.0, 300.0, 300.0, 150.0, 700.0)
+    for clear in ((), (box,)):
+        found = arm.postures(40, near=NEAR[:1], clear=clear, radius=40.0)
+        points = arm.skeleton(found)
+        share = np.linspace(0.0, 1.0, 50)[:, None]
+        upper = points[:, 2, None] + share * (points[:, 3] - points[:, 2])[:, None]
+        outside = np.maximum(np.array(box[:3]) - upper, upper - np.array(box[3:]))
+        far = np.linalg.norm(outside.clip(0.0), axis=-1).min(axis=1)
+        assert (far.min() > 35.0) == bool(clear)
+
+
+def test_a_socket_that_no_posture_reaches_is_named():
+    arm = ur5(sensor=Socket(2))
+    with pytest.raises(ValueError, match=r"socket 1 at \(3000, 0, 0\) must be reached"):
+        arm.postures(20, near=[NEAR[0], [3000.0, 0.0, 0.0]])
+
+
+def test_wrong_rooms_and_views_are_named():
+    arm = SerialChain.from_urdf(CONTACTS / "panda.urdf", tip="ball_link")
+    touching, looking = (arm.measured_with(one) for one in (Socket(1), Board()))
+    near = [[0.4, 0.1, 0.3]]
+    for options, why in (
+        ({"camera": CAMERA}, "camera is of an arm with sensor=Board"),
+        ({"side": "+z"}, "distance and side need camera="),
+        ({"approach": (0, 0, 0)}, "approach must be a direction"),
+        ({"clear": [(1, 2, 3)]}, "clear must hold planes"),
+    ):
+        with pytest.raises(ValueError, match=why):
+            touching.postures(5, near=near, **options)
+    for options, why in (
+        ({"camera": (1, 2, 3)}, "camera must be"),
+        ({"camera": CAMERA, "side": "front"}, "side must be"),
+        ({"camera": CAMERA, "tilt": 95.0}, "tilt must be in"),
+        ({"camera": CAMERA, "distance": (0.5, 0.2)}, "distance must be"),
+    ):
+        with pytest.raises(ValueError, match=why):
+            looking.postures(5, **options)
