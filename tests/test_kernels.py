@@ -60,7 +60,7 @@ import gc
 gc.disable()
 import numpy as np
 import jaxcal
-from jaxcal.selection.policy.kernel import look_ahead
+from jaxcal.selection.policy.policy_kernel import look_ahead
 
 rng = np.random.default_rng(0)
 rows, blocks = rng.random((2000, 3)), rng.normal(size=(300, 3, 12))
@@ -128,7 +128,9 @@ def test_a_machine_without_a_compiler_builds_the_wheel(tmp_path):
         check=True,
     )
     names = zipfile.ZipFile(next(tmp_path.glob("*.whl"))).namelist()
-    assert any(name.startswith("jaxcal/selection/policy/kernel.") for name in names)
+    assert any(
+        name.startswith("jaxcal/selection/policy/policy_kernel.") for name in names
+    )
     assert not [name for name in names if name.endswith(("kernel.py", ".pxd"))]
 
 
@@ -157,7 +159,8 @@ def test_several_threads_may_load_kernels_at_once():
 import sys, threading
 from jaxcal import compiled
 sys.setswitchinterval(1e-6)
-names = ["jaxcal.selection.exchange.kernel", "jaxcal.selection.exact.kernel"] * 8
+kernels = ["exchange.exchange_kernel", "exact.branch_kernel"] * 8
+names = [f"jaxcal.selection.{kernel}" for kernel in kernels]
 start = threading.Barrier(len(names))
 def load(name):
     start.wait()

@@ -67,10 +67,12 @@ def _lengths(
     resolution = _EPS * max(count, 1)
     lengths = np.sqrt((columns * columns).sum(axis=1))
     beside = largest / np.maximum(lengths, _TINY)
-    if not beside.max() < 1.0 / resolution:
+    most = beside.max(axis=1, initial=8.0)
+    if not most.max() < 1.0 / resolution:
         lengths[beside >= 1.0 / resolution] = 0.0
         beside[lengths == 0.0] = 0.0
-    rounding = resolution * beside.max(axis=1, initial=8.0)
+        most = beside.max(axis=1, initial=8.0)
+    rounding = resolution * most
     return lengths, np.maximum(rounding, SINGULAR) if computed else rounding
 
 

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from jaxcal.checks import whole_number
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.exchange import exchange
-from jaxcal.selection.problem import Found, Problem, log_dets, make_problems
+from jaxcal.selection.problem import Problem, Solution, log_dets, make_problems
 from jaxcal.selection.result import BatchSelection
 from jaxcal.selection.solvers import checked_seed, random_indices
 
@@ -37,8 +37,8 @@ def random_batch(
     """A random selection per set, never singular; one seed draws the whole batch."""
     rng = np.random.default_rng(checked_seed(seed))
 
-    def solve(problems: list[Problem]) -> list[Found]:
-        return list(map(Found, random_indices(problems, rng)[0]))
+    def solve(problems: list[Problem]) -> list[Solution]:
+        return list(map(Solution, random_indices(problems, rng)[0]))
 
     return _solved("random", solve, candidates, k, rules)
 
@@ -76,7 +76,7 @@ def exact_batch(
     deadline = None if time_limit is None else time.perf_counter() + time_limit
     one = functools.partial(solve_exact, deadline=deadline)
 
-    def solve(problems: list[Problem]) -> Iterable[Found]:
+    def solve(problems: list[Problem]) -> Iterable[Solution]:
         # Of a simplex most is the hull, which keeps other threads waiting.
         return (map if problems[0].simplex else _in_threads)(one, problems)
 
@@ -84,8 +84,8 @@ def exact_batch(
 
 
 def _in_threads(
-    solve: Callable[[Problem], Found], problems: list[Problem]
-) -> Iterable[Found]:
+    solve: Callable[[Problem], Solution], problems: list[Problem]
+) -> Iterable[Solution]:
     """On every core: compiled solvers release the interpreter."""
     with ThreadPoolExecutor(min(os.cpu_count() or 1, len(problems))) as pool:
         return list(pool.map(solve, problems))
@@ -93,7 +93,7 @@ def _in_threads(
 
 def _solved(
     method: str,
-    solve: Callable[[list[Problem]], Iterable[Found]],
+    solve: Callable[[list[Problem]], Iterable[Solution]],
     candidates: ArrayLike,
     k: int,
     rules: dict[str, Any],

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -41,16 +42,16 @@ __all__ = [
     "Criterion",
     "Ds",
     "I",
-    "Wanted",
+    "Objective",
+    "criterion_of",
     "positions",
-    "wanted",
 ]
 
 Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Criterion:
+class Objective:
     """A criterion in the coordinates of ``root``; the table above has its kinds."""
 
     name: str  # "D", "A", ...
@@ -61,23 +62,32 @@ class Criterion:
     unit: float = 1.0  # V in the caller's units is this times V, of "trace" and "least"
 
     @classmethod
-    def scaled(cls, name: str, kind: str, root: Array, times: int) -> Criterion:
+    def scaled(cls, name: str, kind: str, root: Array, times: int) -> Objective:
         """Of combinations C in any units: their size goes into ``unit`` or ``offset``.
 
         So that values are near 1, whatever the caller's units; by powers of two, which
         is exact.
         """
-        largest = np.abs(root).max(axis=1, keepdims=True, initial=0.0)
         if kind == "det":
-            size = power_of_two(largest)
-            offset = -2.0 * float(np.log(size).sum())
-            return cls(name, kind, root / size, times, offset=offset)
-        size = power_of_two(largest.max(axis=0, initial=0.0))
+            units = power_of_two(np.abs(root).max(axis=1, keepdims=True))
+            offset = -2.0 * float(np.log(units).sum())
+            return cls(name, kind, root / units, times, offset=offset)
+        if not root.any():
+            return cls(name, kind, root, times)
+        size = 2.0 ** math.frexp(np.abs(root).max())[1]
         root = root / size
-        rest = power_of_two(np.sqrt((root * root).sum(keepdims=True))[0])
-        unit = float(size[0] * rest[0])
-        with np.errstate(over="ignore", under="ignore"):  # asked for where it is used
-            return cls(name, kind, root / rest, times, unit=float(np.square(unit)))
+        rest = 2.0 ** math.frexp(math.sqrt((root * root).sum()))[1]
+        try:
+            unit = (size * rest) ** 2
+        except OverflowError:  # asked for where it is used
+            unit = math.inf
+        return cls(name, kind, root / rest, times, unit=unit)
+
+    @property
+    def form(self) -> str:
+        """What kernels call it: "det", of fewer than all "subset", "trace", "least"."""
+        part = self.kind == "det" and len(self.root) < self.root.shape[1]
+        return "subset" if part else self.kind
 
     @property
     def larger_is_better(self) -> bool:
@@ -150,7 +160,7 @@ class Coordinates(NamedTuple):
         return self.white.basis
 
 
-class Wanted:
+class Criterion:
     """A criterion as it is asked for; subclasses are the rows of ``CRITERIA``."""
 
     name: ClassVar[str]
@@ -167,19 +177,19 @@ class Wanted:
         """C (s, p) in the problem's coordinates, of full row rank."""
         return at.basis
 
-    def criterion(self, at: Coordinates) -> Criterion:
+    def objective(self, at: Coordinates) -> Objective:
         """The criterion of one problem."""
         times = 1 if self.per_output else at.times
-        return Criterion.scaled(self.name, self.kind, self.root(at), times)
+        return Objective.scaled(self.name, self.kind, self.root(at), times)
 
 
-class D(Wanted):
+class D(Criterion):
     """Joint uncertainty of all parameters."""
 
     name, kind, says = "D", "det", "log det S"
 
-    def criterion(self, at: Coordinates) -> Criterion:
-        return Criterion(
+    def objective(self, at: Coordinates) -> Objective:
+        return Objective(
             self.name, self.kind, _identity(len(at.basis)), at.times,
             offset=at.white.log_scale,
         )  # fmt: skip
@@ -192,19 +202,19 @@ def _identity(size: int) -> Array:
     return identity
 
 
-class A(Wanted):
+class A(Criterion):
     """Sum of the parameters' variances."""
 
     name, kind, says = "A", "trace", "trace V"
 
 
-class E(Wanted):
+class E(Criterion):
     """The combination of the parameters that is known worst."""
 
     name, kind, says, per_output = "E", "least", "eigenvalue", True
 
 
-class I(Wanted):  # noqa: E742 - the criterion's own name in the literature
+class I(Criterion):  # noqa: E742 - the criterion's own name in the literature
     """Mean variance of the predictions over a region.
 
     Args:
@@ -234,7 +244,7 @@ class I(Wanted):  # noqa: E742 - the criterion's own name in the literature
         return np.asarray(size[keep, None] * right[keep] / np.sqrt(count))
 
 
-class _OfSome(Wanted):
+class _OfSome(Criterion):
     """Of the parameters of interest; the others are nuisance.
 
     Args:
@@ -270,10 +280,12 @@ class As(_OfSome):
     name, kind, says = "As", "trace", "trace V"
 
 
-CRITERIA: dict[str, type[Wanted]] = {each.name: each for each in (D, A, I, E, Ds, As)}
+CRITERIA: dict[str, type[Criterion]] = {
+    each.name: each for each in (D, A, I, E, Ds, As)
+}
 
 
-def wanted(criterion: Any, region: Any, default: str) -> Wanted:
+def criterion_of(criterion: Any, region: Any, default: str) -> Criterion:
     """The criterion asked for by its letters, or as an object that carries its data.
 
     Args:
@@ -281,7 +293,7 @@ def wanted(criterion: Any, region: Any, default: str) -> Wanted:
         region: of I, where it is asked for by its letter.
         default: the criterion where none is asked for.
     """
-    if isinstance(criterion, Wanted):
+    if isinstance(criterion, Criterion):
         asked = criterion
     else:
         name = default if criterion is None else getattr(criterion, "name", criterion)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.checks import aligned, axis_names
+from jaxcal.information.blocks import rank_of_blocks
 from jaxcal.information.criteria import Criteria, criteria
 from jaxcal.selection.criteria import CRITERIA
 from jaxcal.selection.problem import Problem
@@ -100,6 +101,17 @@ class Selection:
         chosen, region = problem.raw[self.indices], problem.readings[problem.available]
         return criteria(chosen, problem.root, region, problem.multiplicity)
 
+    @cached_property
+    def left_without(self) -> NDArray[np.float64]:
+        """(k,) det S without each of the chosen, as a share of det S; 0 is singular."""
+        problem, chosen = self.problem, self.indices
+        others = np.tile(chosen, (len(chosen), 1))[~np.eye(len(chosen), dtype=np.bool_)]
+        raw = problem.raw[others.reshape(len(chosen), -1)]
+        if raw.shape[1] == 0 and not len(problem.root):
+            return np.zeros(len(chosen))
+        log_det = rank_of_blocks(raw, problem.root, problem.white.size)[1]
+        return np.asarray(np.exp(problem.multiplicity * log_det - self.log_det))
+
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, text and lists, as a JSON file takes them."""
         candidates = self.problem.candidates
@@ -114,6 +126,7 @@ class Selection:
             "bound": self.bound,
             "efficiency": self.efficiency,
             "proven": self.proven,
+            "left_without": self.left_without.tolist(),
             "method": self.method,
             "reason": self.reason,
             "seconds": self.seconds,
@@ -124,6 +137,17 @@ class Selection:
         assert self.problem.candidates is not None
         count = self.problem.candidates.shape[1]
         return self.axes or axis_names("names", None, "u", count)
+
+    def _lost(self) -> str:
+        """What is left of det S where one measurement fails, in words."""
+        needed = np.flatnonzero(self.left_without == 0.0)
+        if len(needed) == len(self.indices):
+            return "singular, whichever is lost"
+        if len(needed):
+            return "singular without " + ", ".join(self.labels[i] for i in needed)
+        worst = int(self.left_without.argmin())
+        left = self.left_without[worst]
+        return f"{left:.3g} of det S is left, without {self.labels[worst]}"
 
     def __str__(self) -> str:
         head = ["candidate"] + (["name"] if self.names is not None else [])
@@ -144,6 +168,7 @@ class Selection:
             f"{CRITERIA[self.criterion].says:13} {self.value:.6g} ({best})",
             f"{self.criterion + '-efficiency':13} {self.efficiency:.6f}"
             + ("" if self.proven else " or more"),
+            f"{'without one':13} {self._lost()}",
             f"time          {1e3 * self.seconds:.3g} ms{extra}",
         ]
         return "\n".join(

@@ -1,6 +1,6 @@
 """The table of solvers, and which options each reads. A new solver is one row here.
 
-A solver is a function ``solve(problem, *, option, ...) -> Found``: its keyword
+A solver is a function ``solve(problem, *, option, ...) -> Solution``: its keyword
 arguments are the options it reads, checked and complete.
 """
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from jaxcal.checks import one_of, seconds, share, whole_number
 from jaxcal.selection.exact import exact
 from jaxcal.selection.exchange import exchange
-from jaxcal.selection.problem import Found, Problem, log_dets
+from jaxcal.selection.problem import Problem, Solution, log_dets
 
 __all__ = [
     "METHODS",
@@ -31,10 +31,10 @@ __all__ = [
 _TRIES = 200  # random selections, before the greedy one, where all are singular
 
 
-def solve_random(problem: Problem, *, seed: int | np.random.Generator) -> Found:
+def solve_random(problem: Problem, *, seed: int | np.random.Generator) -> Solution:
     """The baseline of the paper: drawn uniformly, never singular, required first."""
     indices, values = random_indices([problem], np.random.default_rng(seed))
-    return Found(
+    return Solution(
         indices[0], float(values[0]), seed=seed if isinstance(seed, int) else None
     )
 
@@ -64,7 +64,7 @@ def random_indices(
 
 
 @functools.cache
-def _options(solve: Callable[..., Found]) -> tuple[str, ...]:
+def _options(solve: Callable[..., Solution]) -> tuple[str, ...]:
     """Names of the options that a solver reads."""
     found = inspect.signature(solve).parameters.values()
     return tuple(each.name for each in found if each.kind == each.KEYWORD_ONLY)
@@ -72,7 +72,7 @@ def _options(solve: Callable[..., Found]) -> tuple[str, ...]:
 
 def _policy(
     problem: Problem, *, seed: int, checkpoint: Any, decoding: str, num: int
-) -> Found:
+) -> Solution:
     from jaxcal.selection.policy import choose
 
     if problem.candidates is None or problem.model is None:
@@ -91,10 +91,10 @@ def _policy(
             f"postures, got {problem.max_replicates}"
         )
     indices = choose([problem], decoding, num, seed, checkpoint)[0]
-    return Found(np.asarray(indices, dtype=np.int64), seed=seed)
+    return Solution(np.asarray(indices, dtype=np.int64), seed=seed)
 
 
-SOLVERS: dict[str, Callable[..., Found]] = {
+SOLVERS: dict[str, Callable[..., Solution]] = {
     "random": solve_random,
     "greedy": exchange.solve_greedy,
     "exchange": exchange.solve,

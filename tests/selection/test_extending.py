@@ -9,12 +9,12 @@ import pytest
 
 import jaxcal
 from jaxcal.checks import numbers
-from jaxcal.selection.criteria import CRITERIA, Coordinates, Wanted
-from jaxcal.selection.problem import Found, Problem
+from jaxcal.selection.criteria import CRITERIA, Coordinates, Criterion
+from jaxcal.selection.problem import Problem, Solution
 from jaxcal.selection.solvers import SOLVERS
 
 
-class C(Wanted):
+class C(Criterion):
     """Variance of one combination of the parameters."""
 
     name, kind, says = "c", "trace", "variance"
@@ -38,10 +38,10 @@ class L(C):
         return self.weights @ at.basis
 
 
-def largest(problem: Problem, *, seed: int) -> Found:
+def largest(problem: Problem, *, seed: int) -> Solution:
     """The largest candidates, whatever is required."""
     size = (problem.blocks**2).sum(axis=(1, 2)) * problem.available
-    return Found(size.argsort()[::-1][: problem.k], seed=seed)
+    return Solution(size.argsort()[::-1][: problem.k], seed=seed)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -24,7 +24,7 @@ from jaxcal.learning.runtime import weights
 from jaxcal.learning.training import checkpoint
 from jaxcal.selection.policy import select_batch
 from jaxcal.selection.policy.compact import CompactNetwork, _Sets
-from jaxcal.selection.policy.kernel import look_ahead
+from jaxcal.selection.policy.policy_kernel import look_ahead
 from jaxcal.selection.problem import make_problems
 
 

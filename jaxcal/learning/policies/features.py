@@ -38,7 +38,7 @@ FEATURES = (
     *(f"exp of {scale:g} x {AHEAD[-1]}" for scale in _CLOSE),  # with ``close_up``
 )
 """Columns of a candidate; log-volumes ahead are relative to the best candidate's.
-``selection/policy/kernel.py`` computes the same."""
+``selection/policy/policy_kernel.py`` computes the same."""
 
 
 class VectorFeatures(NamedTuple):

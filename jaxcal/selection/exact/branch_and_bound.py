@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from jaxcal import compiled
 from jaxcal.information.blocks import largest_rank
-from jaxcal.selection.criteria import Criterion
+from jaxcal.selection.criteria import Objective
 
 __all__ = ["branch_and_bound"]
 
@@ -43,7 +43,7 @@ class BranchResult:
 def branch_and_bound(
     blocks: Array,
     prior: Array,
-    criterion: Criterion,
+    criterion: Objective,
     lower: Indices,
     upper: Indices,
     start: Indices,
@@ -69,14 +69,14 @@ def branch_and_bound(
     """
     num_blocks, q, p = blocks.shape
     low, high, counts = np.array([lower, upper, start], dtype=np.float64)
-    kind, root, scale, shift = _near_one(blocks, prior, criterion, start)
+    root, scale, shift = _near_one(blocks, prior, criterion, start)
     everything = prior + np.einsum("m,mqa,mqb->ab", upper, blocks, blocks)
     trivial = (float(criterion.value(everything)) - shift) / scale
     near = {"trace": -0.5, "least": 2.0}  # of values near 1: an efficiency of a half
     useful = min(trivial, near.get(criterion.kind, np.inf))
     best_counts, best_values = np.zeros((best, num_blocks)), np.full(best, -np.inf)
-    search = compiled.kernel("jaxcal.selection.exact.kernel").Search(
-        kind, blocks, prior, root, start.sum(), largest_rank(blocks), useful,
+    search = compiled.kernel("jaxcal.selection.exact.branch_kernel").Search(
+        criterion.form, blocks, prior, root, start.sum(), largest_rank(blocks), useful,
         best_counts, best_values,
     )  # fmt: skip
     search.offer(low, high, counts, _left(deadline))
@@ -116,20 +116,18 @@ def _left(deadline: float | None) -> float:
 
 
 def _near_one(
-    blocks: Array, prior: Array, criterion: Criterion, start: Indices
-) -> tuple[int, Array, float, float]:
-    """The kernel's criterion and C, with values near 1, and their unit and origin."""
-    kernel = compiled.kernel("jaxcal.selection.exact.kernel")
+    blocks: Array, prior: Array, criterion: Objective, start: Indices
+) -> tuple[Array, float, float]:
+    """The kernel's C, with values of phi near 1, and their unit and origin."""
     root, p = criterion.root, len(prior)
-    if criterion.kind == "det" and len(root) == p:
-        return kernel.D, root, 1.0, -2.0 * float(np.linalg.slogdet(root)[1])
-    if criterion.kind == "det":
+    if criterion.form == "det":
+        return root, 1.0, -2.0 * float(np.linalg.slogdet(root)[1])
+    if criterion.form == "subset":
         lengths = np.linalg.norm(root, axis=1)
         shift = -2.0 * float(np.log(lengths).sum())
-        return kernel.DS, root / lengths[:, None], 1.0, shift
+        return root / lengths[:, None], 1.0, shift
     chosen = np.repeat(blocks, start, axis=0).reshape(-1, p)
     scale = abs(float(criterion.value(prior + chosen.T @ chosen)))
     scale = scale if 0.0 < scale < np.inf else 1.0
-    if criterion.kind == "trace":
-        return kernel.TRACE, root / np.sqrt(scale), scale, 0.0
-    return kernel.E, root * np.sqrt(scale), scale, 0.0
+    unit = np.sqrt(scale)
+    return (root / unit if criterion.form == "trace" else root * unit), scale, 0.0

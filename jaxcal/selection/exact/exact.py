@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
 from jaxcal.selection.exact.volume import largest_volumes
 from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
-from jaxcal.selection.problem import Found, Problem, values
+from jaxcal.selection.problem import Problem, Solution, values
 
 __all__ = ["TIME_LIMIT", "relaxed", "solve", "solve_auto", "solve_exact", "upper_bound"]
 
@@ -43,7 +43,7 @@ def solve(
     restarts: int | None,
     time_limit: float | None,
     best: int,
-) -> Found:
+) -> Solution:
     """The solver "exact"; 10 s where no time limit is given."""
     deadline = time.perf_counter() + (time_limit or TIME_LIMIT)
     return solve_exact(problem, best, deadline, restarts or STARTING_RESTARTS, seed)
@@ -56,7 +56,7 @@ def solve_auto(
     restarts: int | None,
     time_limit: float | None,
     least_efficiency: float,
-) -> Found:
+) -> Solution:
     """The solver "auto": the cheapest way to an answer that is proven good enough.
 
     Small problems are solved to the proven optimum. On larger ones the search stops as
@@ -98,7 +98,7 @@ def solve_exact(
     restarts: int = STARTING_RESTARTS,
     seed: int = 0,
     enough: float | None = None,
-) -> Found:
+) -> Solution:
     """The ``best`` selections, or the best found by ``deadline`` and a true bound.
 
     They are the ``alternatives``, best first; none of them is singular.
@@ -214,7 +214,7 @@ def _pool(problem: Problem, hull: bool) -> Indices:
 
 def _enumerate(
     problem: Problem, pool: Indices, best: int, deadline: float | None
-) -> Found:
+) -> Solution:
     """Largest volumes beside the required rows, in the space these leave free."""
     required = problem.rows[problem.required]
     vectors = problem.rows[pool]
@@ -242,7 +242,7 @@ def _found(
     best: int,
     phi: float | None,
     nodes: int,
-) -> Found:
+) -> Solution:
     """Values in the caller's unit, singular subsets left out, best first.
 
     ``phi`` is a bound on it from above; None where the first is proven.
@@ -270,7 +270,7 @@ def _found(
                 f"may change the variances by a share of {unsure:.1g}"
             )
         proven = False
-    return Found(
+    return Solution(
         indices=subsets[0],
         value=worth[0],
         bound=bound,

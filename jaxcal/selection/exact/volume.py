@@ -99,11 +99,11 @@ def _climbed(vectors: Array) -> Indices:
     Args:
         vectors: (h, q) of rank q, with orthonormal columns.
     """
-    kernel = compiled.kernel("jaxcal.selection.exchange.kernel")
+    kernel = compiled.kernel("jaxcal.selection.exchange.exchange_kernel")
     q, none = vectors.shape[1], np.zeros(0, dtype=np.int64)
     blocks = np.ascontiguousarray(vectors[:, None])
     nothing, unit, every = np.zeros((q, q)), np.eye(q), np.ones(len(blocks), np.uint8)
-    climber = kernel.Climber(kernel.DET, blocks, nothing, unit, every, 1, none, q, 0)
+    climber = kernel.Climber("det", blocks, nothing, unit, every, 1, none, q, 0)
     chosen, phi = climber.climb(none, _SHARE, 1, math.inf)
     return np.asarray(climber.random_climbs(_STARTS, chosen, phi, math.inf)[0])
 

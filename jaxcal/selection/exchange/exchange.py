@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal import compiled
-from jaxcal.selection.problem import Found, Problem, values
+from jaxcal.selection.problem import Problem, Solution, values
 
 __all__ = [
     "Climbs",
@@ -49,16 +49,16 @@ _MENDING = 10  # random starts where all greedy ones are singular
 _CLIMBS = 2.5e5  # k p^3 of the climbs of E in one call, from each kind of start
 
 
-def solve(problem: Problem, *, seed: int, restarts: int | None) -> Found:
+def solve(problem: Problem, *, seed: int, restarts: int | None) -> Solution:
     """The solver "exchange"."""
     restarts = restarts or default_restarts(problem)
     indices = exchange_indices(problem, restarts, seed)
-    return Found(indices, seed=seed, restarts=restarts)
+    return Solution(indices, seed=seed, restarts=restarts)
 
 
-def solve_greedy(problem: Problem) -> Found:
+def solve_greedy(problem: Problem) -> Solution:
     """The solver "greedy"."""
-    return Found(greedy_indices(problem))
+    return Solution(greedy_indices(problem))
 
 
 def greedy_indices(problem: Problem) -> Indices:
@@ -98,18 +98,16 @@ class Climbs:
     """A problem as the compiled kernel takes it; E is grown and climbed as A."""
 
     def __init__(self, problem: Problem, seed: int, deadline: float | None) -> None:
-        kernel = compiled.kernel("jaxcal.selection.exchange.kernel")
+        kernel = compiled.kernel("jaxcal.selection.exchange.exchange_kernel")
         self._required, self._deadline = problem.required, deadline
         criterion, (_, q, p) = problem.criterion, problem.blocks.shape
-        kind, root = kernel.TRACE, criterion.root
-        if criterion.name == "D":
-            kind = kernel.DET
-        elif criterion.kind == "det":  # variances near 1
-            kind = kernel.SUBSET
+        root = criterion.root
+        if criterion.form == "subset":  # variances near 1
             root = root / np.linalg.norm(root, axis=1, keepdims=True)
+        form = "trace" if criterion.form == "least" else criterion.form
         self.share = _SHARE * min(1.0, problem.k * q / p) ** 6
         self._climber = kernel.Climber(
-            kind,
+            form,
             *map(np.ascontiguousarray, (problem.blocks, problem.prior, root)),
             problem.available.view(np.uint8),
             min(problem.max_replicates, problem.k),

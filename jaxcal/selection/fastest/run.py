@@ -25,10 +25,10 @@ from jaxcal.checks import array_of, one_of, seconds, share
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.fastest.motion import Motion, travel_times
-from jaxcal.selection.problem import Asked
+from jaxcal.selection.problem import CandidateSet
 from jaxcal.selection.solvers import checked_seed
 
-__all__ = ["FastSelection", "ParetoFront", "Travelled"]
+__all__ = ["FastSelection", "ParetoFront", "fastest", "pareto"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -72,82 +72,55 @@ class ParetoFront:
     proven: bool  # every point is, and none is missing
 
 
-class Travelled(Asked):
-    """The questions about time."""
+def fastest(
+    design: CandidateSet,
+    k: int | None,
+    motion: Motion,
+    *,
+    least_efficiency: float = 0.95,
+    start: ArrayLike | None = None,
+    method: str | None = None,
+    time_limit: float = 60.0,
+    seed: int | np.random.Generator = 0,
+) -> FastSelection:
+    """The subset and the order of least time of a design; see ``Design.fastest``."""
+    least = share("least_efficiency", least_efficiency)
+    search = _Search(design, k, motion, start, method, time_limit, seed)
+    found = search.answer(least, None)
+    if found is None:
+        raise ValueError(
+            f"least_efficiency must be reachable, got {least:g}; the optimum is "
+            "only bounded within the time limit: give more time, or ask for less"
+        )
+    return found
 
-    def fastest(
-        self,
-        k: int | None,
-        motion: Motion,
-        *,
-        least_efficiency: float = 0.95,
-        start: ArrayLike | None = None,
-        method: str | None = None,
-        time_limit: float = 60.0,
-        seed: int | np.random.Generator = 0,
-    ) -> FastSelection:
-        """The subset and the order of least time with a D-efficiency.
 
-        Args:
-            k: postures to choose, distinct; the fewest that identify when None.
-            motion: speeds and accelerations in the candidates' unit, settle time.
-            least_efficiency: in (0, 1], against the proven D-optimum.
-            start: (n,) where the device stands; it begins at any posture by default.
-            method: "exact" (k up to 12, with a proof unless the time runs out) or
-                "heuristic" (local search); exact up to k = 8 when not given.
-            time_limit: seconds of the exact search and of the D-optimum behind both.
-            seed: of the heuristic's starts, from which exact starts too.
-
-        Returns:
-            The selection; among runs of equal time the one with the largest
-            determinant.
-        """
-        least = share("least_efficiency", least_efficiency)
-        search = _Search(self, k, motion, start, method, time_limit, seed)
-        found = search.answer(least, None)
-        if found is None:
-            raise ValueError(
-                f"least_efficiency must be reachable, got {least:g}; the optimum is "
-                "only bounded within the time limit: give more time, or ask for less"
-            )
-        return found
-
-    def pareto(
-        self,
-        k: int | None,
-        motion: Motion,
-        *,
-        least_efficiency: float = 0.7,
-        **options: Any,
-    ) -> ParetoFront:
-        """Time against D-efficiency, from ``least_efficiency`` up to the D-optimum.
-
-        Each point is the fastest run more efficient than the point before it.
-
-        Args:
-            k, motion: as in ``fastest``.
-            least_efficiency: where to cut the front off, in (0, 1].
-            options: start, method, seed and time_limit (for each point) of
-                ``fastest``.
-        """
-        least = share("least_efficiency", least_efficiency)
-        asked = {"start": None, "method": None, "time_limit": 60.0, "seed": 0}
-        search = _Search(self, k, motion, **(asked | options))
-        points: list[FastSelection] = []
-        point = search.answer(least, None)
-        while point is not None and len(points) < _MOST_POINTS:
-            points.append(point)
-            point = search.answer(least, point.log_det)
-        kept = [
-            p
-            for p in points
-            if not any(
-                q.seconds <= p.seconds + SAME_TIME and q.log_det > p.log_det
-                for q in points
-            )
-        ]
-        proven = point is None and all(p.proven for p in points)
-        return ParetoFront(tuple(kept), least, proven)
+def pareto(
+    design: CandidateSet,
+    k: int | None,
+    motion: Motion,
+    *,
+    least_efficiency: float = 0.7,
+    **options: Any,
+) -> ParetoFront:
+    """Time against D-efficiency of a design; see ``Design.pareto``."""
+    least = share("least_efficiency", least_efficiency)
+    defaults = {"start": None, "method": None, "time_limit": 60.0, "seed": 0}
+    search = _Search(design, k, motion, **(defaults | options))
+    points: list[FastSelection] = []
+    point = search.answer(least, None)
+    while point is not None and len(points) < _MOST_POINTS:
+        points.append(point)
+        point = search.answer(least, point.log_det)
+    kept = [
+        p
+        for p in points
+        if not any(
+            q.seconds <= p.seconds + SAME_TIME and q.log_det > p.log_det for q in points
+        )
+    ]
+    proven = point is None and all(p.proven for p in points)
+    return ParetoFront(tuple(kept), least, proven)
 
 
 class _Search:
@@ -155,7 +128,7 @@ class _Search:
 
     def __init__(
         self,
-        asked: Asked,
+        design: CandidateSet,
         k: int | None,
         motion: Motion,
         start: ArrayLike | None,
@@ -163,7 +136,7 @@ class _Search:
         time_limit: float,
         seed: int | np.random.Generator,
     ) -> None:
-        problem, points = asked.problem(k, "D"), asked.candidates
+        problem, points = design.problem(k, "D"), design.candidates
         if points is None:
             raise ValueError(
                 "commands must be given with blocks, Design.from_blocks(..., "
@@ -250,7 +223,7 @@ class _Search:
         self, wanted: float, begun: Indices | None, travel: float
     ) -> tuple[Indices | None, bool, int]:
         """The compiled search from a run known: subset, is it proven, nodes."""
-        from jaxcal.selection.fastest.kernel import fastest_subset
+        from jaxcal.selection.fastest.tour_kernel import fastest_subset
 
         chosen = np.zeros(self.k, np.int64) if begun is None else np.sort(begun)
         best = np.array([travel, -np.inf if begun is None else self._log_det(chosen)])
@@ -364,7 +337,7 @@ class _Search:
 
     def _tour(self, chosen: Indices) -> tuple[Indices, float]:
         """``chosen`` (k,) in the best order found, and its seconds of travel."""
-        from jaxcal.selection.fastest.kernel import best_order
+        from jaxcal.selection.fastest.tour_kernel import best_order
 
         order, travel = best_order(
             self.times[np.ix_(chosen, chosen)], self.start[chosen]

@@ -1,5 +1,5 @@
-"""How many postures a wanted accuracy needs."""
+"""How many measurements a wanted accuracy takes."""
 
-from jaxcal.selection.plan.api import Plan, Planned, PlanRow
+from jaxcal.selection.plan.api import Plan, PlanRow, plan
 
-__all__ = ["Plan", "PlanRow", "Planned"]
+__all__ = ["Plan", "PlanRow", "plan"]

@@ -36,11 +36,11 @@ from jaxcal.selection.plan.designs import (
     region_root,
     variances_of,
 )
-from jaxcal.selection.problem import Asked, Problem
+from jaxcal.selection.problem import CandidateSet, Problem
 from jaxcal.selection.problem.sources import shares_regressor
 from jaxcal.selection.solvers import checked_seed
 
-__all__ = ["Plan", "PlanRow", "Planned"]
+__all__ = ["Plan", "PlanRow", "plan"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -124,114 +124,88 @@ class Plan:
         return "\n".join([*lines, f"K = {self.k} is {proof} the smallest"])
 
 
-class Planned(Asked):
-    """The question of how many."""
-
-    def plan(
-        self,
-        accuracy: ArrayLike,
-        noise_std: ArrayLike | None = None,
-        criterion: str = "G",
-        *,
-        parameters: Any = None,
-        region: ArrayLike | None = None,
-        max_k: int | None = None,
-        more: int = 0,
-        seed: int | np.random.Generator = 0,
-    ) -> Plan:
-        """The smallest number of measurements that predicts accurately enough.
-
-        Args:
-            accuracy: () or (m,) standard error a prediction may have, measured unit;
-                with "parameters" () or (s,), that of each parameter of interest.
-            noise_std: () or (m,) standard deviation of one measurement, measured unit;
-                the noise of the design when not given. With blocks it is 1. Noise is
-                taken as white: measuring a posture twice halves its variance.
-            criterion: "G", the largest standard error over the region, "I", the root
-                of the mean variance over it, or "parameters", the standard error of the
-                parameters themselves. It must hold for every output or parameter.
-            parameters: names or indices of the s parameters of interest; all when not
-                given.
-            region: (R, n) commands at which predictions are wanted, with blocks
-                (R, m, p) what is predicted, ``region @ theta``; what is available when
-                not given.
-            max_k: largest K allowed; what is available, up to 200, when not given.
-            more: rows of the table beyond the K that suffices.
-            seed: of the exchange.
-
-        Raises:
-            ValueError: naming the argument, the rule and the value; where no K up to
-                ``max_k`` suffices, with the accuracy that can be reached.
-        """
-        begun = time.perf_counter()
-        one_of("criterion", criterion, tuple(_SUMMARIES))
-        more, start = whole_number("more", more, 0), checked_seed(seed)
-        how = "I" if criterion == "I" else "G"
-        asked = _request(self, criterion, accuracy, noise_std, parameters, region)
-        problem, points, unit = asked.problem, asked.points, asked.unit
-        total, (identify, least_k) = problem.k, _fewest(problem)
-        if max_k is None:
-            max_k = min(total, max(_LARGEST_K, least_k))
-        max_k = whole_number("max_k", max_k, least_k)
-        if max_k > total:
-            raise ValueError(
-                f"max_k must not exceed the {total} measurements allowed, got {max_k}"
-            )
-        root = region_root(points, how)
-
-        @functools.cache
-        def bound_of(k: int) -> float:
-            if k == total:  # there is one design only
-                every = np.repeat(np.arange(len(problem.blocks)), problem.upper)
-                return float(variances_of(problem, every, points, how).max())
-            return lower_bound(problem, root, k)
-
-        def best(k: int, previous: Indices | None) -> tuple[Indices, Array]:
-            one = dataclasses.replace(problem, k=k)
-            found = best_design(one, points, how, previous, start)
-            return found, variances_of(one, found, points, how)
-
-        rows: list[PlanRow] = []
-        chosen: PlanRow | None = None
-        last: Indices | None = None
-        ks = range(least_k, max_k + 1) if bound_of(max_k) <= _ENOUGH else ()
-        for k in ks:  # none where no K allowed is enough
-            last, variance = best(k, last)
-            row = PlanRow(
-                k=k,
-                indices=last,
-                standard_error=unit * np.sqrt(variance),
-                least_error=unit * np.sqrt(max(min(bound_of(k), variance.max()), 0.0)),
-            )
-            rows.append(row)
-            if chosen is None and variance.max() <= _ENOUGH:
-                chosen = row
-            if chosen is not None and k >= chosen.k + more:
-                break
-        if chosen is None:
-            if last is None:
-                variance = best(max_k, None)[1]
-            one = int((unit * np.sqrt(variance) / asked.target).argmax())
-            found, least = unit[one] * np.sqrt([variance.max(), bound_of(max_k)])
-            every = " (all that are allowed)" if max_k == total else ""
-            raise ValueError(
-                f"accuracy must be reachable with max_k = {max_k} measurements{every}: "
-                f"the best design found has a {_SUMMARIES[criterion]} standard error "
-                f"of {found:.6g}, no design has less than {least:.6g}, got "
-                f"{asked.target[one]:g}"
-            )
-        return Plan(
-            k=chosen.k,
-            indices=chosen.indices,
-            standard_error=chosen.standard_error,
-            accuracy=asked.target,
-            noise_std=asked.noise_std,
-            names=asked.names,
-            criterion=criterion,
-            smallest_proven=chosen.k == identify or bound_of(chosen.k - 1) > 1.0,
-            rows=tuple(rows),
-            seconds=time.perf_counter() - begun,
+def plan(
+    design: CandidateSet,
+    accuracy: ArrayLike,
+    noise_std: ArrayLike | None = None,
+    criterion: str = "G",
+    *,
+    parameters: Any = None,
+    region: ArrayLike | None = None,
+    max_k: int | None = None,
+    more: int = 0,
+    seed: int | np.random.Generator = 0,
+) -> Plan:
+    """The smallest number of measurements of a design; see ``Design.plan``."""
+    begun = time.perf_counter()
+    one_of("criterion", criterion, tuple(_SUMMARIES))
+    more, start = whole_number("more", more, 0), checked_seed(seed)
+    how = "I" if criterion == "I" else "G"
+    request = _request(design, criterion, accuracy, noise_std, parameters, region)
+    problem, points, unit = request.problem, request.points, request.unit
+    total, (identify, least_k) = problem.k, _fewest(problem)
+    if max_k is None:
+        max_k = min(total, max(_LARGEST_K, least_k))
+    max_k = whole_number("max_k", max_k, least_k)
+    if max_k > total:
+        raise ValueError(
+            f"max_k must not exceed the {total} measurements allowed, got {max_k}"
         )
+    root = region_root(points, how)
+
+    @functools.cache
+    def bound_of(k: int) -> float:
+        if k == total:  # there is one design only
+            every = np.repeat(np.arange(len(problem.blocks)), problem.upper)
+            return float(variances_of(problem, every, points, how).max())
+        return lower_bound(problem, root, k)
+
+    def best(k: int, previous: Indices | None) -> tuple[Indices, Array]:
+        one = dataclasses.replace(problem, k=k)
+        found = best_design(one, points, how, previous, start)
+        return found, variances_of(one, found, points, how)
+
+    rows: list[PlanRow] = []
+    chosen: PlanRow | None = None
+    last: Indices | None = None
+    ks = range(least_k, max_k + 1) if bound_of(max_k) <= _ENOUGH else ()
+    for k in ks:  # none where no K allowed is enough
+        last, variance = best(k, last)
+        row = PlanRow(
+            k=k,
+            indices=last,
+            standard_error=unit * np.sqrt(variance),
+            least_error=unit * np.sqrt(max(min(bound_of(k), variance.max()), 0.0)),
+        )
+        rows.append(row)
+        if chosen is None and variance.max() <= _ENOUGH:
+            chosen = row
+        if chosen is not None and k >= chosen.k + more:
+            break
+    if chosen is None:
+        if last is None:
+            variance = best(max_k, None)[1]
+        one = int((unit * np.sqrt(variance) / request.target).argmax())
+        found, least = unit[one] * np.sqrt([variance.max(), bound_of(max_k)])
+        every = " (all that are allowed)" if max_k == total else ""
+        raise ValueError(
+            f"accuracy must be reachable with max_k = {max_k} measurements{every}: "
+            f"the best design found has a {_SUMMARIES[criterion]} standard error "
+            f"of {found:.6g}, no design has less than {least:.6g}, got "
+            f"{request.target[one]:g}"
+        )
+    return Plan(
+        k=chosen.k,
+        indices=chosen.indices,
+        standard_error=chosen.standard_error,
+        accuracy=request.target,
+        noise_std=request.noise_std,
+        names=request.names,
+        criterion=criterion,
+        smallest_proven=chosen.k == identify or bound_of(chosen.k - 1) > 1.0,
+        rows=tuple(rows),
+        seconds=time.perf_counter() - begun,
+    )
 
 
 class _Request(NamedTuple):
@@ -246,7 +220,7 @@ class _Request(NamedTuple):
 
 
 def _request(
-    asked: Asked,
+    design: CandidateSet,
     criterion: str,
     accuracy: ArrayLike,
     noise_std: ArrayLike | None,
@@ -257,9 +231,9 @@ def _request(
     of_parameters = criterion == "parameters"
     if parameters is not None and not of_parameters:
         raise ValueError("parameters must come with criterion parameters only")
-    cap = whole_number("max_replicates", asked.max_replicates, 1)
-    total = max(1, int(asked.available.sum()) * cap)
-    model, noise = asked.model, asked.noise
+    cap = whole_number("max_replicates", design.max_replicates, 1)
+    total = max(1, int(design.available.sum()) * cap)
+    model, noise = design.model, design.noise
     shared = False  # one regressor for all outputs?
     if model is None:
         if not (noise_std is noise is None):
@@ -276,11 +250,11 @@ def _request(
                 noise_std = std if np.ndim(std) < 2 else None
         if noise_std is not None:
             noise_std = levels("noise_std", noise_std, model.num_outputs)
-            shared = not of_parameters and shares_regressor(model, asked.prior, None)
+            shared = not of_parameters and shares_regressor(model, design.prior, None)
             # Where outputs share a regressor the noise is in the targets.
-            asked = asked.with_noise(None if shared else Noise(noise_std))
-    problem = asked.problem(total, "D")
-    source = asked.with_noise(None).source(not shared)
+            design = design.with_noise(None if shared else Noise(noise_std))
+    problem = design.problem(total, "D")
+    source = design.with_noise(None).source(not shared)
     names = source.names
     if model is not None:
         assert problem.candidates is not None

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.selection.policy.kernel import CLOSE, describe
+from jaxcal.selection.policy.policy_kernel import CLOSE, describe
 from jaxcal.selection.problem import Problem
 
 __all__ = ["CompactNetwork"]

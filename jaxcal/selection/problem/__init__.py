@@ -1,7 +1,7 @@
 """What is chosen from, under which rules, and by which criterion."""
 
-from jaxcal.selection.problem.asked import Asked
+from jaxcal.selection.problem.candidate_set import CandidateSet
 from jaxcal.selection.problem.making import make_problems
-from jaxcal.selection.problem.problem import Found, Problem, log_dets, values
+from jaxcal.selection.problem.problem import Problem, Solution, log_dets, values
 
-__all__ = ["Asked", "Found", "Problem", "log_dets", "make_problems", "values"]
+__all__ = ["CandidateSet", "Problem", "Solution", "log_dets", "make_problems", "values"]

@@ -27,7 +27,7 @@ from jaxcal.information.singular import (
 )
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model
-from jaxcal.selection.criteria import CRITERIA, Coordinates, Wanted
+from jaxcal.selection.criteria import CRITERIA, Coordinates, Criterion
 from jaxcal.selection.problem.problem import Problem
 
 __all__ = [
@@ -120,16 +120,17 @@ def make_problems(
         raise ValueError(f"required must have shape (B, r), got {forced.shape}")
     raw, coarse = model.blocks(array), coarseness(candidates)
     raw.flags.writeable = mask.flags.writeable = False
-    root, wanted = np.zeros((0, model.num_inputs + 1)), CRITERIA["D"]()
+    root, criterion = np.zeros((0, model.num_inputs + 1)), CRITERIA["D"]()
     white = whiten(raw, mask, root, coarse=coarse)
     k = _check_k(k, raw[0], mask[0], root, regressors=True)  # of no one set
     problems = []
     for b in range(len(array)):
         try:
             problems.append(make_problem(
-                raw[b], root, wanted, k, mask[b], None if forced is None else forced[b],
-                max_replicates, white=white[b], coarse=coarse, times=m,
-                candidates=array[b], model=model,
+                raw[b], root, criterion, k, mask[b],
+                None if forced is None else forced[b], max_replicates,
+                white=white[b], coarse=coarse, times=m, candidates=array[b],
+                model=model,
             ))  # fmt: skip
         except ValueError as error:
             raise ValueError(f"in set {b}: {error}") from None
@@ -139,7 +140,7 @@ def make_problems(
 def make_problem(
     raw: Array,
     root: Array,
-    wanted: Wanted,
+    criterion: Criterion,
     k: int | None,
     available: Mask,
     required: ArrayLike | None,
@@ -158,7 +159,7 @@ def make_problem(
     Args:
         raw: in the caller's numbers, zero where not available.
         root: (r, p) of the precision known beforehand.
-        wanted: the criterion.
+        criterion: what is best.
         k, required, max_replicates: what may be chosen, as asked for.
         available: (M,), checked.
         white: the blocks whitened, where they are already.
@@ -197,7 +198,7 @@ def make_problem(
         )
     at = Coordinates(white, names, count, region, times)
     problem = Problem(
-        white, k, available, forced, cap, wanted.criterion(at), times, raw, readings,
+        white, k, available, forced, cap, criterion.objective(at), times, raw, readings,
         root, candidates, model,
     )  # fmt: skip
     for each in (raw, readings, root, available, forced):

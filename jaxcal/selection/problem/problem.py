@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from jaxcal.information.blocks import Whitened, rank_of_blocks
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model
-from jaxcal.selection.criteria import Criterion
+from jaxcal.selection.criteria import Objective
 
-__all__ = ["Found", "Problem", "log_dets", "values"]
+__all__ = ["Problem", "Solution", "log_dets", "values"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -43,7 +43,7 @@ class Problem:
     available: Mask  # (M,) True where a candidate may be chosen
     required: Indices  # (r,) candidates that must be chosen, r <= k
     max_replicates: int  # how often one candidate may be chosen
-    criterion: Criterion  # in the same coordinates
+    criterion: Objective  # in the same coordinates
     multiplicity: int  # how often log det of the blocks counts
     raw: Array  # (M, q, p) blocks in the caller's numbers, at most p readings each
     readings: Array  # (M, Q, p) these with every reading, as ``raw`` where q is Q
@@ -151,7 +151,7 @@ class Problem:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Found:
+class Solution:
     """A solver's answer; what it leaves out is judged by the caller."""
 
     indices: Indices  # (k,) in the order picked

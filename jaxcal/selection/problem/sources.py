@@ -24,7 +24,7 @@ from jaxcal.models.identifiability import identifiability
 from jaxcal.models.model import Model, derivative
 from jaxcal.models.uncertainty import Noise, Prior
 
-__all__ = ["Given", "Modelled", "Shared", "Source", "shares_regressor"]
+__all__ = ["BlockSource", "ModelSource", "SharedSource", "Source", "shares_regressor"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -66,7 +66,7 @@ def shares_regressor(model: Model, prior: Prior | None, noise: Noise | None) -> 
     return bool(known.free.all() and not known.precision.any())
 
 
-class Shared(Source):
+class SharedSource(Source):
     """A model where all outputs share one regressor, as [u, 1], / std."""
 
     def __init__(self, model: Model, candidates: Array, noise: Noise | None) -> None:
@@ -83,7 +83,7 @@ class Shared(Source):
         return self._model.blocks(points) / self._std
 
 
-class Given(Source):
+class BlockSource(Source):
     """Blocks of the caller's own, and a prior precision (p, p)."""
 
     def __init__(
@@ -115,7 +115,7 @@ class Given(Source):
         return self._noise.whitening(len(blocks), self._q) @ blocks
 
 
-class Modelled(Source):
+class ModelSource(Source):
     """A model at the mean of its prior, without the parameters that are held."""
 
     def __init__(

@@ -48,17 +48,14 @@ from cython.cimports.jaxcal.information.linear_algebra import (
     multiply,
     take,
 )
-from cython.cimports.jaxcal.selection.exchange.kernel import WIDE
+from cython.cimports.jaxcal.selection.exchange.exchange_kernel import WIDE
+from cython.cimports.jaxcal.selection.kinds import DET, SUBSET, TRACE
 from cython.cimports.jaxcal.watch import begin, late
 from cython.cimports.libc.math import INFINITY, fabs
 
-__all__ = ["DET", "SUBSET", "TRACE", "Climber"]
+__all__ = ["Climber"]
 
-DET, SUBSET, TRACE = 0, 1, 2  # log det of all, or of some parameters; a trace
-# Compiled functions read C variables, which Python does not see.
-_DET = cython.declare(cython.int, 0)
-_SUBSET = cython.declare(cython.int, 1)
-_TRACE = cython.declare(cython.int, 2)
+_KINDS = {"det": DET, "subset": SUBSET, "trace": TRACE}
 
 _IMPROVES = cython.declare(cython.double, 1e-11)  # by which a swap must raise phi
 _MOST_SWAPS = cython.declare(cython.int, 100)  # of each place, where a few are usual
@@ -190,10 +187,10 @@ def _best_of(gain, closed, most):
 
 
 class Climber:
-    """The candidates of a problem, and the work space that ``kernel.pxd`` describes.
+    """The candidates of a problem, and work space; ``exchange_kernel.pxd`` has it.
 
     Args:
-        kind: DET, SUBSET or TRACE.
+        form: "det", "subset" or "trace", of the criterion.
         blocks: (M, q, p) whitened.
         prior: (p, p).
         root: C (s, p).
@@ -204,18 +201,19 @@ class Climber:
         seed: of the random starts.
     """
 
-    def __init__(self, kind, blocks, prior, root, usable, cap, required, k, seed):
+    def __init__(self, form, blocks, prior, root, usable, cap, required, k, seed):
         count: cython.Py_ssize_t = blocks.shape[0]
         q: cython.Py_ssize_t = blocks.shape[1]
         p: cython.Py_ssize_t = blocks.shape[2]
         i: cython.Py_ssize_t
         r: cython.Py_ssize_t
         a: cython.Py_ssize_t
-        self.kind, self.k, self.q, self.p, self.s = kind, k, q, p, len(root)
-        self.parts, self.dets = 1 + (kind != DET), 1 + (kind == SUBSET)
+        self.kind = _KINDS[form]
+        self.k, self.q, self.p, self.s = k, q, p, len(root)
+        self.parts, self.dets = 1 + (self.kind != DET), 1 + (self.kind == SUBSET)
         self.fixed, self.groups = len(required), (count + WIDE - 1) // WIDE
         self.size = q * q * WIDE
-        self.rows = q == 1 and kind == DET
+        self.rows = q == 1 and self.kind == DET
         self.blocks, self.prior, self.root = blocks, prior, root
         self.usable, self.available = usable, np.count_nonzero(usable)
         self.cap, self.counts = cap, np.zeros(count, dtype=np.intp)
@@ -401,14 +399,14 @@ class Climber:
         p = self.p
         self._sum(size, -1)
         value: cython.double = factor(self.gram, into, self.lower, p)
-        if self.kind == _DET or not value > -INFINITY:
+        if self.kind == DET or not value > -INFINITY:
             return value
         other = into + p * p
         value = covariance(
-            self.kind == _SUBSET, cython.address(self.root[0, 0]), into, self.s, p,
+            self.kind == SUBSET, cython.address(self.root[0, 0]), into, self.s, p,
             self.half, self.solved, self.small, self.other, self.lower, other,
         )  # fmt: skip
-        for a in range(p * p if self.kind == _SUBSET else 0):
+        for a in range(p * p if self.kind == SUBSET else 0):
             other[a] = into[a] - other[a]
         return value
 
@@ -463,7 +461,7 @@ class Climber:
             _invert(kept + m * self.size, det, q, WIDE)
             for j in range(WIDE):
                 alone[j] = alone[j] / det[j] if m else det[j]
-        if self.kind == _TRACE:
+        if self.kind == TRACE:
             _dots(alone, kept, grown + self.size, q * q)
         for j in range(WIDE):
             det[j] = 0.0
@@ -560,7 +558,7 @@ class Climber:
             _invert(y, det, q, WIDE)
             for j in range(WIDE):
                 gain[j] = gain[j] / max(det[j], 1e-300) if m else alone[j] * det[j]
-        if self.kind != _TRACE:
+        if self.kind != TRACE:
             return
         part, lost = self.work + 2 * self.size, self.work + 3 * self.size
         for a in range(self.size):
@@ -696,11 +694,11 @@ class Climber:
                 ]
         for r in range(q):
             taken += self.at_out[r * q + r] / q
-        most: cython.double = rise if self.kind == _TRACE else 1.0 + rise
+        most: cython.double = rise if self.kind == TRACE else 1.0 + rise
         best: cython.Py_ssize_t = -1
         for c in range(self.groups):
             bound: cython.double = self.tops[2 * c]
-            if self.kind == _DET:
+            if self.kind == DET:
                 stays: cython.double = 1.0 - taken / (1.0 + self.tops[2 * c + 1])
                 for _ in range(q):
                     bound *= stays

@@ -61,18 +61,14 @@ from cython.cimports.jaxcal.information.linear_algebra import (
     multiply,
     take,
 )
+from cython.cimports.jaxcal.selection.kinds import DET, LEAST, SUBSET, TRACE
 from cython.cimports.jaxcal.watch import begin, late
 from cython.cimports.libc.math import INFINITY, exp, fabs, floor, log, log1p, sqrt
 
-__all__ = ["DS", "TRACE", "D", "E", "Search"]
+__all__ = ["Search"]
 
-D, DS, TRACE, E = range(4)
-# Compiled functions read C variables, which Python does not see. RANK and RANK_TRACE
-# are D and TRACE in their sharper forms.
-_D = cython.declare(cython.int, 0)
-_DS = cython.declare(cython.int, 1)
-_TRACE = cython.declare(cython.int, 2)
-_E = cython.declare(cython.int, 3)
+_KINDS = {"det": DET, "subset": SUBSET, "trace": TRACE, "least": LEAST}
+# Sharper forms of DET and TRACE, which compiled functions read.
 _RANK = cython.declare(cython.int, 4)
 _RANK_TRACE = cython.declare(cython.int, 5)
 
@@ -97,17 +93,18 @@ _SAME = cython.declare(cython.double, 1e-7)  # apart in value, selections are tw
 class Search:
     """A problem, where the relaxation of a node is, and the work space of both.
 
-    ``kernel.pxd`` says what each attribute is.
+    ``branch_kernel.pxd`` says what each attribute is.
     """
 
     def __init__(
-        self, kind, blocks, prior, root, k, rank, useful, best_counts, best_values
+        self, form, blocks, prior, root, k, rank, useful, best_counts, best_values
     ):
         # Arrays are C-contiguous float64; the best (best, M) and (best,) are written.
         # (A docstring here would be a global symbol of C, of which a module that holds
         # its code twice has two.)
         self.count, self.q, self.p = blocks.shape
-        self.kind, self.k, self.rank, self.s = kind, k, rank, len(root)
+        self.kind = _KINDS[form]
+        self.k, self.rank, self.s = k, rank, len(root)
         self.best_counts, self.best_values = best_counts, best_values
         self.useful = useful
         self.most_moved = min(self.count, _FRACTIONAL + 2 * self.p + 4)
@@ -182,20 +179,20 @@ class Search:
             value = factor(self.gram, self.inverse, self.vectors, p)
             if not value > -INFINITY:
                 return value
-        if kind == _D:
+        if kind == DET:
             copy(self.gradient, self.inverse, p * p)
-        elif kind == _DS or kind == _TRACE:
-            value = self._covariance(kind == _DS, self.root, self.s, self.gradient)
+        elif kind == SUBSET or kind == TRACE:
+            value = self._covariance(kind == SUBSET, self.root, self.s, self.gradient)
         elif kind == _RANK_TRACE:
             value = self._covariance(False, self.share, self.size, self.other)
         else:
             value = 0.0
         self.base = value
-        if kind < _E:
-            share = -value if kind == _TRACE else p if kind == _D else self.s
+        if kind < LEAST:
+            share = -value if kind == TRACE else p if kind == DET else self.s
             self.base += self._rounded(share)
-        if kind >= _E:
-            value += self._weakest() if kind == _E else self._shared_out(kind)
+        if kind >= LEAST:
+            value += self._weakest() if kind == LEAST else self._shared_out(kind)
             self._bends()
             if kind == _RANK_TRACE:
                 for a in range(p * p):
@@ -323,17 +320,17 @@ class Search:
         for i in range(self.count):
             left -= low[i]
         self.places = cython.cast(cython.int, left) * self.rank
-        sharper: cython.bint = self.kind == _D or self.kind == _TRACE
+        sharper: cython.bint = self.kind == DET or self.kind == TRACE
         if not sharper or self.places >= self.p or self.places == 0:
             return self.kind
         self.constant = factor(self.known, self.inverse, self.half, self.p)
         if not self.constant > -INFINITY:
             return self.kind
-        if self.kind == _D:
+        if self.kind == DET:
             return _RANK
         self._weigh()
         sharper = self._choose_mu(self.p - 1 - self.places)
-        return _RANK_TRACE if sharper else _TRACE
+        return _RANK_TRACE if sharper else TRACE
 
     def _weigh(self):
         """Fill ``weights`` and ``lines``: u and ``v.T inverse(H)``, by rows.
@@ -405,14 +402,14 @@ class Search:
             copy(self.picked + i * q * p, block, q * p)
         for i in range(m * m):
             out[i] = 0.0
-        if kind >= _E:
+        if kind >= LEAST:
             self._turn(m, self.basis, True)
             self._spectral_hessian(m)
             if kind != _RANK_TRACE:
                 return
         self._turn(m, self.inverse, False)
         multiply(False, True, wide, wide, p, self.turned, self.picked, y)
-        if kind != _D:
+        if kind != DET:
             self._turn(m, self.other if kind == _RANK_TRACE else self.gradient, False)
             multiply(False, True, wide, wide, p, self.turned, self.picked, x)
         for i in range(m):
@@ -421,9 +418,9 @@ class Search:
                 for r in range(q):
                     at = (i * q + r) * wide + j * q
                     for s in range(q):
-                        if kind == _D:
+                        if kind == DET:
                             total += y[at + s] * y[at + s]
-                        elif kind == _DS:
+                        elif kind == SUBSET:
                             total += (2.0 * y[at + s] - x[at + s]) * x[at + s]
                         else:
                             total += 2.0 * x[at + s] * y[at + s]
@@ -716,8 +713,8 @@ class Search:
                 if changed:
                     tunes -= 1
                     sharper: cython.bint = self._choose_mu(self._best_place())
-                    kind = _RANK_TRACE if sharper else _TRACE
-            elif kind == _E and not solved:
+                    kind = _RANK_TRACE if sharper else TRACE
+            elif kind == LEAST and not solved:
                 changed = gain <= 0.3 * (self.base - value)
                 if changed and self.smoothing >= _SHARPEST:
                     break

@@ -1,6 +1,6 @@
-"""``Asked``: what may be measured and what is known, checked; it makes problems of it.
+"""``CandidateSet``: what may be measured, what is known and the rules, checked.
 
-``jaxcal.Design`` adds the questions.
+It makes the problem of a question; :class:`jaxcal.Design` has the questions.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from jaxcal.information.blocks import coarseness
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, as_model, by_name
 from jaxcal.models.uncertainty import Noise, Prior
-from jaxcal.selection.criteria import wanted
+from jaxcal.selection.criteria import criterion_of
 from jaxcal.selection.problem.making import (
     check_available,
     filled,
@@ -27,19 +27,19 @@ from jaxcal.selection.problem.making import (
 )
 from jaxcal.selection.problem.problem import Problem
 from jaxcal.selection.problem.sources import (
-    Given,
-    Modelled,
-    Shared,
+    BlockSource,
+    ModelSource,
+    SharedSource,
     Source,
     shares_regressor,
 )
 
-__all__ = ["Asked"]
+__all__ = ["CandidateSet"]
 
 Array = NDArray[np.float64]
 
 
-class Asked:
+class CandidateSet:
     """Candidates of a model or blocks, with what is known of them and the rules."""
 
     candidates: Array | None  # (M, n) in the caller's unit; finite
@@ -114,20 +114,20 @@ class Asked:
                 "prior must be a (p, p) precision with blocks, got a Prior"
             )
         array = filled("blocks", blocks, "M", "q", "p")
-        asked = object.__new__(cls)
-        asked.model, asked.candidates = None, None
-        asked.available = check_available(available, array.shape[:1])
-        asked._blocks = usable_numbers("blocks", array, asked.available)
-        asked._coarse = coarseness(blocks)
+        design = object.__new__(cls)
+        design.model, design.candidates = None, None
+        design.available = check_available(available, array.shape[:1])
+        design._blocks = usable_numbers("blocks", array, design.available)
+        design._coarse = coarseness(blocks)
         if commands is not None:
             rule = ", one for each block"
-            asked.candidates = array_of(
+            design.candidates = array_of(
                 "commands", commands, len(array), "n", rule=rule
             )
-            asked.candidates.flags.writeable = False
-        asked._set_rules(prior, noise, measured, required, max_replicates)
-        asked.names, asked.axes = _labels(array, names)
-        return asked
+            design.candidates.flags.writeable = False
+        design._set_rules(prior, noise, measured, required, max_replicates)
+        design.names, design.axes = _labels(array, names)
+        return design
 
     def __repr__(self) -> str:
         what = "blocks" if self.model is None else type(self.model).__name__
@@ -146,19 +146,20 @@ class Asked:
             region: of I, where it is given by its letter.
         """
         default = "I" if self.model and not self.model.multiplicity else "D"
-        asked = wanted(criterion, region, default)
-        source = self.source(asked.by_name, asked.of_region)
+        criterion = criterion_of(criterion, region, default)
+        source = self.source(criterion.by_name, criterion.of_region)
         raw, root = source.blocks(), source.root
         if self._measured is not None:
             seen = source.at("measured", self._measured, True)
             root = _with_measured(root, seen)
         source.require_identified(self._measured)
-        where = asked.region
-        if where is None and asked.of_region:
+        where = criterion.region
+        if where is None and criterion.of_region:
             where = source.predicted()
         return make_problem(
-            raw, root, asked, k, self.available, self._required, self.max_replicates,
-            coarse=self._coarse, names=source.names, times=source.times,
+            raw, root, criterion, k, self.available, self._required,
+            self.max_replicates, coarse=self._coarse, names=source.names,
+            times=source.times,
             region=None if where is None else source.at("region", where, False),
             candidates=self.candidates, model=self.model,
         )  # fmt: skip
@@ -169,16 +170,16 @@ class Asked:
         Predictions of an arm without a prior have what no parameter explains, too.
         """
         if self._blocks is not None:
-            return Given(self._blocks, self.prior, self.noise)
+            return BlockSource(self._blocks, self.prior, self.noise)
         model, candidates, prior = self.model, self.candidates, self.prior
         assert model is not None and candidates is not None
         if not of_parameters and shares_regressor(model, prior, self.noise):
-            return Shared(model, candidates, self.noise)
+            return SharedSource(model, candidates, self.noise)
         misfit = 0.0
         if of_predictions and prior is None:
             misfit = model.misfit_std
             model = model.with_misfit() if misfit else model
-        return Modelled(model, candidates, self.available, prior, self.noise, misfit)
+        return ModelSource(model, candidates, self.available, prior, self.noise, misfit)
 
     def with_noise(self, noise: Noise | None) -> Self:
         """The same with other noise."""

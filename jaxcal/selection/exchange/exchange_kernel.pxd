@@ -6,7 +6,7 @@ cdef enum:
 
 @cython.final
 cdef class Climber:
-    cdef int kind  # 0 DET, 1 SUBSET, 2 TRACE
+    cdef int kind  # of ``kinds.pxd``
     cdef int parts  # 1 where V is enough, 2 with X
     cdef int dets  # of which the determinant counts
     cdef bint rows  # one reading each, and DET
