@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import importlib.metadata
+import importlib.util
+import sys
 import typing
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-__all__ = ["Setting", "installed", "require", "setting", "settings_of"]
+__all__ = [
+    "Setting",
+    "installed",
+    "named",
+    "path_of",
+    "require",
+    "setting",
+    "settings_of",
+]
 
 
 class Setting(NamedTuple):
@@ -42,6 +53,36 @@ def require(config: Any, rule: str, holds: Callable[[Any], bool], *names: str) -
         value = getattr(config, name)
         if not holds(value):
             raise ValueError(f"{name} must be {rule}, got {value}")
+
+
+def path_of(thing: type) -> str:
+    """``module:Name`` of a class, by which ``named`` finds it again."""
+    return f"{thing.__module__}:{thing.__qualname__}"
+
+
+def named(path: str) -> Any:
+    """What ``module:Name`` or ``file.py:Name`` names.
+
+    Raises:
+        ValueError: there is no such module or file, or no such name in it.
+    """
+    place, _, name = path.rpartition(":")
+    try:
+        if place.endswith(".py"):
+            spec = importlib.util.spec_from_file_location(f"jaxcal.own {place}", place)
+            assert spec is not None and spec.loader is not None  # it is a Python file
+            module = sys.modules.get(spec.name)
+            if module is None:
+                module = importlib.util.module_from_spec(spec)
+                sys.modules[spec.name] = module  # dataclasses look up the module there
+                spec.loader.exec_module(module)
+        else:
+            module = importlib.import_module(place)
+        return getattr(module, name)
+    except (ImportError, AttributeError, OSError) as error:
+        raise ValueError(
+            f"{path} must be MODULE:NAME or FILE.py:NAME that is there: {error}"
+        ) from error
 
 
 def installed(group: str) -> dict[str, importlib.metadata.EntryPoint]:

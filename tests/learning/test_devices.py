@@ -43,11 +43,6 @@ config = EpisodesConfig(
 )
 """
 
-MANY_STEPS = """
-import dataclasses
-config = dataclasses.replace(config, num_minibatches=2, num_epochs=2)
-"""
-
 COMPARE = """
 def run(mesh, num_updates):
     learner = Postures(config, task, network)
@@ -164,8 +159,8 @@ def test_eight_devices_play_what_uncompiled_code_plays() -> None:
     # jaxlib 0.10.2 compiles one reduction wrongly on the CPU; a partitioned program is
     # another program, so it is compared with the plain one too.
     check_equal(python(BEGIN, TINY, COMPARE))
-    out = python(BEGIN, TINY, MANY_STEPS, COMPARE, PLAY)
-    assert out["losses"] < 5e-5 and out["rewards"] < 2e-5
+    # Of several minibatches each device draws its own, so losses differ as seeds do.
+    out = python(BEGIN, TINY, COMPARE, PLAY)
     assert out["same actions"] == 1.0
     assert out["log_prob"] < 1e-5 and out["advantage"] < 1e-3
     assert out["sets"] == 16 and out["shards"] == [2] and out["on"] == 8
@@ -224,3 +219,40 @@ def test_seeds_on_devices_of_their_own_are_what_they_are_side_by_side() -> None:
     )
     assert out["same"] < 2e-5 and out["apart"] > 1e-2
     assert out["shape"] == [2, 4, 64] and out["whole"]
+
+
+@pytest.mark.slow
+def test_devices_exchange_gradients_and_no_experience() -> None:
+    """By the collectives of the compiled update, on one, two and eight devices."""
+    out = python(
+        BEGIN,
+        TINY,
+        """
+        import re
+        config = EpisodesConfig(
+            num_episodes=256, episodes_per_update=256, episodes_per_set=4,
+            num_minibatches=2, warmup_updates=1,
+        )
+        learner = Postures(config, task, network)
+        for number in (2, 8):
+            mesh = devices.make_mesh(config.rows_per_minibatch, number)
+            begun = ppo.begin(config, learner, jax.random.key(3))
+            state = devices.replicate(begun, mesh)
+            update = training.updates(config, learner, mesh)
+            text = update.lower(state, jnp.int32(1)).compile().as_text()
+            found = re.findall(r"= (.*?) (?:all-|collective-|reduce-)\\S*\\(", text)
+            sizes = [
+                int(np.prod([int(n) for n in shape.split(",") if n] or [1]))
+                for line in found
+                for shape in re.findall(r"\\[([0-9,]*)\\]", line)
+            ]
+            out[f"numbers on {number}"] = sum(sizes)
+        rows = jax.eval_shape(lambda s: learner.gather(s.params, s.playing)[0], state)
+        out["experience"] = sum(leaf.size for leaf in jax.tree.leaves(rows))
+        out["params"] = sum(leaf.size for leaf in jax.tree.leaves(begun.params))
+        """,
+        flags=f"{EIGHT} {QUICK}",
+    )
+    assert out["params"] < out["numbers on 8"] < 2.0 * out["params"]
+    assert out["numbers on 2"] < 2.0 * out["params"]
+    assert out["experience"] > 20.0 * out["params"]

@@ -10,6 +10,7 @@ import pytest
 from jaxcal.information import regression
 from jaxcal.learning import small_matrices
 from jaxcal.learning.policies import geometry
+from jaxcal.selection.policy import kernel
 
 
 def log_det(rows: np.ndarray) -> float:
@@ -28,6 +29,26 @@ def test_cholesky_is_numpys(rng):
     np.testing.assert_allclose(
         small_matrices.cholesky(jnp.asarray(gram)), np.linalg.cholesky(gram), rtol=2e-5
     )
+
+
+def test_of_many_candidates_those_of_largest_gain_are_looked_ahead_from(
+    rng, monkeypatch
+):
+    """As the float64 kernel of inference has it, and the same as from all for those."""
+    y = rng.normal(size=(1100, 3)).astype(np.float32)
+    active = rng.random(1100) < 0.9
+    y[~active] = 0.0
+    few = geometry.lookahead(jnp.asarray(y), True, jnp.asarray(active), 3)
+    values = np.empty((4, 1100))
+    given = np.ascontiguousarray(y.T, np.float64)
+    kernel.look_ahead(given, active, True, 3, False, None, values)
+    for mine, theirs in zip(few, values[:3], strict=True):
+        np.testing.assert_allclose(mine, theirs, atol=1e-4)
+    assert (np.asarray(few[1]) > -30.0).sum() == 512
+    monkeypatch.setattr(geometry, "_ALL_START", 10**6)
+    whole = geometry.lookahead(jnp.asarray(y), True, jnp.asarray(active), 3)
+    shown = np.asarray(few[2]) > -30.0
+    np.testing.assert_allclose(few[2][shown], whole[2][shown], atol=1e-5)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])

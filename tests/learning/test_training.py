@@ -24,7 +24,7 @@ from jaxcal.commands import train_arguments
 from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import GivenCandidates, Task
-from jaxcal.learning.policies.compact import build
+from jaxcal.learning.policies.compact import CompactNetwork, build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.training import checkpoint, presets
@@ -287,6 +287,45 @@ def test_presets_survive_their_own_metadata(preset):
     again = TrainConfig.from_meta(meta)
     own = {"about": config.about, "validate_every": again.validate_every}
     assert dataclasses.replace(again, **own) == dataclasses.replace(config, **own)
+
+
+def test_the_policy_that_ships_says_how_it_was_trained():
+    """By a jaxlib that the requirements allow, and in a configuration that reads."""
+    _, meta = checkpoint.read_meta(None)
+    held, general = TrainConfig.from_meta(meta), presets.load("general")
+    assert dataclasses.replace(held, about=general.about) == general
+    assert meta["progress"]["updates"] == general.ppo.num_updates
+    assert meta["versions"]["jaxlib"] != "0.10.2"
+
+
+class Farthest(Task):
+    """A task of one's own: it pays the last choice's first number."""
+
+    def step(self, state, action):
+        after, _, done = super().step(state, action)
+        return after, state.candidates[action, 0], done
+
+
+class Own(CompactNetwork):
+    """A network of one's own."""
+
+
+def test_a_task_and_a_network_of_ones_own_are_in_the_checkpoint(tmp_path):
+    task = Farthest(SelectionConfig(8, 3, 2, 2))
+    network = dataclasses.replace(CONFIG.network, kind=Own)
+    ppo = dataclasses.replace(CONFIG.ppo, num_episodes=64)
+    config = dataclasses.replace(CONFIG, tasks=(task,), network=network, ppo=ppo)
+    training.train(config, tmp_path)
+    _, meta = checkpoint.read_meta(tmp_path)
+    again = TrainConfig.from_meta(meta)
+    assert again == config and type(again.tasks[0]) is Farthest
+    assert isinstance(checkpoint.load(tmp_path).network, Own)
+    with pytest.raises(
+        ValueError, match=r"nowhere:Net must be MODULE:NAME .* is there"
+    ):
+        build(NetworkConfig(kind="nowhere:Net"))
+    with pytest.raises(ValueError, match="kind must be a Network"):
+        build(NetworkConfig(kind="json:JSONDecoder"))
 
 
 def test_the_paper_preset_is_table_2():

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
@@ -66,6 +67,24 @@ class Seen:
     later: Any  # leaves (T - 1, G, ...): of the others; None where T is 1
 
 
+# Bytes of the (M, M) arrays of a look-ahead that are held at a time while it plays.
+_ROOM = {"cpu": 2**29, "gpu": 2**33, "tpu": 2**33}
+
+
+def _at_once(number: int, m: int, each: int = 1) -> int:
+    """Largest divisor of ``number`` for whose (M, M) arrays, five of each, is room."""
+    room = _ROOM.get(jax.default_backend(), 2**33)
+    most = max(room // (20 * each * m * min(m, 1024)), 1)
+    return max(d for d in range(1, number + 1) if number % d == 0 and d <= most)
+
+
+def _mapped(function: Callable[..., Any], at_once: int, leaves: Any) -> Any:
+    """``jax.vmap``, of so many at a time, one after another."""
+    if at_once == len(jax.tree.leaves(leaves)[0]):
+        return jax.vmap(function)(leaves)
+    return jax.lax.map(function, leaves, batch_size=at_once)
+
+
 @dataclasses.dataclass(frozen=True)
 class Postures:
     """The learner of postures."""
@@ -97,8 +116,11 @@ class Postures:
             metrics: scalars, and ``rewards`` (B G,).
         """
         keys = jax.vmap(jax.random.split)(jax.random.wrap_key_data(playing))
-        play = jax.vmap(self._play, in_axes=(None, 0))
-        batch, value, reward, log_det = play(params, keys[:, 0])  # (B, G) the last two
+        m = jax.eval_shape(self.task.reset, keys[0, 0]).available.shape[0]
+        held = _at_once(self.config.episodes_per_set, m)  # episodes of a row at a time
+        rows = _at_once(len(keys), m, held)
+        play = functools.partial(self._play, params, held)
+        batch, value, reward, log_det = _mapped(play, rows, keys[:, 0])
         metrics = {
             "rewards": reward.ravel(),
             "reward_mean": reward.mean(),
@@ -134,7 +156,7 @@ class Postures:
         logits, value = scored
         return logits, value * self.task.value_scale
 
-    def _play(self, params: Any, key: jax.Array) -> tuple[Any, ...]:
+    def _play(self, params: Any, at_once: int, key: jax.Array) -> tuple[Any, ...]:
         """A ``Batch`` of one row; its (T, G) values; (G,) rewards, (G,) outcomes."""
         task, network = self.task, self.network
         learned = task.num_decisions - network.num_unlearned
@@ -169,7 +191,7 @@ class Postures:
         for count, keys in enumerate(jax.random.split(key_actions, shape)):
             decide, axis = functools.partial(score, count=count), None
             if count > 0:  # the first decision is the same for every episode
-                decide, axis = jax.vmap(decide), 0
+                decide, axis = functools.partial(_mapped, decide, at_once), 0
             decision, logits, value = decide(state)
             each = jax.vmap(act, in_axes=(axis, axis, axis, 0))
             state, record = each(state, logits, value, keys)

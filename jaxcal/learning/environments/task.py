@@ -20,6 +20,7 @@ from jaxcal.learning.environments.selection import (
     SelectionConfig,
     SelectionState,
 )
+from jaxcal.learning.settings import named, path_of
 
 __all__ = ["GivenCandidates", "Task"]
 
@@ -63,7 +64,10 @@ class GivenCandidates:
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """An environment and where its candidates come from."""
+    """An environment and where its candidates come from.
+
+    A subclass changes what is paid; a checkpoint holds its module and name.
+    """
 
     environment: SelectionConfig = field(default_factory=SelectionConfig)
     shapes: tuple[str, ...] = ("uniform",)  # see scenarios.SHAPES
@@ -111,15 +115,23 @@ class Task:
         """Plain JSON values; ``from_meta`` reads them back."""
         given = self.given and {"name": self.given.name, "sha256": self.given.sha256}
         meta = dataclasses.asdict(dataclasses.replace(self, given=None))
-        return meta | {"shapes": list(self.shapes), "given": given}
+        own = {} if type(self) is Task else {"class": path_of(type(self))}
+        return meta | {"shapes": list(self.shapes), "given": given} | own
 
     @staticmethod
     def from_meta(meta: dict[str, Any]) -> Task:
-        """The task that ``as_meta`` described; of given candidates only the digest."""
+        """The task that ``as_meta`` described; of given candidates only the digest.
+
+        Raises:
+            ValueError: it is of a class that is no longer there.
+        """
+        meta = dict(meta)
+        path = meta.pop("class", None)
+        made: type[Task] = Task if path is None else named(path)
         given = meta.get("given")
         own = {
             "environment": SelectionConfig(**meta["environment"]),
             "shapes": tuple(meta["shapes"]),
             "given": given and GivenCandidates(**given),
         }
-        return Task(**meta | own)
+        return made(**meta | own)

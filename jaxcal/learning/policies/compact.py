@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import flax.linen as nn
@@ -19,7 +20,7 @@ from jaxcal.learning.policies.features import (
     vector_features,
 )
 from jaxcal.learning.policies.networks import GROUP, NetworkConfig
-from jaxcal.learning.settings import installed
+from jaxcal.learning.settings import installed, named
 
 __all__ = ["CompactNetwork", "build"]
 
@@ -192,8 +193,15 @@ class CompactNetwork(Network):
 
 
 def build(config: NetworkConfig) -> Network:
-    """The network that a configuration names: ``compact``, or what a package adds."""
+    """The network that a configuration names: ``compact``, one's own, a package's."""
     if config.kind == "compact":
         return CompactNetwork(config)
+    if ":" in config.kind:
+        made = named(config.kind)
+        if not (isinstance(made, type) and issubclass(made, Network)):
+            raise ValueError(f"kind must be a Network, got {config.kind}")
+        fields = [field.name for field in dataclasses.fields(made)]
+        own: Network = made(config) if "config" in fields else made()
+        return own
     network: Network = installed(GROUP)[config.kind].load()(config)
     return network

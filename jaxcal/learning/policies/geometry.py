@@ -22,6 +22,8 @@ __all__ = [
 ]
 
 _LOWEST = -30.0  # log-volume of a candidate that is not active
+_ALL_START = 1024  # M up to which all are looked ahead from
+_STARTS = 512  # of more, those of largest gain that are
 _LEAST_GAIN = 1e-5  # of whitened vectors; smaller gains are float32 rounding errors
 
 
@@ -133,7 +135,9 @@ def lookahead(
         ``depth`` arrays (..., M): the log of the factor by which the determinant grows
         over the first 1, 2, ... choices; -30 where not active. The first is the gain.
         The second is the gain of the best pair, exactly; later ones are what greedy
-        choices reach. Cost: ``depth - 1`` products of (M, p) with (p, M).
+        choices reach. Cost: ``depth - 1`` products of (M, p) with (p, M). Of more than
+        1,024 candidates only the 512 of largest gain are looked ahead from, as in
+        ``selection/policy/kernel.py``: of the others all but the first are -30.
     """
     m = y.shape[-2]
     base = 1.0 if spanned else 0.0
@@ -143,10 +147,17 @@ def lookahead(
     if depth == 1:
         return values
     # For every start i (axis -2): the gains of all j (axis -1) after its choices.
-    shape = (*square.shape, m)
-    picked, reached = y, values[0]  # (..., M, p): the newest choice of each start
+    starts = jnp.broadcast_to(jnp.arange(m), square.shape)
+    picked, reached, begins = y, values[0], active  # of each start, its newest choice
+    if m > _ALL_START:
+        starts = jax.lax.top_k(jnp.where(active, square, -1.0), _STARTS)[1]
+        picked = jnp.take_along_axis(y, starts[..., None], axis=-2)
+        reached, begins = (
+            jnp.take_along_axis(x, starts, axis=-1) for x in (reached, begins)
+        )
+    shape = (*starts.shape, m)
     gains = jnp.broadcast_to(square[..., None, :], shape)
-    itself = jnp.broadcast_to(jnp.eye(m, dtype=bool), shape)
+    itself = jax.nn.one_hot(starts, m, dtype=bool)
     rest = jnp.broadcast_to(active[..., None, :], shape) & ~itself
     along: list[tuple[jax.Array, jax.Array]] = []  # directions, and how far they shrink
     for _ in range(1, depth):
@@ -169,8 +180,12 @@ def lookahead(
         step = jnp.log(jnp.maximum(base + gain, _LEAST_GAIN))
         which = jax.nn.one_hot(best, m, dtype=bool)
         rest = rest & ~which
-        reached = jnp.where(active, reached + step, _LOWEST)
-        values.append(reached)
+        reached = jnp.where(begins, reached + step, _LOWEST)
+        of_all = reached
+        if m > _ALL_START:
+            lowest = jnp.full_like(square, _LOWEST)
+            of_all = jnp.put_along_axis(lowest, starts, reached, -1, inplace=False)
+        values.append(of_all)
         picked = jnp.einsum(
             "...ij,...jp->...ip",
             which.astype(y.dtype),

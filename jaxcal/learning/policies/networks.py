@@ -1,7 +1,9 @@
 """Configuration of a network of postures, and the kinds of network there are.
 
-``compact`` is part of this package; an installed package adds a kind by an entry point,
-as jaxcal's own pyproject.toml adds ``paper``:
+``compact`` is part of this package. A network of one's own is a class, or its name:
+``module:Name`` or ``file.py:Name``; it is a ``core.network.Network``, which has this
+configuration if it has a field ``config``. An installed package adds a kind by an entry
+point, as jaxcal's own pyproject.toml adds ``paper``:
 
     [project.entry-points."jaxcal.networks"]
     paper = "jaxcal.paper.network:PaperNetwork"
@@ -10,8 +12,9 @@ as jaxcal's own pyproject.toml adds ``paper``:
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
-from jaxcal.learning.settings import installed, require, setting
+from jaxcal.learning.settings import installed, path_of, require, setting
 
 __all__ = ["GROUP", "NetworkConfig"]
 
@@ -22,7 +25,7 @@ GROUP = "jaxcal.networks"
 class NetworkConfig:
     """Which network, and its size."""
 
-    kind: str = setting("compact", "compact, paper, or what an installed package adds")
+    kind: str = setting("compact", "compact, paper, MODULE:NAME or FILE.py:NAME")
     width: int = setting(32, "features of a candidate; hidden width of paper")
     encoder_rounds: int = setting(3, "message rounds over the whole set, for each set")
     decoder_rounds: int = setting(
@@ -36,12 +39,16 @@ class NetworkConfig:
     initial_actor: float = setting(0.1, "scale of the learned score before learning")
 
     def __post_init__(self) -> None:
-        if self.kind != "compact" and self.kind not in installed(GROUP):
+        kind: Any = self.kind
+        if isinstance(kind, type):
+            object.__setattr__(self, "kind", path_of(kind))
+        own = self.kind == "compact" or ":" in self.kind
+        if not own and self.kind not in installed(GROUP):
             known = ", ".join(["compact", *installed(GROUP)])
             raise ValueError(
                 f"kind must be one of {known}, got "
-                f"{self.kind!r}; a package adds a kind by an entry point in the group "
-                f"{GROUP}, when it is installed"
+                f"{self.kind!r}; your own is MODULE:NAME or FILE.py:NAME, or an entry "
+                f"point in the group {GROUP}"
             )
         require(self, "at least 1", lambda v: v >= 1, "width", "lookahead")
         rounds = ("encoder_rounds", "decoder_rounds")
