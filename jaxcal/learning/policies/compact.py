@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -201,7 +202,8 @@ def build(config: NetworkConfig) -> Network:
         if not (isinstance(made, type) and issubclass(made, Network)):
             raise ValueError(f"kind must be a Network, got {config.kind}")
         fields = [field.name for field in dataclasses.fields(made)]
-        own: Network = made(config) if "config" in fields else made()
+        arguments: dict[str, Any] = {"config": config} if "config" in fields else {}
+        own: Network = made(**arguments)
         return own
     network: Network = installed(GROUP)[config.kind].load()(config)
     return network
