@@ -24,7 +24,7 @@ from jaxcal.models import SerialChain
 HERE = pathlib.Path(__file__).parent
 NAMES = (
     *("ankle", "ur5", "contacts", "hand_eye", "drift", "force_sensor", "triad"),
-    *("camera", "tcp", "own_function", "backlash", "own_policy"),
+    *("camera", "tcp", "own_function", "backlash", "magnetometry", "own_policy"),
 )
 Rows = list[dict[str, str]]
 
