@@ -152,3 +152,11 @@ def test_a_policy_trained_on_its_own_postures_beats_greedy():
 def test_the_picture_of_the_page_is_drawn_from_its_table(name):
     (EXAMPLES / f"{name}.md").read_text()
     assert common.picture(name).axes
+
+
+@pytest.mark.slow
+def test_the_closed_loop_finds_a_peak_with_fewer_readings(tmp_path):
+    found, _ = quick("magnetometry", tmp_path)
+    late = {rule: np.median(np.abs(error[:, 29:])) for rule, error in found.items()}
+    assert late["closed loop"] < 0.75 * late["random"]
+    assert late["closed loop"] < 0.75 * late["beforehand"]

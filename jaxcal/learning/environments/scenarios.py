@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.learning.environments import randomness
 from jaxcal.learning.environments.selection import Candidates, SelectionConfig
 
 __all__ = ["SHAPES", "given", "mixture"]
@@ -63,7 +62,7 @@ def _shape(name: str, key: jax.Array, m: int, n: int) -> jax.Array:
     """(M, n) candidates of one shape, of order one in size."""
     key_a, key_b, key_c = jax.random.split(key, 3)
     if name == "uniform":
-        return randomness.uniform(key_a, (m, n))
+        return jax.random.uniform(key_a, (m, n))
     if name == "gaussian":
         return jax.random.normal(key_a, (m, n))
     if name == "sphere":

@@ -23,7 +23,6 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcal.learning.environments import randomness
 from jaxcal.learning.environments.observation import context_features
 from jaxcal.learning.settings import require, setting
 from jaxcal.learning.small_matrices import log_det_gram, picked
@@ -114,11 +113,11 @@ def reset(
         draw: where candidates come from (``scenarios`` has several); uniform in [0, 1]
             on every axis when None.
     """
-    key_draw, key_next = randomness.split(key)
+    key_draw, key_next = jax.random.split(key)
     if draw is not None:
         return start(*draw(key_draw), config, key_next)
     m = config.num_candidates
-    candidates = randomness.uniform(key_draw, (m, config.num_inputs))
+    candidates = jax.random.uniform(key_draw, (m, config.num_inputs))
     return start(candidates, jnp.ones(m, bool), config, key_next)
 
 
