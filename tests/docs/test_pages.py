@@ -17,6 +17,10 @@ import matplotlib
 import pytest
 
 ROOT = pathlib.Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "docs" / "tools"))
+
+from rooms import lines_of_rooms
+
 PAGES = sorted(
     [*ROOT.glob("docs/**/*.md"), *ROOT.glob("examples/*.md"), *ROOT.glob("*.md")]
 )
@@ -136,3 +140,11 @@ def parse(words: list[str]) -> None:
             made.parse_args([word for word in rest if word != "--help"])
     else:
         _parser([name]).parse_args([name, *rest])
+
+
+def test_the_rooms_have_about_the_lines_that_the_page_says() -> None:
+    page = (ROOT / "docs/architecture.md").read_text()
+    said = re.findall(r"^\| .*? \| ([\d,]+) \| ", page, re.MULTILINE)
+    assert sorted(int(lines.replace(",", "")) for lines in said) == pytest.approx(
+        sorted(lines_of_rooms().values()), rel=0.1
+    )
