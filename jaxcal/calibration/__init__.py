@@ -1,9 +1,8 @@
 """From measurements to a calibration: ``identify`` and the ``Calibration`` it returns.
 
-``fit`` holds what was found and predicts; ``calibration`` adds the judges (``verdict``,
-``check``), the ``inverse``, the summary and the ``file``. ``identify`` fits the affine
-model itself; ``estimate`` (from arguments to the fit) and ``solve`` (the search) every
-other one.
+``fit`` holds what was found and predicts; ``calibration`` adds ``check``, the
+``inverse``, the summary and the ``file``. ``identify`` checks arguments, ``estimate``
+makes the fit of them, ``solve`` is its search, for every model.
 """
 
 from jaxcal.calibration.budget import Budget, Source

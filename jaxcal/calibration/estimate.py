@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration.sizes import Sizes, group_sizes, misfit_size, of_sizes
-from jaxcal.calibration.solve import Solution, Task, solve, student_constants
+from jaxcal.calibration.solve import Solution, Task, apart, solve, student_constants
 from jaxcal.checks import array_of, one_of, require_kind
 from jaxcal.information.blocks import triangle
-from jaxcal.information.singular import exact_zeros, significant
+from jaxcal.information.singular import exact_zeros, null_directions, significant
 from jaxcal.models.identifiability import unknown
 from jaxcal.models.model import Model, as_model, derivative
-from jaxcal.models.uncertainty import Noise, Prior
+from jaxcal.models.uncertainty import Noise, Prior, ResolvedPrior
 
 __all__ = ["fit_model", "require_fitting"]
 
@@ -61,21 +61,22 @@ def fit_model(
     if not used.any():
         raise ValueError("weights must be positive for one measurement at least")
     white, known, spread = _noise_of(noise, weights, commands, measured.shape[1])
-    each = np.arange(measured.shape[1])
-    levels = 0 * each
+    outputs = np.arange(measured.shape[1])
     if spread.any() and model.relative:
         raise ValueError(
             "command_std must not be given with a Pose: the orientations are "
             "compared with those of the commands given; raise the std of the noise"
         )
     model = model.prepared(commands[used], measured[used])
-    usual = model.default_noise()
+    usual, levels = model.default_noise(), outputs
     if usual is not None and not known:
-        of_reading = np.broadcast_to(np.asarray(usual.std), each.shape)
+        of_reading = np.broadcast_to(np.asarray(usual.std), outputs.shape)
         white = white / of_reading[:, None]
         levels = np.unique(of_reading, return_inverse=True)[1]  # positions and turns
-    if common_noise is not None or spread.any():
-        levels = each if common_noise is False else 0 * each
+    if common_noise or spread.any():
+        levels = 0 * outputs
+    elif common_noise is False:
+        levels = outputs
     asked = prior is not None
     whole, bent = model, model
     if not (asked or spread.any()):
@@ -84,12 +85,13 @@ def fit_model(
             whole = bent
     prior = prior or whole.default_prior()
     resolved = prior.resolve(whole)
+    centre, to_centred = _centre(whole, commands, weights, resolved, spread)
     task = Task(
         model=whole,
-        commands=commands[used],
+        commands=commands[used] - (0.0 if centre is None else centre),
         measured=measured[used],
         white=white[used],
-        mean=resolved.mean,
+        mean=to_centred @ resolved.mean,
         precision=np.diagonal(resolved.precision),
         free=resolved.free,
         command_std=spread,
@@ -119,12 +121,12 @@ def fit_model(
         task = scaled
     else:
         found = solve(task)
-    if common_noise is None and _levels_differ(task, found):
-        apart = dataclasses.replace(task, levels=each)
+    if common_noise is None and usual is not None and _levels_differ(task, found):
+        apart = dataclasses.replace(task, levels=outputs)
         other = solve(apart, found)
         if other.freedom.min() >= 1.0:
             task, found = apart, other
-    fields = _fields(task, found, commands, measured, weights)
+    fields = _fields(task, found, commands, measured, weights, centre)
     if fields["joint_covariance"] is not None:
         within = fields["joint_covariance"].copy()
         if sizes is not None:
@@ -144,6 +146,28 @@ def _sized(task: Task) -> tuple[Solution, Sizes, Task]:
         found = solve(scaled, found, rough=not last)
     assert sizes is not None
     return found, sizes, scaled
+
+
+def _centre(
+    model: Model, commands: Array, weights: Array, prior: ResolvedPrior, spread: Array
+) -> tuple[Array | None, Array]:
+    """(n,) what commands are counted from where that changes the parameters alone.
+
+    Far from zero a bias and slopes can hardly be told apart. None where the prior knows
+    something of the parameters as they are, or the commands say little. With it (p, p)
+    what makes of parameters those from there.
+    """
+    same = np.eye(len(prior.mean))
+    if prior.precision.any() or not prior.free.all() or spread.any():
+        return None, same
+    used = weights > 0.0
+    centre = weights[used] @ commands[used] / weights[used].sum()
+    to_centred = model.centred(centre)
+    if to_centred is None:
+        return None, same
+    rows, largest = commands[used], np.abs(commands[used]).max(axis=0)
+    flat = len(rows) <= len(centre) or null_directions(rows - centre, largest)
+    return (None, same) if flat else (centre, to_centred)
 
 
 def _noise_of(
@@ -236,6 +260,7 @@ def _fields(
     commands: Array,
     measured: Array,
     weights: Array,
+    centre: Array | None,
 ) -> dict[str, Any]:
     used = weights > 0.0
     rows = np.sqrt(_informs(task, found))[:, None, None] * found.rows
@@ -251,8 +276,14 @@ def _fields(
         noise_dof = float(np.bincount(shared, found.freedom).min())
         if freedom < 1.0 or noise_dof <= 0.0:
             noise_std, noise_dof = None, 0.0
-    residuals = measured - task.model.predict(commands, found.parameters)
+    origin = 0.0 if centre is None else centre
+    residuals = measured - task.model.predict(commands - origin, found.parameters)
     residuals[used] = found.residuals
+    estimate, mean = found.parameters, task.mean
+    if centre is not None:
+        back = np.asarray(task.model.centred(-centre))
+        estimate, mean = back @ estimate, back @ mean
+        null = None if null is None else null @ back.T
     estimated = None
     if task.command_std.any():
         estimated = commands.copy()
@@ -260,11 +291,11 @@ def _fields(
     loss_weights, distance = np.zeros((2, len(commands)))
     loss_weights[used], distance[used] = found.weights, found.deleted
     return {
-        "estimate": found.parameters,
+        "estimate": estimate,
         "joint_covariance": None if noise_std is None else covariance,
-        "centre": None,
+        "centre": centre,
         "unidentified": null,
-        "prior_mean": task.mean,
+        "prior_mean": mean,
         "prior_precision": task.precision,
         "free": task.free.astype(np.float64),
         "commands": commands,
@@ -299,26 +330,33 @@ def _covariance(task: Task, found: Solution, rows: Array) -> tuple[Array, Array 
     scale = np.sqrt((rows**2).sum(axis=0) + precision)
     scale = np.where(scale > 0.0, scale, 1.0)
     whole = np.concatenate([rows, np.diag(np.sqrt(precision))]) / scale
-    _, singular, right = np.linalg.svd(triangle(whole))
-    known = significant(singular)
+    root, null = [np.zeros((0, len(free)))], [np.zeros((0, len(free)))]
+    of_rows = 0  # combinations of the parameters that the readings use up
+    for columns in apart(whole):
+        _, singular, right = np.linalg.svd(triangle(whole[:, columns]))
+        known = significant(singular)
+        turned = np.zeros((len(columns), len(free)))
+        turned[:, columns] = right
+        root.append(turned[known] / singular[known, None])
+        null.append(exact_zeros(turned[~known]))
+        alone = singular
+        if not known.all():
+            alone = np.linalg.svd(rows[:, columns] / scale[columns], compute_uv=False)
+        of_rows += int(significant(alone).sum())
+    factor, unseen = np.concatenate(root) / scale, np.concatenate(null) / scale
     readings = found.left * len(task.commands)
-    of_rows = 0
-    if not known.all():
-        of_rows = significant(np.linalg.svd(rows / scale, compute_uv=False)).sum()
-    if of_rows >= readings:
+    if len(unseen) and of_rows >= readings:
         prior = found.parameters, task.precision, task.free
         left = "; ".join(
             each.words for each in unknown(task.model, task.commands, *prior)
         )
         raise ValueError(
             f"measured holds {readings} independent readings, too few for "
-            f"{len(free)} free parameters: {int((~known).sum())} combinations of them "
+            f"{len(free)} free parameters: {len(unseen)} combinations of them "
             f"stay unknown{f' ({left})' if left else ''}; measure more, or give a "
             "prior or fixed parameters"
         )
-    root = right[known] / singular[known, None] / scale
-    covariance = np.zeros((size, size))
-    covariance[np.ix_(free, free)] = root.T @ root
-    null = np.zeros((int((~known).sum()), size))
-    null[:, free] = exact_zeros(right[~known]) / scale
-    return covariance, null if len(null) else None
+    covariance, directions = np.zeros((size, size)), np.zeros((len(unseen), size))
+    covariance[np.ix_(free, free)] = factor.T @ factor
+    directions[:, free] = unseen
+    return covariance, directions if len(directions) else None

@@ -27,10 +27,9 @@ Array = NDArray[np.float64]
 class Fit:
     """The identified map from commands u (n inputs) to outputs y (m of them).
 
-    ``y = f(u; theta)`` with the most probable p parameters; P of them with
-    an arm's harmonics. ``identify`` fills it, in closed form where the model is affine
-    and nothing else is asked for. Arrays are copied and frozen; letters are their axes,
-    with N measurements, and numbers their least value.
+    ``y = f(u; theta)`` with the most probable p parameters; P of them with an arm's
+    harmonics. ``identify`` fills it. Arrays are copied and frozen; letters are their
+    axes, with N measurements, and numbers their least value.
     """
 
     input_names: tuple[str, ...]
@@ -42,7 +41,8 @@ class Fit:
     loss: str  # "student" or "gaussian"
     estimate: Annotated[Array, "P"]
     joint_covariance: Annotated[Array | None, "PP"]  # None where the noise is unknown
-    centre: Annotated[Array | None, "n"]  # of the closed form: with b the outputs there
+    # Commands are counted from it in joint_covariance; None: from zero.
+    centre: Annotated[Array | None, "n"]
     unidentified: Annotated[Array | None, "zP"]  # directions that nothing determines
     prior_mean: Annotated[Array, "P"]
     prior_precision: Annotated[Array, "P", 0.0]  # 0 where nothing was known
@@ -115,12 +115,9 @@ class Fit:
     @property
     def to_parameters(self) -> Array:
         """(p, p) from the coordinates of ``joint_covariance`` to ``parameters``."""
-        p, n, m = len(self.names), self.num_inputs, self.num_outputs
-        turn = np.eye(p)
-        if self.centre is not None:
-            # b = (the outputs at the centre) - A centre
-            turn[m * n :, : m * n] = -np.kron(np.eye(m), self.centre)
-        return turn
+        if self.centre is None:
+            return np.eye(len(self.names))
+        return np.asarray(self.model.centred(-self.centre))
 
     @property
     def standard_errors(self) -> Array | None:
@@ -247,7 +244,7 @@ class Fit:
         variance = ((slopes @ covariance) * slopes).sum(axis=-1)
         std = np.sqrt(np.maximum(variance, 0.0) + float(new_measurement) * noise**2)
         if self.unidentified is not None:
-            std = np.where(depends(slopes, self.unidentified), np.inf, std)
+            std = np.where(depends(slopes, self.unseen), np.inf, std)
         return std.reshape(*points.shape[:-1], self.num_outputs)
 
     # -- inside ------------------------------------------------------------------------
@@ -266,6 +263,16 @@ class Fit:
         by = joint[:p, p:]
         within = joint[:p, :p] - by * self.prior_precision[p:] @ by.T
         return derivative(self.model, rows, self.parameters), within
+
+    @property
+    def unseen(self) -> Array:
+        """(z, P) directions that nothing determines, as ``linear`` has the slopes."""
+        null = np.zeros((0, len(self.estimate)))
+        if self.unidentified is not None:
+            null = self.unidentified
+        if self.centre is None:
+            return null
+        return null @ np.asarray(self.model.centred(self.centre)).T
 
     @functools.cached_property
     def whole(self) -> Model:

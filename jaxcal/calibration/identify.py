@@ -1,8 +1,4 @@
-"""``identify``: from measurements to a calibration, with honest uncertainty.
-
-The affine model by itself is weighted least squares in closed form; every other model,
-prior or loss is a search (``estimate``).
-"""
+"""``identify``: from measurements to a calibration, with honest uncertainty."""
 
 from __future__ import annotations
 
@@ -59,11 +55,10 @@ def identify(
 ) -> Calibration:
     """The parameters of ``y = f(u; theta)`` that the measurements make most probable.
 
-    The affine model without prior, student's loss or noise of another kind than
-    ``noise_std`` is fitted by weighted least squares in closed form, and refuses
-    commands that leave a direction unexcited. Every other fit starts at the prior's
-    mean and is of the most probable parameters, so directions that no measurement shows
-    stay there.
+    The fit starts at the prior's mean, and directions that no measurement shows stay
+    there. The affine model without prior, student's loss or noise of another kind than
+    ``noise_std`` is weighted least squares, and refuses commands that leave a direction
+    unexcited.
 
     Args:
         commands: (N, n) what the device was told, in any unit.
@@ -80,12 +75,12 @@ def identify(
             of readings averaged, say); 0 leaves it out. All 1 when not given.
         common_noise: estimate one noise level for all outputs (they must share a unit),
             which has m times the degrees of freedom, or (False) one for each. When not
-            given: one for each of an affine fit; one for all of another model (an arm:
-            one for positions, one for turns) unless the residuals contradict it
-            (F test, 0.1 %).
+            given: one for each, but of an arm one for positions and one for turns
+            unless the residuals contradict it (F test, 0.1 %), and one for all where
+            ``command_std`` is given.
         loss: "gaussian" is least squares; "student" (4 degrees of freedom, of a
             measurement as a whole) gives outliers little weight. "student" when not
-            given, but least squares where the closed form applies.
+            given, but least squares of an affine model without prior.
         input_names: n names; those of a data frame, else u_x, u_y, u_z or u_1 ... u_n,
             when not given.
         output_names: m names, likewise y_x or y_1.
@@ -151,20 +146,17 @@ def identify(
         if not array_of("accuracy", accuracy) > 0.0:
             raise ValueError(f"accuracy must be positive, got {accuracy}")
         about["provenance"]["accuracy"] = float(accuracy)
-    affine = model is None
-    if model is not None:
-        model = require_fitting(model, commands, measured)
-        affine = isinstance(model, Affine)
-    if affine and loss in (None, "gaussian"):
-        if prior is None and noise is None:
-            shared = bool(common_noise)
-            found = _fit_affine(commands, measured, weight, level, shared, inputs)
-            return Calibration(**found, **about)
+    model = Affine(n, m) if model is None else model
+    model = require_fitting(model, commands, measured)
+    plain = prior is None and noise is None and loss in (None, "gaussian")
+    if plain and model.affine(model.nominal) is not None:
+        loss = "gaussian"
+        require_excited(commands[weight > 0.0], inputs)
     found = fit_model(
         commands,
         measured,
         weight,
-        model=Affine(n, m) if model is None else model,
+        model=model,
         prior=prior,
         noise=Noise(std=level) if noise is None and level is not None else noise,
         loss=loss or "student",
@@ -174,85 +166,6 @@ def identify(
     if calibration.verdict is not None and not calibration.verdict.good:
         warnings.warn(str(calibration.verdict), stacklevel=2)
     return calibration
-
-
-def _fit_affine(
-    commands: Array,
-    measured: Array,
-    weight: Array,
-    noise: Array | None,
-    common_noise: bool,
-    names: tuple[str, ...],
-) -> dict[str, Any]:
-    """The fields of a ``Calibration`` but names, units and provenance, in closed form.
-
-    A singular value decomposition of centred and scaled regressors, so encoder pulses
-    and degrees fit equally well. Noise is independent between postures and between
-    outputs. Source: paper, Equations 2 to 4; Seber and Lee, Linear Regression Analysis,
-    chapter 3.
-
-    Raises:
-        ValueError: the commands leave a direction unexcited, which is named.
-    """
-    n, m = commands.shape[1], measured.shape[1]
-    used = weight > 0.0
-    u, y, w = commands[used], measured[used], weight[used]
-    require_excited(u, names)
-
-    total = float(w.sum())
-    share = w / total
-    centre = share @ u
-    offset = u - centre
-    scale = np.sqrt(share @ offset**2)
-    at_centre = share @ y
-    root = np.sqrt(w)[:, None]
-    left, singular, right = np.linalg.svd(root * (offset / scale), full_matrices=False)
-    inverse = right.T / singular
-    slopes = inverse @ (left.T @ (root * (y - at_centre)))
-    matrix = (slopes / scale[:, None]).T
-    residuals = measured - (at_centre + ((commands - centre) / scale) @ slopes)
-
-    free = len(u) - (n + 1)  # residual degrees of freedom of each output
-    squares = w @ residuals[used] ** 2
-    noise_dof = 0
-    if noise is None and free:
-        each = squares / free
-        noise = np.sqrt(np.full(m, each.mean()) if common_noise else each)
-        noise_dof = m * free if common_noise else free
-
-    p = m * (n + 1)
-    covariance, square, distance = None, 0.0, np.zeros(len(commands))
-    if noise is not None:
-        of_slopes = (inverse / scale[:, None]) @ (inverse / scale[:, None]).T
-        covariance = np.zeros((p, p))
-        covariance[: m * n, : m * n] = np.kron(np.diag(noise**2), of_slopes)
-        covariance[m * n :, m * n :] = np.diag(noise**2) / total
-        level = np.where(noise > 0.0, noise, 1.0)  # an exact fit may leave none
-        square = float((squares / level**2).sum())
-        left_out = np.maximum(1.0 - share - (left**2).sum(axis=1), 1e-9)
-        off = ((residuals[used] / level) ** 2).sum(axis=1)
-        distance[used] = w * off / left_out if free else 0.0
-    return {
-        "model": Affine(n, m),
-        "loss": "gaussian",
-        "estimate": np.concatenate([matrix.ravel(), at_centre - matrix @ centre]),
-        "joint_covariance": covariance,
-        "centre": centre,
-        "unidentified": None,
-        "prior_mean": np.zeros(p),
-        "prior_precision": np.zeros(p),
-        "free": np.ones(p),
-        "commands": commands,
-        "estimated_commands": None,
-        "residuals": residuals,
-        "loss_weights": used.astype(np.float64),
-        "distance": distance,
-        "dof": float(m * free),
-        "square": square,
-        "num_readings": float(m),
-        "noise_std": noise,
-        "noise_dof": float(noise_dof),
-    }
 
 
 def _provenance(

@@ -142,9 +142,11 @@ class _Search:
         left, singular, right, rows = self.require_regular(centre)
         if self.fit.joint_covariance is not None:
             # Standard deviation of left . B right, whose value is the smallest one.
-            along = np.kron(left[:, -1] / rows, right[-1] * self.spread)
-            of_slopes = self.fit.joint_covariance[: along.size, : along.size]
-            sure = singular[-1] / float(np.sqrt(along @ of_slopes @ along) or 1e-300)
+            back, ahead = left[:, -1] / rows, right[-1] * self.spread
+            entries = [self.model.affine(one) for one in np.eye(len(self.fit.names))]
+            along = np.array([back @ entry[0] @ ahead for entry in entries if entry])
+            variance = along @ self.fit.joint_covariance @ along
+            sure = singular[-1] / float(np.sqrt(variance) or 1e-300)
             if sure < 3.0:
                 raise ValueError(
                     "matrix A cannot be told from a singular one: its smallest "
@@ -189,7 +191,7 @@ class _Search:
         if fit.unidentified is None:
             return
         slopes = fit.linear(commands)[0]
-        for i, j in np.argwhere(depends(slopes, fit.unidentified))[:1]:
+        for i, j in np.argwhere(depends(slopes, fit.unseen))[:1]:
             used = fit.commands[fit.loss_weights > 0.0]
             known = fit.estimate, fit.prior_precision, fit.free > 0.0
             words = [

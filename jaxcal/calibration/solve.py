@@ -2,7 +2,9 @@
 
 Rows of residuals, whitened: the readings, the prior (one row for each parameter) and,
 where commands are uncertain, the commands. Those are unknowns of their own measurement
-and are eliminated there by an orthogonal projection. Student's loss is iteratively
+and are eliminated there by an orthogonal projection. A model that is linear in its
+parameters is searched along orthogonal directions, so one step is enough whatever its
+units. Student's loss is iteratively
 reweighted least squares. A level of noise that was not given is estimated beside the
 parameters, from the residuals and the degrees of freedom that they really have.
 
@@ -18,10 +20,11 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.information.singular import flat
-from jaxcal.models.model import Model, derivative, predict
+from jaxcal.information.blocks import triangle
+from jaxcal.information.singular import significant
+from jaxcal.models.model import Model, derivative, predict, without_effect
 
-__all__ = ["Solution", "Task", "solve", "student_constants"]
+__all__ = ["Solution", "Task", "apart", "solve", "student_constants"]
 
 Array = NDArray[np.float64]
 
@@ -117,6 +120,24 @@ def _times(matrices: Array, vectors: Array) -> Array:
     return np.asarray((matrices @ vectors[..., None])[..., 0])
 
 
+def apart(rows: Array) -> list[NDArray[np.intp]]:
+    """Columns of rows (R, F) in groups that no row joins, as of independent outputs.
+
+    Each group is solved by itself, so a rounding of one is none of another.
+    """
+    filled = rows != 0.0
+    joined = filled.T.astype(np.float64) @ filled > 0.0
+    groups, rest = [], np.ones(rows.shape[1], dtype=np.bool_)
+    while rest.any():
+        group = np.zeros_like(rest)
+        group[rest.argmax()] = True
+        while (more := group | joined[group].any(axis=0)).sum() > group.sum():
+            group = more
+        groups.append(np.flatnonzero(group))
+        rest &= ~group
+    return groups
+
+
 class Solution:
     """A search, its two moves step (parameters) and settle (levels), and its end."""
 
@@ -143,11 +164,19 @@ class Solution:
         self.left = q - int(np.isinf(task.command_std).sum())  # readings, nuisance out
         # From where another search ended, the derivatives are right far enough.
         self.damping, self.grow = 1e-3 if start is None else 1e-10, 2.0
-        largest = float(np.abs(_times(task.white, task.measured)).max())
-        self.floor = 1e-13 * largest or 1e-6  # of contacts, in their usual noise
+        largest = np.abs(_times(task.white, task.measured)).max(axis=0)
+        largest = np.where(largest > 0.0, largest, largest.max())
+        # (q,) of contacts, whose readings are zero, in their usual noise.
+        self.floor = np.where(largest > 0.0, 1e-13 * largest, 1e-6)
+        self.sizes = task.model.parameter_sizes()
+        self.basis: Array | None = None  # (F, r) directions of a linear model
         self.freedom = np.zeros(q)
         self.shared = task.levels
         self.parameters = task.mean if start is None else start.parameters
+        linear = task.model.linear and not self.uncertain.any()
+        from_zero = linear and start is None and not task.precision[task.free].any()
+        if from_zero:  # the answer is then as exact as its step
+            self.parameters = np.where(task.free, 0.0, task.mean)
         self.commands = task.commands if start is None else start.commands
         self.residuals = task.measured - predict(
             task.model, self.commands, self.parameters
@@ -157,25 +186,62 @@ class Solution:
         if start is None:
             self.weights, self.level = np.ones(count), np.ones(q)
             if not task.known:
-                first = np.sqrt(np.mean(_times(task.white, self.residuals) ** 2))
-                self.level = np.full(q, max(first, self.floor))
+                same = (self.shared[:, None] == self.shared).astype(np.float64)
+                square = (_times(task.white, self.residuals) ** 2).mean(axis=0)
+                mean = same @ square / same.sum(axis=1)
+                self.level = np.maximum(np.sqrt(mean), (same * self.floor).max(axis=1))
         else:
             self.weights, self.level = start.weights, start.level
         self._linearise()
+        if linear:
+            self.basis, self.damping = self._directions(), _LEAST_DAMPING
+        if (
+            from_zero
+            and self.basis is not None
+            and self.basis.shape[1] < task.free.sum()
+        ):
+            self._keep_undetermined()
 
     def _linearise(self) -> None:
         """Derivatives at the present parameters, whitened at level 1."""
         task = self.task
-        rows = derivative(task.model, self.commands, self.parameters)
-        rows = rows[..., task.free]
-        largest = np.abs(rows).max(axis=(0, 1))
-        still = flat(largest, largest.max(initial=0.0))
         self.known, self.more = task.model.facts(self.parameters)
-        self.by_theta = task.white @ np.where(still, 0.0, rows)
+        if self.basis is not None:  # derivatives stay what they are
+            return
+        rows = derivative(task.model, self.commands, self.parameters)
+        still = without_effect(rows, self.sizes)[task.free]
+        self.by_theta = task.white @ np.where(still, 0.0, rows[..., task.free])
         if self.uncertain.any():
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
             rows = derivative(task.model, self.commands, self.parameters, inputs)
             self.by_command = task.white @ rows[..., self.uncertain]
+
+    def _directions(self) -> Array:
+        """(F, r) changes of the parameters, those that nothing determines left out.
+
+        Orthogonal in what they change, the readings in noise and the prior.
+        """
+        rows, _, scale = self._system(0.0)
+        directions = []
+        for columns in apart(rows):
+            _, size, right = np.linalg.svd(triangle(rows[:, columns]))
+            known = np.flatnonzero(significant(size))
+            block = np.zeros((rows.shape[1], len(known)))
+            block[columns] = (right[known] / size[known, None] / scale[columns]).T
+            directions.append(block)
+        return np.hstack(directions)
+
+    def _keep_undetermined(self) -> None:
+        """Move to the prior's mean in directions that nothing determines."""
+        task, basis = self.task, np.asarray(self.basis)
+        mean, size = task.mean[task.free], np.linalg.norm(basis, axis=1)
+        size = np.where(size > 0.0, size, 1.0)
+        shown = np.linalg.lstsq(basis / size[:, None], mean / size, rcond=None)[0]
+        self.parameters = self.parameters.copy()
+        self.parameters[task.free] = mean - basis @ shown
+        self.residuals = task.measured - predict(
+            task.model, self.commands, self.parameters
+        )
 
     def _distance(self, residuals: Array, commands: Array) -> Array:
         """(N,) squared distance of each measurement from the fit, in noise."""
@@ -230,13 +296,18 @@ class Solution:
         return commands
 
     def _system(self, damping: float) -> tuple[Array, Array, Array]:
-        """Weighted rows (R, F), residuals (R,), scale (F,): readings, prior, facts."""
+        """Weighted rows (R, F), residuals (R,), scale (F,): readings, prior, facts.
+
+        By directions, (R, r) and (r,), where the model is linear.
+        """
         free = self.task.free
         root = np.sqrt(self.task.precision[free])
         weight = np.sqrt(self.weights)[:, None]
         rows, right = self._reduce(damping)
         rows = (weight[..., None] * rows).reshape(-1, len(root))
         rows = np.concatenate([rows, np.diag(root), self.more[:, free]])
+        if self.basis is not None:
+            rows = rows @ self.basis
         scale = np.sqrt((rows**2).sum(axis=0))
         scale = np.where(scale > 0.0, scale, 1.0)
         off = root * (self.task.mean - self.parameters)[free]
@@ -257,11 +328,12 @@ class Solution:
             step = inverse @ target
             rest = rows @ step - right
             gain = float(right @ right - rest @ rest)
+            step = step / scale if self.basis is None else self.basis @ (step / scale)
             if gain <= self.least + 1e-13 * cost:
                 return True
             theta = self.parameters.copy()
-            theta[task.free] += step / scale
-            commands = self._moved(step / scale)
+            theta[task.free] += step
+            commands = self._moved(step)
             residuals = task.measured - predict(
                 task.model, commands, theta, finite=False
             )
@@ -325,7 +397,8 @@ class Solution:
             # The weights follow the level: Newton's step takes both at once.
             pulled = self.weights * distance
             faster = pulled.sum() / max(pulled @ self.weights, 1e-300)
-        change = np.log(np.maximum(np.sqrt(square / freedom), self.floor) / self.level)
+        floor = (same * self.floor).max(axis=1)
+        change = np.log(np.maximum(np.sqrt(square / freedom), floor) / self.level)
         near = np.abs(change).max() < 0.3
         step = change * (faster if near else 1.0)
         # Levels that go back and forth may never settle: then half a step is taken.
@@ -341,9 +414,8 @@ class Solution:
             solved = rows, _factor(rows, right, _LEAST_DAMPING)[0]
         rows, inverse = solved
         root = rows @ inverse
-        width, count = rows.shape[1], len(self.weights)
-        readings = len(root) - width - len(self.known)
-        return root[:readings].reshape(count, -1, width)
+        readings = len(root) - int(self.task.free.sum()) - len(self.known)
+        return root[:readings].reshape(len(self.weights), -1, root.shape[1])
 
     def _freedom(self, readings: Array) -> Array:
         """(q,) residual degrees of freedom of each output."""
@@ -354,7 +426,9 @@ class Solution:
         # A reading that nothing moves and that is met is none, as where the sensors of
         # one arm have different numbers of readings.
         none = (self.residuals == 0.0) & (self.by_theta == 0.0).all(axis=-1)
-        return np.asarray(count - none.sum(axis=0) - used.sum(axis=0))
+        freedom = count - none.sum(axis=0) - used.sum(axis=0)
+        whole = np.round(freedom)
+        return np.where(np.abs(freedom - whole) < 1e-9, whole, freedom)
 
     def finish(self) -> Solution:
         """Itself, with what is said of the measurements where it ended."""

@@ -79,6 +79,16 @@ class Affine(Model):
         """(..., N, 1, n + 1) information blocks [u, 1] of commands (..., N, n)."""
         return regressors(commands)[..., None, :]
 
+    @property
+    def linear(self) -> bool:
+        return True
+
+    def centred(self, centre: Array) -> Array:
+        """(p, p): the outputs at the centre stand for b."""
+        to_centred, slopes = np.eye(self.num_parameters), self.num_outputs * len(centre)
+        to_centred[slopes:, :slopes] = np.kron(np.eye(self.num_outputs), centre)
+        return to_centred
+
     def affine(self, parameters: Array) -> tuple[Array, Array]:
         """A (m, n) and b (m,)."""
         m, n = self.num_outputs, self.num_inputs

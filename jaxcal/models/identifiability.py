@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import one_of, require_kind, table
 from jaxcal.information.blocks import triangle
 from jaxcal.information.singular import SINGULAR, exact_zeros, flat, significant
-from jaxcal.models.model import Model, as_model, derivative
+from jaxcal.models.model import Model, as_model, derivative, without_effect
 from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["Direction", "Identifiability", "identifiability", "unknown"]
@@ -92,12 +92,7 @@ def identifiability(
     require_kind("prior", prior, Prior)
     known = None if prior is None else prior.resolve(model)
     mean = model.nominal if known is None else known.mean
-    jacobian = derivative(model, commands, mean)
-    if noise is not None:
-        slopes = None
-        if noise.command_std is not None:
-            slopes = np.asarray(model.command_jacobian(commands, mean))
-        jacobian = noise.whitening(len(commands), model.num_outputs, slopes) @ jacobian
+    jacobian = _white(model, derivative(model, commands, mean), commands, mean, noise)
     rows = jacobian.reshape(-1, model.num_parameters)
     asked = np.ones(model.num_parameters, dtype=np.bool_)
     held: Sequence[str] = ()
@@ -117,12 +112,14 @@ def identifiability(
     names = tuple(model.names[i] for i in at)
     std = np.sqrt(np.diagonal(model.default_prior().resolve(model).precision))[at]
     scale = 1.0 / np.where(std > 0.0, std, 1.0)
+    columns = rows[:, at] * scale
+    largest = np.abs(columns).max(axis=0, initial=0.0)
+    seen = largest > 0.0
     # A triangle of p rows holds all that is needed of the N q.
-    columns = triangle(rows[:, at] * scale)
-    norms = np.linalg.norm(columns, axis=0)
-    seen = ~flat(norms, norms.max(initial=0.0))
-    norms = np.where(seen, norms, 1.0)
-    unit = columns / norms * seen
+    columns = triangle(columns / np.where(seen, largest, 1.0))
+    lengths = np.linalg.norm(columns, axis=0)
+    unit = columns / np.where(seen, lengths, 1.0)
+    norms = np.where(seen, lengths * largest, 1.0)
     found = [np.eye(len(at))[[i]] for i in np.flatnonzero(~seen)]
     first, classes = _parallel(unit, np.flatnonzero(seen))
     found += [each / norms for each in classes]
@@ -146,6 +143,34 @@ def identifiability(
     return Identifiability(
         names, rank, tuple(directions), condition, len(commands), tuple(held)
     )
+
+
+def _white(
+    model: Model, jacobian: Array, commands: Array, mean: Array, noise: Noise | None
+) -> Array:
+    """(N, q, p) derivatives in comparable units, exactly zero where they are rounding.
+
+    In the noise's, else the model's usual noise, else every output in its largest
+    derivative's.
+    """
+    still = without_effect(jacobian, model.parameter_sizes())
+    jacobian = np.where(still, 0.0, jacobian)
+    noise = model.default_noise() if noise is None else noise
+    if noise is None:
+        largest = np.abs(jacobian).max(axis=0, initial=0.0)
+        columns = largest.max(axis=0, initial=0.0)
+        outputs = (largest / np.where(columns > 0.0, columns, 1.0)).max(axis=1)
+        return np.asarray(jacobian / np.where(outputs > 0.0, outputs, 1.0)[:, None])
+    shape = len(commands), model.num_outputs
+    readings = dataclasses.replace(noise, command_std=None)
+    white = readings.whitening(*shape) @ jacobian
+    if noise.command_std is None:
+        return white
+    slopes = np.asarray(model.command_jacobian(commands, mean))
+    rest = noise.whitening(*shape, slopes) @ jacobian
+    # What unknown commands take away whole leaves rounding.
+    lost = flat(np.linalg.norm(rest, axis=(0, 1)), np.linalg.norm(white, axis=(0, 1)))
+    return np.where(lost, 0.0, rest)
 
 
 def unknown(

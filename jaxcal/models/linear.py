@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -117,6 +118,10 @@ class Linear(Model):
         slopes = self._slopes(as_commands(self, commands))
         return np.einsum("mr,nri->nmi", coefficients, slopes)
 
+    @property
+    def linear(self) -> bool:
+        return True
+
     def to_dict(self) -> dict[str, Any]:
         """A function cannot be written: its dict names the terms only."""
         return {
@@ -217,6 +222,22 @@ class Polynomial(Linear):
             self._features, num_outputs, inputs=names, terms=["1", *terms[1:]]
         )
         self._analytic = True
+
+    def centred(self, centre: Array) -> Array:
+        """(p, p) by the binomial theorem: ``u^a = sum of binom(a, k) c^(a-k) v^k``."""
+        high, low = self._powers[None], self._powers[:, None]
+        powers = range(self.degree + 1)
+        choices = np.array([[math.comb(a, k) for k in powers] for a in powers])
+        factors = choices[high, low] * centre ** np.maximum(high - low, 0)
+        of_output = np.prod(factors, axis=-1)  # 0 where a power is lower
+        return np.kron(np.eye(self.num_outputs), of_output)
+
+    def affine(self, parameters: Array) -> tuple[Array, Array] | None:
+        """A (m, n) and b (m,) of degree 1."""
+        if self.degree > 1:
+            return None
+        rows = parameters.reshape(self.num_outputs, -1)
+        return rows[:, 1:], rows[:, 0]
 
     def to_dict(self) -> dict[str, Any]:
         return {

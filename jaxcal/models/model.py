@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, in_words
 from jaxcal.csvtable import COMMANDS, of_frame
+from jaxcal.information.singular import flat
 from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "by_name",
     "derivative",
     "predict",
+    "without_effect",
 ]
 
 Array = NDArray[np.float64]
@@ -127,6 +129,21 @@ class Model(abc.ABC):
         """The usual noise of a reading; None where nothing is known."""
         return None
 
+    def parameter_sizes(self) -> Array:
+        """(p,) in which derivatives by different parameters are compared.
+
+        A derivative below 1e-14 of the others is rounding. The default prior's standard
+        deviation, else the nominal value; NaN where neither says how large, or where
+        derivatives are exact: then zero alone is no effect.
+        """
+        if self.linear:
+            return np.full(len(self.names), np.nan)
+        nominal = np.abs(self.nominal)
+        precision = np.diagonal(self.default_prior().resolve(self).precision)
+        with np.errstate(divide="ignore"):
+            sizes = np.where(precision > 0.0, 1.0 / np.sqrt(precision), nominal)
+        return np.where(sizes > 0.0, sizes, np.nan)
+
     def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
         """What is known besides the prior, as readings that need no command.
 
@@ -160,6 +177,19 @@ class Model(abc.ABC):
         return np.arange(len(commands))
 
     # -- linear models -----------------------------------------------------------------
+
+    @property
+    def linear(self) -> bool:
+        """Whether the outputs are linear in the parameters, and derivatives exact."""
+        return False
+
+    def centred(self, centre: Array) -> Array | None:
+        """(p, p) that makes of parameters those for commands counted from ``centre``.
+
+        ``f(u; theta) = f(u - centre; centred(centre) @ theta)``; None where there are
+        none such.
+        """
+        return None
 
     @property
     def multiplicity(self) -> int:
@@ -358,6 +388,23 @@ def derivative(
             f"for the command {in_words(commands[row])}"
         )
     return found
+
+
+def without_effect(jacobian: Array, sizes: Array) -> NDArray[np.bool_]:
+    """(p,) parameters by which a derivative (N, q, p) is zero, or rounding.
+
+    Args:
+        jacobian: (N, q, p); outputs are judged one by one, whatever their units.
+        sizes: (p,) of the parameters, as ``Model.parameter_sizes`` has them.
+    """
+    largest = np.abs(jacobian).max(axis=0, initial=0.0)
+    zero = ~largest.any(axis=0)
+    known = np.isfinite(sizes)
+    if not known.any():
+        return np.asarray(zero)
+    effect = largest * np.where(known, sizes, 0.0)
+    beside = effect.max(axis=1, keepdims=True)
+    return np.asarray(zero | (known & flat(effect, beside).all(axis=0)))
 
 
 def _require_shape(method: str, found: Array, shape: tuple[int, ...]) -> None:
