@@ -237,7 +237,7 @@ def budget(
     before, misfit = share * before, share * misfit
     noise = np.maximum(total - before - misfit, 0.0)
     if calibration.unidentified is not None:
-        lost = calibration.unidentified[:, : slopes.shape[-1]]
+        lost = calibration.unseen[:, : slopes.shape[-1]]
         noise = np.where(depends(slopes, lost), np.inf, noise)
     parts = {"noise": (noise, calibration.noise_dof or np.inf)}
     if before.any():

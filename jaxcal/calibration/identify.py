@@ -151,7 +151,8 @@ def identify(
     plain = prior is None and noise is None and loss in (None, "gaussian")
     if plain and model.affine(model.nominal) is not None:
         loss = "gaussian"
-        require_excited(commands[weight > 0.0], inputs)
+        if isinstance(model, Affine):
+            require_excited(commands[weight > 0.0], inputs)
     found = fit_model(
         commands,
         measured,
