@@ -26,11 +26,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.sequential.sequence import optimise
+from benchmarks.tasks.breakaway import Cautious, breakaway
 from jaxcal.adaptive.estimates import estimates
 from jaxcal.adaptive.grid import GridBelief, GridTask
 from jaxcal.adaptive.rules import Gain, Random
 from jaxcal.adaptive.tasks.backlash import backlash, dead_zone
-from jaxcal.adaptive.tasks.breakaway import Cautious, breakaway
 
 ENOUGH_DEG = 0.02
 Chooser = Callable[[int, Any, Any, Any], Any]  # number, weights, gains, keys: designs

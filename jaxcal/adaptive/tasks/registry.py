@@ -24,7 +24,6 @@ __all__ = ["FREE", "Entry", "load", "names", "options_from"]
 _GROUP = "jaxcal.tasks"  # entry points
 _OWN = {
     "backlash": "jaxcal.adaptive.tasks.backlash:ENTRY",
-    "breakaway": "jaxcal.adaptive.tasks.breakaway:ENTRY",
     "dead_zone": "jaxcal.adaptive.tasks.backlash:DEAD_ZONE",
     "knee": "jaxcal.adaptive.tasks.knee:ENTRY",
     "transmission": "jaxcal.adaptive.tasks.transmission:ENTRY",
