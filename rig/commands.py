@@ -119,7 +119,9 @@ class Step(Target):
     """How a step of commissioning is begun."""
 
     yes: Annotated[bool, "confirm everything and take every default"] = False
-    reset_alarms: Annotated[bool, "before arming"] = False
+    reset_alarms: Annotated[
+        bool, "reset alarms of the drives before they are armed"
+    ] = False
 
 
 @dataclasses.dataclass
@@ -129,7 +131,9 @@ class Session(Target):
     out: Annotated[Path, "folder for the run's folder"] | None = None
     dry_run: Annotated[bool, "plan; open no port"] = False
     arm: Annotated[bool, "arm without prompting"] = False
-    reset_alarms: Annotated[bool, "before arming"] = False
+    reset_alarms: Annotated[
+        bool, "reset alarms of the drives before they are armed"
+    ] = False
     zero: Annotated[bool, "the device stands in its zero posture"] = False
     use: Annotated[bool, "goto: a calibration whose session said not to"] = False
     live: Annotated[bool, "show it as a page in the browser"] = False

@@ -18,6 +18,7 @@ from jaxcal.calibration.estimate import fit_model
 from jaxcal.calibration.file import save, to_dict
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.inverse import command_for
+from jaxcal.calibration.report import report
 from jaxcal.checks import aligned, in_words
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise
@@ -40,6 +41,7 @@ class Calibration(Fit):
     command_for = command_for
     check = check
     budget = budget
+    report = report
     verification = verification
     to_dict = to_dict
     save = save

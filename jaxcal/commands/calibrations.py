@@ -1,4 +1,4 @@
-"""``jaxcal postures``, ``identify``, ``predict``, ``command``: calibrate a machine."""
+"""``jaxcal postures``, ``identify``, ``check``, ``predict``, ``command``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arguments import several
-from jaxcal.calibration import Calibration
+from jaxcal.calibration import Calibration, Source
 from jaxcal.calibration import identify as identified
 from jaxcal.checks import aligned
 from jaxcal.commands.arms import ArmOptions, ModelPath, in_degrees
@@ -29,7 +29,7 @@ from jaxcal.models import SerialChain
 from jaxcal.models.sensors import SENSORS, Board, Placed
 from jaxcal.selection import select
 
-__all__ = ["command", "identify", "postures", "predict"]
+__all__ = ["check", "command", "identify", "postures", "predict"]
 
 Array = NDArray[np.float64]
 
@@ -149,6 +149,23 @@ def postures(
         print("\n".join(aligned([["", *header], *cells])))
 
 
+ReportFolder = Annotated[
+    str,
+    "write a page, verdict.json and the calibration into this folder; the exit code is "
+    "then 1 where it is not good",
+    "FOLDER",
+]
+Earlier = Annotated[
+    str | None, "an earlier calibration.json that the page compares with", "FILE"
+]
+CertificateSize = Annotated[
+    float | None,
+    "expanded uncertainty (k = 2) in the certificate of the reference instrument, in "
+    "the measured unit, for the budget on the page",
+    "U",
+]
+
+
 def identify(
     file: TablePath,
     *,
@@ -171,8 +188,11 @@ def identify(
     ] = None,
     overwrite: Annotated[bool, "write the .urdf over a file that is there"] = False,
     unproven: Annotated[bool, "write the .urdf of a fit that is not good"] = False,
+    report: ReportFolder = "",
+    against: Earlier = None,
+    certificate: CertificateSize = None,
     json: Annotated[bool, "print JSON"] = False,
-) -> None:
+) -> int:
     """Fit a model to measurements and save the calibration.
 
     Columns that begin with u_ are commands, those with y_ what was measured; --inputs
@@ -222,15 +242,65 @@ def identify(
         saved += f", tip link {calibration.to_urdf(out, force=overwrite)}"
     elif out:
         calibration.save(out)
+    good = True
+    if report:
+        good = calibration.report(
+            report,
+            before=Calibration.load(against) if against else None,
+            sources=[Source.certificate("certificate", certificate)]
+            if certificate is not None
+            else (),
+            files=[path for path in (file, model) if path and os.path.isfile(path)],
+        )
+    elif against or certificate is not None:
+        raise ValueError("--against and --certificate are of --report FOLDER")
     if json:
         write_json("", calibration.to_dict())
-        return
+        return int(not good)
     print(calibration.summary())
     if out:
         print(saved)
+    if report:
+        print(f"report {os.path.join(report, 'index.html')}")
+    return int(not good)
 
 
 CalibrationPath = Annotated[str, "made by identify", "calibration.json"]
+
+
+def check(
+    calibration: CalibrationPath,
+    file: TablePath,
+    *,
+    tolerance: Annotated[
+        float | None, "drift of the outputs that matters; three times the noise", "T"
+    ] = None,
+    placed_anew: Annotated[
+        bool, "of an arm: its sockets, planes or anchors stand elsewhere now"
+    ] = False,
+    report: ReportFolder = "",
+    json: Annotated[bool, "print JSON"] = False,
+) -> int:
+    """Is a machine still as it was calibrated, by a few new readings.
+
+    The table has the calibration's columns. Exit code 0: it holds; 1: it does not, or
+    that cannot be told from these readings; 2: bad input.
+    """
+    found, table = Calibration.load(calibration), read_table(file)
+    inputs = table.named(found.input_names, COMMANDS, unit=found.command_unit)
+    outputs = table.named(found.output_names, MEASURED, unit=found.measured_unit)
+    commands, measured = table.columns(inputs), table.columns(outputs)
+    told = found.check(commands, measured, tolerance=tolerance, placed_anew=placed_anew)
+    if report:
+        files = [path for path in (calibration, file) if os.path.isfile(path)]
+        found.report(report, check=told, readings=(commands, measured), files=files)
+    if json:
+        write_json("", dataclasses.asdict(told))
+    else:
+        print(told)
+        if report:
+            print(f"report {os.path.join(report, 'index.html')}")
+    return int(told.says != "holds")
 
 
 def predict(

@@ -26,6 +26,7 @@ _HERE = {  # command: one line of help, and the module with its flags and functi
         "fit y = A u + b, or a model, to measurements and save the calibration",
         "calibrations",
     ),
+    "check": ("is a machine still as calibrated, by new readings", "calibrations"),
     "predict": ("where a calibrated machine goes for given commands", "calibrations"),
     "command": ("what to command to reach given outputs", "calibrations"),
     "loop": ("measure in a closed loop that another program drives", "loops"),
@@ -54,13 +55,15 @@ def main(argv: list[str] | None = None) -> int:
     """Run one command.
 
     Returns:
-        The exit code: 0, 2 where something given was wrong, 130 after Ctrl-C.
+        The exit code: 0, 1 where a calibration is not good, 2 where something given
+        was wrong, 130 after Ctrl-C.
     """
     given = sys.argv[1:] if argv is None else argv
     if given and given[0] in _WHOLE:
         module = importlib.import_module(f"jaxcal.commands.{given[0]}")
         return int(module.main(given[1:], prog=f"jaxcal {given[0]}"))
     arguments = _parser(given).parse_args(given)
+    code = 0
     try:
         with told(), warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
@@ -69,7 +72,7 @@ def main(argv: list[str] | None = None) -> int:
                 "; ".join(str(warning).splitlines()),
                 file=sys.stderr,
             )
-            arguments.function(**values_of(arguments))
+            code = arguments.function(**values_of(arguments))
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of a pipe, such as head, has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -78,7 +81,7 @@ def main(argv: list[str] | None = None) -> int:
         return 130
     except (ValueError, OSError, MissingExtraError) as error:
         return refused(f"jaxcal {arguments.command}", error)
-    return 0
+    return int(code or 0)
 
 
 def _parser(given: list[str]) -> Parser:

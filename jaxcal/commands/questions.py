@@ -88,16 +88,18 @@ class Judged:
 class Options:
     """Of methods."""
 
-    seed: Annotated[int | None, "of methods that draw at random; 0", "S"] = None
+    seed: Annotated[int | None, "for methods that draw at random; 0", "S"] = None
     restarts: Annotated[int | None, "random starts of the exchange"] = None
-    time_limit: Annotated[float | None, "of auto and exact; 10", "SECONDS"] = None
-    best: Annotated[int | None, "the B best, of exact", "B"] = None
-    least_efficiency: Annotated[float | None, "of auto: to be proven; 0.999"] = None
+    time_limit: Annotated[float | None, "for auto and exact; 10", "SECONDS"] = None
+    best: Annotated[int | None, "with exact: prove the B best choices", "B"] = None
+    least_efficiency: Annotated[
+        float | None, "auto stops when this efficiency is proven; 0.999"
+    ] = None
     checkpoint: Annotated[str | None, "a trained policy", "DIR"] = None
-    decoding: Annotated[str | None, "of policy: greedy, first, samples, exchange"] = (
+    decoding: Annotated[str | None, "for policy: greedy, first, samples, exchange"] = (
         None
     )
-    num: Annotated[int | None, "tries of first and samples; 16"] = None
+    num: Annotated[int | None, "tries with first and samples; 16"] = None
 
 
 def select(

@@ -218,7 +218,7 @@ def test_what_is_known_anywhere_is_said():
         for rows in (np.arange(0, 62, 5), np.arange(62))
     )
     assert few.anywhere > all_.anywhere > few.held_out
-    assert f"anywhere within its limits {few.anywhere:.3g}" in str(few)
+    assert f"within the joint limits {few.anywhere:.3g}" in str(few)
 
 
 def test_a_contact_that_is_written_twice_counts_once():

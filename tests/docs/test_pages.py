@@ -40,8 +40,11 @@ def commands(page: pathlib.Path) -> list[list[str]]:
     lines = [line for text in fenced for line in text.splitlines()]
     lines += re.findall(r"^    (\S.*)$", whole, re.M)
     starts = ("jaxcal ", "jaxcal-rig ", "python ", "make ")
+    printed = re.compile(r"jaxcal \w+: ")  # an error, not a command
     return [
-        shlex.split(line, comments=True) for line in lines if line.startswith(starts)
+        shlex.split(line, comments=True)
+        for line in lines
+        if line.startswith(starts) and not printed.match(line)
     ]
 
 

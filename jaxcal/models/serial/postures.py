@@ -243,9 +243,15 @@ def postures(
             f"{refused[place].total()} postures tried {why}"
         )
     reasons = ", ".join(f"{number} {why}" for why, number in lost.most_common())
+    if not len(found):
+        target = "what the sensor reads" if near is None else f"near = {near}"
+        raise ValueError(
+            f"no posture reaches {target} (of {tried} tried {reasons}): is it in the "
+            "unit of the arm's lengths, and in the frame of its base?"
+        )
     raise ValueError(
-        f"count must be at most {len(found)} here, got {count}: of {tried} postures "
-        f"tried {reasons}"
+        f"count must be at most {len(found)} for this arm and sensor, got {count}: of "
+        f"{tried} postures tried {reasons}"
     )
 
 

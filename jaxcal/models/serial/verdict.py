@@ -81,8 +81,8 @@ class Verdict:
         ]
         if np.isfinite(self.anywhere):
             lines.append(
-                f"anywhere within its limits {self.anywhere:.3g} (standard deviation, "
-                "beside a displacement of the whole arm)"
+                f"standard deviation of the tip within the joint limits "
+                f"{self.anywhere:.3g}, a shift or turn of the whole arm not counted"
             )
         if self.accuracy is not None and not self.interval[1] <= self.accuracy:
             lines.append(f"not the accuracy that was asked for, {self.accuracy:g}")

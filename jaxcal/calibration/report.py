@@ -1,0 +1,497 @@
+"""The report of a calibration: one page, the files it is of, and ``verdict.json``.
+
+The page is HTML that needs no other file and no network; its pictures are SVG drawn
+here, so no drawing library is loaded. ``verdict.json`` is what a pipeline reads.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import html
+import json
+import os
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal import pages
+from jaxcal.calibration.budget import Source, budget
+from jaxcal.calibration.check import Check
+from jaxcal.calibration.fit import Fit
+from jaxcal.files import atomic_write
+
+__all__ = ["SCHEMA", "judged", "left_out", "moved", "report"]
+
+Array = NDArray[np.float64]
+
+_UNLIKELY = 1e-4  # p-value of lack of fit under the noise that was given
+
+SCHEMA: dict[str, Any] = {
+    "$schema": "https://json-schema.org/draft/2020-12/schema",
+    "title": "jaxcal-verdict",
+    "type": "object",
+    "required": [
+        *("format", "version", "of", "good", "exit_code", "reasons", "numbers", "files")
+    ],
+    "properties": {
+        "format": {"const": "jaxcal-verdict"},
+        "version": {"const": 1},
+        "of": {"enum": ["identify", "check"]},
+        "good": {"type": "boolean"},
+        "exit_code": {"enum": [0, 1]},
+        "reasons": {"type": "array", "items": {"type": "string"}},
+        "numbers": {
+            "type": "object",
+            "additionalProperties": {"type": ["number", "null", "string"]},
+        },
+        "files": {
+            "type": "object",
+            "additionalProperties": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
+        },
+        "budget": {"type": "object"},
+        "moved": {"type": "array", "items": {"type": "object"}},
+    },
+}
+"""JSON Schema of ``verdict.json``."""
+
+
+def left_out(calibration: Fit) -> Array:
+    """(N, m) residual of each measurement from the fit without it, to first order."""
+    noise = calibration.require_noise("held-out errors")
+    slopes, covariance = calibration.linear(calibration.commands, misfit=False)
+    spread = slopes @ covariance @ np.matrix_transpose(slopes)
+    root = np.diag(1.0 / np.where(noise > 0.0, noise, 1.0))
+    share = np.minimum(calibration.loss_weights, 1.0)[:, None, None]
+    values, vectors = np.linalg.eigh(np.eye(len(noise)) - share * root @ spread @ root)
+    turned = np.matrix_transpose(vectors) / np.maximum(values, 0.02)[..., None]
+    white = vectors @ turned @ root @ calibration.residuals[..., None]
+    return np.asarray(np.linalg.solve(root, white)[..., 0])
+
+
+def leverage(calibration: Fit) -> Array:
+    """(N,) how many parameters each measurement determines by itself, of p in all."""
+    noise = calibration.require_noise("leverage")
+    slopes, covariance = calibration.linear(calibration.commands, misfit=False)
+    spread = ((slopes @ covariance) * slopes).sum(axis=-1)
+    return np.asarray((spread / np.where(noise > 0.0, noise, np.inf) ** 2).sum(axis=1))
+
+
+def judged(calibration: Fit) -> tuple[bool, tuple[str, ...]]:
+    """Whether a calibration may be used, and the reasons against it.
+
+    Of an arm its verdict. Any other is good with a known noise, every parameter
+    determined, no outlier and no lack of fit.
+    """
+    verdict = calibration.model.verdict(calibration)
+    if verdict is not None:
+        return bool(verdict.good), tuple(str(verdict).splitlines())
+    reasons = []
+    if calibration.noise_std is None:
+        reasons.append(calibration.no_noise("intervals"))
+    if calibration.undetermined.any():
+        lost = np.flatnonzero(calibration.undetermined)
+        reasons.append(
+            f"not determined: {', '.join(calibration.names[i] for i in lost)}"
+        )
+    reasons += [
+        f"measurement {row} is {calibration.distance[row] ** 0.5:.3g} standard "
+        "deviations from the fit of the others"
+        for row in calibration.outliers
+    ]
+    lack = calibration.lack_of_fit()
+    if lack is not None and lack < _UNLIKELY:
+        reasons.append(f"lack of fit under the noise that was given: p = {lack:.2g}")
+    return not reasons, tuple(reasons)
+
+
+def moved(calibration: Fit, before: Fit) -> list[dict[str, Any]]:
+    """What moved since another calibration of the same parameters.
+
+    Returns:
+        For each parameter its name, both values, the difference, and that in standard
+        deviations of the difference, None where neither has one.
+
+    Raises:
+        ValueError: the parameters are not the same.
+    """
+    if calibration.names != before.names:
+        raise ValueError(
+            "before must be a calibration of the same parameters, got "
+            f"{len(before.names)} ({', '.join(before.names[:4])}, ...) for "
+            f"{len(calibration.names)} ({', '.join(calibration.names[:4])}, ...)"
+        )
+    variance = np.zeros(len(calibration.names))
+    for fit in (calibration, before):
+        errors = fit.standard_errors
+        variance = variance + (np.inf if errors is None else errors**2)
+    difference = calibration.parameters - before.parameters
+    with np.errstate(divide="ignore", invalid="ignore"):
+        times = difference / np.sqrt(variance)
+    sure = np.isfinite(variance) & (variance > 0.0)
+    return [
+        {
+            "name": name,
+            "before": float(before.parameters[i]),
+            "after": float(calibration.parameters[i]),
+            "difference": float(difference[i]),
+            "deviations": float(times[i]) if sure[i] else None,
+        }
+        for i, name in enumerate(calibration.names)
+    ]
+
+
+def report(
+    calibration: Fit,
+    folder: str | os.PathLike[str],
+    *,
+    check: Check | None = None,
+    readings: tuple[ArrayLike, ArrayLike] | None = None,
+    before: Fit | None = None,
+    sources: Sequence[Source] = (),
+    files: Sequence[str | os.PathLike[str]] = (),
+) -> bool:
+    """Write ``index.html``, ``calibration.json`` and ``verdict.json`` into a folder.
+
+    The page has the parameters with their uncertainty budget, residuals by row and by
+    input, leverage, held-out errors, the errors before and after, the model, and the
+    files with their SHA-256.
+
+    Args:
+        calibration: what is reported.
+        folder: made where missing.
+        check: of new readings, from ``calibration.check``; then the verdict is its.
+        readings: of the check, (N, n) commands and (N, m) readings, shown in a table.
+        before: an earlier calibration of the same parameters, to compare with.
+        sources: of uncertainty, as in ``budget``.
+        files: that the calibration was made of, listed with their hashes.
+
+    Returns:
+        Whether it is good: may be used, or of a check, that it holds.
+
+    Raises:
+        MissingExtraError: jinja2 is not installed.
+        OSError: the folder cannot be written, or a file not be read.
+        ValueError: ``before`` has other parameters.
+    """
+    good, reasons = judged(calibration)
+    if check is not None:
+        good, reasons = check.says == "holds", (str(check),)
+    hashes = {os.fspath(path): _sha256(pathlib.Path(path)) for path in files}
+    content = json.dumps(calibration.to_dict(), indent=1, allow_nan=False) + "\n"
+    hashes["calibration.json"] = hashlib.sha256(content.encode()).hexdigest()
+    document: dict[str, Any] = {
+        "format": "jaxcal-verdict",
+        "version": 1,
+        "of": "identify" if check is None else "check",
+        "good": good,
+        "exit_code": 0 if good else 1,
+        "reasons": list(reasons),
+        "numbers": _numbers(calibration, check),
+        "files": hashes,
+    }
+    known = calibration.noise_std is not None
+    if known:
+        document["budget"] = budget(calibration, sources=sources).to_dict()
+    if before is not None:
+        document["moved"] = moved(calibration, before)
+    page = _page(calibration, document, sources, readings)
+    written = {
+        "calibration.json": content,
+        "verdict.json": json.dumps(document, indent=1, allow_nan=False) + "\n",
+        "index.html": pages.render(page),  # last: where it stands, all do
+    }
+    place = pathlib.Path(folder)
+    place.mkdir(parents=True, exist_ok=True)
+    for name, text in written.items():
+        with atomic_write(place / name) as file:
+            file.write(text.encode())
+    return good
+
+
+def _sha256(path: pathlib.Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _numbers(calibration: Fit, check: Check | None) -> dict[str, Any]:
+    lack = calibration.lack_of_fit()
+    numbers: dict[str, Any] = {
+        "measurements": calibration.num_measurements,
+        "parameters": len(calibration.names),
+        "degrees_of_freedom": float(calibration.dof),
+        "residual_rms": float(np.sqrt(np.mean(calibration.residuals**2))),
+        "lack_of_fit_p": lack,
+        "unit": calibration.measured_unit,
+    }
+    if calibration.noise_std is not None:
+        off = np.linalg.norm(left_out(calibration), axis=1)
+        numbers["held_out_mean"] = float(off.mean())
+    nominal = _nominal_errors(calibration)
+    if nominal is not None:
+        numbers["nominal_mean"] = float(np.linalg.norm(nominal, axis=1).mean())
+    if check is not None:
+        numbers |= {
+            "check_says": check.says,
+            "check_p": check.p_value,
+            "check_power": check.power,
+            "check_tolerance": check.tolerance,
+        }
+    return {
+        name: value if value is None or isinstance(value, str | int) else float(value)
+        for name, value in numbers.items()
+    }
+
+
+def _nominal_errors(calibration: Fit) -> Array | None:
+    """(N, m) errors before calibration: of the nominal machine, or of the commands."""
+    measured = calibration.residuals + calibration.predict(calibration.commands)
+    if calibration.affine is None:
+        nominal = calibration.model.predict(calibration.commands)
+        return np.asarray(measured - nominal)
+    if calibration.num_inputs != calibration.num_outputs:
+        return None
+    return np.asarray(measured - calibration.commands)
+
+
+# -- the page --------------------------------------------------------------------------
+
+
+def _page(
+    calibration: Fit,
+    document: Mapping[str, Any],
+    sources: Sequence[Source],
+    readings: tuple[ArrayLike, ArrayLike] | None,
+) -> pages.Page:
+    good, check = document["good"], document["of"] == "check"
+    word = "good" if good else "not good"
+    if check:
+        word = str(document["numbers"]["check_says"])
+    badge = pages.Badge(word, "good" if good else "bad")
+    numbers = document["numbers"]
+    rows = [
+        [name.replace("_", " "), _text(value)]
+        for name, value in numbers.items()
+        if value not in (None, "")
+    ]
+    first: list[pages.Block] = [pages.Text(line) for line in document["reasons"]]
+    first.append(pages.Table(("", "value"), rows))
+    sections = [pages.Section("Verdict", first, "verdict", badge)]
+    known = calibration.noise_std is not None
+    if readings is not None:
+        sections.append(_new_section(calibration, *readings))
+    if "moved" in document:
+        sections.append(_moved_section(document["moved"]))
+    if known:
+        table = budget(calibration, sources=sources).rows()
+        note = (
+            "Standard uncertainties by source (GUM), effective degrees of freedom by "
+            "Welch and Satterthwaite, coverage factor k, expanded uncertainty U."
+        )
+        blocks: list[pages.Block] = [pages.Table(table[0], table[1:]), note]
+    else:
+        cells = zip(calibration.names, calibration.parameters, strict=True)
+        parameters = [[name, f"{value:.6g}"] for name, value in cells]
+        blocks = [
+            pages.Table(("", "value"), parameters),
+            pages.Text(calibration.no_noise("intervals"), "warning"),
+        ]
+    sections.append(pages.Section("Parameters", blocks, "parameters"))
+    sections += _residual_sections(calibration)
+    sections.append(_files_section(calibration, document["files"]))
+    made = calibration.provenance.get("created", "")
+    return pages.Page(
+        "Check of a calibration" if check else "Calibration",
+        sections,
+        intro=[calibration.summary().splitlines()[0], pages.Text(str(made), "note")],
+        contents=True,
+        footer=[pages.Text("verdict.json has the same numbers", "note")],
+    )
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else f"{value:.6g}"
+
+
+def _new_section(
+    calibration: Fit, commands: ArrayLike, measured: ArrayLike
+) -> pages.Section:
+    off = np.asarray(measured, float) - calibration.predict(commands)
+    std = calibration.predict_std(commands, new_measurement=True)
+    head = ["row"]
+    for name in calibration.output_names:
+        head += [f"{name} off", "standard deviations"]
+    rows = [
+        [
+            str(i),
+            *(
+                text
+                for one, size in zip(row, sizes, strict=True)
+                for text in (f"{one:.3g}", f"{one / size:+.2f}")
+            ),
+        ]
+        for i, (row, sizes) in enumerate(zip(off, std, strict=True))
+    ]
+    text = "Measured less predicted, and that in what noise and calibration allow."
+    return pages.Section("New readings", [text, pages.Table(head, rows)], "new")
+
+
+def _moved_section(rows: Sequence[Mapping[str, Any]]) -> pages.Section:
+    ordered = sorted(rows, key=lambda row: -abs(row["deviations"] or 0.0))
+    cells: list[list[pages.Content]] = []
+    for row in ordered:
+        times = row["deviations"]
+        shown: pages.Content = "-" if times is None else f"{times:+.2f}"
+        if times is not None and abs(times) > 3.0:
+            shown = pages.Strong(f"{times:+.2f}")
+        values = (f"{row[key]:.6g}" for key in ("before", "after", "difference"))
+        cells.append([row["name"], *values, shown])
+    head = ("", "before", "after", "difference", "standard deviations")
+    note = "The difference in its own standard deviations; beyond 3 in bold."
+    return pages.Section("What moved", [pages.Table(head, cells), note], "moved")
+
+
+def _residual_sections(calibration: Fit) -> list[pages.Section]:
+    names, residuals = calibration.output_names, calibration.residuals
+    known = calibration.noise_std is not None
+    unit = f" ({calibration.measured_unit})" if calibration.measured_unit else ""
+    rows = np.arange(len(residuals), dtype=float)
+    by_row = _scatter(rows, residuals, names, "row", f"residual{unit}")
+    by_input = [
+        pages.Figure(
+            _scatter(u, residuals, names, name, f"residual{unit}"),
+            f"residuals against {name}",
+        )
+        for name, u in zip(calibration.input_names, calibration.commands.T, strict=True)
+    ]
+    head = ["row", *(f"residual {name}" for name in names), "weight"]
+    columns = [*residuals.T, calibration.loss_weights]
+    if known:
+        head += ["leverage", *(f"held-out {name}" for name in names)]
+        columns += [leverage(calibration), *left_out(calibration).T]
+    table = pages.Table(
+        head,
+        [
+            [str(i), *(f"{value:.3g}" for value in row)]
+            for i, row in enumerate(zip(*columns, strict=True))
+        ],
+    )
+    sections = [
+        pages.Section(
+            "Residuals",
+            [pages.Figure(by_row, "residuals by row"), *by_input, table],
+            "residuals",
+        )
+    ]
+    nominal = _nominal_errors(calibration)
+    if nominal is not None:
+        after = left_out(calibration) if known else residuals
+        lengths = np.column_stack(
+            [np.linalg.norm(each, axis=1) for each in (nominal, after)]
+        )
+        labels = ("before", "after, held out" if known else "after")
+        picture = _scatter(rows, lengths, labels, "row", f"error{unit}", zero=True)
+        means = lengths.mean(axis=0)
+        text = f"Mean error {means[0]:.3g} before, {means[1]:.3g} {labels[1]}."
+        sections.append(
+            pages.Section(
+                "Before and after",
+                [pages.Figure(picture, "errors before and after"), text],
+                "before",
+            )
+        )
+    return sections
+
+
+def _files_section(calibration: Fit, files: Mapping[str, str]) -> pages.Section:
+    rows: list[list[pages.Content]] = [
+        [pages.Code(name), pages.Code(digest)] for name, digest in files.items()
+    ]
+    if data := calibration.provenance.get("data_sha256"):
+        rows.append(["the readings, as arrays", pages.Code(str(data))])
+    kind = type(calibration.model).__name__
+    packages = calibration.provenance.get("packages", {})
+    made = ", ".join(f"{name} {version}" for name, version in packages.items())
+    return pages.Section(
+        "Model and files",
+        [
+            f"Model {kind}, {calibration.loss} loss. {made}",
+            pages.Table(("file", "SHA-256"), rows, numeric=False),
+        ],
+        "files",
+    )
+
+
+# -- pictures --------------------------------------------------------------------------
+
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+_WIDTH, _HEIGHT = 640.0, 220.0
+_LEFT, _RIGHT, _TOP, _BOTTOM = 70.0, 12.0, 24.0, 40.0
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Round numbers from low to high, four to ten of them."""
+    power = 10.0 ** np.floor(np.log10((high - low) / 4.0))
+    step = power * max(f for f in (1.0, 2.0, 5.0) if f * power <= (high - low) / 4.0)
+    first, last = np.ceil(low / step), np.floor(high / step)
+    return [float(step * i) for i in np.arange(first, last + 1.0)]
+
+
+def _scatter(
+    x: Array,
+    columns: Array,
+    names: Sequence[str],
+    across: str,
+    up: str,
+    *,
+    zero: bool = False,
+) -> str:
+    """An SVG file: the columns (N, s) as dots above x (N,), each with its colour."""
+    low, high = float(np.min(columns)), float(np.max(columns))
+    low, high = min(low, 0.0), max(high, 0.0)
+    if zero:
+        low = 0.0
+    room = 0.06 * ((high - low) or 1.0)
+    low, high = low - (0.0 if zero else room), high + room
+    left, right = float(np.min(x)), float(np.max(x))
+    pad = 0.03 * ((right - left) or 1.0)
+    left, right = left - pad, right + pad
+
+    def at_x(value: float) -> float:
+        share = (value - left) / (right - left)
+        return _LEFT + share * (_WIDTH - _LEFT - _RIGHT)
+
+    def at_y(value: float) -> float:
+        share = (value - low) / (high - low)
+        return _HEIGHT - _BOTTOM - share * (_HEIGHT - _TOP - _BOTTOM)
+
+    grey = 'stroke="#888" stroke-width="1"'
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" '
+        'font-family="sans-serif" font-size="12" fill="#666">'
+    ]
+    for value in _ticks(low, high):
+        y = at_y(value)
+        parts.append(f'<text x="{_LEFT - 6:g}" y="{y + 4:.1f}" text-anchor="end">'
+                     f"{value:.3g}</text>")  # fmt: skip
+    for value in _ticks(left, right):
+        parts.append(f'<text x="{at_x(value):.1f}" y="{_HEIGHT - _BOTTOM + 16:g}" '
+                     f'text-anchor="middle">{value:.3g}</text>')  # fmt: skip
+    middle = at_y(0.0)
+    parts.append(f'<path d="M{_LEFT:g} {middle:.1f}H{_WIDTH - _RIGHT:g}" {grey}/>')
+    parts.append(f'<text x="{_WIDTH / 2:g}" y="{_HEIGHT - 6:g}" text-anchor="middle">'
+                 f"{html.escape(across)}</text>")  # fmt: skip
+    parts.append(f'<text x="6" y="14">{html.escape(up)}</text>')
+    for i, name in enumerate(names):
+        colour = _COLOURS[i % len(_COLOURS)]
+        start = _WIDTH - _RIGHT - 110.0 * (len(names) - i)
+        label = f'<text x="{start + 8:g}" y="14">{html.escape(name)}</text>'
+        parts.append(f'<circle cx="{start:g}" cy="10" r="4" fill="{colour}"/>{label}')
+        dots = zip(x, columns[:, i], strict=True)
+        parts += [
+            f'<circle cx="{at_x(u):.1f}" cy="{at_y(v):.1f}" r="3" fill="{colour}" '
+            'fill-opacity="0.8"/>'
+            for u, v in dots
+        ]
+    return "\n".join([*parts, "</svg>\n"])
