@@ -134,11 +134,13 @@ def _presets() -> str:
 
 def _help(main: Callable[..., Any], argv: list[str]) -> str:
     out = io.StringIO()
-    os.environ["COLUMNS"] = "88"
+    os.environ["COLUMNS"] = "80"  # fits beside the two menus at 1280 pixels
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
         main(argv)
     return out.getvalue()
 
 
 def _shown(title: str, text: str) -> list[str]:
-    return [f"## {title}", "", "```text", text.rstrip(), "```", ""]
+    text = text.rstrip().replace(".venv/bin/", "")  # where the site is built
+    block = ['<div class="help" markdown>', "", "```text", text, "```", "", "</div>"]
+    return [f"## {title}", "", *block, ""]

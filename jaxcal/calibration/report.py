@@ -26,6 +26,7 @@ from jaxcal.files import atomic_write
 __all__ = ["SCHEMA", "judged", "left_out", "moved", "report"]
 
 Array = NDArray[np.float64]
+Calibration = Any  # a jaxcal.Calibration, whose module imports this one
 
 _UNLIKELY = 1e-4  # p-value of lack of fit under the noise that was given
 
@@ -144,7 +145,7 @@ def moved(calibration: Fit, before: Fit) -> list[dict[str, Any]]:
 
 
 def report(
-    calibration: Fit,
+    calibration: Calibration,
     folder: str | os.PathLike[str],
     *,
     check: Check | None = None,
@@ -259,7 +260,7 @@ def _nominal_errors(calibration: Fit) -> Array | None:
 
 
 def _page(
-    calibration: Fit,
+    calibration: Calibration,
     document: Mapping[str, Any],
     sources: Sequence[Source],
     readings: tuple[ArrayLike, ArrayLike] | None,

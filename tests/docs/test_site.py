@@ -18,7 +18,7 @@ import pytest
 
 ROOT = pathlib.Path(__file__).parents[2]
 BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-SIZES = {"desktop": (1400, 900), "phone": (390, 844)}
+SIZES = {"desktop": (1280, 900), "phone": (390, 844)}
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +124,8 @@ const loaded = performance.getEntriesByType("resource").map(e => e.name);
 return {
   links, ids: [...document.querySelectorAll("[id]")].map(e => e.id),
   broken: images.map(i => i.src), loaded,
+  cut: [...document.querySelectorAll(".help code")].filter(
+    e => e.scrollWidth > e.clientWidth + 1).map(e => e.textContent.slice(0, 40)),
   wide: document.documentElement.scrollWidth - window.innerWidth,
 };
 """
@@ -163,6 +165,7 @@ def test_every_page_and_link(site, browser, scheme, size):
         page = seen[url] = browser.execute_script(PAGE)
         assert not page["broken"], (url, page["broken"])
         assert page["wide"] <= 0, (url, page["wide"])
+        assert not page["cut"], (url, page["cut"])
         outside = [name for name in page["loaded"] if name.startswith("http")]
         assert not outside, (url, outside)
         for link in page["links"]:

@@ -87,7 +87,9 @@ class LivePage:
         sample = watcher.samples[-1] if watcher.running and watcher.samples else {}
         now = watcher.state.present(sample, watcher.running)
         self._device.show(now["measured"], now["commanded"])
-        self._parts["numbers"].set_content(draw("numbers", rows=view.numbers(now)))
+        self._parts["numbers"].set_content(
+            draw("numbers", rows=view.numbers(now, watcher.running))
+        )
         self._stream.set_text(view.stream(sample, time.time()))
 
     def _plot(self) -> None:

@@ -92,13 +92,17 @@ def trouble(state: RunState, running: bool, folder: str) -> list[str]:
     return [line for line in [*lines, *state.warnings] if line]
 
 
-def numbers(now: dict[str, Any]) -> list[tuple[str, ...]]:
-    """A row an axis: commanded, drive, measured, difference, scatter."""
+def numbers(now: dict[str, Any], running: bool) -> list[tuple[str, ...]]:
+    """A row for each axis: commanded, drive, measured, difference, scatter.
+
+    After a run the last posture is shown, and no difference: it is of a command that
+    was not compensated, beside drives that are at rest.
+    """
     columns = [now[name] or NONE for name in ("commanded", "drives", "measured", "std")]
     return [
         (
             name, angle(a), angle(d), angle(y),
-            angle(None if a is None or y is None else y - a),
+            angle(y - a if running and a is not None and y is not None else None),
             "–" if s is None else f"{s:.3f}",
         )
         for name, a, d, y, s in zip(AXIS_NAMES, *columns, strict=True)
