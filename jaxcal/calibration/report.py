@@ -80,13 +80,13 @@ def leverage(calibration: Fit) -> Array:
     return np.asarray((spread / np.where(noise > 0.0, noise, np.inf) ** 2).sum(axis=1))
 
 
-def judged(calibration: Fit) -> tuple[bool, tuple[str, ...]]:
+def judged(calibration: Calibration) -> tuple[bool, tuple[str, ...]]:
     """Whether a calibration may be used, and the reasons against it.
 
     Of an arm its verdict. Any other is good with a known noise, every parameter
     determined, no outlier and no lack of fit.
     """
-    verdict = calibration.model.verdict(calibration)
+    verdict = calibration.verdict
     if verdict is not None:
         return bool(verdict.good), tuple(str(verdict).splitlines())
     reasons = []
