@@ -7,6 +7,7 @@ import pathlib
 import shutil
 import subprocess
 import sys
+import time
 
 import exactly
 import numpy as np
@@ -192,3 +193,17 @@ def test_what_is_left_without_each_measurement_is_told(rng):
     assert "singular, whichever is lost" in str(fewest)
     more = jaxcal.select(rng.random((9, 3)), 6)
     assert f"{more.left_without.min():.3g} of det S is left, without" in str(more)
+
+
+def test_a_time_limit_is_kept_by_many_best_and_by_many_replicates(rng):
+    """Of the processor's time, which a busy machine does not stretch."""
+    u = rng.random((3000, 3))
+    begun = time.process_time()
+    many = jaxcal.select(u, 6, "exact", best=2000, time_limit=1)
+    assert 1 <= len(many.alternatives) <= 2000
+    values = [each.value for each in many.alternatives]
+    assert values == sorted(values, reverse=True)
+    assert len({tuple(each.indices) for each in many.alternatives}) == len(values)
+    often = jaxcal.select(u[:200], 50_000, "exact", max_replicates=50_000, time_limit=1)
+    assert len(often.indices) == 50_000
+    assert time.process_time() - begun < 4.0

@@ -75,9 +75,10 @@ def branch_and_bound(
     near = {"trace": -0.5, "least": 2.0}  # of values near 1: an efficiency of a half
     useful = min(trivial, near.get(criterion.kind, np.inf))
     best_counts, best_values = np.zeros((best, num_blocks)), np.full(best, -np.inf)
+    order = np.arange(best, dtype=np.intp)
     search = compiled.kernel("jaxcal.selection.exact.branch_kernel").Search(
         criterion.form, blocks, prior, root, start.sum(), largest_rank(blocks), useful,
-        best_counts, best_values,
+        best_counts, best_values, order,
     )  # fmt: skip
     search.offer(low, high, counts, _left(deadline))
     nodes, bounds = np.empty((64, 3, num_blocks)), np.full(64, np.inf)
@@ -102,7 +103,7 @@ def branch_and_bound(
         bound = min(bound, trivial)
     found = np.isfinite(best_values)
     return BranchResult(
-        best_counts[found].astype(np.int64),
+        best_counts[order[found]].astype(np.int64),
         scale * best_values[found] + shift,
         float(scale * (bound if size else best_values[0]) + shift),
         done,

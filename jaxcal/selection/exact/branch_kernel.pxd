@@ -9,7 +9,8 @@ cdef class Search:
     cdef double k
     cdef double useful  # a bound above it is sharpened although the time is over
     cdef double[:, ::1] best_counts  # (best, M)
-    cdef double[::1] best_values  # (best,)
+    cdef double[::1] best_values  # (best,), the best first
+    cdef Py_ssize_t[::1] order  # (best,) the row of ``best_counts`` of each
     cdef double[::1] room  # which holds all that is a pointer below
     cdef int most_moved  # counts of a Newton step
     cdef double* blocks  # (M, q, p)

@@ -97,7 +97,17 @@ class Search:
     """
 
     def __init__(
-        self, form, blocks, prior, root, k, rank, useful, best_counts, best_values
+        self,
+        form,
+        blocks,
+        prior,
+        root,
+        k,
+        rank,
+        useful,
+        best_counts,
+        best_values,
+        order,
     ):
         # Arrays are C-contiguous float64; the best (best, M) and (best,) are written.
         # (A docstring here would be a global symbol of C, of which a module that holds
@@ -106,7 +116,7 @@ class Search:
         self.kind = _KINDS[form]
         self.k, self.rank, self.s = k, rank, len(root)
         self.best_counts, self.best_values = best_counts, best_values
-        self.useful = useful
+        self.useful, self.order = useful, order
         self.most_moved = min(self.count, _FRACTIONAL + 2 * self.p + 4)
         self.whole = np.empty(3 + 5 * self.p, dtype=np.intc)
         self.which, self.free = np.empty((2, self.most_moved), dtype=np.intp)
@@ -764,16 +774,16 @@ class Search:
             return
         for r in range(best.shape[0]):
             same: cython.bint = fabs(best[r] - value) < _SAME
-            for i in range(self.count):
-                same = same and self.best_counts[r, i] == counts[i]
+            for i in range(self.count if same else 0):
+                same = same and self.best_counts[self.order[r], i] == counts[i]
             if same:
                 return
+        row = self.order[place]
         while place > 0 and best[place - 1] < value:
-            best[place] = best[place - 1]
-            self.best_counts[place, :] = self.best_counts[place - 1]
+            best[place], self.order[place] = best[place - 1], self.order[place - 1]
             place -= 1
-        best[place] = value
-        copy(cython.address(self.best_counts[place, 0]), counts, self.count)
+        best[place], self.order[place] = value, row
+        copy(cython.address(self.best_counts[row, 0]), counts, self.count)
 
     def offer(
         self,
