@@ -3,12 +3,14 @@ device is tried before it is needed. Judged by the joints and the drives' own lo
 
 import contextlib
 import functools
+import re
 import threading
 import time
 
 import numpy as np
 import pytest
 from commission import device, quick_text, turns
+from harness import fast_config
 
 from rig.__main__ import main
 from rig.config import load_config
@@ -280,3 +282,29 @@ def test_a_session_that_was_stopped_looks_whether_its_drives_stay(
         # Nothing is left to go on to, where the map can say so.
         for drive in sim.drives:
             assert drive._value(drive.map.move, "position") == drive.position
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [("", None), ("unit_stop_ignored,axis=roll", "roll went on .* stop of each unit"),
+     ("watch_ignored,axis=yaw", "yaw went on .* their watch of the line")],
+    ids=["all", "unit", "watch"],
+)  # fmt: skip
+def test_each_way_to_stop_is_tried_where_the_map_has_it(fault, told, at, capsys):
+    generic = fast_config({'map = "leadshine_pr"': 'map = "generic"'})
+    with device(config=generic, transport="rtu", speedup=1.0) as (sim, bus, port):
+        text = quick_text(bus, port).replace("leadshine_pr", "generic")
+        (at / "rig.toml").write_text(text.replace("[bus]", "[bus]\ntimeout_s = 0.2"))
+        assert main(["scan", "--units", "3"]) == 0
+        assert main(["home", "--here", "--yes"]) == 0
+        if fault:
+            sim.faults.add(parse_fault(fault))
+        code, said = main(["axes", "--yes"]), capsys.readouterr().out
+        if told:
+            assert code == 3 and re.search(told, said), said
+            return
+        assert code == 0, said
+        ways = "the stop of each unit, the broadcast stop, their watch of the line"
+        assert f"the drives stop, and stay: {ways}" in said
+        assert all(drive.comm_stops == 1 for drive in sim.drives)
