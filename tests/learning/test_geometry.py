@@ -10,7 +10,7 @@ import pytest
 from jaxcal.information import regression
 from jaxcal.learning import small_matrices
 from jaxcal.learning.policies import geometry
-from jaxcal.selection.policy import kernel
+from jaxcal.selection.policy.policy_kernel import look_ahead
 
 
 def log_det(rows: np.ndarray) -> float:
@@ -41,7 +41,7 @@ def test_of_many_candidates_those_of_largest_gain_are_looked_ahead_from(
     few = geometry.lookahead(jnp.asarray(y), True, jnp.asarray(active), 3)
     values = np.empty((4, 1100))
     given = np.ascontiguousarray(y.T, np.float64)
-    kernel.look_ahead(given, active, True, 3, False, None, values)
+    look_ahead(given, active, True, 3, False, None, values)
     for mine, theirs in zip(few, values[:3], strict=True):
         np.testing.assert_allclose(mine, theirs, atol=1e-4)
     assert (np.asarray(few[1]) > -30.0).sum() == 512

@@ -137,7 +137,7 @@ def lookahead(
         The second is the gain of the best pair, exactly; later ones are what greedy
         choices reach. Cost: ``depth - 1`` products of (M, p) with (p, M). Of more than
         1,024 candidates only the 512 of largest gain are looked ahead from, as in
-        ``selection/policy/kernel.py``: of the others all but the first are -30.
+        ``selection/policy/policy_kernel.py``: of the others all but the first are -30.
     """
     m = y.shape[-2]
     base = 1.0 if spanned else 0.0
