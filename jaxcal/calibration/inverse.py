@@ -47,7 +47,8 @@ def command_for(
         start: (n,) or (..., n) where the search begins; the measured command whose
             output is nearest when not given.
         clip: where the limits leave no exact command, the one within them whose output
-            is nearest, instead of refusing.
+            is nearest, instead of refusing: in the measured unit for a square affine
+            map, else each output in its spread over the measurements.
 
     Returns:
         (..., n) in the command unit.
@@ -237,6 +238,22 @@ class _Search:
         tolerance = _REACHED + 1e-14 * np.abs(self.wanted / self.size).max(axis=1)
         return np.asarray(np.abs(gap).max(axis=1) <= tolerance)
 
+    def _nearest_within(self, wanted: Array, low: Array, high: Array) -> Array:
+        """(n,) within the bounds, whose output of an affine map is nearest."""
+        from scipy import optimize
+
+        matrix, bias = self.model.affine(self.fit.estimate)  # type: ignore[misc]  # is affine
+        scaled = matrix * self.spread
+        unit = np.abs(scaled).max()
+        found = optimize.lsq_linear(
+            scaled / unit,
+            (wanted - bias) / unit,
+            (low / self.spread, high / self.spread),
+            method="bvls",
+            tol=1e-14,
+        )
+        return np.clip(found.x * self.spread, low, high)
+
     def bounded(
         self, i: int, free: Array, reached: bool, bounds: Array, clip: bool
     ) -> Array:
@@ -247,7 +264,8 @@ class _Search:
         high = np.maximum(high, low + 1e-12 * self.spread)
         wanted, names, at = self.wanted[i], self.fit.input_names, np.array([i])
         nearest, least = np.clip(free, low, high), np.inf
-        # Of a square affine map there is one command: a controller holds it there.
+        if self.affine:
+            nearest = self._nearest_within(wanted, low, high)
         for begin in () if self.affine else (free, *self.nearest[i]):
             found = optimize.least_squares(
                 lambda command: -self.gap(command[None], at)[0],
