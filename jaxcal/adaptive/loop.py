@@ -123,13 +123,13 @@ def run(
 
 
 class Loop:
-    """A session step by step, for a program that has its own loop; see :func:`run`.
+    """A session step by step, for a program that has its own loop; see ``run``.
 
     Args:
-        task, decider, journal, seconds, uses, seed: as of :func:`run`.
+        task, decider, journal, seconds, uses, seed: as of ``run``.
 
     Raises:
-        ValueError: as :func:`run`.
+        ValueError: as ``run``.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""A model of :mod:`jaxcal.models` to be measured one by one: ``ParticleTask.of``.
+"""A model of ``jaxcal.models`` to be measured one by one: ``ParticleTask.of``.
 
 A design is the index of a candidate; its reading (q,), or a number where q = 1, is the
 model's prediction and normal noise. A function of ``FromJax`` and a model that is

@@ -261,7 +261,7 @@ class Model(abc.ABC):
         raise self._no_arm()
 
     def writable(self) -> Model:
-        """This model without the parameters that no file of :meth:`write` holds."""
+        """This model without the parameters that no file of ``write`` holds."""
         return self
 
     def write(

@@ -1,6 +1,6 @@
 """``CandidateSet``: what may be measured, what is known and the rules, checked.
 
-It makes the problem of a question; :class:`jaxcal.Design` has the questions.
+It makes the problem of a question; ``jaxcal.Design`` has the questions.
 """
 
 from __future__ import annotations
