@@ -22,7 +22,7 @@ Sequence = np.ndarray[Any, np.dtype[np.int32]]
 
 @struct.dataclass
 class Static:
-    """The same designs in the same order, whatever they answer."""
+    """One sequence of designs, whatever they answer."""
 
     sequence: Any  # (T,) indices of designs; the last is repeated
 

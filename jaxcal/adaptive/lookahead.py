@@ -43,8 +43,7 @@ class Ahead:
             functools.partial(_chosen, task.horizon, self.effort),
             jax.ShapeDtypeStruct((), jnp.int32),
             *(task.likelihood, task.travel, task.extra, task.uses, task.place_after),
-            # What cannot be paid now the tree finds, and what cannot later.
-            *(*task.limits, options.allowed | ~task.payable(session)),
+            *(*task.limits, _possible(task, session, options)),
             *(jnp.stack(constants), hints, belief.weights),
             *(session.place, session.seconds, session.uses, session.made),
             vmap_method="expand_dims",
@@ -56,6 +55,17 @@ class Ahead:
         rule = self.base
         numbers = [rule.time, rule.use, rule.a, rule.b, rule.haste, self.doubt]
         return numbers, np.ones((1, 1)) if self.hints is None else self.hints
+
+
+def _possible(task: GridTask, session: Session, options: Options) -> jax.Array:
+    """(A,) bool: designs that may be measured where they can be paid.
+
+    What can be paid the tree finds. One tree serves all sessions of a batch unless a
+    task of another kind decides by the session.
+    """
+    if type(task).options is GridTask.options:
+        return jnp.ones(len(task.designs), bool)
+    return options.allowed | ~task.payable(session)
 
 
 AHEAD = Ahead()

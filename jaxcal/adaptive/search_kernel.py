@@ -83,7 +83,7 @@ def _log(x):
 
 
 def _largest(values, count, sign):
-    """Of ``sign`` times (count,), a multiple of 8, in eight lanes."""
+    """Largest of ``sign`` times (count,), a multiple of 8, in eight lanes."""
     lanes = cython.declare(cython.float[8])
     for j in range(8):
         lanes[j] = sign * values[j]

@@ -30,7 +30,7 @@ HIT_TOLERANCE = 1e-9  # of log det(Z.T Z): the same determinant to a billionth
 
 @dataclasses.dataclass(frozen=True)
 class _Named:
-    """Which method it is."""
+    """Name and checkpoint of a method."""
 
     method: str  # as asked for: "greedy", "policy:first", ...
     checkpoint: str | None  # of a policy; None for the shipped one and for baselines

@@ -10,6 +10,7 @@ from benchmarks.sequential.family.draws import draw
 from benchmarks.sequential.family.padded import pad, stack
 from benchmarks.sequential.family.structures import Limits
 from benchmarks.sequential.optimum import solve
+from jaxcal.adaptive import lookahead
 from jaxcal.adaptive.episodes import compare
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import Ahead
@@ -122,3 +123,24 @@ def test_padded_tasks_are_decided_as_each_alone_and_without_effort_as_shares():
         alone = each(jax.tree.map(lambda leaf, at=number: leaf[at], tables), keys)[0]
         assert (np.asarray(alone) == chosen[number]).mean() > 0.95  # others are level
         assert chosen[number].max() < len(task.designs)
+
+
+@pytest.mark.parametrize("overrun", [True, False])
+def test_one_tree_serves_the_sessions_of_a_batch(monkeypatch, overrun):
+    """Making it takes thirty times as long as a choice."""
+    made = []
+    tree = lookahead.tree
+    monkeypatch.setattr(lookahead, "tree", lambda *of: made.append(1) or tree(*of))
+    task = random_task(0, 4, 2, 3, overrun)
+
+    @jax.jit
+    def first(task, keys):
+        def one(key):
+            belief, session = task.begin(key)
+            options = task.options(belief, session)
+            return Ahead()(task, belief, session, options, key)
+
+        return jax.vmap(one)(keys)
+
+    first(task, jax.random.split(jax.random.key(0), 16)).block_until_ready()
+    assert len(made) == 1

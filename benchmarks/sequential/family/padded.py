@@ -50,7 +50,7 @@ class Padded(GridTask):
 
 
 def pad(task: GridTask, limits: Limits) -> Padded:
-    """The same task in larger arrays, as numpy.
+    """A task in larger arrays, as numpy.
 
     Raises:
         ValueError: naming the limit that the task breaks.

@@ -46,7 +46,7 @@ class Trained:
 
     @property
     def weights(self) -> Weights:
-        """As plain arrays."""
+        """The policy in plain arrays, for a file of weights."""
         return Weights(self.meta["network"], weights.flat(self.params), self.meta)
 
 
