@@ -26,6 +26,7 @@ from harness import (
     session,
     simulator,
 )
+from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
 import jaxcal
@@ -35,7 +36,7 @@ from rig.journal import read_journal
 from rig.simulator import Truth
 from rig.workbench.identification.refit import attitudes, reread
 from rig.workbench.outputs import trend
-from rig.workbench.outputs.export import LANGUAGES, load_inverse
+from rig.workbench.outputs.export import LANGUAGES, follow, load_inverse
 from rig.workbench.outputs.export import checksum as checksum_of
 from rig.workbench.outputs.report import write_report
 from rig.workbench.outputs.words import numbers
@@ -289,6 +290,10 @@ def targets(finished, rng, count=200):
     return desired, calibration.command_for(desired, limits, clip=True), free
 
 
+def at_limit(commands):
+    return np.isclose(np.abs(commands), 20, rtol=0, atol=1e-9)
+
+
 PROGRAM = r"""
 #include <stdio.h>
 #include "calibration.h"
@@ -326,9 +331,10 @@ def test_the_c_header_computes_what_command_for_does(finished, inverse, rng, tmp
     rows = np.array([list(map(float, line.split())) for line in out.splitlines()])
     values, odd = rows[: len(desired)], rows[len(desired) :]
     np.testing.assert_allclose(values[:, 1:4], clipped, atol=1e-12)
-    beyond = (np.abs(free) > 20) @ [1, 2, 4]
-    assert values[:, 0].tolist() == beyond.tolist() == values[:, 7].tolist()
-    assert 0 < np.mean(beyond > 0) < 1
+    held = at_limit(clipped) @ [1, 2, 4]
+    assert values[:, 0].tolist() == held.tolist() == values[:, 7].tolist()
+    assert 0 < np.mean(held > 0) < 1
+    assert ((held > 0) == (np.abs(free) > 20).any(axis=1)).all()
     config = fast_config()
     assert values[:, 4:7].tolist() == [list(config.to_pulses(u)) for u in clipped]
     np.testing.assert_allclose(values[:, 8:11], clipped, atol=2e-5)  # of float
@@ -336,6 +342,55 @@ def test_the_c_header_computes_what_command_for_does(finished, inverse, rng, tmp
     assert odd[:, 1:7].tolist() == [[99, 99, 99, 77, 77, 77]] * 2
 
 
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_the_c_header_finds_the_nearest_posture_of_any_axes(count, inverse, tmp_path):
+    """Of axes that depend on each other clipping each by itself is far from it."""
+    rng = np.random.default_rng(count)
+    matrix = rng.normal(size=(count, count))
+    if count == 2:
+        matrix = np.array([[1.0, 0.9], [0.9, 1.0]])
+    given = {
+        "matrix": np.linalg.inv(matrix).tolist(), "offset_deg": [0.0] * count,
+        "min_deg": [-1.0] * count, "max_deg": [1.0] * count,
+        "pulses_per_deg": [100.0] * count, "min_pulses": [-100] * count,
+        "max_pulses": [100] * count, "follow": follow(matrix).tolist(),
+        "forward": np.column_stack([matrix, np.zeros(count)]).tolist(),
+        "axes": [f"axis{i}" for i in range(count)],
+    }  # fmt: skip
+    (tmp_path / "calibration.h").write_text(LANGUAGES["c"](inverse | given))
+    read = "".join(f' && scanf("%lf", d + {i}) == 1' for i in range(count))
+    (tmp_path / "main.c").write_text(
+        '#include <stdio.h>\n#include "calibration.h"\n'
+        f"int main(void) {{ double d[{count}], u[{count}]; while (1{read}) {{"
+        'printf("%d", jaxcal_command(d, u, 0));'
+        f'for (int i = 0; i < {count}; ++i) printf(" %.17g", u[i]);'
+        'printf("\\n"); } return 0; }'
+    )
+    subprocess.run(
+        ["gcc", "-std=c99", "main.c", "-o", "main"], cwd=tmp_path, check=True
+    )
+    desired = np.concatenate(
+        [[[2.5, 1.5, 0.5, 0][:count]], rng.normal(0, 2, (60, count))]
+    )
+    out = subprocess.run(
+        [tmp_path / "main"],
+        input="\n".join(" ".join(map(repr, y)) for y in desired.tolist()),
+        text=True, capture_output=True, check=True,
+    ).stdout  # fmt: skip
+    rows = np.array([list(map(float, line.split())) for line in out.splitlines()])
+    for y, (status, *u) in zip(desired, rows, strict=True):
+        nearest = lsq_linear(matrix, y, (-1, 1), tol=1e-14).x
+        assert np.abs(u).max() <= 1.0
+        best = np.linalg.norm(matrix @ nearest - y)
+        assert np.linalg.norm(matrix @ u - y) <= best + 1e-9
+        held = np.isclose(np.abs(u), 1.0, rtol=0, atol=1e-12)
+        assert status == held @ (1 << np.arange(count))
+    if count == 2:
+        np.testing.assert_allclose(rows[0], [3, 1, 1], atol=1e-12)
+
+
+@pytest.mark.slow
 def test_structured_text_parses(inverse):
     blark = pytest.importorskip(
         "blark", reason="blark, the parser of TwinCAT sources, is not installed"
@@ -346,23 +401,38 @@ def test_structured_text_parses(inverse):
     assert "FB_JaxcalCommand" in str(parsed.transform())
 
 
+OPERATORS = {"AND": "and", "OR": "or", "NOT": "not", "MOD": "%", "TRUE": "True",
+             "FALSE": "False", " / 3": " // 3"}  # fmt: skip
+
+
 def translated(text):
-    """The body of the function block as Python, for its few kinds of statements."""
-    body = re.sub(r"\(\*.*?\*\)", "", text, flags=re.S)
-    body = body.rpartition("END_VAR")[2].replace("END_FUNCTION_BLOCK", "")
-    body = re.sub(r"\bDINT#", "", body)
-    body = re.sub(r"(?<![<>:=])=(?!=)", "==", body).replace(":==", "=")
-    body = body.replace(":=", "=").replace("AND", "and").replace("OR", "or")
-    body = body.replace("NOT", "not")
+    """The function block as Python, for its few kinds of statements."""
+    text = re.sub(r"\(\*.*?\*\)", "", text, flags=re.S)
+    declared, _, body = text.rpartition("END_VAR")
     lines, depth = [], 0
-    for statement in " ".join(body.split()).split(";"):
-        if (head := re.match(r"\s*IF (.*?) THEN(.*)", statement)) is not None:
-            lines.append(f"if {head[1]}:")
-            depth, statement = 1, head[2]
-        if statement.strip() == "END_IF":
-            depth = 0
-        elif statement.strip():
-            lines.append("    " * depth + statement.strip())
+    for name, size, values in re.findall(
+        r"(\w+) : ARRAY \[0\.\.(\d+)\] OF \w+(?: := \[(.*?)\])?;", declared, re.S
+    ):
+        lines.append(
+            f"{name} = [{values}]" if values else f"{name} = [0] * {size} + [0]"
+        )
+    body = body.replace("END_FUNCTION_BLOCK", "").replace("DINT#", "")
+    for word in ("THEN", "DO", "ELSE"):
+        body = re.sub(rf"\b{word}\b", f"{word};", body)
+    for statement in (" ".join(part.split()) for part in body.split(";")):
+        python = re.sub(r"(?<![<>:])=", "==", statement).replace(":=", "=")
+        for word, operator in OPERATORS.items():
+            python = re.sub(rf"(?<!\w){word}\b", operator, python)
+        depth -= statement.startswith(("END_", "ELS"))
+        if loop := re.fullmatch(r"FOR (\w+) = (\d+) TO (\d+) DO", python):
+            python = f"for {loop[1]} in range({loop[2]}, {loop[3]} + 1):"
+        elif branch := re.fullmatch(r"(IF|ELSIF) (.*) THEN", python):
+            python = f"{'if' if branch[1] == 'IF' else 'elif'} {branch[2]}:"
+        elif statement == "ELSE":
+            python = "else:"
+        if statement and not statement.startswith("END_"):
+            lines.append("    " * depth + python)
+        depth += python.endswith(":")
     return "\n".join(lines)
 
 
@@ -381,7 +451,8 @@ def test_structured_text_computes_what_command_for_does(finished, inverse, rng):
         pulses = tuple(state[f"pulses_{name}"] for name in AXIS_NAMES)
         assert pulses == config.to_pulses(clipped)
         clamped = [state[f"clamped_{name}"] for name in AXIS_NAMES]
-        assert clamped == (np.abs(free) > 20).tolist() and not state["not_finite"]
+        assert clamped == at_limit(clipped).tolist() and not state["not_finite"]
+        assert any(clamped) == (np.abs(free) > 20).any()
     state["desired_yaw"], last = float("nan"), u
     exec(code, state)
     assert state["not_finite"]

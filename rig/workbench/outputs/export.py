@@ -1,8 +1,9 @@
 """A calibration's inverse map in the languages of controllers.
 
 C and Structured Text compute the same: a desired posture to commands in degrees and
-pulses, each clamped to its limits, with a status of one bit for each axis that was
-clamped. An input that is not a finite number sets the status and nothing else, so that
+pulses; beyond the limits the command within them whose posture is nearest, as
+`command_for(..., clip=True)`, with a status of one bit for each axis that is held at a
+limit. An input that is not a finite number sets the status and nothing else, so that
 the caller keeps its last command. JSON and ROS parameters hold the numbers.
 """
 
@@ -19,6 +20,7 @@ import numpy as np
 
 from rig.config import AXIS_NAMES
 from rig.config.axis import Scale
+from rig.core.attitude import Array
 from rig.core.faults import Refused
 from rig.journal import Record
 from rig.workbench.outputs.words import recalibrate
@@ -33,8 +35,9 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
     Returns:
         matrix (3, 3) M = A^-1 and offset_deg (3,) c = -A^-1 b; min_deg, max_deg (3,)
         soft limits of the commands, the same in pulses, pulses_per_deg (3,) signed;
-        forward (3, 4) [A | b] and half_widths (3, 4), 95 % of all twelve at once; run,
-        created; device, its fingerprint as keys of rig.toml; warnings; axes; checksum.
+        forward (3, 4) [A | b] and half_widths (3, 4), 95 % of all twelve at once;
+        follow (8, 3, 3) of each set of held axes; run, created; device, its fingerprint
+        as keys of rig.toml; warnings; axes; checksum.
 
     Raises:
         Refused: it holds none, or A cannot be inverted.
@@ -73,6 +76,7 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
         "max_pulses": [high for _, high in limits],
         "forward": np.column_stack([calibration.matrix, calibration.bias]).tolist(),
         "half_widths": summary["ci95"],
+        "follow": follow(calibration.matrix).tolist(),
         "run": folder.resolve().name,
         "created": str(calibration.provenance.get("created", "")),
         "device": calibration.provenance["notes"]["device"],
@@ -82,8 +86,31 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
     return inverse | {"checksum": checksum(inverse)}
 
 
+def follow(matrix: Array) -> Array:
+    """How free axes follow those that are held at a limit, for the nearest posture.
+
+    The nearest posture |A (u - free)| over the free axes F of u, where the others H are
+    given, has (u - free)_F = -pinv(A_F) A_H (u - free)_H.
+
+    Args:
+        matrix: (n, n) A, regular.
+
+    Returns:
+        (2 ** n, n, n): for the set of held axes with bit 1 << j of each, degrees of
+        axis i for a degree of axis j; zero but for a free i and a held j.
+    """
+    count = len(matrix)
+    by = np.zeros((2**count, count, count))
+    for number, moved in enumerate(by):
+        held = (number >> np.arange(count)) & 1 == 1
+        if held.any() and not held.all():
+            solved = np.linalg.lstsq(matrix[:, ~held], matrix[:, held], rcond=None)[0]
+            moved[np.ix_(~held, held)] = -solved
+    return by
+
+
 def checksum(inverse: dict[str, Any]) -> str:
-    """SHA-256 of the 30 numbers the map is computed from, in the order of NUMBERS.
+    """SHA-256 of the 30 numbers that make the map, in the order of NUMBERS.
 
     Each as Python's repr of a float, one a line.
     """
@@ -114,8 +141,10 @@ def _code(name: str, inverse: dict[str, Any]) -> str:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"c": _c, "real": _real}
-    return environment.get_template(name).render(**inverse, origin=_origin(inverse))
+    environment.filters |= {"c": _c, "real": _real, "reals": _reals}
+    bits = ", ".join(str(1 << i) for i in range(len(inverse["axes"])))
+    template = environment.get_template(name)
+    return template.render(**inverse, bits=bits, origin=_origin(inverse))
 
 
 def _c(value: Any) -> str:
@@ -128,6 +157,10 @@ def _real(value: float) -> str:
     """1e-07 with the point that YAML and Structured Text want: 1.0e-07."""
     mantissa, e, exponent = repr(float(value)).partition("e")
     return mantissa + ".0" * ("." not in mantissa) + e + exponent
+
+
+def _reals(values: Any) -> str:
+    return ", ".join(_real(value) for value in np.ravel(values).tolist())
 
 
 def _ros(inverse: dict[str, Any]) -> str:
