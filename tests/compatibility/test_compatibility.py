@@ -35,7 +35,9 @@ def test_a_checkpoint_chooses_as_it_did(folder, answers):
     chosen = jaxcal.select(
         CANDIDATES, 4, "policy", checkpoint=folder / "checkpoint.npz"
     )
-    assert chosen.indices.tolist() == answers["policy"]
+    # The look-ahead takes the last two as a pair, whose order is a tie.
+    first, last = chosen.indices[:2].tolist(), sorted(chosen.indices[2:])
+    assert [*first, *last] == [*answers["policy"][:2], *sorted(answers["policy"][2:])]
 
 
 def test_the_calibration_and_the_journal_of_a_run_are_read(folder):

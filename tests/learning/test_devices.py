@@ -149,8 +149,8 @@ def test_a_mesh_takes_the_devices_asked_for_and_names_what_does_not_divide() -> 
     assert "multiple of the 8 devices, got 12" in str(out["odd"])
     assert "use 6 devices" in str(out["odd"]) and out["seeds"] == ["seeds"]
     assert out["odd seeds"] == (
-        "--seeds must be a multiple of the 8 devices, got 6; use 6 devices "
-        "(--devices 6)"
+        "--seeds (times the values of --sweep) must be a multiple of the 8 devices, "
+        "got 6; use 6 devices (--devices 6)"
     )
 
 
