@@ -353,7 +353,9 @@ def test_the_shipped_policy_has_a_row_for_each_decoding(
         assert better >= rows["policy"]["ratio_to_exact"] - 1e-3
 
 
-@pytest.mark.parametrize("command", ["evaluate", "train"])
+@pytest.mark.parametrize(
+    "command", ["evaluate", pytest.param("train", marks=pytest.mark.slow)]
+)
 def test_the_log_level_is_set_before_jax_is_loaded(command: str) -> None:
     # XLA reads it then; else each program from the cache is an error of 1.8 kB.
     code = f"""

@@ -3,6 +3,7 @@
 import fr3
 import numpy as np
 import positioner
+import pytest
 from scipy.spatial.transform import Rotation
 
 from .test_examples import EXAMPLES, quick
@@ -27,6 +28,7 @@ def test_views_are_read_as_poses_of_the_board_in_the_camera():
     np.testing.assert_allclose(camera.apply(view[7:10]) + place, 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_positioner_is_predicted_where_it_was_not_measured(tmp_path):
     found, rows = quick("positioner", tmp_path)
     assert [row["rule"] for row in rows][:2] == ["all, nominal table", "all, fitted"]

@@ -53,6 +53,7 @@ def test_postures_pay_the_log_det_of_what_is_chosen_and_begin_anew():
     assert not np.array_equal(kept[0][0], kept[4][0])
 
 
+@pytest.mark.slow
 def test_sessions_of_a_task_end_and_begin_anew():
     env = TaskEnv(knee(cells=4, sigma=0.05, seconds=(5.0, 9.0)), STATE_RULE, 2)
     kept = play(env, 4, 12)

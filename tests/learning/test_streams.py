@@ -175,6 +175,7 @@ def test_a_run_that_diverges_keeps_its_last_finite_state(tmp_path):
     assert len((tmp_path / "metrics.csv").read_text().splitlines()) == 3
 
 
+@pytest.mark.slow
 def test_swept_values_are_runs_of_their_own_in_one_program(tmp_path):
     """Each is what a run with that value in its configuration is."""
     config = dataclasses.replace(Config(), sweep=(("learning_rate", (1e-3, 3e-2)),))
