@@ -16,13 +16,16 @@ that the other rows keep their digits.
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal import compiled
 from jaxcal.information.singular import (
     SINGULAR,
+    SURE,
     null_directions,
     power_of_two,
     rank_rule,
@@ -32,6 +35,7 @@ from jaxcal.information.singular import (
 __all__ = [
     "Whitened",
     "coarseness",
+    "gram",
     "largest_rank",
     "missing_directions",
     "prior_root",
@@ -49,6 +53,7 @@ _LOSS = 1e-9  # of orthogonality that whitened rows may have
 _CLEAR = 1e6  # share of its digits that a column may lose by centring
 _SMALL = 1e-100  # numbers below and above its inverse are divided by powers of two
 _FAR = 1e5  # times the distance of neighbours: such a row hides what these differ by
+_SOME = 256  # candidates, or a few less, of which neighbours are looked at
 _UNTHREADED = 240_000  # multiplications up to which BLAS starts no threads
 
 
@@ -59,7 +64,7 @@ class _Centred(NamedTuple):
     largest: Array  # (S, p) largest entry of each column of B / scale
     scale: Array | None  # (S, p) powers of two; None: all 1
     shift: Array | None  # (S, p, p), of columns divided by ``scale``; None: zero
-    far: Mask | None  # (S,) whether a row is far from the others; None: not looked at
+    far: Mask | None  # (S,) whether a row is far from the others; None: none is
 
 
 def _centred(
@@ -70,44 +75,49 @@ def _centred(
     ``look`` whether rows are far from the others.
     """
     sets, count, q, p = blocks.shape
-    largest = np.abs(blocks).max(axis=(1, 2), initial=0.0)
-    if len(root):
-        largest = np.maximum(largest, np.abs(root).max(axis=0))
-    scale = None
-    if not _SMALL < largest.min() <= largest.max() < 1.0 / _SMALL:
-        scale = power_of_two(largest)
-        blocks, largest = blocks / scale[:, None, None], largest / scale
-        root = root / scale[:, None]
     first, masked = blocks[:, :1], usable is not None and not usable.all()
     if masked:
         assert usable is not None
         first = blocks[np.arange(sets), usable.argmax(axis=1)][:, None]
         blocks = np.where(usable[..., None, None], blocks, first)
-    same = (blocks == first).all(axis=1)  # (S, q, p)
+    # Some candidates, each column in order: all where they are not many.
+    ordered = np.sort(blocks[:, :: 1 + count // _SOME], axis=1)
+    least, most = ordered[:, 0], ordered[:, -1]  # (S, q, p)
+    if count >= _SOME:
+        least, most = blocks.min(axis=1), blocks.max(axis=1)
+    same, largest = least == most, np.maximum(most, -least)
     if q > 1:
-        same = same.all(axis=1, keepdims=True)
-    dense, where_far, far = first[:, 0], np.zeros_like(same), None
-    if look:
-        dense, where_far = _far(blocks, largest)
-        where_far &= ~same
-        far = np.asarray(where_far.any(axis=(1, 2)))
+        same, largest = same.all(axis=1, keepdims=True), largest.max(axis=1)
+    largest = largest.reshape(sets, p)
+    if len(root):
+        largest = np.maximum(largest, np.abs(root).max(axis=0))
+    scale = None
+    sizes = largest.ravel().tolist()
+    if not (_SMALL < min(sizes) and max(sizes) < 1.0 / _SMALL):
+        scale = power_of_two(largest)
+        largest = largest / scale
+        blocks, first, ordered = (
+            each / scale[:, None, None] for each in (blocks, first, ordered)
+        )
+        root = root / scale[:, None]
+    where_far, dense = _far(ordered, largest, same) if look else (None, None)
     shift, constant = None, first[:, 0] * same
-    if constant.any():
-        total = blocks.sum(axis=1)
+    if np.count_nonzero(constant) and np.count_nonzero(same) < same.size:
+        total = np.add.reduce(blocks, axis=1)
         if masked:
             assert usable is not None
             missing = count - usable.sum(axis=1)[:, None, None]
             total = (total - missing * first[:, 0]) / np.maximum(count - missing, 1)
         else:
             total /= count
-        if far is not None and far.any():
+        if where_far is not None:
             total = np.where(where_far, dense, total)
         centre = total * ~same
         if q == 1:
-            size = (constant * constant).sum(axis=2, keepdims=True)
+            size = np.vecdot(constant, constant)[..., None]
             if sets > 1:
                 size[size == 0.0] = 1.0
-            shift = constant.transpose(0, 2, 1) / size * centre
+            shift = constant.mT / size * centre
             if sets > 1:
                 centre = constant @ shift  # of sets without constants it is zero
         else:
@@ -119,41 +129,28 @@ def _centred(
     rows = blocks.reshape(sets, count * q, p)
     if len(root):
         known = root if shift is None else root - root @ shift
-        rows = np.concatenate([rows, np.broadcast_to(known, (sets, *known.shape[-2:]))],
-                              axis=1)  # fmt: skip
+        known = np.broadcast_to(known, (sets, *known.shape[-2:]))
+        rows = np.concatenate([rows, known], axis=1)
+    far = None if where_far is None else np.asarray(where_far.any(axis=(1, 2)))
     return _Centred(rows, largest, scale, shift, far)
 
 
-def _less_means(rows: Array) -> Array:
-    """Rows (S, N, p) of which columns that differ are centred beside one that does not.
+def _far(
+    ordered: Array, largest: Array, same: Mask
+) -> tuple[Mask | None, Array | None]:
+    """Where entries (S, N, q, p), in order, are far, and where densest, (S, q, p).
 
-    As ``_centred`` has them, in the fewest steps: this is asked of every selection.
+    By the smallest distance between a few neighbours that is not zero; not where all
+    are the ``same``. None where no entry is far.
     """
-    apart = rows - rows[:, :1]
-    same = ~apart.any(axis=1, keepdims=True)
-    some = (same & (rows[:, :1] != 0.0)).any(axis=2, keepdims=True)
-    if not some.any():
-        return rows
-    centred = apart - apart.sum(axis=1, keepdims=True) / rows.shape[1]
-    return np.asarray(np.where(same | ~some, rows, centred))
-
-
-def _far(blocks: Array, largest: Array) -> tuple[Array, Mask]:
-    """Where entries of (S, M, q, p) are densest, (S, q, p), and whether some are far.
-
-    By the smallest distance between a few neighbours that is not zero.
-    """
-    count = blocks.shape[1]
-    few = min(1 + count.bit_length() // 6, count - 1)
-    ordered = np.sort(blocks, axis=1)
-    apart = ordered[:, few:] - ordered[:, : count - few]
-    if not apart.shape[1] or not few:
-        return ordered[:, 0], np.zeros(ordered[:, 0].shape, dtype=np.bool_)
-    far = (largest[:, None, None] > _FAR * apart) & (apart > 0.0)
-    if not far.any():
-        return ordered[:, 0], np.asarray(far[:, 0])
+    few = 1 + ordered.shape[1] // 32
+    apart = ordered[:, few:] - ordered[:, :-few]
+    near = apart * _FAR < largest[:, None, None]
+    if np.count_nonzero(near) == apart.size - np.count_nonzero(apart):  # zeros
+        return None, None
+    near &= apart > 0.0
     at = np.where(apart > 0.0, apart, np.inf).argmin(axis=1)[:, None]
-    return np.take_along_axis(ordered, at, axis=1)[:, 0], np.asarray(far.any(axis=1))
+    return near.any(axis=1) & ~same, np.take_along_axis(ordered, at, axis=1)[:, 0]
 
 
 def _parts(rows: Array) -> Array:
@@ -174,12 +171,12 @@ def _times(rows: Array, matrix: Array) -> Array:
     ]
 
 
-def _gram(rows: Array) -> Array:
+def gram(rows: Array) -> Array:
     """``rows.T @ rows`` (..., p, p)."""
     if rows[..., 0].size * rows.shape[-1] ** 2 <= _UNTHREADED:
-        return np.asarray(np.matrix_transpose(rows) @ rows)
+        return np.asarray(rows.mT @ rows)
     parts = _parts(rows)
-    return np.asarray((np.matrix_transpose(parts) @ parts).sum(axis=-3))
+    return np.asarray((parts.mT @ parts).sum(axis=-3))
 
 
 def triangle(rows: Array) -> Array:
@@ -245,21 +242,29 @@ def rank_of_blocks(
     Returns:
         (S,) of both.
     """
-    if size is None and not len(root) and blocks.shape[2] == 1:
-        largest = np.abs(blocks).max(axis=(1, 2))
-        if _SMALL < largest.min() <= largest.max() < 1.0 / _SMALL:
-            return rank_rule(_less_means(blocks[:, :, 0]), largest)
-    centred = _centred(blocks, None, root)
-    largest = centred.largest
-    scale = centred.scale
-    if size is not None:
-        largest = np.maximum(largest, size if scale is None else size / scale)
-    ranks, log_det = rank_rule(
-        centred.rows, largest, blocks.shape[1], computed=size is not None
-    )
-    if scale is not None:
-        log_det += 2.0 * np.log(scale).sum(axis=1)
+    if not blocks.shape[1]:  # the prior alone
+        blocks = np.broadcast_to(root, (len(blocks), 1, *root.shape))
+        root = root[:0]
+    kernel = compiled.kernel("jaxcal.information.rank_kernel")
+    beside = _nothing(blocks.shape[3]) if size is None else size
+    share = 0.0 if size is None else SINGULAR
+    log_det, clear = kernel.clear_log_dets(blocks, root, beside, _SMALL, share, SURE)
+    ranks = [blocks.shape[3]] * len(blocks)
+    for n in () if clear else np.flatnonzero(np.isnan(log_det)).tolist():
+        centred = _centred(blocks[n : n + 1], None, root)
+        largest, scale = centred.largest, centred.scale
+        if size is not None:
+            largest = np.maximum(largest, size if scale is None else size / scale)
+        judged = rank_rule(centred.rows, largest, blocks.shape[1], size is not None)
+        ranks[n], log_det[n] = judged[0][0], judged[1][0]
+        if scale is not None:
+            log_det[n] += 2.0 * np.log(scale).sum()
     return ranks, log_det
+
+
+@functools.cache
+def _nothing(size: int) -> Array:
+    return np.zeros(size)
 
 
 def largest_rank(blocks: Array) -> int:
@@ -352,18 +357,18 @@ def whiten(
     sets, num, q, p = blocks.shape
     centred = _centred(blocks, usable, root, look=True)
     rows, largest, scale = centred.rows, coarse * centred.largest, centred.scale
-    assert centred.far is not None
-    inverse, back, log_det, good = _cholesky_factors(rows, largest, centred.far)
+    far = np.zeros(sets, dtype=np.bool_) if centred.far is None else centred.far
+    inverse, back, log_det, good = _cholesky_factors(rows, largest, far)
     white = _times(rows, inverse)
     singular = [False] * sets
     for n in () if good.all() else np.flatnonzero(~good):
         ranks, _ = rank_rule(rows[n : n + 1], largest[n : n + 1], num, computed)
         singular[n] = ranks[0] < p
         if not singular[n]:
-            inverse[n], back[n], white[n] = _by_rotations(rows[n], bool(centred.far[n]))
+            inverse[n], back[n], white[n] = _by_rotations(rows[n], bool(far[n]))
             log_det[n] = 2.0 * np.linalg.slogdet(back[n])[1]
-    prior = _gram(white[:, num * q :]) if len(root) else np.zeros((sets, p, p))
-    sizes = _sizes(blocks, centred) if computed else None
+    prior = gram(white[:, num * q :]) if len(root) else np.zeros((sets, p, p))
+    sizes = _sizes(blocks, centred, far) if computed else None
     shift, basis = centred.shift, inverse
     if shift is not None:
         basis = inverse - shift @ inverse
@@ -399,27 +404,26 @@ def _cholesky_factors(
 
     Of S sets of rows (S, N, p), by Cholesky's factor in units of the columns' lengths.
     """
-    gram, p = _gram(rows), rows.shape[2]
-    scale = np.sqrt(gram.diagonal(axis1=1, axis2=2))
+    information, p = gram(rows), rows.shape[2]
+    scale = np.sqrt(information.diagonal(axis1=1, axis2=2))
     good = (scale * _CLEAR > largest).all(axis=1) & ~far
-    if not good.all():
-        gram[~good], scale[~good] = np.eye(p), 1.0
-    unit = gram / (scale[:, :, None] * scale[:, None])
+    if np.count_nonzero(good) < len(good):
+        information[~good], scale[~good] = np.eye(p), 1.0
     try:
-        lower = np.linalg.cholesky(unit)
+        lower = np.linalg.cholesky(information)
     except np.linalg.LinAlgError:
-        lower = np.broadcast_to(np.eye(p), unit.shape).copy()
+        lower = np.broadcast_to(np.eye(p), information.shape).copy()
         for n in np.flatnonzero(good):
             try:
-                lower[n] = np.linalg.cholesky(unit[n])
+                lower[n] = np.linalg.cholesky(information[n])
             except np.linalg.LinAlgError:
                 good[n] = False
-    inverse = np.linalg.inv(lower).transpose(0, 2, 1)
-    good &= (inverse * inverse).sum(axis=(1, 2)) <= _LOSS / _EPS
-    lengths = scale * lower.diagonal(axis1=1, axis2=2)
-    log_det = 2.0 * np.log(lengths).sum(axis=1)
-    back = lower.transpose(0, 2, 1) * scale[:, None]
-    return inverse / scale[:, :, None], back, log_det, good
+    inverse = np.linalg.inv(lower / scale[:, :, None])
+    flat = inverse.reshape(-1, p * p)
+    good &= np.vecdot(flat, flat) <= _LOSS / _EPS
+    lengths = lower.diagonal(axis1=1, axis2=2)
+    log_det = 2.0 * np.add.reduce(np.log(lengths), axis=1)
+    return inverse.mT / scale[:, :, None], np.asarray(lower.mT), log_det, good
 
 
 def _by_rotations(rows: Array, far: bool) -> tuple[Array, Array, Array]:
@@ -450,13 +454,13 @@ def _by_rotations(rows: Array, far: bool) -> tuple[Array, Array, Array]:
     return all_inverse, back, white
 
 
-def _sizes(blocks: Array, centred: _Centred) -> Array:
+def _sizes(blocks: Array, centred: _Centred, far: Mask) -> Array:
     """(S, p) of what the blocks were computed beside: the largest entries.
 
     A row that is far from the others, as x = 1e7 beside 1, is rounded more than these.
     """
     largest = centred.largest * (1.0 if centred.scale is None else centred.scale)
-    for n in np.flatnonzero(centred.far):  # type: ignore[arg-type]  # looked at
+    for n in np.flatnonzero(far):
         size = np.abs(blocks[n]).reshape(-1, blocks.shape[3])
         real = np.where(size > SINGULAR * size.max(axis=0), size, np.nan)
         usual = np.where(largest[n] > 0.0, largest[n], 1.0)

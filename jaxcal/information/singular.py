@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 __all__ = [
     "SINGULAR",
+    "SURE",
     "depends",
     "direction_in_words",
     "directions_in_words",
@@ -37,11 +38,11 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SINGULAR = 1e-10  # share of the largest singular value
+SURE = 1e5  # times the tolerance: distances above it leave no doubt of the rank
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
 _FLAT = 64.0 * _EPS  # of the size of what a number was computed from
 _NONE = 1e-7  # of the largest entry of a direction: its rounding where it nearly exists
-_SURE = 1e5  # times the tolerance: pivots above it leave no doubt of the rank
 
 
 def power_of_two(size: NDArray[Any]) -> Array:
@@ -101,17 +102,25 @@ def rank_rule(
         unit *= (lengths > 0.0)[:, None]
     if num_rows < p:
         distances = np.zeros((len(columns), p))
-    else:  # of each column to the span of those before it: cheaper than the rank
-        factor: Array = np.linalg.qr(unit, mode="r")  # type: ignore[assignment]  # R alone
-        distances = np.abs(factor.diagonal(axis1=1, axis2=2))
+    else:
+        distances = _distances(unit)
     value = 2.0 * np.log(np.maximum(distances * lengths, _TINY)).sum(axis=1)
-    unsure = distances.min(axis=1) <= _SURE * rounding
+    unsure = distances.min(axis=1) <= SURE * rounding
     for n in np.flatnonzero(unsure) if unsure.any() else ():
         singular_values = np.linalg.svd(unit[n], compute_uv=False)
         ranks[n] = int((singular_values > rounding[n]).sum())
         if ranks[n] < p:
             value[n] = -np.inf
     return ranks, value
+
+
+def _distances(columns: Array) -> Array:
+    """(S, p) of each column of (S, R, p) to the span of those before it, R >= p.
+
+    Their product is the volume: cheaper than the singular values.
+    """
+    factor: Array = np.linalg.qr(columns, mode="raw")[0]
+    return np.abs(factor.diagonal(axis1=1, axis2=2))
 
 
 def null_directions(

@@ -136,13 +136,15 @@ class Objective:
     def _half(self, information: Array) -> tuple[Array, NDArray[np.bool_]]:
         """H (..., s, p) with ``H @ H.T = V``, and where M is not singular."""
         size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
-        size = np.where(size > 0.0, size, 1.0)
-        unit = information / (size[..., None] * size[..., None, :])
-        values, vectors = np.linalg.eigh(unit)
+        if not size.all():
+            size = np.where(size > 0.0, size, 1.0)
+        row = size[..., None, :]
+        values, vectors = np.linalg.eigh(information / (size[..., None] * row))
         regular = significant(values, squares=True)[..., 0]
-        scale = np.where(regular[..., None], values, 1.0)
-        root = self.root / size[..., None, :]
-        return root @ vectors / np.sqrt(scale)[..., None, :], regular
+        if not regular.all():
+            values = np.where(regular[..., None], values, 1.0)
+        half = (self.root / row) @ vectors / np.sqrt(values)[..., None, :]
+        return half, regular
 
 
 class Coordinates(NamedTuple):

@@ -143,12 +143,13 @@ class Design(CandidateSet):
         masked = ~self.available[subset]
         require_none(masked, subset, "indices must be available", ", which is masked")
         problem = self.problem(len(subset), criterion)
-        left = problem.required[~np.isin(problem.required, subset)]
+        times = np.bincount(subset, minlength=count)
+        left = problem.required[times[problem.required] == 0]
         if len(left):
             raise ValueError(
                 f"indices must hold every required candidate, got no {left[0]}"
             )
-        repeats = int(np.unique(subset, return_counts=True)[1].max())
+        repeats = int(times.max())
         if repeats > problem.max_replicates:
             raise ValueError(
                 "indices must repeat a candidate at most max_replicates = "
@@ -288,10 +289,9 @@ class Design(CandidateSet):
                 f"method {method!r} must return {problem.k} candidates within lower "
                 f"and upper of its problem, got {indices.tolist()}"
             )
-        if value is None or problem.criterion.name != "D":
+        log_det = found.log_det
+        if value is None or log_det is None:
             value, log_det = (float(each[0]) for each in values(problem, indices[None]))
-        else:
-            log_det = value
         if np.isneginf(log_det):
             name = "indices" if method == "score" else "method"
             what = "" if method == "score" else f", which {method!r} returned"

@@ -34,9 +34,9 @@ _TRIES = 200  # random selections, before the greedy one, where all are singular
 def solve_random(problem: Problem, *, seed: int | np.random.Generator) -> Solution:
     """The baseline of the paper: drawn uniformly, never singular, required first."""
     indices, values = random_indices([problem], np.random.default_rng(seed))
-    return Solution(
-        indices[0], float(values[0]), seed=seed if isinstance(seed, int) else None
-    )
+    log_det, own = float(values[0]), seed if isinstance(seed, int) else None
+    value = log_det if problem.criterion.name == "D" else None
+    return Solution(indices[0], value, log_det, seed=own)
 
 
 def random_indices(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxcal.information.blocks import triangle, whiten
+from jaxcal.information.blocks import rank_of_blocks, triangle, whiten
 
 
 def extended_log_det(rows):
@@ -54,3 +54,43 @@ def test_a_triangle_made_in_parts_has_the_product_of_its_rows(shape):
     np.testing.assert_array_equal(found, np.triu(found))
     products = [each.T @ each for each in (found, rows)]
     np.testing.assert_allclose(*products, atol=1e-10)
+
+
+@pytest.mark.parametrize("known", [0, 2])
+@pytest.mark.parametrize("q", [1, 2])
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_log_det_of_selections_clear_and_not(offset, q, known):
+    """A batch of plain ones, tiny ones, nearly dependent ones and a singular one."""
+    rng = np.random.default_rng(q)
+    sets, root = rng.normal(size=(5, 6, q, 4)), rng.normal(size=(known, 4))
+    sets[..., 0] += offset
+    sets[..., -1] = 1.0
+    sets[2] *= 0.1 if known else 1e-120
+    sets[3, ..., 1] = sets[3, ..., 2] + 1e-6 * rng.normal(size=(6, q))
+    sets[4, ..., 1] = sets[4, ..., 2]
+    if known:
+        root[:, 1] = root[:, 2]
+    ranks, log_det = rank_of_blocks(sets, root)
+    assert ranks == [4, 4, 4, 4, 3]
+    assert log_det[4] == -np.inf
+    for blocks, value in zip(sets[:4], log_det[:4], strict=True):
+        exact = extended_log_det(np.concatenate([blocks.reshape(-1, 4), root]))
+        assert value == pytest.approx(exact, abs=1e-8)
+
+
+@pytest.mark.parametrize("count", [7, 60, 900])
+def test_a_far_row_leaves_the_others_their_digits(count):
+    x = np.random.default_rng(count).uniform(-1.0, 1.0, count)
+    x[count // 2] = 1e9
+    rows = np.stack([x, np.ones(count)], axis=1)[None, :, None]
+    white = whiten(rows, np.ones((1, count), dtype=bool), np.zeros((0, 2)))[0]
+    for pair in ([0, 1], [0, count - 1], [1, count - 2]):
+        value = 2.0 * np.linalg.slogdet(white.blocks[pair, 0])[1] + white.log_scale
+        exact = 2.0 * np.log(np.abs(x[pair[0]] - x[pair[1]]))
+        assert value == pytest.approx(exact, abs=1e-7)
+
+
+def test_a_prior_alone_is_what_is_left_without_the_only_measurement(rng):
+    root = rng.normal(size=(3, 3))
+    _, log_det = rank_of_blocks(np.zeros((2, 0, 1, 3)), root)
+    np.testing.assert_allclose(log_det, 2.0 * np.linalg.slogdet(root)[1])

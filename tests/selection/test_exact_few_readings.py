@@ -101,11 +101,15 @@ def test_a_time_limit_is_kept_while_nodes_are_slow() -> None:
     arguments = (blocks, 1e-2 * np.eye(60), criterion, 0 * whole)
     start = np.bincount(np.arange(15), minlength=120)
     first = branch_and_bound(*arguments, whole, start, deadline=0.0)
-    later = time.perf_counter() + 0.5
-    found = branch_and_bound(*arguments, whole, start, deadline=later)
     assert first.nodes == 1
+    found, limit = first, 0.25
+    while found.nodes == 1:  # a loaded machine gives less of its time
+        assert limit < 60.0
+        limit *= 2.0
+        began, later = time.thread_time(), time.perf_counter() + limit
+        found = branch_and_bound(*arguments, whole, start, deadline=later)
+        assert time.thread_time() - began < limit + 0.1
     assert not found.proven
-    assert found.nodes > 1
     assert found.values[0] < found.bound <= first.bound
 
 

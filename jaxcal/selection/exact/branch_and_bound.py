@@ -10,13 +10,14 @@ than that.
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal import compiled
-from jaxcal.information.blocks import largest_rank
+from jaxcal.information.blocks import gram, largest_rank
 from jaxcal.selection.criteria import Objective
 
 __all__ = ["branch_and_bound"]
@@ -69,9 +70,7 @@ def branch_and_bound(
     """
     num_blocks, q, p = blocks.shape
     low, high, counts = np.array([lower, upper, start], dtype=np.float64)
-    root, scale, shift = _near_one(blocks, prior, criterion, start)
-    everything = prior + np.einsum("m,mqa,mqb->ab", upper, blocks, blocks)
-    trivial = (float(criterion.value(everything)) - shift) / scale
+    root, scale, shift, trivial = _near_one(blocks, prior, criterion, start, upper)
     near = {"trace": -0.5, "least": 2.0}  # of values near 1: an efficiency of a half
     useful = min(trivial, near.get(criterion.kind, np.inf))
     best_counts, best_values = np.zeros((best, num_blocks)), np.full(best, -np.inf)
@@ -117,18 +116,30 @@ def _left(deadline: float | None) -> float:
 
 
 def _near_one(
-    blocks: Array, prior: Array, criterion: Objective, start: Indices
-) -> tuple[Array, float, float]:
-    """The kernel's C, with values of phi near 1, and their unit and origin."""
-    root, p = criterion.root, len(prior)
-    if criterion.form == "det":
-        return root, 1.0, -2.0 * float(np.linalg.slogdet(root)[1])
-    if criterion.form == "subset":
+    blocks: Array, prior: Array, criterion: Objective, start: Indices, upper: Indices
+) -> tuple[Array, float, float, float]:
+    """The kernel's C, with values of phi near 1, and their unit, origin and largest.
+
+    The largest is that of everything measured as often as it may be.
+    """
+    root, form = criterion.root, criterion.form
+    everything = prior + _information(blocks, upper)
+    if form == "det":
+        largest = float(np.linalg.slogdet(everything)[1])
+        return root, 1.0, -2.0 * float(np.linalg.slogdet(root)[1]), largest
+    both = np.array([prior + _information(blocks, start), everything])
+    begun, largest = criterion.value(both).tolist()
+    if form == "subset":
         lengths = np.linalg.norm(root, axis=1)
         shift = -2.0 * float(np.log(lengths).sum())
-        return root / lengths[:, None], 1.0, shift
-    chosen = np.repeat(blocks, start, axis=0).reshape(-1, p)
-    scale = abs(float(criterion.value(prior + chosen.T @ chosen)))
-    scale = scale if 0.0 < scale < np.inf else 1.0
-    unit = np.sqrt(scale)
-    return (root / unit if criterion.form == "trace" else root * unit), scale, 0.0
+        return root / lengths[:, None], 1.0, shift, largest - shift
+    scale = abs(begun) if 0.0 < abs(begun) < np.inf else 1.0
+    unit = math.sqrt(scale)
+    root = root / unit if form == "trace" else root * unit
+    return root, scale, 0.0, largest / scale
+
+
+def _information(blocks: Array, counts: Indices) -> Array:
+    """(p, p) of blocks (M, q, p), each as often as ``counts`` (M,) says."""
+    rows = np.sqrt(counts)[:, None, None] * blocks
+    return gram(rows.reshape(-1, blocks.shape[2]))

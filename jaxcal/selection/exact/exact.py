@@ -273,6 +273,7 @@ def _found(
     return Solution(
         indices=subsets[0],
         value=worth[0],
+        log_det=float(log_det[order[0]]),
         bound=bound,
         proven=proven,
         nodes=nodes,

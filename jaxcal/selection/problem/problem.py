@@ -96,7 +96,7 @@ class Problem:
     @property
     def upper(self) -> Indices:
         """(M,) how often each candidate may be chosen."""
-        return np.where(self.available, min(self.max_replicates, self.k), 0)
+        return self.available * np.int64(min(self.max_replicates, self.k))
 
     @property
     def simplex(self) -> bool:
@@ -139,8 +139,8 @@ class Problem:
         size = np.abs(rows @ self.white.triangle)
         if self.white.size is not None:
             size += self.white.size
-        error = _EPS * p * (size @ np.abs(np.linalg.inv(self.white.triangle)))
-        of_blocks = 2.0 * np.linalg.norm(error / unit) / np.sqrt(least)
+        error = _EPS * p * (size @ np.abs(self.white.inverse)) / unit
+        of_blocks = 2.0 * np.sqrt((error * error).sum() / least)
         return float(of_blocks + _EPS * len(rows) * largest / least)
 
     def log_det(self, indices: Indices) -> float:
@@ -156,6 +156,7 @@ class Solution:
 
     indices: Indices  # (k,) in the order picked
     value: float | None = None  # of the criterion, as reported to the caller
+    log_det: float | None = None  # natural log det S, where it was computed
     bound: float | None = None  # no selection allowed has a better value
     proven: bool = False  # no selection is better by more than 1e-9
     nodes: int | None = None  # nodes of branch and bound or of the search

@@ -70,13 +70,14 @@ class SharedSource(Source):
     """A model where all outputs share one regressor, as [u, 1], / std."""
 
     def __init__(self, model: Model, candidates: Array, noise: Noise | None) -> None:
-        self._model, self._candidates = model, candidates
+        self._model = model
         self._std = 1.0 if noise is None or noise.std is None else float(noise.std)  # type: ignore[arg-type]  # one number
         self.times = model.multiplicity
-        self.root = np.zeros((0, model.blocks(candidates[:1]).shape[-1]))
+        self._blocks = model.blocks(candidates) / self._std
+        self.root = np.zeros((0, self._blocks.shape[2]))
 
     def blocks(self) -> Array:
-        return self._model.blocks(self._candidates) / self._std
+        return self._blocks
 
     def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
         points = array_of(argument, values, "N", self._model.num_inputs, rule=_OF_MODEL)
