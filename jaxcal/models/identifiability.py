@@ -120,13 +120,16 @@ def identifiability(
     lengths = np.linalg.norm(columns, axis=0)
     unit = columns / np.where(seen, lengths, 1.0)
     norms = np.where(seen, lengths * largest, 1.0)
-    found = [np.eye(len(at))[[i]] for i in np.flatnonzero(~seen)]
-    first, classes = _parallel(unit, np.flatnonzero(seen))
-    found += [each / norms for each in classes]
-    for vector in _sparse_null(unit[:, first]):
-        full = np.zeros((1, len(at)))
-        full[0, first] = vector / norms[first]
-        found.append(full)
+    size = np.linalg.svd(unit, compute_uv=False)
+    found: list[Array] = []
+    if len(size) < len(at) or not significant(size).all():
+        found = [np.eye(len(at))[[i]] for i in np.flatnonzero(~seen)]
+        first, classes = _parallel(unit, np.flatnonzero(seen))
+        found += [each / norms for each in classes]
+        for vector in _sparse_null(unit[:, first]):
+            full = np.zeros((1, len(at)))
+            full[0, first] = vector / norms[first]
+            found.append(full)
     directions = []
     for local in found:
         full = np.zeros((len(local), model.num_parameters))
@@ -136,7 +139,6 @@ def identifiability(
         same = np.allclose(np.abs(full[np.abs(full) > 0.0]), np.sqrt(0.5))
         directions.append(Direction(told, _in_words(told, same), full))
     rank = len(at) - sum(len(vectors) for vectors in found)
-    size = np.linalg.svd(unit, compute_uv=False)
     condition = float(size[0] / size[rank - 1]) if rank else np.inf
     order = {name: i for i, name in enumerate(names)}
     directions.sort(key=lambda direction: order[direction.names[0]])
