@@ -313,12 +313,17 @@ class Whitened(NamedTuple):
 
     blocks: Array  # (M, q, p), zero where not usable
     prior: Array  # (p, p) precision
-    basis: Array  # (p, p): raw blocks times it are whitened
     triangle: Array  # (p, p): whitened blocks times it are the centred raw ones
     size: Array | None  # (p,) of what computed blocks are rounded by, or None
     log_scale: float  # log det of unwhitened less whitened information
     shift: Array | None  # (p, p): raw blocks less them times it are centred
     inverse: Array  # (p, p): centred blocks times it are whitened
+
+    @property
+    def basis(self) -> Array:
+        """(p, p): raw blocks times it are whitened."""
+        shift, inverse = self.shift, self.inverse
+        return inverse if shift is None else inverse - shift @ inverse
 
     def of(self, rows: Array) -> Array:
         """Other rows (..., p) of the caller's numbers in these coordinates."""
@@ -357,28 +362,28 @@ def whiten(
     sets, num, q, p = blocks.shape
     centred = _centred(blocks, usable, root, look=True)
     rows, largest, scale = centred.rows, coarse * centred.largest, centred.scale
-    far = np.zeros(sets, dtype=np.bool_) if centred.far is None else centred.far
+    far = centred.far
     inverse, back, log_det, good = _cholesky_factors(rows, largest, far)
     white = _times(rows, inverse)
     singular = [False] * sets
-    for n in () if good.all() else np.flatnonzero(~good):
+    for n in np.flatnonzero(~good) if np.count_nonzero(good) < sets else ():
         ranks, _ = rank_rule(rows[n : n + 1], largest[n : n + 1], num, computed)
         singular[n] = ranks[0] < p
         if not singular[n]:
-            inverse[n], back[n], white[n] = _by_rotations(rows[n], bool(far[n]))
+            inverse[n], back[n], white[n] = _by_rotations(
+                rows[n], far is not None and bool(far[n])
+            )
             log_det[n] = 2.0 * np.linalg.slogdet(back[n])[1]
     prior = gram(white[:, num * q :]) if len(root) else np.zeros((sets, p, p))
-    sizes = _sizes(blocks, centred, far) if computed else None
-    shift, basis = centred.shift, inverse
-    if shift is not None:
-        basis = inverse - shift @ inverse
+    sizes = _sizes(blocks, centred) if computed else None
+    shift = centred.shift
     if scale is not None:
         log_det += 2.0 * np.log(scale).sum(axis=1)
-        basis, inverse = basis / scale[..., None], inverse / scale[..., None]
+        inverse = inverse / scale[..., None]
         back = back * scale[:, None]
         shift = None if shift is None else shift / scale[..., None] * scale[:, None]
     white = white[:, : num * q].reshape(blocks.shape)
-    for part in (white, prior, basis, back):
+    for part in (white, prior, back, inverse):
         part.flags.writeable = False
     return [
         None
@@ -386,7 +391,6 @@ def whiten(
         else Whitened(
             white[n],
             prior[n],
-            basis[n],
             back[n],
             None if sizes is None else sizes[n],
             value,
@@ -398,7 +402,7 @@ def whiten(
 
 
 def _cholesky_factors(
-    rows: Array, largest: Array, far: Mask
+    rows: Array, largest: Array, far: Mask | None
 ) -> tuple[Array, Array, Array, Mask]:
     """Inverse(R), R, log det of ``R.T R = rows.T rows``, and which can be trusted.
 
@@ -406,7 +410,9 @@ def _cholesky_factors(
     """
     information, p = gram(rows), rows.shape[2]
     scale = np.sqrt(information.diagonal(axis1=1, axis2=2))
-    good = (scale * _CLEAR > largest).all(axis=1) & ~far
+    good = np.asarray((scale * _CLEAR > largest).all(axis=1))
+    if far is not None:
+        good &= ~far
     if np.count_nonzero(good) < len(good):
         information[~good], scale[~good] = np.eye(p), 1.0
     try:
@@ -454,13 +460,13 @@ def _by_rotations(rows: Array, far: bool) -> tuple[Array, Array, Array]:
     return all_inverse, back, white
 
 
-def _sizes(blocks: Array, centred: _Centred, far: Mask) -> Array:
+def _sizes(blocks: Array, centred: _Centred) -> Array:
     """(S, p) of what the blocks were computed beside: the largest entries.
 
     A row that is far from the others, as x = 1e7 beside 1, is rounded more than these.
     """
     largest = centred.largest * (1.0 if centred.scale is None else centred.scale)
-    for n in np.flatnonzero(far):
+    for n in () if centred.far is None else np.flatnonzero(centred.far):
         size = np.abs(blocks[n]).reshape(-1, blocks.shape[3])
         real = np.where(size > SINGULAR * size.max(axis=0), size, np.nan)
         usual = np.where(largest[n] > 0.0, largest[n], 1.0)

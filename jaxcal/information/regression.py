@@ -51,7 +51,10 @@ def regressors(commands: ArrayLike) -> Array:
         (..., N, n + 1).
     """
     commands = _as_commands(commands)
-    return np.concatenate([commands, np.ones((*commands.shape[:-1], 1))], axis=-1)
+    *batch, n = commands.shape
+    rows = np.empty((*batch, n + 1))
+    rows[..., :n], rows[..., n] = commands, 1.0
+    return rows
 
 
 def regression_matrix(commands: ArrayLike, num_outputs: int | None = None) -> Array:

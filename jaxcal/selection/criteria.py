@@ -192,7 +192,7 @@ class D(Criterion):
 
     def objective(self, at: Coordinates) -> Objective:
         return Objective(
-            self.name, self.kind, _identity(len(at.basis)), at.times,
+            self.name, self.kind, _identity(len(at.white.prior)), at.times,
             offset=at.white.log_scale,
         )  # fmt: skip
 
@@ -231,7 +231,7 @@ class I(Criterion):  # noqa: E742 - the criterion's own name in the literature
         self.region = region
 
     def root(self, at: Coordinates) -> Array:
-        p = len(at.basis)
+        p = len(at.white.prior)
         if at.region is None and not at.white.prior.any():
             return _identity(p) / np.sqrt(at.readings)
         if at.region is None:

@@ -125,8 +125,8 @@ def _near_one(
     root, form = criterion.root, criterion.form
     everything = prior + _information(blocks, upper)
     if form == "det":
-        largest = float(np.linalg.slogdet(everything)[1])
-        return root, 1.0, -2.0 * float(np.linalg.slogdet(root)[1]), largest
+        of_root, largest = np.linalg.slogdet(np.array([root, everything]))[1].tolist()
+        return root, 1.0, -2.0 * of_root, largest
     both = np.array([prior + _information(blocks, start), everything])
     begun, largest = criterion.value(both).tolist()
     if form == "subset":

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +47,9 @@ def solve(
 ) -> Solution:
     """The solver "exact"; 10 s where no time limit is given."""
     deadline = time.perf_counter() + (time_limit or TIME_LIMIT)
-    return solve_exact(problem, best, deadline, restarts or STARTING_RESTARTS, seed)
+    restarts = restarts or STARTING_RESTARTS
+    found = solve_exact(problem, best, deadline, restarts, seed)
+    return dataclasses.replace(found, seed=seed, restarts=restarts)
 
 
 def solve_auto(
@@ -72,8 +75,9 @@ def solve_auto(
     restarts = restarts or STARTING_RESTARTS
     found = solve_exact(problem, 1, deadline, restarts, seed, least_efficiency)
     assert found.value is not None and found.bound is not None
+    started: dict[str, Any] = {"seed": seed, "restarts": restarts}
     if found.reason:  # rounding
-        return dataclasses.replace(found, method="exact")
+        return dataclasses.replace(found, method="exact", **started)
     name = f"{problem.criterion.name}-efficiency"
     proven_share = problem.criterion.efficiency(found.value, found.bound)
     method, reason = "exact", "the exact search proved this optimum"
@@ -88,7 +92,7 @@ def solve_auto(
             f"the exact search ran out of time after {limit:g} s with a {name} "
             f"of at least {proven_share:.6f} proven; {least_efficiency:g} was asked for"
         )
-    return dataclasses.replace(found, method=method, reason=reason)
+    return dataclasses.replace(found, method=method, reason=reason, **started)
 
 
 def solve_exact(
@@ -123,9 +127,8 @@ def solve_exact(
                 found = _found(problem, [start], best, root_bound, 1)
                 assert found.value is not None and found.bound is not None
                 if problem.criterion.efficiency(found.value, found.bound) >= enough:
-                    return dataclasses.replace(found, seed=seed, restarts=restarts)
-            found = _enumerate(problem, pool, best, deadline)
-            return dataclasses.replace(found, seed=seed, restarts=restarts)
+                    return found
+            return _enumerate(problem, pool, best, deadline)
     start = exchange_indices(problem, restarts, seed, _half(deadline))
     keep, first = _groups(problem, merge=best == 1)
     counts = np.bincount(start, minlength=len(problem.blocks))
@@ -146,8 +149,7 @@ def solve_exact(
     )
     subsets = [_expand(problem, keep, first, each) for each in searched.counts]
     bound = None if searched.proven else searched.bound
-    found = _found(problem, subsets, best, bound, searched.nodes)
-    return dataclasses.replace(found, seed=seed, restarts=restarts)
+    return _found(problem, subsets, best, bound, searched.nodes)
 
 
 def _half(deadline: float | None) -> float | None:
@@ -247,7 +249,7 @@ def _found(
 
     ``phi`` is a bound on it from above; None where the first is proven.
     """
-    chosen, criterion = np.stack(subsets), problem.criterion
+    chosen, criterion = np.array(subsets), problem.criterion
     value, log_det = values(problem, chosen)
     better = max if criterion.larger_is_better else min
     order = np.argsort(-value if better is max else value, kind="stable")[:best]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -133,15 +134,16 @@ class Problem:
         unit = np.sqrt(np.diagonal(information))  # a selection's own scale
         if not unit.all():
             return np.inf
-        least, largest = np.linalg.eigvalsh(information / unit / unit[:, None])[[0, -1]]
+        shares = np.linalg.eigvalsh(information / (unit[:, None] * unit))
+        least, largest = float(shares[0]), float(shares[-1])
         if not least > 0.0:
             return np.inf
         size = np.abs(rows @ self.white.triangle)
         if self.white.size is not None:
             size += self.white.size
-        error = _EPS * p * (size @ np.abs(self.white.inverse)) / unit
-        of_blocks = 2.0 * np.sqrt((error * error).sum() / least)
-        return float(of_blocks + _EPS * len(rows) * largest / least)
+        error = (size @ np.abs(self.white.inverse) / unit).ravel()
+        of_blocks = 2.0 * p * math.sqrt(float(error @ error) / least)
+        return _EPS * (of_blocks + len(rows) * largest / least)
 
     def log_det(self, indices: Indices) -> float:
         """log det S of a subset, natural, in the caller's units; -inf if singular."""
