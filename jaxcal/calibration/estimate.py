@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration.sizes import Sizes, group_sizes, misfit_size, of_sizes
-from jaxcal.calibration.solve import Solution, Task, apart, solve, student_constants
+from jaxcal.calibration.solve import Solution, Task, singular, solve, student_constants
 from jaxcal.checks import array_of, one_of, require_kind
-from jaxcal.information.blocks import triangle
 from jaxcal.information.singular import exact_zeros, null_directions, significant
 from jaxcal.models.identifiability import unknown
 from jaxcal.models.model import Model, as_model, derivative
@@ -272,8 +271,8 @@ def _fields(
     noise_std: Array | None = _noise(task, found, weights[used])
     noise_dof = 0.0
     if not task.known:
-        shared = np.unique(found.level, return_inverse=True)[1]
-        noise_dof = float(np.bincount(shared, found.freedom).min())
+        same = found.level[:, None] == found.level
+        noise_dof = float((same @ found.freedom).min())
         if freedom < 1.0 or noise_dof <= 0.0:
             noise_std, noise_dof = None, 0.0
     origin = 0.0 if centre is None else centre
@@ -314,8 +313,7 @@ def _fields(
 def _noise(task: Task, found: Solution, weights: Array) -> Array:
     """(q,) of a reading of weight 1; root mean square where they were given apart."""
     inverse = np.linalg.inv(task.white) * np.sqrt(weights)[:, None, None]
-    each = inverse @ np.matrix_transpose(inverse)
-    std = np.sqrt(np.diagonal(each, axis1=1, axis2=2).mean(axis=0))
+    std = np.sqrt((inverse**2).sum(axis=2).mean(axis=0))
     return np.asarray(std * found.level)
 
 
@@ -326,20 +324,23 @@ def _covariance(task: Task, found: Solution, rows: Array) -> tuple[Array, Array 
         ValueError: every reading is used up and parameters are still undetermined.
     """
     size, free = len(task.mean), np.flatnonzero(task.free)
+    if found.root is not None:
+        covariance = np.zeros((size, size))
+        covariance[np.ix_(free, free)] = found.root @ found.root.T
+        return covariance, None
     precision = task.precision[free]
     scale = np.sqrt((rows**2).sum(axis=0) + precision)
     scale = np.where(scale > 0.0, scale, 1.0)
     whole = np.concatenate([rows, np.diag(np.sqrt(precision))]) / scale
     root, null = [np.zeros((0, len(free)))], [np.zeros((0, len(free)))]
     of_rows = 0  # combinations of the parameters that the readings use up
-    for columns in apart(whole):
-        _, singular, right = np.linalg.svd(triangle(whole[:, columns]))
-        known = significant(singular)
+    for columns, of_columns, right in singular(whole):
+        known = significant(of_columns)
         turned = np.zeros((len(columns), len(free)))
         turned[:, columns] = right
-        root.append(turned[known] / singular[known, None])
+        root.append(turned[known] / of_columns[known, None])
         null.append(exact_zeros(turned[~known]))
-        alone = singular
+        alone = of_columns
         if not known.all():
             alone = np.linalg.svd(rows[:, columns] / scale[columns], compute_uv=False)
         of_rows += int(significant(alone).sum())

@@ -24,7 +24,7 @@ from jaxcal.information.blocks import triangle
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model, derivative, predict, without_effect
 
-__all__ = ["Solution", "Task", "apart", "solve", "student_constants"]
+__all__ = ["Solution", "Task", "singular", "solve", "student_constants"]
 
 Array = NDArray[np.float64]
 
@@ -95,6 +95,8 @@ def solve(
         start = solve(dataclasses.replace(task, student=False), rough=True)
         start.weights = student_weight(start.deleted, start.left)
     search = Solution(task, start, rough)
+    if search.direct():
+        return search.finish(search.solved)
     evidence: list[float] = []
     for _ in range(_LIMIT):
         evidence.append(search.evidence)
@@ -125,17 +127,33 @@ def apart(rows: Array) -> list[NDArray[np.intp]]:
 
     Each group is solved by itself, so a rounding of one is none of another.
     """
-    filled = rows != 0.0
-    joined = filled.T.astype(np.float64) @ filled > 0.0
-    groups, rest = [], np.ones(rows.shape[1], dtype=np.bool_)
-    while rest.any():
-        group = np.zeros_like(rest)
-        group[rest.argmax()] = True
-        while (more := group | joined[group].any(axis=0)).sum() > group.sum():
-            group = more
-        groups.append(np.flatnonzero(group))
-        rest &= ~group
-    return groups
+    filled = (rows != 0.0).astype(np.float64)
+    joined = filled.T @ filled > 0.0
+    np.fill_diagonal(joined, True)
+    if joined.all():
+        return [np.arange(rows.shape[1])]
+    while (more := joined.astype(np.float64) @ joined > 0.0).sum() > joined.sum():
+        joined = more
+    first = joined.argmax(axis=1)  # column of the group of each
+    return [np.flatnonzero(first == column) for column in dict.fromkeys(first)]
+
+
+def singular(rows: Array) -> list[tuple[NDArray[np.intp], Array, Array]]:
+    """Of each group of ``apart`` columns (c,): these, singular values, right vectors.
+
+    The rows (R, F) must be F or more. The right singular vectors are (c, c).
+    """
+    groups = apart(rows)
+    sizes = {len(columns) for columns in groups}
+    if len(sizes) == 1 and len(rows) <= 128:  # all at once
+        of_groups = rows.T[np.array(groups)].transpose(0, 2, 1)
+        _, size, right = np.linalg.svd(of_groups, full_matrices=False)
+        return list(zip(groups, size, right, strict=True))
+    found = []
+    for columns in groups:
+        _, size, right = np.linalg.svd(triangle(rows[:, columns]))
+        found.append((columns, size, right))
+    return found
 
 
 class Solution:
@@ -150,6 +168,7 @@ class Solution:
     deleted: Array  # (N,) the same from the fit without that measurement
     left: int  # readings of a measurement less its unknown commands
     freedom: Array  # (q,) residual degrees of freedom of each output
+    root: Array | None = None  # (F, F) of the covariance, where it is at hand
     rows: Array  # (N, R, F) whitened derivatives, commands eliminated, no weights
 
     def __init__(self, task: Task, start: Solution | None, rough: bool) -> None:
@@ -223,13 +242,50 @@ class Solution:
         """
         rows, _, scale = self._system(0.0)
         directions = []
-        for columns in apart(rows):
-            _, size, right = np.linalg.svd(triangle(rows[:, columns]))
+        for columns, size, right in singular(rows):
             known = np.flatnonzero(significant(size))
             block = np.zeros((rows.shape[1], len(known)))
             block[columns] = (right[known] / size[known, None] / scale[columns]).T
             directions.append(block)
         return np.hstack(directions)
+
+    def direct(self) -> bool:
+        """Take the one step that is the answer; True where that is so.
+
+        Of least squares of a linear model without a prior, where the levels of noise,
+        if there are several, each have parameters of their own.
+        """
+        task = self.task
+        known = task.precision[task.free].any() or len(self.known)
+        if self.basis is None or task.student or known:
+            return False
+        moved = (self.by_theta != 0.0).any(axis=0)  # (q, F) by which parameter
+        if not task.known and self.shared.any():
+            of_level = [moved[self.shared == k].any(axis=0) for k in set(self.shared)]
+            if np.sum(of_level, axis=0).max() > 1:
+                return False
+        rows, right, scale = self._system(0.0)
+        cost, level, shared = float(right @ right), self.level, self.shared
+        inverse, target = _factor(rows, right, self.damping)
+        self.solved = rows, inverse
+        self.parameters = self.parameters.copy()
+        self.parameters[task.free] += self.basis @ (inverse @ target / scale)
+        self.residuals = task.measured - predict(
+            task.model, self.commands, self.parameters
+        )
+        distance = self._distance(self.residuals, self.commands)
+        gain = float(target @ target)
+        as_said = abs(cost - gain - distance.sum()) <= 1e-9 * cost
+        if not task.known:
+            self._estimate_level(distance)
+        # Where noise is as small as rounding of what was measured, another step helps.
+        exact = 1e-28 * cost * (level / self.level).max() ** 2 <= self.least
+        if not (as_said and exact and self.shared is shared):
+            return False
+        if self.basis.shape[1] == len(self.basis):
+            changed = (self.level / level)[moved.argmax(axis=0)]
+            self.root = changed[:, None] * (self.basis / scale @ inverse)
+        return True
 
     def _keep_undetermined(self) -> None:
         """Move to the prior's mean in directions that nothing determines."""
@@ -408,7 +464,7 @@ class Solution:
         self.level = self.level * np.exp(self.climbed)
 
     def _leverage(self, solved: tuple[Array, Array] | None = None) -> Array:
-        """(N, R, F) roots of the hat matrix, of the readings."""
+        """(N, R, F) roots of the hat matrix, of the readings, at any level."""
         if solved is None:
             rows, right, _ = self._system(0.0)
             solved = rows, _factor(rows, right, _LEAST_DAMPING)[0]
@@ -430,11 +486,15 @@ class Solution:
         whole = np.round(freedom)
         return np.where(np.abs(freedom - whole) < 1e-9, whole, freedom)
 
-    def finish(self) -> Solution:
-        """Itself, with what is said of the measurements where it ended."""
-        readings = self._leverage()
+    def finish(self, solved: tuple[Array, Array] | None = None) -> Solution:
+        """Itself, with what is said of the measurements where it ended.
+
+        ``solved`` is the system there as ``_factor`` left it, if that is known.
+        """
+        readings = self._leverage(solved)
         self.rows, right = self._reduce(0.0)
-        self.freedom = self._freedom(readings)
+        if solved is None or self.task.known:
+            self.freedom = self._freedom(readings)
         self.distance = self._distance(self.residuals, self.commands)
         gap = np.eye(right.shape[1]) - readings @ np.matrix_transpose(readings)
         gap += 1e-9 * np.eye(right.shape[1])

@@ -75,11 +75,10 @@ def regression_matrix(commands: ArrayLike, num_outputs: int | None = None) -> Ar
     *batch, num_postures, num_inputs = commands.shape
     m = num_inputs if num_outputs is None else num_outputs
     whole_number("num_outputs", m, 1)
-    eye = np.eye(m)
-    slopes = np.einsum("ab,...ni->...nabi", eye, commands)
-    slopes = slopes.reshape(*batch, num_postures, m, m * num_inputs)
-    biases = np.broadcast_to(eye, (*batch, num_postures, m, m))
-    rows = np.concatenate([slopes, biases], axis=-1)
+    rows, output = np.zeros((*batch, num_postures, m, m * (num_inputs + 1))), range(m)
+    for i in output:
+        rows[..., i, i * num_inputs : (i + 1) * num_inputs] = commands
+    rows[..., output, m * num_inputs + np.arange(m)] = 1.0
     return rows.reshape(*batch, num_postures * m, m * (num_inputs + 1))
 
 

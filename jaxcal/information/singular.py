@@ -136,8 +136,11 @@ def null_directions(
     norms, rounding = lengths[0], shares[0]
     still = norms == 0.0
     unit = columns / np.where(still, np.inf, norms)
-    unit = np.pad(unit, ((0, max(0, p - len(unit))), (0, 0)))
+    if len(unit) < p:
+        unit = np.concatenate([unit, np.zeros((p - len(unit), p))])
     _, singular, right = np.linalg.svd(unit, full_matrices=False)
+    if p and singular[-1] > rounding:
+        return []
     null = [np.eye(p)[i] for i in np.flatnonzero(still)]
     free = right[singular <= rounding][:, ~still]
     if free.size:

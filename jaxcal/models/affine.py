@@ -56,7 +56,8 @@ class Affine(Model):
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
         """Outputs (N, m) at commands (N, n) for parameters (m (n + 1),)."""
-        return self.jacobian(commands) @ as_parameters(self, parameters)
+        matrix, bias = self.affine(as_parameters(self, parameters))
+        return as_commands(self, commands) @ matrix.T + bias
 
     def jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
@@ -85,8 +86,10 @@ class Affine(Model):
 
     def centred(self, centre: Array) -> Array:
         """(p, p): the outputs at the centre stand for b."""
-        to_centred, slopes = np.eye(self.num_parameters), self.num_outputs * len(centre)
-        to_centred[slopes:, :slopes] = np.kron(np.eye(self.num_outputs), centre)
+        m, n = self.num_outputs, self.num_inputs
+        to_centred, output = np.eye(m * (n + 1)), np.arange(m)
+        slopes = to_centred[:, : m * n].reshape(-1, m, n)
+        slopes[m * n + output, output] = centre
         return to_centred
 
     def affine(self, parameters: Array) -> tuple[Array, Array]:

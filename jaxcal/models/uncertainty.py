@@ -172,6 +172,8 @@ class Noise:
             command_jacobian: (N, q, n) of the model; needed with ``command_std``.
         """
         shape = (count, num_outputs, num_outputs)
+        if self.covariance is None and self.command_std is None:
+            return np.broadcast_to(np.eye(num_outputs) / self._std(*shape[:2]), shape)
         covariance = self._of_readings(count, num_outputs)
         unknown = np.zeros((count, num_outputs, 0))
         if self.command_std is not None:
@@ -197,13 +199,7 @@ class Noise:
     def _of_readings(self, count: int, q: int) -> Array:
         """(q, q) or (N, q, q) covariance."""
         if self.covariance is None:
-            std = np.asarray(1.0 if self.std is None else self.std, dtype=np.float64)
-            if std.shape not in ((), (q,), (count, q)):
-                raise ValueError(
-                    f"std of the noise must be one number, ({q},) or ({count}, {q}), "
-                    f"got {std.shape}"
-                )
-            return np.eye(q) * np.square(std)[..., None]
+            return np.eye(q) * np.square(self._std(count, q))
         covariance = np.asarray(self.covariance, dtype=np.float64)
         if covariance.shape not in ((q, q), (count, q, q)):
             raise ValueError(
@@ -220,6 +216,16 @@ class Noise:
                 f"{np.linalg.eigvalsh(covariance).min():.3g}"
             )
         return covariance
+
+    def _std(self, count: int, q: int) -> Array:
+        """(1, 1), (q, 1) or (N, q, 1) of the readings."""
+        std = np.asarray(1.0 if self.std is None else self.std, dtype=np.float64)
+        if std.shape not in ((), (q,), (count, q)):
+            raise ValueError(
+                f"std of the noise must be one number, ({q},) or ({count}, {q}), "
+                f"got {std.shape}"
+            )
+        return std.reshape(1, 1) if std.ndim == 0 else std[..., None]
 
     def of_commands(self, n: int) -> Array:
         """(n,) command_std, zero where it is not given."""
