@@ -55,7 +55,7 @@ def test_intervals_hold_the_truth_and_predictions_err_as_stated(name, kind):
     count = max(20, 60 // len(noise))
     for size in (0.25, 1.0, 4.0):
         inside, ratios = [], []
-        for seed in range(8):
+        for seed in range(24):
             rng = np.random.default_rng(seed)
             std = known.copy()
             std[: arm.table.size] *= size
@@ -80,5 +80,14 @@ def test_intervals_hold_the_truth_and_predictions_err_as_stated(name, kind):
             off = (fit.predict(commands[count:]) - exact[count:]) / noise
             stated = fit.predict_std(commands[count:]) / noise
             ratios.append(np.sqrt(np.mean(stated**2) / np.mean(off**2)))
-        assert 0.9 < np.mean(inside) < 0.995, (size, np.mean(inside))
-        assert 0.7 < np.median(ratios) < 2.0, (size, ratios)
+        print(
+            name,
+            kind,
+            size,
+            np.round(np.mean(inside), 4),
+            np.round(np.median(ratios), 2),
+        )
+        # Contacts of a SCARA hardly tell that its errors are a quarter: the prior does.
+        most = 0.985 if size > 0.25 else 0.995
+        assert 0.92 < np.mean(inside) < most, (size, np.mean(inside))
+        assert 0.8 < np.median(ratios) < 2.0, (size, ratios)
