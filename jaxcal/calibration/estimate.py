@@ -342,7 +342,8 @@ def _covariance(task: Task, found: Solution, rows: Array) -> tuple[Array, Array 
         null.append(exact_zeros(turned[~known]))
         alone = of_columns
         if not known.all():
-            alone = np.linalg.svd(rows[:, columns] / scale[columns], compute_uv=False)
+            of_readings = rows[:, columns] / scale[columns]
+            alone = np.asarray(np.linalg.svd(of_readings, compute_uv=False), np.float64)
         of_rows += int(significant(alone).sum())
     factor, unseen = np.concatenate(root) / scale, np.concatenate(null) / scale
     readings = found.left * len(task.commands)
