@@ -195,11 +195,10 @@ def timeouts_left(records: list[Record]) -> dict[str, Record]:
 
 @dataclasses.dataclass
 class Seen:
-    """What the phone has shown of the axes at postures, since the zero."""
+    """What the phone has shown of the axes at the last posture, since the zero."""
 
-    commanded: Array  # (3,) degrees, at the last posture
+    commanded: Array  # (3,) degrees
     measured: Array
-    unproven: list[list[str]]  # names of postures since each axis was seen to follow
 
 
 class Device:
@@ -240,7 +239,7 @@ class Device:
         self.zero: Posture | None = None  # once it is taken,
         self.frame: Frame | None = None  # and what the phone reads against it
         self.heard = 0  # connection of the phone by which the frame holds
-        self.seen = Seen(np.zeros(3), np.zeros(3), [[], [], []])
+        self.seen = Seen(np.zeros(3), np.zeros(3))
         self.line_watch = LineWatch(self.drives, run)
         self.heartbeat = Heartbeat(self.stopper, self.requests, config)
         self.bus.check = self._before_exchange

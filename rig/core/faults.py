@@ -34,15 +34,7 @@ class MotionFault(Fault):
 
 
 class NotFollowing(MotionFault):
-    """A drive turned and the IMU did not see it.
-
-    ``suspects`` are the postures recorded since the axis was last seen to follow: the
-    coupling may have slipped before any of them.
-    """
-
-    def __init__(self, text: str, suspects: list[str]) -> None:
-        self.suspects = suspects
-        super().__init__(text)
+    """A drive turned and the IMU did not see it."""
 
 
 class EndedShort(MotionFault):

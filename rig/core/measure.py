@@ -24,7 +24,7 @@ def zeroed(device: Device, frame: Frame, zero: Posture) -> None:
     """Measure against this zero posture from now on."""
     device.frame, device.zero, device.heard = frame, zero, device.imu.connections
     at_deg = device.config.to_deg(zero.pulses)
-    device.seen = Seen(at_deg, np.zeros(3), [[], [], []])
+    device.seen = Seen(at_deg, np.zeros(3))
 
 
 def measure(standing: Standing, samples: int | None = None) -> dict[str, Any]:
@@ -44,7 +44,8 @@ def measure(standing: Standing, samples: int | None = None) -> dict[str, Any]:
         MotionFault: it does not settle in time, or the IMU disagrees with the drives.
         ImuError, BusError, StopRequested: stop everything.
     """
-    (device, (name, target)), settle = standing, standing.device.config.settle
+    device, target = standing.device, standing.posture.pulses
+    settle = device.config.settle
     deadline = time.monotonic() + settle.timeout_s
     readings: list[Reading] = []
     while not readings:  # the stream paused, or what was read was not quiet
@@ -63,7 +64,7 @@ def measure(standing: Standing, samples: int | None = None) -> dict[str, Any]:
     feedback = [status.position for status in statuses]
     _check_position(device, target, feedback)
     if device.oriented:
-        _check_agreement(device, commanded, angles, name)
+        _check_agreement(device, commanded, angles)
     return {
         "pulses": list(target),
         "feedback": feedback,
@@ -171,9 +172,7 @@ def _check_position(device: Device, target: Pulses, feedback: list[int]) -> None
             )
 
 
-def _check_agreement(
-    device: Device, commanded: Array, measured: Array, label: str
-) -> None:
+def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
     """The joints are where the drives say, roughly, and moved when they moved."""
     apart = np.abs(measured - commanded)
     if (apart > DISAGREEMENT_DEG).any():
@@ -189,17 +188,12 @@ def _check_agreement(
     followed = np.sign(way) * (measured - seen.measured)
     leading = max(FOLLOW_MIN_DEG, FOLLOW_LEADING * float(asked.max()))
     for index, name in enumerate(AXIS_NAMES):
-        if asked[index] < leading:
-            seen.unproven[index].append(label)
-        elif followed[index] < FOLLOW_SHARE * asked[index]:
+        if asked[index] >= leading and followed[index] < FOLLOW_SHARE * asked[index]:
             hint = "a slipped coupling, a frozen stream, or axes mixed up"
             if followed[index] < -FOLLOW_SHARE * asked[index]:
                 hint = f"axes.{name}.direction, its wiring, and imu.signs"
             raise NotFollowing(
                 f"the drive of {name} turned {asked[index]:.1f} deg, the IMU "
-                f"saw {followed[index]:.2f}. Look for {hint}",
-                seen.unproven[index],
+                f"saw {followed[index]:.2f}. Look for {hint}"
             )
-        else:
-            seen.unproven[index] = []
     seen.commanded, seen.measured = commanded, measured

@@ -278,9 +278,8 @@ def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
         while found is None or not device.oriented:  # the phone came back in between
             _reorient(device)
             found = measure(move(device, posture))
-    except NotFollowing as fault:
-        if fault.suspects:
-            device.emit("void", sync=True, names=fault.suspects)
+    except NotFollowing:
+        _withdraw(run)
         raise
     except EndedShort as fault:
         ended = {"name": name, "axis": fault.axis, "pulses": fault.pulses}
@@ -297,6 +296,16 @@ def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
     record = device.emit("posture", sync=True, name=name, **found, **fields)
     device.requests.check_pause()
     return record
+
+
+def _withdraw(run: RunFolder) -> None:
+    """A coupling slips, perhaps by a little before it was seen: what was measured
+    since the zero posture was read last is measured again."""
+    looked = [*run.journal.events("zero"), *run.journal.events("reference")]
+    since = max((record["seq"] for record in looked), default=0)
+    names = [n for n, record in run.postures().items() if record["seq"] > since]
+    if names:
+        run.emit("void", sync=True, names=names)
 
 
 def _ended_there(device: Device, ended: Record) -> bool:

@@ -134,7 +134,10 @@ class RunState:
                 if posture.role == "reference":
                     self.drift.append((now, record["measured_deg"]))
             case "unreachable" | "void":
-                lost, note = "withdrawn", "recorded while an axis slipped"
+                lost, note = (
+                    "withdrawn",
+                    "an axis slipped, perhaps before this was measured",
+                )
                 if event == "unreachable":
                     lost, note = event, record["reason"]
                 for name in record.get("names") or [record["name"]]:
