@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 _POWER = 0.8
 _KNOWN = 1e9  # degrees of freedom of noise that was given
 _DRIFT = 10.0  # standard deviations of the prior: no parameter drifts by more
+_RATIOS = 16  # quantiles of how far noise that was estimated is off
 _SWEEPS = 20  # of swaps, at most
 _UNITS = {  # factors between units that are mistaken for each other
     1000.0: "metres for millimetres",
@@ -135,8 +136,7 @@ def check(
     square = float(white @ white)
     dof = calibration.noise_dof or _KNOWN
     p_value = float(special.fdtrc(freedom, dof, square / freedom))
-    limit = special.fdtri(freedom, dof, 0.95) / least
-    needed = least * float(special.ncfdtrinc(freedom, dof, 1.0 - _POWER, limit))
+    needed = _needed(freedom, dof, least)
     free = (calibration.free[:p] > 0.0) & ~own
     seen = np.sqrt((by**2).sum(axis=0))
     with np.errstate(divide="ignore"):
@@ -241,9 +241,30 @@ def _mean_power(freedom: int, dof: float, shifts: Array, least: float = 1.0) -> 
     from scipy import special
 
     limit = special.fdtri(freedom, dof, 0.95) / least
-    missed = special.ncfdtr(freedom, dof, shifts / least, limit)
-    seen = 1.0 - np.nan_to_num(missed, nan=0.0)  # NaN where far too large
+    # Noise that was estimated is as uncertain here as in the test: the ratio of the
+    # squared estimate to the true variance is a chi-square over its dof.
+    ratio = np.ones(1)
+    if dof < _KNOWN:
+        chance = (np.arange(_RATIOS) + 0.5) / _RATIOS
+        ratio = special.gammaincinv(dof / 2.0, chance) * 2.0 / dof
+    shifts = np.asarray(shifts)[..., None] / least
+    missed = special.chndtr(limit * freedom * ratio, freedom, shifts * ratio)
+    seen = (1.0 - np.nan_to_num(missed, nan=0.0)).mean(axis=-1)  # NaN where too large
     return np.asarray(seen.mean(axis=-1))
+
+
+def _needed(freedom: int, dof: float, least: float) -> float:
+    """Noncentrality of a change that is seen with the power asked for."""
+    low, high = 0.0, 1.0
+    while _mean_power(freedom, dof, np.array([high]), least) < _POWER and high < 1e12:
+        low, high = high, 4.0 * high
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        if _mean_power(freedom, dof, np.array([middle]), least) < _POWER:
+            low = middle
+        else:
+            high = middle
+    return high
 
 
 def verification(

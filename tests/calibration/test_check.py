@@ -183,3 +183,23 @@ def test_readings_in_another_unit_are_named(factor):
     assert said.endswith("; calibrate again")
     rng.shuffle(y)
     assert found.check(u[:5], 900.0 * y[:5]).says == "does not hold"
+
+
+def test_power_with_few_degrees_of_freedom_is_what_is_found():
+    """Noise from two residuals is off by half, to which the power owes as much."""
+    rng, said, found = np.random.default_rng(0), [], []
+    model = jaxcal.models.Affine(2, 1)
+    for _ in range(250):
+        commands, again = rng.uniform(-1.0, 1.0, (5, 2)), rng.uniform(-1.0, 1.0, (3, 2))
+        truth = model.nominal
+        measured = model.predict(commands, truth) + 0.1 * rng.normal(size=(5, 1))
+        calibration = jaxcal.identify(commands, measured)
+        slopes = model.jacobian(commands, truth)[:, 0]
+        change = np.zeros(3)
+        which = rng.integers(3)
+        change[which] = 0.5 / np.sqrt((slopes[:, which] ** 2).mean())
+        measured = model.predict(again, truth + change) + 0.1 * rng.normal(size=(3, 1))
+        result = calibration.check(again, measured, tolerance=0.5)
+        said.append(result.power)
+        found.append(result.p_value < 0.05)
+    assert abs(np.mean(said) - np.mean(found)) < 0.08  # .15 with the noise taken as is

@@ -38,6 +38,7 @@ def test_good_contacts_get_a_good_verdict():
     assert "held-out error" in found.summary()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by_default", [False, True])
 def test_held_out_errors_are_those_of_fits_without_each_contact(by_default):
     rows = np.arange(0, 62, 2)

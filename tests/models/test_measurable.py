@@ -108,6 +108,7 @@ def test_links_stay_clear_of_boxes():
         assert (far.min() > 35.0) == bool(clear)
 
 
+@pytest.mark.slow
 def test_a_socket_that_no_posture_reaches_is_named():
     arm = ur5(sensor=Socket(2))
     with pytest.raises(ValueError, match=r"socket 1 at \(3000, 0, 0\) must be reached"):
