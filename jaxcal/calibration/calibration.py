@@ -129,8 +129,9 @@ class Calibration(Fit):
         """The arm's own file, corrected; see ``jaxcal.models.SerialChain.write``.
 
         Files have stiff joints and round gears: what was found of compliance and
-        harmonics is not in them, and the rest is fitted again without it. A warning
-        says how far off the file is then.
+        harmonics is not in them. Without compliance the arm is moved as a whole to where
+        its tip agrees best with the calibration's over its range; without harmonics
+        alone the rest is fitted again. A warning says how far off the file is then.
 
         Returns the tip link.
         """
@@ -152,6 +153,21 @@ class Calibration(Fit):
         kept = np.isin(self.names, plain.names)
         if kept.all() and not self.estimate[len(self.names) :].any():
             return parameters
+        unit = f" {self.measured_unit}" if self.measured_unit else ""
+        if not kept.all():
+            parameters[~kept] = 0.0
+            parameters = self.model.standing_as(self.arm, parameters, self.commands)
+            file = self.model.calibrated(parameters)
+            joints = self.commands[:, : file.num_inputs]
+            off = file.predict(joints) - self.arm.predict(joints)
+            warnings.warn(
+                "the file has stiff joints and round gears: the arm without compliance "
+                "and harmonics, moved as a whole, whose tip at the measured postures "
+                f"is {np.linalg.norm(off, axis=1).mean():.3g}{unit} from the "
+                "calibration's on average",
+                stacklevel=3,
+            )
+            return parameters
         fields = fit_model(
             self.commands,
             self.residuals + self.predict(self.commands),
@@ -164,7 +180,6 @@ class Calibration(Fit):
         )
         again = dataclasses.replace(self, **fields)
         parameters[kept], parameters[~kept] = again.parameters, 0.0
-        unit = f" {self.measured_unit}" if self.measured_unit else ""
         moved = self.predict(self.commands) - again.predict(self.commands)
         told = (
             "its predictions at the measured postures are "
@@ -178,7 +193,7 @@ class Calibration(Fit):
             )
         warnings.warn(
             "the file has stiff joints and round gears and was fitted without "
-            f"{'compliance and ' if not kept.all() else ''}harmonics: {told}",
+            f"harmonics: {told}",
             stacklevel=3,
         )
         return parameters

@@ -264,6 +264,13 @@ class Model(abc.ABC):
         """This model without the parameters that no file of ``write`` holds."""
         return self
 
+    def standing_as(self, other: Any, parameters: Array, commands: Array) -> Array:
+        """(p,) ``parameters`` with the machine moved as a whole to where ``other`` is.
+
+        ``commands`` (N, n) show the range of what has no limits.
+        """
+        return parameters
+
     def write(
         self, form: str, path: Any, parameters: ArrayLike, *, force: bool = False
     ) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 
+import contacts
 import numpy as np
 import pytest
 
@@ -123,6 +124,33 @@ def test_a_urdf_file_is_fitted_without_harmonics_and_says_what_that_costs(tmp_pa
     assert left_out < off < naive
     said = re.search(r"held-out error (\S+), of the calibration", str(told[0].message))
     assert off < float(said[1]) < 2.0 * off
+
+
+@pytest.mark.parametrize(
+    ("name", "place"), [("panda_1", "right"), ("kuka_14", "front")]
+)
+def test_a_file_of_a_real_arm_without_compliance_errs_as_one_that_drops_it(
+    name, place, tmp_path
+):
+    """At the other places; and its tip is nearer to the calibration's."""
+    places = contacts.load(name)
+    every = np.arange(len(places[place][0]))
+    fit = contacts.identify(name, places.pop(place), every)
+    assert any("compliance" in name for name in fit.names)
+    with pytest.warns(UserWarning, match="moved as a whole"):
+        tip = fit.to_urdf(tmp_path / "arm.urdf")
+    file = SerialChain.from_urdf(tmp_path / "arm.urdf", tip=tip)
+    plain = fit.parameters.copy()
+    plain[~np.isin(fit.names, fit.model.writable().names)] = 0.0
+    dropped = fit.model.calibrated(plain)
+    error, far = np.zeros((2, 2))
+    for joints, sockets in places.values():
+        for k, arm in enumerate((file, dropped)):
+            error[k] += contacts.consistency(arm, (joints, sockets))
+            off = arm.predict(joints) - fit.arm.predict(joints)
+            far[k] += np.linalg.norm(off, axis=1).mean()
+    assert error[0] < 1.001 * error[1]
+    assert far[0] < 0.9 * far[1]
 
 
 @pytest.mark.parametrize(("seed", "count"), [(34, 8), (50, 8), (1, 60)])

@@ -30,6 +30,9 @@ __all__ = ["SerialChain"]
 
 Array = NDArray[np.float64]
 
+_POSTURES = 500  # that show where an arm stands
+_BASE = ("x", "y", "z", "rx", "ry", "rz")
+
 _COLUMNS = ("a", "alpha", "d", "theta", "beta")
 # Standard deviations of the default prior. On a UR5 (links of 1.19 m in all): 1.8 mm,
 # 0.3 degrees of the axes and 0.5 of a joint's zero, which is set by hand; 0.12 m and
@@ -475,6 +478,35 @@ class SerialChain(Arm, Model):
             harmonics=(),
             waves=np.zeros((0, 4)),
         )
+
+    def standing_as(self, other: Any, parameters: Array, commands: Array) -> Array:
+        """(p,) ``parameters``, the base where the tip is nearest to that of ``other``.
+
+        Over all postures within the limits of the joints; where there are none, within
+        a turn or the range of ``commands``.
+        """
+        from scipy.spatial.transform import Rotation
+
+        joints = commands[:, : self.num_joints]
+        turns = np.array([kind == "R" for kind in self.joints])
+        limits = np.array(self.limits, dtype=np.float64)
+        limits[turns] = np.clip(limits[turns], -180.0, 180.0)
+        seen = np.column_stack([joints.min(axis=0), joints.max(axis=0)])
+        low, high = np.where(np.isfinite(limits), limits, seen).T
+        rng = np.random.default_rng(0)
+        postures = rng.uniform(low, high, (_POSTURES, len(low)))
+        own = self.calibrated(parameters).predict(postures)
+        wanted = np.asarray(other.predict(postures))
+        turn, _ = Rotation.align_vectors(
+            wanted - wanted.mean(axis=0), own - own.mean(axis=0)
+        )
+        at = [self.names.index(f"base {axis}") for axis in _BASE]
+        base = pose_matrix(parameters[at])
+        moved = parameters.copy()
+        place = turn.apply(base[:3, 3] - own.mean(axis=0)) + wanted.mean(axis=0)
+        turned = (turn * Rotation.from_matrix(base[:3, :3])).as_euler("XYZ", True)
+        moved[at] = np.concatenate([place, turned])
+        return moved
 
     def write(
         self,
