@@ -129,9 +129,9 @@ class Calibration(Fit):
         """The arm's own file, corrected; see ``jaxcal.models.SerialChain.write``.
 
         Files have stiff joints and round gears: what was found of compliance and
-        harmonics is not in them. Without compliance the arm is moved as a whole to where
-        its tip agrees best with the calibration's over its range; without harmonics
-        alone the rest is fitted again. A warning says how far off the file is then.
+        harmonics is not in them. Without compliance the arm is moved as a whole to
+        where its tip agrees best with the calibration's over its range; without
+        harmonics alone the rest is fitted again. A warning says how far off it is then.
 
         Returns the tip link.
         """
