@@ -252,7 +252,7 @@ def test_reports_of_collect_verify_and_goto(run, tmp_path, capsys):
     out = ["--out", str(tmp_path / "more")]
     assert main(["collect", *given, *out, "--count", "3"]) == 0
     assert main(["verify", str(run), *given, *out, "--count", "1"]) in (0, 1)
-    assert main(["goto", str(run), *given, *out, "--to", "1", "-4", "2"]) == 0
+    assert main(["goto", str(run), *given, *out, "--use", "--to", "1", "-4", "2"]) == 0
     capsys.readouterr()
     folders = sorted((tmp_path / "more").iterdir())
     assert [path.name.split("-")[0] for path in folders] == [
