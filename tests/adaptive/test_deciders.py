@@ -86,7 +86,7 @@ def chosen(task, deciders):
     @jax.jit
     def choose(task, deciders, key):
         belief = GridBelief(task.prior).update(task, 1, 2)
-        session = task.spend(task.session(7.0, 2), 1, 2)
+        session = task.spend(task.session(7.0, 4), 1, 2)
         options = task.options(belief, session)
         return options.allowed, {
             name: decider(task, belief, session, options, key)

@@ -134,8 +134,8 @@ def test_a_static_sequence_is_as_good_as_the_best_of_all():
     keys = jax.random.split(jax.random.key(5), 256)
     found = sequence.optimise(task, length=3, episodes=256, starts=8, seed=5)
 
-    def nats(sequence):
-        return float(play(task, sequence.Static(np.array(sequence)), keys).gain.mean())
+    def nats(designs):
+        return float(play(task, sequence.Static(np.array(designs)), keys).gain.mean())
 
     every = [nats((a, b, c)) for a in range(6) for b in range(6) for c in range(6)]
     assert nats(found.sequence) == pytest.approx(max(every), rel=0.02)
