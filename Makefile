@@ -11,9 +11,10 @@ READY := $(VENV)/.ready
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile --no-deps
 KERNELS := hatch_build.py $(shell find jaxcal -name '*kernel.py' -o -name '*.pxd')
 
-# Newer versions end at this flag, which they do not know.
-EMITTERS = $(shell $(BIN)/python -c 'import importlib.metadata as m; \
-	print("--xla_cpu_use_fusion_emitters=false" * m.version("jaxlib").startswith("0.10."))')
+# Newer versions end at the second flag, and with the first their loss is NaN.
+QUICK_XLA = $(shell $(BIN)/python -c 'import importlib.metadata as m; print(\
+	"--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false" \
+	* m.version("jaxlib").startswith("0.10."))')
 
 .DEFAULT_GOAL := help
 .PHONY: help train checkpoint evaluate reproduce test test-all lint format benchmark docs docs-serve release-check clean
@@ -44,7 +45,7 @@ reproduce: $(READY) ## the paper's figures, tables and claims from our own runs,
 
 # Most of a first run is XLA compiling: without its optimiser that takes a third of the
 # time. `make test-all` compiles as users do.
-test: export XLA_FLAGS ?= --xla_backend_optimization_level=0 $(EMITTERS)
+test: export XLA_FLAGS ?= $(QUICK_XLA)
 # Hundreds of programs are started: what one has compiled the others load.
 test: export PYTHONDONTWRITEBYTECODE =
 # Half of the rig's tests wait for a device, so four share two cores, file by file in order:

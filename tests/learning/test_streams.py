@@ -216,6 +216,7 @@ def test_values_that_are_not_traced_are_refused():
         make_train(streams())(jax.random.key(0), 1.0, num_epochs=2)
 
 
+@pytest.mark.slow
 def test_rates_and_entropy_map_in_one_program():
     train = make_train(streams())
     rates = jnp.array([1e-3, 1e-2])

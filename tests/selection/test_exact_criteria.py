@@ -156,7 +156,7 @@ def test_few_readings_are_bounded_far_below_the_natural_relaxation() -> None:
 @pytest.mark.parametrize("degree", [2, 3, 4])
 def test_d_optimal_polynomials_are_at_the_zeros_of_legendre(degree: int) -> None:
     """The support is +-1 and the zeros of P_d' (Guest 1958; Hoel 1958)."""
-    roots = np.polynomial.legendre.Legendre.basis(degree).deriv().roots()
+    roots = np.polynomial.legendre.Legendre.basis(degree).deriv().roots().real
     support = np.concatenate([[-1.0], roots, [1.0]])
     grid = np.unique(np.concatenate([np.linspace(-1.0, 1.0, 41), support]))
     blocks = np.vander(grid, degree + 1)[:, None]
