@@ -58,7 +58,7 @@ def listen(loop: Loop, path: str | os.PathLike[str]) -> None:
 
     Args:
         loop: the session.
-        path: of the socket; removed at the end. One that nobody answers is replaced.
+        path: of the socket; removed at the end. One without a listener is replaced.
 
     Raises:
         ValueError: another process answers there.

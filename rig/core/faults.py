@@ -38,8 +38,10 @@ class NotFollowing(MotionFault):
 
 
 class EndedShort(MotionFault):
-    """A drive stands off its target and says that it is done: somebody stopped it, or
-    it reached a limit of its own."""
+    """A drive reports its move done but stands short of the target.
+
+    It was stopped from outside, or reached a limit of its own.
+    """
 
     def __init__(self, text: str, axis: str, pulses: int) -> None:
         self.axis = axis

@@ -510,7 +510,7 @@ def test_one_trains_on_ones_own_pool_and_resumes_with_it(tmp_path, rng, capsys):
     assert "num_candidates = 50 available candidates" in capsys.readouterr().err
 
 
-def test_two_pools_are_two_also_where_nobody_names_their_digest(rng):
+def test_two_pools_differ_where_their_digest_is_not_given(rng):
     one, two = (
         GivenCandidates("mine", rng.uniform(size=(1, 60, 3)).astype(np.float32))
         for _ in range(2)
