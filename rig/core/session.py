@@ -20,7 +20,7 @@ import numpy as np
 
 from rig.config import RigConfig
 from rig.config.axis import Pulses
-from rig.core import known
+from rig.core import record_check
 from rig.core.attitude import Array, angle_between_deg, frame_at
 from rig.core.device import Device, Posture, check_plan
 from rig.core.drive import Drive
@@ -53,7 +53,7 @@ def open_device(
     record: DeviceRecord,
     requests: Requests | None = None,
     *,
-    check: Check = known.check_drives,
+    check: Check = record_check.check_drives,
     beside: Sequence[Beside] = (),
     simulated: bool = False,
     reset_alarms: bool = False,
@@ -137,7 +137,7 @@ def _close(device: Device) -> None:
     if device.requests.armed:
         try:
             with device.bus.urgent():  # also after a stop that latched
-                known.leave(device.drives, device.record)
+                record_check.leave(device.drives, device.record)
         except OSError as error:
             text = f"{device.record.path} cannot be written: {error}"
             device.emit("note", text=text)
@@ -149,7 +149,7 @@ def _close(device: Device) -> None:
 
 
 def take_zero(
-    device: Device, at: Pulses | None = None, kept: known.KeptZero | None = None
+    device: Device, at: Pulses | None = None, kept: record_check.KeptZero | None = None
 ) -> None:
     """Measure the zero posture, that all others are measured against.
 
@@ -196,7 +196,7 @@ def take_zero(
 
 
 def _compare_zero(
-    device: Device, pulses: Pulses, attitude: Array, kept: known.KeptZero | None
+    device: Device, pulses: Pulses, attitude: Array, kept: record_check.KeptZero | None
 ) -> None:
     """With the calibration's zero posture, or else with the last one taken."""
     config, last = device.config, device.record.state(ZEROED)
@@ -205,7 +205,7 @@ def _compare_zero(
     elif last:
         then = np.array(last["attitude"])
         try:
-            known.KeptZero("the last session", last["pulses"], then).check(
+            record_check.KeptZero("the last session", last["pulses"], then).check(
                 config, pulses, attitude
             )
         except MotionFault as fault:  # a phone mounted anew is calibrated anew
@@ -221,9 +221,9 @@ def _check_reference(device: Device, zero: Posture) -> None:
     device.emit("reference", sync=True, angles=angles, limit=limit)
     if max(map(abs, angles)) > limit:
         raise MotionFault(
-            f"the zero posture of this run has moved: {known.axes_text(angles)} (limit "
-            f"{limit:g}): the drives lost their origin, or the phone or the device was "
-            "moved. Start a new run"
+            "the zero posture of this run has moved: "
+            f"{record_check.axes_text(angles)} (limit {limit:g}): the drives "
+            "lost their origin, or the phone or the device was moved. Start a new run"
         )
 
 
@@ -246,8 +246,8 @@ def _reorient(device: Device) -> None:
         if device.imu.connections != count:
             continue
         now = np.array(found["attitude"])
-        told = known.check_zero(config, frame.zero, now, "this run")
-        turn = known.heading_turn(config, frame.zero, now)
+        told = record_check.check_zero(config, frame.zero, now, "this run")
+        turn = record_check.heading_turn(config, frame.zero, now)
         if (turned := angle_between_deg(np.eye(3), turn)) > LEAST_TURN_DEG:
             device.imu.turn(turn)
         zeroed(device, frame, zero)

@@ -10,7 +10,7 @@ from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.core.device import Device
 from rig.core.faults import EXIT_FAULT, PlanOnly, Refused, ending
-from rig.core.known import KeptZero, check_drives
+from rig.core.record_check import KeptZero, check_drives
 from rig.core.session import Beside, Check, open_device, take_zero
 from rig.journal import DeviceRecord, JournalError, Record, RunFolder
 from rig.signals import Signals

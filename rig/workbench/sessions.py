@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from rig.config import RigConfig, load_config, parse_config
 from rig.core.faults import Refused
-from rig.core.known import KeptZero
+from rig.core.record_check import KeptZero
 from rig.journal import (
     JOURNAL,
     STOP_PROVED,
@@ -26,7 +26,9 @@ from rig.simulator import Simulator
 from rig.workbench.commission import steps
 from rig.workbench.commission.operator import Operator
 from rig.workbench.outputs.console import listen
-from rig.workbench.procedures import calibrate, checking
+from rig.workbench.procedures import calibrate, verify
+from rig.workbench.procedures.collect import collect
+from rig.workbench.procedures.goto import goto
 from rig.workbench.run import Run, run_safely
 
 
@@ -123,14 +125,14 @@ def _procedure(
     if mode == "calibrate":
         return calibrate.calibrate, None, []
     if mode == "collect":
-        return lambda run: checking.collect(run, inputs["count"]), None, []
-    found, kept = checking.load_calibration(
+        return lambda run: collect(run, inputs["count"]), None, []
+    found, kept = verify.load_calibration(
         pathlib.Path(inputs["calibration"]), config, start["simulated"] is not None
     )
     if mode == "verify":
-        return lambda run: checking.verify(run, found, inputs["count"]), kept, []
-    doubts = checking.doubts(found)
-    return lambda run: checking.goto(run, found, inputs["to"]), kept, doubts
+        return lambda run: verify.verify(run, found, inputs["count"]), kept, []
+    doubts = verify.doubts(found)
+    return lambda run: goto(run, found, inputs["to"]), kept, doubts
 
 
 def _confirm(given: SessionOptions, doubts: list[str], session: Run) -> None:

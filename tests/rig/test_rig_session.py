@@ -35,7 +35,7 @@ from rig.journal import read_journal
 from rig.simulator import Truth
 from rig.workbench.identification.conclusion import order_residuals
 from rig.workbench.procedures.calibrate import calibrate
-from rig.workbench.procedures.checking import collect
+from rig.workbench.procedures.collect import collect
 from rig.workbench.procedures.plan import choose, draw_candidates
 from rig.workbench.run import run_safely
 

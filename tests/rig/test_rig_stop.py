@@ -31,7 +31,7 @@ from rig.journal import lock
 from rig.journal.lock import BusLock, read_armed
 from rig.signals import Signals
 from rig.simulator import parse_fault
-from rig.workbench.procedures.checking import collect
+from rig.workbench.procedures.collect import collect
 from rig.workbench.run import run_safely
 
 GENERIC = {'map = "leadshine_pr"': 'map = "generic"', **HASTY}

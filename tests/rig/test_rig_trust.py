@@ -27,8 +27,8 @@ from rig.__main__ import main
 from rig.config import example_text, parse_config
 from rig.core.attitude import euler_to_matrix, frame_at
 from rig.core.faults import MotionFault, Refused
-from rig.core.known import KeptZero, check_zero, moved, unseen
 from rig.core.phone import Imu
+from rig.core.record_check import KeptZero, check_zero, moved, unseen
 from rig.journal import (
     HOMED,
     IDENTIFIED,
@@ -42,12 +42,9 @@ from rig.simulator import Truth
 from rig.simulator.faults import FaultInjector
 from rig.simulator.phone import Phone
 from rig.workbench.identification.conclusion import check_matrix
-from rig.workbench.procedures.checking import (
-    collect,
-    load_calibration,
-    unchecked,
-    verify,
-)
+from rig.workbench.procedures.collect import collect
+from rig.workbench.procedures.goto import unchecked
+from rig.workbench.procedures.verify import load_calibration, verify
 from rig.workbench.run import run_safely
 
 LOST = 1.4  # degrees, as was seen

@@ -18,7 +18,7 @@ from rig.core.proof import GROWTH, Reach
 from rig.simulator import Truth, parse_fault
 from rig.simulator.drive import SimDrive
 from rig.workbench.commission import steps
-from rig.workbench.commission.findings import require_gearing, require_unit
+from rig.workbench.commission.axis_check import require_gearing, require_unit
 from rig.workbench.commission.operator import Operator
 
 

@@ -1,6 +1,5 @@
 """Commissioning: from cables to a device whose axes, signs and zero are proved.
 
-Each step is a command. ``findings`` is the mathematics of the axis check, ``bench`` the
-armed device that every moving step shares with a session. Nothing of a session imports
-this package.
+Each step is a command of ``steps``; ``axis_check`` is the mathematics of ``axes``.
+Nothing of a session imports this package.
 """

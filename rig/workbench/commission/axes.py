@@ -10,7 +10,7 @@ from rig.core.faults import MotionFault, Refused
 from rig.core.motion import move
 from rig.core.proof import FIRST_MOTOR_DEG, unit_proved
 from rig.journal import SIGN_CHECKED
-from rig.workbench.commission.findings import (
+from rig.workbench.commission.axis_check import (
     CLEAR,
     CORNERS,
     Change,
@@ -79,7 +79,7 @@ def check_axes(run: Run, device: Device) -> list[Change]:
 
 
 def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
-    """Visit the places that ``findings.find`` reads from, and come back.
+    """Visit the places that ``axis_check.find`` reads from, and come back.
 
     Raises:
         Refused: an axis stands too near to a limit.

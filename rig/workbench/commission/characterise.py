@@ -24,8 +24,8 @@ from rig.core.faults import MotionFault, Refused
 from rig.core.motion import move
 from rig.core.proof import ALLOWED_DEG
 from rig.workbench.commission.axes import ROOM_DEG, SEEN_DEG
+from rig.workbench.commission.axis_check import Stand, stand_at, turn
 from rig.workbench.commission.breakaway import Breakaway, Estimate
-from rig.workbench.commission.findings import Stand, stand_at, turn
 from rig.workbench.run import Run
 
 LEVEL = 0.95

@@ -16,10 +16,10 @@ from rig.core.bus import Bus
 from rig.core.device import Device, Posture
 from rig.core.drive import Drive
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
-from rig.core.known import check_drives
 from rig.core.motion import move
 from rig.core.phone import Imu
 from rig.core.proof import ALLOWED_DEG, slowed
+from rig.core.record_check import check_drives
 from rig.journal import (
     HOMED,
     IDENTIFIED,
@@ -30,7 +30,7 @@ from rig.journal import (
 )
 from rig.journal.lock import BusLock
 from rig.workbench.commission.axes import check_axes
-from rig.workbench.commission.findings import Change
+from rig.workbench.commission.axis_check import Change
 from rig.workbench.commission.home import can_home, home, identity, unlimited
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.phone import addresses_text, watch

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from rig.config import AXIS_NAMES
 from rig.core.attitude import ORDERS, angle_between_deg, euler_to_matrix
 from rig.core.faults import MotionFault
-from rig.workbench.commission.findings import (
+from rig.workbench.commission.axis_check import (
     CORNERS,
     Stand,
     corner_name,

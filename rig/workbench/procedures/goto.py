@@ -1,0 +1,72 @@
+"""goto: move to a desired orientation through a calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rig.config import RigConfig
+from rig.core.attitude import Frame
+from rig.core.device import Posture
+from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError
+from rig.core.record_check import unseen
+from rig.core.session import visit
+from rig.workbench.run import Run
+
+
+def goto(run: Run, calibration: Any, to: Sequence[float]) -> int:
+    """Move the end-effector to (3,) desired degrees through a calibration."""
+    config, desired = run.config, np.array(to, dtype=np.float64)
+    command = np.asarray(calibration.command_for(desired), dtype=np.float64)
+    for axis, value in zip(config.axes, command, strict=True):
+        if not axis.min_deg <= value <= axis.max_deg:
+            raise LimitError(
+                f"{desired.tolist()} deg needs {axis.name} commanded to {value:.3f} "
+                f"deg, outside [{axis.min_deg:g}, {axis.max_deg:g}]. Choose a target "
+                "further inside"
+            )
+    pulses = config.to_pulses(command)
+    run.say(
+        f"desired {desired.tolist()} deg: command {command.round(4).tolist()} deg, "
+        f"pulses {list(pulses)}"
+    )
+    if run.lacks(["goto"]):
+        with run.device() as device:
+            visit(device, Posture("goto", pulses), role="goto")
+            counted = [drive.axis.name for drive in device.drives if drive.origin]
+            names = unchecked(config, device.frame, counted)
+        if names:
+            run.say(
+                f"NOT CHECKED: whether {', '.join(names)} was moved while without "
+                "power. The drive does not tell, and the phone does not see a turn "
+                "about the vertical. If in doubt: jaxcal-rig home"
+            )
+    record = run.postures().get("goto")
+    if record is None:
+        return EXIT_RECALIBRATE
+    reached = np.array(record["measured_deg"])
+    run.say(
+        f"reached {reached.round(4).tolist()} deg, off by "
+        f"{(reached - desired).round(4).tolist()}"
+    )
+    return EXIT_OK
+
+
+def unchecked(
+    config: RigConfig, frame: Frame | None, told: Sequence[str] = ()
+) -> list[str]:
+    """Axes of which neither drive nor phone tells that they were moved when off.
+
+    A drive without homed bit and absolute encoder counts from 0 when it is switched on:
+    where it was left there, its count says nothing. That of ``told`` axes does, whose
+    home is at a count of its own.
+    """
+    seen = [] if frame is None else unseen(config, frame.zero)
+    return [
+        axis.name
+        for axis in config.axes
+        if axis.name in seen
+        and not (axis.map.homed or axis.map.absolute_encoder or axis.name in told)
+    ]
