@@ -22,11 +22,10 @@ Atkinson, Donev and Tobias, Optimum Experimental Designs.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -42,7 +41,6 @@ __all__ = [
     "Criterion",
     "Ds",
     "I",
-    "Objective",
     "criterion_of",
     "positions",
 ]
@@ -50,30 +48,70 @@ __all__ = [
 Array = NDArray[np.float64]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Objective:
-    """A criterion in the coordinates of ``root``; the table above has its kinds."""
+class Coordinates(NamedTuple):
+    """The coordinates of one problem, in which everything measured at once says I."""
 
-    name: str  # "D", "A", ...
-    kind: str  # "det", "trace" or "least"
+    white: Whitened
+    names: tuple[str, ...]  # (p,) of the caller's parameters
+    readings: int  # that all available candidates give together
+    region: Array | None  # (R, q, p) blocks of the criterion's region, in the caller's
+    times: int  # outputs that share these parameters' information
+
+    @property
+    def basis(self) -> Array:
+        """(p, p): combinations C of the caller's parameters are ``C @ basis`` here."""
+        return self.white.basis
+
+
+class Criterion:
+    """What a choice is judged by; subclasses are the rows of ``CRITERIA``.
+
+    As it is asked for it carries its data. ``within`` gives that of one problem, which
+    has ``root`` and what follows, in the coordinates of the problem.
+    """
+
+    name: ClassVar[str]
+    kind: ClassVar[str]  # "det", "trace" or "least"
+    says: ClassVar[str]  # what a table prints before the value; V is a covariance
+    per_output: ClassVar[bool] = False  # the value is one output's, not their sum
+    of_region: ClassVar[bool] = False  # it is about predictions, see ``region``
+    by_name: ClassVar[bool] = (
+        False  # it tells the parameters apart, ``Coordinates.names``
+    )
+    region: ArrayLike | None = None  # commands or blocks where; the candidates if None
+
     root: Array  # C (s, p), of full row rank; square for "least"
     times: int = 1  # how often log det V or trace V counts: outputs of equal blocks
     offset: float = 0.0  # added to phi of "det" where C was changed by a factor
     unit: float = 1.0  # V in the caller's units is this times V, of "trace" and "least"
 
     @classmethod
-    def scaled(cls, name: str, kind: str, root: Array, times: int) -> Objective:
-        """Of combinations C in any units: their size goes into ``unit`` or ``offset``.
+    def of_rows(
+        cls, root: Array, times: int = 1, offset: float = 0.0, unit: float = 1.0
+    ) -> Self:
+        """The criterion of the combinations ``root`` (s, p), as they are."""
+        criterion = cls.__new__(cls)
+        criterion.root, criterion.times = root, times
+        criterion.offset, criterion.unit = offset, unit
+        return criterion
 
-        So that values are near 1, whatever the caller's units; by powers of two, which
-        is exact.
+    def rows(self, at: Coordinates) -> Array:
+        """C (s, p) in the problem's coordinates, of full row rank."""
+        return at.basis
+
+    def within(self, at: Coordinates) -> Self:
+        """The criterion in the coordinates of one problem.
+
+        The size of C, which may be in any units, goes into ``unit`` or ``offset``, so
+        that values are near 1; by powers of two, which is exact.
         """
-        if kind == "det":
+        root, times = self.rows(at), 1 if self.per_output else at.times
+        if self.kind == "det":
             units = power_of_two(np.abs(root).max(axis=1, keepdims=True))
             offset = -2.0 * float(np.log(units).sum())
-            return cls(name, kind, root / units, times, offset=offset)
+            return self.of_rows(root / units, times, offset=offset)
         if not root.any():
-            return cls(name, kind, root, times)
+            return self.of_rows(root, times)
         size = 2.0 ** math.frexp(np.abs(root).max())[1]
         root = root / size
         rest = 2.0 ** math.frexp(math.sqrt((root * root).sum()))[1]
@@ -81,7 +119,7 @@ class Objective:
             unit = (size * rest) ** 2
         except OverflowError:  # asked for where it is used
             unit = math.inf
-        return cls(name, kind, root / rest, times, unit=unit)
+        return self.of_rows(root / rest, times, unit=unit)
 
     @property
     def form(self) -> str:
@@ -147,54 +185,14 @@ class Objective:
         return half, regular
 
 
-class Coordinates(NamedTuple):
-    """The coordinates of one problem, in which everything measured at once says I."""
-
-    white: Whitened
-    names: tuple[str, ...]  # (p,) of the caller's parameters
-    readings: int  # that all available candidates give together
-    region: Array | None  # (R, q, p) blocks of the criterion's region, in the caller's
-    times: int  # outputs that share these parameters' information
-
-    @property
-    def basis(self) -> Array:
-        """(p, p): combinations C of the caller's parameters are ``C @ basis`` here."""
-        return self.white.basis
-
-
-class Criterion:
-    """A criterion as it is asked for; subclasses are the rows of ``CRITERIA``."""
-
-    name: ClassVar[str]
-    kind: ClassVar[str]  # "det", "trace" or "least"
-    says: ClassVar[str]  # what a table prints before the value; V is a covariance
-    per_output: ClassVar[bool] = False  # the value is one output's, not their sum
-    of_region: ClassVar[bool] = False  # it is about predictions, see ``region``
-    by_name: ClassVar[bool] = (
-        False  # it tells the parameters apart, ``Coordinates.names``
-    )
-    region: ArrayLike | None = None  # commands or blocks where; the candidates if None
-
-    def root(self, at: Coordinates) -> Array:
-        """C (s, p) in the problem's coordinates, of full row rank."""
-        return at.basis
-
-    def objective(self, at: Coordinates) -> Objective:
-        """The criterion of one problem."""
-        times = 1 if self.per_output else at.times
-        return Objective.scaled(self.name, self.kind, self.root(at), times)
-
-
 class D(Criterion):
     """Joint uncertainty of all parameters."""
 
     name, kind, says = "D", "det", "log det S"
 
-    def objective(self, at: Coordinates) -> Objective:
-        return Objective(
-            self.name, self.kind, _identity(len(at.white.prior)), at.times,
-            offset=at.white.log_scale,
-        )  # fmt: skip
+    def within(self, at: Coordinates) -> Self:
+        identity = _identity(len(at.white.prior))
+        return self.of_rows(identity, at.times, offset=at.white.log_scale)
 
 
 @functools.cache
@@ -230,7 +228,7 @@ class I(Criterion):  # noqa: E742 - the criterion's own name in the literature
     def __init__(self, region: ArrayLike | None = None) -> None:
         self.region = region
 
-    def root(self, at: Coordinates) -> Array:
+    def rows(self, at: Coordinates) -> Array:
         p = len(at.white.prior)
         if at.region is None and not at.white.prior.any():
             return _identity(p) / np.sqrt(at.readings)
@@ -258,7 +256,7 @@ class _OfSome(Criterion):
     def __init__(self, parameters: Sequence[str | int]) -> None:
         self.parameters = parameters
 
-    def root(self, at: Coordinates) -> Array:
+    def rows(self, at: Coordinates) -> Array:
         return at.basis[positions(self.parameters, at.names)]
 
 

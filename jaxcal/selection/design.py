@@ -17,9 +17,8 @@ from jaxcal.checks import (
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.exact.exact import TIME_LIMIT, solve_exact
-from jaxcal.selection.fastest.motion import Motion
-from jaxcal.selection.fastest.run import FastSelection, ParetoFront, fastest, pareto
-from jaxcal.selection.plan import Plan, plan
+from jaxcal.selection.fastest.run import fastest, pareto
+from jaxcal.selection.plan import plan
 from jaxcal.selection.problem import CandidateSet, Problem, Solution, values
 from jaxcal.selection.result import Selection, Subset
 from jaxcal.selection.solvers import SOLVERS, checked_options
@@ -167,111 +166,9 @@ class Design(CandidateSet):
         )
         return self._judged(problem, found, "score", start)
 
-    def plan(
-        self,
-        accuracy: ArrayLike,
-        noise_std: ArrayLike | None = None,
-        criterion: str = "G",
-        *,
-        parameters: Any = None,
-        region: ArrayLike | None = None,
-        max_k: int | None = None,
-        more: int = 0,
-        seed: int | np.random.Generator = 0,
-    ) -> Plan:
-        """The smallest number of measurements that predicts accurately enough.
-
-        Args:
-            accuracy: () or (m,) standard error a prediction may have, measured unit;
-                with "parameters" () or (s,), that of each parameter of interest.
-            noise_std: () or (m,) standard deviation of one measurement, measured unit;
-                the noise of the design when not given. With blocks it is 1. Noise is
-                taken as white: measuring a posture twice halves its variance.
-            criterion: "G", the largest standard error over the region, "I", the root
-                of the mean variance over it, or "parameters", the standard error of the
-                parameters themselves. It must hold for every output or parameter.
-            parameters: names or indices of the s parameters of interest; all when not
-                given.
-            region: (R, n) commands at which predictions are wanted, with blocks
-                (R, m, p) what is predicted, ``region @ theta``; what is available when
-                not given.
-            max_k: largest K allowed; what is available, up to 200, when not given.
-            more: rows of the table beyond the K that suffices.
-            seed: of the exchange.
-
-        Raises:
-            ValueError: naming the argument, the rule and the value; where no K up to
-                ``max_k`` suffices, with the accuracy that can be reached.
-        """
-        return plan(
-            self,
-            accuracy,
-            noise_std,
-            criterion,
-            parameters=parameters,
-            region=region,
-            max_k=max_k,
-            more=more,
-            seed=seed,
-        )
-
-    def fastest(
-        self,
-        k: int | None,
-        motion: Motion,
-        *,
-        least_efficiency: float = 0.95,
-        start: ArrayLike | None = None,
-        method: str | None = None,
-        time_limit: float = 60.0,
-        seed: int | np.random.Generator = 0,
-    ) -> FastSelection:
-        """The subset and the order of least time with a D-efficiency.
-
-        Args:
-            k: postures to choose, distinct; the fewest that identify when None.
-            motion: speeds and accelerations in the candidates' unit, settle time.
-            least_efficiency: in (0, 1], against the proven D-optimum.
-            start: (n,) where the device stands; it begins at any posture by default.
-            method: "exact" (k up to 12, with a proof unless the time runs out) or
-                "heuristic" (local search); exact up to k = 8 when not given.
-            time_limit: seconds of the exact search and of the D-optimum behind both.
-            seed: of the heuristic's starts, from which exact starts too.
-
-        Returns:
-            The selection; among runs of equal time the one with the largest
-            determinant.
-        """
-        return fastest(
-            self,
-            k,
-            motion,
-            least_efficiency=least_efficiency,
-            start=start,
-            method=method,
-            time_limit=time_limit,
-            seed=seed,
-        )
-
-    def pareto(
-        self,
-        k: int | None,
-        motion: Motion,
-        *,
-        least_efficiency: float = 0.7,
-        **options: Any,
-    ) -> ParetoFront:
-        """Time against D-efficiency, from ``least_efficiency`` up to the D-optimum.
-
-        Each point is the fastest run more efficient than the point before it.
-
-        Args:
-            k, motion: as in ``fastest``.
-            least_efficiency: where to cut the front off, in (0, 1].
-            options: start, method, seed and time_limit (for each point) of
-                ``fastest``.
-        """
-        return pareto(self, k, motion, least_efficiency=least_efficiency, **options)
+    plan = plan
+    fastest = fastest
+    pareto = pareto
 
     def _judged(
         self, problem: Problem, found: Solution, method: str, start: float

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxcal.selection.criteria import CRITERIA, Objective
+from jaxcal.selection.criteria import CRITERIA
 
 P = 4
 PICK = np.eye(P)[[0, 2]]
@@ -24,7 +24,7 @@ def made(name, rng, times=1):
         root = PICK
     elif name == "E":
         root = np.eye(P) + 0.2 * rng.normal(size=(P, P))
-    return Objective(name, CRITERIA[name].kind, root, times)
+    return CRITERIA[name].of_rows(root, times)
 
 
 def definition(criterion, m):
@@ -89,7 +89,7 @@ def test_a_factor_of_the_root_is_given_back_by_the_offset():
     rng = np.random.default_rng(3)
     m, factor = information(rng), rng.normal(size=(2, 2))
     offset = 2.0 * np.log(abs(np.linalg.det(factor)))
-    changed = Objective("Ds", "det", factor @ PICK, 2, offset)
-    plain = Objective("Ds", "det", PICK, 2)
+    changed = CRITERIA["Ds"].of_rows(factor @ PICK, 2, offset)
+    plain = CRITERIA["Ds"].of_rows(PICK, 2)
     expected = plain.reported(plain.value(m))
     assert changed.reported(changed.value(m)) == pytest.approx(expected)

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from jaxcal.models import Affine
 from jaxcal.selection import select
-from jaxcal.selection.criteria import CRITERIA, Objective
+from jaxcal.selection.criteria import CRITERIA, Criterion
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
 from jaxcal.selection.exact.exact import upper_bound
 
@@ -29,7 +29,7 @@ def subsets(count: int, k: int, cap: int = 1) -> list[tuple[int, ...]]:
 
 def drawn(
     seed: int, m: int, q: int, p: int, name: str, weight: float
-) -> tuple[Array, Array, Objective]:
+) -> tuple[Array, Array, Criterion]:
     """Blocks, a prior precision and a criterion."""
     rng = np.random.default_rng(seed)
     root = np.eye(p)
@@ -38,11 +38,11 @@ def drawn(
     elif name == "I":
         root = rng.normal(size=(p, p))
     known = rng.normal(size=(p, p))
-    criterion = Objective(name, CRITERIA[name].kind, root)
+    criterion = CRITERIA[name].of_rows(root)
     return rng.normal(size=(m, q, p)), weight * known.T @ known, criterion
 
 
-def phi(blocks: Array, prior: Array, criterion: Objective, chosen: object) -> float:
+def phi(blocks: Array, prior: Array, criterion: Criterion, chosen: object) -> float:
     rows = blocks[list(chosen)].reshape(-1, blocks.shape[2])  # type: ignore[call-overload]  # any iterable
     return float(criterion.value(prior + rows.T @ rows))
 
@@ -144,7 +144,7 @@ def test_few_readings_are_bounded_far_below_the_natural_relaxation() -> None:
     rng = np.random.default_rng(0)
     blocks, whole = rng.normal(size=(20, 3, 12)), np.ones(20, dtype=np.int64)
     start = np.bincount([0, 1], minlength=20)
-    plain = Objective("D", "det", np.eye(12))
+    plain = CRITERIA["D"].of_rows(np.eye(12))
     prior = 1e-4 * np.eye(12)
     sharp = branch_and_bound(
         blocks, prior, plain, 0 * whole, whole, start, root_only=True

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from jaxcal.commands.main import main
 from jaxcal.selection import select
-from jaxcal.selection.criteria import CRITERIA, Objective
+from jaxcal.selection.criteria import CRITERIA, Criterion
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
 
 Array = np.ndarray
@@ -30,10 +30,10 @@ def drawn(seed: int, m: int, q: int, p: int, name: str, weight: float) -> Any:
         root = rng.normal(size=(p if name == "I" else p - 2, p))
         root *= 10.0 ** rng.uniform(-1, 1, (len(root), 1))
     known = rng.normal(size=(p, p)) * 10.0 ** rng.uniform(-0.5, 0, p)[:, None]
-    return blocks, weight * known.T @ known, Objective(name, CRITERIA[name].kind, root)
+    return blocks, weight * known.T @ known, CRITERIA[name].of_rows(root)
 
 
-def phi(blocks: Array, prior: Array, criterion: Objective, counts: Array) -> float:
+def phi(blocks: Array, prior: Array, criterion: Criterion, counts: Array) -> float:
     rows = np.repeat(blocks, counts, axis=0).reshape(-1, blocks.shape[2])
     return float(criterion.value(prior + rows.T @ rows))
 
@@ -82,7 +82,7 @@ def test_variances_that_no_reading_is_left_for_stay(name: str) -> None:
     rng = np.random.default_rng(0)
     blocks, whole = 1e3 * rng.normal(size=(60, 3, 12)), np.ones(60, dtype=np.int64)
     root = np.eye(12) if name == "A" else rng.normal(size=(12, 12))
-    criterion = Objective(name, CRITERIA[name].kind, root)
+    criterion = CRITERIA[name].of_rows(root)
     arguments = (0 * whole, whole, np.bincount([0, 1], minlength=60))
     bound = branch_and_bound(
         blocks, np.eye(12), criterion, *arguments, root_only=True
@@ -97,7 +97,7 @@ def test_a_time_limit_is_kept_while_nodes_are_slow() -> None:
     """60 parameters: a look at the clock every few nodes would be too late."""
     rng = np.random.default_rng(1)
     blocks, whole = rng.normal(size=(120, 3, 60)), np.ones(120, dtype=np.int64)
-    criterion = Objective("A", "trace", np.eye(60))
+    criterion = CRITERIA["A"].of_rows(np.eye(60))
     arguments = (blocks, 1e-2 * np.eye(60), criterion, 0 * whole)
     start = np.bincount(np.arange(15), minlength=120)
     first = branch_and_bound(*arguments, whole, start, deadline=0.0)

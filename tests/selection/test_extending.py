@@ -23,7 +23,7 @@ class C(Criterion):
     def __init__(self, weights) -> None:
         self.weights = numbers("weights", weights)
 
-    def root(self, at: Coordinates) -> np.ndarray:
+    def rows(self, at: Coordinates) -> np.ndarray:
         if self.weights.shape != (len(at.names),):
             raise ValueError(f"weights must be ({len(at.names)},)")
         return self.weights[None] @ at.basis
@@ -34,7 +34,7 @@ class L(C):
 
     name, kind, says, per_output = "L", "least", "precision", True
 
-    def root(self, at: Coordinates) -> np.ndarray:
+    def rows(self, at: Coordinates) -> np.ndarray:
         return self.weights @ at.basis
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from jaxcal import compiled
 from jaxcal.information.blocks import gram, largest_rank
-from jaxcal.selection.criteria import Objective
+from jaxcal.selection.criteria import Criterion
 
 __all__ = ["branch_and_bound"]
 
@@ -44,7 +44,7 @@ class BranchResult:
 def branch_and_bound(
     blocks: Array,
     prior: Array,
-    criterion: Objective,
+    criterion: Criterion,
     lower: Indices,
     upper: Indices,
     start: Indices,
@@ -116,7 +116,7 @@ def _left(deadline: float | None) -> float:
 
 
 def _near_one(
-    blocks: Array, prior: Array, criterion: Objective, start: Indices, upper: Indices
+    blocks: Array, prior: Array, criterion: Criterion, start: Indices, upper: Indices
 ) -> tuple[Array, float, float, float]:
     """The kernel's C, with values of phi near 1, and their unit, origin and largest.
 

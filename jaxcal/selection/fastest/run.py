@@ -83,7 +83,22 @@ def fastest(
     time_limit: float = 60.0,
     seed: int | np.random.Generator = 0,
 ) -> FastSelection:
-    """The subset and the order of least time of a design; see ``Design.fastest``."""
+    """The subset and the order of least time with a D-efficiency.
+
+    Args:
+        design: what may be measured; ``design.fastest(k, motion)`` asks the same.
+        k: postures to choose, distinct; the fewest that identify when None.
+        motion: speeds and accelerations in the candidates' unit, settle time.
+        least_efficiency: in (0, 1], against the proven D-optimum.
+        start: (n,) where the device stands; it begins at any posture by default.
+        method: "exact" (k up to 12, with a proof unless the time runs out) or
+            "heuristic" (local search); exact up to k = 8 when not given.
+        time_limit: seconds of the exact search and of the D-optimum behind both.
+        seed: of the heuristic's starts, from which exact starts too.
+
+    Returns:
+        The selection; among runs of equal time the one with the largest determinant.
+    """
     least = share("least_efficiency", least_efficiency)
     search = _Search(design, k, motion, start, method, time_limit, seed)
     found = search.answer(least, None)
@@ -103,7 +118,16 @@ def pareto(
     least_efficiency: float = 0.7,
     **options: Any,
 ) -> ParetoFront:
-    """Time against D-efficiency of a design; see ``Design.pareto``."""
+    """Time against D-efficiency, from ``least_efficiency`` up to the D-optimum.
+
+    Each point is the fastest run more efficient than the point before it.
+
+    Args:
+        design: what may be measured; ``design.pareto(k, motion)`` asks the same.
+        k, motion: as in ``fastest``.
+        least_efficiency: where to cut the front off, in (0, 1].
+        options: start, method, seed and time_limit (for each point) of ``fastest``.
+    """
     least = share("least_efficiency", least_efficiency)
     defaults = {"start": None, "method": None, "time_limit": 60.0, "seed": 0}
     search = _Search(design, k, motion, **(defaults | options))

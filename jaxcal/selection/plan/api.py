@@ -136,7 +136,29 @@ def plan(
     more: int = 0,
     seed: int | np.random.Generator = 0,
 ) -> Plan:
-    """The smallest number of measurements of a design; see ``Design.plan``."""
+    """The smallest number of measurements that predicts accurately enough.
+
+    Args:
+        design: what may be measured; ``design.plan(accuracy, ...)`` asks the same.
+        accuracy: () or (m,) standard error a prediction may have, measured unit; with
+            "parameters" () or (s,), that of each parameter of interest.
+        noise_std: () or (m,) standard deviation of one measurement, measured unit; the
+            noise of the design when not given. With blocks it is 1. Noise is taken as
+            white: measuring a posture twice halves its variance.
+        criterion: "G", the largest standard error over the region, "I", the root of the
+            mean variance over it, or "parameters", the standard error of the parameters
+            themselves. It must hold for every output or parameter.
+        parameters: names or indices of the s parameters of interest, or all.
+        region: (R, n) commands at which predictions are wanted, with blocks (R, m, p)
+            what is predicted, ``region @ theta``; what is available when not given.
+        max_k: largest K allowed; what is available, up to 200, when not given.
+        more: rows of the table beyond the K that suffices.
+        seed: of the exchange.
+
+    Raises:
+        ValueError: naming the argument, the rule and the value; where no K up to
+            ``max_k`` suffices, with the accuracy that can be reached.
+    """
     begun = time.perf_counter()
     one_of("criterion", criterion, tuple(_SUMMARIES))
     more, start = whole_number("more", more, 0), checked_seed(seed)

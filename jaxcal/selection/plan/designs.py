@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.information.singular import significant
-from jaxcal.selection.criteria import Objective
+from jaxcal.selection.criteria import I
 from jaxcal.selection.exact.exact import relaxed
 from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
 from jaxcal.selection.problem import Problem
@@ -184,5 +184,5 @@ def region_root(points: Array, how: str) -> Array:
 
 def lower_bound(problem: Problem, root: Array, k: int) -> float:
     """No design of k within the counts has a smaller ``trace(root M^-1 root.T)``."""
-    one = dataclasses.replace(problem, k=k, criterion=Objective("I", "trace", root))
+    one = dataclasses.replace(problem, k=k, criterion=I.of_rows(root))
     return -relaxed(one, greedy_indices(one))

@@ -198,7 +198,7 @@ def make_problem(
         )
     at = Coordinates(white, names, count, region, times)
     problem = Problem(
-        white, k, available, forced, cap, criterion.objective(at), times, raw, readings,
+        white, k, available, forced, cap, criterion.within(at), times, raw, readings,
         root, candidates, model,
     )  # fmt: skip
     for each in (raw, readings, root, available, forced):

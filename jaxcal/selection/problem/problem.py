@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from jaxcal.information.blocks import Whitened, rank_of_blocks
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model
-from jaxcal.selection.criteria import Objective
+from jaxcal.selection.criteria import Criterion
 
 __all__ = ["Problem", "Solution", "log_dets", "values"]
 
@@ -44,7 +44,7 @@ class Problem:
     available: Mask  # (M,) True where a candidate may be chosen
     required: Indices  # (r,) candidates that must be chosen, r <= k
     max_replicates: int  # how often one candidate may be chosen
-    criterion: Objective  # in the same coordinates
+    criterion: Criterion  # in the same coordinates
     multiplicity: int  # how often log det of the blocks counts
     raw: Array  # (M, q, p) blocks in the caller's numbers, at most p readings each
     readings: Array  # (M, Q, p) these with every reading, as ``raw`` where q is Q
