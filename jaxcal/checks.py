@@ -35,11 +35,21 @@ def in_words(values: Array) -> str:
     return "(" + ", ".join(f"{value:.6g}" for value in np.atleast_1d(values)) + ")"
 
 
-def aligned(rows: Sequence[Sequence[str]], *, left: bool = False) -> list[str]:
-    """Rows of cells as lines, every column padded to one width."""
+def aligned(
+    rows: Sequence[Sequence[str]], sides: str = ">", *, ruled: bool = False
+) -> list[str]:
+    """Rows of cells as lines, every column padded to one width.
+
+    Args:
+        rows: of as many cells each.
+        sides: "<" or ">" for each column, the last for all that follow.
+        ruled: the first row is a head, with a rule below it.
+    """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    pad = str.ljust if left else str.rjust
-    return ["  ".join(map(pad, row, widths)).rstrip() for row in rows]
+    if ruled:
+        rows = [rows[0], ["-" * width for width in widths], *rows[1:]]
+    formats = [f"{{:{sides[: i + 1][-1]}{width}}}" for i, width in enumerate(widths)]
+    return ["  ".join(formats).format(*row).rstrip() for row in rows]
 
 
 def axis_letter(index: int, count: int) -> str:

@@ -75,7 +75,7 @@ class Calibration(Fit):
             cells["unit"] = list(units)
         table = [[name, *column] for name, column in cells.items()]
         rows = [*zip(*table, strict=True)]
-        lines += [f"  {line}" for line in aligned(rows, left=True)]
+        lines += [f"  {line}" for line in aligned(rows, "<")]
         unit = f" {self.measured_unit}" if self.measured_unit else ""
         size = np.sqrt(np.mean(self.residuals**2, axis=0))
         lack = self.lack_of_fit()

@@ -124,7 +124,7 @@ def doctor(*, json: Annotated[bool, "print JSON"] = False) -> None:
     if json:
         write_json("", found)
         return
-    print("\n".join(aligned([*found.items()], left=True)))
+    print("\n".join(aligned([*found.items()], "<")))
 
 
 def _required() -> dict[str, str]:

@@ -7,13 +7,13 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from jaxcal.checks import aligned
 from jaxcal.evaluation.results import Evaluation, Summary
 from jaxcal.extras import versions
 from jaxcal.files import atomic_write
 from jaxcal.pages import Block, Code, Figure, Page, Section, Table, Text, render
 
 __all__ = [
-    "aligned",
     "document",
     "file_prefixes",
     "json_document",
@@ -38,21 +38,8 @@ _ABOUT = (
 
 def text_table(shown: Summary, *, many: bool = False) -> str:
     """One dataset as a table; where there are ``many``, a policy's checkpoint too."""
-    lines = aligned([_COLUMNS, *_rows(shown, many)])
+    lines = aligned([_COLUMNS, *_rows(shown, many)], "<>", ruled=True)
     return "\n  ".join([_heading(shown), *lines, *notes(shown)])
-
-
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table, its head first: names to the left, all else to the right."""
-    head, *body = rows
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for name, *cells in (head, ["-" * width for width in widths], *body):
-        pairs = zip(cells, widths[1:], strict=True)
-        lines.append(
-            "  ".join([name.ljust(widths[0]), *(c.rjust(w) for c, w in pairs)])
-        )
-    return lines
 
 
 def notes(shown: Summary) -> list[str]:

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.evaluation.report import aligned, document, write_folder
+from jaxcal.checks import aligned
+from jaxcal.evaluation.report import document, write_folder
 from jaxcal.evaluation.sequential import METHODS, Result
 from jaxcal.pages import Table
 
@@ -26,7 +27,7 @@ _ABOUT = (
 
 def text_table(result: Result) -> str:
     """The table in the terminal."""
-    return "\n  ".join([_heading(result), *aligned(_rows(result))])
+    return "\n  ".join([_heading(result), *aligned(_rows(result), "<>", ruled=True)])
 
 
 def _rows(result: Result) -> list[tuple[str, ...]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -42,11 +44,6 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-# The C library keeps freed memory for the next array once an array as large as this was
-# freed. Else every array of a problem is given back to the system and asked for again,
-# which takes longer than what is computed in it. No page of this one is touched.
-np.empty(2**21)
-
 _FILLED = ", none of them 0"
 
 
@@ -60,8 +57,19 @@ def filled(name: str, values: ArrayLike, *letters: str) -> Array:
     return array
 
 
+@functools.cache
+def _keep_freed_memory() -> None:
+    """The C library keeps freed memory once an array as large as this was freed.
+
+    Else the arrays of every large problem go back to the system and are asked for
+    again, which takes longer than what is computed in them. No page of it is touched.
+    """
+    np.empty(2**21)
+
+
 def usable_numbers(name: str, array: Array, mask: Mask) -> Array:
     """A copy, finite where available; what is not finite elsewhere becomes zero."""
+    _keep_freed_memory()
     own = np.array(array, order="C")
     bad = ~np.isfinite(own)
     if bad.any():

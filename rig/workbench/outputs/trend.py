@@ -100,7 +100,7 @@ def _moved(before: Record, now: Record) -> list[str]:
 
 def trend_lines(device: Device) -> list[str]:
     """The table and the verdict for the console."""
-    table = [f"  {line}" for line in aligned([HEAD, *device.rows], left=True)]
+    table = [f"  {line}" for line in aligned([HEAD, *device.rows], "<")]
     told, keys = device.fingerprint, ("map", "unit", "pulses_per_rev", "reduction")
     axes = (
         " ".join([name, *(str(told.get(f"axes.{name}.{k}", "?")) for k in keys)])
