@@ -22,6 +22,7 @@ from jaxcal.calibration.report import report
 from jaxcal.checks import aligned, in_words
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise
+from jaxcal.models.verdict import Verdict
 
 __all__ = ["Calibration"]
 
@@ -84,38 +85,23 @@ class Calibration(Fit):
             "degrees of freedom"
             + ("" if lack is None else f"; lack-of-fit p = {lack:.3g}")
         )
-        if self.noise_std is None and self.verdict is None:
-            lines.append(self.no_noise("intervals"))
-        elif self.noise_std is not None:
+        if self.noise_std is not None:
             source = "as given" if self.noise_known else "from the residuals"
             lines.append(f"noise std {in_words(self.noise_std)}{unit}, {source}")
             if self.dof < 0.5:
                 lines.append("no residual degree of freedom: the noise is not checked")
-        if self.verdict is not None:
-            lines += str(self.verdict).splitlines()
-        if self.unidentified is not None:
-            named = [
-                name
-                for name, lost in zip(self.names, self.undetermined, strict=True)
-                if lost
-            ]
-            lines.append(
-                f"not determined, held near the prior's mean: {', '.join(named)}; "
-                "see identifiability()"
-            )
-        for row, weight in self.outliers.items():
-            lines.append(
-                f"outlier: measurement {row}, {self.distance[row] ** 0.5:.3g} standard "
-                f"deviations from the fit of the others, weight {weight:.2g}"
-            )
+        lines += str(self.verdict).splitlines()
         return "\n".join(lines)
 
     # -- can it be trusted -------------------------------------------------------------
 
     @functools.cached_property
-    def verdict(self) -> Any:
-        """What the model says of this calibration, of an arm a
-        ``jaxcal.models.serial.verdict.Verdict``; None of most models."""
+    def verdict(self) -> Verdict:
+        """Whether it may be used, why not, and what to do next; printed, these lines.
+
+        Of an arm with held-out errors (``jaxcal.models.serial.verdict.Verdict``). The
+        summary, ``report``, the exit codes and the warning of ``identify`` say this.
+        """
         return self.model.verdict(self)
 
     # -- an arm, written back ----------------------------------------------------------
@@ -187,9 +173,10 @@ class Calibration(Fit):
             "on average"
         )
         if again.noise_std is not None and self.noise_std is not None:
+            of_arms: tuple[Any, Any] = again.verdict, self.verdict
             told += (
-                f"; held-out error {again.verdict.held_out:.3g}{unit}, of the "
-                f"calibration {self.verdict.held_out:.3g}"
+                f"; held-out error {of_arms[0].held_out:.3g}{unit}, of the "
+                f"calibration {of_arms[1].held_out:.3g}"
             )
         warnings.warn(
             "the file has stiff joints and round gears and was fitted without "

@@ -40,25 +40,40 @@ class Check:
     tolerance: float  # root mean square of the outputs' change that matters
     unit: str = ""  # of the tolerance, where the calibration has one
 
-    def __str__(self) -> str:
-        text = (
-            f"the calibration {self.says}"
-            if self.says != "cannot be told"
-            else ("whether the calibration holds cannot be told")
-        )
+    @property
+    def good(self) -> bool:
+        """It holds."""
+        return self.says == "holds"
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """The finding, in a sentence."""
+        text = f"the calibration {self.says}"
+        if self.says == "cannot be told":
+            text = "whether the calibration holds cannot be told"
         change = f"{self.tolerance:.3g} {self.unit}".strip()
         text += (
             f" (p = {self.p_value:.3g}, false alarms 5 %); a change by {change} is "
             f"seen with {self.power:.0%} on average"
         )
-        if self.says == "cannot be told":
-            text += (
-                f", and could hide in {', '.join(self.unseen)}; measure more: "
-                "calibration.verification(candidates, k) says where"
-            )
+        if self.unseen and not self.good:
+            text += f", and could hide in {', '.join(self.unseen)}"
+        return (text,)
+
+    @property
+    def next_step(self) -> str:
+        """What to do about it."""
+        if self.good:
+            return "go on using it"
         if self.says == "does not hold":
-            text += "; calibrate again"
-        return text
+            return (
+                "measure one of these rows again to rule out a wrong reading, then "
+                "calibrate again (identify)"
+            )
+        return "measure more: calibration.verification(candidates, k) says where"
+
+    def __str__(self) -> str:
+        return f"{self.reasons[0]}; next: {self.next_step}"
 
 
 def check(

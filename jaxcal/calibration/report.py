@@ -6,6 +6,7 @@ here, so no drawing library is loaded. ``verdict.json`` is what a pipeline reads
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import html
 import json
@@ -18,24 +19,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal import pages
-from jaxcal.calibration.budget import Source, budget
+from jaxcal.calibration.budget import Budget, Source, budget
 from jaxcal.calibration.check import Check
 from jaxcal.calibration.fit import Fit
 from jaxcal.files import atomic_write
 
-__all__ = ["SCHEMA", "judged", "left_out", "moved", "report"]
+__all__ = ["SCHEMA", "left_out", "moved", "report"]
 
 Array = NDArray[np.float64]
 Calibration = Any  # a jaxcal.Calibration, whose module imports this one
-
-_UNLIKELY = 1e-4  # p-value of lack of fit under the noise that was given
 
 SCHEMA: dict[str, Any] = {
     "$schema": "https://json-schema.org/draft/2020-12/schema",
     "title": "jaxcal-verdict",
     "type": "object",
     "required": [
-        *("format", "version", "of", "good", "exit_code", "reasons", "numbers", "files")
+        *("format", "version", "of", "good", "exit_code", "reasons", "next_step"),
+        *("unit", "numbers", "files"),
     ],
     "properties": {
         "format": {"const": "jaxcal-verdict"},
@@ -44,6 +44,8 @@ SCHEMA: dict[str, Any] = {
         "good": {"type": "boolean"},
         "exit_code": {"enum": [0, 1]},
         "reasons": {"type": "array", "items": {"type": "string"}},
+        "next_step": {"type": "string"},
+        "unit": {"type": "string"},
         "numbers": {
             "type": "object",
             "additionalProperties": {"type": ["number", "null", "string"]},
@@ -53,6 +55,7 @@ SCHEMA: dict[str, Any] = {
             "additionalProperties": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
         },
         "budget": {"type": "object"},
+        "budget_of_predictions": {"type": "object"},
         "moved": {"type": "array", "items": {"type": "object"}},
     },
 }
@@ -78,34 +81,6 @@ def leverage(calibration: Fit) -> Array:
     slopes, covariance = calibration.linear(calibration.commands, misfit=False)
     spread = ((slopes @ covariance) * slopes).sum(axis=-1)
     return np.asarray((spread / np.where(noise > 0.0, noise, np.inf) ** 2).sum(axis=1))
-
-
-def judged(calibration: Calibration) -> tuple[bool, tuple[str, ...]]:
-    """Whether a calibration may be used, and the reasons against it.
-
-    Of an arm its verdict. Any other is good with a known noise, every parameter
-    determined, no outlier and no lack of fit.
-    """
-    verdict = calibration.verdict
-    if verdict is not None:
-        return bool(verdict.good), tuple(str(verdict).splitlines())
-    reasons = []
-    if calibration.noise_std is None:
-        reasons.append(calibration.no_noise("intervals"))
-    if calibration.undetermined.any():
-        lost = np.flatnonzero(calibration.undetermined)
-        reasons.append(
-            f"not determined: {', '.join(calibration.names[i] for i in lost)}"
-        )
-    reasons += [
-        f"measurement {row} is {calibration.distance[row] ** 0.5:.3g} standard "
-        "deviations from the fit of the others"
-        for row in calibration.outliers
-    ]
-    lack = calibration.lack_of_fit()
-    if lack is not None and lack < _UNLIKELY:
-        reasons.append(f"lack of fit under the noise that was given: p = {lack:.2g}")
-    return not reasons, tuple(reasons)
 
 
 def moved(calibration: Fit, before: Fit) -> list[dict[str, Any]]:
@@ -152,13 +127,14 @@ def report(
     readings: tuple[ArrayLike, ArrayLike] | None = None,
     before: Fit | None = None,
     sources: Sequence[Source] = (),
+    at: ArrayLike | None = None,
     files: Sequence[str | os.PathLike[str]] = (),
 ) -> bool:
     """Write ``index.html``, ``calibration.json`` and ``verdict.json`` into a folder.
 
-    The page has the parameters with their uncertainty budget, residuals by row and by
-    input, leverage, held-out errors, the errors before and after, the model, and the
-    files with their SHA-256.
+    The page has the parameters and predictions with their uncertainty budgets,
+    residuals by row and by input, leverage, held-out errors, the errors before and
+    after, the model, and the files with their SHA-256.
 
     Args:
         calibration: what is reported.
@@ -167,6 +143,8 @@ def report(
         readings: of the check, (N, n) commands and (N, m) readings, shown in a table.
         before: an earlier calibration of the same parameters, to compare with.
         sources: of uncertainty, as in ``budget``.
+        at: (P, n) commands whose predictions get a budget; when not given two that
+            were measured, the one nearest to the mean and the least certain one.
         files: that the calibration was made of, listed with their hashes.
 
     Returns:
@@ -177,9 +155,10 @@ def report(
         OSError: the folder cannot be written, or a file not be read.
         ValueError: ``before`` has other parameters.
     """
-    good, reasons = judged(calibration)
+    verdict = calibration.verdict
+    good, reasons, next_step = verdict.good, verdict.lines(), verdict.next_step
     if check is not None:
-        good, reasons = check.says == "holds", (str(check),)
+        good, reasons, next_step = check.good, check.reasons, check.next_step
     hashes = {os.fspath(path): _sha256(pathlib.Path(path)) for path in files}
     content = json.dumps(calibration.to_dict(), indent=1, allow_nan=False) + "\n"
     hashes["calibration.json"] = hashlib.sha256(content.encode()).hexdigest()
@@ -190,15 +169,22 @@ def report(
         "good": good,
         "exit_code": 0 if good else 1,
         "reasons": list(reasons),
+        "next_step": next_step,
+        "unit": calibration.measured_unit,
         "numbers": _numbers(calibration, check),
         "files": hashes,
     }
-    known = calibration.noise_std is not None
-    if known:
-        document["budget"] = budget(calibration, sources=sources).to_dict()
+    budgets: list[Budget] = []
+    if calibration.noise_std is not None:
+        budgets = [
+            budget(calibration, sources=sources),
+            _of_predictions(calibration, at, sources),
+        ]
+        document["budget"] = budgets[0].to_dict()
+        document["budget_of_predictions"] = budgets[1].to_dict()
     if before is not None:
         document["moved"] = moved(calibration, before)
-    page = _page(calibration, document, sources, readings)
+    page = _page(calibration, document, budgets, readings)
     written = {
         "calibration.json": content,
         "verdict.json": json.dumps(document, indent=1, allow_nan=False) + "\n",
@@ -210,6 +196,26 @@ def report(
         with atomic_write(place / name) as file:
             file.write(text.encode())
     return good
+
+
+def _of_predictions(
+    calibration: Fit, at: ArrayLike | None, sources: Sequence[Source]
+) -> Budget:
+    """The budget at some commands, which are named by their rows."""
+    if at is not None:
+        return budget(calibration, at, sources=sources)
+    commands = calibration.commands
+    spread = commands.std(axis=0)
+    off = (commands - commands.mean(axis=0)) / np.where(spread > 0.0, spread, 1.0)
+    std = calibration.predict_std(commands) / calibration.require_noise("budget")
+    rows = [int((off**2).sum(axis=1).argmin()), int((std**2).sum(axis=1).argmax())]
+    names = [
+        f"{output} as at measurement {row} ({place})"
+        for row, place in zip(rows, ("middle", "least certain"), strict=True)
+        for output in calibration.output_names
+    ]
+    found = budget(calibration, commands[rows], sources=sources)
+    return dataclasses.replace(found, names=tuple(names))
 
 
 def _sha256(path: pathlib.Path) -> str:
@@ -224,7 +230,6 @@ def _numbers(calibration: Fit, check: Check | None) -> dict[str, Any]:
         "degrees_of_freedom": float(calibration.dof),
         "residual_rms": float(np.sqrt(np.mean(calibration.residuals**2))),
         "lack_of_fit_p": lack,
-        "unit": calibration.measured_unit,
     }
     if calibration.noise_std is not None:
         off = np.linalg.norm(left_out(calibration), axis=1)
@@ -262,7 +267,7 @@ def _nominal_errors(calibration: Fit) -> Array | None:
 def _page(
     calibration: Calibration,
     document: Mapping[str, Any],
-    sources: Sequence[Source],
+    budgets: Sequence[Budget],
     readings: tuple[ArrayLike, ArrayLike] | None,
 ) -> pages.Page:
     good, check = document["good"], document["of"] == "check"
@@ -277,20 +282,21 @@ def _page(
         if value not in (None, "")
     ]
     first: list[pages.Block] = [pages.Text(line) for line in document["reasons"]]
+    first.append(pages.Text(f"Next: {document['next_step']}."))
     first.append(pages.Table(("", "value"), rows))
     sections = [pages.Section("Verdict", first, "verdict", badge)]
-    known = calibration.noise_std is not None
     if readings is not None:
         sections.append(_new_section(calibration, *readings))
     if "moved" in document:
         sections.append(_moved_section(document["moved"]))
-    if known:
-        table = budget(calibration, sources=sources).rows()
+    blocks: list[pages.Block]
+    if budgets:
+        of_parameters, of_predictions = (one.rows() for one in budgets)
         note = (
             "Standard uncertainties by source (GUM), effective degrees of freedom by "
             "Welch and Satterthwaite, coverage factor k, expanded uncertainty U."
         )
-        blocks: list[pages.Block] = [pages.Table(table[0], table[1:]), note]
+        blocks = [pages.Table(of_parameters[0], of_parameters[1:]), note]
     else:
         cells = zip(calibration.names, calibration.parameters, strict=True)
         parameters = [[name, f"{value:.6g}"] for name, value in cells]
@@ -299,6 +305,14 @@ def _page(
             pages.Text(calibration.no_noise("intervals"), "warning"),
         ]
     sections.append(pages.Section("Parameters", blocks, "parameters"))
+    if budgets:
+        unit = f", {calibration.measured_unit}" if calibration.measured_unit else ""
+        text = (
+            f"Of the true outputs{unit}, without the noise of a reading there: what "
+            "the calibration does not know."
+        )
+        table = pages.Table(of_predictions[0], of_predictions[1:])
+        sections.append(pages.Section("Predictions", [text, table], "predictions"))
     sections += _residual_sections(calibration)
     sections.append(_files_section(calibration, document["files"]))
     made = calibration.provenance.get("created", "")

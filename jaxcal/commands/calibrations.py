@@ -23,7 +23,7 @@ from jaxcal.commands.tables import (
     write_json,
     write_rows,
 )
-from jaxcal.csvtable import COMMANDS, MEASURED, read_table
+from jaxcal.csvtable import COMMANDS, MEASURED, Table, read_table
 from jaxcal.extras import needs
 from jaxcal.models import SerialChain
 from jaxcal.models.sensors import SENSORS, Board, Placed
@@ -32,6 +32,8 @@ from jaxcal.selection import select
 __all__ = ["check", "command", "identify", "postures", "predict"]
 
 Array = NDArray[np.float64]
+
+_LENGTHS = ("position", "socket", "plane", "distance")  # sensors that read lengths
 
 
 def postures(
@@ -191,6 +193,11 @@ def identify(
     report: ReportFolder = "",
     against: Earlier = None,
     certificate: CertificateSize = None,
+    at: Annotated[
+        str | None,
+        "table of commands whose predictions get a budget on the page",
+        "FILE",
+    ] = None,
     json: Annotated[bool, "print JSON"] = False,
 ) -> int:
     """Fit a model to measurements and save the calibration.
@@ -205,6 +212,8 @@ def identify(
         names = of_arm.columns(machine, table, inputs, "--inputs")
         commands = of_arm.commands(machine, table, names)
         known = machine.sensor.outputs
+        if machine.sensor.kind in _LENGTHS:  # files of this format are in metres
+            measured_unit = measured_unit or "m"
         if machine.sensor.zeros:  # a contact needs no columns of readings
             measured = np.zeros((len(commands), len(known)))
         else:
@@ -234,7 +243,7 @@ def identify(
         accuracy=accuracy,
     )
     told, saved = calibration.verdict, f"saved {out}"
-    if as_urdf and told and not told.good and not unproven:
+    if as_urdf and not told.good and not unproven:
         raise ValueError(
             f"{out} is not written, --unproven writes it all the same:\n{told}"
         )
@@ -250,10 +259,11 @@ def identify(
             sources=[Source.certificate("certificate", certificate)]
             if certificate is not None
             else (),
+            at=None if at is None else _commands_for(calibration, read_table(at)),
             files=[path for path in (file, model) if path and os.path.isfile(path)],
         )
-    elif against or certificate is not None:
-        raise ValueError("--against and --certificate are of --report FOLDER")
+    elif against or at or certificate is not None:
+        raise ValueError("--against, --certificate and --at are of --report FOLDER")
     if json:
         write_json("", calibration.to_dict())
         return int(not good)
@@ -287,9 +297,9 @@ def check(
     that cannot be told from these readings; 2: bad input.
     """
     found, table = Calibration.load(calibration), read_table(file)
-    inputs = table.named(found.input_names, COMMANDS, unit=found.command_unit)
+    commands = _commands_for(found, table)
     outputs = table.named(found.output_names, MEASURED, unit=found.measured_unit)
-    commands, measured = table.columns(inputs), table.columns(outputs)
+    measured = table.columns(outputs)
     told = found.check(commands, measured, tolerance=tolerance, placed_anew=placed_anew)
     if report:
         files = [path for path in (calibration, file) if os.path.isfile(path)]
@@ -300,7 +310,7 @@ def check(
         print(told)
         if report:
             print(f"report {os.path.join(report, 'index.html')}")
-    return int(told.says != "holds")
+    return int(not told.good)
 
 
 def predict(
@@ -314,9 +324,8 @@ def predict(
 ) -> None:
     """Where a calibrated machine goes for given commands."""
     found = Calibration.load(calibration)
-    table, unit = read_table(file), found.command_unit
-    names = table.named(found.input_names, COMMANDS, chosen=columns, unit=unit)
-    commands = table.columns(names)
+    table = read_table(file)
+    commands = _commands_for(found, table, columns)
     if radians:
         if not isinstance(found.model, SerialChain):
             raise ValueError("--radians is of arms")
@@ -357,6 +366,16 @@ def command(
         limits = limits * found.num_inputs
     commands = found.command_for(desired, limits=limits or None, clip=clip)
     _emit(output, found.input_names, commands)
+
+
+def _commands_for(
+    calibration: Calibration, table: Table, chosen: str | None = None
+) -> Array:
+    """(N, n) the commands of a calibration in a table, by name."""
+    unit = calibration.command_unit
+    return table.columns(
+        table.named(calibration.input_names, COMMANDS, chosen=chosen, unit=unit)
+    )
 
 
 def _emit(output: Output, names: Sequence[str], values: Array) -> None:

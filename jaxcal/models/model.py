@@ -19,6 +19,7 @@ from jaxcal.checks import array_of, in_words
 from jaxcal.csvtable import COMMANDS, of_frame
 from jaxcal.information.singular import flat
 from jaxcal.models.uncertainty import Noise, Prior
+from jaxcal.models.verdict import Verdict, verdict
 
 __all__ = [
     "ErrorGroups",
@@ -247,14 +248,13 @@ class Model(abc.ABC):
         """
         return lambda commands, rows: desired[rows]
 
-    def verdict(self, fit: Any) -> Any:
+    def verdict(self, fit: Any) -> Verdict:
         """Whether a ``jaxcal.Calibration`` of this model can be trusted.
 
-        Returns:
-            Printed, the reasons; ``good`` if it may be used. None where the model has
-            nothing to say.
+        Printed, the reasons and the next step; ``good`` if it may be used. A model
+        that has an answer of its own returns a subclass of ``Verdict``.
         """
-        return None
+        return verdict(fit)
 
     def calibrated(self, parameters: ArrayLike) -> Model:
         """The machine whose nominal is this one's with ``parameters``."""

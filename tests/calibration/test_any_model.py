@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import pathlib
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +24,7 @@ from jaxcal.models import (
     SerialChain,
     identifiability,
 )
+from jaxcal.models.verdict import Verdict, verdict
 
 
 class Wave:
@@ -121,7 +122,7 @@ def test_students_loss_is_at_its_minimum() -> None:
     expected = optimize.minimize(loss, TRUTH[:5], method="BFGS", tol=1e-10).x
     np.testing.assert_allclose(found.parameters[:5], expected, atol=2e-6)
     assert list(found.outliers) == [4] and found.outliers[4] < 0.05
-    assert "outlier: measurement 4," in repr(found)
+    assert "measurement 4 is" in repr(found)
     plain = identify(commands, measured, model=WAVE, noise_std=0.05, loss="gaussian")
     error, plain_error = (
         np.linalg.norm((each.parameters - TRUTH)[:5]) for each in (found, plain)
@@ -630,15 +631,12 @@ class Line(Model):
             raise ValueError("commands must not be negative")
 
     def verdict(self, fit):
-        return None if fit.noise_std is None else Good(bool(fit.noise_std[0] < 1.0))
+        said = f"a noise of {fit.noise_std[0]:.1g}"
+        return Verdict(bool(fit.noise_std[0] < 1.0), (said,), "measure the line again")
 
     @property
     def placed(self):
         return ("a",)
-
-
-class Good(NamedTuple):
-    good: bool
 
 
 def test_a_model_of_ones_own_answers_for_itself():
@@ -646,7 +644,9 @@ def test_a_model_of_ones_own_answers_for_itself():
     measured = 1.0 + 2.0 * commands + 0.1 * np.cos(9.0 * commands)
     calibration = identify(commands, measured, model=Line())
     assert calibration.verdict.good
-    with pytest.warns(UserWarning, match="good=False"):
+    with pytest.warns(
+        UserWarning, match="a noise of 8\nnot good; next: measure the line again"
+    ):
         identify(commands, measured + 9.0 * np.cos(9.0 * commands), model=Line())
     with pytest.raises(ValueError, match="must not be negative"):
         identify(-commands, measured, model=Line())
@@ -672,7 +672,7 @@ def test_seven_names_are_a_model():
     commands = np.arange(6.0)[:, None]
     measured = 1.0 + 2.0 * commands + 0.1 * np.cos(9.0 * commands)
     least, line = (identify(commands, measured, model=m) for m in (Least(), Line()))
-    assert least.verdict is None and "of Least" in least.summary()
+    assert least.verdict == verdict(line) and "of Least" in least.summary()
     np.testing.assert_allclose(least.estimate, line.estimate, atol=1e-9)
     assert jaxcal.select(commands, 2, model=Least()).log_det > 0.0
     assert identifiability(Least(), commands).rank == 2

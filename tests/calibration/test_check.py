@@ -180,7 +180,7 @@ def test_readings_in_another_unit_are_named(factor):
     # Far off, but by no unit: a verdict, not a refusal.
     said = str(found.check(u[:5], y[:5] + 300.0))
     assert said.startswith("the calibration does not hold")
-    assert said.endswith("; calibrate again")
+    assert said.endswith("then calibrate again (identify)")
     rng.shuffle(y)
     assert found.check(u[:5], 900.0 * y[:5]).says == "does not hold"
 

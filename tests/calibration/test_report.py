@@ -42,10 +42,12 @@ def test_held_out_errors_and_leverage_are_those_of_fits_without_the_row(tmp_path
 def test_a_pipeline_reads_the_verdict_and_the_exit_code(tmp_path, rng, capsys):
     pytest.importorskip("jinja2")
     data, folder = tmp_path / "t.csv", tmp_path / "report"
-    table(data, rng)
+    u, y = table(data, rng)
+    (tmp_path / "at.csv").write_text("c,a,b\n3,10,-2\n")
     saved = str(tmp_path / "c.json")
     asked = ["identify", str(data), "--out", saved, "--report", str(folder)]
-    assert main([*asked, "--certificate", "0.02"]) == 0
+    at = ["--at", str(tmp_path / "at.csv")]
+    assert main([*asked, "--certificate", "0.02", *at]) == 0
     found = json.loads((folder / "verdict.json").read_text())
     assert found["good"] and found["exit_code"] == 0 and found["of"] == "identify"
     assert found["files"][str(data)] == hashlib.sha256(data.read_bytes()).hexdigest()
@@ -55,8 +57,23 @@ def test_a_pipeline_reads_the_verdict_and_the_exit_code(tmp_path, rng, capsys):
     wanted = jaxcal.Calibration.load(saved)
     assert again.parameters.tolist() == wanted.parameters.tolist()
     assert [s["name"] for s in found["budget"]["sources"]] == ["noise", "certificate"]
+    z = np.column_stack([u, np.ones(len(u))])
+    off = y - z @ np.linalg.lstsq(z, y)[0]
+    std = np.sqrt((off**2).sum(axis=0) / (len(u) - 4))
+    point = np.array([10.0, -2.0, 3.0, 1.0])
+    std *= np.sqrt(point @ np.linalg.solve(z.T @ z, point))
+    rows = found["budget_of_predictions"]["results"]
+    combined = [row["combined"] for row in rows]
+    np.testing.assert_allclose(combined, np.hypot(std, 0.01), rtol=1e-9)
+    assert found["next_step"].startswith("use it")
     page = (folder / "index.html").read_text()
-    for title in ("Verdict", "Parameters", "Residuals", "Before and after", "files"):
+    for title in (
+        "Verdict",
+        "Parameters",
+        "Predictions",
+        "Residuals",
+        "Before and after",
+    ):
         assert title in page
     assert "<script" not in page and "http" not in page.replace("http://www.w3", "")
 

@@ -354,12 +354,19 @@ class SerialChain(Arm, Model):
         slack = np.where(units == "deg", _BEYOND, 0.01 * _BEYOND * (high - low))
         far = np.argwhere((joints < low - slack) | (joints > high + slack))
         for row, joint in far[:1]:
+            name, column = self.joint_names[joint], -joints[:, joint]
+            least, most = (low - slack)[joint], (high + slack)[joint]
+            if ((column >= least) & (column <= most)).all():
+                advice = f"{name} seems reversed, all rows are within them with the "
+                advice += "other sign: negate that column."
+            else:
+                advice = "are the columns in this order: "
+                advice += f"{', '.join(self.joint_names)}?"
             raise ValueError(
-                f"{self.joint_names[joint]} must be within its limits "
-                f"{in_words(self.limits[joint])}, to {slack[joint]:g}, got "
-                f"{joints[row, joint]:g} in row {row}; are the columns in this order: "
-                f"{', '.join(self.joint_names)}? Where the file's limits are wrong, "
-                "give limits={name: (low, high)}, --limits"
+                f"{name} must be within its limits {in_words(self.limits[joint])}, to "
+                f"{slack[joint]:g}, got {joints[row, joint]:g} in row {row}; {advice} "
+                "Where the file's limits are wrong, give limits={name: (low, high)}, "
+                "--limits"
             )
 
     def prepared(self, commands: Array, measured: Array | None = None) -> Self:

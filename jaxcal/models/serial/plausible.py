@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from jaxcal.checks import in_words
 from jaxcal.models.sensors import Pose, Position, Socket
+from jaxcal.models.serial.mistaken import mistaken_columns
 
 __all__ = ["require_readings", "require_sockets", "warn_of_radians"]
 
@@ -65,7 +66,7 @@ def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
             raise ValueError(
                 f"contacts of socket {i} must be at one point within {most:.2g}, but "
                 f"the arm as described scatters by {np.median(far):.2g} there: "
-                + (still or _OTHER_ARM)
+                + (still or mistaken_columns(arm, commands, measured) or _OTHER_ARM)
             )
         lost = rows[far > most + 4.0 * np.median(far)]
         if lost.size:

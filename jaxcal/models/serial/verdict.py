@@ -13,8 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.information.singular import depends
+from jaxcal.models import verdict as models
 from jaxcal.models.sensors import Placed, Pose, Position, Socket
 from jaxcal.models.sensors.sensor import hats
+from jaxcal.models.serial.mistaken import mistaken_columns
+from jaxcal.models.verdict import UNLIKELY, outlying
 
 __all__ = ["Verdict", "verdict"]
 
@@ -23,7 +26,6 @@ Chain = Any  # a Chain, whose module imports this one
 Fit = Any  # a jaxcal.Calibration, whose package imports this one
 
 _SCATTER = 3.0  # times the sensor's usual noise: the model does not explain that
-_UNLIKELY = 1e-4  # p-value of lack of fit
 _FAR = 4.0  # standard deviations of the prior
 _MOVED = 3.0  # times the scatter of a socket's contacts: it was moved
 _SHUFFLES = 400
@@ -40,59 +42,56 @@ _TIP = 0.004  # of the arm's length: tools are built nearer to their description
 _LINK = 0.02  # likewise; without a known distance an arm may shrink to fit contacts
 _ZERO = 10.0  # degrees: no zero of a joint is set so badly
 _LOUD, _IDLE = 10.0, 0.2  # times the usual noise; of it, what the readings scatter by
+_PLAIN = 0.01  # of the arm's length: columns as they should be are nearer than that
 _DRAWN = 200  # postures anywhere within the limits
 
 
-@dataclasses.dataclass(frozen=True)
-class Verdict:
-    """What the readings say of a calibration; printed, the reasons line by line."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Verdict(models.Verdict):
+    """What the readings say of an arm's calibration.
+
+    Good: held-out errors are below the accuracy asked for. Where none was, it is better
+    than the nominal machine, and the noise explains the scatter or what is left is a
+    third of the nominal error. In either case no reading contradicts the others.
+    """
 
     # None where there are too few measurements to tell.
-    explains: bool | None  # the scatter of the readings is what the noise can be
-    helps: bool | None  # held-out errors are smaller than those of the nominal machine
-    clean: bool | None  # no reading contradicts the others, nor the arm its description
-    held_out: float  # mean held-out error of a measurement, in the readings' unit
-    interval: tuple[float, float]  # 95 % of that mean
-    nominal: float  # mean error of the nominal machine
-    anywhere: float  # standard deviation within the limits; NaN where not known
-    reasons: tuple[str, ...]
+    explains: bool | None = None  # the scatter of the readings is what the noise can be
+    helps: bool | None = None  # held-out errors are below those of the nominal machine
+    clean: bool | None = None  # no reading contradicts the others or the description
+    held_out: float = np.nan  # mean held-out error of a measurement, in ``unit``
+    interval: tuple[float, float] = (np.nan, np.nan)  # 95 % of that mean
+    nominal: float = np.nan  # mean error of the nominal machine
+    anywhere: float = np.nan  # standard deviation within the limits; NaN if not known
     accuracy: float | None = None  # that was asked for
 
-    @property
-    def good(self) -> bool:
-        """It may be used.
-
-        Held-out errors are below the accuracy asked for. Where none was, it is better
-        than the nominal machine, and the noise explains the scatter or what is left is
-        a third of the nominal error.
-        """
-        if self.accuracy is not None:
-            return bool(self.clean and self.interval[1] <= self.accuracy)
-        enough = self.explains or self.interval[1] < _LITTLE * self.nominal
-        return bool(self.clean and self.helps and enough)
-
-    def __str__(self) -> str:
+    def lines(self) -> tuple[str, ...]:
+        """The errors, and what speaks against the calibration."""
         if self.explains is None:
-            return "\n".join(self.reasons)
-        low, high = self.interval
+            return self.reasons
+        (low, high), unit = self.interval, f" {self.unit}" if self.unit else ""
+        of_unit = unit or " in the readings' unit"
         lines = [
-            f"held-out error {self.held_out:.3g} [{low:.3g}, {high:.3g}], nominal "
-            f"{self.nominal:.3g}"
+            f"held-out error {self.held_out:.3g} [{low:.3g}, {high:.3g}]{of_unit}, "
+            f"nominal {self.nominal:.3g}"
         ]
         if np.isfinite(self.anywhere):
             lines.append(
                 f"standard deviation of the tip within the joint limits "
-                f"{self.anywhere:.3g}, a shift or turn of the whole arm not counted"
+                f"{self.anywhere:.3g}{unit}, a shift or turn of the whole arm not "
+                "counted"
             )
         if self.accuracy is not None and not self.interval[1] <= self.accuracy:
-            lines.append(f"not the accuracy that was asked for, {self.accuracy:g}")
+            lines.append(
+                f"not the accuracy that was asked for, {self.accuracy:g}{unit}"
+            )
         if not self.explains:
             lines.append("this model does not explain these readings by its noise")
         if self.helps is None:
             lines.append("whether it is better than the nominal machine is not sure")
         elif not self.helps:
             lines.append("it is no better than the nominal machine")
-        return "\n".join([*lines, *self.reasons])
+        return (*lines, *self.reasons)
 
 
 def verdict(calibration: Fit) -> Verdict:
@@ -100,13 +99,16 @@ def verdict(calibration: Fit) -> Verdict:
 
     Held-out errors with an interval beside those of the nominal arm, the scatter
     against the sensor's usual noise, and by name: outliers, contacts of another socket,
-    a socket that was moved, parameters far from what was known.
+    a socket that was moved, joints reversed or exchanged, parameters far from what was
+    known.
     """
-    model = calibration.model
+    model, unit = calibration.model, calibration.measured_unit
     if calibration.noise_std is None:
-        why = calibration.no_noise("intervals and no verdict")
         return Verdict(
-            None, None, None, np.nan, (np.nan, np.nan), np.nan, np.nan, (why,)
+            good=False,
+            reasons=(calibration.no_noise("intervals and no verdict"),),
+            next_step="measure more postures, or state noise_std, --noise",
+            unit=unit,
         )
     used = np.flatnonzero(calibration.loss_weights > 0.0)
     commands, residuals = calibration.commands[used], calibration.residuals[used]
@@ -121,43 +123,96 @@ def verdict(calibration: Fit) -> Verdict:
     nominal = float(np.linalg.norm(before / size, axis=1).mean())
     mean = float(errors.mean())
     half = 1.96 * errors.std() / np.sqrt(max(len(errors) - 1, 1))
+    interval = (max(mean - half, 0.0), mean + half)
     explains, reasons = _scattered(calibration, usual)
     swapped = _swapped(calibration, model, used, explains)
     for row, other in swapped.items():
         reasons.append(f"measurement {row} fits {model.sensor.kind} {other} instead")
-    for row in calibration.outliers:
-        if row not in swapped:
-            reasons.append(
-                f"measurement {row} is {calibration.distance[row] ** 0.5:.3g} standard "
-                "deviations from the fit of the others"
-            )
+    loose = [row for row in calibration.outliers if row not in swapped]
+    reasons += [outlying(calibration, row) for row in loose]
     for left in np.flatnonzero(calibration.loss_weights == 0.0):
         same = (commands == calibration.commands[left]).all(axis=1)
         if model.sensor.zeros and same.any():
             reasons.append(f"measurement {left} is {used[same][0]} again, counted once")
     right = ~np.isin(used, list(swapped))
     exchanged = _exchanged(calibration, model)
-    moved = _moved(model, commands[right], residuals[right], used[right])
+    moved = _moved(calibration, model, commands[right], residuals[right], used[right])
     limit = _LOOSE if len(used) > _SPARSE else 0.0
-    loose = (calibration.distance[list(calibration.outliers)] > limit**2).any()
-    if swapped or exchanged or loose:
+    far = (calibration.distance[list(calibration.outliers)] > limit**2).any()
+    contradict = bool(swapped or exchanged or far)
+    if contradict:
         reasons.insert(0, "some readings contradict the others")
+    mistaken = ""
+    if not explains and nominal > _PLAIN * model.length:
+        mistaken = mistaken_columns(model, commands, measured)
     tip, doubtful = _other_tip(calibration, model)
-    other_arm = _other_links(calibration, model)
+    other_arm = [] if mistaken else _other_links(calibration, model)
     other_arm = other_arm or _other_distances(calibration, model)
     still, unused = _still(model, commands)
-    reasons += moved + exchanged + _far(calibration) + tip + other_arm + still
-    doubtful |= bool(swapped or exchanged or loose or other_arm or unused)
+    told = reasons + moved + exchanged + _far(calibration) + tip + other_arm + still
+    if mistaken:  # what the fit made of it is no reason
+        told = [mistaken]
+    doubtful |= bool(contradict or other_arm or unused or mistaken)
+    clean = not (doubtful or (moved and not explains))
+    helps = True if mean < nominal else None if mean - half < nominal else False
+    accuracy = calibration.provenance.get("accuracy")
+    if accuracy is not None:
+        good = clean and interval[1] <= accuracy
+    else:
+        enough = explains or interval[1] < _LITTLE * nominal
+        good = bool(clean and helps and enough)
+    if mistaken:
+        step = "correct the columns, then identify again"
+    elif contradict:
+        listed = ", ".join(map(str, sorted({*swapped, *calibration.outliers})))
+        step = (
+            "look at the sockets' columns"
+            if exchanged
+            else (
+                f"look at measurement {listed} (counted from 0): correct it, measure "
+                "it again or leave it out"
+            )
+        )
+    elif moved and not explains:
+        kind = model.sensor.kind
+        step = (
+            f"measure again with the {kind} fixed, or number it as two: one {kind} "
+            "before it moved and another after"
+        )
+    elif doubtful:
+        step = "clear up what ends in a question or an advice, then identify again"
+    elif good:
+        step = models.USE
+    elif accuracy is not None or helps is None:
+        step = "measure more postures: jaxcal postures --measured chooses them"
+    else:
+        step = (
+            "look at the residuals (report, --report); keep the nominal machine until "
+            "they are explained"
+        )
     return Verdict(
+        good=good,
+        reasons=tuple(told),
+        next_step=step,
+        unit=unit,
         explains=explains,
-        helps=True if mean < nominal else None if mean - half < nominal else False,
-        clean=not (doubtful or (moved and not explains)),
+        helps=helps,
+        clean=clean,
         held_out=mean,
-        interval=(max(mean - half, 0.0), mean + half),
+        interval=interval,
         nominal=nominal,
         anywhere=_anywhere(calibration, model, commands),
-        reasons=tuple(reasons),
-        accuracy=calibration.provenance.get("accuracy"),
+        accuracy=accuracy,
+    )
+
+
+def _in(calibration: Fit) -> str:
+    """The unit of lengths after a number: that of the readings, where it is stated."""
+    of_lengths = not calibration.measured_unit.startswith(("deg", "rad", "m/s"))
+    return (
+        f" {calibration.measured_unit}"
+        if calibration.measured_unit and of_lengths
+        else ""
     )
 
 
@@ -187,7 +242,7 @@ def _scattered(calibration: Fit, usual: Array) -> tuple[bool, list[str]]:
                 f"usually has, and the readings scatter by {ratio:.2g} of it: is it in "
                 "their unit?"
             ]
-        if fit is None or fit > _UNLIKELY:
+        if fit is None or fit > UNLIKELY:
             return True, []
         return False, [f"lack of fit under the noise that was given: p = {fit:.2g}"]
     noise = np.asarray(calibration.noise_std)
@@ -195,9 +250,10 @@ def _scattered(calibration: Fit, usual: Array) -> tuple[bool, list[str]]:
     if times < _SCATTER:
         return True, []
     largest = float(noise[(noise / usual).argmax()])
+    unit = _in(calibration) if np.ptp(usual) == 0.0 else ""
     return False, [
-        f"the readings scatter by {largest:.3g}, {times:.3g} times what this sensor "
-        "usually does: their noise, or what no parameter explains"
+        f"the readings scatter by {largest:.3g}{unit}, {times:.3g} times what this "
+        "sensor usually does: their noise, or what no parameter explains"
     ]
 
 
@@ -234,10 +290,10 @@ def _other_tip(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
         return [], False
     std = float(np.sqrt(variance)) / far
     allowed = 2.0 / np.sqrt(calibration.prior_precision[at].max() + 1e-300)
+    by = ", ".join(f"{each:.3g}" for each in moved)
     return [
-        f"the tip is {far:.3g} from where the arm's description has it "
-        f"(tool {', '.join(f'{each:.3g}' for each in moved)}), known to {std:.2g}: is "
-        "it another tip?"
+        f"the tip is {far:.3g}{_in(calibration)} from where the arm's description has "
+        f"it (tool {by}), known to {std:.2g}: is it another tip?"
     ], bool(far < _SURE * std or far > allowed)
 
 
@@ -249,15 +305,15 @@ def _other_distances(calibration: Fit, model: Chain) -> list[str]:
     off, rows = model.facts(calibration.parameters)
     spread = rows @ np.asarray(calibration.covariance)
     share = np.minimum((spread * rows).sum(axis=1), 1.0 - 1e-9)
-    said = []
+    said, unit = [], _in(calibration)
     for (first, second, distance, std), left, h in zip(known, off, share, strict=True):
         free = distance - std * left / (1.0 - h)  # fitted without it, to first order
         sure = abs(left) > _APART * np.sqrt(1.0 - h) and h < 1.0 - _ALONE
         if not sure or abs(free - distance) < _SHORT * model.length:
             continue
         said.append(
-            f"sockets {first:.0f} and {second:.0f} are given as {distance:g} apart, "
-            f"but the contacts and the arm's lengths say {free:.4g} +- "
+            f"sockets {first:.0f} and {second:.0f} are given as {distance:g}{unit} "
+            f"apart, but the contacts and the arm's lengths say {free:.4g} +- "
             f"{std * np.sqrt(h / (1.0 - h)):.2g}: measure that distance again"
         )
     return said
@@ -290,7 +346,8 @@ def _other_links(calibration: Fit, model: Chain) -> list[str]:
         far = np.flatnonzero(lengths & (sure > most))
         if far.size:
             found.append(
-                f"{', '.join(names[far])}: to {off[far].max():.3g} from the arm's "
+                f"{', '.join(names[far])}: to {off[far].max():.3g}"
+                f"{_in(calibration)} from the arm's "
                 "description: readings of another arm, in another unit, of a board of "
                 "another size, or of several sockets as one?"
             )
@@ -360,10 +417,14 @@ def _groups(model: Chain, commands: Array) -> list[NDArray[np.intp]]:
 
 
 def _moved(
-    model: Chain, commands: Array, residuals: Array, names: NDArray[np.intp]
+    calibration: Fit,
+    model: Chain,
+    commands: Array,
+    residuals: Array,
+    names: NDArray[np.intp],
 ) -> list[str]:
     """Sockets and planes whose first and last contacts lie apart."""
-    found = []
+    found, unit = [], _in(calibration)
     rng = np.random.default_rng(0)
     for i, rows in enumerate(_groups(model, commands)):
         if len(rows) < 2 * _FEW:
@@ -377,8 +438,8 @@ def _moved(
         if gain > np.quantile(shuffled, 0.99):
             first, last = names[rows[:at]], names[rows[at:]]
             found.append(
-                f"{model.sensor.kind} {i} seems to have moved by {apart:.3g} between "
-                f"measurements {first[-1]} and {last[0]}"
+                f"{model.sensor.kind} {i} seems to have moved by {apart:.3g}{unit} "
+                f"between measurements {first[-1]} and {last[0]}"
             )
     return found
 

@@ -1,0 +1,93 @@
+"""Whether a calibration may be used, why not, and what to do next: one answer for all.
+
+``Verdict`` is what ``Model.verdict`` returns; ``verdict`` is the answer of a model that
+knows no better. Summary, report, exit codes and warnings ask no one else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+__all__ = ["USE", "Verdict", "outlying", "verdict"]
+
+Fit = Any  # a jaxcal.Calibration, whose package imports this one
+
+UNLIKELY = 1e-4  # p-value of lack of fit under the noise that was given
+
+USE = (
+    "use it (command_for, jaxcal command); check it with a few new readings after a "
+    "change of the machine (check, jaxcal check)"
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """Whether a calibration may be used; printed, the reasons and the next step."""
+
+    good: bool
+    reasons: tuple[str, ...]  # against it, or worth knowing
+    next_step: str
+    unit: str = ""  # of the readings, and of the lengths or angles in the reasons
+
+    def lines(self) -> tuple[str, ...]:
+        """What it says, without the last line, which is the verdict itself."""
+        return self.reasons
+
+    def __str__(self) -> str:
+        word = "good" if self.good else "not good"
+        return "\n".join([*self.lines(), f"{word}; next: {self.next_step}"])
+
+
+def outlying(fit: Fit, row: int) -> str:
+    """How far a measurement is from the others, which do not have to be near it."""
+    return (
+        f"measurement {row} is {fit.distance[row] ** 0.5:.3g} standard deviations from "
+        "the fit of the others"
+    )
+
+
+def verdict(fit: Fit) -> Verdict:
+    """Good with a known noise, every parameter determined, no outlier, no misfit."""
+    told: list[tuple[str, str]] = []  # a reason and what to do about it
+    if fit.noise_std is None:
+        told.append(
+            (
+                fit.no_noise("intervals"),
+                "measure more rows, or state noise_std, --noise",
+            )
+        )
+    if fit.undetermined.any():
+        names = ", ".join(fit.names[i] for i in np.flatnonzero(fit.undetermined))
+        told.append(
+            (
+                f"not determined, held near the prior's mean: {names}; see "
+                "identifiability()",
+                "measure rows that determine them: "
+                "select(candidates, model=..., measured=commands)",
+            )
+        )
+    if fit.outliers:
+        rows = ", ".join(map(str, fit.outliers))
+        again = f"measure again, or leave out, measurement {rows} (counted from 0)"
+        told += [
+            (f"{outlying(fit, row)}, weight {weight:.2g}", again)
+            for row, weight in fit.outliers.items()
+        ]
+    lack = fit.lack_of_fit()
+    if lack is not None and lack < UNLIKELY:
+        told.append(
+            (
+                f"lack of fit under the noise that was given: p = {lack:.2g}",
+                "look at the residuals (report, --report): a pattern asks for a model "
+                "with more terms, none for a larger noise",
+            )
+        )
+    return Verdict(
+        good=not told,
+        reasons=tuple(reason for reason, _ in told),
+        next_step=told[0][1] if told else USE,
+        unit=fit.measured_unit,
+    )
