@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import sys
 from collections.abc import Sequence
 
@@ -14,12 +15,13 @@ from rig.journal.errors import JournalError
 
 # Looked for before any port opens; finding is quicker than importing.
 NEEDED = ("pydantic", "pymodbus")
+NUMBER = re.compile(r"[-+.0-9]+(?:[eE][-+]?[0-9]+)?")
 OTHERS = ("jinja2", "tomlkit")  # not by `stop`; the report is written last
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
-    argv = sys.argv[1:] if argv is None else argv
+    argv = _ordered(sys.argv[1:] if argv is None else argv)
     args = make_parser(argv[0] if argv else None).parse_args(argv)
     command, code = args.command, EXIT_BAD_INPUT
     try:
@@ -40,6 +42,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(error, JournalError) and command == "resume":
             return EXIT_BAD_INPUT
         return EXIT_FAULT if isinstance(error, RuntimeError) else code
+
+
+def _ordered(argv: Sequence[str]) -> list[str]:
+    """The numbers of ``goto --to`` last: they are as many as the device measures, and
+    would take the calibration behind them for one more."""
+    words = list(argv)
+    if words[:1] != ["goto"] or "--to" not in words:
+        return words
+    begin = end = words.index("--to") + 1
+    while end < len(words) and NUMBER.fullmatch(words[end]):
+        end += 1
+    return [*words[: begin - 1], *words[end:], *words[begin - 1 : end]]
 
 
 if __name__ == "__main__":

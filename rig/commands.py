@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import pathlib
 import sys
 import time
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from jaxcal.arguments import Parser
 from rig.core.faults import EXIT_FAULT, EXIT_OK, EXIT_RECALIBRATE, Refused
@@ -21,19 +20,16 @@ if TYPE_CHECKING:
 
 
 def _axes(text: str) -> list[str]:
-    names = text.split(",")
-    if unknown := [name for name in names if name not in NAMES]:
-        raise argparse.ArgumentTypeError(f"no axis {unknown[0]!r}: pitch, yaw, roll")
-    return names
+    return text.split(",")
 
 
 Path = pathlib.Path
 FILE = Path("rig.toml")  # without --config
-Axis = Literal["pitch", "yaw", "roll"]
-NAMES = get_args(Axis)
+AxisName = Annotated[str, "of rig.toml"]
 Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
 Angles = tuple[float, float, float]
 CIRCLE = (-360, 360)
+WIDE = (-1e6, 1e6)
 RunPath = Annotated[Path, "the run's folder"]
 Saved = Annotated[Path, "its file, or its run's folder"]
 ConfigPath = Annotated[Path, "default: rig.toml here"]
@@ -106,8 +102,13 @@ class Target(Simulation):
         options = options or self.simulation
         return Simulator(
             config,
-            truth_of(options, config.session.seed),
-            [parse_fault(text) for text in self.fault or ()],
+            truth_of(
+                options,
+                config.session.seed,
+                config.axis_names,
+                len(config.output_names),
+            ),
+            [parse_fault(text, config.axis_names) for text in self.fault or ()],
             transport=options["transport"],
             rate_hz=options["rate"],
             speedup=options["speedup"],
@@ -214,15 +215,18 @@ def imu(
 
 
 def jog(
-    axis: Axis, step: Annotated[float, "degrees", (-10, 10)], *, given: Step
+    axis: AxisName,
+    step: Annotated[float, "degrees, or mm", (-10, 10)],
+    *,
+    given: Step,
 ) -> int:
     """move one axis by a step"""
-    return _step(given, "IDENTIFIED", "jog", NAMES.index(axis), step)
+    return _step(given, "IDENTIFIED", "jog", axis, step)
 
 
-def characterise(axis: Axis, *, given: Step) -> int:
+def characterise(axis: AxisName, *, given: Step) -> int:
     """measure play, dead zone and breakaway of one axis"""
-    return _step(given, "SIGN_CHECKED", "characterise", NAMES.index(axis))
+    return _step(given, "SIGN_CHECKED", "characterise", axis)
 
 
 def home(
@@ -301,7 +305,7 @@ def verify(calibration: Saved, *, count: Postures = 6, given: Session) -> int:
 def goto(
     calibration: Saved,
     *,
-    to: Annotated[Angles, "pitch, yaw, roll in degrees", CIRCLE],
+    to: Annotated[tuple[float, ...], "what is to be measured, a number each", WIDE],
     given: Session,
 ) -> int:
     """move the end-effector to a posture, calibrated"""
@@ -391,7 +395,8 @@ def identify(given: Target) -> int:
             print(
                 f"{unit}, {axis.map.title}): status 0x{status.word:04X} {words}, "
                 f"position {status.position} pulses = "
-                f"{axis.to_deg(status.position):.4f} deg" + (alarm and f", {alarm}"),
+                f"{axis.to_deg(status.position):.4f} {axis.unit_name}"
+                + (alarm and f", {alarm}"),
                 *(f"    {name} = {value}" for name, value in identity.items()),
                 sep="\n",
             )
@@ -415,7 +420,7 @@ def check(file: ConfigPath | None = None, *, config: ConfigPath | None = None) -
     for axis in found.axes:
         print(
             f"  {axis.name}: unit {axis.unit}, {axis.map.name}, "
-            f"{axis.pulses_per_deg:.3f} pulses per degree, "
+            f"{axis.pulses_per_deg:.3f} pulses per {axis.unit_name}, "
             f"{axis.min_pulses}..{axis.max_pulses} pulses"
         )
     print(f"  heartbeat {found.heartbeat_s:.3g} s")
@@ -544,7 +549,7 @@ emergency stop is required.
 
 def make_parser(only: str | None = None) -> Parser:
     """The parser of every command; with the options of one alone it is made quicker."""
-    about = "Calibrate a three-axis device over Modbus and a phone's IMU."
+    about = "Calibrate a device of one to six axes: its drives, and what measures them."
     parser = Parser(prog="jaxcal-rig", description=about, epilog=EPILOG)
     added = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for function in [each for each in COMMANDS if each.__name__ == only] or COMMANDS:

@@ -1,7 +1,7 @@
 """What rig.toml and a register map may say, and what is wrong with one that does not.
 
 ``settings``, ``axis`` and ``maps`` are the schemas, one field a key; ``schema`` words
-the faults; ``config`` reads. (3,) arrays are in the order pitch, yaw, roll.
+the faults; ``config`` reads. (n,) arrays are in the order of the axes.
 """
 
 from rig.config.axis import AXIS_NAMES

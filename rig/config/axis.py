@@ -4,22 +4,43 @@ import math
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ValidationInfo,
+    WithJsonSchema,
+    model_validator,
+)
 
 from rig.config.maps import RegisterMap, encode, load_map
 from rig.config.schema import Section, advanced, key
 
-AXIS_NAMES = ("pitch", "yaw", "roll")  # the order of every (3,) in this package
+AXIS_NAMES = ("pitch", "yaw", "roll")  # of the device that `setup` begins with
+MOST_AXES = 6
 DEFAULT_ROTATES = {"pitch": "X", "yaw": "Z", "roll": "Y"}
 ROUNDING = 1e-9  # of a product that is a whole number of counts but for its last bits
 LOWEST, HIGHEST = -(2**31), 2**31 - 1
 
-Pulses = tuple[int, ...]  # (3,) of pitch, yaw and roll
+Pulses = tuple[int, ...]  # (n,) in the order of the axes
+# Keys of a translation, and where their values are kept: in the unit of the axis.
+OF_TRANSLATION = {
+    "min_mm": "min_deg", "max_mm": "max_deg", "speed_mm_s": "speed_deg_s",
+    "accel_mm_s2": "accel_deg_s2", "range_mm": "range_deg",
+}  # fmt: skip
 
 
 class Scale(Section):
-    """Pulses and degrees of one axis: ``theta = 360 p / (omega kappa)``."""
+    """Pulses and degrees of one axis: ``theta = 360 p / (omega kappa)``.
 
+    What is called degrees here is millimetres of an axis that is a translation:
+    ``x = lead p / (omega kappa)``.
+    """
+
+    kind: Literal["rotation", "translation"] = key("what the axis does", "rotation")
+    lead_mm: float | None = key(
+        "of a translation: way for one turn of its screw, pulley or pinion",
+        None, 1e-3, 1e4,
+    )  # fmt: skip
     pulses_per_rev: int = key(
         "omega: pulses for one motor turn, as set in the drive", ..., 1, 100_000_000
     )
@@ -31,12 +52,18 @@ class Scale(Section):
     @classmethod
     def of(cls, described: dict[str, Any]) -> "Scale":
         """Of an axis as a journal describes it."""
-        return cls(**{name: described[name] for name in Scale.model_fields})
+        names = Scale.model_fields.keys() & described.keys()
+        return cls(**{name: described[name] for name in names})
 
     @property
     def turns_per_deg(self) -> float:
         """Turns of the motor for one degree of the joint."""
-        return self.reduction / 360.0
+        return self.reduction / (self.lead_mm or 360.0)
+
+    @property
+    def unit_name(self) -> str:
+        """Unit in which its places are given."""
+        return "mm" if self.kind == "translation" else "deg"
 
     @property
     def pulses_per_deg(self) -> float:
@@ -62,27 +89,58 @@ def _map(name: Any, info: ValidationInfo) -> RegisterMap:
     return load_map(name, (info.context or {}).get("folder"))
 
 
-class Axis(Scale):
-    """One joint and the drive that moves it."""
+def _limit(value: float, info: ValidationInfo) -> float:
+    if info.data.get("kind") == "rotation" and abs(value) > 180:
+        raise ValueError(f"must be a number in [-180, 180], got {value!r}")
+    return value
 
-    name: Literal["pitch", "yaw", "roll"] = key("of the joint")
-    rotates: Literal["X", "Y", "Z"] = key(
-        "axis of the joint in the device's frame",
+
+JointAngle = Annotated[float, AfterValidator(_limit)]
+Range = tuple[JointAngle, JointAngle]
+
+
+class Axis(Scale):
+    """One joint and the drive that moves it.
+
+    A translation has ``min_mm``, ``max_mm``, ``speed_mm_s``, ``accel_mm_s2`` and
+    ``range_mm`` for the keys in degrees.
+    """
+
+    name: str = key("of the joint", pattern="^[a-z][a-z0-9_]{0,23}$")
+    rotates: Literal["X", "Y", "Z"] | None = key(
+        "of a rotation: axis of the joint in the device's frame, as a phone sees it",
         "X, Z, Y of pitch, yaw, roll",
-        by=lambda made: DEFAULT_ROTATES[made["name"]],
+        by=lambda made: DEFAULT_ROTATES.get(made["name"]),
     )
     unit: int = key("Modbus unit id", ..., 1, 247)
     map: Annotated[
         RegisterMap, BeforeValidator(_map), WithJsonSchema({"type": "string"})
     ] = key("register map: a name, or a .toml file relative to this one")
-    min_deg: float = key("soft limit", ..., -180, 180)
-    max_deg: float = key("soft limit", ..., -180, 180)
+    min_deg: JointAngle = key("soft limit", ..., -10_000, 10_000)
+    max_deg: JointAngle = key("soft limit", ..., -10_000, 10_000)
     speed_deg_s: float = key("of every move", ..., 1e-3, 5000)
     accel_deg_s2: float = key("of every move, also to brake", ..., 1e-3, 1e5)
     comm_timeout_s: float | None = advanced(
         "the drive stops itself when the line is silent for so long",
         "of [bus], where the map has it", 0.01, 60, by=lambda made: None,
     )  # fmt: skip
+
+    range_deg: Range | None = advanced("of the candidates; absent: the limits", None)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _in_millimetres(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or data.get("kind") != "translation":
+            return data
+        for new, name in OF_TRANSLATION.items():
+            if name in data:
+                raise ValueError(f"{name}: a translation has {new}")
+        return {OF_TRANSLATION.get(name, name): data[name] for name in data}
+
+    def key_of(self, name: str) -> str:
+        """The key of rig.toml that holds a value, such as ``min_deg`` or ``min_mm``."""
+        pairs = OF_TRANSLATION.items() if self.kind == "translation" else ()
+        return next((new for new, old in pairs if old == name), name)
 
     @classmethod
     def unmoved(cls, name: str, unit: int, register_map: RegisterMap) -> "Axis":
@@ -136,13 +194,15 @@ class Axis(Scale):
                 key_name, unit, per = "speed_deg_s", "deg/s", per_speed
             if count < 1:
                 raise ValueError(
-                    f"{key_name}: must be at least {1.0 / per:.6g} {unit}, one count "
+                    f"{self.key_of(key_name)}: must be at least {1.0 / per:.6g} "
+                    f"{unit.replace('deg', self.unit_name)}, one count "
                     f"of the drive's register, got {getattr(self, key_name):g}"
                 )
             try:
                 encode(count, place[1], self.map.word_order)
             except ValueError as error:
-                raise ValueError(f"{key_name}: the drive's register: {error}") from None
+                name = self.key_of(key_name)
+                raise ValueError(f"{name}: the drive's register: {error}") from None
         return counts
 
     @property
@@ -156,9 +216,11 @@ class Axis(Scale):
 
     def broken_rules(self) -> Iterator[str]:
         if self.min_deg >= self.max_deg:
-            yield (
-                f"min_deg: must be under max_deg, got {self.min_deg} and {self.max_deg}"
-            )
+            low, high = self.key_of("min_deg"), self.key_of("max_deg")
+            yield f"{low}: must be under {high}, got {self.min_deg} and {self.max_deg}"
+            return
+        if (self.kind == "translation") != (self.lead_mm is not None):
+            yield f"lead_mm: a translation needs one, a rotation has none: {self.kind}"
             return
         try:
             self.motion_counts()

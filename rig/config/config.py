@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import PrivateAttr
 
-from rig.config.axis import AXIS_NAMES, DEFAULT_ROTATES, Axis, Pulses, Scale
+from rig.config.axis import (
+    AXIS_NAMES,
+    DEFAULT_ROTATES,
+    MOST_AXES,
+    Axis,
+    Pulses,
+    Scale,
+)
 from rig.config.schema import ConfigError, Section, key, parse, read_text
 from rig.config.settings import (
     BusSettings,
@@ -33,13 +40,29 @@ PHONE = (
 # Where bus and phone are reached, and when a session gives up or says that it is good,
 # may change between a run and its resumption.
 UNMEASURED = (
-    "bus.", "axes.pitch.comm_timeout_s", "axes.yaw.comm_timeout_s",
-    "axes.roll.comm_timeout_s", "imu.host", "imu.port", "imu.transport", "imu.allow",
-    "imu.stale_s", "imu.heading", "motion.poll_s", "motion.stall_s",
+    "bus.", "imu.host", "imu.port", "imu.transport", "imu.allow", "imu.stale_s",
+    "imu.heading", "motion.poll_s", "motion.stall_s",
     "motion.envelope_margin_deg", "motion.mirror_limits",
     "settle.timeout_s", "session.verify_limit_deg",
     "session.reference_tolerance_deg", "session.max_unreachable",
 )  # fmt: skip
+UNMEASURED_OF_AXES = (".comm_timeout_s",)  # likewise, of each axis
+
+
+def names_of(described: dict[str, Any]) -> tuple[list[str], list[str]]:
+    """Names of the axes, and of what is measured, of a configuration as a journal
+    keeps it."""
+    axes = [str(axis["name"]) for axis in described.get("axes", ())]
+    readings = described.get("readings") or {"names": axes}
+    return axes, [str(name) for name in readings["names"]]
+
+
+def units_of(described: dict[str, Any]) -> tuple[str, str]:
+    """Units of the commands and of what is measured, likewise."""
+    kinds = [axis.get("kind", "rotation") for axis in described.get("axes", ())]
+    units = dict.fromkeys("mm" if kind == "translation" else "deg" for kind in kinds)
+    readings = described.get("readings") or {"unit": "deg"}
+    return ", ".join(units), str(readings["unit"])
 
 
 def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
@@ -83,7 +106,7 @@ class RigConfig(Section):
     """A whole, valid configuration."""
 
     bus: BusSettings
-    axes: tuple[Axis, Axis, Axis]
+    axes: tuple[Axis, ...]
     imu: ImuSettings
     mechanism: MechanismSettings = MechanismSettings()
     settle: SettleSettings = SettleSettings()
@@ -102,16 +125,52 @@ class RigConfig(Section):
         return self._folder / self.device
 
     @property
+    def axis_names(self) -> tuple[str, ...]:
+        """Of the axes, in the order of every command."""
+        return tuple(axis.name for axis in self.axes)
+
+    @property
+    def axis_unit(self) -> str:
+        """Of the commands: deg or mm, or both."""
+        return ", ".join(dict.fromkeys(axis.unit_name for axis in self.axes))
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """Of what is measured, in the order of every measurement."""
+        return self.axis_names
+
+    @property
+    def output_unit(self) -> str:
+        """Of what is measured."""
+        return "deg"
+
+    @property
+    def k(self) -> int:
+        """Postures that are chosen."""
+        return self.session.k or len(self.axes) + 1
+
+    @property
+    def method(self) -> str:
+        """How they are chosen."""
+        return self.session.method or ("policy" if len(self.axes) == 3 else "auto")
+
+    @property
     def letters(self) -> tuple[str, ...]:
-        """Axis letters of pitch, yaw and roll."""
-        return tuple(axis.rotates for axis in self.axes)
+        """Axis letter of each joint."""
+        return tuple(str(axis.rotates) for axis in self.axes)
+
+    @property
+    def joint_order(self) -> str:
+        """Axis letters of the joints that there are, from the base outwards."""
+        return "".join(at for at in self.mechanism.order if at in self.letters)
 
     @property
     def ranges(self) -> tuple[tuple[float, float], ...]:
-        """(3, 2) degrees in which candidates are drawn."""
+        """(n, 2) degrees in which candidates are drawn."""
         overshoot = self.motion.approach_overshoot_deg
         return tuple(
-            getattr(self.session, f"{axis.name}_range_deg")
+            axis.range_deg
+            or getattr(self.session, f"{axis.name}_range_deg", None)
             or (axis.min_deg + overshoot, axis.max_deg)
             for axis in self.axes
         )
@@ -150,12 +209,12 @@ class RigConfig(Section):
         return self.bus.timeout_s * (self.bus.read_retries + 1)
 
     def to_pulses(self, angles_deg: Any) -> Pulses:
-        """Whole pulses of (3,) degrees."""
+        """Whole pulses of (n,) degrees."""
         each = zip(self.axes, angles_deg, strict=True)
         return tuple(axis.to_pulses(float(angle)) for axis, angle in each)
 
     def to_deg(self, pulses: Any) -> "NDArray[np.float64]":
-        """(..., 3) degrees of (..., 3) pulses."""
+        """(..., n) degrees of (..., n) pulses."""
         import numpy as np  # a third of what `stop` would wait for at its start
 
         scales = np.array([axis.pulses_per_deg for axis in self.axes])
@@ -164,7 +223,9 @@ class RigConfig(Section):
     def described(self) -> dict[str, Any]:
         """Every key as JSON, as the journal keeps it; of a map its name and digest."""
         data = self.model_dump(exclude={"output", "device"})
-        data["session"]["ranges"] = self.ranges  # those left out too
+        # Those left out too.
+        session = {"ranges": self.ranges, "k": self.k, "method": self.method}
+        data["session"] |= session
         for axis, described in zip(self.axes, data["axes"], strict=True):
             described["map"] = {"name": axis.map.name, "digest": axis.map.digest}
         return data
@@ -178,7 +239,11 @@ class RigConfig(Section):
         now = json.loads(json.dumps(self.described(), default=str))
         then, now = _flat(described), _flat(now)
         # Keys that came after the run began had their defaults in it.
-        then = {key: then[key] for key in then if not key.startswith(UNMEASURED)}
+        then = {
+            key: then[key]
+            for key in then
+            if not (key.startswith(UNMEASURED) or key.endswith(UNMEASURED_OF_AXES))
+        }
         return differences(then, {key: now.get(key) for key in then})
 
     def device_fingerprint(self) -> dict[str, Any]:
@@ -190,6 +255,8 @@ class RigConfig(Section):
         found: dict[str, Any] = {}
         for axis in self.axes:
             scale = axis.model_dump(include={*Scale.model_fields, "unit", "rotates"})
+            if axis.kind == "rotation":  # as records of before say nothing of it
+                del scale["kind"], scale["lead_mm"]
             family = f"{axis.map.name} ({_digest(axis.map.text, PLACES)})"
             values = {"map": family, **scale}
             found |= {f"axes.{axis.name}.{name}": values[name] for name in values}
@@ -208,10 +275,22 @@ class RigConfig(Section):
         motion, session = self.motion, self.session
         slowest = self._slowest_read_s
         overshoot = motion.approach_overshoot_deg
-        if session.k >= session.candidates:
+        if self.k >= session.candidates:
             yield f"session.k: must be under candidates ({session.candidates})"
-        middle = self.axes[self.letters.index(self.mechanism.order[1])]
-        if middle.min_deg <= -90.0 or middle.max_deg >= 90.0:
+        if self.k <= len(self.axes):
+            fewest = len(self.axes) + 1
+            yield f"session.k: must be at least {fewest}, axes and one, got {self.k}"
+        for axis in self.axes:
+            if axis.kind != "rotation" or axis.rotates is None:
+                yield (
+                    f"axes.{axis.name}.rotates: missing; a phone measures rotations "
+                    "about X, Y, Z"
+                )
+                return
+        for middle in self.axes:
+            within = -90.0 < middle.min_deg and middle.max_deg < 90.0
+            if within or middle.rotates != self.mechanism.order[1]:
+                continue
             yield (
                 f"axes.{middle.name}: min_deg and max_deg must lie between -90 and 90: "
                 "no phone reads the middle one of mechanism.order elsewhere; got "
@@ -219,9 +298,12 @@ class RigConfig(Section):
             )
         for axis, (low, high) in zip(self.axes, self.ranges, strict=True):
             at, span = f"axes.{axis.name}", f"session.{axis.name}_range_deg"
+            if axis.range_deg or axis.name not in AXIS_NAMES:
+                span = f"{at}.{axis.key_of('range_deg')}"
             if axis.speed_deg_s > motion.max_speed_deg_s:
                 yield (
-                    f"{at}.speed_deg_s: must be at most motion.max_speed_deg_s = "
+                    f"{at}.{axis.key_of('speed_deg_s')}: must be at most "
+                    "motion.max_speed_deg_s = "
                     f"{motion.max_speed_deg_s:g}, got {axis.speed_deg_s:g}"
                 )
             if abs(1.0 / axis.pulses_per_deg) > motion.position_tolerance_deg:
@@ -255,8 +337,9 @@ def parse_config(
 ) -> RigConfig:
     """Check the text of a configuration; maps by path are relative to ``folder``."""
     config = parse(RigConfig, text, source, {"folder": folder}, _repeated)
-    axes = sorted(config.axes, key=lambda axis: AXIS_NAMES.index(axis.name))
-    config = config.model_copy(update={"axes": tuple(axes)})
+    if set(config.axis_names) == set(AXIS_NAMES):  # written in any order
+        axes = sorted(config.axes, key=lambda axis: AXIS_NAMES.index(axis.name))
+        config = config.model_copy(update={"axes": tuple(axes)})
     config._folder = folder or pathlib.Path()
     return config
 
@@ -266,10 +349,12 @@ def _repeated(data: dict[str, Any]) -> Iterator[str]:
     given = data.get("axes")
     axes = [a for a in given if isinstance(a, dict)] if isinstance(given, list) else []
     axes = [{"rotates": DEFAULT_ROTATES.get(str(a.get("name"))), **a} for a in axes]
+    if isinstance(given, list) and not 1 <= len(given) <= MOST_AXES:
+        yield f"axes: must be 1 to {MOST_AXES} tables, got {len(given)}"
     for name in ("name", "unit", "rotates"):
         values = [str(a[name]) for a in axes if a.get(name) is not None]
         if len(set(values)) < len(values):
-            yield f"axes: {name} must differ between the three, got {', '.join(values)}"
+            yield f"axes: {name} must differ between them, got {', '.join(values)}"
 
 
 def example_names() -> list[str]:

@@ -156,14 +156,18 @@ def rule(described: dict[str, Any], root: dict[str, Any]) -> str:
     if kind == "array":
         item = described.get("items") or described["prefixItems"][0]
         count = described.get("minItems", "")
-        exact = count and count == described.get("maxItems")
-        return f"a list of {count if exact else 'items'}, each {rule(item, root)}"
+        most = described.get("maxItems")
+        number = f"{count} to {most}" if most else "items"
+        number = str(count) if count and count == most else number
+        return f"a list of {number}, each {rule(item, root)}"
     if kind in ("integer", "number"):
         noun = "a whole number" if kind == "integer" else "a number"
         if "minimum" not in described:
             return noun
         low, high = described["minimum"], described["maximum"]
         return f"{noun} in [{low}, {high}]"
+    if "pattern" in described:
+        return "a name of small letters, digits and _, a letter first"
     return {"boolean": "true or false", "string": "a text"}.get(str(kind), "a table")
 
 
@@ -174,16 +178,19 @@ def _texts(error: Any, value: Any, root: dict[str, Any]) -> list[str]:
         return []  # it is made from a key that is at fault itself
     for part in error["loc"]:
         table = resolved(here, root)
+        name = str(part)
+        if isinstance(value, dict) and value.get("kind") == "translation":
+            name = name.replace("_deg", "_mm")  # as it is written of such an axis
         try:
             value = value[part]
         except (KeyError, IndexError, TypeError):
             value = None
         if isinstance(part, int):
-            name = value.get("name") if isinstance(value, dict) else None
-            path += f".{name}" if isinstance(name, str) else f"[{part}]"
+            called = value.get("name") if isinstance(value, dict) else None
+            path += f".{called}" if isinstance(called, str) else f"[{part}]"
             here = table.get("items") or table["prefixItems"][part]
         else:
-            path += f".{part}" if path else str(part)
+            path += f".{name}" if path else name
             known = sorted(table.get("properties", ()))
             others = table.get("additionalProperties") or {}
             here = table.get("properties", {}).get(part, others)

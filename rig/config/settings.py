@@ -6,20 +6,19 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from rig.config.axis import Range
 from rig.config.schema import Section, advanced, key
 
 Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
 Sign = Literal[1, -1]
 Column = Annotated[int, Field(ge=0, le=200)]
 Angle = Annotated[float, Field(ge=-360, le=360)]
-JointAngle = Annotated[float, Field(ge=-180, le=180)]
-Range = tuple[JointAngle, JointAngle]
 
 # key(what it means, default (... where required), lowest, highest)
 
 
 class BusSettings(Section):
-    """One Modbus line for the three drives."""
+    """One Modbus line for all drives."""
 
     transport: Literal["tcp", "rtu_tcp", "rtu"] = key(
         "rtu: serial port; tcp: Modbus TCP; rtu_tcp: RTU frames over TCP"
@@ -178,13 +177,16 @@ class SessionSettings(Section):
     """What a calibration session does."""
 
     candidates: int = key("M, postures drawn", 50, 5, 100_000)
-    k: int = key("K, postures chosen; 4 leave no residual", 4, 4, 10_000)
-    method: Literal["policy", "auto", "exact", "exchange", "greedy", "random"] = key(
-        "how they are chosen", "policy"
-    )
+    k: int | None = key(
+        "K, postures chosen; absent: one more than axes, which leaves no residual",
+        None, 2, 10_000,
+    )  # fmt: skip
+    method: (
+        Literal["policy", "auto", "exact", "exchange", "greedy", "random"] | None
+    ) = key("how they are chosen; absent: policy for three axes, auto for others", None)
     min_efficiency: float = advanced("under this D-efficiency exact is used", 0.9, 0, 1)
     seed: int = advanced("of the candidates drawn", 0, 0, 2**31 - 1)
-    pitch_range_deg: Range | None = key("of the candidates; absent: the limits", None)
+    pitch_range_deg: Range | None = key("range_deg of the axis pitch", None)
     yaw_range_deg: Range | None = key("likewise", None)
     roll_range_deg: Range | None = key("likewise", None)
     verify_postures: int = key("held out; each before and after", 4, 0, 1000)

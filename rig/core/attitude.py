@@ -69,10 +69,10 @@ class Frame:
     zero: Array  # (3, 3) R0, attitude of the phone in the zero posture
     mounting: Array  # (3, 3) R_EP, phone to end-effector
     order: str  # axes of the mechanism from the base outwards
-    letters: tuple[str, ...]  # axis letter of pitch, yaw and roll
+    letters: tuple[str, ...]  # axis letter of each joint that there is
 
     def angles(self, matrix: ArrayLike, order: str | None = None) -> Array:
-        """(..., 3) pitch, yaw and roll in degrees of phone attitudes (..., 3, 3)."""
+        """(..., n) joint angles in degrees of phone attitudes (..., 3, 3)."""
         order = order or self.order
         turned = self.zero.T @ np.asarray(matrix, dtype=np.float64)
         sequence = matrix_to_euler(self.mounting @ turned @ self.mounting.T, order)

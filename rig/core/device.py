@@ -45,7 +45,7 @@ class Posture(NamedTuple):
     """Where to stand, by name."""
 
     name: str
-    pulses: Pulses  # of pitch, yaw and roll
+    pulses: Pulses
 
 
 def approach(config: RigConfig, target: Pulses) -> list[Pulses]:
@@ -59,9 +59,9 @@ def approach(config: RigConfig, target: Pulses) -> list[Pulses]:
 def check_plan(config: RigConfig, targets: Iterable[Pulses]) -> None:
     """LimitError lists each target, or point it is approached from, that is outside."""
     faults = [
-        f"{axis.name} to {pulses} pulses ({axis.to_deg(pulses):.3f} deg), limits "
-        f"{axis.min_pulses}..{axis.max_pulses} pulses and "
-        f"{axis.min_deg:g}..{axis.max_deg:g} deg"
+        f"{axis.name} to {pulses} pulses ({axis.to_deg(pulses):.3f} {axis.unit_name}), "
+        f"limits {axis.min_pulses}..{axis.max_pulses} pulses and "
+        f"{axis.min_deg:g}..{axis.max_deg:g} {axis.unit_name}"
         for target in targets
         for point in approach(config, target)
         for axis, pulses in zip(config.axes, point, strict=True)
@@ -197,12 +197,12 @@ def timeouts_left(records: list[Record]) -> dict[str, Record]:
 class Seen:
     """What the phone has shown of the axes at the last posture, since the zero."""
 
-    commanded: Array  # (3,) degrees
-    measured: Array
+    commanded: Array  # (n,) degrees of the axes
+    measured: Array  # (m,) of what is measured
 
 
 class Device:
-    """Three drives and a phone: armed explicitly, and never moved once stopped."""
+    """Drives and a phone: armed explicitly, and never moved once stopped."""
 
     def __init__(
         self,
@@ -239,7 +239,7 @@ class Device:
         self.zero: Posture | None = None  # once it is taken,
         self.frame: Frame | None = None  # and what the phone reads against it
         self.heard = 0  # connection of the phone by which the frame holds
-        self.seen = Seen(np.zeros(3), np.zeros(3))
+        self.seen = Seen(np.zeros(len(config.axes)), np.zeros(len(config.output_names)))
         self.line_watch = LineWatch(self.drives, run)
         self.heartbeat = Heartbeat(self.stopper, self.requests, config)
         self.bus.check = self._before_exchange
@@ -298,8 +298,9 @@ class Device:
         for drive, at, was in zip(self.drives, here, self.rest or here, strict=True):
             if abs(at - was) > drive.axis.pulses_within(tolerance):
                 raise MotionFault(
-                    f"{drive.axis.name} stands at {drive.axis.to_deg(at):.3f} deg and "
-                    f"was left at {drive.axis.to_deg(was):.3f}: something else moved it"
+                    f"{drive.axis.name} stands at {drive.axis.to_deg(at):.3f} "
+                    f"{drive.axis.unit_name} and was left at "
+                    f"{drive.axis.to_deg(was):.3f}: something else moved it"
                 )
         for drive, held in zip(self.drives, self.targets, strict=bool(self.targets)):
             if held is not None and drive.held() not in (None, held):

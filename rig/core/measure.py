@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rig.config.axis import AXIS_NAMES, Pulses
+from rig.config.axis import Pulses
 from rig.core.attitude import Array, Frame, Reading, frame_at, mean_rotation, raw_fields
 from rig.core.device import Device, Posture, Seen
 from rig.core.drive import Status
@@ -24,7 +24,7 @@ def zeroed(device: Device, frame: Frame, zero: Posture) -> None:
     """Measure against this zero posture from now on."""
     device.frame, device.zero, device.heard = frame, zero, device.imu.connections
     at_deg = device.config.to_deg(zero.pulses)
-    device.seen = Seen(at_deg, np.zeros(3))
+    device.seen = Seen(at_deg, np.zeros(len(device.config.output_names)))
 
 
 def measure(standing: Standing, samples: int | None = None) -> dict[str, Any]:
@@ -36,7 +36,7 @@ def measure(standing: Standing, samples: int | None = None) -> dict[str, Any]:
 
     Returns:
         For the journal: ``pulses`` commanded and ``feedback`` of the drives;
-        ``commanded_deg``, ``measured_deg`` and, of single readings, ``std_deg`` (3,);
+        ``commanded_deg``, ``measured_deg`` and, of single readings, ``std_deg``;
         ``samples``; ``attitude`` (3, 3), the mean of the phone's; ``quaternions`` and
         ``stamps`` of every reading.
 
@@ -56,7 +56,7 @@ def measure(standing: Standing, samples: int | None = None) -> dict[str, Any]:
         if readings:
             frame, matrices = _frame(device, readings), [r.matrix for r in readings]
             raw = frame.angles(matrices)
-            std = raw.std(axis=0, ddof=1) if len(raw) > 1 else np.zeros(3)
+            std = raw.std(axis=0, ddof=1) if len(raw) > 1 else np.zeros(raw.shape[1])
             if (std > settle.std_deg).any():
                 readings = []
     attitude = mean_rotation(matrices)
@@ -118,6 +118,7 @@ def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
     readings = readings[first:]
     if now - readings[-1].time > device.config.imu.stale_s:
         return f"the phone's readings are stale. {hint}"
+    names = device.config.output_names
     angles = _frame(device, readings).angles([reading.matrix for reading in readings])
     times = np.array([reading.time for reading in readings])
     times = times - times.mean()
@@ -129,7 +130,7 @@ def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
         worst = int(np.argmax(found))
         if found[worst] > limit:
             return (
-                f"{AXIS_NAMES[worst]} reads {found[worst]:.3f} {unit} (settle.{what} = "
+                f"{names[worst]} reads {found[worst]:.3f} {unit} (settle.{what} = "
                 f"{limit:g}). Either something still shakes, or the limit is below "
                 "the phone's noise: `jaxcal-rig imu` shows that; raise the key above it"
             )
@@ -174,11 +175,11 @@ def _check_position(device: Device, target: Pulses, feedback: list[int]) -> None
 
 def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
     """The joints are where the drives say, roughly, and moved when they moved."""
-    apart = np.abs(measured - commanded)
+    apart, names = np.abs(measured - commanded), device.config.axis_names
     if (apart > DISAGREEMENT_DEG).any():
         worst = int(np.argmax(apart))
         raise MotionFault(
-            f"the IMU reads {AXIS_NAMES[worst]} {apart[worst]:.1f} deg away from "
+            f"the IMU reads {names[worst]} {apart[worst]:.1f} deg away from "
             f"the command (limit {DISAGREEMENT_DEG:g}). Check the zero posture, then "
             "run `jaxcal-rig axes`"
         )
@@ -187,7 +188,7 @@ def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
     asked = np.abs(way)
     followed = np.sign(way) * (measured - seen.measured)
     leading = max(FOLLOW_MIN_DEG, FOLLOW_LEADING * float(asked.max()))
-    for index, name in enumerate(AXIS_NAMES):
+    for index, name in enumerate(names):
         if asked[index] >= leading and followed[index] < FOLLOW_SHARE * asked[index]:
             hint = "a slipped coupling, a frozen stream, or axes mixed up"
             if followed[index] < -FOLLOW_SHARE * asked[index]:

@@ -28,7 +28,7 @@ class Standing(NamedTuple):
 
 
 def move(device: Device, posture: Posture) -> Standing:
-    """Move all three axes to a posture, in pieces, from the chosen side.
+    """Move all axes to a posture, in pieces, from the chosen side.
 
     Raises:
         LimitError: the target leaves the limits; nothing was sent.
@@ -118,7 +118,7 @@ def _send(device: Device, drive: Drive, start: Status, pulses: int) -> None:
 def _watch(
     device: Device, starts: list[Status], target: Pulses, connection: int
 ) -> None:
-    """Poll until all three stand on their targets, or something is wrong."""
+    """Poll until all stand on their targets, or something is wrong."""
     motion, begun, most_s = device.config.motion, time.monotonic(), 0.0
     here = tuple(start.position for start in starts)
     for drive, a, b in zip(device.drives, here, target, strict=True):
@@ -148,9 +148,9 @@ def _watch(
             low, high = min(begin, end) - FOLLOWING_DEG, max(begin, end) + FOLLOWING_DEG
             if not low <= angle <= high:
                 raise MotionFault(
-                    f"{axis.name} is at {angle:.3f} deg on its way from {begin:.3f} to "
-                    f"{end:.3f}, more than {FOLLOWING_DEG:g} deg off it. Check gearing "
-                    "and direction, and that no other controller moves it"
+                    f"{axis.name} is at {angle:.3f} {axis.unit_name} on its way from "
+                    f"{begin:.3f} to {end:.3f}, more than {FOLLOWING_DEG:g} off it. "
+                    "Check gearing and direction, and that no other controller moves it"
                 )
             if abs(status.position - last[index][0]) > STILL_COUNTS:
                 last[index] = (status.position, status.time)
@@ -159,15 +159,17 @@ def _watch(
                 moved = abs(status.position - start) > tolerance
                 if status.done and not status.moving and moved:
                     raise EndedShort(
-                        f"{axis.name} ended {left:.3f} deg short of its target, at "
-                        f"{angle:.3f} deg, and its drive says that it is done. Look "
+                        f"{axis.name} ended {left:.3f} {axis.unit_name} short of its "
+                        f"target, at {angle:.3f}, and its drive says that it is done. "
+                        "Look "
                         "who stopped it: another controller, an emergency stop that "
                         "was released, a limit of the drive itself",
                         axis.name, status.position,
                     )  # fmt: skip
                 raise MotionFault(
-                    f"{axis.name} does not follow: it stands {left:.3f} deg from "
-                    f"its target for {stood:.2f} s (limit motion.stall_s = "
+                    f"{axis.name} does not follow: it stands {left:.3f} "
+                    f"{axis.unit_name} from its target for {stood:.2f} s (limit "
+                    "motion.stall_s = "
                     f"{motion.stall_s:g}). Look for an obstacle, a loose coupling, "
                     "a drive that is not enabled, or whoever stopped it"
                 )
@@ -200,8 +202,9 @@ def _check_speed(device: Device, axis: Axis, seen: list[Status]) -> None:
         device.paces[axis.name] = Pace(way, asked, speed)
     if speed > TOO_FAST * asked and not device.simulated:
         raise MotionFault(
-            f"{axis.name} moves at {speed:.3g} deg/s or faster, and was told to move "
-            f"at {asked:.3g}: the drive does not take its speed. Check `units` and "
+            f"{axis.name} moves at {speed:.3g} {axis.unit_name}/s or faster, and was "
+            f"told to move at {asked:.3g}: the drive does not take its speed. Check "
+            "`units` and "
             f"`move` of the map {axis.map.name}, pulses_per_rev and reduction"
         )
 

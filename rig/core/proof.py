@@ -58,8 +58,8 @@ LARGEST_RAD = 2.0 * math.pi + 0.1  # no larger number is an angle in radians
 class Turns(NamedTuple):
     """Turns of the phone, in its own frame, for a commanded degree of each axis."""
 
-    pulses: Array  # (3,) where they were measured
-    deg: Array  # (3, 3) columns, rotation vectors in degrees
+    pulses: Array  # (n,) where they were measured
+    deg: Array  # (3, n) columns, rotation vectors in degrees
 
     @classmethod
     def of(cls, record: DeviceRecord) -> Turns | None:
@@ -78,7 +78,7 @@ class Turns(NamedTuple):
         In the phone's frame a joint's axis turns with the joints that it carries.
         """
         turns, away = self.deg.copy(), config.to_deg(np.subtract(pulses, self.pulses))
-        chain = [config.letters.index(letter) for letter in config.mechanism.order]
+        chain = [config.letters.index(letter) for letter in config.joint_order]
         for place, joint in enumerate(chain):
             for inner in chain[place + 1 :]:
                 turn = Rotation.from_rotvec(self.deg[:, inner] * away[inner], True)
@@ -182,16 +182,16 @@ class Reach:
 
 
 class Proof:
-    """What is proved of the three axes of a device that is armed."""
+    """What is proved of the axes of a device that is armed."""
 
     def __init__(
         self,
         axes: Sequence[Axis],
         checked: bool,
         simulated: bool = False,
-        gains: Sequence[float | None] = (None, None, None),
+        gains: Sequence[float | None] = (),
     ) -> None:
-        self.axes = axes
+        self.axes, gains = axes, gains or [None] * len(axes)
         self.reaches = [
             Reach(axis, checked=checked, gain=gain)
             for axis, gain in zip(axes, gains, strict=True)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rig.config import AXIS_NAMES, RigConfig
+from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.config.config import differences
 from rig.core.attitude import Array, angle_between_deg, frame_at
@@ -110,7 +110,7 @@ def leave(drives: Sequence[Drive], record: DeviceRecord) -> None:
     Raises:
         OSError: the record cannot be written.
     """
-    positions: list[int | None] = []
+    positions: dict[str, int | None] = {}
     homed: list[str] = []
     for drive in drives:
         try:
@@ -118,11 +118,11 @@ def leave(drives: Sequence[Drive], record: DeviceRecord) -> None:
                 status = drive.standing(retries=0)
                 alarm = drive.alarm() or "no code given" if status.fault else ""
         except BusError:
-            positions.append(None)
+            positions[drive.axis.name] = None
             continue
         if alarm and not drive.axis.map.absolute_encoder:
             record.void(HOMED, f"{drive.axis.name} went into alarm: {alarm}")
-        positions.append(None if status.moving else status.position)
+        positions[drive.axis.name] = None if status.moving else status.position
         if drive.says_homed:
             homed.append(drive.axis.name)
     record.left_at(positions, homed)
@@ -148,7 +148,7 @@ class KeptZero(NamedTuple):
         if np.abs(off).max() > config.session.reference_tolerance_deg:
             raise MotionFault(
                 "in its zero posture the device counts other pulses than for "
-                f"{self.whose}: {axes_text(off)}. Either this is not the zero "
+                f"{self.whose}: {axes_text(config, off)}. Either this is not the zero "
                 "posture, or the drives have lost their origin: home them"
             )
         return check_zero(config, self.attitude, attitude, self.whose)
@@ -158,7 +158,7 @@ def moved(config: RigConfig, then: Array, now: Array) -> tuple[float, Array]:
     """How far one attitude of the zero posture stands from another, (3, 3) each.
 
     Returns:
-        The angle in degrees, and as (3,) joint angles. Without an absolute heading the
+        The angle in degrees, and as (n,) joint angles. Without an absolute heading the
         turn about the vertical that comes last is taken out of both.
     """
     now = heading_turn(config, then, now) @ now
@@ -180,7 +180,7 @@ def unseen(config: RigConfig, zero: Array) -> list[str]:
         return []
     upright = np.abs((zero @ frame_at(config, zero).mounting.T)[2])
     least = np.cos(np.radians(UNSEEN_DEG))
-    pairs = zip(AXIS_NAMES, config.letters, strict=True)
+    pairs = zip(config.axis_names, config.letters, strict=True)
     return [name for name, letter in pairs if upright["XYZ".index(letter)] > least]
 
 
@@ -202,16 +202,16 @@ def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:
     if angle <= limit:
         return f"zero posture stands {angle:.3f} deg from that of {whose}{but}"
     raise MotionFault(
-        f"the zero posture is not that of {whose}: {axes_text(joints)} (limit "
+        f"the zero posture is not that of {whose}: {axes_text(config, joints)} (limit "
         f"session.reference_tolerance_deg = {limit:g}){but}. Drives that were without "
         "power have lost their origin: home them. Where the phone or the base was "
         "moved, calibrate again"
     )
 
 
-def axes_text(joints: Sequence[float] | Array) -> str:
-    """(3,) degrees in words, of the axes that moved most."""
+def axes_text(config: RigConfig, joints: Sequence[float] | Array) -> str:
+    """(n,) degrees in words, of the axes that moved most."""
     least = TOLD_SHARE * np.abs(joints).max()
-    pairs = zip(AXIS_NAMES, joints, strict=True)
+    pairs = zip(config.axis_names, joints, strict=True)
     told = [f"{name} {angle:+.2f}" for name, angle in pairs if abs(angle) >= least]
     return f"{', '.join(told)} deg from where it stood"

@@ -91,7 +91,8 @@ def open_device(
             requests.armed = True
             device.arm(reset_alarms)
             # Where they stand is not known until they do again.
-            record.left_at(homed=[d.axis.name for d in device.drives if d.says_homed])
+            homed = [d.axis.name for d in device.drives if d.says_homed]
+            record.left_at(dict.fromkeys(config.axis_names), homed)
             device.emit("armed", drives=len(device.drives), where=config.bus.where)
             yield device
         except BaseException as error:
@@ -122,6 +123,7 @@ def _last_move(device: Device) -> Record:
             phone = device.frame.angles(device.imu.latest().matrix).round(3).tolist()
     return {
         "label": label,
+        "axes": list(config.axis_names),
         "from_deg": config.to_deg(start).round(3).tolist(),
         "to_deg": config.to_deg(end).round(3).tolist(),
         "drives_deg": [
@@ -171,7 +173,7 @@ def take_zero(
             return _check_reference(device, before)
         at = at or before.pulses
     elif at is None and config.session.zero == "drive":
-        at = (0, 0, 0)
+        at = (0,) * len(config.axes)
     moves = at is not None or config.motion.approach_overshoot_deg > 0
     if moves:  # or the zero is measured first, where the device was put
         show(device)
@@ -222,8 +224,9 @@ def _check_reference(device: Device, zero: Posture) -> None:
     if max(map(abs, angles)) > limit:
         raise MotionFault(
             "the zero posture of this run has moved: "
-            f"{record_check.axes_text(angles)} (limit {limit:g}): the drives "
-            "lost their origin, or the phone or the device was moved. Start a new run"
+            f"{record_check.axes_text(device.config, angles)} (limit {limit:g}): the "
+            "drives lost their origin, or the phone or the device was moved. Start a "
+            "new run"
         )
 
 

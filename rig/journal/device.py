@@ -13,7 +13,7 @@ from __future__ import annotations
 import datetime
 import json
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from jaxcal.files import write_text
@@ -146,17 +146,17 @@ class DeviceRecord:
 
     def left_at(
         self,
-        positions: Sequence[int | None] = (None, None, None),
+        positions: Mapping[str, int | None],
         homed: Sequence[str] = (),
     ) -> None:
         """Where the drives are left.
 
         Args:
-            positions: pulses; None where it is not known, as while armed.
+            positions: pulses by axis; None where it is not known, as while armed.
             homed: names of the axes whose drives say that they are homed.
         """
-        pulses = dict(zip(("pitch", "yaw", "roll"), positions, strict=True))
-        self._left = {"time": _now(), "pulses": pulses, "homed": list(homed)}
+        left = {"pulses": dict(positions), "homed": list(homed)}
+        self._left = {"time": _now(), **left}
         self.save()
 
     def left(self) -> tuple[dict[str, int | None], list[str]]:

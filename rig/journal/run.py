@@ -227,10 +227,11 @@ class RunFolder:
 
     def save_pairs(self) -> None:
         """Write pairs.csv: role, commands, measurements, scatter of every posture."""
-        from rig.config import AXIS_NAMES
-
-        of_axes = ("pulses", "u_deg", "y_deg", "std_deg")
-        columns = [f"{what}_{axis}" for what in of_axes for axis in AXIS_NAMES]
+        inputs, outputs = self.config.axis_names, self.config.output_names
+        columns = [f"{what}_{name}" for what in ("pulses", "u_deg") for name in inputs]
+        columns += [
+            f"{what}_{name}" for what in ("y_deg", "std_deg") for name in outputs
+        ]
         rows: list[list[Any]] = [["name", "role", *columns, "samples"]]
         for r in self.postures().values():
             values = r["pulses"] + r["commanded_deg"] + r["measured_deg"] + r["std_deg"]

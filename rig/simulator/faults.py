@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 import time
+from collections.abc import Sequence
 from typing import Any
 
 from rig.config.axis import AXIS_NAMES
@@ -58,7 +59,7 @@ class FaultSpec:
     begun: float | None = None  # by the monotonic clock; None: it waits
 
 
-def parse_fault(text: str) -> FaultSpec:
+def parse_fault(text: str, names: Sequence[str] = AXIS_NAMES) -> FaultSpec:
     """Read ``kind[@phase][,count=N][,axis=NAME][,seconds=S][,share=P][,factor=F]``."""
     head, *options = text.split(",")
     kind, _, when = head.partition("@")
@@ -67,7 +68,7 @@ def parse_fault(text: str) -> FaultSpec:
     found: dict[str, Any] = {}
     readers: dict[str, Any] = {"count": int, "seconds": float, "share": float}
     readers["factor"] = float
-    readers["axis"] = AXIS_NAMES.index
+    readers["axis"] = list(names).index
     try:
         if when:
             found["phase"] = PHASES[PHASES.index(when)]
@@ -78,7 +79,7 @@ def parse_fault(text: str) -> FaultSpec:
         raise ValueError(
             f"fault {text!r}: after @ comes one of {', '.join(PHASES)}; "
             "options are count=N, seconds=S, share=P, factor=F, axis=NAME of "
-            f"{', '.join(AXIS_NAMES)}"
+            f"{', '.join(names)}"
         ) from None
     return FaultSpec(kind, **found)
 

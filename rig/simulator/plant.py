@@ -32,17 +32,19 @@ class Plant:
         self._rng = np.random.default_rng(truth.seed)
         self._matrix = np.array(truth.matrix)
         self._bias = np.array(truth.bias)
-        self._geared = [(1.0, 0.0)] * 3  # degrees of each motor: factor and offset
+        self._geared = [(1.0, 0.0)] * len(
+            drives
+        )  # degrees of each motor: factor and offset
         self._drive_deg = self._commanded()
         self._loose = self._drive_deg.copy()  # behind the play
-        self.slip = np.zeros(3)
+        self.slip = np.zeros(len(drives))
         self._joint = self._drive_deg.copy()  # behind the friction too
-        self._sliding = np.zeros(3, dtype=bool)
+        self._sliding = np.zeros(len(drives), dtype=bool)
         self._centre = self._drive_deg + truth.dead_centre_deg
         self._mounting = euler_to_matrix(config.imu.mounting_deg, "ZYX")
 
     def _commanded(self) -> Array:
-        """(3,) degrees by which the motors turn the joints."""
+        """(n,) degrees by which the motors turn the joints."""
         turned = [
             factor * (drive.position - drive.offset) / drive.pulses_per_deg + offset
             for drive, (factor, offset) in zip(self._drives, self._geared, strict=True)
@@ -61,14 +63,14 @@ class Plant:
         self._mounting = self._mounting @ turn
 
     def joints(self) -> Array:
-        """(3,) joint angles in degrees now.
+        """(n,) joint angles in degrees now, or (m,) of what is measured.
 
         ``A u + b`` behind the play, the friction (a joint at rest stays until its drive
         is ``breakaway_deg`` away, then follows it until that stands) and the dead zone.
         """
         for drive in self._drives:
             drive.advance()
-        for axis in range(3):
+        for axis in range(len(self._drives)):
             if fault := self._faults.take("regeared", axis):
                 fault.count = 0
                 self.regear(axis, fault.factor or 2.0)
@@ -76,7 +78,7 @@ class Plant:
             fault.count = 0
             self.turn_phone(10.0)
         now = self._commanded()
-        for axis in range(3):
+        for axis in range(len(self._drives)):
             if self._faults.take("slipping_axis", axis):
                 self.slip[axis] += now[axis] - self._drive_deg[axis]
         self._drive_deg = now
@@ -97,7 +99,8 @@ class Plant:
         joints = self.joints()
         config = self._config
         order = config.mechanism.order
-        sequence = [joints[config.letters.index(letter)] for letter in order]
+        of_letter = dict(zip(config.letters, joints, strict=True))
+        sequence = [of_letter.get(letter, 0.0) for letter in order]
         minutes = (time.monotonic() - self._start) / 60.0
         heading = self.truth.heading_deg + self.truth.drift_deg_per_min * minutes
         attitude = (

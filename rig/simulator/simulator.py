@@ -28,7 +28,9 @@ class Simulator:
         speedup: float = 1.0,
     ) -> None:
         self.config = config
-        self.truth = truth or Truth(seed=config.session.seed)
+        self.truth = truth or Truth.of_axes(
+            len(config.axes), len(config.output_names), seed=config.session.seed
+        )
         self.faults = FaultInjector(faults)
         self.transport = transport
         self.drives: list[SimDrive] = []

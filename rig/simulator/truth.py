@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from rig.config.axis import AXIS_NAMES
 from rig.core.attitude import Array
 
 
@@ -16,7 +16,7 @@ class Truth:
     """What a calibration should find, and what disturbs it.
 
     The defaults are the set values of the paper's Table 1 (pitch, yaw, roll) with a
-    little cross-coupling.
+    little cross-coupling; ``of_axes`` has those of other numbers.
     """
 
     matrix: tuple[tuple[float, ...], ...] = (
@@ -24,7 +24,7 @@ class Truth:
         (-0.010, 0.71, 0.015),
         (0.006, -0.014, 0.87),
     )
-    bias: tuple[float, float, float] = (3.1, -5.8, 2.41)  # degrees
+    bias: tuple[float, ...] = (3.1, -5.8, 2.41)  # degrees
     noise_deg: float = 0.02  # white, each reading
     backlash_deg: float = 0.0  # play of each joint
     breakaway_deg: float = 0.0  # of its drive, until a joint at rest yields
@@ -37,7 +37,7 @@ class Truth:
     reversed: tuple[bool, ...] = (False, False, False)  # turns the other way
     swapped: tuple[int, ...] = (0, 1, 2)  # joint i is turned by drive swapped[i]
     drive_pulses_per_rev: tuple[int, ...] | None = None  # None: as configured
-    lost_origin_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the counters
+    lost_origin_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # of the counters
     # What real drives do besides what their registers say:
     latency_s: float = 0.0  # of every reply
     enable_delay_s: float = 0.0  # > 0: it starts disabled, and takes so long to enable
@@ -45,17 +45,36 @@ class Truth:
     jitter_counts: int = 0  # of the position read while it stands
     idle_watchdog: bool = False  # the comm timeout also acts while it stands
 
+    @classmethod
+    def of_axes(cls, count: int, outputs: int | None = None, **more: Any) -> Truth:
+        """Of so many axes, and of as many measurements unless said otherwise."""
+        shape, known = (outputs or count, count), cls()
+        matrix = 0.01 * np.cos(np.arange(shape[0] * count)).reshape(shape)
+        matrix += 0.8 * np.eye(*shape)
+        least = min(*shape, len(known.matrix))
+        matrix[:least, :least] = np.array(known.matrix)[:least, :least]
+        bias = [*known.bias, 1.3, -2.2, 0.7][: shape[0]]
+        given = {
+            "matrix": tuple(map(tuple, matrix.tolist())),
+            "bias": tuple(bias),
+            "reversed": (False,) * count,
+            "swapped": tuple(range(count)),
+            "lost_origin_deg": (0.0,) * count,
+        }
+        return cls(**given | more)
+
     @property
     def jig_deg(self) -> Array:
-        """(3,) turns of the motors, by axis, at which every joint stands at zero."""
-        joints = np.linalg.solve(np.array(self.matrix), -np.array(self.bias))
-        motors = np.empty(3)
+        """(n,) turns of the motors, by axis, at which every joint stands at zero."""
+        matrix, bias = np.array(self.matrix), np.array(self.bias)
+        joints = np.linalg.lstsq(matrix, -bias, rcond=None)[0]
+        motors = np.empty(len(joints))
         motors[list(self.swapped)] = joints
         return motors * self.signs
 
     @property
     def signs(self) -> Array:
-        """(3,) -1 where a motor turns the other way."""
+        """(n,) -1 where a motor turns the other way."""
         return np.where(self.reversed, -1.0, 1.0)
 
 
@@ -68,27 +87,35 @@ REALISTIC: dict[str, Any] = {
 }
 
 
-def truth_of(options: dict[str, Any], seed: int) -> Truth:
+def truth_of(
+    options: dict[str, Any], seed: int, names: Sequence[str], outputs: int
+) -> Truth:
     """The simulated device that the options of a command line describe.
 
     Raises:
-        ValueError: ``swapped`` does not name two axes.
+        ValueError: ``swapped`` or ``reversed`` names no axes of the device.
     """
-    order = [0, 1, 2]
-    if names := options["swapped"]:
-        if len(set(names)) != 2:
-            raise ValueError(f"--swapped must name two axes, got {','.join(names)}")
-        a, b = map(AXIS_NAMES.index, names)
+    order = list(range(len(names)))
+    for key in ("swapped", "reversed"):
+        if unknown := set(options[key] or ()) - set(names):
+            known = ", ".join(names)
+            raise ValueError(f"--{key}: no axis {min(unknown)!r}: have {known}")
+    if swapped := options["swapped"]:
+        if len(set(swapped)) != 2:
+            raise ValueError(f"--swapped must name two axes, got {','.join(swapped)}")
+        a, b = map(list(names).index, swapped)
         order[a], order[b] = b, a
     degrees = ("noise", "backlash", "breakaway", "dead_zone")
     pulses, turned = options["gearing"], options["reversed"] or ()
-    return Truth(
+    return Truth.of_axes(
+        len(names),
+        outputs,
         drift_deg_per_min=options["drift"],
         seed=seed,
-        reversed=tuple(name in turned for name in AXIS_NAMES),
+        reversed=tuple(name in turned for name in names),
         swapped=tuple(order),
-        drive_pulses_per_rev=pulses and (pulses,) * 3,
-        lost_origin_deg=(options["lost_origin"],) * 3,
+        drive_pulses_per_rev=pulses and (pulses,) * len(names),
+        lost_origin_deg=(options["lost_origin"],) * len(names),
         **{f"{name}_deg": options[name] for name in degrees},
         **(REALISTIC if options["realistic"] else {}),
     )

@@ -61,7 +61,7 @@ class Run(RunFolder):
     def zero_pulses(self) -> Pulses:
         """Where the zero posture was taken; where drives count 0 before it was."""
         zeros = self.journal.events("zero")
-        return tuple(zeros[-1]["pulses"]) if zeros else (0, 0, 0)
+        return tuple(zeros[-1]["pulses"]) if zeros else (0,) * len(self.config.axes)
 
     def lacks(self, names: Iterable[str]) -> bool:
         """Some of these postures are neither measured nor known to be out of reach."""

@@ -77,6 +77,18 @@ def fast_text(changes: dict[str, str] | None = None, session: str = SESSION) -> 
     return text + session
 
 
+def axes_text(axes: dict[str, str], order: str = "ZXY", session: str = SESSION) -> str:
+    """The same of other axes: name to the letter that each turns about."""
+    head, first, *_, last = fast_text(session=session).split("[[axes]]")
+    tables = [
+        f'[[axes]]\nname = "{name}"\nrotates = "{letter}"\nunit = {unit}'
+        + first.partition("unit = 1")[2]
+        for unit, (name, letter) in enumerate(axes.items(), 1)
+    ]
+    tail = last[last.index("[imu]") :].replace('order = "ZXY"', f'order = "{order}"')
+    return head + "".join(tables) + tail
+
+
 def changed(settings, **changes):
     """The same settings but for some."""
     return settings.model_copy(update=changes)
@@ -95,7 +107,7 @@ def commissioned(
     """
     record = DeviceRecord.load(folder / "device.json")
     if record.state(HOMED) is None:
-        record.left_at()
+        record.left_at(dict.fromkeys(config.axis_names))
         for drive in sim.drives if sim else ():
             drive.alarm = 0
     for name in (IDENTIFIED, HOMED, SIGN_CHECKED, STOP_PROVED):

@@ -11,9 +11,9 @@ from rig.config import AXIS_NAMES
 from rig.core.attitude import ORDERS, angle_between_deg, euler_to_matrix
 from rig.core.faults import MotionFault
 from rig.workbench.commission.axis_check import (
-    CORNERS,
     Stand,
     corner_name,
+    corners_of,
     find,
     proposals,
 )  # fmt: skip
@@ -77,8 +77,11 @@ class Chain:
                 ("minus", -reach_deg), ("up", 0.0),
             ):  # fmt: skip
                 stand(f"{name}:{part}", {j: way})
-        for signs in CORNERS:
-            stand(corner_name(signs), dict(enumerate(np.multiply(corner_deg, signs))))
+        for signs in corners_of(3):
+            stand(
+                corner_name(CONFIG, signs),
+                dict(enumerate(np.multiply(corner_deg, signs))),
+            )
         return stands
 
 

@@ -184,8 +184,8 @@ def test_a_count_of_0_after_a_power_cycle_is_not_home(at, name, obeys, monkeypat
         counts = [round(drive.position) for drive in sim.drives]
         assert counts == ([2**30] * 3 if obeys else [0] * 3)
         assert record.state(HOMED)["pulses"] == [0, 0, 0]
-        assert steps.jog(place, 0, 1.0) == 0
-        assert steps.jog(place, 0, -1.0) == 0
+        assert steps.jog(place, "pitch", 1.0) == 0
+        assert steps.jog(place, "pitch", -1.0) == 0
         np.testing.assert_allclose(sim.plant.joints(), 0.0, atol=0.1)
         assert [round(drive.position) for drive in sim.drives] == counts
         for drive in sim.drives:

@@ -9,6 +9,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 import jaxcal
+from rig.config import AXIS_NAMES
 from rig.core.attitude import ORDERS, Frame, Reading, euler_to_matrix, raw_fields
 from rig.simulator import Truth
 from rig.workbench.identification.conclusion import estimate_drift, without_drift
@@ -147,7 +148,7 @@ def test_a_drift_that_is_not_linear_stays_and_is_judged():
     assert not drift["corrected"] and drift["over"]
     told = {"drift": drift}
     assert "session.drift_limit_deg (0.2)" in " ".join(recalibrate(told, 0.5))
-    assert "not linear" in drift_text(drift)
+    assert "not linear" in drift_text(drift, AXIS_NAMES)
     assert not estimate_drift(visits, frame, 0.6)["over"]
 
 

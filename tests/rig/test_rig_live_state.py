@@ -40,8 +40,14 @@ def trouble(state, running, folder):
     return live.draw("trouble", lines=view.trouble(state, running, folder))
 
 
+AXES = ["pitch", "yaw", "roll"]
+
+
 def numbers(state, running):
-    return live.draw("numbers", rows=view.numbers(state.present({}, running), running))
+    return live.draw(
+        "numbers",
+        rows=view.numbers(state.present({}, running), running, state.names),
+    )
 
 
 def waiting(state):
@@ -105,7 +111,10 @@ def test_every_moment_of_a_run_can_be_drawn(run):
         for text in (
             live.draw("head", state=state, now=now, said=said, folder="run"),
             queue(state),
-            live.draw("numbers", rows=view.numbers(state.present({}, True), True)),
+            live.draw(
+                "numbers",
+                rows=view.numbers(state.present({}, True), True, state.names),
+            ),
             trouble(state, True, "run"),
             live.draw("log", lines=state.log),
         ):
@@ -321,7 +330,9 @@ def test_a_session_is_known_by_the_lock_on_its_journal(tmp_path):
 def test_a_run_that_is_over_shows_no_difference():
     now = {"commanded": [1, 2, 3], "drives": [0, 0, 0], "measured": [9, 9, 9]}
     now["std"] = [0.1, 0.1, 0.1]
-    while_running, after = (view.numbers(now, running) for running in (True, False))
+    while_running, after = (
+        view.numbers(now, running, (AXES, AXES)) for running in (True, False)
+    )
     assert [row[4] for row in while_running] == [view.angle(d) for d in (8, 7, 6)]
     assert {row[4] for row in after} == {view.angle(None)}
     assert [row[:4] for row in after] == [row[:4] for row in while_running]

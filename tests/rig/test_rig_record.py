@@ -106,13 +106,13 @@ def test_a_fingerprint_is_the_same_once_it_was_json():
 
 
 def test_where_the_drives_were_left(record):
-    record.left_at((10, None, -3))
+    record.left_at({"pitch": 10, "yaw": None, "roll": -3})
     assert DeviceRecord.load(record.path).left()[0] == {
         "pitch": 10,
         "yaw": None,
         "roll": -3,
     }
-    record.left_at()
+    record.left_at(dict.fromkeys(("pitch", "yaw", "roll")))
     assert set(DeviceRecord.load(record.path).left()[0].values()) == {None}
 
 

@@ -107,7 +107,9 @@ def test_one_mangled_position_voids_no_home(tmp_path):
     with simulator(fast_config()) as sim:
         config = sim.start()
         record = commissioned(config, tmp_path)
-        record.left_at([d.position for d in sim.drives])
+        record.left_at(
+            {a.name: d.position for a, d in zip(config.axes, sim.drives, strict=True)}
+        )
         drive, calls = sim.drives[1], []
         place = drive.map.position.address
 

@@ -357,6 +357,7 @@ def test_the_c_header_finds_the_nearest_posture_of_any_axes(count, inverse, tmp_
         "max_pulses": [100] * count, "follow": follow(matrix).tolist(),
         "forward": np.column_stack([matrix, np.zeros(count)]).tolist(),
         "axes": [f"axis{i}" for i in range(count)],
+        "outputs": [f"y{i}" for i in range(count)],
     }  # fmt: skip
     (tmp_path / "calibration.h").write_text(LANGUAGES["c"](inverse | given))
     read = "".join(f' && scanf("%lf", d + {i}) == 1' for i in range(count))

@@ -102,13 +102,13 @@ def test_exchanged_axes_end_the_session(tmp_path):
 
 def test_a_fit_that_is_reversed_or_exchanged_is_refused_by_its_axis():
     good = np.array(Truth().matrix)
-    assert check_matrix(good) == []
+    assert check_matrix(fast_config(), good) == []
     reversed_roll = good * [1, 1, -1]
     with pytest.raises(MotionFault, match=r"roll turns -0\.87 deg .*axes\.roll\.direc"):
-        check_matrix(reversed_roll)
+        check_matrix(fast_config(), reversed_roll)
     with pytest.raises(MotionFault, match=r"pitch follows the command of yaw"):
-        check_matrix(good[[1, 0, 2]])
-    (warning,) = check_matrix(good * [[0.5], [1], [1]])
+        check_matrix(fast_config(), good[[1, 0, 2]])
+    (warning,) = check_matrix(fast_config(), good * [[0.5], [1], [1]])
     assert "pitch turns 0.21 deg" in warning
 
 
@@ -201,7 +201,7 @@ def test_an_absolute_encoder_keeps_its_place(calibrated, tmp_path):
     with simulator(config, noise_deg=0.005) as sim:
         served = sim.start()
         record = commissioned(served, tmp_path)
-        record.left_at((0, 0, 0))  # moved by hand since
+        record.left_at(dict.fromkeys(config.axis_names, 0))  # moved by hand since
         code, said = run_verify(served, calibrated, tmp_path / "run", sim, record)
     assert code == 0, said
 
@@ -523,7 +523,9 @@ def test_a_position_not_read_after_a_session_voids_home(bit, tmp_path):
         record = commissioned(served, tmp_path, sim)
         for drive in sim.drives:
             drive.homed = bit
-        record.left_at(homed=("pitch", "yaw", "roll") if bit else ())  # as when armed
+        record.left_at(
+            dict.fromkeys(served.axis_names), served.axis_names if bit else ()
+        )  # as when armed
         run = make_run(served, tmp_path, "collect", [].append, record=record)
         run.listeners.append(sim.answer)
         code = run_safely(run, lambda r: collect(r, 1))

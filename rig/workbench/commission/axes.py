@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from rig.config import AXIS_NAMES
 from rig.core.device import Device, Posture
 from rig.core.faults import MotionFault, Refused
 from rig.core.motion import move
@@ -12,10 +11,10 @@ from rig.core.proof import FIRST_MOTOR_DEG, unit_proved
 from rig.journal import SIGN_CHECKED
 from rig.workbench.commission.axis_check import (
     CLEAR,
-    CORNERS,
     Change,
     Stand,
     corner_name,
+    corners_of,
     find,
     lines,
     proposals,
@@ -46,7 +45,7 @@ def check_axes(run: Run, device: Device) -> list[Change]:
     Where nothing is to be corrected the device is SIGN_CHECKED, and once every way to
     stop it has been tried, STOP_PROVED.
     """
-    stands = measure_axes(run, device)
+    stands, names = measure_axes(run, device), run.config.axis_names
     found = find(run.config, stands)
     told = [drive.pulses_per_rev() for drive in device.drives]
     ratios = ratios_of(run.config, found)
@@ -55,14 +54,14 @@ def check_axes(run: Run, device: Device) -> list[Change]:
     require_gearing(run.config, ratios, told)
     changes = proposals(run.config, found, told)
     evidence = {
-        "ratio": dict(zip(AXIS_NAMES, np.round(ratios, 4).tolist(), strict=True)),
+        "ratio": dict(zip(names, np.round(ratios, 4).tolist(), strict=True)),
         "phone_turned_deg": round(found.turned_deg, 2),
         "run": run.folder.name,
     }
     scales = np.array([axis.pulses_per_deg for axis in run.config.axes])
     turns = {
         "pulses": stands["start"].pulses.tolist(),
-        "deg": (rates_of(stands) * scales).round(6).tolist(),
+        "deg": (rates_of(run.config, stands) * scales).round(6).tolist(),
     }
     run.emit("axes", sync=True, **evidence, changes=[str(change) for change in changes])
     run.say(*lines(run.config, found))
@@ -105,8 +104,9 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
         stands[name] = stand_at(run, device, Posture(name, target), samples)
         return stands[name]
 
+    names, corners = config.axis_names, corners_of(len(config.axes))
     run.say(
-        f"axes: about {22 + len(CORNERS)} places; each axis first by "
+        f"axes: about {1 + 7 * len(names) + len(corners)} places; each axis first by "
         f"{FIRST_MOTOR_DEG:g} deg of its motor, then as far as the phone's turn "
         f"allows, {REACH_DEG:g} deg at most either way"
     )
@@ -126,7 +126,7 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
             count = reach.pulses(wanted[j], REACH_DEG)
             if count <= FAR_ENOUGH * counts[-1]:
                 return way * counts[-2], way * counts[-1]
-            look = visit(f"{AXIS_NAMES[j]}:plus", {j: way * count}, samples)
+            look = visit(f"{names[j]}:plus", {j: way * count}, samples)
             reach.saw(count, turned(look), noise)
             counts.append(count)
 
@@ -139,14 +139,14 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
         ratios = []
         for j, axis in enumerate(config.axes):
             _, far = grow(j, False, 4 * config.settle.samples)
-            seen = turned(stands[f"{AXIS_NAMES[j]}:plus"])
+            seen = turned(stands[f"{names[j]}:plus"])
             told = device.drives[j].pulses_per_rev() or axis.pulses_per_rev
             geared = told / axis.pulses_per_rev
             ratios.append(geared * seen / abs(axis.to_deg(far)))
-            visit(f"{AXIS_NAMES[j]}:back", {j: 0})
+            visit(f"{names[j]}:back", {j: 0})
         require_unit(config, ratios)
-    corner = [0, 0, 0]
-    for j, name in enumerate(AXIS_NAMES):
+    corner = [0] * len(names)
+    for j, name in enumerate(names):
         axis = config.axes[j]
         look, far = grow(j, True)
         plus = stands[f"{name}:plus"]
@@ -172,10 +172,11 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
             f"  {name}: {abs(axis.to_deg(far)):.2f} deg commanded, the phone turned "
             f"{way:.3f}"
         )
-    clear = int(np.ceil((CLEAR * base.std_deg / CORNER_STD_DEG) ** 2 / 8))
+    clear = CLEAR * base.std_deg / CORNER_STD_DEG
+    clear = int(np.ceil(clear**2 / max(1, len(corners))))
     samples = min(max(clear, config.settle.samples), 8 * config.settle.samples)
-    for signs in CORNERS:
+    for signs in corners:
         ways = {j: sign * corner[j] for j, sign in enumerate(signs)}
-        visit(corner_name(signs), ways, samples)
+        visit(corner_name(config, signs), ways, samples)
     move(device, Posture("back", start))
     return stands

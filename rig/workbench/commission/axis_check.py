@@ -1,11 +1,11 @@
-"""What small moves of three drives say about a device: axes, signs, gearing, placement.
+"""What small moves of the drives say about a device: axes, signs, gearing, placement.
 
 Everything is taken from rotations of the phone against its attitude at the start, so
 neither the heading of the phone's world nor the zero posture enters. A rotation vector
 is (3,) degrees in the phone's own frame at the start.
 
 A drive's axis there, with its sign, is the direction of its rotation vector for
-positive pulses. With the three axes alone, a phone that is placed differently cannot be
+positive pulses. With these axes alone, a phone that is placed differently cannot be
 told from drives whose names and signs are exchanged, so the configured placement is
 taken as known, as good as ``NEAREST``.
 """
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rig.config import AXIS_NAMES, RigConfig
+from rig.config import RigConfig
 from rig.core.attitude import Array, euler_to_matrix, matrix_to_euler
 from rig.core.device import Device, Posture
 from rig.core.faults import MotionFault
@@ -46,11 +46,6 @@ BY_PLATE = (
     "gearboxes' plates say, then run `jaxcal-rig axes` again"
 )
 DIGITS = 4  # of a reduction that was measured
-# Signs of the moves of the three drives, one of them changed at a time.
-CORNERS = (
-    (-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1),
-    (-1, 1, 1), (1, 1, 1), (1, -1, 1), (-1, -1, 1),
-)  # fmt: skip
 OF_DRIVE = ("unit", "map", "pulses_per_rev", "comm_timeout_s")  # go with the cable
 
 
@@ -58,7 +53,7 @@ OF_DRIVE = ("unit", "map", "pulses_per_rev", "comm_timeout_s")  # go with the ca
 class Stand:
     """The device measured at one place."""
 
-    pulses: Array  # (3,)
+    pulses: Array  # (n,)
     attitude: Array  # (3, 3) phone to its world
     std_deg: float  # of one reading
     samples: int
@@ -77,9 +72,17 @@ def stand_at(run: Run, device: Device, posture: Posture, samples: int = 0) -> St
     )
 
 
-def corner_name(signs: Sequence[int]) -> str:
+def corners_of(count: int) -> list[tuple[int, ...]]:
+    """Signs of combined moves of so many axes, one changed at a time; none of one."""
+    signs: list[tuple[int, ...]] = [()]
+    for _ in range(count):
+        signs = [(*s, -1) for s in signs] + [(*s, 1) for s in reversed(signs)]
+    return signs if count > 1 else []
+
+
+def corner_name(config: RigConfig, signs: Sequence[int]) -> str:
     """Such as ``pitch+ yaw- roll+``."""
-    named = zip(AXIS_NAMES, signs, strict=True)
+    named = zip(config.axis_names, signs, strict=True)
     return " ".join(f"{name}{'+' if sign > 0 else '-'}" for name, sign in named)
 
 
@@ -88,10 +91,10 @@ def turn(base: Array, attitude: Array) -> Array:
     return Rotation.from_matrix(base.T @ attitude).as_rotvec(degrees=True)
 
 
-def rates_of(stands: Mapping[str, Stand]) -> Array:
-    """(3, 3) columns: rotation vector for one pulse of each drive."""
-    base, rates = stands["start"].attitude, np.empty((3, 3))
-    for j, name in enumerate(AXIS_NAMES):
+def rates_of(config: RigConfig, stands: Mapping[str, Stand]) -> Array:
+    """(3, n) columns: rotation vector for one pulse of each drive."""
+    base, rates = stands["start"].attitude, np.empty((3, len(config.axes)))
+    for j, name in enumerate(config.axis_names):
         parts = ("look", "plus", "back", "minus")
         places = [stands[f"{name}:{part}"] for part in parts]
         look, plus, back, minus = (turn(base, each.attitude) for each in places)
@@ -103,34 +106,40 @@ def rates_of(stands: Mapping[str, Stand]) -> Array:
     return rates
 
 
-def _inner(stands: Mapping[str, Stand], rates: Array) -> list[int] | None:
+def _inner(
+    config: RigConfig, stands: Mapping[str, Stand], rates: Array
+) -> list[int] | None:
     """For each drive how many joints its own carries; [] where nothing fits.
 
     With A nearer to the base the phone turns by exp(a) exp(b), otherwise by exp(b)
     exp(a). The two differ by a x b: half of it, up or down, in the direction in which
     neither turns alone. It changes its sign with either move, so its mean over the
-    eight corners, each with the product of the two signs, is free of what A or B turn
+    corners, each with the product of the two signs, is free of what A or B turn
     alone, of play and of a steady drift. Angles read in a wrong order or with wrong
     signs turn like a mirror image, and combine like nothing. None: the phone is too
     noisy to tell.
     """
-    base, corners = stands["start"], [stands[corner_name(each)] for each in CORNERS]
+    count, base = rates.shape[1], stands["start"]
+    corners = [stands[corner_name(config, each)] for each in corners_of(count)]
+    if not corners:  # of a single axis
+        return [0]
     turned = np.array([turn(base.attitude, each.attitude) for each in corners])
     ways = np.array([each.pulses - base.pulses for each in corners])
-    noise = base.std_deg * np.sqrt(sum(1 / each.samples for each in corners)) / 8
-    inner = [0, 0, 0]
-    for a, b in itertools.combinations(range(3), 2):
+    number = len(corners)
+    noise = base.std_deg * np.sqrt(sum(1 / each.samples for each in corners)) / number
+    inner = [0] * count
+    for a, b in itertools.combinations(range(count), 2):
         product = ways[:, a] * ways[:, b]  # as large at each
         normal = np.cross(rates[:, a], rates[:, b])
         scale = np.linalg.norm(normal)
-        seen = np.sign(product) @ turned @ normal / scale / 8
+        seen = np.sign(product) @ turned @ normal / scale / number
         whole = np.radians(np.abs(product).mean() * scale) / 2
         if CLEAR * noise > whole / 2:
             return None
         if not whole / 2 < abs(seen) < 2 * whole:
             return []
         inner[a if seen > 0 else b] += 1
-    return inner if sorted(inner) == [0, 1, 2] else []
+    return inner if sorted(inner) == [*range(count)] else []
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,8 +147,8 @@ class Findings:
     """Of the drives in the order of the configuration's axes, unless said otherwise."""
 
     joints: tuple[int, ...]  # for each drive: the axis that it turns
-    deg_per_pulse: Array  # (3,) of the phone, > 0 where pulses turn the joint positive
-    mounting: Array  # (3, 3) phone to end-effector, nearest to the three axes
+    deg_per_pulse: Array  # (n,) of the phone, > 0 where pulses turn the joint positive
+    mounting: Array  # (3, 3) phone to end-effector, nearest to the axes
     turned_deg: float  # that from the configured one
     order: str | None  # axes of the mechanism from the base outwards; None: not clear
 
@@ -153,25 +162,28 @@ def find(
     Args:
         config: as the moves were made.
         stands: ``start``; of each axis NAME ``NAME:look``, ``:plus``, ``:back``,
-            ``:minus``; of each of CORNERS its ``corner_name``.
+            ``:minus``; of each of ``corners_of`` its ``corner_name``.
 
     Raises:
-        MotionFault: the axes fit no three joints, or the readings are no rotations.
+        MotionFault: the axes fit no joints, or the readings are no rotations.
     """
-    rates = rates_of(stands)
+    rates = rates_of(config, stands)
     size = np.linalg.norm(rates, axis=0)
     axes = rates / size
     joints, signs, mounting = _placed(config, axes)
-    order, inner = None, _inner(stands, rates)
+    order, inner = None, _inner(config, stands, rates)
     if inner is not None:
         if not inner:
             raise MotionFault(
-                "the phone's readings do not combine as rotations of three joints do: "
+                "the phone's readings do not combine as rotations of joints do: "
                 "imu.order, imu.columns or imu.signs is wrong, or the phone is loose. "
                 "Nothing was corrected"
             )
         order = "".join(config.letters[joints[i]] for i in np.argsort(inner)[::-1])
-    mirrored = np.linalg.det(axes * _directions(config) @ _expected(config)) < 0
+    turned_as_told = axes * _directions(config)  # of fewer axes nothing is a mirror
+    mirrored = rates.shape[1] == 3 and (
+        np.linalg.det(turned_as_told @ _expected(config)) < 0
+    )
     if mirrored and order is None:
         raise MotionFault(
             "the axes are mirrored, and the phone is too noisy to tell whether a "
@@ -184,12 +196,12 @@ def find(
 
 
 def _expected(config: RigConfig) -> Array:
-    """(3, 3) columns: axis of each joint in the end-effector's frame."""
+    """(3, n) columns: axis of each joint in the end-effector's frame."""
     return np.eye(3)[:, [LETTERS.index(letter) for letter in config.letters]]
 
 
 def _directions(config: RigConfig) -> Array:
-    """(3,) the configured ones of the drives."""
+    """(n,) the configured ones of the drives."""
     return np.array([float(axis.direction) for axis in config.axes])
 
 
@@ -199,10 +211,10 @@ def _placed(config: RigConfig, axes: Array) -> tuple[tuple[int, ...], Array, Arr
     told = euler_to_matrix(config.imu.mounting_deg, "ZYX")
     cosines = expected.T @ told @ axes  # rows: joints
     joints: tuple[int, ...] = max(
-        itertools.permutations(range(3)),
-        key=lambda order: np.abs(cosines[order, range(3)]).sum(),
+        itertools.permutations(range(len(cosines))),
+        key=lambda order: np.abs(cosines[order, range(len(order))]).sum(),
     )
-    own = cosines[joints, range(3)]
+    own = cosines[joints, range(len(joints))]
     signs = np.sign(own)
     if np.abs(own).min() < NEAREST:
         unit = config.axes[int(np.abs(own).argmin())].unit
@@ -211,8 +223,15 @@ def _placed(config: RigConfig, axes: Array) -> tuple[tuple[int, ...], Array, Arr
             "joint's, so the phone is not placed as imu.mounting_deg says. Correct "
             "that roughly, then run `jaxcal-rig axes` again"
         )
-    fitted, _ = Rotation.align_vectors((expected[:, joints] * signs).T, axes.T)
-    return joints, signs, fitted.as_matrix()
+    wanted, found = expected[:, joints] * signs, told @ axes
+    if len(joints) == 1:  # the least turn that fits it
+        across = np.cross(found[:, 0], wanted[:, 0])
+        sine = np.linalg.norm(across)
+        angle = np.arctan2(sine, found[:, 0] @ wanted[:, 0])
+        correction = Rotation.from_rotvec(across * (angle / max(sine, 1e-12)))
+    else:
+        correction, _ = Rotation.align_vectors(wanted.T, found.T)
+    return joints, signs, correction.as_matrix() @ told
 
 
 # What follows for rig.toml
@@ -244,22 +263,23 @@ def require_unit(
 ) -> None:
     """The unit of the phone's angles is the configured one, by what the axes turned.
 
-    Two gearings of the file that agree with the phone prove it: both would have to be
-    wrong by 57.3. A gearing is corrected only where the unit is proved, so that no
+    Two gearings of the file that agree with the phone prove it (of a single axis the
+    one): both would have to be wrong by 57.3. A gearing is corrected only where the
+    unit is proved, so that no
     phone's radians are taken for a gearbox.
 
     Args:
         config: names the unit.
-        ratios: of three axes, measured against commanded, by the drives' own registers
+        ratios: of the axes, measured against commanded, by the drives' own registers
             where they have one.
-        proved: only that all three do not turn as if the unit were the other.
+        proved: only that not all turn as if the unit were the other.
 
     Raises:
         MotionFault: it is the other unit, or that is not clear.
     """
     unit = config.imu.unit
     other, factor = ("rad", RADIANS) if unit == "deg" else ("deg", 1.0 / RADIANS)
-    seen, (low, high) = _seen(ratios), NEAR_UNIT
+    seen, (low, high) = _seen(config, ratios), NEAR_UNIT
     if all(low <= ratio * factor <= high for ratio in ratios):
         raise MotionFault(
             f'{seen}, about {1 / factor:.3g}: rig.toml says imu.unit = "{unit}", and '
@@ -267,7 +287,8 @@ def require_unit(
             "axes` again"
         )
     low, high = SOUND_RATIO
-    if not proved and sum(low <= ratio <= high for ratio in ratios) < 2:
+    sound = sum(low <= ratio <= high for ratio in ratios)
+    if not proved and sound < min(2, len(ratios)):
         raise MotionFault(
             f"{seen}, and none of its angles is over 6.3: either imu.unit or the "
             f"gearings are wrong. {BY_PLATE}"
@@ -280,7 +301,7 @@ def require_gearing(
     """A gearing that is off by more than a factor of 2 has a second proof.
 
     That is the drive's own register, or another axis that turns as it is told: what is
-    off by as much on all three may be the phone, or what the file says of all drives.
+    off by as much on all of them may be the phone, or what the file says of all drives.
 
     Args:
         config, ratios: as of ``require_unit``.
@@ -295,15 +316,18 @@ def require_gearing(
     for axis, ratio, register in zip(config.axes, ratios, told, strict=True):
         if register is None and max(ratio, 1.0 / ratio) > UNPROVED_FACTOR:
             raise MotionFault(
-                f"{_seen(ratios)}, and the drive of {axis.name} has no register that "
+                f"{_seen(config, ratios)}, and the drive of {axis.name} has no "
+                "register that "
                 "says its pulses for a turn, so it is not known what is wrong. "
                 f"{BY_PLATE}"
             )
 
 
-def _seen(ratios: Sequence[float]) -> str:
+def _seen(config: RigConfig, ratios: Sequence[float]) -> str:
+    *most, last = config.axis_names
+    names = f"{', '.join(most)} and {last}" if most else last
     text = ", ".join(f"{ratio:.3g}" for ratio in ratios)
-    return f"the phone turned {text} of what pitch, yaw and roll were commanded"
+    return f"the phone turned {text} of what {names} were commanded"
 
 
 def proposals(
@@ -343,13 +367,15 @@ def proposals(
                 changes.append(Change(f"axes.{axis.name}.{name}", *each))
     if found.turned_deg > MOUNTING_DEG:
         angles = matrix_to_euler(found.mounting, "ZYX").round(2) + 0.0
-        before, reason = list(config.imu.mounting_deg), "the three axes put the phone"
+        before, reason = list(config.imu.mounting_deg), "the axes put the phone"
         reason += f" {found.turned_deg:.1f} deg from there"
         changes.append(Change("imu.mounting_deg", before, angles.tolist(), reason))
-    if found.order not in (None, config.mechanism.order):
+    if found.order not in (None, config.joint_order):
         reason = "combined moves show which joint carries which"
-        order = config.mechanism.order
-        changes.append(Change("mechanism.order", order, found.order, reason))
+        order, seen = config.mechanism.order, iter(str(found.order))
+        # What no joint turns about keeps its place.
+        new = "".join(next(seen) if at in config.letters else at for at in order)
+        changes.append(Change("mechanism.order", order, new, reason))
     return changes
 
 

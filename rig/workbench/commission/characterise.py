@@ -17,7 +17,6 @@ import math
 import numpy as np
 from scipy import special
 
-from rig.config import AXIS_NAMES
 from rig.core.attitude import mean_rotation
 from rig.core.device import Device, Posture
 from rig.core.faults import MotionFault, Refused
@@ -50,7 +49,7 @@ class Probe:
 
     def __init__(self, run: Run, device: Device, axis: int) -> None:
         self.run, self.device = run, device
-        self.axis, self.name = axis, AXIS_NAMES[axis]
+        self.axis, self.name = axis, run.config.axis_names[axis]
         self.scale = run.config.axes[axis]
         self.start = device.positions()
         self.here_deg = here = self.scale.to_deg(self.start[axis])

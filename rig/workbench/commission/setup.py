@@ -40,6 +40,7 @@ class Given:
     units: int = UNITS
     values: dict[str, Any] = dataclasses.field(default_factory=dict)  # of rig.toml
     home: str = "here"
+    names: tuple[str, ...] = AXIS_NAMES  # of the axes
 
 
 def setting(text: str) -> tuple[str, Any]:
@@ -104,7 +105,7 @@ def write_config(path: pathlib.Path, given: Given, operator: Operator) -> RigCon
     )
     port = port or operator.ask("TCP port that the phone sends to", "2055")
     values = dict(given.values)
-    for name in AXIS_NAMES:
+    for name in given.names:
         key = f"axes.{name}.reduction"
         if key not in values:
             question = f"{name}: motor turns for one turn of the joint (gearbox)"
@@ -120,16 +121,18 @@ def _ask_axes(
     found: list[Found], given: Given, operator: Operator
 ) -> list[dict[str, Any]]:
     usable = {each.unit: each for each in found if each.families}
-    if len(usable) < 3:
+    if len(usable) < len(given.names):
         unknown = [each.unit for each in found if not each.families]
         raise Refused(
-            f"three drives of a known family are needed, found {len(usable)}"
+            f"{len(given.names)} drives of a known family are needed, for "
+            f"{', '.join(given.names)}; found {len(usable)}"
             + (f"; units {unknown} answer, of no known family" if unknown else "")
             + ". Check power, wiring, termination, the line format, and that every "
             "drive has a unit id of its own; another family needs a map (docs/rig.md)"
         )
     left, axes = sorted(usable), []
-    for name in AXIS_NAMES:
+    letters = ["X", "Y", "Z"]
+    for name in given.names:
         choices = [str(unit) for unit in left]
         unit = int(operator.choose(f"unit of {name}", choices, choices[0]))
         left.remove(unit)
@@ -141,7 +144,10 @@ def _ask_axes(
         pulses = each.pulses_per_rev or int(
             operator.number(f"{name}: pulses for one motor turn", 10000)
         )
-        letter = DEFAULT_ROTATES[name]
+        letter = DEFAULT_ROTATES.get(name) or operator.choose(
+            f"{name}: turns about (X, Y, Z, as it is mounted)", letters, letters[0]
+        )
+        letters = [each for each in letters if each != letter]
         axes.append(
             dict(name=name, letter=letter, unit=unit, family=family, pulses=pulses)
         )
@@ -159,13 +165,14 @@ def go(place: steps.Place, given: Given) -> int:
     pin(place, steps.look_at_phone(place))
     if record.missing(place.config, HOMED):
         say("6 jog and home")
-        choices = [*AXIS_NAMES, "no"]
+        names = place.config.axis_names
+        choices = [*names, "no"]
         question = f"move an axis towards the zero posture ({', '.join(choices)})"
         while not operator.yes:
             if (name := operator.choose(question, choices, "no")) == "no":
                 break
             way = operator.number(f"{name}: degrees", 1.0, steps.MOST_JOG_DEG)
-            steps.jog(place, AXIS_NAMES.index(name), way)
+            steps.jog(place, name, way)
         how = "here"
         if can_home(place.config):
             question = (

@@ -9,7 +9,7 @@ import os
 import pathlib
 from collections.abc import Callable, Iterator
 
-from rig.config import AXIS_NAMES, RigConfig
+from rig.config import RigConfig
 from rig.core import session
 from rig.core.attitude import angle_between_deg
 from rig.core.bus import Bus
@@ -174,16 +174,26 @@ def go_home(place: Place, here: bool) -> int:
     )  # fmt: skip
 
 
-def jog(place: Place, axis: int, way_deg: float) -> int:
+def number_of(config: RigConfig, name: str) -> int:
+    """Of an axis by its name; Refused where there is none."""
+    if name not in config.axis_names:
+        raise Refused(f"no axis {name!r}: have {', '.join(config.axis_names)}")
+    return config.axis_names.index(name)
+
+
+def jog(place: Place, name: str, way_deg: float) -> int:
     """Move one axis by so many degrees, cut at its limits.
 
     Where its gearing is not proved it stops once the phone has turned so far.
     """
-    name = AXIS_NAMES[axis]
+    axis = number_of(place.config, name)
+    unit = place.config.axes[axis].unit_name
     homed = place.record.missing(place.config, HOMED) is None
     if not homed:
         place.say("the device is not HOMED: the soft limits are not in force")
-    place.operator.confirm(f"jog: {name} will move by {way_deg:g} deg, slowly", "jog")
+    place.operator.confirm(
+        f"jog: {name} will move by {way_deg:g} {unit}, slowly", "jog"
+    )
 
     def procedure(run: Run, device: Device) -> None:
         each, here = run.config.axes[axis], list(device.positions())
@@ -208,16 +218,19 @@ def jog(place: Place, axis: int, way_deg: float) -> int:
                 f"  stopped: the phone has turned by {turned} deg after {gone:.2g} "
                 f"commanded. Check the reduction of {name}"
             )
-        run.say(f"  {name} stands at {each.to_deg(device.positions()[axis]):.3f} deg")
+        run.say(
+            f"  {name} stands at {each.to_deg(device.positions()[axis]):.3f} {unit}"
+        )
 
     return place.run("jog", procedure, limits=homed, again=f"jog {name} {way_deg:g}")
 
 
-def characterise(place: Place, axis: int) -> int:
+def characterise(place: Place, name: str) -> int:
     """Measure play, dead zone and breakaway of an axis."""
     from rig.workbench.commission import characterise as measured
 
-    name, most = AXIS_NAMES[axis], measured.BASE_DEG + measured.FAR_DEG
+    axis = number_of(place.config, name)
+    most = measured.BASE_DEG + measured.FAR_DEG
     place.operator.confirm(
         f"characterise: {name} will move up to {most:.2f} deg from where it stands, "
         "many times. Keep out of the device's reach",
@@ -234,7 +247,7 @@ def axes(place: Place) -> int:
     """Check each axis, correct rig.toml after a yes, and check again: SIGN_CHECKED."""
     place.operator.confirm(
         "axes: the device stands in its zero posture. Each axis in turn will move a "
-        "little, then up to 3 deg either way; then all three by turns, up to 6 deg. "
+        "little, then up to 3 deg either way; then all by turns, up to 6 deg. "
         "Watch that the joint that moves is the one that is named, and keep out of the "
         "device's reach",
         "axes",

@@ -1,6 +1,6 @@
 """Every way that the software has to stop the drives, tried in a slow move.
 
-The three axes move together, 3 degrees either side of where they stood, and are stopped
+The axes move together, 3 degrees either side of where they stood, and are stopped
 on the way: by the frame to each unit, by the broadcast where the map has one, and by
 the drives' own watch of the line where they have one. Each must stand short of its
 target, by its drive and by the phone, and must stay there.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from rig.config import AXIS_NAMES, RigConfig
+from rig.config import RigConfig
 from rig.core.attitude import ORDERS, Frame, frame_at
 from rig.core.faults import MotionFault
 from rig.journal import Record, measured_postures
@@ -51,7 +51,7 @@ def conclude(
         turn = drift["turn_deg_per_min"]
         postures = {n: without_drift(r, turn, zero, frame) for n, r in postures.items()}
     chosen = [r for r in postures.values() if r["role"] == "select"]
-    held_out, errors = held_out_errors(config, held, postures, identify(chosen))
+    held_out, errors = held_out_errors(config, held, postures, identify(config, chosen))
     zero_share = chosen[0]["samples"] / zero["samples"]
     limits = uncertainty(chosen, held_out, zero_share)
     shared = {
@@ -72,12 +72,13 @@ def conclude(
         "verdict": {"good": not reasons, "reasons": reasons},
     }
     noise = np.maximum(1e-9, limits["noise_std_deg"])
-    calibration = identify(chosen, noise, notes, zero_share)
+    calibration = identify(config, chosen, noise, notes, zero_share)
     return calibration, {
         "schema": 1,
         "measured_at": zero["time"],
-        "axes": list(AXIS_NAMES),
-        "unit": "deg",
+        "axes": list(config.axis_names),
+        "outputs": list(config.output_names),
+        "unit": config.output_unit,
         "A": np.asarray(calibration.matrix).tolist(),
         "b": np.asarray(calibration.bias).tolist(),
         **limits,
@@ -104,7 +105,7 @@ def estimate_drift(
         limit_deg: ``session.drift_limit_deg``.
 
     Returns:
-        minutes (V,) and angles_deg (V, 3) of the visits; size_deg, the largest angle;
+        minutes (V,) and angles_deg (V, m) of the visits; size_deg, the largest angle;
         turn_deg_per_min (3,), w; corrected: it is linear and to be taken out; left_deg,
         what is in the measurements then; limit_deg, and whether left is over it.
     """
@@ -112,7 +113,8 @@ def estimate_drift(
     if len(visits) < 2:
         return None
     minutes = np.array([visit["time"] - zero["time"] for visit in visits]) / 60.0
-    seen = np.array([np.zeros(3), *(visit["measured_deg"] for visit in visits[1:])])
+    later = [visit["measured_deg"] for visit in visits[1:]]
+    seen = np.array([np.zeros(len(later[0])), *later])
     attitudes = np.array([visit["attitude"] for visit in visits])
     turns = Rotation.from_matrix(attitudes @ attitudes[0].T).as_rotvec(degrees=True)
     away = minutes - minutes.mean()
@@ -153,14 +155,15 @@ def order_residuals(
 ) -> dict[str, Any]:
     """Residual of the linear fit under each of the six mechanism orders.
 
-    The right order leaves noise; a wrong one leaves degrees. Needs more than four
-    postures; with four every order fits exactly.
+    The right order leaves noise; a wrong one leaves degrees. Needs two postures more
+    than a fit does, which without them is exact under every order.
 
     Returns:
         rms (order to degrees), configured, warning (empty where all is well).
     """
     configured = config.mechanism.order
-    if len(records) < 6:
+    count = len(config.axes) + 1
+    if len(records) < count + 2:
         return {"rms": {}, "configured": configured, "warning": ""}
     design = np.column_stack([pairs(records)[0], np.ones(len(records))])
     across = np.eye(len(records)) - design @ np.linalg.pinv(design)
@@ -168,7 +171,9 @@ def order_residuals(
     rms: dict[str, float] = {}
     for order in ORDERS:
         left = across @ frame.angles(attitudes, order)
-        rms[order] = float(np.sqrt((left**2).sum() / (3 * (len(records) - 4))))
+        rms[order] = float(
+            np.sqrt((left**2).sum() / (left.shape[1] * (len(records) - count)))
+        )
     best = min(rms, key=lambda order: rms[order])
     noise = float(np.mean([r["std_deg"] for r in records]))
     warning = ""
@@ -187,8 +192,10 @@ def order_residuals(
     return {"rms": rms, "configured": configured, "warning": warning}
 
 
-def check_matrix(matrix: ArrayLike) -> list[str]:
-    """A (3, 3) fitted matrix A is one of a device whose axes turn as they are named.
+def check_matrix(config: RigConfig, matrix: ArrayLike) -> list[str]:
+    """An (m, n) fitted matrix A is one of a device whose axes turn as they are named.
+
+    What is measured under the name of an axis follows that axis, its way.
 
     Returns:
         Warnings: gains that are far from 1.
@@ -198,11 +205,15 @@ def check_matrix(matrix: ArrayLike) -> list[str]:
     """
     gains = np.asarray(matrix, dtype=np.float64)
     faults, warnings = [], []
-    for i, name in enumerate(AXIS_NAMES):
-        gain, strongest = gains[i, i], int(np.abs(gains[i]).argmax())
-        if strongest != i:
+    names = config.axis_names
+    for i, name in enumerate(config.output_names):
+        if name not in names:
+            continue
+        own, strongest = names.index(name), int(np.abs(gains[i]).argmax())
+        gain = gains[i, own]
+        if strongest != own:
             faults.append(
-                f"{name} follows the command of {AXIS_NAMES[strongest]} "
+                f"{name} follows the command of {names[strongest]} "
                 f"({gains[i, strongest]:.2f} deg for each degree) more than its own "
                 f"({gain:.2f}): units, cables or `rotates` are exchanged"
             )

@@ -8,18 +8,19 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from rig.config import AXIS_NAMES, RigConfig
+from rig.config import RigConfig
 from rig.core.attitude import Array
 from rig.journal import Record
 
 
 def pairs(records: list[Record]) -> tuple[Array, Array]:
-    """(N, 3) commands and (N, 3) measurements in degrees of posture records."""
-    commands = np.array([r["commanded_deg"] for r in records]).reshape(-1, 3)
-    return commands, np.array([r["measured_deg"] for r in records]).reshape(-1, 3)
+    """(N, n) commands and (N, m) measurements of N posture records, N >= 1."""
+    commands = np.array([r["commanded_deg"] for r in records], dtype=np.float64)
+    return commands, np.array([r["measured_deg"] for r in records], dtype=np.float64)
 
 
 def identify(
+    config: RigConfig,
     records: list[Record],
     noise_std: Array | None = None,
     notes: Record | None = None,
@@ -28,8 +29,9 @@ def identify(
     """Slopes A and bias b of ``y = A u + b`` from posture records: a ``Calibration``.
 
     Args:
+        config: names axes and measurements.
         records: chosen postures.
-        noise_std: (3,) degrees, of one recorded mean, where it is known.
+        noise_std: (m,), of one recorded mean, where it is known.
         notes: stored in the calibration's file.
         zero_share: variance of the zero posture's mean over that of another's. It
             shifts every posture equally, so it adds to the variance of the bias.
@@ -39,16 +41,17 @@ def identify(
     fitted: Any = jaxcal.identify(
         *pairs(records),
         noise_std=noise_std,
-        input_names=AXIS_NAMES,
-        output_names=AXIS_NAMES,
-        command_unit="deg",
-        measured_unit="deg",
+        input_names=config.axis_names,
+        output_names=config.output_names,
+        command_unit=config.axis_unit,
+        measured_unit=config.output_unit,
         notes=notes,
     )
     if noise_std is None:
         return fitted
     covariance = np.array(fitted.joint_covariance)
-    covariance[range(-3, 0), range(-3, 0)] += zero_share * noise_std**2
+    bias = range(-len(noise_std), 0)
+    covariance[bias, bias] += zero_share * noise_std**2
     return dataclasses.replace(fitted, joint_covariance=covariance)
 
 
@@ -57,7 +60,8 @@ def uncertainty(
 ) -> dict[str, Any]:
     """Noise of one recorded mean, and 95 % half-widths of A and b, axis by axis.
 
-    Four postures leave no residual, so the noise is that of a fit of all postures,
+    One posture more than axes leaves no residual, so the noise is that of a fit of all
+    postures,
     those held out too: it holds play, slow noise and drift. The parameters' errors are
     part of those residuals, which makes Student's t a little too wide. Without
     held-out postures only the scatter of single readings is known, which is too
@@ -69,23 +73,25 @@ def uncertainty(
         zero_share: as of ``identify``.
 
     Returns:
-        noise_std_deg (3,), dof of an axis, basis, and ci95 (3, 4), half-widths of
-        [A | b] in degrees, which hold all twelve at once (Bonferroni).
+        noise_std_deg (m,), dof of an axis, basis, and ci95 (m, n + 1), half-widths of
+        [A | b], which hold all of these at once (Bonferroni).
     """
     import jaxcal
 
-    everything = [*chosen, *held_out]
-    basis, dof = f"the fit of all {len(everything)} postures", len(everything) - 4
+    everything, count = [*chosen, *held_out], len(chosen[0]["commanded_deg"]) + 1
+    basis, dof = f"the fit of all {len(everything)} postures", len(everything) - count
     if dof:
         noise = np.array(jaxcal.identify(*pairs(everything)).noise_std)
     else:
-        basis, dof = "scatter of single readings only", chosen[0]["samples"] * 4 - 4
+        basis = "scatter of single readings only"
+        dof = (chosen[0]["samples"] - 1) * len(chosen)
         scatter = np.mean([np.square(r["std_deg"]) for r in chosen], axis=0)
         noise = np.sqrt(scatter / chosen[0]["samples"])
     rows = np.column_stack([pairs(chosen)[0], np.ones(len(chosen))])
     variances = np.diag(np.linalg.inv(rows.T @ rows)).copy()
-    variances[3] += zero_share
-    width = special.stdtrit(max(1, dof), 1.0 - 0.025 / 12) * np.sqrt(variances)
+    variances[-1] += zero_share
+    tail = 0.025 / (count * len(noise))
+    width = special.stdtrit(max(1, dof), 1.0 - tail) * np.sqrt(variances)
     return {
         "noise_std_deg": noise.tolist(),
         "dof": dof,
@@ -95,7 +101,7 @@ def uncertainty(
 
 
 def spread(off: Array) -> dict[str, Any]:
-    """(N, 3) errors in degrees, and how large they are."""
+    """(N, m) errors, and how large they are."""
     return {
         "rms_axis": np.sqrt((off**2).mean(axis=0)).tolist(),
         "rms": float(np.sqrt((off**2).mean())),

@@ -51,9 +51,9 @@ def reread(records: list[Record], then: RigConfig, now: RigConfig) -> list[Recor
     postures = measured_postures(records)
     chosen = [r for r in postures.values() if r["role"] == "select"]
     zeros = [r for r in records if r["event"] == "zero"]
-    if not zeros or len(chosen) < then.session.k:
+    if not zeros or len(chosen) < then.k:
         raise Refused(
-            f"the run holds {len(chosen)} of the {then.session.k} chosen postures that "
+            f"the run holds {len(chosen)} of the {then.k} chosen postures that "
             "a calibration takes. Finish it first with `jaxcal-rig resume`"
         )
     same = (then.imu.order, then.imu.signs) == (now.imu.order, now.imu.signs)
@@ -69,7 +69,7 @@ def reread(records: list[Record], then: RigConfig, now: RigConfig) -> list[Recor
         attitude = mean_rotation(turned)
         frame = frame or frame_at(now, attitude)  # of the zero, which comes first
         spread = frame.angles(turned)
-        std = spread.std(axis=0, ddof=1) if len(spread) > 1 else np.zeros(3)
+        std = spread.std(axis=0, ddof=1) if len(spread) > 1 else 0.0 * spread[0]
         quaternions = Rotation.from_matrix(turned).as_quat(canonical=True)
         return record | {
             "measured_deg": frame.angles(attitude).round(9).tolist(),
@@ -121,7 +121,7 @@ def refit(
     notes = {"refit_of": folder.name, "simulated": start["simulated"] is not None}
     calibration, summary = conclude(now, records, notes, compensated=not changed)
     try:
-        warnings = check_matrix(calibration.matrix)
+        warnings = check_matrix(now, calibration.matrix)
     except MotionFault as fault:
         raise Refused(f"nothing was written: read like this, {fault}") from None
     summary |= {

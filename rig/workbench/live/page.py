@@ -29,7 +29,7 @@ NOTES = {  # of the cards, in their order: below the title
     "Postures": "",
     "Angles": "Solid: phone. Dashed: drives.",
     "Settling": "Standard deviation over the settle window.",
-    "Commands": "Candidates and postures. The larger the mark, the larger the roll.",
+    "Commands": "Candidates and postures.",
     "Drift": "The zero posture, read again; it should read zero.",
     "What happened": "",
 }
@@ -50,6 +50,9 @@ class LivePage:
             for title, note in NOTES.items():
                 kind = title.lower().replace(" ", "-")
                 with ui.element("section").classes(f"card card-{kind}"):
+                    axes = watcher.state.names[0]
+                    if title == "Commands" and len(axes) > 2:
+                        note += f" The larger the mark, the larger the {axes[2]}."
                     ui.html(f"<h2>{title}</h2><p class='note'>{note}</p>")
                     self._fill(title)
         self.update()
@@ -88,7 +91,10 @@ class LivePage:
         now = watcher.state.present(sample, watcher.running)
         self._device.show(now["measured"], now["commanded"])
         self._parts["numbers"].set_content(
-            draw("numbers", rows=view.numbers(now, watcher.running))
+            draw(
+                "numbers",
+                rows=view.numbers(now, watcher.running, watcher.state.names),
+            )
         )
         self._stream.set_text(view.stream(sample, time.time()))
 

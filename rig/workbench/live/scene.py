@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from typing import Any
 
 import numpy as np
 from nicegui import ui
 
-from rig.config import AXIS_NAMES
 from rig.workbench.live.charts import AXIS_COLORS
 from rig.workbench.outputs.state import Degrees
 
@@ -48,38 +48,42 @@ class DeviceScene:
     """The device as the phone says, and a ghost of its plate as commanded."""
 
     def __init__(self, config: dict[str, Any]) -> None:
-        letters = [axis["rotates"] for axis in config.get("axes", [])] or [*"XZY"]
+        axes = config.get("axes", [])
+        letters = [axis["rotates"] for axis in axes]
         # Outermost joint first.
-        self._order = config.get("mechanism", {}).get("order", "ZXY")
+        order = config.get("mechanism", {}).get("order", "ZXY")
+        self._order = [letter for letter in order if letter in letters]
         self._joints = [letters.index(letter) for letter in self._order]
-        outer, inner, last = (UNIT[letter] for letter in self._order)
+        turns = [UNIT[letter] for letter in self._order]
         colors = [AXIS_COLORS[joint] for joint in self._joints]
+        ends = [1.95, *RADII[: len(turns) - 1], 0.3]  # of the axle of each joint
+        groups = []
         self._shown: list[Degrees | None] = [None, None]
         camera = ui.scene.perspective_camera(fov=32)
         camera.x, camera.y, camera.z = 4.7, -5.3, 2.7
         scene = ui.scene(grid=False, camera=camera, background_color=BACK)
         with scene.classes("device"):
-            _axle(1.95 * outer, RADII[0] * outer, METAL)
-            with ui.scene.group() as first:
-                _ring(outer, inner, RADII[0], colors[0])
-                _axle(RADII[0] * inner, RADII[1] * inner, colors[1])
-                with ui.scene.group() as second:
-                    _ring(inner, last, RADII[1], colors[1])
-                    _axle(RADII[1] * last, 0.3 * last, colors[2])
-                    with ui.scene.group() as third:
-                        _plate(PLATE, 1.0)
-                        ui.scene.box(0.3, 0.62, 0.05).move(z=0.065).material("#10151b")
-                        ui.scene.box(0.26, 0.56, 0.01).move(z=0.092).material("#3b9de0")
-            with ui.scene.group() as a, ui.scene.group() as b, ui.scene.group() as c:
+            with contextlib.ExitStack() as inside:
+                for number, turn in enumerate(turns):
+                    color = METAL if number == 0 else colors[number]
+                    _axle(ends[number] * turn, ends[number + 1] * turn, color)
+                    groups.append(inside.enter_context(ui.scene.group()))
+                    if number + 1 < len(turns):
+                        radius = RADII[number]
+                        _ring(turn, turns[number + 1], radius, colors[number])
+                _plate(PLATE, 1.0)
+                ui.scene.box(0.3, 0.62, 0.05).move(z=0.065).material("#10151b")
+                ui.scene.box(0.26, 0.56, 0.01).move(z=0.092).material("#3b9de0")
+            with contextlib.ExitStack() as inside:
+                ghosts = [inside.enter_context(ui.scene.group()) for _ in turns]
                 _plate(GHOST, 0.32)
-            for letter, name, color in zip(
-                letters, AXIS_NAMES, AXIS_COLORS, strict=True
-            ):
+            for axis, color in zip(axes, AXIS_COLORS, strict=False):
                 style = f"color:{color};font:600 12px system-ui"
-                ui.scene.text(name, style).move(*(1.72 * UNIT[letter]).tolist())
-        self._chains = ((first, second, third), (a, b, c))
-        first.with_name("device")  # a browser makes them in any order
-        a.with_name("ghost")
+                at = 1.72 * UNIT[axis["rotates"]]
+                ui.scene.text(axis["name"], style).move(*at.tolist())
+        self._chains = (groups, ghosts)
+        groups[0].with_name("device")  # a browser makes them in any order
+        ghosts[0].with_name("ghost")
 
     def show(self, measured: Degrees | None, commanded: Degrees | None) -> None:
         """Turn device and ghost, where they changed."""

@@ -47,13 +47,14 @@ def listen(run: Run) -> None:
 def plan_lines(
     config: RigConfig, choice: Any, pulses: Array, start_deg: Array
 ) -> list[str]:
-    """What will be done: a choice, in the order of visits, of (M, 3) ``pulses``."""
+    """What will be done: a choice, in the order of visits, of (M, n) ``pulses``."""
     session, settle = config.session, config.settle
     text = choice_text(vars(choice))
-    lines = [f"{session.k} of {session.candidates} candidates by {text}"]
+    lines = [f"{config.k} of {session.candidates} candidates by {text}"]
     if choice.note:
         lines.append(f"  note: {choice.note}")
-    lines.append("  order   candidate   degrees (pitch yaw roll)        pulses")
+    head = f"{config.axis_unit} ({' '.join(config.axis_names)})"
+    lines.append(f"  order   candidate   {head:<{10 * len(config.axes)}}  pulses")
     visited = pulses[list(choice.indices)]
     degrees = config.to_deg(visited)
     for number, index in enumerate(choice.indices):
@@ -61,9 +62,9 @@ def plan_lines(
         lines.append(f"  {number + 1:>5}   {index:>9}   {angles}   {sent}")
     ways = np.abs(np.diff(np.vstack([start_deg, degrees]), axis=0))
     speeds = np.array([axis.speed_deg_s for axis in config.axes])
-    seconds = (ways / speeds).max(axis=1).sum() / session.k
+    seconds = (ways / speeds).max(axis=1).sum() / config.k
     seconds += settle.window_s + 0.02 * settle.samples + 0.1
-    total = seconds * (session.k + 2 * session.verify_postures + 2)
+    total = seconds * (config.k + 2 * session.verify_postures + 2)
     lines.append(
         f"  with {session.verify_postures} held-out postures, before and after, about "
         f"{total:.0f} s"

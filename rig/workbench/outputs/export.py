@@ -18,8 +18,8 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from rig.config import AXIS_NAMES
 from rig.config.axis import Scale
+from rig.config.config import names_of, units_of
 from rig.core.attitude import Array
 from rig.core.faults import Refused
 from rig.journal import Record
@@ -33,22 +33,22 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
     """The inverse map of the calibration in a run's folder, and its journal's records.
 
     Returns:
-        matrix (3, 3) M = A^-1 and offset_deg (3,) c = -A^-1 b; min_deg, max_deg (3,)
-        soft limits of the commands, the same in pulses, pulses_per_deg (3,) signed;
-        forward (3, 4) [A | b] and half_widths (3, 4), 95 % of all twelve at once;
-        follow (8, 3, 3) of each set of held axes; run, created; device, its fingerprint
-        as keys of rig.toml; warnings; axes; checksum.
+        matrix (n, m) M, the inverse of A or, where m > n, what comes nearest, and
+        offset_deg (n,) c = -M b; min_deg, max_deg (n,) soft limits of the commands, the
+        same in pulses, pulses_per_deg (n,) signed; forward (m, n + 1) [A | b] and
+        half_widths, 95 % of all of them at once; follow (2 ** n, n, n) of each set of
+        held axes; run, created; device, its fingerprint as keys of rig.toml; warnings;
+        axes, outputs and their units; checksum.
 
     Raises:
-        Refused: it holds none, or A cannot be inverted.
+        Refused: it holds none, or A does not determine a command.
     """
     import jaxcal
 
     path = folder / "calibration.json"
     try:
         calibration: Any = jaxcal.Calibration.load(path)
-        at_zero = calibration.command_for(np.zeros(3))
-        columns = [calibration.command_for(unit) - at_zero for unit in np.eye(3)]
+        matrix = _inverse(np.asarray(calibration.matrix, dtype=np.float64))
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise Refused(
@@ -56,8 +56,10 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
             "`jaxcal-rig calibrate` that has ended, or its refit"
         ) from None
     config = records[0]["config"]  # of the run, also where it was refitted
+    names, outputs = names_of(config)
+    axis_unit, output_unit = units_of(config)
     of_name = {axis["name"]: axis for axis in config["axes"]}
-    axes = [of_name[name] for name in AXIS_NAMES]
+    axes = [of_name[name] for name in names]
     scales = [Scale.of(axis) for axis in axes]
     limits = [
         sorted(scale.to_pulses(axis[end]) for end in ("min_deg", "max_deg"))
@@ -67,8 +69,8 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
     if summary.get("simulated"):
         warnings.append("made on a simulated rig")
     inverse = {
-        "matrix": np.column_stack(columns).tolist(),
-        "offset_deg": at_zero.tolist(),
+        "matrix": matrix.tolist(),
+        "offset_deg": (-matrix @ np.asarray(calibration.bias)).tolist(),
         "min_deg": [float(axis["min_deg"]) for axis in axes],
         "max_deg": [float(axis["max_deg"]) for axis in axes],
         "pulses_per_deg": [scale.pulses_per_deg for scale in scales],
@@ -81,9 +83,26 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
         "created": str(calibration.provenance.get("created", "")),
         "device": calibration.provenance["notes"]["device"],
         "warnings": warnings,
-        "axes": list(AXIS_NAMES),
+        "axes": names,
+        "outputs": outputs,
+        "axis_unit": axis_unit,
+        "output_unit": output_unit,
     }
     return inverse | {"checksum": checksum(inverse)}
+
+
+def _inverse(matrix: Array) -> Array:
+    """(n, m) of (m, n) A: what gives the command whose measurement is nearest.
+
+    Raises:
+        ValueError: several commands give the same.
+    """
+    if np.linalg.matrix_rank(matrix) < matrix.shape[1]:
+        raise ValueError(
+            f"{matrix.shape[0]} measurements do not determine {matrix.shape[1]} "
+            "commands: A has no inverse"
+        )
+    return np.linalg.pinv(matrix).astype(np.float64)
 
 
 def follow(matrix: Array) -> Array:
@@ -93,13 +112,13 @@ def follow(matrix: Array) -> Array:
     given, has (u - free)_F = -pinv(A_F) A_H (u - free)_H.
 
     Args:
-        matrix: (n, n) A, regular.
+        matrix: (m, n) A, of rank n.
 
     Returns:
         (2 ** n, n, n): for the set of held axes with bit 1 << j of each, degrees of
         axis i for a degree of axis j; zero but for a free i and a held j.
     """
-    count = len(matrix)
+    count = matrix.shape[1]
     by = np.zeros((2**count, count, count))
     for number, moved in enumerate(by):
         held = (number >> np.arange(count)) & 1 == 1
@@ -110,7 +129,7 @@ def follow(matrix: Array) -> Array:
 
 
 def checksum(inverse: dict[str, Any]) -> str:
-    """SHA-256 of the 30 numbers that make the map, in the order of NUMBERS.
+    """SHA-256 of the numbers that make the map, in the order of NUMBERS.
 
     Each as Python's repr of a float, one a line.
     """

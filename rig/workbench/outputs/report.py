@@ -7,16 +7,16 @@ Figures need matplotlib; without it the page says so.
 from __future__ import annotations
 
 import datetime
+import functools
 import json
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from jaxcal.extras import install
 from jaxcal.pages import Code, Figure, Page, Section, Table, Text, write_page
-from rig.config import AXIS_NAMES
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE
 from rig.journal import JOURNAL, Record, RunFolder, is_written, measured_postures
 from rig.workbench.outputs.state import RunState
@@ -28,7 +28,6 @@ FOOTER = (
     "hardware emergency stop is required."
 )
 MOST_ROWS = 60  # of the table of postures; more are in pairs.csv
-HEAD = [*(f"u {name}" for name in AXIS_NAMES), "b"]  # of the columns of [A | b]
 
 
 def save_result(
@@ -60,7 +59,7 @@ def write_report(folder: pathlib.Path, records: list[Record]) -> pathlib.Path:
     told += trouble(state, running, str(folder))
     intro = [Text(f"{made}."), Text(f"{headline(state, running)[1]}.")]
     intro += [Text(f"{text}.", "warning") for text in told]
-    sections = [*_result(state, summary), _measured(records)]
+    sections = [*_result(state, summary), _measured(state, records)]
     rows = [
         [f"{datetime.datetime.fromtimestamp(when):%H:%M:%S}", line]
         for when, line in state.log
@@ -87,7 +86,9 @@ def _result(state: RunState, summary: Record) -> list[Section]:
         shown = {"raw": "before", "compensated": "after"}
         each = {t: summary[key]["each"] for t, key in shown.items() if key in summary}
         alt = "held-out errors in degrees, raw and compensated"
-        parts.append(drawn(draw_errors, each, (9, 3.4), alt))
+        names = summary.get("outputs", state.names[1])
+        draw = functools.partial(draw_errors, names=names, unit=state.unit)
+        parts.append(drawn(draw, each, (9, 3.4), alt))
     if rms := summary.get("orders", {}).get("rms"):
         rows = [[order, f"{left:.4f}"] for order, left in rms.items()]
         told = f"configured: {summary['orders']['configured']}"
@@ -101,7 +102,7 @@ def _result(state: RunState, summary: Record) -> list[Section]:
     return found
 
 
-def _measured(records: list[Record]) -> Section:
+def _measured(state: RunState, records: list[Record]) -> Section:
     """Every posture measured so far."""
     postures = list(measured_postures(records).values())
     if not postures:
@@ -115,10 +116,13 @@ def _measured(records: list[Record]) -> Section:
         ]
         for r in postures[:MOST_ROWS]
     ]  # fmt: skip
-    head = ["posture", "commanded [deg]", "measured [deg]", "scatter [deg]"]
+    told = f"[{state.unit}]"
+    head = ["posture", "commanded", f"measured {told}", f"scatter {told}"]
+    head[1] += f" [{state.axis_unit}]"
     more = f", the first {MOST_ROWS} of them" if len(postures) > MOST_ROWS else ""
     table = Table(head, rows, f"{len(postures)} measured{more}")
-    picture = drawn(draw_postures, postures, (6, 5), "commanded postures")
+    draw = functools.partial(draw_postures, names=state.names[0], unit=state.axis_unit)
+    picture = drawn(draw, postures, (6, 5), "commanded postures")
     return Section("Postures", [picture, table])
 
 
@@ -141,36 +145,47 @@ def drawn(
     return Figure(as_bytes(figure, "svg"), alt)
 
 
-def draw_errors(figure: Any, each: dict[str, Any]) -> None:
+def draw_errors(
+    figure: Any, each: dict[str, Any], names: Sequence[str], unit: str
+) -> None:
     """Errors at held-out targets, raw beside compensated, each on its scale."""
     from jaxcal import plots
 
     axes = figure.subplots(1, len(each), squeeze=False)[0]
     for axis, (title, values) in zip(axes, each.items(), strict=True):
-        plots.before_after(axis, {title: values}, AXIS_NAMES, "deg")
+        plots.before_after(axis, {title: values}, names, unit)
 
 
-def draw_postures(figure: Any, records: list[Record]) -> None:
-    """Commands of all visits, and of those the calibration is identified from."""
+def draw_postures(
+    figure: Any, records: list[Record], names: Sequence[str], unit: str
+) -> None:
+    """Commands of all visits, and of those the calibration is identified from; of more
+    than three axes the first three."""
     from jaxcal import plots
 
-    commands = [r["commanded_deg"] for r in records]
+    commands = np.array([r["commanded_deg"] for r in records])[:, :3]
     chosen = [i for i, r in enumerate(records) if r.get("role") == "select"]
-    names = [f"{name} [deg]" for name in AXIS_NAMES]
-    axes = figure.add_subplot(projection="3d")
+    names = [f"{name} [{unit}]" for name in names[:3]]
+    if len(names) == 1:  # against nothing
+        commands, names = np.column_stack([commands, 0 * commands]), [*names, ""]
+    axes = figure.add_subplot(projection="3d" if len(names) == 3 else None)
     shown = chosen or range(len(commands))
     plots.selection(axes, commands, list(shown), names, label="measured")
 
 
 def draw_parameters(figure: Any, runs: list[Record]) -> None:
     """A and b with their intervals, calibration after calibration."""
-    axes = figure.subplots(3, 4, sharex=True)
     values = np.array([np.column_stack([r["A"], r["b"]]) for r in runs])
+    _, rows, columns = values.shape
+    last = runs[-1]
+    outputs = last["outputs"] if "outputs" in last else last["axes"]
+    head = [*(f"u {name}" for name in runs[-1]["axes"]), "b"]
+    axes = figure.subplots(rows, columns, sharex=True, squeeze=False)
     wide = np.array([r["ci95"] for r in runs])
     days = np.array([r["time"] for r in runs]) / 86400.0
-    for row, column in np.ndindex(3, 4):
+    for row, column in np.ndindex(rows, columns):
         y, e = values[:, row, column], wide[:, row, column]
         axis = axes[row, column]
         axis.errorbar(days - days[0], y, e, fmt="o-", capsize=3, markersize=4)
-        axis.set_title(f"{AXIS_NAMES[row]}: {HEAD[column]}", fontsize=9)
-        axis.set_xlabel("days" if row == 2 else "")
+        axis.set_title(f"{outputs[row]}: {head[column]}", fontsize=9)
+        axis.set_xlabel("days" if row == rows - 1 else "")

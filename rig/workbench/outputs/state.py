@@ -10,10 +10,11 @@ import dataclasses
 from typing import Any
 
 from rig.config.axis import Scale
+from rig.config.config import names_of, units_of
 from rig.journal import Record
 from rig.workbench.outputs.words import ENDS, event_lines
 
-Degrees = list[float]  # pitch, yaw, roll
+Degrees = list[float]  # in the order of the axes, or of what is measured
 LOGGED = 200  # newest lines of what happened
 SESSIONS = ("calibrate", "collect", "verify", "goto")  # the others are commissioning
 LOST = ("unreachable", "withdrawn")
@@ -122,7 +123,10 @@ class RunState:
                 posture = self._posture(record["name"], record["pulses"])
                 posture.state, self.target = "moving", posture.commanded
             case "zero":
-                self.target, self.drift = record["commanded_deg"], [(now, [0.0] * 3)]
+                self.target, self.drift = (
+                    record["commanded_deg"],
+                    [(now, [0.0] * len(self.names[1]))],
+                )
             case "reference":
                 self.drift.append((now, record["angles"]))
             case "posture" | "stand":  # a stand, of commissioning, is against no zero
@@ -173,7 +177,7 @@ class RunState:
         return posture
 
     def to_deg(self, pulses: Any) -> Degrees:
-        """Degrees of (3,) pulses, by the scales in the journal's configuration."""
+        """Degrees of (n,) pulses, by the scales in the journal's configuration."""
         scales = [Scale.of(axis) for axis in self.start["config"]["axes"]]
         pairs = zip(scales, pulses, strict=True)
         return [round(scale.to_deg(count), 6) for scale, count in pairs]
@@ -187,6 +191,21 @@ class RunState:
             asked, found, std = self.target, sample.get("deg"), sample.get("std")
         drives = sample.get("drives")
         return {"commanded": asked, "drives": drives, "measured": found, "std": std}
+
+    @property
+    def names(self) -> tuple[list[str], list[str]]:
+        """Of the axes, and of what is measured."""
+        return names_of(self.start.get("config", {}))
+
+    @property
+    def axis_unit(self) -> str:
+        """Of the commands."""
+        return units_of(self.start.get("config", {}))[0]
+
+    @property
+    def unit(self) -> str:
+        """Of what is measured."""
+        return units_of(self.start.get("config", {}))[1]
 
     @property
     def mode(self) -> str:

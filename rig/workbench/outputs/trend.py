@@ -11,7 +11,6 @@ import numpy as np
 
 from jaxcal.checks import aligned
 from jaxcal.pages import Badge, Block, Page, Section, Table, Text, write_page
-from rig.config import AXIS_NAMES
 from rig.journal import JournalError, Record, read_journal
 from rig.workbench.outputs.report import draw_parameters, drawn
 from rig.workbench.outputs.words import held_out, recalibrate
@@ -90,10 +89,12 @@ def _moved(before: Record, now: Record) -> list[str]:
     """Parameters that differ by more than their intervals allow, A before b."""
     then, new = (np.column_stack([run["A"], run["b"]]) for run in (before, now))
     change, allowed = new - then, np.hypot(now["ci95"], before["ci95"])
-    names = [[f"A[{y}, {u}]" for u in AXIS_NAMES] + [f"b[{y}]"] for y in AXIS_NAMES]
+    axes, last = now["axes"], len(now["axes"])
+    outputs = now["outputs"] if "outputs" in now else axes
+    names = [[f"A[{y}, {u}]" for u in axes] + [f"b[{y}]"] for y in outputs]
     return [
         f"{names[i][j]} {change[i, j]:+.4f} (interval {allowed[i, j]:.4f})"
-        for i, j in sorted(np.ndindex(3, 4), key=lambda at: at[1] == 3)
+        for i, j in sorted(np.ndindex(change.shape), key=lambda at: at[1] == last)
         if abs(change[i, j]) > allowed[i, j]
     ]
 
@@ -102,11 +103,13 @@ def trend_lines(device: Device) -> list[str]:
     """The table and the verdict for the console."""
     table = [f"  {line}" for line in aligned([HEAD, *device.rows], "<")]
     told, keys = device.fingerprint, ("map", "unit", "pulses_per_rev", "reduction")
+    parts = [key.split(".") for key in told]
+    names = dict.fromkeys(part[1] for part in parts if part[0] == "axes")
     axes = (
         " ".join([name, *(str(told.get(f"axes.{name}.{k}", "?")) for k in keys)])
-        for name in AXIS_NAMES
+        for name in names
     )
-    label = f"{'; '.join(axes)}; order {told['mechanism.order']}"
+    label = f"{'; '.join(axes)}; order {told.get('mechanism.order', '-')}"
     simulated = "simulated: " if told.get("simulated") else ""
     return [f"device {simulated}{label}", *table, f"  {device.verdict}"]
 

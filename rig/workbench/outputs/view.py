@@ -6,7 +6,6 @@ import math
 import shlex
 from typing import Any
 
-from rig.config import AXIS_NAMES
 from rig.core.faults import EXIT_RECALIBRATE
 from rig.core.stop import UnitStop
 from rig.workbench.outputs.state import ACTIVE, SESSIONS, Posture, Record, RunState
@@ -14,7 +13,6 @@ from rig.workbench.outputs.words import error_text, event_lines, summary_lines
 
 SHOWN = 40  # rows of a long queue
 STALE_S = 1.0
-NONE = (None, None, None)  # of three axes, where nothing is known
 PHASES = {
     "opening": "Waiting for drives and phone",
     "showing": "Looking at each axis",
@@ -92,20 +90,34 @@ def trouble(state: RunState, running: bool, folder: str) -> list[str]:
     return [line for line in [*lines, *state.warnings] if line]
 
 
-def numbers(now: dict[str, Any], running: bool) -> list[tuple[str, ...]]:
-    """A row for each axis: commanded, drive, measured, difference, scatter.
+def numbers(
+    now: dict[str, Any], running: bool, names: tuple[list[str], list[str]]
+) -> list[tuple[str, ...]]:
+    """A row for each axis or measurement: commanded, drive, measured, difference,
+    scatter; of an axis and a measurement of one name in one row.
 
     After a run the last posture is shown, and no difference: it is of a command that
     was not compensated, beside drives that are at rest.
     """
-    columns = [now[name] or NONE for name in ("commanded", "drives", "measured", "std")]
+    axes, outputs = names
+    columns = [
+        dict(zip(of, now[what] or [None] * len(of), strict=True))
+        for what, of in (
+            ("commanded", axes), ("drives", axes), ("measured", outputs),
+            ("std", outputs),
+        )
+    ]  # fmt: skip
+    rows: list[Any] = [
+        (name, *(column.get(name) for column in columns))
+        for name in dict.fromkeys([*axes, *outputs])
+    ]
     return [
         (
             name, angle(a), angle(d), angle(y),
             angle(y - a if running and a is not None and y is not None else None),
             "–" if s is None else f"{s:.3f}",
         )
-        for name, a, d, y, s in zip(AXIS_NAMES, *columns, strict=True)
+        for name, a, d, y, s in rows
     ]  # fmt: skip
 
 

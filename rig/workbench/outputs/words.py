@@ -6,7 +6,7 @@ Console, page and report say the same.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,8 @@ from rig.config import AXIS_NAMES
 from rig.core.stop import UnitStop
 from rig.journal import Record
 
+NUMBERS = {2: "two", 4: "four", 6: "six", 12: "twelve"}
+UNITS = {"deg": "degrees", "mm": "millimetres"}
 ENDS = ("end", "fault", "stopped", "paused", "refused")
 REPLIES = {
     "obeyed": "the drive obeys",
@@ -52,7 +54,9 @@ def _stayed(record: Record) -> str:
 def _last_move(record: Record) -> str:
     """What moved last, from where to where, and what drives and phone say now."""
     ways = []
-    for i, name in enumerate(AXIS_NAMES):
+    # Written before axes had names of their own: those of the first device.
+    names = record.get("axes", AXIS_NAMES)
+    for i, name in enumerate(names):
         begin, end = record["from_deg"][i], record["to_deg"][i]
         if begin != end:
             drive, phone = record["drives_deg"][i], record["phone_deg"]
@@ -114,14 +118,22 @@ def numbers(values: Any, width: int = 9, digits: int = 4) -> str:
 
 def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
     """A and b with their intervals, the errors and any warning."""
-    lines = ["y = A u + b in degrees, +- 95 % confidence for all twelve at once:"]
-    for row, name in enumerate(AXIS_NAMES):
+    outputs = summary.get("outputs", summary["axes"])
+    count = np.size(summary["ci95"])
+    number = NUMBERS.get(count, count)
+    unit = summary["unit"]
+    lines = [
+        f"y = A u + b in {UNITS.get(unit, unit)}, +- 95 % confidence for all {number} "
+        "at once:"
+    ]
+    for row, name in enumerate(outputs):
         a, b, wide = summary["A"][row], summary["b"][row], summary["ci95"][row]
-        values = "  ".join(f"{a[i]:8.5f} +- {wide[i]:.5f}" for i in range(3))
-        lines.append(f"  {name:<5} [{values}]   {b:8.4f} +- {wide[3]:.4f}")
-    std = zip(AXIS_NAMES, summary["noise_std_deg"], strict=True)
+        values = "  ".join(f"{a[i]:8.5f} +- {wide[i]:.5f}" for i in range(len(a)))
+        lines.append(f"  {name:<5} [{values}]   {b:8.4f} +- {wide[-1]:.4f}")
+    std = zip(outputs, summary["noise_std_deg"], strict=True)
     lines.append(
-        f"  noise of one posture {', '.join(f'{n} {v:.4f}' for n, v in std)} deg, from "
+        f"  noise of one posture {', '.join(f'{n} {v:.4f}' for n, v in std)} {unit}, "
+        "from "
         f"{summary['basis']} ({summary['dof']} degrees of freedom each)"
     )
     if "after" in summary:
@@ -132,7 +144,7 @@ def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
             f"(max {found['max']:.4f})"
         )
     if summary.get("drift"):
-        lines.append(f"drift: {drift_text(summary['drift'])}")
+        lines.append(f"drift: {drift_text(summary['drift'], outputs)}")
     if summary["orders"]["warning"]:
         lines.append(f"WARNING: {summary['orders']['warning']}")
     if reasons := recalibrate(summary, limit_deg):
@@ -163,12 +175,12 @@ def recalibrate(summary: dict[str, Any], limit_deg: float) -> list[str]:
     return reasons
 
 
-def drift_text(drift: dict[str, Any]) -> str:
+def drift_text(drift: dict[str, Any], outputs: Sequence[str]) -> str:
     """How far the zero drifted, and what was done about it."""
     worst = int(np.argmax(np.abs(drift["angles_deg"]).max(axis=0)))
     text = (
         f"the zero posture read up to {drift['size_deg']:.4f} deg from zero "
-        f"({AXIS_NAMES[worst]}) on later visits (limit {drift['limit_deg']:g})"
+        f"({outputs[worst]}) on later visits (limit {drift['limit_deg']:g})"
     )
     if drift["corrected"]:
         rate = drift["angles_deg"][-1][worst] / drift["minutes"][-1]

@@ -38,7 +38,7 @@ def calibrate(run: Run) -> int:
             _visit_chosen(run, device, candidates, choice)
             run.emit("phase", phase="saving")
             chosen = [r for r in run.postures().values() if r["role"] == "select"]
-            first = identify(chosen)
+            first = identify(config, chosen)
             _check_gains(run, first.matrix)
             held = _held_out(run, first)
             if held:
@@ -52,14 +52,14 @@ def calibrate(run: Run) -> int:
 
 
 def _plan(run: Run) -> tuple[Array, Choice]:
-    """(M, 3) candidate pulses and the first choice; made once, then remembered."""
+    """(M, n) candidate pulses and the first choice; made once, then remembered."""
     config = run.config
 
     def make() -> dict[str, Any]:
         session = config.session
         run.say(
-            f"planning: {session.k} of {session.candidates} candidates by "
-            f"{session.method}, and the proven optimum; nothing moves yet"
+            f"planning: {config.k} of {session.candidates} candidates by "
+            f"{config.method}, and the proven optimum; nothing moves yet"
         )
         candidates = draw_candidates(config)
         choice = choose(config, config.to_deg(candidates))
@@ -78,7 +78,7 @@ def _plan(run: Run) -> tuple[Array, Choice]:
 def _ordered(
     run: Run, choice: Choice, candidates: Array, here: Array, done: Sequence[int] = ()
 ) -> Choice:
-    """A choice in the order of its visits, from (3,) degrees; done ones first."""
+    """A choice in the order of its visits, from (n,) degrees; done ones first."""
     left = np.array([i for i in choice.indices if i not in done], dtype=int)
     points = run.config.to_deg(candidates[left])
     queue = left[travel_order(run.config, points, here)].tolist()
@@ -115,7 +115,7 @@ def _visit_chosen(run: Run, device: Device, candidates: Array, choice: Choice) -
 def _check_gains(run: Run, matrix: Any) -> None:
     """Refuse a fit whose axes are reversed or exchanged: the sign check is void."""
     try:
-        run.say(*(f"WARNING: {text}" for text in check_matrix(matrix)))
+        run.say(*(f"WARNING: {text}" for text in check_matrix(run.config, matrix)))
     except MotionFault as fault:
         run.record.void(SIGN_CHECKED, str(fault))
         raise
@@ -157,7 +157,7 @@ def visit_pairs(run: Run, device: Device, held: list[Any]) -> None:
     """Visit held-out targets raw and compensated, in the order of least travel."""
     names = pair_names(held)
     targets = [pair[number] for number in (0, 1) for pair in held]
-    points = run.config.to_deg(targets or np.empty((0, 3)))
+    points = run.config.to_deg(targets or np.empty((0, len(run.config.axes))))
     start = run.config.to_deg(run.zero_pulses)
     queue = travel_order(run.config, points, start)
     run.emit("queue", names=[names[number] for number in queue])

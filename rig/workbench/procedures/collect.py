@@ -19,7 +19,8 @@ def collect(run: Run, count: int) -> int:
     """Record ``count`` random postures: the paper's Datasets 4 and 5.
 
     Writes pairs.csv and dataset.npz with ``candidates`` and ``measured`` of shape
-    (episodes, M, 3), M as configured; the last, unfinished episode is in the CSV only.
+    (episodes, M, n) and (episodes, M, m), M as configured; the last, unfinished
+    episode is in the CSV only.
     """
     config = run.config
     targets = run.remember(
@@ -44,8 +45,8 @@ def collect(run: Run, count: int) -> int:
     with atomic_write(run.folder / "dataset.npz") as file:
         np.savez(
             file,
-            candidates=commands[: episodes * size].reshape(episodes, size, 3),
-            measured=measured[: episodes * size].reshape(episodes, size, 3),
+            candidates=commands[: episodes * size].reshape(episodes, size, -1),
+            measured=measured[: episodes * size].reshape(episodes, size, -1),
         )
     run.say(
         f"saved: {run.folder}/pairs.csv ({len(commands)} postures), dataset.npz "

@@ -10,27 +10,30 @@ import numpy as np
 from rig.config import RigConfig
 from rig.core.attitude import Frame
 from rig.core.device import Posture
-from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError
+from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
 from rig.core.record_check import unseen
 from rig.core.session import visit
 from rig.workbench.run import Run
 
 
 def goto(run: Run, calibration: Any, to: Sequence[float]) -> int:
-    """Move the end-effector to (3,) desired degrees through a calibration."""
+    """Move the end-effector to (m,) desired measurements through a calibration."""
     config, desired = run.config, np.array(to, dtype=np.float64)
+    if len(desired) != len(config.output_names):
+        outputs = ", ".join(config.output_names)
+        raise Refused(f"--to must be {outputs}, got {len(desired)} numbers")
     command = np.asarray(calibration.command_for(desired), dtype=np.float64)
     for axis, value in zip(config.axes, command, strict=True):
         if not axis.min_deg <= value <= axis.max_deg:
             raise LimitError(
-                f"{desired.tolist()} deg needs {axis.name} commanded to {value:.3f} "
-                f"deg, outside [{axis.min_deg:g}, {axis.max_deg:g}]. Choose a target "
-                "further inside"
+                f"{desired.tolist()} {config.output_unit} needs {axis.name} commanded "
+                f"to {value:.3f} {axis.unit_name}, outside [{axis.min_deg:g}, "
+                f"{axis.max_deg:g}]. Choose a target further inside"
             )
     pulses = config.to_pulses(command)
     run.say(
-        f"desired {desired.tolist()} deg: command {command.round(4).tolist()} deg, "
-        f"pulses {list(pulses)}"
+        f"desired {desired.tolist()} {config.output_unit}: command "
+        f"{command.round(4).tolist()} {config.axis_unit}, pulses {list(pulses)}"
     )
     if run.lacks(["goto"]):
         with run.device() as device:
@@ -48,7 +51,7 @@ def goto(run: Run, calibration: Any, to: Sequence[float]) -> int:
         return EXIT_RECALIBRATE
     reached = np.array(record["measured_deg"])
     run.say(
-        f"reached {reached.round(4).tolist()} deg, off by "
+        f"reached {reached.round(4).tolist()} {config.output_unit}, off by "
         f"{(reached - desired).round(4).tolist()}"
     )
     return EXIT_OK

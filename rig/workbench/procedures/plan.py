@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxcal.models import Affine
 from jaxcal.selection.fastest import Motion, fastest_tour, travel_times
 from rig.config import RigConfig
 from rig.config.axis import Pulses
@@ -23,24 +24,24 @@ class Choice:
     """The postures to measure, and how good they are."""
 
     indices: tuple[int, ...]
-    log_det: float  # of the 12 x 12 information matrix, commands in degrees
+    log_det: float  # of the information matrix of [A | b], commands in degrees
     best_log_det: float  # of the best subset known
-    efficiency: float  # D-efficiency (det S / det S*) ** (1/12)
+    efficiency: float  # D-efficiency (det S / det S*) ** (1 / parameters)
     proven: bool  # that best is the proven optimum
     method: str
     note: str = ""
 
 
 def draw(config: RigConfig, count: int, *seed: int) -> Array:
-    """(count, 3) int pulses, uniform in the ranges; only whole ones can be sent."""
+    """(count, n) int pulses, uniform in the ranges; only whole ones can be sent."""
     low, high = np.array(config.ranges).T
     rng = np.random.default_rng([config.session.seed, *seed])
-    angles = rng.uniform(low, high, size=(count, 3))
+    angles = rng.uniform(low, high, size=(count, len(low)))
     return np.array([config.to_pulses(angle) for angle in angles])
 
 
 def draw_candidates(config: RigConfig) -> Array:
-    """(M, 3) int pulses from which the postures are chosen."""
+    """(M, n) int pulses from which the postures are chosen."""
     return draw(config, config.session.candidates)
 
 
@@ -50,11 +51,11 @@ def choose(
     available: Array | None = None,
     required: tuple[int, ...] = (),
 ) -> Choice:
-    """The K postures to measure of (M, 3) candidates.
+    """The K postures to measure of (M, n) candidates.
 
     Args:
         config: names K, the method and the efficiency under which exact replaces it.
-        candidates_deg: (M, 3).
+        candidates_deg: (M, n).
         available: (M,) False where a posture cannot be reached. The drives stand armed
             then: it is the exact solver alone, and less time.
         required: indices measured already, which stay in the choice.
@@ -62,38 +63,40 @@ def choose(
     import jaxcal
 
     session, replanning = config.session, available is not None
+    n, m = len(config.axes), len(config.output_names)
+    model, parameters = None if m == n else Affine(n, m), m * (n + 1)
     limit = REPLAN_LIMIT_S if replanning else EXACT_LIMIT_S
 
     def select(method: str, **more: Any) -> Any:
         if method != "greedy":  # which draws nothing
             more["seed"] = session.seed
         return jaxcal.select(
-            candidates_deg, session.k, method=method,
+            candidates_deg, config.k, method=method, model=model,
             available=available, required=list(required) or None, **more,
         )  # fmt: skip
 
     exact = chosen = select("exact", time_limit=limit)
     note, more = "", {}
-    if session.method == "auto":
+    if config.method == "auto":
         more = {"least_efficiency": session.min_efficiency, "time_limit": limit}
-    if session.method != "exact" and not replanning:
+    if config.method != "exact" and not replanning:
         try:
-            chosen = select(session.method, **more)
+            chosen = select(config.method, **more)
             note = getattr(chosen, "reason", "")
         except Exception as error:
-            if session.method not in ("policy", "auto"):
+            if config.method not in ("policy", "auto"):
                 raise
             # A missing or foreign checkpoint must not keep a rig from being calibrated.
             reason = " ".join(str(error).split())[:200]
             note = f"no policy could be used ({reason}); exact is used instead"
     best = max(exact.log_det, chosen.log_det)
-    efficiency = math.exp((chosen.log_det - best) / 12.0)
+    efficiency = math.exp((chosen.log_det - best) / parameters)
     if efficiency < session.min_efficiency:
         note = (
-            f"{session.method} reached a D-efficiency of {efficiency:.3f}, under "
+            f"{config.method} reached a D-efficiency of {efficiency:.3f}, under "
             f"session.min_efficiency = {session.min_efficiency:g}; using exact"
         )
-        chosen, efficiency = exact, math.exp((exact.log_det - best) / 12.0)
+        chosen, efficiency = exact, math.exp((exact.log_det - best) / parameters)
     return Choice(
         indices=tuple(int(i) for i in chosen.indices),
         log_det=float(chosen.log_det),
@@ -106,7 +109,7 @@ def choose(
 
 
 def travel_order(config: RigConfig, points_deg: Array, start_deg: Array) -> list[int]:
-    """Order of visits of (N, 3) points of least travel time from (3,), ending anywhere.
+    """Order of visits of (N, n) points of least travel time from (n,), ending anywhere.
 
     The axes move at the same time, so the slowest of them sets the time. Optimal for N
     up to 12; above 200 each next point is the nearest.

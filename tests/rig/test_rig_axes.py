@@ -1,0 +1,93 @@
+"""Devices of other axes than pitch, yaw and roll: their files, sessions and exports."""
+
+import json
+
+import numpy as np
+import pytest
+from commission import device
+from harness import RATE_HZ, SPEEDUP, Simulator, axes_text, session
+
+import jaxcal
+from rig.__main__ import main
+from rig.config import ConfigError, parse_config
+from rig.journal import SIGN_CHECKED, STOP_PROVED, DeviceRecord, read_journal
+from rig.simulator import Truth
+from rig.workbench.outputs.export import load_inverse
+
+TABLE = {"table": "Z"}
+GIMBAL = {"pan": "Z", "tilt": "X"}
+
+
+def simulated(config, **more):
+    count, outputs = len(config.axes), len(config.output_names)
+    truth = Truth.of_axes(count, outputs, noise_deg=0.005, **more)
+    return Simulator(config, truth, rate_hz=RATE_HZ, speedup=SPEEDUP)
+
+
+def calibrated(config, folder):
+    """Calibration, summary and export of a session that ends well, and what it said."""
+    said = []
+    with simulated(config) as sim:
+        assert session(sim.start(), folder, sim, said) == 0, said
+        truth = sim.truth
+    calibration = jaxcal.Calibration.load(folder / "calibration.json")
+    np.testing.assert_allclose(calibration.matrix, truth.matrix, atol=0.01)
+    return calibration, json.loads((folder / "summary.json").read_text()), said
+
+
+def test_a_turntable_is_calibrated_with_two_postures(tmp_path):
+    config = parse_config(axes_text(TABLE))
+    calibration, summary, said = calibrated(config, tmp_path)
+    assert summary["axes"] == summary["outputs"] == ["table"]
+    assert len(summary["postures"]) == config.k == 2
+    assert any(line.startswith("  table [") for line in said)
+    head = (tmp_path / "pairs.csv").read_text().splitlines()[0]
+    assert head == (
+        "name,role,pulses_table,u_deg_table,y_deg_table,std_deg_table,samples"
+    )
+    exported = load_inverse(tmp_path, read_journal(tmp_path / "journal.jsonl"))
+    assert exported["axes"] == ["table"] and len(exported["follow"]) == 2
+    at = np.array(exported["matrix"]) @ [3.0] + exported["offset_deg"]
+    np.testing.assert_allclose(at, calibration.command_for([3.0]), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_gimbal_is_calibrated_with_three(tmp_path):
+    _, summary, said = calibrated(parse_config(axes_text(GIMBAL)), tmp_path)
+    assert len(summary["postures"]) == 3 and "all six at once" in " ".join(said)
+
+
+@pytest.mark.slow
+def test_a_gimbal_is_commissioned_and_corrected(at, capsys):
+    """One axis turns the other way, and the other joint carries it."""
+    text = axes_text(GIMBAL, "XZY")
+    config = parse_config(text)
+    truth = Truth.of_axes(2, noise_deg=0.005, reversed=(True, False))
+    with device(truth, config=parse_config(axes_text(GIMBAL, "ZXY"))) as (_, bus, port):
+        number = bus.rpartition(":")[2]
+        text = text.replace("port = 5020", f"port = {number}")
+        (at / "rig.toml").write_text(text.replace("port = 2055", f"port = {port}"))
+        for command in (["scan", "--units", "2"], ["home", "--here", "--yes"]):
+            assert main(command) == 0
+        assert main(["axes", "--yes"]) == 0
+    now = parse_config((at / "rig.toml").read_text())
+    assert now.axes[0].direction == -config.axes[0].direction
+    assert now.mechanism.order == "ZXY"
+    record = DeviceRecord.load(at / "device.json")
+    assert np.shape(record.state(SIGN_CHECKED)["turns"]["deg"]) == (3, 2)
+    assert record.state(STOP_PROVED)
+
+
+@pytest.mark.parametrize(
+    "old, new, told",
+    [
+        ('name = "tilt"', 'name = "pan"', "axes: name must differ between them"),
+        ('name = "tilt"', 'name = "Tilt"', "axes.Tilt.name: must be a name of small"),
+        ('rotates = "X"\n', "", "axes.tilt.rotates: missing; a phone measures"),
+        ('name = "tilt"', 'name = "tilt"\nkind = "translation"', "min_deg: a transl"),
+        ("[settle]", "[session]\nk = 2\n[settle]", "session.k: must be at least 3"),
+    ],
+)
+def test_wrong_axes_are_refused(old, new, told):
+    with pytest.raises(ConfigError, match=told):
+        parse_config(axes_text(GIMBAL, session="").replace(old, new, 1))
