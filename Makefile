@@ -14,6 +14,7 @@ KERNELS := hatch_build.py $(shell find jaxcal -name '*kernel.py' -o -name '*.pxd
 # Newer versions end at the second flag, and with the first their loss is NaN.
 QUICK_XLA = $(shell $(BIN)/python -c 'import importlib.metadata as m; print(\
 	"--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false" \
+	" --xla_cpu_parallel_codegen_split_count=1" \
 	* m.version("jaxlib").startswith("0.10."))')
 
 .DEFAULT_GOAL := help

@@ -31,13 +31,18 @@ def task(overrun=False, seconds=(3.0, 6.0), cost=1.0):
     )  # fmt: skip
 
 
-def deciders(of):
-    params = initial(jax.random.key(0), 4, 1, 8)
-    return {
-        "random": Random(), "gain": Gain(), "shares": SHARES, "state": RULE,
-        "ahead": AHEAD, "fitted": fit(of).decider,
-        "policy": Policy(params, RULE, 4, 8, sample=True),
-    }  # fmt: skip
+DECIDERS = {
+    "random": lambda of: Random(),
+    "gain": lambda of: Gain(),
+    "shares": lambda of: SHARES,
+    "state": lambda of: RULE,
+    "ahead": lambda of: AHEAD,
+    "fitted": lambda of: fit(of).decider,
+    "policy": lambda of: Policy(
+        initial(jax.random.key(0), 4, 1, 8), RULE, 4, 8, sample=True
+    ),
+}
+QUICK = ("random", "state", "ahead")
 
 
 def spent(of, episodes, number):
@@ -60,19 +65,22 @@ def spent(of, episodes, number):
     return left, place, made
 
 
-def test_no_decider_spends_more_than_there_is_and_each_goes_on_while_it_can():
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in DECIDERS],
+)
+def test_no_decider_spends_more_than_there_is_and_each_goes_on_while_it_can(name):
     of = task(cost=3.0)
     keys = jax.random.split(jax.random.key(0), 48)
-    for name, decider in deciders(of).items():
-        episodes = play(of, jax.tree.map(jnp.asarray, decider), keys)
-        for number in range(48):
-            left, place, made = spent(of, episodes, number)
-            assert made > 0, name
-            assert min(seconds for seconds, _ in left) > -1e-3, name
-            assert min(uses for _, uses in left) >= 0, name
-            seconds, uses = left[-1]
-            cheapest = float(of.travel[place].min()) + 0.5
-            assert uses == 0 or made == 12 or seconds < cheapest + 1e-3, name
+    episodes = play(of, jax.tree.map(jnp.asarray, DECIDERS[name](of)), keys)
+    for number in range(48):
+        left, place, made = spent(of, episodes, number)
+        assert made > 0
+        assert min(seconds for seconds, _ in left) > -1e-3
+        assert min(uses for _, uses in left) >= 0
+        seconds, uses = left[-1]
+        cheapest = float(of.travel[place].min()) + 0.5
+        assert uses == 0 or made == 12 or seconds < cheapest + 1e-3
 
 
 def test_with_overrun_the_last_measurement_may_cost_more():

@@ -25,6 +25,7 @@ TABLES = (
 )
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=40)
 @given(
     st.integers(0, 2**31), st.sampled_from(ALL), st.sampled_from(BUDGETS),
@@ -184,6 +185,7 @@ def test_the_unit_of_time_changes_no_choice_of_shares(budget):
     assert one.alive.any(axis=0).sum() > 2
 
 
+@pytest.mark.slow
 def test_the_default_looks_ahead_where_time_or_uses_count():
     budget = {"seconds": 9.0, "uses": 2}
     counted, free = knee(8, sigma=0.05), draw(3, "band", "number", SHAPE)

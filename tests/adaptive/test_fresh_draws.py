@@ -99,6 +99,7 @@ def test_the_estimates_that_win_are_too_large(task):
     assert not has_exact_mean(won)
 
 
+@pytest.mark.slow
 def test_play_credits_what_an_option_tells(task):
     played = play(task, Gain(), jax.random.split(jax.random.key(1), 256))
     assert has_exact_mean(played.gain)

@@ -99,6 +99,7 @@ def test_outcomes_come_as_often_as_the_likelihood_says():
     assert np.abs(found - np.asarray(task.prior)).max() < 5 * math.sqrt(0.1 / 4000)
 
 
+@pytest.mark.slow
 def test_three_estimators_of_the_information_agree():
     found = compare(knee(**SMALL), {"state": STATE_RULE, "random": Random()}, 2048)
     for row in range(2):
@@ -155,6 +156,7 @@ def test_the_optimum_is_that_of_brute_force(uses, overrun):
     assert found.mean == pytest.approx(wanted, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_no_rule_passes_the_optimum_and_more_never_hurts():
     task = knee(5, sigma=1e-9, slip=0.0, seconds=(4.0, 12.0), trips=(1, 2))
     found = solve(task, 0.2)

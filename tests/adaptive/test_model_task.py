@@ -106,6 +106,7 @@ NAMES = ["centre", "height", "base"]
 IN_JAX = FromJax(peak, [3.0, 1.0, 0.0], names=NAMES)
 
 
+@pytest.mark.slow
 def test_a_model_in_numpy_is_measured_as_the_same_in_jax():
     history = [(3, 1.2)]
     found = [next_measurement(of_peak(model), history) for model in (IN_JAX, InNumpy())]
@@ -115,6 +116,7 @@ def test_a_model_in_numpy_is_measured_as_the_same_in_jax():
     assert known[0] == pytest.approx(known[1], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_loop_with_a_budget_that_is_killed_goes_on(tmp_path):
     task = of_peak(IN_JAX, seconds=9.0, cost=[1, 2, 3, 1, 2, 3, 1])
     truth = np.array([2.7, 2.0, 0.3])

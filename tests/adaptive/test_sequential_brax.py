@@ -14,6 +14,7 @@ from jaxcal.learning.environments.brax_env import wrap_fresh
 SMALL = {"cells": 4, "sigma": 0.05, "seconds": (5.0, 9.0)}
 
 
+@pytest.mark.slow
 def test_the_adapter_plays_sessions_and_draws_new_ones():
     task = knee(**SMALL)
     with jax.numpy_rank_promotion("allow"):

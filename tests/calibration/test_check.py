@@ -112,6 +112,7 @@ def test_the_affine_device_is_checked_too():
     assert found.check(new, found.predict(new) + 0.2).says == "does not hold"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["panda_1", "kuka_14"])
 def test_a_drift_it_states_is_seen_at_real_contacts(name):
     """Of a few contacts the noise is uncertain too, and misfit may not be there."""

@@ -153,6 +153,7 @@ def test_a_file_of_a_real_arm_without_compliance_errs_as_one_that_drops_it(
     assert far[0] < 0.9 * far[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "count"), [(34, 8), (50, 8), (1, 60)])
 def test_positions_have_one_level_of_noise_and_turns_another(seed, count):
     """Of few poses the noise of a single reading ran to zero and back, without end."""
@@ -173,6 +174,7 @@ def test_positions_have_one_level_of_noise_and_turns_another(seed, count):
         assert found.noise_dof > 100.0
 
 
+@pytest.mark.slow
 def test_contacts_of_eccentric_gears_err_elsewhere_as_predicted():
     """One socket does not show them; the fit bends its parameters instead."""
     arm = SerialChain.from_urdf(

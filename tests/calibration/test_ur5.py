@@ -20,6 +20,7 @@ def error(found: object) -> float:
     return float(np.linalg.norm(predicted - TEST, axis=1).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", ["gaussian", "student"])
 def test_all_poses_leave_a_tenth_of_a_millimetre(loss: str) -> None:
     found = identify(

@@ -479,6 +479,7 @@ def metrics(folder: pathlib.Path, updates: int = 30) -> None:
     (folder / "metrics.csv").write_text("\n".join(lines) + "\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("updates", [1, 2, 30])
 def test_training_curves_have_the_papers_three_panels(
     tmp_path: pathlib.Path, updates: int

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from .test_examples import EXAMPLES, quick
 
 
+@pytest.mark.slow
 def test_a_camera_on_an_arm_is_found_with_the_arm():
     every = np.arange(114)
     chosen = fr3.choose(20)

@@ -150,6 +150,7 @@ sys.exit(processes.run_job("job.py", None, work, "start every process again"))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("victim", [0, 1])
 def test_a_killed_process_ends_the_other(tmp_path: pathlib.Path, victim: int) -> None:
     script = tmp_path / "job.py"
