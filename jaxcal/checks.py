@@ -57,7 +57,7 @@ def axis_letter(index: int, count: int) -> str:
 
 
 def numbers(name: str, values: ArrayLike, *, finite: bool = True) -> Array:
-    if np.ma.is_masked(values):
+    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
         raise ValueError(f"{name} must not be masked; leave those rows out")
     try:
         given = np.asarray(values)
@@ -83,9 +83,10 @@ def array_of(
 ) -> Array:
     """``values`` as float64 of a shape, in which letters stand for any size."""
     array = numbers(name, values, finite=finite)
-    pairs = zip(shape, array.shape, strict=False)
-    fits = all(isinstance(want, str) or want == got for want, got in pairs)
-    if array.ndim != len(shape) or not fits:
+    fits = array.ndim == len(shape)
+    for want, got in zip(shape, array.shape, strict=False):
+        fits = fits and (want == got or isinstance(want, str))
+    if not fits:
         comma = "," if len(shape) == 1 else ""
         wanted = f"({', '.join(map(str, shape))}{comma})"
         raise ValueError(f"{name} must have shape {wanted}{rule}, got {array.shape}")
@@ -93,9 +94,9 @@ def array_of(
 
 
 def require_finite(name: str, array: Array) -> None:
-    bad = ~np.isfinite(array)
-    if bad.any():
-        where = tuple(int(i) for i in np.argwhere(bad)[0])
+    finite = np.isfinite(array)
+    if not finite.all():
+        where = tuple(int(i) for i in np.argwhere(~finite)[0])
         raise ValueError(f"{name} must be finite, got {array[where]} at {where}")
 
 
@@ -125,17 +126,17 @@ def table(name: str, values: ArrayLike) -> Array:
 
 
 def one_or_each(name: str, values: ArrayLike, count: int, more: str = "") -> Array:
-    """(count,) of one number for all or one each; not to be written to."""
+    """(count,) of one number for all or one each."""
     given = numbers(name, values, finite=False)
     if given.shape not in ((), (count,)):
         raise ValueError(
             f"{name} must be one number or ({count},){more}, got {given.shape}"
         )
-    return np.broadcast_to(given, (count,))
+    return given if given.shape else np.full(count, given)
 
 
 def levels(name: str, values: ArrayLike, count: int) -> Array:
-    """(count,) positive numbers, one for all or one each; not to be written to."""
+    """(count,) positive numbers, one for all or one each."""
     given = one_or_each(name, values, count)
     require_finite(name, given)
     require_none(given <= 0.0, given, f"{name} must be positive")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from jaxcal.calibration.sizes import Sizes, group_sizes, misfit_size, of_sizes
 from jaxcal.calibration.solve import Solution, Task, singular, solve, student_constants
-from jaxcal.checks import array_of, one_of, require_kind
+from jaxcal.checks import one_of, require_kind
 from jaxcal.information.singular import exact_zeros, null_directions, significant
 from jaxcal.models.identifiability import unknown
 from jaxcal.models.model import Model, as_model, derivative
@@ -30,10 +30,18 @@ def require_fitting(model: Any, commands: Array, measured: Array) -> Model:
     model = as_model(model)
     if not len(commands):
         raise ValueError("commands must hold at least one row, got none")
-    model.predict(commands, None)  # tells some models their number of inputs
-    rule = " for this model"
-    array_of("commands", commands, "N", model.num_inputs, rule=rule)
-    array_of("measured", measured, "N", model.num_outputs, rule=rule)
+    try:
+        shapes = model.num_inputs, model.num_outputs
+    except ValueError:  # of a function, not known before its first commands
+        model.predict(commands[:1], None)
+        shapes = model.num_inputs, model.num_outputs
+    for name, table, width in zip(
+        ("commands", "measured"), (commands, measured), shapes, strict=True
+    ):
+        if table.shape[1] != width:
+            raise ValueError(
+                f"{name} must have shape (N, {width}) for this model, got {table.shape}"
+            )
     return model
 
 
@@ -59,7 +67,10 @@ def fit_model(
     used = weights > 0.0
     if not used.any():
         raise ValueError("weights must be positive for one measurement at least")
-    white, known, spread = _noise_of(noise, weights, commands, measured.shape[1])
+    noise = noise or Noise()
+    known = noise.std is not None or noise.covariance is not None
+    white, reading_std = _of_readings(noise, weights, measured.shape[1])
+    spread = _of_commands(noise, commands, measured.shape[1])
     outputs = np.arange(measured.shape[1])
     if spread.any() and model.relative:
         raise ValueError(
@@ -71,6 +82,7 @@ def fit_model(
     if usual is not None and not known:
         of_reading = np.broadcast_to(np.asarray(usual.std), outputs.shape)
         white = white / of_reading[:, None]
+        reading_std = reading_std * of_reading
         levels = np.unique(of_reading, return_inverse=True)[1]  # positions and turns
     if common_noise or spread.any():
         levels = 0 * outputs
@@ -90,6 +102,7 @@ def fit_model(
         commands=commands[used] - (0.0 if centre is None else centre),
         measured=measured[used],
         white=white[used],
+        reading_std=reading_std[used],
         mean=to_centred @ resolved.mean,
         precision=np.diagonal(resolved.precision),
         free=resolved.free,
@@ -169,20 +182,29 @@ def _centre(
     return (None, same) if flat else (centre, to_centred)
 
 
-def _noise_of(
-    noise: Noise | None, weights: Array, commands: Array, q: int
-) -> tuple[Array, bool, Array]:
-    """Whitening (N, q, q), whether its level is known, and command_std (n,)."""
-    noise = noise or Noise()
-    readings = Noise(std=noise.std, covariance=noise.covariance)
-    white = readings.whitening(len(commands), q) * np.sqrt(weights)[:, None, None]
+def _of_readings(noise: Noise, weights: Array, q: int) -> tuple[Array, Array]:
+    """Whitening (N, q, q) at these weights, and standard deviations (N, q) at 1."""
+    if noise.command_std is not None:
+        noise = Noise(std=noise.std, covariance=noise.covariance)
+    white = noise.whitening(len(weights), q)
+    if noise.covariance is None:
+        std = 1.0 / white.diagonal(axis1=1, axis2=2)
+    else:
+        std = np.sqrt((np.linalg.inv(white) ** 2).sum(axis=2))
+    return white * np.sqrt(weights)[:, None, None], std
+
+
+def _of_commands(noise: Noise, commands: Array, q: int) -> Array:
+    """(n,) command_std, zero where it is not given."""
+    if noise.command_std is None:
+        return np.zeros(commands.shape[1])
     spread = noise.of_commands(commands.shape[1])
     if np.isinf(spread).sum() >= q:
         raise ValueError(
             f"command_std must leave fewer unknown commands than the {q} readings of a "
             f"measurement, got {int(np.isinf(spread).sum())}"
         )
-    return white, noise.std is not None or noise.covariance is not None, spread
+    return spread
 
 
 def _levels_differ(task: Task, found: Solution) -> bool:
@@ -262,22 +284,21 @@ def _fields(
     centre: Array | None,
 ) -> dict[str, Any]:
     used = weights > 0.0
-    rows = np.sqrt(_informs(task, found))[:, None, None] * found.rows
-    rows = rows.reshape(-1, rows.shape[-1])
-    known = task.model.facts(found.parameters)[1][:, task.free]
-    rows = np.concatenate([rows, known])
-    covariance, null = _covariance(task, found, rows)
+    covariance, null = _covariance(task, found)
     freedom = float(found.freedom.sum())
-    noise_std: Array | None = _noise(task, found, weights[used])
+    noise_std: Array | None = found.level * np.sqrt((task.reading_std**2).mean(axis=0))
     noise_dof = 0.0
     if not task.known:
         same = found.level[:, None] == found.level
         noise_dof = float((same @ found.freedom).min())
         if freedom < 1.0 or noise_dof <= 0.0:
             noise_std, noise_dof = None, 0.0
-    origin = 0.0 if centre is None else centre
-    residuals = measured - task.model.predict(commands - origin, found.parameters)
+    residuals = np.empty_like(measured)
     residuals[used] = found.residuals
+    if not used.all():
+        left_out = commands[~used] - (0.0 if centre is None else centre)
+        outputs = task.model.predict(left_out, found.parameters)
+        residuals[~used] = measured[~used] - outputs
     estimate, mean = found.parameters, task.mean
     if centre is not None:
         back = np.asarray(task.model.centred(-centre))
@@ -310,14 +331,7 @@ def _fields(
     }
 
 
-def _noise(task: Task, found: Solution, weights: Array) -> Array:
-    """(q,) of a reading of weight 1; root mean square where they were given apart."""
-    inverse = np.linalg.inv(task.white) * np.sqrt(weights)[:, None, None]
-    std = np.sqrt((inverse**2).sum(axis=2).mean(axis=0))
-    return np.asarray(std * found.level)
-
-
-def _covariance(task: Task, found: Solution, rows: Array) -> tuple[Array, Array | None]:
+def _covariance(task: Task, found: Solution) -> tuple[Array, Array | None]:
     """(P, P) of what is determined, and directions (z, P) of what is not.
 
     Raises:
@@ -325,9 +339,11 @@ def _covariance(task: Task, found: Solution, rows: Array) -> tuple[Array, Array 
     """
     size, free = len(task.mean), np.flatnonzero(task.free)
     if found.root is not None:
-        covariance = np.zeros((size, size))
-        covariance[np.ix_(free, free)] = found.root @ found.root.T
-        return covariance, None
+        covariance = found.root @ found.root.T
+        return _among(size, free, covariance), None
+    rows = np.sqrt(_informs(task, found))[:, None, None] * found.rows
+    rows = rows.reshape(-1, rows.shape[-1])
+    rows = np.concatenate([rows, task.model.facts(found.parameters)[1][:, free]])
     precision = task.precision[free]
     scale = np.sqrt((rows**2).sum(axis=0) + precision)
     scale = np.where(scale > 0.0, scale, 1.0)
@@ -358,7 +374,16 @@ def _covariance(task: Task, found: Solution, rows: Array) -> tuple[Array, Array 
             f"stay unknown{f' ({left})' if left else ''}; measure more, or give a "
             "prior or fixed parameters"
         )
-    covariance, directions = np.zeros((size, size)), np.zeros((len(unseen), size))
-    covariance[np.ix_(free, free)] = factor.T @ factor
+    directions = np.zeros((len(unseen), size))
     directions[:, free] = unseen
+    covariance = _among(size, free, factor.T @ factor)
     return covariance, directions if len(directions) else None
+
+
+def _among(size: int, free: NDArray[np.intp], covariance: Array) -> Array:
+    """(P, P) covariance of all ``size`` parameters, from that of the free ones."""
+    if len(free) == size:
+        return covariance
+    whole = np.zeros((size, size))
+    whole[np.ix_(free, free)] = covariance
+    return whole

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
 from collections.abc import Mapping
@@ -61,13 +60,12 @@ class Fit:
     noise_dof: Annotated[float, "", 0.0]  # of the noise estimated, 0 where given
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
+        for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
                 value = np.array(value)
                 value.setflags(write=False)
-                object.__setattr__(self, field.name, value)
-        object.__setattr__(self, "provenance", copy.deepcopy(self.provenance))
+                object.__setattr__(self, name, value)
+        object.__setattr__(self, "provenance", _copied(self.provenance))
 
     # -- parameters --------------------------------------------------------------------
 
@@ -330,3 +328,10 @@ class Fit:
         if self.affine is None:
             raise AttributeError(f"{name}: only an affine model y = A u + b has one")
         return self.affine
+
+
+def _copied(content: Any) -> Any:
+    """A copy of what JSON can hold."""
+    if isinstance(content, Mapping):
+        return {key: _copied(value) for key, value in content.items()}
+    return [*map(_copied, content)] if isinstance(content, list) else content

@@ -179,7 +179,7 @@ def _provenance(
     commands: Array, measured: Array, weight: Array, notes: Mapping[str, Any] | None
 ) -> dict[str, Any]:
     try:
-        noted = json.loads(json.dumps(dict(notes or {}), allow_nan=False))
+        noted = json.loads(json.dumps(dict(notes), allow_nan=False)) if notes else {}
     except (TypeError, ValueError) as error:
         raise ValueError(f"notes must be what JSON can hold: {error}") from None
     digest = hashlib.sha256()

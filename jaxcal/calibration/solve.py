@@ -32,6 +32,7 @@ NU = 4.0  # degrees of freedom of Student's loss
 _LIMIT = 300  # iterations
 _PATIENCE = 20  # iterations whose gain together decides whether the search creeps
 _CHOLESKY = 1e-6  # least pivot, of the largest, at which it is as exact as reflections
+_CLEAR = 1e8  # most by which directions differ that are determined without a doubt
 _LEAST_DAMPING = 1e-14  # keeps directions that nothing determines where they are
 
 
@@ -43,6 +44,7 @@ class Task:
     commands: Array  # (N, n)
     measured: Array  # (N, q)
     white: Array  # (N, q, q) whitening of the readings, at level 1
+    reading_std: Array  # (N, q) of a reading of weight 1, at level 1
     mean: Array  # (P,) of the prior
     precision: Array  # (P,) of the prior, 0 where nothing is known
     free: NDArray[np.bool_]  # (P,) False: held at the mean
@@ -176,50 +178,58 @@ class Solution:
         # 1e-6 standard deviations; 1e-5 where convergence is linear.
         self.least = 1e-2 if rough else 1e-10 if task.student else 1e-12
         self.change = (3e-2, 3e-2) if rough else (1e-5, 1e-4)  # of weights and levels
-        self.solved: tuple[Array, Array] | None = None  # hardly damped, in a step
+        # (R, r) roots of the hat matrix, hardly damped, where a step had them.
+        self.solved: Array | None = None
         count, q = task.measured.shape
         self.uncertain = task.command_std > 0.0
         self.command_root = 1.0 / task.command_std[self.uncertain]  # 0: unknown
         self.left = q - int(np.isinf(task.command_std).sum())  # readings, nuisance out
         # From where another search ended, the derivatives are right far enough.
         self.damping, self.grow = 1e-3 if start is None else 1e-10, 2.0
-        largest = np.abs(_times(task.white, task.measured)).max(axis=0)
+        readings = _times(task.white, task.measured)
+        largest = np.abs(readings).max(axis=0)
         largest = np.where(largest > 0.0, largest, largest.max())
         # (q,) of contacts, whose readings are zero, in their usual noise.
         self.floor = np.where(largest > 0.0, 1e-13 * largest, 1e-6)
-        self.sizes = task.model.parameter_sizes()
         self.basis: Array | None = None  # (F, r) directions of a linear model
         self.freedom = np.zeros(q)
         self.shared = task.levels
         self.parameters = task.mean if start is None else start.parameters
         linear = task.model.linear and not self.uncertain.any()
         from_zero = linear and start is None and not task.precision[task.free].any()
+        self.commands = task.commands if start is None else start.commands
         if from_zero:  # the answer is then as exact as its step
             self.parameters = np.where(task.free, 0.0, task.mean)
-        self.commands = task.commands if start is None else start.commands
-        self.residuals = task.measured - predict(
-            task.model, self.commands, self.parameters
-        )
+        if from_zero and task.free.all():
+            self.residuals = task.measured
+        else:
+            self._predict()
+            readings = _times(task.white, self.residuals)
         # The last step of the logarithms of the levels, and how much of one is taken.
         self.climbed, self.trust = np.zeros(q), 1.0
         if start is None:
             self.weights, self.level = np.ones(count), np.ones(q)
             if not task.known:
-                same = (self.shared[:, None] == self.shared).astype(np.float64)
-                square = (_times(task.white, self.residuals) ** 2).mean(axis=0)
-                mean = same @ square / same.sum(axis=1)
+                same = self.shared[:, None] == self.shared
+                mean = same @ (readings**2).sum(axis=0) / (count * same.sum(axis=1))
                 self.level = np.maximum(np.sqrt(mean), (same * self.floor).max(axis=1))
         else:
             self.weights, self.level = start.weights, start.level
         self._linearise()
         if linear:
             self.basis, self.damping = self._directions(), _LEAST_DAMPING
-        if (
-            from_zero
-            and self.basis is not None
-            and self.basis.shape[1] < task.free.sum()
-        ):
-            self._keep_undetermined()
+            if from_zero and self.basis.shape[1] < len(self.basis):
+                self._keep_undetermined()
+
+    @functools.cached_property
+    def sizes(self) -> Array:
+        """(P,) of the parameters."""
+        return self.task.model.parameter_sizes()
+
+    def _predict(self) -> None:
+        """Residuals at the present parameters and commands."""
+        predicted = predict(self.task.model, self.commands, self.parameters)
+        self.residuals = self.task.measured - predicted
 
     def _linearise(self) -> None:
         """Derivatives at the present parameters, whitened at level 1."""
@@ -228,8 +238,11 @@ class Solution:
         if self.basis is not None:  # derivatives stay what they are
             return
         rows = derivative(task.model, self.commands, self.parameters)
-        still = without_effect(rows, self.sizes)[task.free]
-        self.by_theta = task.white @ np.where(still, 0.0, rows[..., task.free])
+        if not task.model.linear:  # those of a linear model are exact
+            rows = np.where(without_effect(rows, self.sizes), 0.0, rows)
+        if not task.free.all():
+            rows = rows[..., task.free]
+        self.by_theta = task.white @ rows
         if self.uncertain.any():
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
             rows = derivative(task.model, self.commands, self.parameters, inputs)
@@ -241,6 +254,13 @@ class Solution:
         Orthogonal in what they change, the readings in noise and the prior.
         """
         rows, _, scale = self._system(0.0)
+        inverse, across = _cholesky(rows, 0.0)
+        # The least singular value is above one over the length of the inverse.
+        if inverse is not None and np.vdot(inverse, inverse) * len(scale) < _CLEAR**2:
+            self.solved = across
+            return inverse / scale[:, None]
+        if len(rows) < len(scale):
+            rows = np.concatenate([rows, np.zeros((len(scale), len(scale)))])
         directions = []
         for columns, size, right in singular(rows):
             known = np.flatnonzero(significant(size))
@@ -256,23 +276,25 @@ class Solution:
         if there are several, each have parameters of their own.
         """
         task = self.task
-        known = task.precision[task.free].any() or len(self.known)
+        known = len(self.known) or task.precision[task.free].any()
         if self.basis is None or task.student or known:
             return False
-        moved = (self.by_theta != 0.0).any(axis=0)  # (q, F) by which parameter
         if not task.known and self.shared.any():
-            of_level = [moved[self.shared == k].any(axis=0) for k in set(self.shared)]
-            if np.sum(of_level, axis=0).max() > 1:
+            moved = (self.by_theta != 0.0).any(axis=0)  # (q, F) by which parameter
+            levels = np.where(moved, self.shared[:, None], -1)
+            if (moved & (levels != levels.max(axis=0))).any():
                 return False
-        rows, right, scale = self._system(0.0)
-        cost, level, shared = float(right @ right), self.level, self.shared
-        inverse, target = _factor(rows, right, self.damping)
-        self.solved = rows, inverse
+        level, shared, basis = self.level, self.shared, self.basis
+        right = _times(task.white, self.residuals) / level
+        right = (np.sqrt(self.weights)[:, None] * right).ravel()
+        if self.solved is None:
+            rows, _, scale = self._system(0.0)
+            inverse, _ = _factor(rows, right, self.damping)
+            self.solved, basis = rows @ inverse, basis / scale @ inverse
+        cost, target = float(right @ right), self.solved.T @ right
         self.parameters = self.parameters.copy()
-        self.parameters[task.free] += self.basis @ (inverse @ target / scale)
-        self.residuals = task.measured - predict(
-            task.model, self.commands, self.parameters
-        )
+        self.parameters[task.free] += basis @ target
+        self._predict()
         distance = self._distance(self.residuals, self.commands)
         gain = float(target @ target)
         as_said = abs(cost - gain - distance.sum()) <= 1e-9 * cost
@@ -282,9 +304,11 @@ class Solution:
         exact = 1e-28 * cost * (level / self.level).max() ** 2 <= self.least
         if not (as_said and exact and self.shared is shared):
             return False
-        if self.basis.shape[1] == len(self.basis):
-            changed = (self.level / level)[moved.argmax(axis=0)]
-            self.root = changed[:, None] * (self.basis / scale @ inverse)
+        if basis.shape[1] == len(basis):
+            self.root = basis
+            if not task.known:
+                output = (self.by_theta != 0.0).any(axis=0).argmax(axis=0)
+                self.root = (self.level / level)[output, None] * basis
         return True
 
     def _keep_undetermined(self) -> None:
@@ -295,15 +319,16 @@ class Solution:
         shown = np.linalg.lstsq(basis / size[:, None], mean / size, rcond=None)[0]
         self.parameters = self.parameters.copy()
         self.parameters[task.free] = mean - basis @ shown
-        self.residuals = task.measured - predict(
-            task.model, self.commands, self.parameters
-        )
+        self._predict()
 
     def _distance(self, residuals: Array, commands: Array) -> Array:
         """(N,) squared distance of each measurement from the fit, in noise."""
         readings = _times(self.task.white, residuals) / self.level
-        moved = (commands - self.task.commands)[:, self.uncertain] * self.command_root
-        return np.asarray((readings**2).sum(axis=1) + (moved**2).sum(axis=1))
+        square = np.asarray((readings**2).sum(axis=1))
+        if len(self.command_root):
+            moved = (commands - self.task.commands)[:, self.uncertain]
+            square += ((moved * self.command_root) ** 2).sum(axis=1)
+        return square
 
     @property
     def cost(self) -> float:
@@ -356,22 +381,21 @@ class Solution:
 
         By directions, (R, r) and (r,), where the model is linear.
         """
+        rows, right = self._reduce(damping)
+        weight = np.sqrt(self.weights)[:, None]
+        rows = (weight[..., None] * rows).reshape(-1, rows.shape[-1])
+        right = (weight * right).ravel()
         free = self.task.free
         root = np.sqrt(self.task.precision[free])
-        weight = np.sqrt(self.weights)[:, None]
-        rows, right = self._reduce(damping)
-        rows = (weight[..., None] * rows).reshape(-1, len(root))
-        rows = np.concatenate([rows, np.diag(root), self.more[:, free]])
+        if len(self.known) or root.any():
+            off = root * (self.task.mean - self.parameters)[free]
+            rows = np.concatenate([rows, np.diag(root), self.more[:, free]])
+            right = np.concatenate([right, off, self.known])
         if self.basis is not None:
             rows = rows @ self.basis
         scale = np.sqrt((rows**2).sum(axis=0))
         scale = np.where(scale > 0.0, scale, 1.0)
-        off = root * (self.task.mean - self.parameters)[free]
-        return (
-            rows / scale,
-            np.concatenate([(weight * right).ravel(), off, self.known]),
-            scale,
-        )
+        return rows / scale, right, scale
 
     def step(self) -> bool:
         """Move the parameters to a lower cost; True where they need not move."""
@@ -380,7 +404,7 @@ class Solution:
         while True:
             rows, right, scale = self._system(self.damping)
             inverse, target = _factor(rows, right, self.damping)
-            self.solved = (rows, inverse) if self.damping < 1e-9 else None
+            self.solved = rows @ inverse if self.damping < 1e-9 else None
             step = inverse @ target
             rest = rows @ step - right
             gain = float(right @ right - rest @ rest)
@@ -463,62 +487,76 @@ class Solution:
         self.climbed = self.trust * step
         self.level = self.level * np.exp(self.climbed)
 
-    def _leverage(self, solved: tuple[Array, Array] | None = None) -> Array:
+    def _leverage(self, root: Array | None = None) -> Array:
         """(N, R, F) roots of the hat matrix, of the readings, at any level."""
-        if solved is None:
+        if root is None:
             rows, right, _ = self._system(0.0)
-            solved = rows, _factor(rows, right, _LEAST_DAMPING)[0]
-        rows, inverse = solved
-        root = rows @ inverse
-        readings = len(root) - int(self.task.free.sum()) - len(self.known)
-        return root[:readings].reshape(len(self.weights), -1, root.shape[1])
+            root = rows @ _factor(rows, right, _LEAST_DAMPING)[0]
+        count, width = len(self.weights), root.shape[1]
+        readings = self.residuals.shape[1] + len(self.command_root)
+        return root[: count * readings].reshape(count, readings, width)
 
     def _freedom(self, readings: Array) -> Array:
         """(q,) residual degrees of freedom of each output."""
         count, q = self.residuals.shape
-        used = (readings**2).sum(axis=-1)
+        used = np.einsum("nqf,nqf->q", readings, readings)
         if len(self.command_root):
             return np.full(q, (count * self.left - used.sum()) / q)
-        # A reading that nothing moves and that is met is none, as where the sensors of
-        # one arm have different numbers of readings.
-        none = (self.residuals == 0.0) & (self.by_theta == 0.0).all(axis=-1)
-        freedom = count - none.sum(axis=0) - used.sum(axis=0)
-        whole = np.round(freedom)
+        freedom = count - used
+        if (met := self.residuals == 0.0).any():
+            # A reading that nothing moves and that is met is none, as where the sensors
+            # of one arm have different numbers of readings.
+            freedom -= (met & (self.by_theta == 0.0).all(axis=-1)).sum(axis=0)
+        whole = np.rint(freedom)
         return np.where(np.abs(freedom - whole) < 1e-9, whole, freedom)
 
-    def finish(self, solved: tuple[Array, Array] | None = None) -> Solution:
+    def finish(self, solved: Array | None = None) -> Solution:
         """Itself, with what is said of the measurements where it ended.
 
-        ``solved`` is the system there as ``_factor`` left it, if that is known.
+        ``solved`` are the roots of the hat matrix there, if they are known.
         """
         readings = self._leverage(solved)
         self.rows, right = self._reduce(0.0)
         if solved is None or self.task.known:
             self.freedom = self._freedom(readings)
         self.distance = self._distance(self.residuals, self.commands)
-        gap = np.eye(right.shape[1]) - readings @ np.matrix_transpose(readings)
-        gap += 1e-9 * np.eye(right.shape[1])
+        gap = (1.0 + 1e-9) * np.eye(right.shape[1])
+        gap = gap - readings @ np.matrix_transpose(readings)
         deleted = np.linalg.solve(gap, right[..., None])[..., 0]
         self.deleted = np.maximum((right * deleted).sum(axis=1), 0.0)
         return self
 
 
 def _factor(rows: Array, right: Array, damping: float) -> tuple[Array, Array]:
-    """The inverse of R and ``Q.T right`` of the damped rows (R, F).
+    """The inverse of R and ``Q.T right`` of the damped rows (R, F)."""
+    inverse, across = _cholesky(rows, damping)
+    if inverse is not None:
+        return inverse, across.T @ right
+    damp = np.sqrt(damping) * np.eye(rows.shape[1])
+    whole, triangle = np.linalg.qr(np.concatenate([rows, damp]))
+    return np.linalg.inv(triangle), whole[: len(rows)].T @ right
+
+
+def _cholesky(rows: Array, damping: float) -> tuple[Array | None, Array]:
+    """The inverse of R, and Q of the damped rows (R, F); None where it is not exact.
 
     Cholesky twice (Yamamoto et al., 2015) is as exact as Householder's reflections
     where it succeeds, and does not wait for BLAS's threads in every column.
     """
     from scipy.linalg.lapack import dpotrf, dtrtri
 
-    damp = damping * np.eye(rows.shape[1])
-    turned, inverse = rows, np.eye(rows.shape[1])
+    turned, inverse = rows, None
     for _ in range(2):
-        root, failed = dpotrf(turned.T @ turned + inverse.T @ damp @ inverse)
+        gram = turned.T @ turned
+        if damping:
+            gram += damping * (
+                np.eye(len(gram)) if inverse is None else inverse.T @ inverse
+            )
+        root, failed = dpotrf(gram)
         size = np.diagonal(root)
         if failed or size.min(initial=np.inf) < _CHOLESKY * size.max(initial=0.0):
-            whole, triangle = np.linalg.qr(np.concatenate([rows, np.sqrt(damp)]))
-            return np.linalg.inv(triangle), whole[: len(rows)].T @ right
-        inverse = inverse @ dtrtri(root)[0]
+            return None, rows
+        step = dtrtri(root)[0]
+        inverse = step if inverse is None else inverse @ step
         turned = rows @ inverse
-    return inverse, turned.T @ right
+    return inverse, turned

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from jaxcal import compiled
 from jaxcal.information.singular import (
     SINGULAR,
+    SMALL,
     SURE,
     null_directions,
     power_of_two,
@@ -51,7 +52,6 @@ Mask = NDArray[np.bool_]
 _EPS = float(np.finfo(np.float64).eps)
 _LOSS = 1e-9  # of orthogonality that whitened rows may have
 _CLEAR = 1e6  # share of its digits that a column may lose by centring
-_SMALL = 1e-100  # numbers below and above its inverse are divided by powers of two
 _FAR = 1e5  # times the distance of neighbours: such a row hides what these differ by
 _SOME = 256  # candidates, or a few less, of which neighbours are looked at
 _UNTHREADED = 240_000  # multiplications up to which BLAS starts no threads
@@ -93,7 +93,7 @@ def _centred(
         largest = np.maximum(largest, np.abs(root).max(axis=0))
     scale = None
     sizes = largest.ravel().tolist()
-    if not (_SMALL < min(sizes) and max(sizes) < 1.0 / _SMALL):
+    if not (SMALL < min(sizes) and max(sizes) < 1.0 / SMALL):
         scale = power_of_two(largest)
         largest = largest / scale
         blocks, first, ordered = (
@@ -248,7 +248,7 @@ def rank_of_blocks(
     kernel = compiled.kernel("jaxcal.information.rank_kernel")
     beside = _nothing(blocks.shape[3]) if size is None else size
     share = 0.0 if size is None else SINGULAR
-    log_det, clear = kernel.clear_log_dets(blocks, root, beside, _SMALL, share, SURE)
+    log_det, clear = kernel.clear_log_dets(blocks, root, beside, SMALL, share, SURE)
     ranks = [blocks.shape[3]] * len(blocks)
     for n in () if clear else np.flatnonzero(np.isnan(log_det)).tolist():
         centred = _centred(blocks[n : n + 1], None, root)

@@ -19,8 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal import compiled
+
 __all__ = [
     "SINGULAR",
+    "SMALL",
     "SURE",
     "depends",
     "direction_in_words",
@@ -38,6 +41,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SINGULAR = 1e-10  # share of the largest singular value
+SMALL = 1e-100  # numbers below and above its inverse are divided by powers of two
 SURE = 1e5  # times the tolerance: distances above it leave no doubt of the rank
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
@@ -130,6 +134,8 @@ def null_directions(
 
     Axes that no row moves come first, then a basis of the rest of the null space.
     """
+    if len(columns) and _independent(columns, largest, computed):
+        return []
     p, scale = columns.shape[1], power_of_two(largest)
     columns, largest = columns / scale, largest / scale
     lengths, shares = _lengths(columns[None], largest[None], len(columns), computed)
@@ -150,6 +156,14 @@ def null_directions(
             direction[~still] = vector / norms[~still] * (scale.min() / scale[~still])
             null.append(direction)
     return null
+
+
+def _independent(columns: Array, largest: Array, computed: bool) -> bool:
+    """Whether ``rank_rule`` leaves no doubt that columns (R, p) are independent."""
+    kernel = compiled.kernel("jaxcal.information.rank_kernel")
+    share = SINGULAR if computed else 0.0
+    blocks, none = columns[None, :, None], np.zeros((0, len(largest)))
+    return bool(kernel.clear_log_dets(blocks, none, largest, SMALL, share, SURE)[1])
 
 
 def significant(size: NDArray[Any], squares: bool = False) -> Mask:
@@ -198,7 +212,7 @@ def require_excited(
         coarse: how many times coarser than float64 the numbers are.
     """
     count, n = commands.shape
-    offset = commands - commands.mean(axis=0) if count else commands
+    offset = commands - commands.sum(axis=0) / count if count else commands
     largest = np.abs(commands).max(axis=0, initial=0.0)
     null = null_directions(offset, coarse * largest)
     if count >= n + 1 and not null:

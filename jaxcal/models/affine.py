@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import axis_letter, whole_number
-from jaxcal.information.regression import regression_matrix, regressors
+from jaxcal.information.regression import regressors
 from jaxcal.models.model import Model, as_commands, as_parameters
 
 __all__ = ["Affine"]
@@ -38,7 +39,7 @@ class Affine(Model):
         """How often log det of the blocks counts: once per output."""
         return self.num_outputs
 
-    @property
+    @functools.cached_property
     def names(self) -> tuple[str, ...]:
         """``a11 a12 ... bx by bz``; ``a1,10`` where there are more than nine."""
         n, m = self.num_inputs, self.num_outputs
@@ -64,8 +65,12 @@ class Affine(Model):
     ) -> Array:
         """(N, m, m (n + 1)) derivative of the outputs; ``parameters`` do not matter."""
         commands = as_commands(self, commands)
-        matrix = regression_matrix(commands, self.num_outputs)
-        return matrix.reshape(-1, self.num_outputs, self.num_parameters)
+        (count, n), m = commands.shape, self.num_outputs
+        slopes, output = np.zeros((count, m, m * (n + 1))), np.arange(m)
+        by_slopes = slopes[:, :, : m * n].reshape(count, m, m, n)  # a view
+        by_slopes[:, output, output] = commands[:, None]
+        slopes[:, output, m * n + output] = 1.0
+        return slopes
 
     def command_jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None

@@ -37,6 +37,7 @@ class Linear(Model):
 
     num_inputs: int
     num_outputs: int
+    inputs: tuple[str, ...]
 
     def __init__(
         self,

@@ -36,6 +36,8 @@ __all__ = [
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
+_NOTHING_KNOWN = Prior(np.inf)
+
 
 class ErrorGroups(NamedTuple):
     """Parameters whose prior has one unknown scale: ``Prior.sized()``."""
@@ -71,6 +73,13 @@ class Model(abc.ABC):
         def num_outputs(self) -> int:
             """q."""
 
+        @property
+        def inputs(self) -> tuple[str, ...]:
+            """n names of the columns of the commands; () where they have none."""
+
+    else:
+        inputs = ()
+
     # -- f and its derivatives ---------------------------------------------------------
 
     @abc.abstractmethod
@@ -98,11 +107,6 @@ class Model(abc.ABC):
         """p."""
         return len(self.names)
 
-    @functools.cached_property
-    def inputs(self) -> tuple[str, ...]:
-        """n names of the columns of the commands; () where they have none."""
-        return ()
-
     @property
     def title(self) -> str:
         """The model in the first line of a calibration's summary."""
@@ -124,7 +128,7 @@ class Model(abc.ABC):
 
     def default_prior(self) -> Prior:
         """Infinite standard deviations where nothing is known."""
-        return Prior(np.inf)
+        return _NOTHING_KNOWN
 
     def default_noise(self) -> Noise | None:
         """The usual noise of a reading; None where nothing is known."""
@@ -181,7 +185,7 @@ class Model(abc.ABC):
 
     @property
     def linear(self) -> bool:
-        """Whether the outputs are linear in the parameters, and derivatives exact."""
+        """Whether ``f(u; theta) = J(u) theta``, and the derivatives J are exact."""
         return False
 
     def centred(self, centre: Array) -> Array | None:
@@ -367,11 +371,11 @@ def predict(
                 raise
             return np.full(shape, np.nan)
     _require_shape("predict", found, shape)
-    bad = np.flatnonzero(~np.isfinite(found).all(axis=1))
-    if finite and bad.size:
+    if finite and not np.isfinite(found).all():
+        bad = np.isfinite(found).all(axis=1).argmin()
         raise ValueError(
-            f"model.predict must be finite, got {in_words(found[bad[0]])} for the "
-            f"command {in_words(commands[bad[0]])}"
+            f"model.predict must be finite, got {in_words(found[bad])} for the "
+            f"command {in_words(commands[bad])}"
         )
     return found
 
@@ -386,8 +390,9 @@ def derivative(
         found = getattr(model, method)(commands, parameters)
     found = np.asarray(found, dtype=np.float64)
     _require_shape(method, found, (len(commands), model.num_outputs, len(names)))
-    bad = ~np.isfinite(found)
-    for row, output, column in np.argwhere(bad)[:1] if bad.any() else ():
+    if not np.isfinite(found).all():
+        bad = ~np.isfinite(found)
+        row, output, column = np.argwhere(bad)[0]
         # A forward derivative may spoil the columns beside that of the one to blame.
         by = ", ".join(np.array(names)[bad[row, output]])
         raise ValueError(

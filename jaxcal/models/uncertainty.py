@@ -78,30 +78,31 @@ class Prior:
     def resolve(self, model: Any) -> ResolvedPrior:
         """The prior of ``model``'s parameters, checked against its names."""
         names = model.names
-        unknown = np.full(len(names), np.inf)
-        std = _by_name("std of the prior", self.std, names, unknown)
-        nominal = np.array(model.nominal, dtype=np.float64)
+        std = _by_name("std of the prior", self.std, names, np.inf)
+        nominal = np.asarray(model.nominal, dtype=np.float64)
         mean = _by_name("mean of the prior", self.mean, names, nominal)
         require_finite("mean of the prior", mean)
-        _by_name("fixed", dict.fromkeys(self.fixed, 0.0), names, unknown)
-        free = ~np.isin(names, list(self.fixed))
+        free = np.ones(len(names), dtype=np.bool_)
+        for name in self.fixed:
+            free[names.index(one_of("parameter in fixed", name, names))] = False
         if not free.any():
             raise ValueError("prior must leave a parameter free, but it fixes them all")
         return ResolvedPrior(mean, np.diag(std**-2.0), free)
 
 
 def _by_name(
-    argument: str, values: Named | None, names: tuple[str, ...], default: Array
+    argument: str, values: Named | None, names: tuple[str, ...], default: Any
 ) -> Array:
     """(p,) ``values`` in the order of ``names``; ``default`` where they are silent."""
     if values is None or isinstance(values, Mapping):
-        result = default.copy()
+        result = np.empty(len(names))
+        result[:] = default
         for name, value in (values or {}).items():
             one_of(f"parameter in {argument}", name, names)
             number = array_of(f"{argument} of {name}", value, finite=False)
             result[names.index(name)] = number
         return result
-    return one_or_each(argument, values, len(names), " or a mapping from names").copy()
+    return one_or_each(argument, values, len(names), " or a mapping from names")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,7 +174,9 @@ class Noise:
         """
         shape = (count, num_outputs, num_outputs)
         if self.covariance is None and self.command_std is None:
-            return np.broadcast_to(np.eye(num_outputs) / self._std(*shape[:2]), shape)
+            white = np.empty(shape)
+            white[:] = np.eye(num_outputs) / self._std(*shape[:2])
+            return white
         covariance = self._of_readings(count, num_outputs)
         unknown = np.zeros((count, num_outputs, 0))
         if self.command_std is not None:
