@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.adaptive.session import Session
 from jaxcal.checks import numbers, table
-from jaxcal.models import FromJax, Noise, Prior
+from jaxcal.models import FromFunction, FromJax, Noise, Prior
 from jaxcal.models.model import (
     Model,
     as_commands,
@@ -49,6 +49,7 @@ class Candidates:
     seconds: jax.Array  # (M,)
     at_mean: jax.Array  # (M, q) readings, by which journals tell models apart
     slope: jax.Array  # (M, q, p) by the parameters, of a model that is linear in them
+    periods: jax.Array | None  # (q,) of readings that wrap, inf of the others
     draw: Draw | None = struct.field(pytree_node=False)
     outputs: Callable[..., jax.Array] | None = struct.field(pytree_node=False)
     names: tuple[str, ...] = struct.field(pytree_node=False)
@@ -81,7 +82,12 @@ class Candidates:
     def log_prob(self, prediction: Any, outcome: jax.Array) -> jax.Array:
         """() log density."""
         reading, design = prediction
-        off = self.white[design] @ (jnp.atleast_1d(outcome) - reading)
+        off = jnp.atleast_1d(outcome) - reading
+        if self.periods is not None:
+            whole = jnp.where(jnp.isinf(self.periods), 1.0, self.periods)
+            turns = jnp.where(jnp.isinf(self.periods), 0.0, jnp.round(off / whole))
+            off = off - whole * turns
+        off = self.white[design] @ off
         density = self.log_scale[design] - 0.5 * (off * off).sum()
         return jnp.where(jnp.isnan(density), -jnp.inf, density)  # the model refused
 
@@ -116,7 +122,7 @@ def candidates_of(
             own, or of which nothing can be drawn; candidates or costs that are wrong.
     """
     model = as_model(model)
-    if isinstance(model, FromJax):  # counts its inputs by its first commands
+    if isinstance(model, FromJax | FromFunction):  # which count inputs by the first
         model.predict(table("candidates", by_name(model, candidates))[:1])
     commands = as_commands(model, candidates)
     if not len(commands):
@@ -141,6 +147,7 @@ def candidates_of(
         log_scale=_single(scale),
         seconds=_single(np.broadcast_to(costs, len(commands))),
         at_mean=_single(at_mean), slope=_single(slope), draw=draw,
+        periods=None if model.periods is None else _single(model.periods),
         outputs=None if linear else _outputs(model, commands, mean), names=model.names,
     )  # fmt: skip
 

@@ -119,6 +119,7 @@ def check(
     slopes = np.asarray(model.jacobian(commands, theta))
     p = slopes.shape[-1]
     predicted = calibration.predict(commands)
+    measured = predicted + model.wrapped(measured - predicted, commands)
     _require_unit(calibration, measured, predicted, noise)
     off = (measured - predicted).ravel()
     rows = slopes.reshape(-1, p)

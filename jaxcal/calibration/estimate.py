@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration.sizes import Sizes, group_sizes, misfit_size, of_sizes
-from jaxcal.calibration.solve import Solution, Task, singular, solve, student_constants
+from jaxcal.calibration.solve import (
+    Solution,
+    Task,
+    singular,
+    solve,
+    student_constants,
+    whiten,
+)
 from jaxcal.checks import one_of, require_kind
 from jaxcal.information.singular import exact_zeros, null_directions, significant
 from jaxcal.models.identifiability import unknown
@@ -23,6 +30,7 @@ Array = NDArray[np.float64]
 # Of -2 log likelihood, what misfit must gain where readings of one place do not tell
 # how it goes on elsewhere.
 _TOLD = 20.0
+_MANY = 64  # readings of a measurement from which no matrix of their noise is made
 
 
 def require_fitting(model: Any, commands: Array, measured: Array) -> Model:
@@ -81,7 +89,7 @@ def fit_model(
     usual, levels = model.default_noise(), outputs
     if usual is not None and not known:
         of_reading = np.broadcast_to(np.asarray(usual.std), outputs.shape)
-        white = white / of_reading[:, None]
+        white = white / (of_reading if white.ndim == 2 else of_reading[:, None])
         reading_std = reading_std * of_reading
         levels = np.unique(of_reading, return_inverse=True)[1]  # positions and turns
     if common_noise or spread.any():
@@ -183,12 +191,18 @@ def _centre(
 
 
 def _of_readings(noise: Noise, weights: Array, q: int) -> tuple[Array, Array]:
-    """Whitening (N, q, q) at these weights, and standard deviations (N, q) at 1."""
+    """Whitening (N, q, q) at these weights, and standard deviations (N, q) at 1.
+
+    Of many independent readings the diagonal (N, q).
+    """
     if noise.command_std is not None:
         noise = Noise(std=noise.std, covariance=noise.covariance)
     white = noise.whitening(len(weights), q)
     if noise.covariance is None:
-        std = 1.0 / white.diagonal(axis1=1, axis2=2)
+        diagonal = white.diagonal(axis1=1, axis2=2)
+        std = 1.0 / diagonal
+        if q > _MANY:
+            return diagonal * np.sqrt(weights)[:, None], std
     else:
         std = np.sqrt((np.linalg.inv(white) ** 2).sum(axis=2))
     return white * np.sqrt(weights)[:, None, None], std
@@ -214,7 +228,7 @@ def _levels_differ(task: Task, found: Solution) -> bool:
         return False
     from scipy import special
 
-    white = (task.white @ found.residuals[..., None])[..., 0]
+    white = whiten(task.white, found.residuals[..., None])[..., 0]
     variance = found.weights @ (white / found.level) ** 2 / found.freedom
     high, low = int(variance.argmax()), int(variance.argmin())
     ratio = variance[high] / max(variance[low], np.finfo(np.float64).tiny)
@@ -248,7 +262,8 @@ def _misfit(
     none = np.zeros(count)
     theta = np.concatenate([found.parameters, none])
     waves = derivative(bent, task.commands, theta)[..., -count:]
-    white = task.white / found.level[:, None] @ (waves * std)
+    level = found.level if task.white.ndim == 2 else found.level[:, None]
+    white = whiten(task.white / level, waves * std)
     gram = np.einsum("n,nrf,nrw->fw", _informs(task, found), found.rows, white)
     turned = within[:, task.free] @ gram
     joint = np.zeros((len(theta), len(theta)))
@@ -298,7 +313,7 @@ def _fields(
     if not used.all():
         left_out = commands[~used] - (0.0 if centre is None else centre)
         outputs = task.model.predict(left_out, found.parameters)
-        residuals[~used] = measured[~used] - outputs
+        residuals[~used] = task.model.wrapped(measured[~used] - outputs, left_out)
     estimate, mean = found.parameters, task.mean
     if centre is not None:
         back = np.asarray(task.model.centred(-centre))
@@ -349,18 +364,19 @@ def _covariance(task: Task, found: Solution) -> tuple[Array, Array | None]:
     scale = np.where(scale > 0.0, scale, 1.0)
     whole = np.concatenate([rows, np.diag(np.sqrt(precision))]) / scale
     root, null = [np.zeros((0, len(free)))], [np.zeros((0, len(free)))]
+    off = task.model.resolution
     of_rows = 0  # combinations of the parameters that the readings use up
     for columns, of_columns, right in singular(whole):
-        known = significant(of_columns)
+        known = significant(of_columns, off=off)
         turned = np.zeros((len(columns), len(free)))
         turned[:, columns] = right
         root.append(turned[known] / of_columns[known, None])
-        null.append(exact_zeros(turned[~known]))
+        null.append(exact_zeros(turned[~known], off))
         alone = of_columns
         if not known.all():
             of_readings = rows[:, columns] / scale[columns]
             alone = np.asarray(np.linalg.svd(of_readings, compute_uv=False), np.float64)
-        of_rows += int(significant(alone).sum())
+        of_rows += int(significant(alone, off=off).sum())
     factor, unseen = np.concatenate(root) / scale, np.concatenate(null) / scale
     readings = found.left * len(task.commands)
     if len(unseen) and of_rows >= readings:

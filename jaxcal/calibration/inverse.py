@@ -115,6 +115,7 @@ class _Search:
         there = self.goal(np.tile(known, (len(wanted), 1)), np.repeat(points, count))
         outputs = predict(self.model, known, fit.estimate)
         there = there.reshape(len(wanted), count, -1) - outputs
+        there = self.model.wrapped(there, known)
         # Relative outputs spread as what is wanted, seen from where it was measured.
         seen = np.concatenate(there) if fit.model.relative else outputs
         self.size = np.where(np.ptp(seen, axis=0) > 0.0, seen.std(axis=0), 1.0)
@@ -127,9 +128,8 @@ class _Search:
 
     def gap(self, commands: Array, rows: NDArray[np.intp]) -> Array:
         """(R, q) of points ``rows`` from the outputs at ``commands``, in sizes."""
-        return np.asarray(
-            (self.goal(commands, rows) - self.outputs(commands)) / self.size
-        )
+        off = self.goal(commands, rows) - self.outputs(commands)
+        return np.asarray(self.model.wrapped(off, commands) / self.size)
 
     def slopes(self, commands: Array) -> Array:
         """(P, q, n) in units of the spreads."""

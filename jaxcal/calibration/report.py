@@ -254,8 +254,8 @@ def _nominal_errors(calibration: Fit) -> Array | None:
     """(N, m) errors before calibration: of the nominal machine, or of the commands."""
     measured = calibration.residuals + calibration.predict(calibration.commands)
     if calibration.affine is None:
-        nominal = calibration.model.predict(calibration.commands)
-        return np.asarray(measured - nominal)
+        model, commands = calibration.model, calibration.commands
+        return model.wrapped(measured - model.predict(commands), commands)
     if calibration.num_inputs != calibration.num_outputs:
         return None
     return np.asarray(measured - calibration.commands)
@@ -333,6 +333,7 @@ def _new_section(
     calibration: Fit, commands: ArrayLike, measured: ArrayLike
 ) -> pages.Section:
     off = np.asarray(measured, float) - calibration.predict(commands)
+    off = calibration.model.wrapped(off, np.asarray(commands, float))
     std = calibration.predict_std(commands, new_measurement=True)
     head = ["row"]
     for name in calibration.output_names:

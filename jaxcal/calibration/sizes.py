@@ -233,7 +233,10 @@ def _reduced(task: Task, found: Solution) -> tuple[Array, Array]:
     theta, free, precision = found.parameters, task.free, task.precision
     # One level for all: what the fit found of how they compare is kept.
     level = found.level / np.exp(np.log(found.level).mean())
-    white = task.white / level[:, None]
+    white = task.white
+    if white.ndim == 2:  # of many readings
+        white = white[..., None] * np.eye(white.shape[1])
+    white = white / level[:, None]
     white = white * np.sqrt(np.minimum(found.weights, 1.0))[:, None, None]
     slopes = derivative(task.model, task.commands, theta)
     off = found.residuals[..., None] + slopes @ (theta - task.mean)[:, None]

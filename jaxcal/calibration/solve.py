@@ -24,13 +24,14 @@ from jaxcal.information.blocks import triangle
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model, derivative, predict, without_effect
 
-__all__ = ["Solution", "Task", "singular", "solve", "student_constants"]
+__all__ = ["Solution", "Task", "singular", "solve", "student_constants", "whiten"]
 
 Array = NDArray[np.float64]
 
 NU = 4.0  # degrees of freedom of Student's loss
 _LIMIT = 300  # iterations
 _PATIENCE = 20  # iterations whose gain together decides whether the search creeps
+_MANY = 64  # readings of a measurement from which matrices of them are not made
 _CHOLESKY = 1e-6  # least pivot, of the largest, at which it is as exact as reflections
 _CLEAR = 1e8  # most by which directions differ that are determined without a doubt
 _LEAST_DAMPING = 1e-14  # keeps directions that nothing determines where they are
@@ -43,7 +44,7 @@ class Task:
     model: Model
     commands: Array  # (N, n)
     measured: Array  # (N, q)
-    white: Array  # (N, q, q) whitening of the readings, at level 1
+    white: Array  # (N, q, q) whitening of the readings, at level 1; (N, q) a diagonal
     reading_std: Array  # (N, q) of a reading of weight 1, at level 1
     mean: Array  # (P,) of the prior
     precision: Array  # (P,) of the prior, 0 where nothing is known
@@ -120,8 +121,15 @@ def solve(
     )
 
 
+def whiten(matrices: Array, rows: Array) -> Array:
+    """(N, q, F) rows times matrices (N, q, q), or their diagonals (N, q)."""
+    if matrices.ndim == 2:
+        return matrices[..., None] * rows
+    return np.asarray(matrices @ rows)
+
+
 def _times(matrices: Array, vectors: Array) -> Array:
-    return np.asarray((matrices @ vectors[..., None])[..., 0])
+    return whiten(matrices, vectors[..., None])[..., 0]
 
 
 def apart(rows: Array) -> list[NDArray[np.intp]]:
@@ -228,8 +236,13 @@ class Solution:
 
     def _predict(self) -> None:
         """Residuals at the present parameters and commands."""
-        predicted = predict(self.task.model, self.commands, self.parameters)
-        self.residuals = self.task.measured - predicted
+        self.residuals = self._off(self.commands, self.parameters)
+
+    def _off(self, commands: Array, theta: Array, finite: bool = True) -> Array:
+        """(N, q) measured less predicted."""
+        model = self.task.model
+        predicted = predict(model, commands, theta, finite=finite)
+        return model.wrapped(self.task.measured - predicted, commands)
 
     def _linearise(self) -> None:
         """Derivatives at the present parameters, whitened at level 1."""
@@ -242,11 +255,11 @@ class Solution:
             rows = np.where(without_effect(rows, self.sizes), 0.0, rows)
         if not task.free.all():
             rows = rows[..., task.free]
-        self.by_theta = task.white @ rows
+        self.by_theta = whiten(task.white, rows)
         if self.uncertain.any():
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
             rows = derivative(task.model, self.commands, self.parameters, inputs)
-            self.by_command = task.white @ rows[..., self.uncertain]
+            self.by_command = whiten(task.white, rows[..., self.uncertain])
 
     def _directions(self) -> Array:
         """(F, r) changes of the parameters, those that nothing determines left out.
@@ -414,9 +427,7 @@ class Solution:
             theta = self.parameters.copy()
             theta[task.free] += step
             commands = self._moved(step)
-            residuals = task.measured - predict(
-                task.model, commands, theta, finite=False
-            )
+            residuals = self._off(commands, theta, finite=False)
             known, _ = task.model.facts(theta)
             after = self._cost(residuals, theta, commands, known)
             ratio = (cost - after) / gain if np.isfinite(after) else -1.0
@@ -520,11 +531,27 @@ class Solution:
         if solved is None or self.task.known:
             self.freedom = self._freedom(readings)
         self.distance = self._distance(self.residuals, self.commands)
-        gap = (1.0 + 1e-9) * np.eye(right.shape[1])
-        gap = gap - readings @ np.matrix_transpose(readings)
-        deleted = np.linalg.solve(gap, right[..., None])[..., 0]
+        deleted = _deleted(readings, right)
         self.deleted = np.maximum((right * deleted).sum(axis=1), 0.0)
         return self
+
+
+def _deleted(readings: Array, right: Array) -> Array:
+    """(N, R) residuals of each measurement from the fit without it.
+
+    Args:
+        readings: (N, R, F) roots of the hat matrix.
+        right: (N, R) residuals.
+    """
+    count, columns = readings.shape[1:]
+    back = np.matrix_transpose(readings)
+    if count <= max(_MANY, columns):
+        gap = (1.0 + 1e-9) * np.eye(count) - readings @ back
+        return np.asarray(np.linalg.solve(gap, right[..., None])[..., 0])
+    one = 1.0 + 1e-9  # the same by the F columns, of a trajectory of many readings
+    inner = one * np.eye(columns) - back @ readings
+    along = np.linalg.solve(inner, back @ right[..., None])
+    return np.asarray((right + (readings @ along)[..., 0]) / one)
 
 
 def _factor(rows: Array, right: Array, damping: float) -> tuple[Array, Array]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import pathlib
+import sys
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -15,6 +17,7 @@ from jaxcal.arguments import several
 from jaxcal.csvtable import COMMANDS, Table
 from jaxcal.models import Model, SerialChain, from_dict
 from jaxcal.models.linear import input_letters
+from jaxcal.models.model import as_model
 from jaxcal.models.sensors import SENSORS, Placed, Socket
 
 __all__ = ["ArmOptions", "ModelPath", "in_degrees"]
@@ -23,7 +26,8 @@ Array = NDArray[np.float64]
 
 ModelPath = Annotated[
     str | None,
-    "model: JSON of its to_dict(), or an arm's .urdf; y = A u + b by default",
+    "model: JSON of its to_dict(), an arm's .urdf, or a .py that sets `model`; "
+    "y = A u + b by default",
     "FILE",
 ]
 
@@ -110,6 +114,8 @@ class ArmOptions:
             return self.read(path, table)
         if self != ArmOptions():
             raise ValueError("options of an arm need --model FILE.urdf")
+        if path and path.lower().endswith(".py"):
+            return _run_model(path)
         return None if path is None else _read_model(path)
 
     def columns(
@@ -160,6 +166,28 @@ def in_degrees(arm: SerialChain, commands: Array) -> Array:
     return commands
 
 
+def _run_model(path: str) -> Model:
+    """What a file of Python calls ``model``, its folder importable as for a script.
+
+    Raises:
+        OSError: there is no such file.
+        ValueError: naming the file and what is wrong in it.
+    """
+    file = pathlib.Path(path).resolve()
+    file.read_bytes()
+    sys.path.insert(0, str(file.parent))
+    try:
+        model = importlib.import_module(file.stem).model
+    except AttributeError:
+        raise ValueError(f"{path}: it must set `model`, one of jaxcal.models") from None
+    except Exception as error:
+        raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+    try:
+        return as_model(model)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
 def _read_model(path: str) -> Model:
     """The model in a JSON file.
 
@@ -171,7 +199,8 @@ def _read_model(path: str) -> Model:
         read = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
     except ValueError:
         raise ValueError(
-            f"{path}: a model must be a JSON file of its to_dict(), or an arm's .urdf"
+            f"{path}: a model must be a JSON file of its to_dict(), an arm's .urdf or "
+            "a .py"
         ) from None
     if isinstance(read, dict) and read.get("format") == "jaxcal-calibration":
         raise ValueError(

@@ -46,6 +46,7 @@ SURE = 1e5  # times the tolerance: distances above it leave no doubt of the rank
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
 _FLAT = 64.0 * _EPS  # of the size of what a number was computed from
+_OFF = 8.0  # times the share that columns are off: of r columns together
 _NONE = 1e-7  # of the largest entry of a direction: its rounding where it nearly exists
 
 
@@ -166,14 +167,15 @@ def _independent(columns: Array, largest: Array, computed: bool) -> bool:
     return bool(kernel.clear_log_dets(blocks, none, largest, SMALL, share, SURE)[1])
 
 
-def significant(size: NDArray[Any], squares: bool = False) -> Mask:
+def significant(size: NDArray[Any], squares: bool = False, off: float = 0.0) -> Mask:
     """Which singular values (..., r) of columns in comparable units are no rounding.
 
     Args:
         size: singular values, or eigenvalues.
         squares: they are eigenvalues of a product of these columns with themselves.
+        off: share by which the columns are off beyond rounding, as differences are.
     """
-    share = 8.0 * _EPS * size.shape[-1] if squares else SINGULAR
+    share = 8.0 * _EPS * size.shape[-1] if squares else max(SINGULAR, _OFF * off)
     return size > share * size.max(axis=-1, initial=0.0, keepdims=True)
 
 
@@ -182,10 +184,13 @@ def flat(size: NDArray[Any], beside: Any) -> Mask:
     return np.asarray(size <= _FLAT * beside)
 
 
-def exact_zeros(directions: Array) -> Array:
-    """Directions (..., p) in comparable units; an entry that is rounding becomes 0."""
+def exact_zeros(directions: Array, off: float = 0.0) -> Array:
+    """Directions (..., p) in comparable units; an entry that is rounding becomes 0.
+
+    ``off``: share by which the columns that they come from are off beyond rounding.
+    """
     size = np.abs(directions)
-    least = _NONE * size.max(axis=-1, initial=0.0, keepdims=True)
+    least = max(_NONE, _OFF * off) * size.max(axis=-1, initial=0.0, keepdims=True)
     return np.where(size > least, directions, 0.0)
 
 

@@ -1,7 +1,9 @@
 """What a machine does with a command: ``y = f(u; theta)``, its names and derivative."""
 
 from jaxcal.models.affine import Affine
+from jaxcal.models.differences import Differences
 from jaxcal.models.from_jax import FromJax
+from jaxcal.models.function import FromFunction
 from jaxcal.models.identifiability import Direction, Identifiability, identifiability
 from jaxcal.models.kinds import from_dict
 from jaxcal.models.linear import Linear, Polynomial
@@ -25,8 +27,10 @@ from jaxcal.models.uncertainty import Noise, Prior, ResolvedPrior
 __all__ = [
     "Affine",
     "Board",
+    "Differences",
     "Direction",
     "Distance",
+    "FromFunction",
     "FromJax",
     "Gravity",
     "Identifiability",

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import axis_names, numbers, table, whole_number
 from jaxcal.extras import needs
 from jaxcal.models.model import Model, as_commands, as_parameters
+from jaxcal.models.periods import checked_periods
 
 __all__ = ["FromJax"]
 
@@ -31,6 +32,8 @@ class FromJax(Model):
         nominal: (p,) parameters of the machine as it was designed.
         names: of the parameters; t1, t2, ... when not given.
         num_inputs: n; that of the first commands when not given.
+        periods: (q,) of readings that wrap, 360 of an angle in degrees, inf of others;
+            one number for all.
     """
 
     names: tuple[str, ...]
@@ -42,6 +45,7 @@ class FromJax(Model):
         nominal: ArrayLike,
         names: Sequence[str] | None = None,
         num_inputs: int | None = None,
+        periods: ArrayLike | None = None,
     ) -> None:
         if not callable(f):
             raise ValueError(f"f must be a function of (u, theta), got {f!r}")
@@ -53,6 +57,7 @@ class FromJax(Model):
         given = tuple(f"t{i + 1}" for i in range(p)) if names is None else names
         self.names = axis_names("names", given, "t", p)
         self._num_inputs: int | None = None
+        self._periods = None if periods is None else np.asarray(periods)
         with needs("policy", "FromJax"):
             import jax  # noqa: F401  # refused here where it is not installed
         if num_inputs is not None:
@@ -72,6 +77,11 @@ class FromJax(Model):
     def num_outputs(self) -> int:
         """m; 0 before the first commands."""
         return self._num_outputs if self.num_inputs else 0
+
+    @property
+    def periods(self) -> Array | None:
+        """(q,) of readings that wrap."""
+        return self._periods
 
     def predict(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
@@ -135,7 +145,10 @@ class FromJax(Model):
                 "f must return an array (q,) for one command, got "
                 f"{type(result).__name__ if shape is None else shape}"
             )
-        self._num_inputs, self._num_outputs = num_inputs, shape[0] if shape else 1
+        count = shape[0] if shape else 1
+        if self._periods is not None:
+            self._periods = checked_periods(self._periods, count)
+        self._num_inputs, self._num_outputs = num_inputs, count
 
     @functools.cached_property
     def _compiled(self) -> tuple[Callable[..., Any], ...]:

@@ -11,8 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import one_of, require_kind, table
 from jaxcal.information.blocks import triangle
-from jaxcal.information.singular import SINGULAR, exact_zeros, flat, significant
-from jaxcal.models.model import Model, as_model, derivative, without_effect
+from jaxcal.information.singular import exact_zeros, flat, significant
+from jaxcal.models.model import (
+    Model,
+    answered,
+    as_model,
+    derivative,
+    without_effect,
+)
 from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["Direction", "Identifiability", "identifiability", "unknown"]
@@ -92,6 +98,7 @@ def identifiability(
     require_kind("prior", prior, Prior)
     known = None if prior is None else prior.resolve(model)
     mean = model.nominal if known is None else known.mean
+    commands = commands[answered(model, commands, mean)]
     jacobian = _white(model, derivative(model, commands, mean), commands, mean, noise)
     rows = jacobian.reshape(-1, model.num_parameters)
     asked = np.ones(model.num_parameters, dtype=np.bool_)
@@ -120,13 +127,13 @@ def identifiability(
     lengths = np.linalg.norm(columns, axis=0)
     unit = columns / np.where(seen, lengths, 1.0)
     norms = np.where(seen, lengths * largest, 1.0)
-    size = np.linalg.svd(unit, compute_uv=False)
+    size, off = np.linalg.svd(unit, compute_uv=False), model.resolution
     found: list[Array] = []
-    if len(size) < len(at) or not significant(size).all():
+    if len(size) < len(at) or not significant(size, off=off).all():
         found = [np.eye(len(at))[[i]] for i in np.flatnonzero(~seen)]
-        first, classes = _parallel(unit, np.flatnonzero(seen))
+        first, classes = _parallel(unit, np.flatnonzero(seen), off)
         found += [each / norms for each in classes]
-        for vector in _sparse_null(unit[:, first]):
+        for vector in _sparse_null(unit[:, first], off):
             full = np.zeros((1, len(at)))
             full[0, first] = vector / norms[first]
             found.append(full)
@@ -204,7 +211,9 @@ def _in_words(names: tuple[str, ...], same: bool) -> str:
     return f"{names[0]} with {rest}" if rest else names[0]
 
 
-def _parallel(unit: Array, at: NDArray[np.intp]) -> tuple[list[int], list[Array]]:
+def _parallel(
+    unit: Array, at: NDArray[np.intp], off: float
+) -> tuple[list[int], list[Array]]:
     """Of columns ``at`` that are multiples of each other the first, and vectors (k, p)
     of each of the others against it."""
     first: list[int] = []
@@ -212,7 +221,8 @@ def _parallel(unit: Array, at: NDArray[np.intp]) -> tuple[list[int], list[Array]
     for i in at:
         along = unit[:, first].T @ unit[:, i]
         apart = unit[:, [i]] - unit[:, first] * along
-        same = np.flatnonzero(np.linalg.norm(apart, axis=0) < SINGULAR)
+        sizes = np.append(1.0, np.linalg.norm(apart, axis=0))
+        same = np.flatnonzero(~significant(sizes, off=off)[1:])
         if same.size:
             j = int(same[0])
             vector = np.zeros(unit.shape[1])
@@ -224,16 +234,16 @@ def _parallel(unit: Array, at: NDArray[np.intp]) -> tuple[list[int], list[Array]
     return first, [np.array(each) for each in classes if each]
 
 
-def _sparse_null(columns: Array) -> Array:
+def _sparse_null(columns: Array, off: float) -> Array:
     """(k, m) a basis of the null space of columns (R, m) with few entries each."""
     _, size, right = np.linalg.svd(columns)
-    null = right[int(significant(size).sum()) :].copy()
+    null = right[int(significant(size, off=off).sum()) :].copy()
     for row in range(len(null)):  # reduced echelon form: a pivot of its own for each
         pivot = int(np.abs(null[row]).argmax())
         null[row] /= null[row, pivot]
         others = np.arange(len(null)) != row
         null[others] -= np.outer(null[others, pivot], null[row])
-    null = exact_zeros(null)
+    null = exact_zeros(null, off)
     shorter = True
     while shorter:  # combine two where that leaves fewer entries
         shorter = False
@@ -241,7 +251,7 @@ def _sparse_null(columns: Array) -> Array:
             for k in np.flatnonzero((null[i] != 0.0) & (null[j] != 0.0)):
                 if i == j:
                     continue
-                trial = exact_zeros(null[i] - null[i, k] / null[j, k] * null[j])
+                trial = exact_zeros(null[i] - null[i, k] / null[j, k] * null[j], off)
                 if np.count_nonzero(trial) < np.count_nonzero(null[i]):
                     null[i] = trial / np.abs(trial).max()
                     shorter = True

@@ -8,6 +8,7 @@ from typing import Any
 from jaxcal.checks import one_of
 from jaxcal.models.affine import Affine
 from jaxcal.models.from_jax import FromJax
+from jaxcal.models.function import FromFunction
 from jaxcal.models.linear import Linear, Polynomial
 from jaxcal.models.model import Model
 from jaxcal.models.serial import SerialChain
@@ -17,6 +18,7 @@ __all__ = ["from_dict"]
 # What makes a model of each kind; its arguments are the keys of the file.
 _KINDS: dict[str, Callable[..., Model]] = {
     "affine": Affine,
+    "function": FromFunction,
     "jax": FromJax,
     "linear": Linear,
     "polynomial": Polynomial,
@@ -35,7 +37,7 @@ def from_dict(data: Mapping[str, Any]) -> Model:
         raise ValueError(f"a model must be a JSON object with a kind, got {data!r}")
     given = dict(data)
     kind = one_of("kind of the model", given.pop("kind", None), tuple(_KINDS))
-    if kind == "jax" or given.get("features", "") is None:
+    if kind in ("jax", "function") or given.get("features", "") is None:
         raise ValueError(
             "the model holds a function, which a file cannot: give the model itself, "
             "model=..."

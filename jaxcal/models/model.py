@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import abc
 import functools
+import warnings
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,12 +19,14 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import array_of, in_words
 from jaxcal.csvtable import COMMANDS, of_frame
 from jaxcal.information.singular import flat
+from jaxcal.models.periods import within_half
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.models.verdict import Verdict, verdict
 
 __all__ = [
     "ErrorGroups",
     "Model",
+    "answered",
     "as_commands",
     "as_model",
     "as_parameters",
@@ -37,6 +40,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 _NOTHING_KNOWN = Prior(np.inf)
+_NAMED = 5  # candidates that a warning names
 
 
 class ErrorGroups(NamedTuple):
@@ -160,6 +164,31 @@ class Model(abc.ABC):
     def error_groups(self) -> ErrorGroups | None:
         """The scales that ``Prior.sized()`` takes from the readings; None without."""
         return None
+
+    # -- readings that wrap, and a model that can only be run --------------------------
+
+    @property
+    def periods(self) -> Array | None:
+        """(q,) periods of readings that wrap, as 360 of an angle in degrees, inf of
+        those that do not; None where none does."""
+        return None
+
+    def wrapped(self, off: Array, commands: Array) -> Array:
+        """(N, q) differences of readings at commands, those that wrap within half a
+        period."""
+        return within_half(off, self.periods)
+
+    @property
+    def resolution(self) -> float:
+        """Share by which derivatives are off where they are differences, else 0."""
+        return 0.0
+
+    def unanswered(
+        self, commands: Array, parameters: ArrayLike | None = None
+    ) -> dict[int, str]:
+        """Rows of commands (N, n) for which there is no prediction, and why; only of a
+        model that may fail for some of them."""
+        return {}
 
     # -- the commands and readings of a fit or a choice --------------------------------
 
@@ -400,6 +429,34 @@ def derivative(
             f"for the command {in_words(commands[row])}"
         )
     return found
+
+
+def answered(
+    model: Model,
+    commands: Array,
+    parameters: Array | None,
+    names: Sequence[str] | None = None,
+) -> NDArray[np.bool_]:
+    """(N,) where the model has a prediction; a warning names the others.
+
+    Args:
+        model: any.
+        commands: (N, n).
+        parameters: (p,), the nominal ones for None.
+        names: (N,) of the commands, their numbers when not given.
+    """
+    lost = model.unanswered(commands, parameters) if len(commands) else {}
+    mask = np.ones(len(commands), dtype=np.bool_)
+    if lost:
+        mask[list(lost)] = False
+        named = [f"{names[i] if names else i} ({reason})" for i, reason in lost.items()]
+        more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
+        warnings.warn(
+            f"{len(lost)} of {len(commands)} candidates are left out, the model fails "
+            f"for {', '.join(named[:_NAMED])}{more}",
+            stacklevel=4,
+        )
+    return mask
 
 
 def without_effect(jacobian: Array, sizes: Array) -> NDArray[np.bool_]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, numbers, whole_number
+from jaxcal.models.periods import within_half
 
 __all__ = [
     "BASE",
@@ -91,6 +92,8 @@ class Sensor(abc.ABC):
     compliant: ClassVar[bool] = False  # shown to be better with joints that yield
     local: ClassVar[bool] = False  # of few places: harmonics are fitted if they gain
     misfit: ClassVar[float] = 0.0  # what they leave, by the arm's length, in a choice
+    # (q,) of readings that wrap, 360 of an angle in degrees, inf of the others.
+    periods: ClassVar[tuple[float, ...] | None] = None
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -132,6 +135,11 @@ class Sensor(abc.ABC):
     @abc.abstractmethod
     def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
         """Readings at N postures, with columns ``inputs`` (N, e) and parameters."""
+
+    def wrapped(self, off: Array, inputs: Array, length: float) -> Array:
+        """(..., N, q) differences of readings at columns ``inputs`` (N, e), those that
+        wrap within half a period."""
+        return within_half(off, self.periods)
 
     def located(
         self, tip: Tip, inputs: Array, measured: Array | None

@@ -173,6 +173,14 @@ class Several(Sensor):
             first = last
         return Reading(values, by_tip, by_own)
 
+    def wrapped(self, off: Array, inputs: Array, length: float) -> Array:
+        off = off.copy()
+        for _, one, rows, columns in self.parts(inputs):
+            width, scale = len(one.outputs), one.stds(length)
+            its = off[..., rows, :width] * scale
+            off[..., rows, :width] = one.wrapped(its, columns, length) / scale
+        return off
+
     def located(
         self, tip: Tip, inputs: Array, measured: Array | None
     ) -> tuple[Self, Array | None]:

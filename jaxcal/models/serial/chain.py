@@ -765,6 +765,11 @@ class SerialChain(Arm, Model):
         own = np.zeros((*result.shape[:2], len(self.sensor.inputs)))
         return np.concatenate([result @ self.drive, own], axis=-1)
 
+    def wrapped(self, off: Array, commands: Array) -> Array:
+        """(N, q) differences of readings, those of the sensor that wrap within half a
+        period."""
+        return self.sensor.wrapped(off, commands[:, self.num_joints :], self.length)
+
     def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
         """What is known besides the prior, as readings that need no posture.
 

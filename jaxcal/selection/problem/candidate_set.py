@@ -16,7 +16,7 @@ from jaxcal.checks import array_of, numbers, require_kind
 from jaxcal.csvtable import COMMANDS, names_of, of_frame
 from jaxcal.information.blocks import coarseness
 from jaxcal.models.affine import Affine
-from jaxcal.models.model import Model, as_model, by_name
+from jaxcal.models.model import Model, answered, as_model, by_name
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.criteria import criterion_of
 from jaxcal.selection.problem.making import (
@@ -76,12 +76,22 @@ class CandidateSet:
             )
         self.available = check_available(available, array.shape[:1])
         self.candidates = usable_numbers("candidates", array, self.available)
-        self.candidates.flags.writeable = False
         self._blocks: Array | None = None
         self._coarse = coarseness(candidates)
         noise = self.model.default_noise() if noise is None else noise
         self._set_rules(prior, noise, measured, required, max_replicates)
         self.names, self.axes = _labels(candidates, names)
+        self._leave_unanswered()
+        self.candidates.flags.writeable = False
+
+    def _leave_unanswered(self) -> None:
+        """Mask candidates for which the model fails; a warning names them."""
+        assert self.model is not None and self.candidates is not None
+        rows = np.flatnonzero(self.available)
+        mean = None if self.prior is None else self.prior.resolve(self.model).mean
+        names = None if self.names is None else [self.names[i] for i in rows]
+        kept = answered(self.model, self.candidates[rows], mean, names)
+        self.available[rows[~kept]] = False
 
     @classmethod
     def from_blocks(

@@ -1,0 +1,237 @@
+"""Derivatives by finite differences whose steps are chosen by looking.
+
+Noise: the values at seven points so close together that f is a polynomial there; what
+their higher differences leave is the noise of f. Step: derivatives of fourth order at
+steps halved again and again; the step taken is the one where the change from one step
+to the next, and what noise does to it, are least together. Parameters that may go to
+one side only, as a friction of zero, get differences to that side.
+
+Sources: Moré and Wild, Estimating computational noise, 2011; Ridders, 1982.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.checks import aligned
+from jaxcal.models.periods import within_half
+
+__all__ = ["STENCILS", "Differences", "Stencil", "combined", "look"]
+
+Array = NDArray[np.float64]
+Evaluate = Callable[[Array], Array]  # points (S, p) -> values (S, N, q), NaN: refused
+
+_FIRST, _RUNGS = 0.25, 22  # of the scale, the largest step; halvings tried
+_WORSE = 3  # steps in a row that are worse than the best one end the search
+_POINTS, _CLOSE = 7, 1e-7  # of the noise; of the scale, their distance
+_EPS = float(np.finfo(np.float64).eps)
+
+
+@dataclasses.dataclass(frozen=True)
+class Stencil:
+    """Where f is asked, in steps, and what makes a derivative of the values."""
+
+    offsets: Array  # (4,)
+    fine: Array  # (4,) weights of the derivative times the step
+    coarse: Array  # (4,) of a lower order, to see by how much they differ
+    amplifies: float  # noise of f, by the step
+
+
+def _stencil(offsets: list[float], fine: list[float], coarse: list[float]) -> Stencil:
+    weights = np.array(fine)
+    size = float(np.sqrt((weights**2).sum()))
+    return Stencil(np.array(offsets), weights, np.array(coarse), size)
+
+
+STENCILS = {
+    "central": _stencil(
+        [1.0, 0.5, -0.5, -1.0], [-1 / 6, 4 / 3, -4 / 3, 1 / 6], [0.0, 1.0, -1.0, 0.0]
+    ),
+    "forward": _stencil(
+        [0.0, 0.25, 0.5, 1.0], [-7.0, 32 / 3, -4.0, 1 / 3], [-6.0, 8.0, -2.0, 0.0]
+    ),
+    "backward": _stencil(
+        [0.0, -0.25, -0.5, -1.0], [7.0, -32 / 3, 4.0, -1 / 3], [6.0, -8.0, 2.0, 0.0]
+    ),
+}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Differences:
+    """The steps that were chosen; printed, a table of them and of their errors."""
+
+    names: tuple[str, ...]  # p
+    steps: Array  # (p,)
+    sides: tuple[str, ...]  # p, of ``STENCILS``
+    errors: Array  # (p,) of the derivatives, as a share of them
+    noise: Array  # (q,) standard deviation of f itself, in the readings' units
+    size: Array  # (q,) largest reading seen, beside which the noise is one
+
+    @property
+    def error(self) -> float:
+        """The largest of ``errors`` of a parameter that has an effect."""
+        return float(np.nanmax(self.errors, initial=0.0))
+
+    def rounding(self) -> Array:
+        """(q, p) below which a derivative is the noise of f."""
+        size = [STENCILS[side].amplifies for side in self.sides]
+        return np.asarray(4.0 * self.noise[:, None] * size / self.steps)
+
+    def __str__(self) -> str:
+        rows = [("parameter", "step", "side", "error")]
+        for name, step, side, error in zip(
+            self.names, self.steps, self.sides, self.errors, strict=True
+        ):
+            shown = "no effect" if np.isnan(error) else f"{error:.1e}"
+            rows.append((name, f"{step:.3g}", side, shown))
+        share = float((self.noise / np.where(self.size > 0, self.size, 1.0)).max())
+        return "\n".join(
+            [*aligned(rows, "<"), f"noise of f: {share:.1e} of its readings"]
+        )
+
+
+def combined(values: Array, weights: Array, periods: Array | None) -> Array:
+    """(...) sum of weights (4,), which add up to 0, times values (4, ...)."""
+    return np.tensordot(weights, within_half(values - values[:1], periods), 1)
+
+
+def look(
+    evaluate: Evaluate,
+    at: Array,
+    scale: Array,
+    names: Sequence[str],
+    periods: Array | None = None,
+) -> Differences:
+    """Choose steps for derivatives at ``at`` (p,).
+
+    Args:
+        evaluate: values at points (S, p); NaN where there are none.
+        at: (p,) finite values are there.
+        scale: (p,) by which the parameters may change.
+        names: p.
+        periods: (q,) of readings that wrap.
+    """
+    noise, size = _noise(evaluate, at, scale, periods)
+    ladders = [_Ladder(evaluate, at, scale, j, periods, noise) for j in range(len(at))]
+    effects = [ladder.effect for ladder in ladders]
+    largest = np.max(effects, axis=0, initial=0.0)  # (q,) by a change of the scale
+    weights = 1.0 / np.where(largest > 0.0, largest, 1.0)
+    chosen = [ladder.chosen(weights) for ladder in ladders]
+    steps, sides, errors = zip(*chosen, strict=True)
+    return Differences(
+        tuple(names), np.array(steps), sides, np.array(errors), noise, size
+    )
+
+
+def _noise(
+    evaluate: Evaluate, at: Array, scale: Array, periods: Array | None
+) -> tuple[Array, Array]:
+    """(q,) standard deviation of f's noise, and the largest reading."""
+    least = 64.0 * _EPS * np.abs(at)
+    along = np.where(np.arange(len(at)) % 2, -1.0, 1.0)
+    for close in (_CLOSE, 100.0 * _CLOSE, 1e4 * _CLOSE):
+        step = np.maximum(close * scale, least) * along
+        points = at + np.arange(_POINTS)[:, None] * step
+        values = evaluate(points)
+        if not np.isfinite(values).all():  # at the edge of what f takes
+            values = evaluate(at - np.arange(_POINTS)[:, None] * step)
+        good = np.isfinite(values).all(axis=(0, 2))
+        values = values[:, good]
+        size = np.abs(values).max(axis=(0, 1), initial=0.0)
+        off = within_half(values - values[:1], periods)
+        changes = np.diff(off, axis=0) != 0.0
+        if not changes.any() or changes.mean() > 0.5:
+            break  # else most values are alike: points that are farther apart say more
+    levels = []
+    table = off
+    for k in range(1, _POINTS):
+        table = np.diff(table, axis=0)
+        factor = math.factorial(k) ** 2 / math.factorial(2 * k)
+        square = (table**2).mean(axis=(0, 1)) if table.size else np.zeros(len(size))
+        levels.append(np.sqrt(factor * square))
+    found = np.array(levels)  # (6, q)
+    noise = found[-1].copy()
+    for q in range(found.shape[1]):
+        for k in range(1, len(found) - 2):
+            near = found[k : k + 3, q]
+            if near.max() <= 4.0 * near.min():
+                noise[q] = near[0]
+                break
+    return np.maximum(noise, 0.25 * _EPS * size), size
+
+
+class _Ladder:
+    """Derivatives by one parameter at steps halved from the largest on."""
+
+    def __init__(
+        self,
+        evaluate: Evaluate,
+        at: Array,
+        scale: Array,
+        j: int,
+        periods: Array | None,
+        noise: Array,
+    ) -> None:
+        self.scale, self.noise = float(scale[j]), noise
+        least = 1e4 * _EPS * abs(at[j])
+        self.side, self.rungs = "", []
+        values: dict[float, Array] = {}
+        for side, stencil in STENCILS.items():
+            rungs: list[tuple[float, Array]] = []
+            best, worse = np.inf, 0
+            for i in range(_RUNGS):
+                step = _FIRST * self.scale * 2.0**-i
+                if step < least and rungs:
+                    break
+                wanted = [o * step for o in stencil.offsets.tolist()]
+                new = [o for o in wanted if o not in values]
+                points = np.tile(at, (len(new), 1))
+                points[:, j] += new
+                if new:
+                    values |= dict(zip(new, evaluate(points), strict=True))
+                stack = np.array([values[o] for o in wanted])
+                slope = combined(stack, stencil.fine, periods) / step
+                if not np.isfinite(slope).all():
+                    continue
+                rungs.append((step, slope))
+                if len(rungs) > 1:
+                    change = np.abs(rungs[-1][1] - rungs[-2][1]).max()
+                    worse = worse + 1 if change >= best else 0
+                    best = min(best, change)
+                    if worse == _WORSE or change == 0.0:
+                        break
+            if len(rungs) > 1:
+                self.side, self.rungs = side, rungs
+                return
+        if not self.rungs:
+            self.side = "central"
+
+    @property
+    def effect(self) -> Array:
+        """(q,) of a change of the scale."""
+        if not self.rungs:
+            return np.zeros_like(self.noise)
+        return np.asarray(np.abs(self.rungs[-1][1]).max(axis=0) * self.scale)
+
+    def chosen(self, weights: Array) -> tuple[float, str, float]:
+        """Step, side, and error as a share of the derivative (NaN: no effect)."""
+        if not self.rungs:
+            return 1e-3 * self.scale, self.side, np.inf
+        amplifies = STENCILS[self.side].amplifies
+        best = (np.inf, *self.rungs[0])
+        for (step, slope), (_, finer) in zip(self.rungs, self.rungs[1:], strict=False):
+            change = float(np.sqrt((((slope - finer) * weights) ** 2).mean()))
+            of_noise = float(np.sqrt(((self.noise * weights) ** 2).mean()))
+            error = change + amplifies * of_noise / step
+            if error < best[0]:
+                best = (error, step, slope)
+        error, step, slope = best
+        size = float(np.sqrt(((slope * weights) ** 2).mean()))
+        if not (np.abs(slope) > 4.0 * amplifies * self.noise / step).any():
+            return step, self.side, np.nan
+        return step, self.side, error / size

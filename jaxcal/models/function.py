@@ -1,0 +1,395 @@
+"""Any function, simulator or program as a model, by finite differences."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import (
+    array_of,
+    axis_names,
+    in_words,
+    levels,
+    require_kind,
+    seconds,
+    table,
+    whole_number,
+)
+from jaxcal.models.differences import (
+    STENCILS,
+    Differences,
+    combined,
+    look,
+)
+from jaxcal.models.model import (
+    Model,
+    as_commands,
+    as_parameters,
+    by_name,
+)
+from jaxcal.models.periods import checked_periods
+from jaxcal.models.runs import CommandLine, Runs
+from jaxcal.models.uncertainty import Noise
+
+__all__ = ["FromFunction"]
+
+Array = NDArray[np.float64]
+
+_PILOTS = 4  # commands at which steps are chosen
+_ROUGH = 0.1  # of the largest derivative: a difference between orders that is told
+_SETS = 6  # of parameters whose results are kept in memory
+
+
+class FromFunction(Model):
+    """``y = f(u, theta)`` that can only be run; derivatives by finite differences.
+
+    Their steps are chosen by looking, at the first derivative that is asked for, and
+    ``differences`` says which they are and how far off derivatives are. Commands for
+    which f raises, or returns what is not finite, are left out of a choice and named.
+
+    Args:
+        f: function of one command (n,) and parameters (p,) that returns the q readings,
+            or a program: its arguments with ``{name}`` where values go, which prints
+            them.
+        nominal: (p,) parameters of the machine as it was designed.
+        scale: (p,) by how much each parameter may be off: steps are a small part of it.
+            A tenth of the nominal value when not given, which then must not be 0.
+        names: of the parameters; t1, t2, ... when not given.
+        inputs: names of the n commands, or n; n is that of the first commands when not
+            given. A program needs them.
+        batch: f takes commands (N, n) and returns (N, q).
+        noise: the usual noise of a reading, where none is given to what asks.
+        periods: (q,) of readings that wrap, 360 of an angle in degrees, inf of others;
+            one number for all.
+        processes: that run f at a time; f must then be importable.
+        cache: file in which runs are kept. It tells functions apart by their code, not
+            by what they call or read: delete it when that changes.
+        timeout: seconds after which a run of a program has failed.
+        quiet: no progress on standard error.
+    """
+
+    names: tuple[str, ...]
+    nominal: Array
+
+    def __init__(
+        self,
+        f: Callable[..., Any] | str | Sequence[str],
+        nominal: ArrayLike,
+        scale: ArrayLike | None = None,
+        names: Sequence[str] | None = None,
+        *,
+        inputs: Sequence[str] | int | None = None,
+        batch: bool = False,
+        noise: Noise | None = None,
+        periods: ArrayLike | None = None,
+        processes: int = 1,
+        cache: str | os.PathLike[str] | None = None,
+        timeout: float | None = None,
+        quiet: bool = False,
+    ) -> None:
+        self.nominal = array_of("nominal", nominal, "p")
+        p = len(self.nominal)
+        if not p:
+            raise ValueError("nominal must hold at least one parameter, got none")
+        given = tuple(f"t{i + 1}" for i in range(p)) if names is None else names
+        self.names = axis_names("names", given, "t", p)
+        self.scale = self._scale(scale)
+        self._num_inputs: int | None = None
+        self._inputs: tuple[str, ...] = ()
+        if isinstance(inputs, int):
+            self._num_inputs = whole_number("inputs", inputs, 1)
+        elif inputs is not None:
+            self._inputs = axis_names("inputs", inputs, "u", len(inputs))
+            self._num_inputs = len(self._inputs)
+        if not callable(f):
+            if not self.inputs or batch:
+                raise ValueError(
+                    "a program needs the names of its commands, inputs=[...], and "
+                    "takes one at a time"
+                )
+            limit = None if timeout is None else seconds("timeout", timeout)
+            f = CommandLine(f, (*self.inputs, *self.names), limit)
+        elif timeout is not None:
+            raise ValueError("timeout is of a program, and f is a function")
+        require_kind("noise", noise, Noise)
+        self._noise, self._given_periods = noise, periods
+        self._runs = Runs(
+            f, bool(batch), whole_number("processes", processes, 1), cache, quiet
+        )
+        self.f = f
+        self._known = _Memory()
+        self._steps: dict[str, Differences] = {}
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """n names of the commands; () where they have none."""
+        return self._inputs
+
+    # -- shapes ------------------------------------------------------------------------
+
+    @property
+    def num_inputs(self) -> int:
+        """n."""
+        if self._num_inputs is None:
+            raise ValueError(
+                "num_inputs of this model is not known before its first commands: "
+                "FromFunction(f, nominal, inputs=...)"
+            )
+        return self._num_inputs
+
+    @property
+    def num_outputs(self) -> int:
+        """q; 0 before the first run."""
+        return self._runs.num_outputs or 0
+
+    @property
+    def periods(self) -> Array | None:
+        """(q,) of readings that wrap."""
+        if self._given_periods is None or not self.num_outputs:
+            return None
+        return checked_periods(self._given_periods, self.num_outputs)
+
+    # -- f and its derivatives ---------------------------------------------------------
+
+    def predict(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """Outputs (N, q) at commands (N, n), NaN where f fails."""
+        rows, theta = self._asked(commands), as_parameters(self, parameters)
+        return self._known.of(
+            "f", theta, rows, lambda new: self._run([(new, theta)])[0]
+        )
+
+    def jacobian(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """(N, q, p), NaN where f fails."""
+        rows, theta = self._asked(commands), as_parameters(self, parameters)
+        return self._known.of(
+            "by parameters", theta, rows, lambda new: self._by_parameters(new, theta)
+        )
+
+    def command_jacobian(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """(N, q, n), NaN where f fails."""
+        rows, theta = self._asked(commands), as_parameters(self, parameters)
+        return self._known.of(
+            "by commands", theta, rows, lambda new: self._by_commands(new, theta)
+        )
+
+    def differences(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Differences:
+        """How derivatives by the parameters are taken; chosen at these commands, if not
+        at earlier ones."""
+        rows, theta = self._asked(commands), as_parameters(self, parameters)
+        return self._steps_for("parameters", rows, theta)
+
+    @property
+    def resolution(self) -> float:
+        """Share by which derivatives are off; 0 before the first."""
+        steps = self._steps.get("parameters")
+        return 0.0 if steps is None else min(steps.error, 1.0)
+
+    def unanswered(
+        self, commands: Array, parameters: ArrayLike | None = None
+    ) -> dict[int, str]:
+        """Rows of commands (N, n) for which f fails at or near parameters, and why."""
+        theta = as_parameters(self, parameters)
+        lost = np.isnan(self.jacobian(commands, theta)).any(axis=(1, 2))
+        rows = self._asked(commands)
+        return {
+            int(i): self._reasons.get(rows[i].tobytes(), "it fails")
+            for i in np.flatnonzero(lost)
+        }
+
+    def parameter_sizes(self) -> Array:
+        """(p,) the scale."""
+        return self.scale
+
+    def default_noise(self) -> Noise | None:
+        """As given."""
+        return self._noise
+
+    @property
+    def title(self) -> str:
+        return "of a function"
+
+    def to_dict(self) -> dict[str, Any]:
+        """The function itself cannot be written."""
+        return {
+            "kind": "function",
+            "names": list(self.names),
+            "nominal": self.nominal.tolist(),
+        }
+
+    def close(self) -> None:
+        """End the processes that run f, if there are any; they start again if asked."""
+        self._runs.close()
+
+    # -- inside ------------------------------------------------------------------------
+
+    @property
+    def _reasons(self) -> dict[bytes, str]:
+        return self._known.reasons
+
+    def _scale(self, scale: ArrayLike | None) -> Array:
+        if scale is not None:
+            return levels("scale", scale, len(self.nominal)).copy()
+        zero = np.flatnonzero(self.nominal == 0.0)
+        if zero.size:
+            raise ValueError(
+                "scale, by how much each parameter may be off, must be given where "
+                f"the nominal value is 0, as of {self.names[zero[0]]}"
+            )
+        return np.asarray(0.1 * np.abs(self.nominal))
+
+    def _asked(self, commands: ArrayLike) -> Array:
+        if self._num_inputs is None:
+            self._num_inputs = table("commands", by_name(self, commands)).shape[1]
+        rows = as_commands(self, commands)
+        if not len(rows):
+            raise ValueError("commands must hold at least one row, got none")
+        return rows
+
+    def _run(self, jobs: list[tuple[Array, Array]]) -> list[Array]:
+        """(N, q) of each job."""
+        values, reasons = self._runs(jobs)
+        for (rows, _), why in zip(jobs, reasons, strict=True):
+            for i, reason in why.items():
+                self._reasons[rows[i].tobytes()] = reason
+        if self._given_periods is not None:
+            checked_periods(self._given_periods, self.num_outputs)
+        return values
+
+    def _by_parameters(self, rows: Array, theta: Array) -> Array:
+        steps = self._steps_for("parameters", rows, theta)
+
+        def jobs() -> Iterator[tuple[Array, Array]]:
+            for j, offsets in enumerate(self._offsets(steps)):
+                for offset in offsets:
+                    point = theta.copy()
+                    point[j] += offset
+                    yield rows, point
+
+        return self._slopes(steps, rows, self._run([*jobs()]))
+
+    def _by_commands(self, rows: Array, theta: Array) -> Array:
+        steps = self._steps_for("commands", rows, theta)
+        points = []
+        for i, offsets in enumerate(self._offsets(steps)):
+            for offset in offsets:
+                moved = rows.copy()
+                moved[:, i] += offset
+                points.append(moved)
+        values = self._run([(np.concatenate(points), theta)])[0]
+        return self._slopes(steps, rows, [*values.reshape(len(points), len(rows), -1)])
+
+    @staticmethod
+    def _offsets(steps: Differences) -> list[Array]:
+        pairs = zip(steps.sides, steps.steps, strict=True)
+        return [STENCILS[side].offsets * step for side, step in pairs]
+
+    def _slopes(self, steps: Differences, rows: Array, values: list[Array]) -> Array:
+        """(N, q, p) of the values at the offsets, four for each parameter."""
+        columns, rough = [], []
+        for j, (side, step) in enumerate(zip(steps.sides, steps.steps, strict=True)):
+            stack, stencil = np.array(values[4 * j : 4 * j + 4]), STENCILS[side]
+            columns.append(combined(stack, stencil.fine, self.periods) / step)
+            rough.append(combined(stack, stencil.coarse, self.periods) / step)
+        slopes = np.stack(columns, axis=-1)
+        with np.errstate(invalid="ignore"):
+            largest = np.nanmax(np.abs(slopes), axis=0, initial=0.0)  # (q, p)
+            apart = np.abs(slopes - np.stack(rough, axis=-1))
+            floor = np.maximum(_ROUGH * largest, 8.0 * steps.rounding())
+            jumps = np.argwhere((apart > floor).any(axis=1))
+        if len(jumps):
+            i, j = jumps[0]
+            others = len({*jumps[:, 0]}) - 1
+            warnings.warn(
+                f"f is not smooth in {steps.names[j]} at the command "
+                f"{in_words(rows[i])}{f' and {others} others' if others else ''}: its "
+                "derivative there is not to be trusted (a reading that wraps needs "
+                "periods=)",
+                stacklevel=5,
+            )
+        # A derivative that is the noise of f for all commands is none.
+        return np.where(largest <= steps.rounding(), 0.0 * slopes, slopes)
+
+    def _steps_for(self, what: str, rows: Array, theta: Array) -> Differences:
+        """The steps, chosen where f does not fail."""
+        if what in self._steps:
+            return self._steps[what]
+        # Far from each other in the table, and more of them where f fails.
+        order = np.argsort((np.arange(len(rows)) * 0.6180339887) % 1.0)
+        pilots: list[int] = []
+        for first in range(0, len(rows), _PILOTS):
+            trial = order[first : first + _PILOTS]
+            found = self.predict(rows[trial], theta)
+            pilots += trial[np.isfinite(found).all(axis=1)].tolist()
+            if len(pilots) >= _PILOTS:
+                break
+        if not pilots:
+            raise ValueError(
+                f"f must return readings, but fails for all {len(rows)} commands, for "
+                f"{in_words(rows[0])}: "
+                f"{self._reasons[rows[0].tobytes()]}"
+            )
+        at = rows[pilots[:_PILOTS]]
+        if what == "parameters":
+            steps = look(
+                lambda points: np.array(self._run([(at, point) for point in points])),
+                theta,
+                self.scale,
+                self.names,
+                self.periods,
+            )
+        else:
+            steps = look(
+                lambda points: self._run(
+                    [((at[None] + points[:, None]).reshape(-1, at.shape[1]), theta)]
+                )[0].reshape(len(points), len(at), -1),
+                np.zeros(at.shape[1]),
+                self._spread(rows),
+                self.inputs or tuple(f"command {i + 1}" for i in range(at.shape[1])),
+                self.periods,
+            )
+        self._steps[what] = steps
+        return steps
+
+    @staticmethod
+    def _spread(rows: Array) -> Array:
+        """(n,) a tenth of what the commands spread over, else of their size, else 1."""
+        spread, size = np.ptp(rows, axis=0), np.abs(rows).max(axis=0)
+        whole = np.where(spread > 1e-6 * size, spread, size)
+        return 0.1 * np.where(whole > 0.0, whole, 1.0)
+
+
+class _Memory:
+    """Results by parameters and command, of the last sets of parameters."""
+
+    def __init__(self) -> None:
+        self.reasons: dict[bytes, str] = {}  # by command
+        self._sets: dict[tuple[str, bytes], dict[bytes, Array]] = {}
+
+    def of(
+        self, what: str, theta: Array, rows: Array, make: Callable[[Array], Array]
+    ) -> Array:
+        """Results (N, ...) at rows, those made that are not known."""
+        key = what, theta.tobytes()
+        known = self._sets.pop(key, {})
+        self._sets[key] = known  # the newest
+        while len(self._sets) > 3 * _SETS:
+            del self._sets[next(iter(self._sets))]
+        labels = [row.tobytes() for row in rows]
+        new = list(dict.fromkeys(x for x in labels if x not in known))
+        if new:
+            first = [labels.index(x) for x in new]
+            known |= dict(zip(new, make(rows[first]), strict=True))
+        return np.array([known[x] for x in labels])

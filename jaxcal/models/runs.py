@@ -1,0 +1,397 @@
+"""Runs of a caller's function: in this process or several, kept on disk, with failures.
+
+A job is some commands with one set of parameters. A run that raises, or whose numbers
+are not finite, is a failure with a reason; another shape than that of the others is an
+error. Runs that were made before are read from a file where the caller names one.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import contextlib
+import hashlib
+import multiprocessing
+import os
+import pathlib
+import pickle
+import shlex
+import shutil
+import sqlite3
+import subprocess
+import time
+import types
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.checks import in_words
+from jaxcal.progress import Progress
+
+__all__ = ["CommandLine", "Runs"]
+
+Array = NDArray[np.float64]
+Job = tuple[Array, Array]  # commands (N, n) and parameters (p,)
+Answer = Array | str  # readings (q,), or why there are none
+
+_EVERY = 2.0  # seconds between writings of runs to the disk
+_TASKS_EACH = 4  # pieces of work for each process, so that none waits long
+
+
+class _Failed(Exception):
+    """A run of a program."""
+
+
+class CommandLine:
+    """A program that prints the readings of one command.
+
+    Args:
+        words: the program and its arguments, in which ``{name}`` stands for the value
+            of a command or parameter of that name; one text is split as a shell does.
+        names: of commands and parameters, in this order.
+        timeout: seconds after which a run has failed.
+    """
+
+    def __init__(
+        self, words: str | Sequence[str], names: Sequence[str], timeout: float | None
+    ) -> None:
+        self.words = tuple(shlex.split(words) if isinstance(words, str) else words)
+        self.names, self.timeout = tuple(names), timeout
+        if not self.words or not all(isinstance(word, str) for word in self.words):
+            raise ValueError(f"f must be a program and its arguments, got {words!r}")
+        if shutil.which(self.words[0]) is None:
+            raise ValueError(f"f must be a program that can be run, got {words!r}")
+        unused = [x for x in self.names if not any(f"{{{x}}}" in w for w in self.words)]
+        if unused:
+            raise ValueError(
+                f"the arguments of f must hold {{{unused[0]}}}, where the value of "
+                f"{unused[0]} goes, got {' '.join(self.words)!r}"
+            )
+
+    def __call__(self, command: Array, parameters: Array) -> Array:
+        line = list(self.words)
+        for name, value in zip(self.names, [*command, *parameters], strict=True):
+            line = [word.replace(f"{{{name}}}", repr(float(value))) for word in line]
+        done = subprocess.run(
+            line, capture_output=True, text=True, timeout=self.timeout, check=False
+        )
+        if done.returncode:
+            last = (done.stderr.strip().splitlines() or [""])[-1]
+            raise _Failed(f"exit code {done.returncode}: {last}"[:200])
+        try:
+            return np.array([float(x) for x in done.stdout.replace(",", " ").split()])
+        except ValueError as error:
+            raise _Failed(f"standard output: {error}") from None
+
+    def content(self) -> bytes:
+        """What its results depend on: the words, and the files that they name."""
+        parts = [*self.words]
+        for word in self.words:
+            path = pathlib.Path(shutil.which(word) or word)
+            if path.is_file():
+                parts.append(hashlib.sha256(path.read_bytes()).hexdigest())
+        return "\0".join(parts).encode()
+
+
+class Runs:
+    """See the top of the module.
+
+    Args:
+        f: one command and the parameters, or with ``batch`` many commands.
+        batch: f takes commands (N, n) and returns (N, q).
+        processes: that run at a time.
+        cache: file of runs, made where it does not exist; None: nothing is kept.
+        quiet: no progress on standard error.
+    """
+
+    def __init__(
+        self,
+        f: Callable[..., Any],
+        batch: bool,
+        processes: int,
+        cache: str | os.PathLike[str] | None,
+        quiet: bool,
+    ) -> None:
+        self.f, self.batch, self.processes = f, batch, processes
+        self.num_outputs: int | None = None  # of the first run
+        self._progress = Progress(quiet=quiet)
+        self._pool: concurrent.futures.Executor | None = None
+        self._kept = None if cache is None else _Kept(cache, _content(f))
+        if processes > 1 and not isinstance(f, CommandLine):
+            try:
+                pickle.dumps(f)
+            except Exception as error:
+                raise ValueError(
+                    "f must be a function at the top of a module that can be imported "
+                    f"where processes is above 1: {error}"
+                ) from None
+
+    def __call__(self, jobs: Sequence[Job]) -> tuple[list[Array], list[dict[int, str]]]:
+        """Of each job readings (N, q), NaN where a run failed, and why by row."""
+        answers: list[list[Answer | None]] = [[None] * len(rows) for rows, _ in jobs]
+        if self._kept is not None:
+            answers = [self._kept.read(*job) for job in jobs]
+        pieces = self._pieces(jobs, answers)
+        total, done = sum(len(rows) for _, rows in pieces), 0
+        self._progress("runs of f", 0, total)
+        try:
+            for (j, rows), found in self._answered(jobs, pieces):
+                for i, answer in zip(rows, found, strict=True):
+                    answers[j][i] = self._checked(answer, jobs[j][0][i])
+                if self._kept is not None:
+                    self._kept.write(jobs[j], rows, answers[j])
+                done += len(rows)
+                self._progress("runs of f", done, total)
+        finally:
+            self._progress.clear()
+            if self._kept is not None:
+                self._kept.flush()
+        q = self.num_outputs
+        if q is None:  # known from files alone, or not at all
+            sizes = {len(x) for a in answers for x in a if isinstance(x, np.ndarray)}
+            self.num_outputs = q = sizes.pop() if sizes else None
+        if q is None:
+            reasons = [x for a in answers for x in a if isinstance(x, str)]
+            raise ValueError(
+                f"f must return readings, but fails for all {len(reasons)} commands, "
+                f"for {in_words(jobs[0][0][0])}: {reasons[0]}"
+            )
+        return self._arrays(answers, q)
+
+    def close(self) -> None:
+        """End the processes."""
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+            self._pool = None
+
+    def _arrays(
+        self, answers: list[list[Answer | None]], q: int
+    ) -> tuple[list[Array], list[dict[int, str]]]:
+        values, reasons = [], []
+        for of_job in answers:
+            table = np.full((len(of_job), q), np.nan)
+            why = {}
+            for i, answer in enumerate(of_job):
+                if isinstance(answer, np.ndarray):
+                    table[i] = answer
+                else:
+                    why[i] = str(answer)
+            values.append(table)
+            reasons.append(why)
+        return values, reasons
+
+    def _pieces(
+        self, jobs: Sequence[Job], answers: list[list[Answer | None]]
+    ) -> list[tuple[int, list[int]]]:
+        """Job and rows of each piece of work."""
+        open_rows = [
+            (j, [i for i, answer in enumerate(of_job) if answer is None])
+            for j, of_job in enumerate(answers)
+        ]
+        total = sum(len(rows) for _, rows in open_rows)
+        size = max(1, -(-total // (_TASKS_EACH * self.processes)))
+        if self.processes == 1:
+            size = max(total, 1) if self.batch else 1
+        return [
+            (j, rows[first : first + size])
+            for j, rows in open_rows
+            for first in range(0, len(rows), size)
+        ]
+
+    def _answered(
+        self, jobs: Sequence[Job], pieces: list[tuple[int, list[int]]]
+    ) -> Iterator[tuple[tuple[int, list[int]], list[Answer]]]:
+        if self.processes == 1:
+            for j, rows in pieces:
+                commands, parameters = jobs[j]
+                yield (j, rows), _answer(self.f, self.batch, commands[rows], parameters)
+            return
+        try:
+            broken = []
+            futures = {
+                self._submit(jobs[j][0][rows], jobs[j][1]): (j, rows)
+                for j, rows in pieces
+            }
+            for future in concurrent.futures.as_completed(futures):
+                try:
+                    yield futures[future], future.result()
+                except BrokenProcessPool:
+                    broken.append(futures[future])
+            # A run that ends its process takes those beside it along: one by one.
+            for j, rows in broken:
+                found: list[Answer] = []
+                for i in rows:
+                    self.close()
+                    try:
+                        found += self._submit(jobs[j][0][[i]], jobs[j][1]).result()
+                    except BrokenProcessPool:
+                        found.append("its process ended")
+                self.close()
+                yield (j, rows), found
+        except BaseException:
+            self.close()
+            raise
+
+    def _submit(self, commands: Array, parameters: Array) -> Any:
+        if self._pool is None and isinstance(self.f, CommandLine):
+            self._pool = concurrent.futures.ThreadPoolExecutor(self.processes)
+        elif self._pool is None:
+            self._pool = concurrent.futures.ProcessPoolExecutor(
+                self.processes, multiprocessing.get_context("spawn")
+            )
+            try:
+                self._pool.submit(callable, self.f).result()
+            except BrokenProcessPool:
+                raise ValueError(
+                    "f must be importable by a new process where processes is above 1: "
+                    "put it at the top of a module, and what runs behind `if __name__ "
+                    "== '__main__':`"
+                ) from None
+        return self._pool.submit(_answer, self.f, self.batch, commands, parameters)
+
+    def _checked(self, answer: Answer, command: Array) -> Answer:
+        """The answer, of the shape of the first; what is not finite is a failure."""
+        if isinstance(answer, str):
+            return answer
+        if self.num_outputs is None:
+            self.num_outputs = len(answer)
+        if len(answer) != self.num_outputs:
+            raise ValueError(
+                f"f must return ({self.num_outputs},) for every command, got "
+                f"({len(answer)},) for {in_words(command)}"
+            )
+        bad = np.flatnonzero(~np.isfinite(answer))
+        return f"reading {bad[0] + 1} is {answer[bad[0]]}" if bad.size else answer
+
+
+def _answer(
+    f: Callable[..., Any], batch: bool, commands: Array, parameters: Array
+) -> list[Answer]:
+    """Of each command its readings, or why it has none."""
+    if batch and len(commands) > 1:
+        try:
+            with np.errstate(all="ignore"):
+                found = f(commands.copy(), parameters.copy())
+        except Exception:  # of which command, each by itself will say
+            found = None
+        if found is not None:
+            return [*_readings(found, len(commands))]
+    answers: list[Answer] = []
+    for command in commands:
+        given = command[None] if batch else command
+        try:
+            with np.errstate(all="ignore"):
+                found = f(given.copy(), parameters.copy())
+        except Exception as error:
+            name = "" if isinstance(error, _Failed) else f"{type(error).__name__}: "
+            answers.append(f"{name}{error}".splitlines()[0])
+            continue
+        answers.append(_readings(found, 1 if batch else 0)[0])
+    return answers
+
+
+def _readings(found: Any, rows: int) -> Array:
+    """(N, q) of what f returned for ``rows`` commands, 0: for one without an axis."""
+    try:
+        array = np.asarray(found, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"f must return numbers, got {type(found).__name__}") from None
+    if not rows and array.ndim <= 1 and array.size:
+        return array.reshape(1, -1)
+    if rows and array.ndim == 1 and len(array) == rows:
+        return array[:, None]
+    if not rows or array.ndim != 2 or len(array) != rows or not array.shape[1]:
+        rule = f"({rows}, q) for {rows} commands" if rows else "(q,) for one command"
+        raise ValueError(f"f must return {rule}, got {array.shape}")
+    return array
+
+
+class _Kept:
+    """Runs in a file of SQLite; those of another f are other runs."""
+
+    def __init__(self, path: str | os.PathLike[str], content: bytes) -> None:
+        self._path, self._content = os.fspath(path), content
+        self._waiting: list[tuple[bytes, bytes]] = []
+        self._written = time.monotonic()
+        try:
+            with self._opened() as file:
+                file.execute(
+                    "CREATE TABLE IF NOT EXISTS runs (key BLOB PRIMARY KEY, value BLOB)"
+                )
+        except sqlite3.Error as error:
+            raise ValueError(f"cache must be a file of runs, {path}: {error}") from None
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[sqlite3.Connection]:
+        """Committed when the block succeeds."""
+        connection = sqlite3.connect(self._path, timeout=60.0)
+        with contextlib.closing(connection), connection:
+            yield connection
+
+    def _keys(self, commands: Array, parameters: Array) -> list[bytes]:
+        first = hashlib.sha256(self._content)
+        first.update(parameters.tobytes())
+        keys = []
+        for command in commands:
+            whole = first.copy()
+            whole.update(command.tobytes())
+            keys.append(whole.digest())
+        return keys
+
+    def read(self, commands: Array, parameters: Array) -> list[Answer | None]:
+        found: list[Answer | None] = []
+        with self._opened() as file:
+            for key in self._keys(commands, parameters):
+                row = file.execute("SELECT value FROM runs WHERE key = ?", (key,))
+                value = row.fetchone()
+                found.append(None if value is None else np.frombuffer(value[0]).copy())
+        return found
+
+    def write(self, job: Job, rows: list[int], answers: list[Answer | None]) -> None:
+        """What succeeded; a failure may be another one tomorrow."""
+        commands, parameters = job
+        keys = self._keys(commands[rows], parameters)
+        self._waiting += [
+            (key, answer.tobytes())
+            for key, answer in zip(keys, (answers[i] for i in rows), strict=True)
+            if isinstance(answer, np.ndarray)
+        ]
+        if time.monotonic() > self._written + _EVERY:
+            self.flush()
+
+    def flush(self) -> None:
+        """Put what waits on the disk."""
+        if self._waiting:
+            with self._opened() as file:
+                file.executemany(
+                    "INSERT OR REPLACE INTO runs VALUES (?, ?)", self._waiting
+                )
+        self._waiting, self._written = [], time.monotonic()
+
+
+def _content(f: Any) -> bytes:
+    """What tells one f from another: its code and what it holds.
+
+    Functions that it calls, and files that it reads, are not looked at.
+    """
+    if isinstance(f, CommandLine):
+        return f.content()
+    if isinstance(f, types.FunctionType):
+        held = [f.__defaults__, *(cell.cell_contents for cell in f.__closure__ or ())]
+        code = repr(_code(f.__code__)).encode()
+        return code + b"".join(_content(one) for one in held)
+    try:
+        return pickle.dumps(f)
+    except Exception as error:
+        raise ValueError(
+            f"cache must be left out: what f holds cannot be compared: {error}"
+        ) from None
+
+
+def _code(code: types.CodeType) -> tuple[Any, ...]:
+    constants = [
+        _code(x) if isinstance(x, types.CodeType) else x for x in code.co_consts
+    ]
+    return code.co_code, code.co_names, constants
