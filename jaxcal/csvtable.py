@@ -116,7 +116,7 @@ class Table:
             prefix: ``COMMANDS`` or ``MEASURED``, which either side may lack.
             chosen: names separated by commas, where the user gave them: in the order
                 of ``wanted``, unless they are its names.
-            option: by which they are given.
+            option: by which they are given; "" where a command has none.
             unit: that the names may hold: "pitch_deg", "u_deg_pitch", "pitch [deg]".
 
         Raises:
@@ -158,12 +158,14 @@ class Table:
         try:
             found = columns_by_name(wanted, self.header, prefix, unit)
         except ValueError as error:
-            raise ValueError(f"{self.source}: {error}; choose with {option}") from None
+            choose = f"choose with {option}" if option else "rename one of them"
+            raise ValueError(f"{self.source}: {error}; {choose}") from None
+        advice = f"; name those of {', '.join(wanted)} in that order with {option}"
+        advice = advice if option else ""
         if missing := [x for x, y in zip(wanted, found, strict=True) if y is None]:
             raise ValueError(
                 f"{self.source}: there is no column {', '.join(map(repr, missing))}, "
-                f"with {prefix} or without; columns: {', '.join(self.header)}; name "
-                f"those of {', '.join(wanted)} in that order with {option}"
+                f"with {prefix} or without; columns: {', '.join(self.header)}" + advice
             )
         self.say(wanted, found, "by name")
         return tuple(found)

@@ -22,6 +22,7 @@ from jaxcal import pages
 from jaxcal.calibration.budget import Budget, Source, budget
 from jaxcal.calibration.check import Check
 from jaxcal.calibration.fit import Fit
+from jaxcal.csvtable import COMMANDS, MEASURED
 from jaxcal.files import atomic_write
 
 __all__ = ["SCHEMA", "left_out", "moved", "report"]
@@ -251,14 +252,19 @@ def _numbers(calibration: Fit, check: Check | None) -> dict[str, Any]:
 
 
 def _nominal_errors(calibration: Fit) -> Array | None:
-    """(N, m) errors before calibration: of the nominal machine, or of the commands."""
+    """(N, m) errors before calibration: of the nominal machine, or of the commands.
+
+    None of an affine machine whose outputs are not named as its inputs.
+    """
     measured = calibration.residuals + calibration.predict(calibration.commands)
     if calibration.affine is None:
         model, commands = calibration.model, calibration.commands
         return model.wrapped(measured - model.predict(commands), commands)
-    if calibration.num_inputs != calibration.num_outputs:
+    inputs = [name.removeprefix(COMMANDS) for name in calibration.input_names]
+    outputs = [name.removeprefix(MEASURED) for name in calibration.output_names]
+    if {*inputs} != {*outputs} or len(inputs) != len(outputs):
         return None
-    return np.asarray(measured - calibration.commands)
+    return np.asarray(measured - calibration.commands[:, [*map(inputs.index, outputs)]])
 
 
 # -- the page --------------------------------------------------------------------------

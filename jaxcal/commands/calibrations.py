@@ -259,7 +259,7 @@ def identify(
             sources=[Source.certificate("certificate", certificate)]
             if certificate is not None
             else (),
-            at=None if at is None else _commands_for(calibration, read_table(at)),
+            at=None if at is None else _commands_for(calibration, read_table(at))[1],
             files=[path for path in (file, model) if path and os.path.isfile(path)],
         )
     elif against or at or certificate is not None:
@@ -297,8 +297,14 @@ def check(
     that cannot be told from these readings; 2: bad input.
     """
     found, table = Calibration.load(calibration), read_table(file)
-    commands = _commands_for(found, table)
-    outputs = table.named(found.output_names, MEASURED, unit=found.measured_unit)
+    inputs, commands = _commands_for(found, table, option="")
+    unit = found.measured_unit
+    outputs = table.named(found.output_names, MEASURED, option="", unit=unit)
+    if both := sorted({*inputs} & {*outputs}):
+        raise ValueError(
+            f"{file}: columns of commands and of readings must differ, both would be "
+            f"{', '.join(both)}; begin their names with {COMMANDS} and {MEASURED}"
+        )
     measured = table.columns(outputs)
     told = found.check(commands, measured, tolerance=tolerance, placed_anew=placed_anew)
     if report:
@@ -325,7 +331,7 @@ def predict(
     """Where a calibrated machine goes for given commands."""
     found = Calibration.load(calibration)
     table = read_table(file)
-    commands = _commands_for(found, table, columns)
+    _, commands = _commands_for(found, table, columns)
     if radians:
         if not isinstance(found.model, SerialChain):
             raise ValueError("--radians is of arms")
@@ -369,13 +375,20 @@ def command(
 
 
 def _commands_for(
-    calibration: Calibration, table: Table, chosen: str | None = None
-) -> Array:
-    """(N, n) the commands of a calibration in a table, by name."""
-    unit = calibration.command_unit
-    return table.columns(
-        table.named(calibration.input_names, COMMANDS, chosen=chosen, unit=unit)
+    calibration: Calibration,
+    table: Table,
+    chosen: str | None = None,
+    option: str = "--columns",
+) -> tuple[tuple[str, ...], Array]:
+    """The columns of the commands of a calibration in a table, and (N, n) they hold."""
+    names = table.named(
+        calibration.input_names,
+        COMMANDS,
+        chosen=chosen,
+        option=option,
+        unit=calibration.command_unit,
     )
+    return names, table.columns(names)
 
 
 def _emit(output: Output, names: Sequence[str], values: Array) -> None:

@@ -88,7 +88,7 @@ class Selection:
 
     @property
     def efficiency(self) -> float:
-        """Against ``bound``: at least this share of the best possible value.
+        """Lower limit of the efficiency against the best selection, from ``bound``.
 
         ``exp((value - bound) / s)`` for s parameters of interest (D, Ds), else a ratio.
         """

@@ -157,6 +157,26 @@ def test_what_half_matches_is_refused(ask, command, header, message):
     assert message.replace("PREFIX", own) in said
 
 
+def test_check_and_report_take_both_by_name(ask, tmp_path):
+    rng = np.random.default_rng(5)
+    columns = {f"u_{axis}": COMMANDED[axis] for axis in AXES}
+    columns |= {axis: REACHED[axis] + rng.normal(0.0, 0.01, 12) for axis in AXES}
+    asked = "identify t.csv --outputs roll,pitch,yaw --out noisy.json --report r"
+    pytest.importorskip("jinja2")
+    assert ask(asked, columns)[0] == 0
+    off = np.stack([columns[axis] - COMMANDED[axis] for axis in AXES])
+    numbers = json.loads((tmp_path / "r" / "verdict.json").read_text())["numbers"]
+    before = np.linalg.norm(off, axis=0).mean()
+    assert numbers["nominal_mean"] == pytest.approx(before)
+    shuffled = dict([*columns.items()][i] for i in (5, 1, 4, 0, 3, 2))
+    assert ask("check noisy.json t.csv", shuffled)[0] == 0
+    alone = {axis: COMMANDED[axis] for axis in AXES}
+    code, _, said = ask("check noisy.json t.csv", alone)
+    assert code == 2 and "both would be pitch, roll, yaw; begin their names" in said
+    code, _, said = ask("check noisy.json t.csv", alone | {"u_roll": COMMANDED["yaw"]})
+    assert code == 2 and "--columns" not in said
+
+
 def test_columns_that_are_named_are_in_the_order_named(ask):
     table = {"a": REACHED["pitch"], "b": REACHED["roll"], "c": REACHED["yaw"]}
     code, out, _ = ask("command c.json t.csv --columns a,c,b", table)
