@@ -125,23 +125,23 @@ class Budget:
 
     def rows(self) -> list[list[str]]:
         """Cells of the table, its head first."""
-        head = ["", "value", *self.sources, "combined", "dof", "k"]
-        head.append(f"U ({self.confidence:.3g})")
+        head = ["", "value", f"U ({self.confidence:.3g})"]
+        head += [*self.sources, "combined", "dof", "k"]
         columns = zip(
-            self.names, self.values, self.contributions, self.combined, self.dof,
-            self.coverage_factor, self.expanded, strict=True,
+            self.names, self.values, self.expanded, self.contributions, self.combined,
+            self.dof, self.coverage_factor, strict=True,
         )  # fmt: skip
         return [head] + [
             [
                 name,
                 f"{value:.6g}",
+                f"{expanded:.3g}",
                 *(f"{part:.3g}" for part in parts),
                 f"{combined:.3g}",
                 "inf" if dof > 1e6 else f"{dof:.3g}",
                 f"{factor:.3g}",
-                f"{expanded:.3g}",
             ]
-            for name, value, parts, combined, dof, factor, expanded in columns
+            for name, value, expanded, parts, combined, dof, factor in columns
         ]
 
     def __str__(self) -> str:

@@ -30,6 +30,8 @@ __all__ = ["SCHEMA", "left_out", "moved", "report"]
 Array = NDArray[np.float64]
 Calibration = Any  # a jaxcal.Calibration, whose module imports this one
 
+_IN_UNIT = ("residual_rms", "held_out_mean", "nominal_mean", "check_tolerance")
+
 SCHEMA: dict[str, Any] = {
     "$schema": "https://json-schema.org/draft/2020-12/schema",
     "title": "jaxcal-verdict",
@@ -185,7 +187,7 @@ def report(
         document["budget_of_predictions"] = budgets[1].to_dict()
     if before is not None:
         document["moved"] = moved(calibration, before)
-    page = _page(calibration, document, budgets, readings)
+    page = _page(calibration, document, budgets, readings, at)
     written = {
         "calibration.json": content,
         "verdict.json": json.dumps(document, indent=1, allow_nan=False) + "\n",
@@ -211,9 +213,7 @@ def _of_predictions(
     std = calibration.predict_std(commands) / calibration.require_noise("budget")
     rows = [int((off**2).sum(axis=1).argmin()), int((std**2).sum(axis=1).argmax())]
     names = [
-        f"{output} as at measurement {row} ({place})"
-        for row, place in zip(rows, ("middle", "least certain"), strict=True)
-        for output in calibration.output_names
+        f"{output} at {row}" for row in rows for output in calibration.output_names
     ]
     found = budget(calibration, commands[rows], sources=sources)
     return dataclasses.replace(found, names=tuple(names))
@@ -275,6 +275,7 @@ def _page(
     document: Mapping[str, Any],
     budgets: Sequence[Budget],
     readings: tuple[ArrayLike, ArrayLike] | None,
+    at: ArrayLike | None,
 ) -> pages.Page:
     good, check = document["good"], document["of"] == "check"
     word = "good" if good else "not good"
@@ -282,10 +283,14 @@ def _page(
         word = str(document["numbers"]["check_says"])
     badge = pages.Badge(word, "good" if good else "bad")
     numbers = document["numbers"]
+    of_readings = f" {calibration.measured_unit}" if calibration.measured_unit else ""
     rows = [
-        [name.replace("_", " "), _text(value)]
+        [
+            name.replace("_", " "),
+            _text(value) + (of_readings if name in _IN_UNIT else ""),
+        ]
         for name, value in numbers.items()
-        if value not in (None, "")
+        if value is not None
     ]
     first: list[pages.Block] = [pages.Text(line) for line in document["reasons"]]
     first.append(pages.Text(f"Next: {document['next_step']}."))
@@ -294,10 +299,13 @@ def _page(
     if readings is not None:
         sections.append(_new_section(calibration, *readings))
     if "moved" in document:
-        sections.append(_moved_section(document["moved"]))
+        sections.append(_moved_section(calibration, document["moved"]))
     blocks: list[pages.Block]
     if budgets:
         of_parameters, of_predictions = (one.rows() for one in budgets)
+        if units := _units(calibration):
+            pairs = zip(of_parameters, ("unit", *units), strict=True)
+            of_parameters = [[*row, unit] for row, unit in pairs]
         note = (
             "Standard uncertainties by source (GUM), effective degrees of freedom by "
             "Welch and Satterthwaite, coverage factor k, expanded uncertainty U."
@@ -314,9 +322,14 @@ def _page(
     if budgets:
         unit = f", {calibration.measured_unit}" if calibration.measured_unit else ""
         text = (
-            f"Of the true outputs{unit}, without the noise of a reading there: what "
-            "the calibration does not know."
+            f"Of the true outputs{unit}, without the noise of a reading there; rows "
+            "are counted from 0."
         )
+        if at is None:
+            text += (
+                " Of the rows measured the first is nearest to their middle, the "
+                "second is known least."
+            )
         table = pages.Table(of_predictions[0], of_predictions[1:])
         sections.append(pages.Section("Predictions", [text, table], "predictions"))
     sections += _residual_sections(calibration)
@@ -359,7 +372,18 @@ def _new_section(
     return pages.Section("New readings", [text, pages.Table(head, rows)], "new")
 
 
-def _moved_section(rows: Sequence[Mapping[str, Any]]) -> pages.Section:
+def _units(calibration: Fit) -> tuple[str, ...]:
+    """(p,) of the parameters; empty where none is known."""
+    units = calibration.model.units_for(
+        calibration.command_unit, calibration.measured_unit
+    )
+    return units if any(units) else ()
+
+
+def _moved_section(
+    calibration: Fit, rows: Sequence[Mapping[str, Any]]
+) -> pages.Section:
+    units = dict(zip(calibration.names, _units(calibration), strict=False))
     ordered = sorted(rows, key=lambda row: -abs(row["deviations"] or 0.0))
     cells: list[list[pages.Content]] = []
     for row in ordered:
@@ -368,8 +392,10 @@ def _moved_section(rows: Sequence[Mapping[str, Any]]) -> pages.Section:
         if times is not None and abs(times) > 3.0:
             shown = pages.Strong(f"{times:+.2f}")
         values = (f"{row[key]:.6g}" for key in ("before", "after", "difference"))
-        cells.append([row["name"], *values, shown])
-    head = ("", "before", "after", "difference", "standard deviations")
+        unit = [units[row["name"]]] if units else []
+        cells.append([row["name"], *values, shown, *unit])
+    head = ["", "before", "after", "difference", "standard deviations"]
+    head += ["unit"] if units else []
     note = "The difference in its own standard deviations; beyond 3 in bold."
     return pages.Section("What moved", [pages.Table(head, cells), note], "moved")
 
@@ -448,8 +474,9 @@ def _files_section(calibration: Fit, files: Mapping[str, str]) -> pages.Section:
 # -- pictures --------------------------------------------------------------------------
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-_WIDTH, _HEIGHT = 640.0, 220.0
-_LEFT, _RIGHT, _TOP, _BOTTOM = 70.0, 12.0, 24.0, 40.0
+_WIDTH, _HEIGHT = 480.0, 230.0  # readable on a phone, which shows 330 pixels
+_LEFT, _RIGHT, _TOP, _BOTTOM = 64.0, 12.0, 46.0, 42.0
+_NAMED = 8  # columns beyond which no name is written
 
 
 def _ticks(low: float, high: float) -> list[float]:
@@ -457,7 +484,7 @@ def _ticks(low: float, high: float) -> list[float]:
     power = 10.0 ** np.floor(np.log10((high - low) / 4.0))
     step = power * max(f for f in (1.0, 2.0, 5.0) if f * power <= (high - low) / 4.0)
     first, last = np.ceil(low / step), np.floor(high / step)
-    return [float(step * i) for i in np.arange(first, last + 1.0)]
+    return [float(step * i) + 0.0 for i in np.arange(first, last + 1.0)]  # no -0
 
 
 def _scatter(
@@ -491,7 +518,8 @@ def _scatter(
     grey = 'stroke="#888" stroke-width="1"'
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" '
-        'font-family="sans-serif" font-size="12" fill="#666">'
+        f'width="{1.5 * _WIDTH:g}" height="{1.5 * _HEIGHT:g}" '
+        'font-family="sans-serif" font-size="13" fill="#666">'
     ]
     for value in _ticks(low, high):
         y = at_y(value)
@@ -507,9 +535,12 @@ def _scatter(
     parts.append(f'<text x="6" y="14">{html.escape(up)}</text>')
     for i, name in enumerate(names):
         colour = _COLOURS[i % len(_COLOURS)]
-        start = _WIDTH - _RIGHT - 110.0 * (len(names) - i)
-        label = f'<text x="{start + 8:g}" y="14">{html.escape(name)}</text>'
-        parts.append(f'<circle cx="{start:g}" cy="10" r="4" fill="{colour}"/>{label}')
+        if len(names) <= _NAMED:
+            start = 10.0 + i * (_WIDTH - _RIGHT - 10.0) / max(len(names), 3)
+            label = f'<text x="{start + 8:g}" y="34">{html.escape(name)}</text>'
+            parts.append(
+                f'<circle cx="{start:g}" cy="30" r="4" fill="{colour}"/>{label}'
+            )
         dots = zip(x, columns[:, i], strict=True)
         parts += [
             f'<circle cx="{at_x(u):.1f}" cy="{at_y(v):.1f}" r="3" fill="{colour}" '
