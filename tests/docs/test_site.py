@@ -126,7 +126,8 @@ return {
   broken: images.map(i => i.src), loaded,
   cut: [...document.querySelectorAll(".help code")].filter(
     e => e.scrollWidth > e.clientWidth + 1).map(e => e.textContent.slice(0, 40)),
-  scrolled: [...document.querySelectorAll(".md-typeset__scrollwrap, .language-text code")]
+  scrolled: [...document.querySelectorAll(
+    ".md-typeset__scrollwrap, .language-text code")]
     .filter(e => e.scrollWidth > e.clientWidth + 1)
     .map(e => e.className + e.textContent.trim().slice(0, 40)),
   wide: document.documentElement.scrollWidth - window.innerWidth,
