@@ -22,7 +22,17 @@ if TYPE_CHECKING:
     )
     from jaxcal.models import Noise, Prior
     from jaxcal.models.identifiability import identifiability
-    from jaxcal.selection import As, Design, Ds, I, Motion, Selection, select
+    from jaxcal.selection import (
+        As,
+        Design,
+        Ds,
+        I,
+        Mean,
+        Motion,
+        Selection,
+        Worst,
+        select,
+    )
 
 __all__ = [
     "As",
@@ -30,10 +40,12 @@ __all__ = [
     "Design",
     "Ds",
     "I",
+    "Mean",
     "Motion",
     "Noise",
     "Prior",
     "Selection",
+    "Worst",
     "identifiability",
     "identify",
     "log_det_information",
@@ -57,8 +69,10 @@ _HOME = {
     "Design": "jaxcal.selection",
     "Ds": "jaxcal.selection",
     "I": "jaxcal.selection",
+    "Mean": "jaxcal.selection",
     "Motion": "jaxcal.selection",
     "Selection": "jaxcal.selection",
+    "Worst": "jaxcal.selection",
     "select": "jaxcal.selection",
 }
 

@@ -14,7 +14,7 @@ from jaxcal.commands.tables import Output, TablePath
 from jaxcal.csvtable import Table, read_table
 from jaxcal.information.singular import require_excited
 from jaxcal.models import Affine, Noise
-from jaxcal.selection import Design, Selection
+from jaxcal.selection import Design, Selection, Worst
 from jaxcal.selection.criteria import CRITERIA
 
 __all__ = ["Numbers", "plan", "score", "select"]
@@ -36,6 +36,9 @@ class Asked:
     noise: Annotated[Numbers, "std of a measurement; or one per output", "S"] = None
     replicates: Annotated[int, "how often one row may be measured", "R"] = 1
     required: Annotated[Rows, "rows, counted from 0, that must be chosen", "I,J"] = None
+    scenarios: Annotated[
+        int | None, "draws of the model's parameters; the mean over them counts", "N"
+    ] = None
 
     def design(self, table: Table, of_arm: ArmOptions) -> Design:
         """Of these candidates."""
@@ -58,6 +61,7 @@ class Asked:
             available=mask,
             required=self.required,
             max_replicates=self.replicates,
+            scenarios=self.scenarios,
             names=next(iter(table.labels.values()), None),
         )
         design.axes = names
@@ -70,6 +74,7 @@ class Judged:
 
     criterion: Annotated[str | None, "D of affine models, else I", [*CRITERIA]] = None
     parameters: Annotated[Names, "of Ds and As: those of interest", "A,B"] = None
+    worst: Annotated[bool, "with --scenarios: the worst counts, not the mean"] = False
 
     def by(self) -> Any:
         """The criterion."""
@@ -79,9 +84,10 @@ class Judged:
                 "--parameters, those of interest, must be given with --criterion Ds or "
                 f"As, and with no other, got {parameters!r} with {name!r}"
             )
-        if name is None or parameters is None:
-            return name
-        return CRITERIA[name](parameters)  # type: ignore[call-arg]  # these two take them
+        criterion: Any = name
+        if name is not None and parameters is not None:
+            criterion = CRITERIA[name](parameters)  # type: ignore[call-arg]  # both do
+        return Worst(criterion) if self.worst else criterion
 
 
 @dataclasses.dataclass

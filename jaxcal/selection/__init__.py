@@ -6,7 +6,7 @@ from jaxcal.selection.batch import (
     greedy_batch,
     random_batch,
 )
-from jaxcal.selection.criteria import As, Ds, I
+from jaxcal.selection.criteria import As, Ds, I, Mean, Worst
 from jaxcal.selection.design import Design, select
 from jaxcal.selection.fastest.motion import Motion
 from jaxcal.selection.problem import Problem, make_problems
@@ -20,10 +20,12 @@ __all__ = [
     "Design",
     "Ds",
     "I",
+    "Mean",
     "Motion",
     "Problem",
     "Selection",
     "Subset",
+    "Worst",
     "exact_batch",
     "exchange_batch",
     "greedy_batch",

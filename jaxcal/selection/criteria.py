@@ -22,6 +22,7 @@ Atkinson, Donev and Tobias, Optimum Experimental Designs.
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from collections.abc import Iterable, Sequence
@@ -41,6 +42,9 @@ __all__ = [
     "Criterion",
     "Ds",
     "I",
+    "Joined",
+    "Mean",
+    "Worst",
     "criterion_of",
     "positions",
 ]
@@ -278,6 +282,149 @@ class As(_OfSome):
     """
 
     name, kind, says = "As", "trace", "trace V"
+
+
+class Joined:
+    """A criterion over scenarios: ``Mean`` or ``Worst``.
+
+    As it is asked for it carries the criterion of each scenario. ``within`` gives that
+    of one problem, with what tells its values: they are read as those of a Criterion.
+
+    Args:
+        criterion: letters of ``CRITERIA`` or an object of it; when not given the
+            design's own.
+    """
+
+    word: ClassVar[str]
+    least: ClassVar[bool]  # the worst scenario counts
+    of_efficiency: bool = False
+    each: Criterion  # of the first scenario
+
+    def __init__(self, criterion: Any = None) -> None:
+        if isinstance(criterion, Joined):
+            raise ValueError(
+                f"{type(self).__name__} must be given a criterion of one scenario, got "
+                f"{type(criterion).__name__}"
+            )
+        self.criterion = criterion
+
+    def within(self, each: Criterion) -> Self:
+        """The criterion of a problem whose first scenario has ``each``."""
+        joined = copy.copy(self)
+        joined.each = each
+        return joined
+
+    @property
+    def name(self) -> str:
+        """As it is written: "Mean(D)"."""
+        return f"{type(self).__name__}({self.each.name})"
+
+    @property
+    def says(self) -> str:
+        """What a table prints before the value."""
+        return f"{self.each.says}, {self.word}"
+
+    @property
+    def kind(self) -> str:
+        """Of the criterion of each scenario."""
+        return self.each.kind
+
+    @property
+    def larger_is_better(self) -> bool:
+        """Of the reported value."""
+        return self.of_efficiency or self.each.larger_is_better
+
+    def efficiency(self, value: float, bound: float) -> float:
+        """Share in (0, 1] of the best possible, of reported values."""
+        if self.of_efficiency:
+            return value / bound
+        return self.each.efficiency(value, bound)
+
+    def bettered(self, value: float, share: float) -> float:
+        """A reported value where every variance is smaller by ``share`` of itself."""
+        if self.of_efficiency:
+            return min(1.0, value * (1.0 + share))
+        return self.each.bettered(value, share)
+
+    def enough(self, efficiency: float) -> tuple[float, float]:
+        """A bound of at most the first times the value, plus the second, proves it."""
+        if self.of_efficiency and self.kind == "det":
+            return 1.0, -float(np.log(efficiency))
+        slope, shift = self.each.enough(efficiency)
+        return slope, self.each.times * shift
+
+    def terms(
+        self, criteria: Sequence[Criterion], optima: Array | None
+    ) -> tuple[Array, Array]:
+        """(S,) scale and shift: ``scale phi + shift`` of a scenario is what is joined.
+
+        It is the reported value, of a trace its negative. Of efficiencies e it is
+        log e (det), -1 / e (trace) or e (least), which are concave in the information.
+
+        Args:
+            criteria: (S,) of the scenarios.
+            optima: (S,) reported values that efficiencies are measured by.
+        """
+        if self.kind == "det":
+            scale = np.array([float(one.times) for one in criteria])
+            shift = scale * [one.offset for one in criteria]
+            if optima is None:
+                return scale, shift
+            rows = scale * len(criteria[0].root)
+            return scale / rows, (shift - optima) / rows
+        units = np.array([one.unit for one in criteria])
+        if self.kind == "trace":
+            scale = units * criteria[0].times
+        else:
+            scale = 1.0 / units
+        return (scale if optima is None else scale / optima), np.zeros(len(scale))
+
+    def reported(self, joined: Array | float) -> Any:
+        """The value as the caller reads it, of what ``terms`` make."""
+        if not self.of_efficiency:
+            return -joined if self.kind == "trace" else joined
+        if self.kind == "det":
+            return np.exp(joined)
+        return -1.0 / np.asarray(joined) if self.kind == "trace" else joined
+
+
+class Mean(Joined):
+    """The weighted mean over the scenarios of a criterion.
+
+    Args:
+        criterion: letters as "D", or an object that carries data, as ``I(region)``.
+    """
+
+    word, least = "mean", False
+
+
+class Worst(Joined):
+    """The criterion in the scenario where it is worst.
+
+    Args:
+        criterion: letters as "I", or an object that carries data.
+        efficiency: compare scenarios by the efficiency in each, measured by its own
+            optimum, or where that is not proven by the bound on it.
+    """
+
+    least = True
+
+    def __init__(self, criterion: Any = None, efficiency: bool = False) -> None:
+        super().__init__(criterion)
+        self.of_efficiency = bool(efficiency)
+
+    word = "worst"
+
+    @property
+    def name(self) -> str:
+        more = ", efficiency" if self.of_efficiency else ""
+        return f"Worst({self.each.name}{more})"
+
+    @property
+    def says(self) -> str:
+        if self.of_efficiency:
+            return f"least {self.each.name}-efficiency"
+        return super().says
 
 
 CRITERIA: dict[str, type[Criterion]] = {

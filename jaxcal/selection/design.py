@@ -18,6 +18,7 @@ from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.exact.exact import TIME_LIMIT, solve_exact
 from jaxcal.selection.fastest.run import fastest, pareto
+from jaxcal.selection.in_scenarios import with_optima
 from jaxcal.selection.plan import plan
 from jaxcal.selection.problem import CandidateSet, Problem, Solution, values
 from jaxcal.selection.result import Selection, Subset
@@ -49,6 +50,10 @@ class Design(CandidateSet):
             default.
         required: (r,) candidates that must be among the chosen.
         max_replicates: how often one candidate may be chosen; 1 keeps them distinct.
+        scenarios: where the nominal is a guess, parameters that the choice is judged
+            by as well: a whole number of draws from the prior (seeded), (S, p), or
+            ``(parameters, weights)``. A criterion is then ``jaxcal.Mean("D")``, as
+            letters alone are, or ``jaxcal.Worst("D")``.
         names: (M,) names of the candidates, for the answers.
 
     Raises:
@@ -102,7 +107,7 @@ class Design(CandidateSet):
         """
         given = checked_options(method, options)
         start = time.perf_counter()
-        problem = self.problem(k, criterion, region)
+        problem = with_optima(self.problem(k, criterion, region))
         found = SOLVERS[method](problem, **given)
         return self._judged(problem, found, method, start)
 
@@ -141,7 +146,7 @@ class Design(CandidateSet):
         require_none(outside, subset, f"indices must lie in [0, {count})")
         masked = ~self.available[subset]
         require_none(masked, subset, "indices must be available", ", which is masked")
-        problem = self.problem(len(subset), criterion)
+        problem = with_optima(self.problem(len(subset), criterion))
         times = np.bincount(subset, minlength=count)
         left = problem.required[times[problem.required] == 0]
         if len(left):
@@ -252,6 +257,7 @@ def select(
     available: ArrayLike | None = None,
     required: ArrayLike | None = None,
     max_replicates: int = 1,
+    scenarios: Any = None,
     names: Any = None,
     **options: Any,
 ) -> Selection:
@@ -263,10 +269,10 @@ def select(
         candidates: (M, n) commands that could be measured, or None with blocks.
         k: candidates to choose; the fewest that identify when not given.
         method: "auto", "exact", "exchange", "greedy", "random" or "policy".
-        blocks: (M, q, p) instead of candidates and model, as in
-            ``Design.from_blocks``; ``prior`` is then a (p, p) precision.
-        model, prior, noise, measured, available, required, max_replicates, names: of
-            the problem, see ``Design``.
+        blocks: (M, q, p), of scenarios (S, M, q, p), instead of candidates and model,
+            as in ``Design.from_blocks``; ``prior`` is then a (p, p) precision.
+        model, prior, noise, measured, available, required, max_replicates, scenarios,
+            names: of the problem, see ``Design``.
         criterion, region: what is best, see ``Design.select``.
         options: seed, restarts, time_limit, best, least_efficiency, checkpoint,
             decoding, num: those that the method reads, see ``Design.select``.
@@ -286,7 +292,11 @@ def select(
         got = "neither" if blocks is None else "both"
         raise ValueError(f"either candidates or blocks must be given, got {got}")
     if candidates is not None:
-        design = Design(candidates, model, **rules)
+        design = Design(candidates, model, scenarios=scenarios, **rules)
+    elif scenarios is not None:
+        raise ValueError(
+            "scenarios must come with candidates; of blocks they are (S, M, q, p)"
+        )
     elif model is not None:
         raise ValueError("model must come with candidates, not with blocks")
     else:

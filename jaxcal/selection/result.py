@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from jaxcal.checks import aligned, axis_names
 from jaxcal.information.blocks import rank_of_blocks
 from jaxcal.information.criteria import Criteria, criteria
-from jaxcal.selection.criteria import CRITERIA
-from jaxcal.selection.problem import Problem
+from jaxcal.selection.problem import Problem, ScenarioProblem
+
+if TYPE_CHECKING:
+    from jaxcal.selection.in_scenarios import InScenarios
 
 __all__ = ["BatchSelection", "Selection", "Subset"]
 
@@ -57,7 +59,7 @@ class Selection:
 
     @property
     def criterion(self) -> str:
-        """Its name in ``CRITERIA``: D, A, I, E, Ds or As."""
+        """Its name in ``CRITERIA``, D, A, I, E, Ds or As; of scenarios "Mean(D)"."""
         return self.problem.criterion.name
 
     @property
@@ -93,6 +95,15 @@ class Selection:
         ``exp((value - bound) / s)`` for s parameters of interest (D, Ds), else a ratio.
         """
         return self.problem.criterion.efficiency(self.value, self.bound)
+
+    @cached_property
+    def in_scenarios(self) -> InScenarios | None:
+        """Its efficiency in each scenario; None where there is one only."""
+        if not isinstance(self.problem, ScenarioProblem):
+            return None
+        from jaxcal.selection.in_scenarios import in_scenarios
+
+        return in_scenarios(self.problem, self.indices)
 
     @cached_property
     def criteria(self) -> Criteria:
@@ -131,6 +142,19 @@ class Selection:
             "reason": self.reason,
             "seconds": self.seconds,
             "seed": self.seed,
+            **self._of_scenarios(),
+        }
+
+    def _of_scenarios(self) -> dict[str, Any]:
+        """Of ``to_dict``."""
+        if self.in_scenarios is None:
+            return {}
+        fields = vars(self.in_scenarios).items()
+        return {
+            "in_scenarios": {
+                name: None if value is None else value.tolist()
+                for name, value in fields
+            }
         }
 
     def _axes(self) -> tuple[str, ...]:
@@ -161,13 +185,16 @@ class Selection:
         count = int(self.problem.available.sum())
         side = "upper" if self.problem.criterion.larger_is_better else "lower"
         best = "proven optimal" if self.proven else f"{side} bound {self.bound:.6g}"
+        share = f"{self.criterion}-efficiency"
+        if self.in_scenarios is not None:
+            share = "efficiency"
         extra = "" if self.seed is None else f", seed {self.seed}"
         lines = [
             f"{len(self.indices)} of {count} candidates, method {self.method}",
             *aligned([head, *cells]),
-            f"{CRITERIA[self.criterion].says:13} {self.value:.6g} ({best})",
-            f"{self.criterion + '-efficiency':13} {self.efficiency:.6f}"
-            + ("" if self.proven else " or more"),
+            f"{self.problem.criterion.says:13} {self.value:.6g} ({best})",
+            f"{share:13} {self.efficiency:.6f}" + ("" if self.proven else " or more"),
+            *(() if self.in_scenarios is None else self.in_scenarios.summary()),
             f"{'without one':13} {self._lost()}",
             f"time          {1e3 * self.seconds:.3g} ms{extra}",
         ]

@@ -13,6 +13,7 @@ cdef class Search:
     cdef Py_ssize_t[::1] order  # (best,) the row of ``best_counts`` of each
     cdef double[::1] room  # which holds all that is a pointer below
     cdef int most_moved  # counts of a Newton step
+    cdef bint lent  # the largest work space is that of a JointSearch
     cdef double* blocks  # (M, q, p)
     cdef double* prior  # (p, p)
     cdef double* root  # C (s, p)
@@ -95,7 +96,27 @@ cdef class Search:
     cdef double _at(self, int kind, const double* low, const double* c) noexcept nogil
     cdef void _spread(self, const double* low, const double* high, double* c) noexcept nogil
     cdef double _relax(self, int kind, double* low, double* high, double* c, double goal, double share) except? -1.0 nogil
+    cdef double _worth(self, const double* counts) noexcept nogil
     cdef void _offer(self, const double* counts) noexcept nogil
     cdef bint _balance(self, const double* low, const double* high, double* c) noexcept nogil
     cdef void _stiffen(self, const double* c) noexcept nogil
     cdef Py_ssize_t _process(self, double* low, double* high, double* c, double slack, double share, double* bound) except -2 nogil
+
+
+cdef class JointSearch(Search):
+    cdef list keep  # a Search of each scenario
+    cdef Py_ssize_t[::1] addresses  # (S,) of them: a call takes no reference
+    cdef void** members  # the same
+    cdef bint least_counts  # the least, else the mean
+    cdef double[::1] weights_of  # (S,), as are the rest
+    cdef double[::1] scale
+    cdef double[::1] shift
+    cdef double[::1] mixture  # of sum 1: the weights, or of the smoothed least
+    cdef double[::1] worth  # scale phi + shift
+    cdef double[::1] bases  # what the bounds of the scenarios add up from
+    cdef int _kind_of(self, const double* low) noexcept nogil
+    cdef double _at(self, int kind, const double* low, const double* c) noexcept nogil
+    cdef double _worth(self, const double* counts) noexcept nogil
+    cdef double _evaluate(self, int kind) noexcept nogil
+    cdef void _leverages(self) noexcept nogil
+    cdef void _hessian(self, int kind, int m) noexcept nogil

@@ -65,14 +65,18 @@ from cython.cimports.jaxcal.selection.kinds import DET, LEAST, SUBSET, TRACE
 from cython.cimports.jaxcal.watch import begin, late
 from cython.cimports.libc.math import INFINITY, exp, fabs, floor, log, log1p, sqrt
 
-__all__ = ["Search"]
+__all__ = ["JointSearch", "Search"]
 
 _KINDS = {"det": DET, "subset": SUBSET, "trace": TRACE, "least": LEAST}
 # Sharper forms of DET and TRACE, which compiled functions read.
 _RANK = cython.declare(cython.int, 4)
 _RANK_TRACE = cython.declare(cython.int, 5)
+# Of several scenarios: their mean, and what is smoothed, their least or a mean of E.
+_JOINT = cython.declare(cython.int, 6)
+_SMOOTHED = cython.declare(cython.int, 7)
 
 _EPS = cython.declare(cython.double, 2.0**-52)
+_UNSEEN = cython.declare(cython.double, 1e-12)  # a share of the mixture left out
 
 _SOLVED = cython.declare(cython.double, 1e-11)  # a bound this near the value is solved
 _CLOSE = cython.declare(cython.double, 0.05)  # share of the way to the goal left open
@@ -108,6 +112,7 @@ class Search:
         best_counts,
         best_values,
         order,
+        lent=False,
     ):
         # Arrays are C-contiguous float64; the best (best, M) and (best,) are written.
         # (A docstring here would be a global symbol of C, of which a module that holds
@@ -118,6 +123,7 @@ class Search:
         self.best_counts, self.best_values = best_counts, best_values
         self.useful, self.order = useful, order
         self.most_moved = min(self.count, _FRACTIONAL + 2 * self.p + 4)
+        self.lent = lent
         self.whole = np.empty(3 + 5 * self.p, dtype=np.intc)
         self.which, self.free = np.empty((2, self.most_moved), dtype=np.intp)
         self.open = np.empty(self.count, dtype=np.intp)
@@ -135,6 +141,9 @@ class Search:
         p, m, square = self.p, self.most_moved, self.p * self.p
         wide: cython.Py_ssize_t = m * self.q
         crossed = max(wide * wide, m * p * (p + 1) // 2)
+        table: cython.Py_ssize_t = m * m
+        if self.lent:  # by a JointSearch
+            wide = crossed = table = 0
         self.blocks = take(at, self.count * self.q * p)  # as given, in this order
         self.prior, self.root = take(at, square), take(at, self.s * p)
         self.known, self.rest = take(at, square), take(at, square)
@@ -152,7 +161,7 @@ class Search:
         self.leverage, self.wish = take(at, self.count), take(at, self.count)
         self.picked, self.turned = take(at, wide * p), take(at, wide * p)
         self.crossed, self.bent = take(at, crossed), take(at, crossed)
-        self.curvature, self.face = take(at, m * m), take(at, m * m)
+        self.curvature, self.face = take(at, table), take(at, table)
         self.ends, self.move = take(at, m), take(at, m)
         self.before, self.slope = take(at, m), take(at, m)
         self.least, self.most = take(at, m), take(at, m)
@@ -724,7 +733,7 @@ class Search:
                     tunes -= 1
                     sharper: cython.bint = self._choose_mu(self._best_place())
                     kind = _RANK_TRACE if sharper else TRACE
-            elif kind == LEAST and not solved:
+            elif (kind == LEAST or kind == _SMOOTHED) and not solved:
                 changed = gain <= 0.3 * (self.base - value)
                 if changed and self.smoothing >= _SHARPEST:
                     break
@@ -763,13 +772,17 @@ class Search:
 
     # --- branching ------------------------------------------------------------------
 
+    def _worth(self, counts):
+        """phi of a selection; -inf where it is singular."""
+        self._sum(cython.NULL, counts, self.prior, self.gram)
+        self.smoothing = INFINITY  # E itself
+        return self._evaluate(self.kind)
+
     def _offer(self, counts):
         """Insert a selection into the sorted list of the best, once."""
         best = self.best_values
         place: cython.Py_ssize_t = best.shape[0] - 1
-        self._sum(cython.NULL, counts, self.prior, self.gram)
-        self.smoothing = INFINITY  # E itself
-        value = self._evaluate(self.kind)
+        value = self._worth(counts)
         if not value > best[place]:
             return
         for r in range(best.shape[0]):
@@ -1013,3 +1026,152 @@ class Search:
                     begun[(1 - side) * m + branch] = split + side
                     size += self._balance(begun, begun + m, begun + 2 * m)
         return size, done, going
+
+
+class JointSearch(Search):
+    """A choice in several scenarios: the weighted mean of their phi, or the least.
+
+    The mean is concave and so is its relaxation. The least is smoothed,
+    ``-log(sum of exp(-b phi_s)) / b``, whose gradient mixes those of the scenarios: a
+    mixture of their bounds is a bound, whatever b is. phi of a scenario counts as
+    ``scale phi + shift``.
+    """
+
+    def join(self, members, weights, scale, shift, least):
+        # A Search each, made with ``lent``, over the same candidates.
+        count: cython.Py_ssize_t = len(members)
+        s: cython.Py_ssize_t
+        self.keep, self.least_counts = list(members), least
+        self.addresses = np.zeros(count, dtype=np.intp)
+        self.weights_of = np.array(weights, dtype=np.float64)
+        self.scale, self.shift = np.array([scale, shift], dtype=np.float64)
+        self.mixture, self.worth, self.bases = np.zeros((3, count))
+        for s in range(count):
+            member: Search = self.keep[s]
+            member.open, member.which = self.open, self.which
+            member.picked, member.turned = self.picked, self.turned
+            member.crossed, member.bent = self.crossed, self.bent
+            member.curvature = self.face
+            self.addresses[s] = cython.cast(
+                cython.Py_ssize_t, cython.cast(cython.p_void, member)
+            )
+        self.members = cython.cast(
+            cython.pointer(cython.p_void), cython.address(self.addresses[0])
+        )
+
+    def _kind_of(self, low):
+        smoothed: cython.bint = self.least_counts
+        self.smoothing = _SMOOTHING
+        for s in range(self.addresses.shape[0]):
+            kind: cython.int = cython.cast(Search, self.members[s])._kind_of(low)
+            cython.cast(Search, self.members[s]).now = kind
+            if kind == LEAST:
+                smoothed = True
+        return _SMOOTHED if smoothed else _JOINT
+
+    def _at(self, kind, low, c):
+        size = self.p * self.p
+        for s in range(self.addresses.shape[0]):
+            cython.cast(Search, self.members[s])._sum(
+                low, c, cython.NULL, cython.cast(Search, self.members[s]).rest
+            )
+            gram, known, rest = (
+                cython.cast(Search, self.members[s]).gram,
+                cython.cast(Search, self.members[s]).known,
+                cython.cast(Search, self.members[s]).rest,
+            )
+            for a in range(size):
+                gram[a] = known[a] + rest[a]
+        return self._evaluate(kind)
+
+    def _worth(self, counts):
+        self.smoothing = INFINITY
+        for s in range(self.addresses.shape[0]):
+            cython.cast(Search, self.members[s]).now = cython.cast(
+                Search, self.members[s]
+            ).kind
+            cython.cast(Search, self.members[s])._sum(
+                cython.NULL,
+                counts,
+                cython.cast(Search, self.members[s]).prior,
+                cython.cast(Search, self.members[s]).gram,
+            )
+        return self._evaluate(_JOINT)
+
+    def _evaluate(self, kind):
+        """The joined value, the mixture of the scenarios, and the base of a bound."""
+        lowest: cython.double = INFINITY
+        value: cython.double = 0.0
+        total: cython.double = 0.0
+        for s in range(self.addresses.shape[0]):
+            cython.cast(Search, self.members[s]).smoothing = self.smoothing
+            value = cython.cast(Search, self.members[s])._evaluate(
+                cython.cast(Search, self.members[s]).now
+            )
+            if not value > -INFINITY:
+                return -INFINITY
+            self.worth[s] = self.scale[s] * value + self.shift[s]
+            self.bases[s] = (
+                self.scale[s] * cython.cast(Search, self.members[s]).base
+                + self.shift[s]
+            )
+            lowest = min(lowest, self.worth[s])
+        for s in range(self.addresses.shape[0]):
+            share: cython.double = self.weights_of[s]
+            if self.least_counts:
+                apart = self.worth[s] - lowest
+                share = exp(-self.smoothing * apart) if apart > 0.0 else 1.0
+            self.mixture[s] = share
+            total += share
+        value = lowest - log(total) / self.smoothing
+        seen: cython.double = 0.0
+        for s in range(self.addresses.shape[0]):
+            self.mixture[s] /= total
+            if self.mixture[s] < _UNSEEN:
+                self.mixture[s] = 0.0
+            seen += self.mixture[s]
+        if not self.least_counts:
+            value = 0.0
+        self.base = 0.0
+        for s in range(self.addresses.shape[0]):
+            self.mixture[s] /= seen
+            self.base += self.mixture[s] * self.bases[s]
+            if not self.least_counts:
+                value += self.mixture[s] * self.worth[s]
+        return value
+
+    def _leverages(self):
+        for o in range(self.opened):
+            self.leverage[self.open[o]] = 0.0
+        for s in range(self.addresses.shape[0]):
+            share = self.mixture[s] * self.scale[s]
+            if share > 0.0:
+                cython.cast(Search, self.members[s]).opened = self.opened
+                cython.cast(Search, self.members[s])._leverages()
+                one = cython.cast(Search, self.members[s]).leverage
+                for o in range(self.opened):
+                    self.leverage[self.open[o]] += share * one[self.open[o]]
+
+    def _hessian(self, kind, m):
+        out, one = self.curvature, self.face
+        for a in range(m * m):
+            out[a] = 0.0
+        for s in range(self.addresses.shape[0]):
+            share = self.mixture[s] * self.scale[s]
+            if not share > 0.0:
+                continue
+            cython.cast(Search, self.members[s])._hessian(
+                cython.cast(Search, self.members[s]).now, m
+            )
+            for a in range(m * m):
+                out[a] += share * one[a]
+            if not self.least_counts:
+                continue
+            weight = self.smoothing * self.mixture[s]
+            own, ends = cython.cast(Search, self.members[s]).leverage, self.ends
+            for i in range(m):
+                at = self.which[i]
+                ends[i] = self.scale[s] * own[at] - self.leverage[at]
+            for i in range(m):
+                for j in range(m):
+                    out[i * m + j] += weight * ends[i] * ends[j]

@@ -17,10 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.selection.exact.branch_and_bound import branch_and_bound
+from jaxcal.selection.exact.branch_and_bound import (
+    BranchResult,
+    Scenario,
+    branch_and_bound,
+    joint_branch_and_bound,
+)
 from jaxcal.selection.exact.volume import largest_volumes
 from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
-from jaxcal.selection.problem import Problem, Solution, values
+from jaxcal.selection.problem import Problem, ScenarioProblem, Solution, values
 
 __all__ = ["TIME_LIMIT", "relaxed", "solve", "solve_auto", "solve_exact", "upper_bound"]
 
@@ -136,17 +141,10 @@ def solve_exact(
         np.add.reduceat(each[keep], first)
         for each in (problem.lower, problem.upper, counts)
     )
-    searched = branch_and_bound(
-        problem.blocks[keep[first]],
-        problem.prior,
-        problem.criterion,
-        low,
-        np.minimum(high, problem.k),
-        begun,
-        best,
-        deadline,
-        enough,
-    )
+    searched = _branched(
+        problem, keep[first], low, np.minimum(high, problem.k), begun,
+        best=best, deadline=deadline, enough=enough,
+    )  # fmt: skip
     subsets = [_expand(problem, keep, first, each) for each in searched.counts]
     bound = None if searched.proven else searched.bound
     return _found(problem, subsets, best, bound, searched.nodes)
@@ -177,16 +175,24 @@ def relaxed(problem: Problem, start: Indices, deadline: float | None = None) -> 
     """Upper bound on phi of the criterion, from a selection (k,) to climb from."""
     keep = np.flatnonzero(problem.available)
     counts = np.bincount(start, minlength=len(problem.blocks))
-    return branch_and_bound(
-        problem.blocks[keep],
-        problem.prior,
-        problem.criterion,
-        problem.lower[keep],
-        problem.upper[keep],
-        counts[keep],
-        deadline=deadline,
-        root_only=True,
-    ).bound
+    rules = problem.lower[keep], problem.upper[keep], counts[keep]
+    return _branched(problem, keep, *rules, deadline=deadline, root_only=True).bound
+
+
+def _branched(
+    problem: Problem, keep: Indices, *rules: Any, **options: Any
+) -> BranchResult:
+    """Branch and bound over the candidates ``keep``, in all scenarios."""
+    if not isinstance(problem, ScenarioProblem):
+        blocks, criterion = problem.blocks[keep], problem.criterion
+        return branch_and_bound(blocks, problem.prior, criterion, *rules, **options)
+    scenarios = [
+        Scenario(member.blocks[keep], member.prior, member.criterion)
+        for member in problem.members
+    ]
+    joined, weights = problem.joined, problem.weights
+    terms = problem.terms()
+    return joint_branch_and_bound(scenarios, joined, weights, terms, *rules, **options)
 
 
 def _pool(problem: Problem, hull: bool) -> Indices:
@@ -291,7 +297,9 @@ def _groups(problem: Problem, merge: bool) -> tuple[Indices, Indices]:
     """
     keep = np.flatnonzero(problem.available)
     if merge:
-        flat = problem.raw[keep].reshape(len(keep), -1)
+        members = getattr(problem, "members", (problem,))
+        raw = [member.raw[keep].reshape(len(keep), -1) for member in members]
+        flat = np.concatenate(raw, axis=1) if len(raw) > 1 else raw[0]
         total = np.sort(flat.sum(axis=1))
         if (total[1:] == total[:-1]).any():  # otherwise no two are equal
             label = np.unique(flat, axis=0, return_inverse=True)[1]

@@ -13,12 +13,14 @@ still because two are equal.
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal import compiled
-from jaxcal.selection.problem import Problem, Solution, values
+from jaxcal.selection.criteria import Criterion
+from jaxcal.selection.problem import Problem, ScenarioProblem, Solution, values
 
 __all__ = [
     "Climbs",
@@ -90,7 +92,13 @@ def default_restarts(problem: Problem) -> int:
     if problem.criterion.kind == "least":
         most = 100
     count, q, p = problem.blocks.shape
-    work = _WORK.get(problem.criterion.name, _WORK["other"])
+    name = problem.criterion.name
+    if isinstance(problem, ScenarioProblem):
+        name = problem.joined.each.name
+        count *= len(problem.members)
+    work = _WORK.get(name, _WORK["other"])
+    if name == "E" and isinstance(problem, ScenarioProblem):
+        most = 2  # a swap takes eigenvalues in every scenario
     return int(min(max(work / ((problem.k + 8) * count * q * q * p), 1.0), most))
 
 
@@ -98,24 +106,38 @@ class Climbs:
     """A problem as the compiled kernel takes it; E is grown and climbed as A."""
 
     def __init__(self, problem: Problem, seed: int, deadline: float | None) -> None:
-        kernel = compiled.kernel("jaxcal.selection.exchange.exchange_kernel")
         self._required, self._deadline = problem.required, deadline
-        criterion, (_, q, p) = problem.criterion, problem.blocks.shape
-        root = criterion.root
-        if criterion.form == "subset":  # variances near 1
-            root = root / np.linalg.norm(root, axis=1, keepdims=True)
-        form = "trace" if criterion.form == "least" else criterion.form
+        _, q, p = problem.blocks.shape
         self.share = _SHARE * min(1.0, problem.k * q / p) ** 6
-        self._climber = kernel.Climber(
-            form,
-            *map(np.ascontiguousarray, (problem.blocks, problem.prior, root)),
-            problem.available.view(np.uint8),
-            min(problem.max_replicates, problem.k),
-            problem.required,
-            problem.k,
-            seed,
-        )
+        self._terms: tuple[tuple[Array, Array], ...] = ()  # of the swaps that raise E
+        if isinstance(problem, ScenarioProblem):
+            self._climber = self._joint(problem, seed)
+        else:
+            self._climber = _climber(problem, seed)
         self.random_start = self._climber.random_start  # (k,), the required first
+
+    def _joint(self, problem: ScenarioProblem, seed: int) -> Any:
+        """The climbers of the scenarios, joined."""
+        kernel = compiled.kernel("jaxcal.selection.exchange.exchange_kernel")
+        members = [_climber(member, seed) for member in problem.members]
+        joint = kernel.JointClimber(members, problem.weights, problem.joined.least)
+        scale, shift = problem.terms()
+        if problem.joined.kind == "det":
+            lengths = [_lengths(member.criterion) for member in problem.members]
+            shift = shift - 2.0 * scale * [np.log(row).sum() for row in lengths]
+        else:  # values near 1
+            whole = [member.criterion.root for member in problem.members]
+            size = np.array([(root * root).sum() for root in whole])
+            share = problem.available.sum() / problem.k
+            if problem.joined.kind == "least":
+                of_traces = 1.0 / scale
+                of_traces = of_traces / (problem.weights @ (of_traces * size) * share)
+                scale = scale / (problem.weights @ scale / share)
+                self._terms = (of_traces, shift), (scale, shift)
+            else:
+                scale = scale / (problem.weights @ (scale * size) * share)
+        joint.weigh(scale, shift)
+        return joint
 
     def _seconds(self) -> float:
         """Left until the deadline."""
@@ -127,6 +149,8 @@ class Climbs:
         self, start: Indices, share: float = 0.0, swaps: int = 1
     ) -> tuple[Indices, float]:
         """``start`` completed and climbed, required first, and its phi; 2 climbs E."""
+        if self._terms:
+            self._climber.weigh(*self._terms[swaps == 2])
         found: tuple[Indices, float]
         found = self._climber.climb(start, share, swaps, self._seconds())
         return found
@@ -166,6 +190,30 @@ class Climbs:
         more = [self.random_start() for _ in range(min(most, restarts - many))]
         found = [self.climbed(start, swaps=2) for start in (*starts[order], *more)]
         return max(found, key=lambda each: each[1])
+
+
+def _lengths(criterion: Criterion) -> Array:
+    """(s,) by which combinations are divided for a kernel: variances near 1."""
+    if criterion.form == "subset":
+        return np.asarray(np.linalg.norm(criterion.root, axis=1))
+    return np.ones(len(criterion.root))
+
+
+def _climber(problem: Problem, seed: int) -> Any:
+    """The kernel's of one scenario; E is climbed as A."""
+    kernel = compiled.kernel("jaxcal.selection.exchange.exchange_kernel")
+    criterion, root = problem.criterion, problem.criterion.root
+    if criterion.form == "subset":
+        root = root / _lengths(criterion)[:, None]
+    return kernel.Climber(
+        "trace" if criterion.form == "least" else criterion.form,
+        *map(np.ascontiguousarray, (problem.blocks, problem.prior, root)),
+        problem.available.view(np.uint8),
+        min(problem.max_replicates, problem.k),
+        problem.required,
+        problem.k,
+        seed,
+    )
 
 
 def exchange_indices(

@@ -79,8 +79,40 @@ cdef class Climber:
     cdef void _fill(self, Py_ssize_t size) noexcept nogil
     cdef double _finish(self, bint climbs) except? -2.0 nogil
     cdef double _climb(self, bint least) except? -2.0 nogil
+    cdef void _take_out(self, Py_ssize_t out) noexcept nogil
     cdef Py_ssize_t _replacement(self, Py_ssize_t out, double rise) noexcept nogil
     cdef double _least(self) noexcept nogil
+    cdef bint _bound_without(self, Py_ssize_t at) noexcept nogil
+    cdef Py_ssize_t _next(self, double least) noexcept nogil
+    cdef Py_ssize_t _strongest(self, Py_ssize_t at, double* found) noexcept nogil
+
+@cython.final
+cdef class JointClimber:
+    cdef list climbers
+    cdef Climber lead  # the first of them: what is chosen, and the clock
+    cdef Py_ssize_t[::1] addresses  # (S,) of the climbers: a call takes no reference
+    cdef void** members  # the same
+    cdef void* first
+    cdef bint least  # the least counts, else the mean
+    cdef double[::1] weights  # (S,), as are the next four
+    cdef double[::1] scale
+    cdef double[::1] shift
+    cdef double[::1] phi  # of the chosen
+    cdef double[::1] after  # of those after a swap
+    cdef double[::1] total  # (WIDE,)
+    cdef double[::1] ahead  # (groups WIDE,) bounds on E in the first scenario
+    cdef void _set_known(self, double share, double ridge) noexcept nogil
+    cdef double _join(self, const double* phi) noexcept nogil
+    cdef double _evaluate(self, Py_ssize_t size, bint trial) noexcept nogil
+    cdef void _refresh(self) noexcept nogil
+    cdef void _carry(self, Py_ssize_t came, Py_ssize_t went) noexcept nogil
+    cdef void _totals(self, Py_ssize_t c, bint swaps) noexcept nogil
+    cdef int _grow(self, Py_ssize_t size, double share) except -1 nogil
+    cdef Py_ssize_t _best(self, bint swaps, double most) noexcept nogil
+    cdef double _finish(self, bint climbs) except? -2.0 nogil
+    cdef double _least_eigenvalue(self) noexcept nogil
+    cdef double _climb(self, bint eigenvalue) except? -2.0 nogil
+    cdef bint _betters(self, Py_ssize_t e, double* found) noexcept nogil
     cdef Py_ssize_t _strongest(self, Py_ssize_t at, double* found) noexcept nogil
 
 cdef void _weigh(double* into, double* weights, double* rows, Py_ssize_t count) noexcept nogil

@@ -51,9 +51,9 @@ from cython.cimports.jaxcal.information.linear_algebra import (
 from cython.cimports.jaxcal.selection.exchange.exchange_kernel import WIDE
 from cython.cimports.jaxcal.selection.kinds import DET, SUBSET, TRACE
 from cython.cimports.jaxcal.watch import begin, late
-from cython.cimports.libc.math import INFINITY, fabs
+from cython.cimports.libc.math import INFINITY, fabs, log
 
-__all__ = ["Climber"]
+__all__ = ["Climber", "JointClimber"]
 
 _KINDS = {"det": DET, "subset": SUBSET, "trace": TRACE}
 
@@ -312,6 +312,10 @@ class Climber:
                     value = found
                     best[:] = self.chosen
         return np.asarray(best), value
+
+    def wide(self):
+        """Candidates, in whole groups."""
+        return self.groups * WIDE
 
     def random_start(self):
         """(k,) the required, then others at random."""
@@ -680,11 +684,10 @@ class Climber:
                 self._carry(best, out)
         return value
 
-    def _replacement(self, out, rise):
-        """Who raises phi most in the place of ``out``, by over ``rise``; -1: none."""
+    def _take_out(self, out):
+        """B_i V, B_i X, D_ii and H_ii of the candidate that goes out."""
         q, p = self.q, self.p
         g, e = out // WIDE, out % WIDE
-        taken: cython.double = 0.0
         for m in range(self.parts):
             multiply(False, False, q, p, p, cython.address(self.blocks[out, 0, 0]),
                      self.now + m * p * p, self.tall + 2 * m * q * p)  # fmt: skip
@@ -692,6 +695,12 @@ class Climber:
                 self.at_out[m * q * q + a] = self.grown[
                     (2 * g + m) * self.size + a * WIDE + e
                 ]
+
+    def _replacement(self, out, rise):
+        """Who raises phi most in the place of ``out``, by over ``rise``; -1: none."""
+        q = self.q
+        taken: cython.double = 0.0
+        self._take_out(out)
         for r in range(q):
             taken += self.at_out[r * q + r] / q
         most: cython.double = rise if self.kind == TRACE else 1.0 + rise
@@ -725,6 +734,43 @@ class Climber:
 
     def _strongest(self, at, found):
         """Who in place ``at`` gives the largest E, over ``found``; -1: none."""
+        p = self.p
+        gram, rest = self.gram, self.rest
+        if not self._bound_without(at):
+            return -1
+        best: cython.Py_ssize_t = -1
+        while True:
+            e = self._next(found[0])
+            if e < 0:
+                return best
+            copy(gram, rest, p * p)
+            self._add(e)
+            lower = self.lower
+            for a in range(p * p):
+                lower[a] = gram[a] - found[0] * self.metric[a]
+            if cholesky(lower, lower, p, 0.0) > -INFINITY:
+                value = self._least()
+                if value > found[0]:
+                    best, found[0] = e, value
+
+    def _next(self, least):
+        """The candidate of the largest bound over ``least``, each once; -1: none."""
+        g: cython.Py_ssize_t = 0
+        for c in range(1, self.groups):
+            if self.tops[2 * c] > self.tops[2 * g]:
+                g = c
+        if not self.tops[2 * g] > least:
+            return -1
+        bound = self.bounds + g * WIDE
+        e: cython.Py_ssize_t = 0
+        while bound[e] != self.tops[2 * g]:
+            e += 1
+        bound[e] = -INFINITY
+        self.tops[2 * g] = _largest(bound)
+        return g * WIDE + e
+
+    def _bound_without(self, at):
+        """Bound E with each candidate in place ``at``; false where all are singular."""
         p, q = self.p, self.q
         gram, rest = self.gram, self.rest
         self._sum(self.k, at)
@@ -733,7 +779,7 @@ class Climber:
             gram[a * p + a] += _SLIGHT
         value = self._least()
         if not value > -INFINITY:
-            return -1
+            return False
         # A block of q readings leaves the variances after the q largest no smaller.
         cap = 1.0 / self.values[p - 1 - q] if q < p else INFINITY
         strong = self.small + (p - 1) * p
@@ -753,26 +799,354 @@ class Climber:
             for j in range(WIDE):
                 bound[j] = min(bound[j], cap) - closed[j]
             self.tops[2 * c] = _largest(bound)
+        return True
+
+
+class JointClimber:
+    """One choice in several scenarios, the mean or the least of whose phi counts.
+
+    phi of a scenario counts as ``scale phi + shift``. What is chosen, and which may be
+    chosen once more, is the first climber's; the others hold V, X and what follows.
+
+    Args:
+        climbers: a ``Climber`` each, of one shape, with the same rules.
+        weights: (S,) of the mean; ignored where the least counts.
+        least: whether the least counts.
+    """
+
+    def __init__(self, climbers, weights, least):
+        count: cython.Py_ssize_t = len(climbers)
+        s: cython.Py_ssize_t
+        self.climbers, self.least = list(climbers), least
+        self.addresses = np.zeros(count, dtype=np.intp)
+        self.weights = np.array(weights, dtype=np.float64)
+        self.scale, self.shift = np.ones(count), np.zeros(count)
+        self.phi, self.after = np.zeros((2, count))
+        self.total = np.zeros(WIDE)
+        self.ahead = np.zeros(climbers[0].wide())
+        self.lead = climbers[0]
+        for s in range(count):
+            member: Climber = self.climbers[s]
+            member.chosen = self.lead.chosen
+            self.addresses[s] = cython.cast(
+                cython.Py_ssize_t, cython.cast(cython.p_void, member)
+            )
+        self.members = cython.cast(
+            cython.pointer(cython.p_void), cython.address(self.addresses[0])
+        )
+        self.first = self.members[0]
+
+    def weigh(self, scale, shift):
+        """Let phi of the scenarios count as ``scale phi + shift``, (S,) both."""
+        self.scale = np.array(scale, dtype=np.float64)
+        self.shift = np.array(shift, dtype=np.float64)
+
+    def climb(self, start, share, swaps, seconds):
+        """See ``Climber.climb``."""
+        lead: Climber = self.lead
+        lead.watch = begin(seconds)
+        size: cython.Py_ssize_t = len(start)
+        kept: cython.double = share
+        how: cython.int = swaps
+        value: cython.double = 0.0
+        for r in range(size):
+            lead.chosen[r] = start[r]
+        with cython.nogil:
+            lead._clear()
+            for c in range(size):
+                lead._count(lead.chosen[c], 1)
+            if how == 2:
+                self._set_known(0.0, 0.0)
+                value = self._climb(True)
+            else:
+                self._grow(size, kept)
+                value = self._finish(how)
+        return np.array(lead.chosen), value
+
+    def random_climbs(self, count, chosen, phi, seconds):
+        """See ``Climber.random_climbs``."""
+        lead: Climber = self.lead
+        lead.watch = begin(seconds)
+        best: cython.Py_ssize_t[::1] = np.array(chosen)
+        value: cython.double = phi
+        starts: cython.Py_ssize_t = count
+        with cython.nogil:
+            for _ in range(starts):
+                if late(cython.address(lead.watch)) and value > -INFINITY:
+                    break
+                lead._random_start()
+                found = self._finish(1)
+                if found > value + 1e-10 * max(1.0, fabs(value)) or not (
+                    value > -INFINITY
+                ):
+                    value = found
+                    best[:] = lead.chosen
+        return np.asarray(best), value
+
+    def random_start(self):
+        """(k,) the required, then others at random."""
+        return self.lead.random_start()
+
+    def value(self, chosen):
+        """The joined phi of a selection (k,), and (S,) that of each scenario."""
+        lead: Climber = self.lead
+        for r in range(len(chosen)):
+            lead.chosen[r] = chosen[r]
+        self._set_known(0.0, 0.0)
+        value = self._evaluate(lead.k, False)
+        return value, np.array(self.phi)
+
+    # --- the joined phi -------------------------------------------------------------
+
+    def _set_known(self, share, ridge):
+        for s in range(self.addresses.shape[0]):
+            cython.cast(Climber, self.members[s])._set_known(share, ridge)
+
+    def _join(self, phi):
+        """The mean, or the least, of (S,) phi."""
+        value: cython.double = INFINITY if self.least else 0.0
+        for s in range(self.addresses.shape[0]):
+            if self.least:
+                value = min(value, phi[s])
+            else:
+                value += self.weights[s] * phi[s]
+        return value
+
+    def _evaluate(self, size, trial):
+        """The joined phi of the first ``size`` chosen; fills V and X of each."""
+        for s in range(self.addresses.shape[0]):
+            into = cython.cast(Climber, self.members[s]).now
+            if trial:
+                into = cython.cast(Climber, self.members[s]).trial
+            value = cython.cast(Climber, self.members[s])._evaluate(size, into)
+            if not value > -INFINITY:
+                return -INFINITY
+            value = self.scale[s] * value + self.shift[s]
+            if trial:
+                self.after[s] = value
+            else:
+                self.phi[s] = value
+        phi = self.after if trial else self.phi
+        return self._join(cython.address(phi[0]))
+
+    def _refresh(self):
+        for s in range(self.addresses.shape[0]):
+            cython.cast(Climber, self.members[s])._refresh()
+
+    def _carry(self, came, went):
+        """After a swap, or where ``went`` is -1 one more, judged by ``_evaluate``."""
+        for s in range(self.addresses.shape[0]):
+            self.phi[s] = self.after[s]
+            cython.cast(Climber, self.members[s])._carry(came, went)
+
+    def _totals(self, c, swaps):
+        """The joined phi with each of a group, alone or in the place that is left."""
+        total = cython.address(self.total[0])
+        for j in range(WIDE):
+            total[j] = INFINITY if self.least else 0.0
+        for s in range(self.addresses.shape[0]):
+            kind = cython.cast(Climber, self.members[s]).kind
+            gain = cython.cast(Climber, self.members[s]).alone + c * WIDE
+            if swaps:
+                cython.cast(Climber, self.members[s])._swaps(c)
+                gain = cython.cast(Climber, self.members[s]).gain
+            scale, phi, weight = self.scale[s], self.phi[s], self.weights[s]
+            for j in range(WIDE):
+                rise: cython.double = gain[j]
+                if kind != TRACE:
+                    rise = log(rise) if rise > 1e-300 else -INFINITY
+                rise = phi + scale * rise
+                if self.least:
+                    total[j] = min(total[j], rise)
+                else:
+                    total[j] += weight * rise
+
+    # --- greedy and exchange, as of a Climber ---------------------------------------
+
+    def _grow(self, size, share):
+        """Complete the first ``size`` chosen, the largest joined phi first."""
+        k = cython.cast(Climber, self.first).k
+        if size == k:
+            return 0
+        self._set_known(share, 0.0)
+        self._evaluate(size, False)
+        self._refresh()
+        while True:
+            if late(cython.address(cython.cast(Climber, self.first).watch)):
+                cython.cast(Climber, self.first)._fill(size)
+                return 0
+            best = self._best(False, -INFINITY)
+            if best < 0:
+                cython.cast(Climber, self.first)._fill(size)
+                return 0
+            cython.cast(Climber, self.first).chosen[size] = best
+            cython.cast(Climber, self.first)._count(best, 1)
+            size += 1
+            if size == k:
+                return 0
+            self._evaluate(size, True)
+            self._carry(best, -1)
+
+    def _best(self, swaps, most):
+        """Which candidate gives the largest joined phi above ``most``; -1: none."""
+        best: cython.Py_ssize_t = -1
+        total = cython.address(self.total[0])
+        for c in range(cython.cast(Climber, self.first).groups):
+            self._totals(c, swaps)
+            j = _best_of(
+                total, cython.cast(Climber, self.first).closed + c * WIDE, most
+            )
+            if j >= 0:
+                best, most = c * WIDE + j, total[j]
+        return best
+
+    def _finish(self, climbs):
+        """The joined phi of the chosen, climbed; swaps may mend a singular start."""
+        value: cython.double = 0.0
+        for attempt in range(5):
+            ridge: cython.double = 0.0
+            if attempt % 2:
+                ridge = _RIDGE if attempt == 1 else 1e-4 * _RIDGE
+            self._set_known(0.0, ridge)
+            if not climbs:
+                return self._evaluate(cython.cast(Climber, self.first).k, False)
+            value = self._climb(False)
+            if ridge == 0.0 and value > -INFINITY:
+                break
+        return value
+
+    def _least_eigenvalue(self):
+        """The joined E of the grams of all, -inf where one is singular."""
+        for s in range(self.addresses.shape[0]):
+            value = cython.cast(Climber, self.members[s])._least()
+            if not value > -INFINITY:
+                return -INFINITY
+            self.after[s] = self.scale[s] * value + self.shift[s]
+        return self._join(cython.address(self.after[0]))
+
+    def _climb(self, eigenvalue):
+        """Swap each chosen for its best replacement until none helps; the value."""
+        k = cython.cast(Climber, self.first).k
+        fixed = cython.cast(Climber, self.first).fixed
+        value: cython.double = 0.0
+        if eigenvalue:
+            for s in range(self.addresses.shape[0]):
+                cython.cast(Climber, self.members[s])._sum(k, -1)
+            value = self._least_eigenvalue()
+        else:
+            value = self._evaluate(k, False)
+        if k == fixed or not value > -INFINITY:
+            return value
+        if not eigenvalue:
+            self._refresh()
+        position, since, swaps = fixed, 0, 0
+        tried = cython.address(cython.cast(Climber, self.first).tried[0])
+        chosen = cython.address(cython.cast(Climber, self.first).chosen[0])
+        for i in range(cython.cast(Climber, self.first).tried.shape[0]):
+            tried[i] = -1
+        while since < k - fixed and swaps < _MOST_SWAPS * k:
+            if late(cython.address(cython.cast(Climber, self.first).watch)):
+                break
+            at, out, after = position, chosen[position], value
+            since += 1
+            position = position + 1 if position + 1 < k else fixed
+            if tried[out] == swaps:  # another measurement of the same
+                continue
+            tried[out] = swaps
+            rise = _IMPROVES * max(1.0, fabs(value))
+            if eigenvalue:
+                after += max(_LIFTS * fabs(value), rise)
+                best = self._strongest(at, cython.address(after))
+            else:
+                for s in range(self.addresses.shape[0]):
+                    cython.cast(Climber, self.members[s])._take_out(out)
+                best = self._best(True, value + rise)
+                if best == out:
+                    best = -1
+            if best < 0:
+                continue
+            chosen[at] = best
+            if not eigenvalue:
+                after = self._evaluate(k, True)
+                if not after > value + rise:  # the formulas promised more
+                    chosen[at] = out
+                    continue
+            value, since = after, 0
+            swaps += 1
+            cython.cast(Climber, self.first)._count(out, -1)
+            cython.cast(Climber, self.first)._count(best, 1)
+            if not eigenvalue:
+                self._carry(best, out)
+        return value
+
+    def _strongest(self, at, found):
+        """Who in place ``at`` gives the largest joined E, over ``found``; -1: none."""
+        groups = cython.cast(Climber, self.first).groups
+        bounds = cython.cast(Climber, self.first).bounds
+        tops = cython.cast(Climber, self.first).tops
+        for s in range(self.addresses.shape[0]):
+            if not cython.cast(Climber, self.members[s])._bound_without(at):
+                return -1
+            bound = cython.cast(Climber, self.members[s]).bounds
+            scale, shift, weight = self.scale[s], self.shift[s], self.weights[s]
+            for i in range(groups * WIDE):
+                value: cython.double = scale * bound[i] + shift
+                if s == 0:
+                    self.ahead[i] = value
+                if not self.least:
+                    value *= weight
+                if s == 0:
+                    bounds[i] = value
+                elif self.least:
+                    bounds[i] = min(bounds[i], value)
+                else:
+                    bounds[i] += value
+        for c in range(groups):
+            tops[2 * c] = _largest(bounds + c * WIDE)
         best: cython.Py_ssize_t = -1
         while True:
-            g: cython.Py_ssize_t = 0
-            for c in range(1, self.groups):
-                if self.tops[2 * c] > self.tops[2 * g]:
-                    g = c
-            if not self.tops[2 * g] > found[0]:
+            e = cython.cast(Climber, self.first)._next(found[0])
+            if e < 0:
                 return best
-            bound = self.bounds + g * WIDE
-            e: cython.Py_ssize_t = 0
-            while bound[e] != self.tops[2 * g]:
-                e += 1
-            bound[e] = -INFINITY
-            self.tops[2 * g] = _largest(bound)
-            copy(gram, rest, p * p)
-            self._add(g * WIDE + e)
-            lower = self.lower
-            for a in range(p * p):
-                lower[a] = gram[a] - found[0] * self.metric[a]
-            if cholesky(lower, lower, p, 0.0) > -INFINITY:
-                value = self._least()
-                if value > found[0]:
-                    best, found[0] = g * WIDE + e, value
+            if self._betters(e, found):
+                best = e
+
+    def _betters(self, e, found):
+        """Whether the joined E with candidate e is over ``found``, which then is it.
+
+        Bounds give way to values one scenario after the other, until it cannot be.
+        """
+        total: cython.double = INFINITY if self.least else 0.0
+        for s in range(self.addresses.shape[0]):
+            if not self.least:
+                ahead = (
+                    self.scale[s] * cython.cast(Climber, self.members[s]).bounds[e]
+                    + self.shift[s]
+                )
+                total += self.weights[s] * (self.ahead[e] if s == 0 else ahead)
+        for s in range(self.addresses.shape[0]):
+            copy(
+                cython.cast(Climber, self.members[s]).gram,
+                cython.cast(Climber, self.members[s]).rest,
+                cython.cast(Climber, self.members[s]).p
+                * cython.cast(Climber, self.members[s]).p,
+            )
+            cython.cast(Climber, self.members[s])._add(e)
+            value = cython.cast(Climber, self.members[s])._least()
+            if not value > -INFINITY:
+                return False
+            value = self.scale[s] * value + self.shift[s]
+            if self.least:
+                total = min(total, value)
+            else:
+                ahead = (
+                    self.scale[s] * cython.cast(Climber, self.members[s]).bounds[e]
+                    + self.shift[s]
+                )
+                total += self.weights[s] * (
+                    value - (self.ahead[e] if s == 0 else ahead)
+                )
+            if not total > found[0]:
+                return False
+        found[0] = total
+        return True

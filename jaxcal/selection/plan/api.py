@@ -28,15 +28,17 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import array_of, levels, one_of, whole_number
 from jaxcal.information.blocks import largest_rank
 from jaxcal.models.uncertainty import Noise
-from jaxcal.selection.criteria import positions
+from jaxcal.selection.criteria import Mean, positions
 from jaxcal.selection.exchange.exchange import greedy_indices
 from jaxcal.selection.plan.designs import (
+    Case,
     best_design,
     lower_bound,
     region_root,
     variances_of,
 )
 from jaxcal.selection.problem import CandidateSet, Problem
+from jaxcal.selection.problem.scenario_problem import joined_problem
 from jaxcal.selection.problem.sources import shares_regressor
 from jaxcal.selection.solvers import checked_seed
 
@@ -163,8 +165,14 @@ def plan(
     one_of("criterion", criterion, tuple(_SUMMARIES))
     more, start = whole_number("more", more, 0), checked_seed(seed)
     how = "I" if criterion == "I" else "G"
-    request = _request(design, criterion, accuracy, noise_std, parameters, region)
-    problem, points, unit = request.problem, request.points, request.unit
+    given = criterion, accuracy, noise_std, parameters, region
+    requests = [_request(one, *given) for one in design.each()]
+    request = requests[0]
+    cases = [Case(one.problem, one.points) for one in requests]
+    unit, problem = request.unit, request.problem
+    if design.scenarios is not None:
+        each, weights = [case.problem for case in cases], design.scenarios.weights
+        problem = joined_problem(each, weights, Mean("D"), None)
     total, (identify, least_k) = problem.k, _fewest(problem)
     if max_k is None:
         max_k = min(total, max(_LARGEST_K, least_k))
@@ -173,19 +181,21 @@ def plan(
         raise ValueError(
             f"max_k must not exceed the {total} measurements allowed, got {max_k}"
         )
-    root = region_root(points, how)
+    roots = [region_root(case.points, how) for case in cases]
 
     @functools.cache
     def bound_of(k: int) -> float:
         if k == total:  # there is one design only
             every = np.repeat(np.arange(len(problem.blocks)), problem.upper)
-            return float(variances_of(problem, every, points, how).max())
-        return lower_bound(problem, root, k)
+            return float(variances_of(cases, every, how).max())
+        return max(
+            lower_bound(case.problem, root, k)
+            for case, root in zip(cases, roots, strict=True)
+        )
 
     def best(k: int, previous: Indices | None) -> tuple[Indices, Array]:
-        one = dataclasses.replace(problem, k=k)
-        found = best_design(one, points, how, previous, start)
-        return found, variances_of(one, found, points, how)
+        indices = best_design(problem.of_size(k), cases, how, previous, start)
+        return indices, variances_of(cases, indices, how)
 
     rows: list[PlanRow] = []
     chosen: PlanRow | None = None
@@ -318,7 +328,7 @@ def _fewest(problem: Problem) -> tuple[int, int]:
     least = k = max(1, len(problem.required) - (-missing // most))
     if problem.blocks.shape[1] > 1:
         while k < problem.k and np.isneginf(
-            problem.log_det(greedy_indices(dataclasses.replace(problem, k=k)))
+            problem.log_det(greedy_indices(problem.of_size(k)))
         ):
             k += 1
     return least, k

@@ -14,8 +14,8 @@ free (Kiefer and Wolfowitz 1960). Source: Pukelsheim, Optimal Design of Experime
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from jaxcal.selection.exact.exact import relaxed
 from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
 from jaxcal.selection.problem import Problem
 
-__all__ = ["best_design", "lower_bound", "region_root", "variances_of"]
+__all__ = ["Case", "best_design", "lower_bound", "region_root", "variances_of"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -39,15 +39,25 @@ _D_RESTARTS = 50  # of the exchange that looks for the D-optimal selection
 _ITERATIONS = 300  # of the weights of G: any count gives a true bound
 
 
-def variances_of(problem: Problem, indices: Indices, points: Array, how: str) -> Array:
-    """(s,) the criterion of each output of a design; inf where it is singular.
+class Case(NamedTuple):
+    """One scenario of the problem, or all there is."""
+
+    problem: Problem  # whitened blocks and prior
+    points: Array  # (R, s, p) whitened rows of the region
+
+
+def variances_of(cases: Sequence[Case], indices: Indices, how: str) -> Array:
+    """(s,) the criterion of each output in the scenario where it is worst.
 
     Args:
-        problem: whitened blocks and prior.
-        indices: (k,) the design.
-        points: (R, s, p) whitened rows of the region.
+        cases: the scenarios.
+        indices: (k,) the design; inf where it is singular.
         how: "G" or "I".
     """
+    return np.asarray(np.max([_variances(*case, indices, how) for case in cases], 0))
+
+
+def _variances(problem: Problem, points: Array, indices: Indices, how: str) -> Array:
     rows = problem.blocks[indices].reshape(-1, points.shape[-1])
     if problem.prior.any():
         size, vectors = np.linalg.eigh(problem.prior)
@@ -60,7 +70,7 @@ def variances_of(problem: Problem, indices: Indices, points: Array, how: str) ->
 
 def best_design(
     problem: Problem,
-    points: Array,
+    cases: Sequence[Case],
     how: str,
     previous: Indices | None,
     seed: int,
@@ -69,17 +79,17 @@ def best_design(
 
     Args:
         problem: candidates, limits and k.
-        points: (R, s, p) whitened rows of the region.
+        cases: its scenarios.
         how: the criterion, "G" or "I".
         previous: (k - 1,) the design of one measurement less.
         seed: of exchange and of the random starts.
     """
     best = exchange_indices(problem, _D_RESTARTS, seed)
-    value = variances_of(problem, best, points, how).max()
+    value = variances_of(cases, best, how).max()
     starts = [best, greedy_indices(problem)]
     if previous is not None:
         more = _room(problem, previous)
-        values = _after(problem, previous, [None], more, points, how)[0]
+        values = _worst_after(cases, previous, [None], more, how)[0]
         starts.append(np.append(previous, more[int(values.argmin())]))
     rng = np.random.default_rng([seed, problem.k])
     room = np.repeat(np.arange(len(problem.blocks)), problem.upper - problem.lower)
@@ -87,21 +97,21 @@ def best_design(
         some = rng.permutation(room)[: problem.k - len(problem.required)]
         starts.append(np.concatenate([problem.required, some]))
     for start in starts:
-        indices, reached = _exchange(problem, start, points, how)
+        indices, reached = _exchange(problem, start, cases, how)
         if reached < value * (1.0 - 1e-12):
             best, value = indices, reached
     return np.sort(best)
 
 
 def _exchange(
-    problem: Problem, start: Indices, points: Array, how: str
+    problem: Problem, start: Indices, cases: Sequence[Case], how: str
 ) -> tuple[Indices, float]:
     """Swap one posture at a time, the best swap first, until none lowers the criterion.
 
     The required candidates stay, one measurement of each. A singular start stays too.
     """
     chosen = np.array(start)
-    value = variances_of(problem, chosen, points, how).max()
+    value = variances_of(cases, chosen, how).max()
     while np.isfinite(value):
         fixed = [int(np.flatnonzero(chosen == i)[0]) for i in problem.required]
         free = np.setdiff1d(np.arange(len(chosen)), fixed)
@@ -109,23 +119,37 @@ def _exchange(
         more = _room(problem, chosen)
         if not len(free) or not len(more):
             break
-        values = _after(problem, chosen, list(chosen[free]), more, points, how)
+        values = _worst_after(cases, chosen, list(chosen[free]), more, how)
         i, j = divmod(int(values.argmin()), len(more))
         tried = chosen.copy()
         tried[free[i]] = more[j]
-        reached = variances_of(problem, tried, points, how).max()
+        reached = variances_of(cases, tried, how).max()
         if not reached < value * (1.0 - 1e-9):
             break
         chosen, value = tried, reached
     return chosen, value
 
 
-def _after(
-    problem: Problem,
+def _worst_after(
+    cases: Sequence[Case],
     chosen: Indices,
     out: list[int | None],
     new: Indices,
+    how: str,
+) -> Array:
+    """(out, new) criterion of the worst scenario after a swap, see ``_after``."""
+    worst = _after(*cases[0], chosen, out, new, how)
+    for case in cases[1:]:
+        worst = np.maximum(worst, _after(*case, chosen, out, new, how))
+    return worst
+
+
+def _after(
+    problem: Problem,
     points: Array,
+    chosen: Indices,
+    out: list[int | None],
+    new: Indices,
     how: str,
 ) -> Array:
     """(out, new) criterion after taking one out (None: nothing) and one in.

@@ -3,5 +3,14 @@
 from jaxcal.selection.problem.candidate_set import CandidateSet
 from jaxcal.selection.problem.making import make_problems
 from jaxcal.selection.problem.problem import Problem, Solution, log_dets, values
+from jaxcal.selection.problem.scenario_problem import ScenarioProblem
 
-__all__ = ["CandidateSet", "Problem", "Solution", "log_dets", "make_problems", "values"]
+__all__ = [
+    "CandidateSet",
+    "Problem",
+    "ScenarioProblem",
+    "Solution",
+    "log_dets",
+    "make_problems",
+    "values",
+]

@@ -18,7 +18,7 @@ from jaxcal.information.blocks import coarseness
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, answered, as_model, by_name
 from jaxcal.models.uncertainty import Noise, Prior
-from jaxcal.selection.criteria import criterion_of
+from jaxcal.selection.criteria import Criterion, Joined, Mean, criterion_of
 from jaxcal.selection.problem.making import (
     check_available,
     filled,
@@ -26,6 +26,8 @@ from jaxcal.selection.problem.making import (
     usable_numbers,
 )
 from jaxcal.selection.problem.problem import Problem
+from jaxcal.selection.problem.scenario_problem import joined_problem
+from jaxcal.selection.problem.scenarios import Scenarios, checked_weights, scenarios_of
 from jaxcal.selection.problem.sources import (
     BlockSource,
     ModelSource,
@@ -47,6 +49,7 @@ class CandidateSet:
     noise: Noise | None  # as given, or the model's own
     names: tuple[str, ...] | None  # (M,) of the candidates, the caller's own
     axes: tuple[str, ...] | None  # (n,) of the inputs, the caller's own
+    scenarios: Scenarios | None  # None: the nominal alone
 
     def __init__(
         self,
@@ -59,6 +62,7 @@ class CandidateSet:
         required: ArrayLike | None = None,
         max_replicates: int = 1,
         *,
+        scenarios: Any = None,
         names: Sequence[str] | None = None,
     ) -> None:
         if model is not None:
@@ -81,17 +85,24 @@ class CandidateSet:
         noise = self.model.default_noise() if noise is None else noise
         self._set_rules(prior, noise, measured, required, max_replicates)
         self.names, self.axes = _labels(candidates, names)
+        self.scenarios = None
+        if scenarios is not None:
+            self.scenarios = scenarios_of(scenarios, self.model, prior)
         self._leave_unanswered()
         self.candidates.flags.writeable = False
 
     def _leave_unanswered(self) -> None:
         """Mask candidates for which the model fails; a warning names them."""
         assert self.model is not None and self.candidates is not None
-        rows = np.flatnonzero(self.available)
         mean = None if self.prior is None else self.prior.resolve(self.model).mean
-        names = None if self.names is None else [self.names[i] for i in rows]
-        kept = answered(self.model, self.candidates[rows], mean, names)
-        self.available[rows[~kept]] = False
+        cases = [mean]
+        if self.scenarios is not None and self.scenarios.parameters is not None:
+            cases += list(self.scenarios.parameters)
+        for parameters in cases:
+            rows = np.flatnonzero(self.available)
+            names = [str(i) if self.names is None else self.names[i] for i in rows]
+            kept = answered(self.model, self.candidates[rows], parameters, names)
+            self.available[rows[~kept]] = False
 
     @classmethod
     def from_blocks(
@@ -106,27 +117,36 @@ class CandidateSet:
         *,
         commands: ArrayLike | None = None,
         names: Sequence[str] | None = None,
+        weights: ArrayLike | None = None,
     ) -> Self:
         """The problem of information blocks, of any model.
 
         Args:
             blocks: (M, q, p); candidate i gives q readings, ``y = B_i theta + noise``
                 with noise of unit variance, and adds ``B_i.T @ B_i`` to the
-                information.
+                information. Or (S, M, q, p), those of S scenarios.
             prior: (p, p) precision of what is known beforehand; nothing by default.
             noise: of the readings, where it is not of unit variance.
-            measured: (N, q, p) blocks that were measured already.
+            measured: (N, q, p) blocks that were measured already, of scenarios
+                (S, N, q, p).
             available, required, max_replicates, names: as for candidates.
             commands: (M, n) of the candidates, for travel between them and for tables.
+            weights: (S,) of the scenarios, of sum 1; equal when not given.
         """
         if isinstance(prior, Prior):
             raise ValueError(
                 "prior must be a (p, p) precision with blocks, got a Prior"
             )
-        array = filled("blocks", blocks, "M", "q", "p")
+        shape = ("S", "M", "q", "p") if np.ndim(blocks) == 4 else ("M", "q", "p")
+        array = filled("blocks", blocks, *shape)
         design = object.__new__(cls)
-        design.model, design.candidates = None, None
-        design.available = check_available(available, array.shape[:1])
+        design.model, design.candidates, design.scenarios = None, None, None
+        design.available = check_available(available, array.shape[-3:-2])
+        if array.ndim == 4:
+            design.scenarios = Scenarios(None, checked_weights(weights, len(array)))
+            array = np.moveaxis(array, 1, 0)
+        elif weights is not None:
+            raise ValueError("weights must come with blocks (S, M, q, p) of scenarios")
         design._blocks = usable_numbers("blocks", array, design.available)
         design._coarse = coarseness(blocks)
         if commands is not None:
@@ -136,6 +156,12 @@ class CandidateSet:
             )
             design.candidates.flags.writeable = False
         design._set_rules(prior, noise, measured, required, max_replicates)
+        seen = design._measured
+        if seen is not None and array.ndim == 4 and len(seen) != array.shape[1]:
+            raise ValueError(
+                "measured must have shape (S, N, q, p), blocks of every scenario, got "
+                f"{seen.shape}"
+            )
         design.names, design.axes = _labels(array, names)
         return design
 
@@ -155,8 +181,39 @@ class CandidateSet:
                 model and blocks, else I.
             region: of I, where it is given by its letter.
         """
+        joined = criterion if isinstance(criterion, Joined) else Mean(criterion)
         default = "I" if self.model and not self.model.multiplicity else "D"
-        criterion = criterion_of(criterion, region, default)
+        of_one = criterion_of(joined.criterion, region, default)
+        if self.scenarios is None:
+            return self._problem(k, of_one)
+        members = []
+        for s, one in enumerate(self.each()):
+            try:
+                members.append(one._problem(k, of_one))
+            except ValueError as error:
+                raise ValueError(f"in scenario {s}: {error}") from None
+        nominal = None if self.model is None else self._problem(k, of_one)
+        return joined_problem(members, self.scenarios.weights, joined, nominal)
+
+    def each(self) -> list[Self]:
+        """The candidates in each scenario alone; where there are none, as they are."""
+        if self.scenarios is None:
+            return [self]
+        alone = []
+        for s in range(len(self.scenarios.weights)):
+            one = copy.copy(self)
+            one.scenarios = None
+            if self.scenarios.parameters is not None:
+                one._parameters = self.scenarios.parameters[s]
+            if self._blocks is not None:
+                one._blocks = np.ascontiguousarray(self._blocks[:, s])
+                if self._measured is not None:
+                    one._measured = self._measured[s]
+            alone.append(one)
+        return alone
+
+    def _problem(self, k: int | None, criterion: Criterion) -> Problem:
+        """The problem of one scenario, or at the nominal."""
         source = self.source(criterion.by_name, criterion.of_region)
         raw, root = source.blocks(), source.root
         if self._measured is not None:
@@ -189,7 +246,10 @@ class CandidateSet:
         if of_predictions and prior is None:
             misfit = model.misfit_std
             model = model.with_misfit() if misfit else model
-        return ModelSource(model, candidates, self.available, prior, self.noise, misfit)
+        return ModelSource(
+            model, candidates, self.available, prior, self.noise, misfit,
+            self._parameters,
+        )  # fmt: skip
 
     def with_noise(self, noise: Noise | None) -> Self:
         """The same with other noise."""
@@ -210,6 +270,7 @@ class CandidateSet:
         # Copies: the caller's arrays may change before the next question.
         self._measured = None if measured is None else numbers("measured", measured)
         self._required = copy.deepcopy(required)
+        self._parameters: Array | None = None  # of one scenario; None: the nominal's
         self.max_replicates = max_replicates
 
 

@@ -13,6 +13,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,6 @@ from numpy.typing import NDArray
 from jaxcal.information.blocks import Whitened, rank_of_blocks
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model
-from jaxcal.selection.criteria import Criterion
 
 __all__ = ["Problem", "Solution", "log_dets", "values"]
 
@@ -44,7 +44,7 @@ class Problem:
     available: Mask  # (M,) True where a candidate may be chosen
     required: Indices  # (r,) candidates that must be chosen, r <= k
     max_replicates: int  # how often one candidate may be chosen
-    criterion: Criterion  # in the same coordinates
+    criterion: Any  # Criterion, or Joined of several scenarios, in the same coordinates
     multiplicity: int  # how often log det of the blocks counts
     raw: Array  # (M, q, p) blocks in the caller's numbers, at most p readings each
     readings: Array  # (M, Q, p) these with every reading, as ``raw`` where q is Q
@@ -145,6 +145,14 @@ class Problem:
         of_blocks = 2.0 * p * math.sqrt(float(error @ error) / least)
         return _EPS * (of_blocks + len(rows) * largest / least)
 
+    def of_size(self, k: int) -> Self:
+        """The same with k candidates to choose."""
+        return dataclasses.replace(self, k=k)
+
+    def values(self, indices: Indices) -> tuple[Array, Array]:
+        """Reported value of the criterion, and log det S, of subsets (R, k)."""
+        return values_of_one(self, indices)
+
     def log_det(self, indices: Indices) -> float:
         """log det S of a subset, natural, in the caller's units; -inf if singular."""
         blocks = self.raw[np.asarray(indices)[None]]
@@ -177,6 +185,11 @@ def log_dets(problems: Sequence[Problem], indices: Indices) -> Array:
 
 
 def values(problem: Problem, indices: Indices) -> tuple[Array, Array]:
+    """Reported value of the criterion, and log det S, of subsets (R, k): (R,) each."""
+    return problem.values(indices)
+
+
+def values_of_one(problem: Problem, indices: Indices) -> tuple[Array, Array]:
     """Reported value of the criterion, and log det S, of subsets (R, k): (R,) each."""
     log_det = rank_of_blocks(problem.raw[indices], problem.root, problem.white.size)[1]
     log_det *= problem.multiplicity

@@ -127,6 +127,7 @@ class ModelSource(Source):
         prior: Prior | None,
         noise: Noise | None,
         misfit: float = 0.0,
+        parameters: Array | None = None,
     ) -> None:
         model = model.prepared(candidates[available])
         self._model, self._candidates, self._available = model, candidates, available
@@ -136,6 +137,8 @@ class ModelSource(Source):
         self._prior = model.default_prior() if prior is None else prior
         known = self._prior.resolve(model)
         self._mean, self._free = known.mean, known.free
+        if parameters is not None:  # of a scenario; what came last is not told
+            self._mean = np.append(parameters, known.mean[len(parameters) :])
         pairs = zip(model.names, known.free, strict=True)
         self.names = tuple(name for name, free in pairs if free)
         self._precision = known.precision[np.ix_(known.free, known.free)]
