@@ -1,8 +1,9 @@
 """From measurements to a calibration: ``identify`` and the ``Calibration`` it returns.
 
-``fit`` holds what was found and predicts; ``calibration`` adds ``check``, the
-``inverse``, the summary and the ``file``. ``identify`` checks arguments, ``estimate``
-makes the fit of them, ``solve`` is its search, for every model.
+``identify`` checks the arguments, ``fit_model`` makes a problem of them and of its
+solution the fields of a calibration; ``least_squares`` is the search, for every model,
+and ``prior_scales`` how large a machine's errors are. ``fit`` holds what was found and
+predicts; ``calibration`` adds ``check``, the ``inverse``, the summary and the ``file``.
 """
 
 from jaxcal.calibration.budget import Budget, Source

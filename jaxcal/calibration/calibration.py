@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from jaxcal.calibration import file
 from jaxcal.calibration.budget import budget
 from jaxcal.calibration.check import check, verification
-from jaxcal.calibration.estimate import fit_model
 from jaxcal.calibration.file import save, to_dict
 from jaxcal.calibration.fit import Fit
+from jaxcal.calibration.fit_model import fit_model
 from jaxcal.calibration.inverse import command_for
 from jaxcal.calibration.report import report
 from jaxcal.checks import aligned, in_words

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxcal.calibration.fit import Fit
 from jaxcal.files import write_text
-from jaxcal.models.kinds import from_dict
+from jaxcal.models.from_dict import from_dict
 from jaxcal.models.model import Model, as_model
 
 __all__ = ["fields", "read", "save", "to_dict"]

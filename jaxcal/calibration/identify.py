@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.calibration import Calibration
-from jaxcal.calibration.estimate import fit_model, require_fitting
+from jaxcal.calibration.fit_model import fit_model, require_fitting
 from jaxcal.checks import (
     array_of,
     axis_names,

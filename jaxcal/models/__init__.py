@@ -2,10 +2,10 @@
 
 from jaxcal.models.affine import Affine
 from jaxcal.models.differences import Differences
+from jaxcal.models.from_dict import from_dict
 from jaxcal.models.from_jax import FromJax
 from jaxcal.models.function import FromFunction
 from jaxcal.models.identifiability import Direction, Identifiability, identifiability
-from jaxcal.models.kinds import from_dict
 from jaxcal.models.linear import Linear, Polynomial
 from jaxcal.models.model import Model
 from jaxcal.models.sensors import (

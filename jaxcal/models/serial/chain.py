@@ -420,7 +420,7 @@ class SerialChain(Arm, Model):
         Raises:
             ValueError: the arm never stood still; it says how the joints jitter.
         """
-        from jaxcal.models.serial.bags import at_rest, jitter, joint_states
+        from jaxcal.models.serial.recordings import at_rest, jitter, joint_states
 
         times, joints = joint_states(path, self.joint_names)
         turns = np.array(self.command_units) == "deg"
@@ -549,7 +549,7 @@ class SerialChain(Arm, Model):
                 others are not; a gear ratio was found, which none can hold.
             FileExistsError: there is a file and ``force`` is not given.
         """
-        from jaxcal.models.serial.written import written
+        from jaxcal.models.serial.arm_files import written
 
         ratios, yields, waves = self._drives(as_parameters(self, parameters))
         for i in np.flatnonzero(ratios != 1.0):

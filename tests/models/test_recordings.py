@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxcal.models import SerialChain
-from jaxcal.models.serial.bags import at_rest
+from jaxcal.models.serial.recordings import at_rest
 
 from .arms import CONTACTS
 

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.sizes import Sizes, group_sizes, misfit_size, of_sizes
-from jaxcal.calibration.solve import (
-    Solution,
-    Task,
+from jaxcal.calibration.least_squares import (
+    FitProblem,
+    FitSolution,
     singular,
     solve,
     student_constants,
     whiten,
+)
+from jaxcal.calibration.prior_scales import (
+    PriorScales,
+    covariance_of_scales,
+    group_scales,
+    misfit_scale,
 )
 from jaxcal.checks import one_of, require_kind
 from jaxcal.information.singular import exact_zeros, null_directions, significant
@@ -67,46 +72,32 @@ def fit_model(
     """The fields of a ``Calibration`` but names, units and provenance."""
     one_of("loss", loss, ("student", "gaussian"))
     require_kind("prior", prior, Prior)
-    rows = np.flatnonzero(weights > 0.0)
-    once = np.zeros_like(weights)
-    first = rows[model.distinct(commands[rows], measured[rows])]
-    once[first] = weights[first]
-    weights = once
-    used = weights > 0.0
-    if not used.any():
-        raise ValueError("weights must be positive for one measurement at least")
+    weights = _of_distinct(model, commands, measured, weights)
     noise = noise or Noise()
-    known = noise.std is not None or noise.covariance is not None
-    white, reading_std = _of_readings(noise, weights, measured.shape[1])
     spread = _of_commands(noise, commands, measured.shape[1])
-    outputs = np.arange(measured.shape[1])
     if spread.any() and model.relative:
         raise ValueError(
             "command_std must not be given with a Pose: the orientations are "
             "compared with those of the commands given; raise the std of the noise"
         )
+    used = weights > 0.0
     model = model.prepared(commands[used], measured[used])
-    usual, levels = model.default_noise(), outputs
-    if usual is not None and not known:
-        of_reading = np.broadcast_to(np.asarray(usual.std), outputs.shape)
-        white = white / (of_reading if white.ndim == 2 else of_reading[:, None])
-        reading_std = reading_std * of_reading
-        levels = np.unique(of_reading, return_inverse=True)[1]  # positions and turns
+    white, reading_std, levels = _of_readings(model, noise, weights, measured.shape[1])
     if common_noise or spread.any():
-        levels = 0 * outputs
+        levels = 0 * levels
     elif common_noise is False:
-        levels = outputs
-    asked = prior is not None
-    whole, bent = model, model
-    if not (asked or spread.any()):
-        bent = model.with_misfit()
+        levels = np.arange(len(levels))
+    fitted, with_misfit = model, model
+    if prior is None and not spread.any():
+        with_misfit = model.with_misfit()
         if model.fits_misfit:
-            whole = bent
-    prior = prior or whole.default_prior()
-    resolved = prior.resolve(whole)
-    centre, to_centred = _centre(whole, commands, weights, resolved, spread)
-    task = Task(
-        model=whole,
+            fitted = with_misfit
+    scaled = prior is not None or not spread.any()  # as far as the prior wants it
+    prior = prior or fitted.default_prior()
+    resolved = prior.resolve(fitted)
+    centre, to_centred = _centre(fitted, commands, weights, resolved, spread)
+    problem = FitProblem(
+        model=fitted,
         commands=commands[used] - (0.0 if centre is None else centre),
         measured=measured[used],
         white=white[used],
@@ -115,57 +106,100 @@ def fit_model(
         precision=np.diagonal(resolved.precision),
         free=resolved.free,
         command_std=spread,
-        known=known,
+        noise_known=noise.std is not None or noise.covariance is not None,
         levels=levels,
         student=loss == "student",
     )
-    sizes: Sizes | None = None
-    times = 1.0
-    if prior.by_data and (asked or not spread.any()):
-        if whole.error_groups() is None or spread.any():
+    scales: PriorScales | None = None
+    misfit_factor = 1.0
+    if prior.by_data and scaled:
+        if fitted.error_groups() is None or spread.any():
             raise ValueError("Prior.sized() is of arms, without command_std")
-        found, sizes, scaled = _sized(task)
-        if bent is not whole:
-            gain, times = misfit_size(bent, task, found, sizes)
-            if gain > _TOLD:
-                whole = bent
-                resolved = bent.default_prior().resolve(bent)
-                task = dataclasses.replace(
-                    task,
-                    model=bent,
-                    mean=resolved.mean,
-                    precision=np.diagonal(resolved.precision),
-                    free=resolved.free,
-                )
-                found, sizes, scaled = _sized(task)
-        task = scaled
+        fit, misfit_factor = _solve_with_misfit(problem, with_misfit)
+        solution, scales, problem = fit
     else:
-        found = solve(task)
-    if common_noise is None and usual is not None and _levels_differ(task, found):
-        apart = dataclasses.replace(task, levels=outputs)
-        other = solve(apart, found)
-        if other.freedom.min() >= 1.0:
-            task, found = apart, other
-    fields = _fields(task, found, commands, measured, weights, centre)
+        solution = solve(problem)
+    if common_noise is None and model.default_noise() is not None:
+        problem, solution = _with_levels_apart(problem, solution)
+    fields = _fields(problem, solution, commands, measured, weights, centre)
     if fields["joint_covariance"] is not None:
-        within = fields["joint_covariance"].copy()
-        if sizes is not None:
-            fields["joint_covariance"] += of_sizes(task, found, sizes)
-        if bent is not whole:
-            fields |= _misfit(bent, task, found, fields, within, times)
+        by_noise = fields["joint_covariance"].copy()
+        if scales is not None:
+            added = covariance_of_scales(problem, solution, scales)
+            fields["joint_covariance"] += added
+        if with_misfit is not problem.model:
+            fields |= _misfit(
+                with_misfit, problem, solution, fields, by_noise, misfit_factor
+            )
     return fields | {"model": model, "loss": loss}
 
 
-def _sized(task: Task) -> tuple[Solution, Sizes, Task]:
-    """The fit with sizes from the readings, these, and the task with them."""
-    found, scaled = solve(task, rough=True), task
-    sizes: Sizes | None = None
+def _of_distinct(
+    model: Model, commands: Array, measured: Array, weights: Array
+) -> Array:
+    """(N,) the weights of the measurements that count, 0 elsewhere."""
+    rows = np.flatnonzero(weights > 0.0)
+    if not rows.size:
+        raise ValueError("weights must be positive for one measurement at least")
+    rows = rows[model.distinct(commands[rows], measured[rows])]
+    distinct = np.zeros_like(weights)
+    distinct[rows] = weights[rows]
+    return distinct
+
+
+class _ScaledFit(NamedTuple):
+    """A fit whose prior has its scales from the readings."""
+
+    solution: FitSolution
+    scales: PriorScales
+    problem: FitProblem  # with the prior that was scaled
+
+
+def _solve_with_misfit(
+    problem: FitProblem, with_misfit: Model
+) -> tuple[_ScaledFit, float]:
+    """The fit, misfit fitted too where the readings tell it, and its factor."""
+    fit = _solve_with_scales(problem)
+    if with_misfit is problem.model:
+        return fit, 1.0
+    gain, factor = misfit_scale(with_misfit, problem, fit.solution, fit.scales)
+    if gain <= _TOLD:
+        return fit, factor
+    resolved = with_misfit.default_prior().resolve(with_misfit)
+    problem = dataclasses.replace(
+        problem,
+        model=with_misfit,
+        mean=resolved.mean,
+        precision=np.diagonal(resolved.precision),
+        free=resolved.free,
+    )
+    return _solve_with_scales(problem), factor
+
+
+def _with_levels_apart(
+    problem: FitProblem, solution: FitSolution
+) -> tuple[FitProblem, FitSolution]:
+    """The fit with a level of noise for each output where the residuals ask for it."""
+    if _levels_differ(problem, solution):
+        levels = np.arange(len(problem.levels))
+        apart = dataclasses.replace(problem, levels=levels)
+        other = solve(apart, solution)
+        if other.freedom.min() >= 1.0:
+            return apart, other
+    return problem, solution
+
+
+def _solve_with_scales(problem: FitProblem) -> _ScaledFit:
+    solution, scaled = solve(problem, rough=True), problem
+    scales: PriorScales | None = None
     for last in (False, True):
-        sizes = group_sizes(task, found, sizes)
-        scaled = dataclasses.replace(task, precision=task.precision / sizes.factors**2)
-        found = solve(scaled, found, rough=not last)
-    assert sizes is not None
-    return found, sizes, scaled
+        scales = group_scales(problem, solution, scales)
+        scaled = dataclasses.replace(
+            problem, precision=problem.precision / scales.factors**2
+        )
+        solution = solve(scaled, solution, rough=not last)
+    assert scales is not None
+    return _ScaledFit(solution, scales, scaled)
 
 
 def _centre(
@@ -190,22 +224,33 @@ def _centre(
     return (None, same) if flat else (centre, to_centred)
 
 
-def _of_readings(noise: Noise, weights: Array, q: int) -> tuple[Array, Array]:
-    """Whitening (N, q, q) at these weights, and standard deviations (N, q) at 1.
+def _of_readings(
+    model: Model, noise: Noise, weights: Array, q: int
+) -> tuple[Array, Array, NDArray[np.intp]]:
+    """The noise of the readings.
 
-    Of many independent readings the diagonal (N, q).
+    Returns:
+        Whitening (N, q, q) at these weights, or its diagonal (N, q) of many independent
+        readings; standard deviations (N, q) at weight 1; and (q,) which outputs share a
+        level, from 0.
     """
     if noise.command_std is not None:
         noise = Noise(std=noise.std, covariance=noise.covariance)
-    white = noise.whitening(len(weights), q)
+    white, levels = noise.whitening(len(weights), q), np.arange(q)
     if noise.covariance is None:
         diagonal = white.diagonal(axis1=1, axis2=2)
         std = 1.0 / diagonal
-        if q > _MANY:
-            return diagonal * np.sqrt(weights)[:, None], std
+        white = diagonal if q > _MANY else white
     else:
         std = np.sqrt((np.linalg.inv(white) ** 2).sum(axis=2))
-    return white * np.sqrt(weights)[:, None, None], std
+    usual = model.default_noise()
+    if usual is not None and noise.std is None and noise.covariance is None:
+        usual_std = np.broadcast_to(np.asarray(usual.std), (q,))
+        white = white / (usual_std if white.ndim == 2 else usual_std[:, None])
+        std = std * usual_std
+        levels = np.unique(usual_std, return_inverse=True)[1]  # positions and turns
+    root = np.sqrt(weights)[:, None]
+    return white * (root if white.ndim == 2 else root[..., None]), std, levels
 
 
 def _of_commands(noise: Noise, commands: Array, q: int) -> Array:
@@ -221,25 +266,30 @@ def _of_commands(noise: Noise, commands: Array, q: int) -> Array:
     return spread
 
 
-def _levels_differ(task: Task, found: Solution) -> bool:
+def _levels_differ(problem: FitProblem, solution: FitSolution) -> bool:
     """Whether levels that are shared contradict the residuals (F test, 0.1 %)."""
-    q = len(found.freedom)
-    if task.known or q == 1 or found.freedom.min() < 1.0 or task.command_std.any():
+    q = len(solution.freedom)
+    if (
+        problem.noise_known
+        or q == 1
+        or solution.freedom.min() < 1.0
+        or problem.command_std.any()
+    ):
         return False
     from scipy import special
 
-    white = whiten(task.white, found.residuals[..., None])[..., 0]
-    variance = found.weights @ (white / found.level) ** 2 / found.freedom
+    white = whiten(problem.white, solution.residuals[..., None])[..., 0]
+    variance = solution.weights @ (white / solution.level) ** 2 / solution.freedom
     high, low = int(variance.argmax()), int(variance.argmin())
     ratio = variance[high] / max(variance[low], np.finfo(np.float64).tiny)
-    chance = special.fdtrc(found.freedom[high], found.freedom[low], ratio)
+    chance = special.fdtrc(solution.freedom[high], solution.freedom[low], ratio)
     return bool(chance * q * (q - 1) < 1e-3)
 
 
 def _misfit(
-    bent: Model,
-    task: Task,
-    found: Solution,
+    with_misfit: Model,
+    problem: FitProblem,
+    solution: FitSolution,
     fields: dict[str, Any],
     within: Array,
     times: float,
@@ -250,22 +300,22 @@ def _misfit(
     by more than the noise explains.
 
     Args:
-        bent: the arm with them.
-        task: that was solved.
-        found: its solution.
+        with_misfit: the arm with them.
+        problem: that was solved.
+        solution: its solution.
         fields: of it, with the covariance (P, P) that is returned.
         within: (P, P) covariance of the parameters by the noise alone.
         times: their size, of the default prior's.
     """
-    count = len(bent.names) - len(task.mean)
-    std = times * np.asarray(bent.default_prior().std)[-count:]
+    count = len(with_misfit.names) - len(problem.mean)
+    std = times * np.asarray(with_misfit.default_prior().std)[-count:]
     none = np.zeros(count)
-    theta = np.concatenate([found.parameters, none])
-    waves = derivative(bent, task.commands, theta)[..., -count:]
-    level = found.level if task.white.ndim == 2 else found.level[:, None]
-    white = whiten(task.white / level, waves * std)
-    gram = np.einsum("n,nrf,nrw->fw", _informs(task, found), found.rows, white)
-    turned = within[:, task.free] @ gram
+    theta = np.concatenate([solution.parameters, none])
+    waves = derivative(with_misfit, problem.commands, theta)[..., -count:]
+    level = solution.level if problem.white.ndim == 2 else solution.level[:, None]
+    white = whiten(problem.white / level, waves * std)
+    gram = np.einsum("n,nrf,nrw->fw", _informs(problem, solution), solution.rows, white)
+    turned = within[:, problem.free] @ gram
     joint = np.zeros((len(theta), len(theta)))
     joint[:-count, :-count] = fields["joint_covariance"] + turned @ turned.T
     joint[:-count, -count:] = -turned * std
@@ -276,118 +326,123 @@ def _misfit(
         "estimate": theta,
         "joint_covariance": joint,
         "unidentified": null if null is None else np.pad(null, ((0, 0), (0, count))),
-        "prior_mean": np.concatenate([task.mean, none]),
-        "prior_precision": np.concatenate([task.precision, std**-2.0]),
+        "prior_mean": np.concatenate([problem.mean, none]),
+        "prior_precision": np.concatenate([problem.precision, std**-2.0]),
         "free": np.concatenate([fields["free"], none + 1.0]),
     }
 
 
-def _informs(task: Task, found: Solution) -> Array:
+def _informs(problem: FitProblem, solution: FitSolution) -> Array:
     """(N,) how much each measurement says, one in full."""
-    if not task.student:
-        return found.weights
-    _, mean, efficiency = student_constants(found.left)
-    return np.asarray(efficiency * np.minimum(1.0, found.weights / mean))
+    if not problem.student:
+        return solution.weights
+    _, mean, efficiency = student_constants(solution.num_readings)
+    return np.asarray(efficiency * np.minimum(1.0, solution.weights / mean))
 
 
 def _fields(
-    task: Task,
-    found: Solution,
+    problem: FitProblem,
+    solution: FitSolution,
     commands: Array,
     measured: Array,
     weights: Array,
     centre: Array | None,
 ) -> dict[str, Any]:
     used = weights > 0.0
-    covariance, null = _covariance(task, found)
-    freedom = float(found.freedom.sum())
-    noise_std: Array | None = found.level * np.sqrt((task.reading_std**2).mean(axis=0))
+    covariance, null = _covariance(problem, solution)
+    freedom = float(solution.freedom.sum())
+    noise_std: Array | None = solution.level * np.sqrt(
+        (problem.reading_std**2).mean(axis=0)
+    )
     noise_dof = 0.0
-    if not task.known:
-        same = found.level[:, None] == found.level
-        noise_dof = float((same @ found.freedom).min())
+    if not problem.noise_known:
+        same = solution.level[:, None] == solution.level
+        noise_dof = float((same @ solution.freedom).min())
         if freedom < 1.0 or noise_dof <= 0.0:
             noise_std, noise_dof = None, 0.0
     residuals = np.empty_like(measured)
-    residuals[used] = found.residuals
+    residuals[used] = solution.residuals
     if not used.all():
         left_out = commands[~used] - (0.0 if centre is None else centre)
-        outputs = task.model.predict(left_out, found.parameters)
-        residuals[~used] = task.model.wrapped(measured[~used] - outputs, left_out)
-    estimate, mean = found.parameters, task.mean
+        outputs = problem.model.predict(left_out, solution.parameters)
+        residuals[~used] = problem.model.wrapped(measured[~used] - outputs, left_out)
+    estimate, mean = solution.parameters, problem.mean
     if centre is not None:
-        back = np.asarray(task.model.centred(-centre))
+        back = np.asarray(problem.model.centred(-centre))
         estimate, mean = back @ estimate, back @ mean
         null = None if null is None else null @ back.T
     estimated = None
-    if task.command_std.any():
+    if problem.command_std.any():
         estimated = commands.copy()
-        estimated[used] = found.commands
+        estimated[used] = solution.commands
     loss_weights, distance = np.zeros((2, len(commands)))
-    loss_weights[used], distance[used] = found.weights, found.deleted
+    loss_weights[used], distance[used] = solution.weights, solution.deleted
     return {
         "estimate": estimate,
         "joint_covariance": None if noise_std is None else covariance,
         "centre": centre,
         "unidentified": null,
         "prior_mean": mean,
-        "prior_precision": task.precision,
-        "free": task.free.astype(np.float64),
+        "prior_precision": problem.precision,
+        "free": problem.free.astype(np.float64),
         "commands": commands,
         "estimated_commands": estimated,
         "residuals": residuals,
         "loss_weights": loss_weights,
         "distance": distance,
         "dof": max(freedom, 0.0),
-        "square": float(found.distance.sum()),
-        "num_readings": float(found.left),
+        "square": float(solution.distance.sum()),
+        "num_readings": float(solution.num_readings),
         "noise_std": noise_std,
         "noise_dof": noise_dof,
     }
 
 
-def _covariance(task: Task, found: Solution) -> tuple[Array, Array | None]:
+def _covariance(
+    problem: FitProblem, solution: FitSolution
+) -> tuple[Array, Array | None]:
     """(P, P) of what is determined, and directions (z, P) of what is not.
 
     Raises:
         ValueError: every reading is used up and parameters are still undetermined.
     """
-    size, free = len(task.mean), np.flatnonzero(task.free)
-    if found.root is not None:
-        covariance = found.root @ found.root.T
+    size, free = len(problem.mean), np.flatnonzero(problem.free)
+    if solution.root is not None:
+        covariance = solution.root @ solution.root.T
         return _among(size, free, covariance), None
-    rows = np.sqrt(_informs(task, found))[:, None, None] * found.rows
+    rows = np.sqrt(_informs(problem, solution))[:, None, None] * solution.rows
     rows = rows.reshape(-1, rows.shape[-1])
-    rows = np.concatenate([rows, task.model.facts(found.parameters)[1][:, free]])
-    precision = task.precision[free]
+    rows = np.concatenate([rows, problem.model.facts(solution.parameters)[1][:, free]])
+    precision = problem.precision[free]
     scale = np.sqrt((rows**2).sum(axis=0) + precision)
     scale = np.where(scale > 0.0, scale, 1.0)
     whole = np.concatenate([rows, np.diag(np.sqrt(precision))]) / scale
     root, null = [np.zeros((0, len(free)))], [np.zeros((0, len(free)))]
-    off = task.model.resolution
+    off = problem.model.resolution
     of_rows = 0  # combinations of the parameters that the readings use up
     for columns, of_columns, right in singular(whole):
-        known = significant(of_columns, off=off)
+        determined = significant(of_columns, off=off)
         turned = np.zeros((len(columns), len(free)))
         turned[:, columns] = right
-        root.append(turned[known] / of_columns[known, None])
-        null.append(exact_zeros(turned[~known], off))
+        root.append(turned[determined] / of_columns[determined, None])
+        null.append(exact_zeros(turned[~determined], off))
         alone = of_columns
-        if not known.all():
+        if not determined.all():
             of_readings = rows[:, columns] / scale[columns]
             alone = np.asarray(np.linalg.svd(of_readings, compute_uv=False), np.float64)
         of_rows += int(significant(alone, off=off).sum())
     factor, unseen = np.concatenate(root) / scale, np.concatenate(null) / scale
-    readings = found.left * len(task.commands)
+    readings = solution.num_readings * len(problem.commands)
     if len(unseen) and of_rows >= readings:
-        prior = found.parameters, task.precision, task.free
-        left = "; ".join(
-            each.words for each in unknown(task.model, task.commands, *prior)
+        prior = solution.parameters, problem.precision, problem.free
+        words = "; ".join(
+            direction.words
+            for direction in unknown(problem.model, problem.commands, *prior)
         )
         raise ValueError(
             f"measured holds {readings} independent readings, too few for "
             f"{len(free)} free parameters: {len(unseen)} combinations of them "
-            f"stay unknown{f' ({left})' if left else ''}; measure more, or give a "
+            f"stay unknown{f' ({words})' if words else ''}; measure more, or give a "
             "prior or fixed parameters"
         )
     directions = np.zeros((len(unseen), size))

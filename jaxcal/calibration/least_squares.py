@@ -24,7 +24,14 @@ from jaxcal.information.blocks import triangle
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model, derivative, predict, without_effect
 
-__all__ = ["Solution", "Task", "singular", "solve", "student_constants", "whiten"]
+__all__ = [
+    "FitProblem",
+    "FitSolution",
+    "singular",
+    "solve",
+    "student_constants",
+    "whiten",
+]
 
 Array = NDArray[np.float64]
 
@@ -38,7 +45,7 @@ _LEAST_DAMPING = 1e-14  # keeps directions that nothing determines where they ar
 
 
 @dataclasses.dataclass(frozen=True)
-class Task:
+class FitProblem:
     """N measurements of q outputs, P parameters of which F are free."""
 
     model: Model
@@ -50,7 +57,7 @@ class Task:
     precision: Array  # (P,) of the prior, 0 where nothing is known
     free: NDArray[np.bool_]  # (P,) False: held at the mean
     command_std: Array  # (n,) 0 exact, inf unknown in every measurement
-    known: bool  # the level is 1; else it is estimated
+    noise_known: bool  # the level is 1; else it is estimated
     levels: NDArray[np.intp]  # (q,) from 0: outputs of the same number share one
     student: bool
 
@@ -83,8 +90,8 @@ def student_weight(square: Array, q: int) -> Array:
 
 
 def solve(
-    task: Task, start: Solution | None = None, *, rough: bool = False
-) -> Solution:
+    problem: FitProblem, start: FitSolution | None = None, *, rough: bool = False
+) -> FitSolution:
     """The most probable parameters, from the prior's mean or from ``start``.
 
     ``rough`` is to .1 standard deviations, the weights of the loss to .03, for what
@@ -94,10 +101,10 @@ def solve(
         ValueError: the model fails at the start, a derivative is not finite, or the
             search does not converge.
     """
-    if task.student and start is None:
-        start = solve(dataclasses.replace(task, student=False), rough=True)
-        start.weights = student_weight(start.deleted, start.left)
-    search = Solution(task, start, rough)
+    if problem.student and start is None:
+        start = solve(dataclasses.replace(problem, student=False), rough=True)
+        start.weights = student_weight(start.deleted, start.num_readings)
+    search = FitSolution(problem, start, rough)
     if search.direct():
         return search.finish(search.solved)
     evidence: list[float] = []
@@ -159,14 +166,14 @@ def singular(rows: Array) -> list[tuple[NDArray[np.intp], Array, Array]]:
         of_groups = rows.T[np.array(groups)].transpose(0, 2, 1)
         _, size, right = np.linalg.svd(of_groups, full_matrices=False)
         return list(zip(groups, size, right, strict=True))
-    found = []
+    decompositions = []
     for columns in groups:
         _, size, right = np.linalg.svd(triangle(rows[:, columns]))
-        found.append((columns, size, right))
-    return found
+        decompositions.append((columns, size, right))
+    return decompositions
 
 
-class Solution:
+class FitSolution:
     """A search, its two moves step (parameters) and settle (levels), and its end."""
 
     parameters: Array  # (P,)
@@ -175,49 +182,53 @@ class Solution:
     level: Array  # (q,) of the noise
     weights: Array  # (N,) of the loss, 1 for least squares
     distance: Array  # (N,) squared, of each measurement from the fit, in noise
-    deleted: Array  # (N,) the same from the fit without that measurement
-    left: int  # readings of a measurement less its unknown commands
+    deleted: Array  # (N,) squared, from the fit without that measurement, in noise
+    num_readings: int  # of a measurement, less its unknown commands
     freedom: Array  # (q,) residual degrees of freedom of each output
     root: Array | None = None  # (F, F) of the covariance, where it is at hand
     rows: Array  # (N, R, F) whitened derivatives, commands eliminated, no weights
 
-    def __init__(self, task: Task, start: Solution | None, rough: bool) -> None:
-        self.task = task
+    def __init__(
+        self, problem: FitProblem, start: FitSolution | None, rough: bool
+    ) -> None:
+        self.problem = problem
         # 1e-6 standard deviations; 1e-5 where convergence is linear.
-        self.least = 1e-2 if rough else 1e-10 if task.student else 1e-12
+        self.least = 1e-2 if rough else 1e-10 if problem.student else 1e-12
         self.change = (3e-2, 3e-2) if rough else (1e-5, 1e-4)  # of weights and levels
         # (R, r) roots of the hat matrix, hardly damped, where a step had them.
         self.solved: Array | None = None
-        count, q = task.measured.shape
-        self.uncertain = task.command_std > 0.0
-        self.command_root = 1.0 / task.command_std[self.uncertain]  # 0: unknown
-        self.left = q - int(np.isinf(task.command_std).sum())  # readings, nuisance out
+        count, q = problem.measured.shape
+        self.uncertain = problem.command_std > 0.0
+        self.command_root = 1.0 / problem.command_std[self.uncertain]  # 0: unknown
+        self.num_readings = q - int(np.isinf(problem.command_std).sum())
         # From where another search ended, the derivatives are right far enough.
         self.damping, self.grow = 1e-3 if start is None else 1e-10, 2.0
-        readings = _times(task.white, task.measured)
+        readings = _times(problem.white, problem.measured)
         largest = np.abs(readings).max(axis=0)
         largest = np.where(largest > 0.0, largest, largest.max())
         # (q,) of contacts, whose readings are zero, in their usual noise.
         self.floor = np.where(largest > 0.0, 1e-13 * largest, 1e-6)
         self.basis: Array | None = None  # (F, r) directions of a linear model
         self.freedom = np.zeros(q)
-        self.shared = task.levels
-        self.parameters = task.mean if start is None else start.parameters
-        linear = task.model.linear and not self.uncertain.any()
-        from_zero = linear and start is None and not task.precision[task.free].any()
-        self.commands = task.commands if start is None else start.commands
+        self.shared = problem.levels
+        self.parameters = problem.mean if start is None else start.parameters
+        linear = problem.model.linear and not self.uncertain.any()
+        from_zero = (
+            linear and start is None and not problem.precision[problem.free].any()
+        )
+        self.commands = problem.commands if start is None else start.commands
         if from_zero:  # the answer is then as exact as its step
-            self.parameters = np.where(task.free, 0.0, task.mean)
-        if from_zero and task.free.all():
-            self.residuals = task.measured
+            self.parameters = np.where(problem.free, 0.0, problem.mean)
+        if from_zero and problem.free.all():
+            self.residuals = problem.measured
         else:
             self._predict()
-            readings = _times(task.white, self.residuals)
+            readings = _times(problem.white, self.residuals)
         # The last step of the logarithms of the levels, and how much of one is taken.
         self.climbed, self.trust = np.zeros(q), 1.0
         if start is None:
             self.weights, self.level = np.ones(count), np.ones(q)
-            if not task.known:
+            if not problem.noise_known:
                 same = self.shared[:, None] == self.shared
                 mean = same @ (readings**2).sum(axis=0) / (count * same.sum(axis=1))
                 self.level = np.maximum(np.sqrt(mean), (same * self.floor).max(axis=1))
@@ -232,7 +243,7 @@ class Solution:
     @functools.cached_property
     def sizes(self) -> Array:
         """(P,) of the parameters."""
-        return self.task.model.parameter_sizes()
+        return self.problem.model.parameter_sizes()
 
     def _predict(self) -> None:
         """Residuals at the present parameters and commands."""
@@ -240,26 +251,26 @@ class Solution:
 
     def _off(self, commands: Array, theta: Array, finite: bool = True) -> Array:
         """(N, q) measured less predicted."""
-        model = self.task.model
+        model = self.problem.model
         predicted = predict(model, commands, theta, finite=finite)
-        return model.wrapped(self.task.measured - predicted, commands)
+        return model.wrapped(self.problem.measured - predicted, commands)
 
     def _linearise(self) -> None:
         """Derivatives at the present parameters, whitened at level 1."""
-        task = self.task
-        self.known, self.more = task.model.facts(self.parameters)
+        problem = self.problem
+        self.facts, self.fact_rows = problem.model.facts(self.parameters)
         if self.basis is not None:  # derivatives stay what they are
             return
-        rows = derivative(task.model, self.commands, self.parameters)
-        if not task.model.linear:  # those of a linear model are exact
+        rows = derivative(problem.model, self.commands, self.parameters)
+        if not problem.model.linear:  # those of a linear model are exact
             rows = np.where(without_effect(rows, self.sizes), 0.0, rows)
-        if not task.free.all():
-            rows = rows[..., task.free]
-        self.by_theta = whiten(task.white, rows)
+        if not problem.free.all():
+            rows = rows[..., problem.free]
+        self.by_theta = whiten(problem.white, rows)
         if self.uncertain.any():
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
-            rows = derivative(task.model, self.commands, self.parameters, inputs)
-            self.by_command = whiten(task.white, rows[..., self.uncertain])
+            rows = derivative(problem.model, self.commands, self.parameters, inputs)
+            self.by_command = whiten(problem.white, rows[..., self.uncertain])
 
     def _directions(self) -> Array:
         """(F, r) changes of the parameters, those that nothing determines left out.
@@ -276,9 +287,11 @@ class Solution:
             rows = np.concatenate([rows, np.zeros((len(scale), len(scale)))])
         directions = []
         for columns, size, right in singular(rows):
-            known = np.flatnonzero(significant(size))
-            block = np.zeros((rows.shape[1], len(known)))
-            block[columns] = (right[known] / size[known, None] / scale[columns]).T
+            determined = np.flatnonzero(significant(size))
+            block = np.zeros((rows.shape[1], len(determined)))
+            block[columns] = (
+                right[determined] / size[determined, None] / scale[columns]
+            ).T
             directions.append(block)
         return np.hstack(directions)
 
@@ -288,17 +301,17 @@ class Solution:
         Of least squares of a linear model without a prior, where the levels of noise,
         if there are several, each have parameters of their own.
         """
-        task = self.task
-        known = len(self.known) or task.precision[task.free].any()
-        if self.basis is None or task.student or known:
+        problem = self.problem
+        informed = len(self.facts) or problem.precision[problem.free].any()
+        if self.basis is None or problem.student or informed:
             return False
-        if not task.known and self.shared.any():
+        if not problem.noise_known and self.shared.any():
             moved = (self.by_theta != 0.0).any(axis=0)  # (q, F) by which parameter
             levels = np.where(moved, self.shared[:, None], -1)
             if (moved & (levels != levels.max(axis=0))).any():
                 return False
         level, shared, basis = self.level, self.shared, self.basis
-        right = _times(task.white, self.residuals) / level
+        right = _times(problem.white, self.residuals) / level
         right = (np.sqrt(self.weights)[:, None] * right).ravel()
         if self.solved is None:
             rows, _, scale = self._system(0.0)
@@ -306,12 +319,12 @@ class Solution:
             self.solved, basis = rows @ inverse, basis / scale @ inverse
         cost, target = float(right @ right), self.solved.T @ right
         self.parameters = self.parameters.copy()
-        self.parameters[task.free] += basis @ target
+        self.parameters[problem.free] += basis @ target
         self._predict()
         distance = self._distance(self.residuals, self.commands)
         gain = float(target @ target)
         as_said = abs(cost - gain - distance.sum()) <= 1e-9 * cost
-        if not task.known:
+        if not problem.noise_known:
             self._estimate_level(distance)
         # Where noise is as small as rounding of what was measured, another step helps.
         exact = 1e-28 * cost * (level / self.level).max() ** 2 <= self.least
@@ -319,34 +332,34 @@ class Solution:
             return False
         if basis.shape[1] == len(basis):
             self.root = basis
-            if not task.known:
+            if not problem.noise_known:
                 output = (self.by_theta != 0.0).any(axis=0).argmax(axis=0)
                 self.root = (self.level / level)[output, None] * basis
         return True
 
     def _keep_undetermined(self) -> None:
         """Move to the prior's mean in directions that nothing determines."""
-        task, basis = self.task, np.asarray(self.basis)
-        mean, size = task.mean[task.free], np.linalg.norm(basis, axis=1)
+        problem, basis = self.problem, np.asarray(self.basis)
+        mean, size = problem.mean[problem.free], np.linalg.norm(basis, axis=1)
         size = np.where(size > 0.0, size, 1.0)
         shown = np.linalg.lstsq(basis / size[:, None], mean / size, rcond=None)[0]
         self.parameters = self.parameters.copy()
-        self.parameters[task.free] = mean - basis @ shown
+        self.parameters[problem.free] = mean - basis @ shown
         self._predict()
 
     def _distance(self, residuals: Array, commands: Array) -> Array:
         """(N,) squared distance of each measurement from the fit, in noise."""
-        readings = _times(self.task.white, residuals) / self.level
+        readings = _times(self.problem.white, residuals) / self.level
         square = np.asarray((readings**2).sum(axis=1))
         if len(self.command_root):
-            moved = (commands - self.task.commands)[:, self.uncertain]
+            moved = (commands - self.problem.commands)[:, self.uncertain]
             square += ((moved * self.command_root) ** 2).sum(axis=1)
         return square
 
     @property
     def cost(self) -> float:
         """Sum of squares of readings, commands and prior, weighted."""
-        return self._cost(self.residuals, self.parameters, self.commands, self.known)
+        return self._cost(self.residuals, self.parameters, self.commands, self.facts)
 
     @property
     def evidence(self) -> float:
@@ -354,26 +367,28 @@ class Solution:
         return self.cost + 2.0 * float(self.freedom @ np.log(self.level))
 
     def _cost(
-        self, residuals: Array, theta: Array, commands: Array, known: Array
+        self, residuals: Array, theta: Array, commands: Array, facts: Array
     ) -> float:
-        off = (theta - self.task.mean) ** 2 @ self.task.precision + known @ known
+        off = (theta - self.problem.mean) ** 2 @ self.problem.precision + facts @ facts
         return float(self.weights @ self._distance(residuals, commands) + off)
 
     def _reduce(self, damping: float) -> tuple[Array, Array]:
         """Rows (N, R, F) and residuals (N, R), the commands eliminated."""
         rows = self.by_theta / self.level[:, None]
-        right = _times(self.task.white, self.residuals) / self.level
+        right = _times(self.problem.white, self.residuals) / self.level
         k = len(self.command_root)
         if not k:
             return rows, right
-        own = self.by_command / self.level[:, None]
-        known = np.broadcast_to(np.diag(self.command_root), (len(own), k, k))
-        own = np.concatenate([own, known], axis=1)
-        length = np.sqrt((own**2).sum(axis=1))[:, :, None] * np.eye(k)
-        own = np.concatenate([own, np.sqrt(damping) * length], axis=1)
-        moved = (self.task.commands - self.commands)[:, self.uncertain]
+        by_command = self.by_command / self.level[:, None]
+        command_rows = np.broadcast_to(
+            np.diag(self.command_root), (len(by_command), k, k)
+        )
+        by_command = np.concatenate([by_command, command_rows], axis=1)
+        length = np.sqrt((by_command**2).sum(axis=1))[:, :, None] * np.eye(k)
+        by_command = np.concatenate([by_command, np.sqrt(damping) * length], axis=1)
+        moved = (self.problem.commands - self.commands)[:, self.uncertain]
         right = np.concatenate([right, moved * self.command_root, 0.0 * moved], axis=1)
-        turn, triangle = np.linalg.qr(own, mode="complete")
+        turn, triangle = np.linalg.qr(by_command, mode="complete")
         turn = np.matrix_transpose(turn)
         rows, right = turn[..., : rows.shape[1]] @ rows, _times(turn, right)
         self._back = triangle[:, :k], rows[:, :k], right[:, :k]
@@ -384,9 +399,9 @@ class Solution:
         commands = self.commands
         if len(self.command_root):
             triangle, rows, right = self._back
-            own = np.linalg.solve(triangle, (right - rows @ step)[..., None])[..., 0]
+            change = np.linalg.solve(triangle, (right - rows @ step)[..., None])[..., 0]
             commands = commands.copy()
-            commands[:, self.uncertain] += own
+            commands[:, self.uncertain] += change
         return commands
 
     def _system(self, damping: float) -> tuple[Array, Array, Array]:
@@ -398,12 +413,12 @@ class Solution:
         weight = np.sqrt(self.weights)[:, None]
         rows = (weight[..., None] * rows).reshape(-1, rows.shape[-1])
         right = (weight * right).ravel()
-        free = self.task.free
-        root = np.sqrt(self.task.precision[free])
-        if len(self.known) or root.any():
-            off = root * (self.task.mean - self.parameters)[free]
-            rows = np.concatenate([rows, np.diag(root), self.more[:, free]])
-            right = np.concatenate([right, off, self.known])
+        free = self.problem.free
+        root = np.sqrt(self.problem.precision[free])
+        if len(self.facts) or root.any():
+            off = root * (self.problem.mean - self.parameters)[free]
+            rows = np.concatenate([rows, np.diag(root), self.fact_rows[:, free]])
+            right = np.concatenate([right, off, self.facts])
         if self.basis is not None:
             rows = rows @ self.basis
         scale = np.sqrt((rows**2).sum(axis=0))
@@ -412,7 +427,7 @@ class Solution:
 
     def step(self) -> bool:
         """Move the parameters to a lower cost; True where they need not move."""
-        task = self.task
+        problem = self.problem
         cost = self.cost
         while True:
             rows, right, scale = self._system(self.damping)
@@ -425,11 +440,11 @@ class Solution:
             if gain <= self.least + 1e-13 * cost:
                 return True
             theta = self.parameters.copy()
-            theta[task.free] += step
+            theta[problem.free] += step
             commands = self._moved(step)
             residuals = self._off(commands, theta, finite=False)
-            known, _ = task.model.facts(theta)
-            after = self._cost(residuals, theta, commands, known)
+            facts, _ = problem.model.facts(theta)
+            after = self._cost(residuals, theta, commands, facts)
             ratio = (cost - after) / gain if np.isfinite(after) else -1.0
             if ratio > 1e-4:
                 self.parameters, self.commands, self.residuals = (
@@ -457,12 +472,12 @@ class Solution:
 
         Changes of ``slack`` times ``self.change`` are none.
         """
-        task = self.task
+        problem = self.problem
         before = self.weights, np.log(self.level)
         distance = self._distance(self.residuals, self.commands)
-        if task.student:
-            self.weights = student_weight(distance, self.left)
-        if not task.known:
+        if problem.student:
+            self.weights = student_weight(distance, self.num_readings)
+        if not problem.noise_known:
             self._estimate_level(distance)
         after = self.weights, np.log(self.level)
         return all(
@@ -472,19 +487,19 @@ class Solution:
 
     def _estimate_level(self, distance: Array) -> None:
         """Sums of squares over the degrees of freedom that they have."""
-        task = self.task
+        problem = self.problem
         self.freedom = freedom = self._freedom(self._leverage(self.solved))
         if freedom.sum() < 1.0:
             return
-        square = self.weights @ _times(task.white, self.residuals) ** 2
+        square = self.weights @ _times(problem.white, self.residuals) ** 2
         same = self.shared[:, None] == self.shared
         if (same @ freedom < 0.5).any():
             # What is met exactly has no level of its own, from then on.
             self.shared, same = 0 * self.shared, np.ones_like(same)
         square, freedom = same @ square, same @ freedom
         faster = 1.0
-        if task.student:
-            square = square / student_constants(self.left)[0]
+        if problem.student:
+            square = square / student_constants(self.num_readings)[0]
             # The weights follow the level: Newton's step takes both at once.
             pulled = self.weights * distance
             faster = pulled.sum() / max(pulled @ self.weights, 1e-300)
@@ -512,7 +527,7 @@ class Solution:
         count, q = self.residuals.shape
         used = np.einsum("nqf,nqf->q", readings, readings)
         if len(self.command_root):
-            return np.full(q, (count * self.left - used.sum()) / q)
+            return np.full(q, (count * self.num_readings - used.sum()) / q)
         freedom = count - used
         if (met := self.residuals == 0.0).any():
             # A reading that nothing moves and that is met is none, as where the sensors
@@ -521,14 +536,14 @@ class Solution:
         whole = np.rint(freedom)
         return np.where(np.abs(freedom - whole) < 1e-9, whole, freedom)
 
-    def finish(self, solved: Array | None = None) -> Solution:
+    def finish(self, solved: Array | None = None) -> FitSolution:
         """Itself, with what is said of the measurements where it ended.
 
         ``solved`` are the roots of the hat matrix there, if they are known.
         """
         readings = self._leverage(solved)
         self.rows, right = self._reduce(0.0)
-        if solved is None or self.task.known:
+        if solved is None or self.problem.noise_known:
             self.freedom = self._freedom(readings)
         self.distance = self._distance(self.residuals, self.commands)
         deleted = _deleted(readings, right)
@@ -548,7 +563,7 @@ def _deleted(readings: Array, right: Array) -> Array:
     if count <= max(_MANY, columns):
         gap = (1.0 + 1e-9) * np.eye(count) - readings @ back
         return np.asarray(np.linalg.solve(gap, right[..., None])[..., 0])
-    one = 1.0 + 1e-9  # the same by the F columns, of a trajectory of many readings
+    one = 1.0 + 1e-9  # by the F columns, of a trajectory of many readings
     inner = one * np.eye(columns) - back @ readings
     along = np.linalg.solve(inner, back @ right[..., None])
     return np.asarray((right + (readings @ along)[..., 0]) / one)

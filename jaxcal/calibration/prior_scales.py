@@ -18,12 +18,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.solve import Solution, Task
+from jaxcal.calibration.least_squares import FitProblem, FitSolution
 from jaxcal.information.blocks import triangle, without
 from jaxcal.information.singular import significant
 from jaxcal.models.model import ErrorGroups, Model, derivative
 
-__all__ = ["Sizes", "group_sizes", "misfit_size", "of_sizes"]
+__all__ = ["PriorScales", "covariance_of_scales", "group_scales", "misfit_scale"]
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ _TRIED = np.array([-5.0, -4.0, -3.0, -2.0, -1.2, -0.4, 0.4, 1.2])  # likewise
 _SCORES = 100  # steps of Fisher's scoring, at most
 
 
-class Sizes(NamedTuple):
+class PriorScales(NamedTuple):
     """Factors of the prior's standard deviations."""
 
     logs: Array  # (G + 1,) of the groups' factors and the level
@@ -42,22 +42,24 @@ class Sizes(NamedTuple):
     covariance: Array  # (G, G) of the logarithms of the groups' factors
 
 
-def group_sizes(task: Task, found: Solution, before: Sizes | None) -> Sizes:
+def group_scales(
+    problem: FitProblem, solution: FitSolution, start: PriorScales | None
+) -> PriorScales:
     """The factors that make the readings most probable.
 
     Args:
-        task: with the prior that the factors are of, and a model with groups.
-        found: a fit with any such prior; the model is made linear there.
-        before: where the search begins; with factors of one where there is nothing.
+        problem: with the prior that the factors are of, and a model with groups.
+        solution: a fit with any such prior; the model is made linear there.
+        start: where the search begins; with factors of one where there is nothing.
     """
-    p = len(task.mean)
-    of_model = task.model.error_groups()
+    p = len(problem.mean)
+    of_model = problem.model.error_groups()
     assert of_model is not None
     groups, num_groups = of_model.members, len(of_model.medians)
     middle, wide = _thought(of_model)
-    cost = _evidence(task, found, of_model)
+    cost = _evidence(problem, solution, of_model)
     # A level that is known floats too: misfit beyond it is no size of the errors.
-    best = middle if before is None else before.logs
+    best = middle if start is None else start.logs
     least, slope, curve = cost(best)
     for _ in range(_SCORES):
         step = np.linalg.solve(curve, slope)
@@ -71,8 +73,8 @@ def group_sizes(task: Task, found: Solution, before: Sizes | None) -> Sizes:
             break
     factors = np.ones(p)
     factors[groups >= 0] = np.exp(best[groups[groups >= 0]])
-    if before is None:  # the sizes of a rough fit, which begin the next
-        return Sizes(best, factors, groups, np.zeros((num_groups, num_groups)))
+    if start is None:  # of a rough fit, which begin the next
+        return PriorScales(best, factors, groups, np.zeros((num_groups, num_groups)))
     steps = 1e-3 * np.eye(len(best))
     curves = [cost(best + step)[1] - cost(best - step)[1] for step in steps]
     # Half the cost's, in units of what was thought, which the readings only sharpen.
@@ -80,7 +82,7 @@ def group_sizes(task: Task, found: Solution, before: Sizes | None) -> Sizes:
     size, axes = np.linalg.eigh(curve)
     axes = wide[:, None] * axes
     inside = (axes / np.maximum(size, 1.0)) @ axes.T
-    return Sizes(best, factors, groups, inside[:num_groups, :num_groups])
+    return PriorScales(best, factors, groups, inside[:num_groups, :num_groups])
 
 
 def _thought(groups: ErrorGroups) -> tuple[Array, Array]:
@@ -90,12 +92,12 @@ def _thought(groups: ErrorGroups) -> tuple[Array, Array]:
 
 
 def _evidence(
-    task: Task, found: Solution, groups: ErrorGroups
+    problem: FitProblem, solution: FitSolution, groups: ErrorGroups
 ) -> Callable[[Array], tuple[float, Array, Array]]:
     """-2 log marginal likelihood of the logarithms (G + 1,), with slope and curve."""
     middle, wide = _thought(groups)
-    rows, right = _reduced(task, found)
-    sized = groups.members[task.free & (task.precision > 0.0)]
+    rows, right = _reduced(problem, solution)
+    sized = groups.members[problem.free & (problem.precision > 0.0)]
     count, width = len(right), rows.shape[1]
     # All that the readings say is in a triangle; the rest of them is noise alone.
     factor = triangle(np.column_stack([rows, right]))
@@ -131,40 +133,41 @@ def _evidence(
     return cost
 
 
-def misfit_size(
-    bent: Model, task: Task, found: Solution, sizes: Sizes
+def misfit_scale(
+    with_misfit: Model, problem: FitProblem, solution: FitSolution, scales: PriorScales
 ) -> tuple[float, float]:
     """What misfit that was not fitted would gain, and how large it is.
 
     Args:
-        bent: the model with it: its last parameters, the last of its groups.
-        task: without it, with the prior that the factors are of.
-        found: its solution.
-        sizes: of it.
+        with_misfit: the model with it: its last parameters, the last of its groups.
+        problem: without it, with the prior that the factors are of.
+        solution: its solution.
+        scales: of it.
 
     Returns:
         How much less -2 log marginal likelihood is at best with it, and the root of its
         mean squared factor.
     """
-    more = len(bent.names) - len(task.mean)
-    std, groups = np.asarray(bent.default_prior().std)[-more:], bent.error_groups()
+    more = len(with_misfit.names) - len(problem.mean)
+    std = np.asarray(with_misfit.default_prior().std)[-more:]
+    groups = with_misfit.error_groups()
     assert groups is not None
-    beside = copy.copy(found)
-    beside.parameters = np.append(found.parameters, np.zeros(more))
+    beside = copy.copy(solution)
+    beside.parameters = np.append(solution.parameters, np.zeros(more))
     whole = dataclasses.replace(
-        task,
-        model=bent,
-        mean=np.append(task.mean, np.zeros(more)),
-        precision=np.append(task.precision, std**-2.0),
-        free=np.append(task.free, np.ones(more, dtype=np.bool_)),
+        problem,
+        model=with_misfit,
+        mean=np.append(problem.mean, np.zeros(more)),
+        precision=np.append(problem.precision, std**-2.0),
+        free=np.append(problem.free, np.ones(more, dtype=np.bool_)),
     )
     cost = _evidence(whole, beside, groups)
     middle, wide = _thought(groups)
-    logs, least = sizes.logs.copy(), np.zeros(len(_TRIED))
+    logs, least = scales.logs.copy(), np.zeros(len(_TRIED))
     rest = np.flatnonzero(np.arange(len(logs)) != len(logs) - 2)
     for k, tried in enumerate(_TRIED):
         logs[-2] = tried
-        for _ in range(2):  # steps of the other sizes
+        for _ in range(2):  # steps of the other scales
             _, slope, curve = cost(logs)
             step = np.linalg.solve(curve[np.ix_(rest, rest)], slope[rest])
             logs[rest] = np.clip(logs[rest] - np.clip(step, -1.0, 1.0), -_MOST, _MOST)
@@ -175,21 +178,23 @@ def misfit_size(
     return float(gains[0] - gains.min()), float(np.sqrt(square))
 
 
-def of_sizes(task: Task, found: Solution, sizes: Sizes) -> Array:
-    """(P, P) what the sizes, which are estimates too, add to the covariance.
+def covariance_of_scales(
+    problem: FitProblem, solution: FitSolution, scales: PriorScales
+) -> Array:
+    """(P, P) what the scales, which are estimates too, add to the covariance.
 
-    Mean and covariance of the parameters are averaged over the sizes; the model is
+    Mean and covariance of the parameters are averaged over the scales; the model is
     linear.
     """
-    free = task.free
-    groups = sizes.groups[free]
-    weights = np.sqrt(np.minimum(found.weights, 1.0))[:, None, None]
-    rows = (weights * found.rows).reshape(-1, found.rows.shape[-1])
-    known = task.model.facts(found.parameters)[1][:, free]
-    gram = rows.T @ rows + known.T @ known
-    precision = task.precision[free]
+    free = problem.free
+    groups = scales.groups[free]
+    weights = np.sqrt(np.minimum(solution.weights, 1.0))[:, None, None]
+    rows = (weights * solution.rows).reshape(-1, solution.rows.shape[-1])
+    fact_rows = problem.model.facts(solution.parameters)[1][:, free]
+    gram = rows.T @ rows + fact_rows.T @ fact_rows
+    precision = problem.precision[free]
     scale = 1.0 / np.sqrt(np.diagonal(gram) + precision + 1e-300)
-    off = (found.parameters - task.mean)[free]
+    off = (solution.parameters - problem.mean)[free]
     right = scale * (gram @ off + precision * off)  # as the fit balances them
 
     gram = scale[:, None] * gram * scale
@@ -204,13 +209,13 @@ def of_sizes(task: Task, found: Solution, sizes: Sizes) -> Array:
 
     # The logarithm of a size has a long upper tail where few errors show it: its mean
     # is above the most probable one, by its variance, less where the prior sets it.
-    of_model = task.model.error_groups()
+    of_model = problem.model.error_groups()
     assert of_model is not None
-    variance = np.diagonal(sizes.covariance)
+    variance = np.diagonal(scales.covariance)
     skew = variance * (1.0 - variance / _thought(of_model)[1][:-1] ** 2)
     skew = np.where(of_model.medians < 1.0, 0.0, skew)  # of what may not be there
     wider = np.sqrt(1.0 + 2.0 * skew)
-    values, axes = np.linalg.eigh(wider[:, None] * sizes.covariance * wider)
+    values, axes = np.linalg.eigh(wider[:, None] * scales.covariance * wider)
     nodes = np.sqrt(3.0 * np.maximum(values, 0.0)) * axes  # of Gauss and Hermite
     first, least = at(np.zeros(len(values)))
     spread = np.zeros_like(gram)
@@ -225,27 +230,27 @@ def of_sizes(task: Task, found: Solution, sizes: Sizes) -> Array:
     return result
 
 
-def _reduced(task: Task, found: Solution) -> tuple[Array, Array]:
+def _reduced(problem: FitProblem, solution: FitSolution) -> tuple[Array, Array]:
     """Rows (R, s) by standard deviations of what a prior knows, and readings (R,).
 
     Free of the parameters of which nothing is known.
     """
-    theta, free, precision = found.parameters, task.free, task.precision
+    theta, free, precision = solution.parameters, problem.free, problem.precision
     # One level for all: what the fit found of how they compare is kept.
-    level = found.level / np.exp(np.log(found.level).mean())
-    white = task.white
+    level = solution.level / np.exp(np.log(solution.level).mean())
+    white = problem.white
     if white.ndim == 2:  # of many readings
         white = white[..., None] * np.eye(white.shape[1])
     white = white / level[:, None]
-    white = white * np.sqrt(np.minimum(found.weights, 1.0))[:, None, None]
-    slopes = derivative(task.model, task.commands, theta)
-    off = found.residuals[..., None] + slopes @ (theta - task.mean)[:, None]
+    white = white * np.sqrt(np.minimum(solution.weights, 1.0))[:, None, None]
+    slopes = derivative(problem.model, problem.commands, theta)
+    off = solution.residuals[..., None] + slopes @ (theta - problem.mean)[:, None]
     right = (white @ off).ravel()
     rows = (white @ slopes).reshape(len(right), -1)
-    known = rows[:, free & (precision > 0.0)]
-    known = known / np.sqrt(precision[free & (precision > 0.0)])
+    informed = rows[:, free & (precision > 0.0)]
+    informed = informed / np.sqrt(precision[free & (precision > 0.0)])
     flat = rows[:, free & (precision == 0.0)]
     if flat.shape[1]:
         flat = flat / (np.linalg.norm(flat, axis=0) + 1e-300)
-        known, right = without(flat, known, right)
-    return known, right
+        informed, right = without(flat, informed, right)
+    return informed, right
