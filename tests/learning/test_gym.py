@@ -8,6 +8,7 @@ import pytest
 gymnasium = pytest.importorskip("gymnasium")
 
 
+@pytest.mark.slow
 def test_make_vec_plays_episodes_that_pay_their_log_det():
     envs = gymnasium.make_vec(
         "jaxcal.learning.gym:jaxcal/Postures-v0", num_envs=3, num_candidates=8
