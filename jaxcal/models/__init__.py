@@ -20,6 +20,7 @@ from jaxcal.models.sensors import (
     Several,
     Socket,
     Tip,
+    Wrench,
 )
 from jaxcal.models.serial import SerialChain
 from jaxcal.models.uncertainty import Noise, Prior, ResolvedPrior
@@ -49,6 +50,7 @@ __all__ = [
     "Several",
     "Socket",
     "Tip",
+    "Wrench",
     "from_dict",
     "identifiability",
 ]

@@ -160,3 +160,10 @@ def test_the_closed_loop_finds_a_peak_with_fewer_readings(tmp_path):
     late = {rule: np.median(np.abs(error[:, 29:])) for rule, error in found.items()}
     assert late["closed loop"] < 0.75 * late["random"]
     assert late["closed loop"] < 0.75 * late["beforehand"]
+
+
+@pytest.mark.slow
+def test_four_chosen_postures_weigh_a_tool_better_than_four_far_apart(tmp_path):
+    found, _ = quick("wrench", tmp_path)
+    for rule in ("wrist alone", "random", "far apart"):
+        assert (rms(found["chosen (I)", 4]) < 0.95 * rms(found[rule, 4])).all()

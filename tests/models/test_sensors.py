@@ -22,6 +22,7 @@ from jaxcal.models import (
     SerialChain,
     Several,
     Socket,
+    Wrench,
     from_dict,
     identifiability,
 )
@@ -69,6 +70,12 @@ def _distance(tip, row, own):
     return [np.linalg.norm(tip[:3, 3] - [x, y, z]) - zero]
 
 
+def _weight(tip, row, own):
+    down = -own[0] * 9.81 * np.array([0.1, 0.0, 1.0]) / np.sqrt(1.01)
+    force = tip[:3, :3].T @ down
+    return [*(force + own[4:7]), *(np.cross(own[1:4], force) + own[7:])]
+
+
 CORNERS = np.array([[x, y, 0.0] for x in (0.0, 30.0, 60.0) for y in (0.0, 40.0)])
 CAMERA = (800.0, 820.0, 320.0, 240.0)
 
@@ -105,6 +112,7 @@ CASES = {
             own[0] * 9.81 * tip[:3, :3].T @ [0.1, 0.0, 1.0] / np.sqrt(1.01) + own[1:]
         ),
     ),
+    "wrench": (Wrench(up=(0.1, 0.0, 1.0)), np.zeros((6, 0)), _weight),
     "camera on the tip": (
         Board("camera", PLACE),
         SEEN,
@@ -506,6 +514,57 @@ def test_gravity_in_another_unit_or_frame_is_told_by_name(change, told):
     np.testing.assert_allclose(given.predict(JOINTS), same, atol=1e-9)
 
 
+def _weighed(seed=7, count=8):
+    """Postures, readings of 1.6 kg on a sensor turned by MOUNT, by frames alone."""
+    rng = np.random.default_rng(seed)
+    joints, own = rng.uniform(-150.0, 150.0, (count, 6)), rng.normal(size=6)
+    arm = SerialChain.from_dh(UR5_TABLE)
+    values = dict(zip(arm.names, arm.nominal, strict=True))
+    tips = [tool_frame(arm, row, values) @ MOUNT for row in joints]
+    forces = np.array([tip[:3, :3].T @ [0.0, 0.0, -9.81] for tip in tips])
+    read = np.hstack([1.6 * forces, 1.6 * np.cross([10.0, -5.0, 80.0], forces)]) + own
+    noise = np.array([0.1] * 3 + [5.0] * 3)
+    return joints, read + noise * rng.normal(size=read.shape), forces, noise
+
+
+def test_a_load_is_weighed_as_by_linear_least_squares():
+    """Where mounting and gravity are known it is linear in m, m c and six zeros."""
+    joints, read, forces, noise = _weighed()
+    rows = []
+    for force in forces:
+        lever = -np.cross(np.eye(3), force).T  # of torque = (m c) x force
+        rows.append(np.hstack([force, np.zeros(3)])[:, None])
+        rows[-1] = np.hstack([rows[-1], np.vstack([np.zeros((3, 3)), -lever])])
+        rows[-1] = np.hstack([rows[-1], np.eye(6)])
+    white = np.tile(noise, len(joints))
+    matrix = np.concatenate(rows) / white[:, None]
+    x = np.linalg.lstsq(matrix, read.ravel() / white)[0]
+    held = [f"{a} r{b}" for a in ("base", "tool") for b in "xyz"]
+    model = SerialChain.from_dh(UR5_TABLE, tool=MOUNT, sensor=Wrench())
+    fixed = (*model.sensor.unseen(model), *held)
+    prior = jaxcal.Prior(model.default_prior().std, fixed=fixed)
+    options = {"noise": jaxcal.Noise(std=noise), "loss": "gaussian", "prior": prior}
+    found = jaxcal.identify(joints, read, model=model, **options)
+    own = dict(zip(found.names, found.parameters, strict=True))
+    own = np.array([own[name] for name in model.sensor.names])
+    np.testing.assert_allclose(own, [x[0], *x[1:4] / x[0], *x[4:]], rtol=1e-6)
+
+
+def test_how_a_wrench_is_mounted_is_found_and_its_mistakes_are_named():
+    joints, read, *_ = _weighed()
+    arm = SerialChain.from_dh(UR5_TABLE, sensor=Wrench())
+    found = jaxcal.identify(joints, read, model=arm)
+    own = dict(zip(found.names, found.parameters, strict=True))
+    assert own["mass"] == pytest.approx(1.6, abs=0.05) and found.verdict.good
+    turn = found.arm.tool[:3, :3].T @ MOUNT[:3, :3]
+    assert np.degrees(Rotation.from_matrix(turn).magnitude()) < 2.0
+    with pytest.raises(ValueError, match="negate forces and torques"):
+        arm.located(joints, -read)
+    with pytest.raises(ValueError, match="unit of the arm's lengths"):
+        arm.located(joints, read * [1, 1, 1, 1e3, 1e3, 1e3])
+    assert arm.located(joints[:3], read[:3]) is arm  # too few to tell
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Height(Sensor):
     """A stranger's: the height of the tip above the measuring frame."""
@@ -542,6 +601,7 @@ def test_a_sensor_of_ones_own_needs_no_more_than_a_class():
         (lambda: Plane(1, [[0, 0, 0, 1]]), "must have normals other than zero"),
         (lambda: Gravity(up=(0, 0, 0)), "up must be a direction"),
         (lambda: Gravity(0.0), "magnitude must be positive"),
+        (lambda: Wrench(mass=0.0), "mass must be positive, got 0.0"),
         (lambda: Board(corners=np.eye(3)), "corners must be four or more rows"),
         (lambda: Board(corners=CORNERS), "camera must be .fx, fy, cx, cy. in pixels"),
         (lambda: Board("hand"), "moves must be one of camera, board"),

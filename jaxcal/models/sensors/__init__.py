@@ -9,6 +9,7 @@ from jaxcal.models.sensors.position import Position
 from jaxcal.models.sensors.sensor import Placed, Reading, Sensor, Tip, hats
 from jaxcal.models.sensors.several import Several
 from jaxcal.models.sensors.socket import Socket
+from jaxcal.models.sensors.wrench import Wrench
 
 __all__ = [
     "SENSORS",
@@ -24,11 +25,22 @@ __all__ = [
     "Several",
     "Socket",
     "Tip",
+    "Wrench",
     "hats",
 ]
 
 # By their names in files and on the command line; a sensor of one's own is added here.
 SENSORS: dict[str, type[Sensor]] = {
     one.kind: one
-    for one in (Position, Pose, Socket, Plane, Distance, Gravity, Board, Several)
+    for one in (
+        Position,
+        Pose,
+        Socket,
+        Plane,
+        Distance,
+        Gravity,
+        Wrench,
+        Board,
+        Several,
+    )
 }

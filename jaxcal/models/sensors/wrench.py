@@ -1,0 +1,140 @@
+"""A force and torque sensor on the tip, with what it carries."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import array_of, in_words, numbers
+from jaxcal.models.sensors.sensor import Named, Reading, Sensor, Tip, hats
+
+__all__ = ["Wrench"]
+
+Array = NDArray[np.float64]
+
+_FEW = 4  # postures that show how the sensor is mounted
+_SPREAD = 0.1  # of the largest: forces along more than a line, and off a plane
+_TURNED = 0.45  # radians on the tool, from which the fit does not find them
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Wrench(Sensor):
+    """Force and torque x, y, z in the tip's frame at rest: its load's weight and zeros.
+
+    With R from the tip to the measuring frame and the load's mass m and centre c in the
+    tip's frame, ``force = m magnitude R' down + zero`` and ``torque = c x (the same) +
+    zero``: the load pulls on the sensor. A sensor that reads what holds the load has
+    the other sign; negate its readings. The zeros are those of the electronics.
+
+    The arm itself is held, weights are too coarse to calibrate it. How the sensor is
+    turned on the tool (``tool rx``, ``ry``, ``rz``, found without a guess from four
+    readings) and which way is down (``base rx``, ``ry``) are known as those of any
+    tool and base. Torques are in newtons times the arm's unit of length. Noise 0.1 N,
+    and as much at 5 % of the arm's length.
+
+    Attributes:
+        mass: of the load with what of the sensor moves with it, kg, roughly; a choice
+            of postures hangs on it little.
+        centre: (3,) of the load in the tip's frame, roughly.
+        magnitude: of gravity, 9.81 for newtons.
+        up: (3,) direction in the measuring frame.
+    """
+
+    mass: float = 1.0
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    magnitude: float = 9.81
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+    kind = "wrench"
+    tool = ("rx", "ry", "rz")
+    local = True
+    outputs = tuple(f"{what} {axis}" for what in ("force", "torque") for axis in "xyz")
+    names = (
+        *("mass", "centre x", "centre y", "centre z"),
+        *(f"zero {output}" for output in outputs),
+    )
+    units = ("kg", *["length"] * 3, *["N"] * 3, *["N length"] * 3)
+
+    def __post_init__(self) -> None:
+        up = array_of("up", self.up, 3)
+        if not np.linalg.norm(up) > 0.0:
+            raise ValueError(f"up must be a direction (3,), got {in_words(up)}")
+        for name in ("mass", "magnitude"):
+            if not numbers(name, getattr(self, name)) > 0.0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        centre = array_of("centre", self.centre, 3)
+        object.__setattr__(self, "centre", tuple(centre.tolist()))
+        object.__setattr__(self, "up", tuple((up / np.linalg.norm(up)).tolist()))
+
+    @property
+    def nominal(self) -> Array:
+        return np.array([self.mass, *self.centre, *[0.0] * 6])
+
+    def usual_noise(self, length: float) -> ArrayLike:
+        return [0.1] * 3 + [0.1 * 0.05 * length] * 3
+
+    def unseen(self, arm: Named) -> tuple[str, ...]:
+        about = "xyz"[int(np.abs(self.up).argmax())]
+        seen = {f"base r{axis}" for axis in "xyz" if axis != about}
+        seen |= {*self.names, *(f"tool {axis}" for axis in self.tool)}
+        return tuple(name for name in arm.names if name not in seen)
+
+    def _pull(self, tip: Tip) -> Array:
+        """(N, 3) force of one kilogram in the tip's frame."""
+        return -self.magnitude * np.array(self.up) @ tip.rotation
+
+    def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
+        mass, lever = own[0], hats(own[1:4])
+        unit, down = self._pull(tip), -self.magnitude * np.array(self.up)
+        force = mass * unit
+        count = len(force)
+        by_tip = np.zeros((count, 6, 6))
+        by_tip[:, :3, 3:] = mass * np.matrix_transpose(tip.rotation) @ hats(down)
+        by_tip[:, 3:, 3:] = lever @ by_tip[:, :3, 3:]
+        by_own = np.zeros((count, 6, 10))
+        by_own[:, :3, 0], by_own[:, 3:, 0] = unit, unit @ lever.T
+        by_own[:, 3:, 1:4] = -hats(force)
+        by_own[:, :, 4:] = np.eye(6)
+        values = np.hstack([force, force @ lever.T]) + own[4:]
+        return Reading(values, by_tip, by_own)
+
+    def located(
+        self, tip: Tip, inputs: Array, measured: Array | None
+    ) -> tuple[Self, Array | None]:
+        """Itself, and how it is turned on the tool where that is far from nominal.
+
+        From differences of the forces: zeros do not matter. Refused are readings of
+        the other sign, and torques in another unit.
+        """
+        from scipy.spatial.transform import Rotation
+
+        if measured is None or len(measured) < _FEW:
+            return self, None
+        force, torque = np.split(measured - measured.mean(axis=0), 2, axis=1)
+        arm = float(np.linalg.norm(torque) / (np.linalg.norm(force) + 1e-300))
+        if arm > tip.length:
+            raise ValueError(
+                "torques must be in newtons times the unit of the arm's lengths, got "
+                f"a load {arm:.3g} from the sensor on an arm of {tip.length:.3g}"
+            )
+        pull = self._pull(tip)
+        pull = pull - pull.mean(axis=0)
+        left, spread, right = np.linalg.svd(pull.T @ force)
+        if spread[1] < _SPREAD * spread[0]:
+            return self, None
+        turn, handed = left @ right, np.linalg.det(left @ right)
+        if handed < 0.0 and spread[2] > _SPREAD * spread[0]:
+            raise ValueError(
+                "forces must be those of the load on the sensor, along gravity; these "
+                "have the other sign: negate forces and torques"
+            )
+        left[:, 2] *= handed
+        turn = left @ right
+        if Rotation.from_matrix(turn).magnitude() < _TURNED:
+            return self, None
+        frame = np.eye(4)
+        frame[:3, :3] = turn
+        return self, frame
