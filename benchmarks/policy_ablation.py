@@ -43,7 +43,7 @@ from jaxcal.files import require_writable_folder, write_text
 from jaxcal.information.regression import log_det_information
 from jaxcal.learning.environments import scenarios
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.policies import decoding
+from jaxcal.learning.policies import scorer
 from jaxcal.learning.policies.compact import CompactNetwork
 from jaxcal.learning.policies.features import (
     AHEAD,
@@ -104,20 +104,18 @@ def unlearned(
     out = []
     for begin in range(0, batch, size):
         rows = np.arange(begin, begin + size).clip(max=batch - 1)
-        picked = decoding.choose(
+        picked = scorer.choose(
             network,
             {},
-            jnp.asarray(sets[rows], jnp.float32),
-            jnp.asarray(free[rows]),
-            jnp.asarray(kept[rows], jnp.int32),
-            jax.random.key(0),
+            sets[rows].astype(np.float32),
+            free[rows],
+            kept[rows],
             k=k,
-            num_required=kept.shape[1],
             decoding="first" if num > 1 else "greedy",
             num=num,
         )
-        out.append(np.asarray(picked)[: batch - begin])
-    return np.concatenate(out).astype(np.int64)
+        out.append(picked[: batch - begin])
+    return np.concatenate(out)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,9 @@ A command is a function, its docstring its help. A parameter is an argument, a
 keyword-only one an option; one whose type is a dataclass stands for options, its
 fields. ``Annotated[T, ...]`` says more of one: its help and, where the type does not
 tell, what stands for its value; two numbers are its range, a list its choices, a
-function makes the value of a text. An underscore at the end is no part of a name.
+function makes the value of a text. An underscore at the end is no part of a name. A
+``bool | None`` has a flag for yes and one for no. Options of a dataclass with a
+``TITLE`` stand under it in the help, and under its ``ABOUT``, if any.
 """
 
 from __future__ import annotations
@@ -50,8 +52,14 @@ class Parser(argparse.ArgumentParser):
         """Itself, for the arguments of a function, or a dataclass called ``options``:
         a function's own come before those of its dataclasses."""
         self.set_defaults(function=function)
-        for _, *one in sorted(_arguments(function), key=lambda each: bool(each[0])):
-            _add(self, *one)
+        groups: dict[type, Any] = {}
+        for owner, *one in sorted(_arguments(function), key=lambda each: bool(each[0])):
+            kind = owner and owner[1]
+            if kind not in groups:
+                title = getattr(kind, "TITLE", None)
+                about = getattr(kind, "ABOUT", None)
+                groups[kind] = self.add_argument_group(title, about) if title else self
+            _add(groups[kind], *one)
         return self
 
     def error(self, message: str) -> NoReturn:
@@ -93,15 +101,15 @@ def _options(parameter: str, kind: Any) -> Iterator[tuple[Any, ...]]:
         yield (parameter, kind), each.name, hints[each.name], each.default, True
 
 
-def _add(
-    parser: argparse.ArgumentParser, name: str, hint: Any, default: Any, option: bool
-) -> None:
+def _add(parser: Any, name: str, hint: Any, default: Any, option: bool) -> None:
     kind: Any = hint
     said: tuple[Any, ...] = ()
+    may_be_none = False
     while (optional := type(None) in (parts := typing.get_args(kind))) or (
         typing.get_origin(kind) is typing.Annotated
     ):
         kind, said = parts[0], said if optional else parts[1:]
+        may_be_none |= optional
     text, metavar, *_ = *(each for each in said if isinstance(each, str)), "", ""
     parse = next(filter(callable, said), None)
     limits: tuple[float, ...] = next((x for x in said if isinstance(x, tuple)), ())
@@ -119,7 +127,8 @@ def _add(
         shown = metavar or _METAVARS.get(one, name.upper())
         more["metavar"] = shown if option or metavar else name
     if kind is bool:
-        more["action"] = "store_true"
+        yes_no = argparse.BooleanOptionalAction
+        more["action"] = yes_no if may_be_none else "store_true"
     elif origin is list and (parse is None or typing.get_origin(one) is list):
         more["action"] = "append"
     elif origin is tuple and parts[-1] is Ellipsis:

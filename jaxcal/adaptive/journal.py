@@ -1,15 +1,8 @@
-"""Measurements on disk, one per line, for a closed loop that may be killed.
-
-The first line says what is measured and how; each further one is a measurement and is
-on the disk (fsync) before the next begins. One process writes it at a time. A torn
-last line, as a kill or a full disk leave it, is dropped; other damage is an error.
-"""
+"""Measurements of a closed loop on disk, each before the next begins."""
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
-import json
 import os
 import pathlib
 import re
@@ -17,6 +10,8 @@ from typing import Any
 
 import jax
 import numpy as np
+
+from jaxcal.jsonlines import JsonLines, Record
 
 __all__ = ["Journal", "fingerprint"]
 
@@ -35,7 +30,7 @@ def fingerprint(tree: Any) -> str:
 
 
 class Journal:
-    """An append-only file of a header and measurements.
+    """A header, which says what is measured and how, and a record a measurement.
 
     Args:
         path: of the file; made where missing, in an existing folder.
@@ -48,44 +43,28 @@ class Journal:
     """
 
     def __init__(self, path: str | os.PathLike[str], header: dict[str, Any]) -> None:
-        self.path = pathlib.Path(path)
         header = {"kind": _KIND, "version": 1, **header}
-        self._file = self.path.open("ab")
-        try:
-            try:
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise ValueError(f"{path}: a running session is writing it") from None
-            lines, self._size = _whole_lines(self.path.read_bytes(), self.path)
-            self.entries = lines[1:]
-            """Measurements so far: dicts with ``design`` and ``outcome``."""
-            if lines:
-                _require_same(self.path, lines[0], header)
-            self._file.truncate(self._size)
-            if not lines:
-                self._write(header)
-        except BaseException:
-            self._file.close()
-            raise
+
+        def check(records: list[Record]) -> None:
+            if records:
+                _require_same(pathlib.Path(path), records[0], header)
+
+        self._lines = JsonLines(path, _whole, check)
+        if not self._lines.records:
+            self._lines.append(lambda: header, sync=True)
+
+    @property
+    def entries(self) -> list[Record]:
+        """Measurements so far: dicts with ``design`` and ``outcome``."""
+        return self._lines.records[1:]
 
     def append(self, **entry: Any) -> None:
         """Write a measurement; it is on the disk when this returns."""
-        self._write(entry)
-        self.entries.append(entry)
-
-    def _write(self, record: dict[str, Any]) -> None:
-        line = json.dumps(record, separators=(",", ":"), allow_nan=False) + "\n"
-        try:
-            self._file.write(line.encode())
-            self._file.flush()
-            os.fsync(self._file.fileno())
-        except BaseException:
-            self._file.truncate(self._size)
-            raise
-        self._size += len(line.encode())
+        self._lines.append(lambda: entry, sync=True)
 
     def close(self) -> None:
-        self._file.close()
+        """Let another process go on with the session."""
+        self._lines.close()
 
     def __enter__(self) -> Journal:
         return self
@@ -94,27 +73,8 @@ class Journal:
         self.close()
 
 
-def _whole_lines(data: bytes, path: pathlib.Path) -> tuple[list[Any], int]:
-    """Records, and the bytes that they take."""
-    *lines, torn = data.split(b"\n")
-    records: list[Any] = []
-    size = 0
-    for number, line in enumerate(lines):
-        try:
-            record = json.loads(line)
-            if not isinstance(record, dict):
-                raise ValueError
-            if number and not {"design", "outcome"} <= record.keys():
-                raise ValueError
-        except ValueError:
-            if number == len(lines) - 1 and not torn:
-                break  # a damaged last line counts as torn, also with its newline
-            raise ValueError(
-                f"{path}: line {number + 1} is damaged; the session cannot be resumed"
-            ) from None
-        records.append(record)
-        size += len(line) + 1
-    return records, size
+def _whole(number: int, record: Record) -> bool:
+    return number == 0 or {"design", "outcome"} <= record.keys()
 
 
 def _require_same(

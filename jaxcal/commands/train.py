@@ -6,7 +6,6 @@ measurement of a task (``--task``); they differ in what is read from the flags.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import datetime
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from jaxcal.adaptive.policy.config import PolicyConfig
     from jaxcal.adaptive.rules import StateRule
     from jaxcal.adaptive.tasks.registry import Entry
+    from jaxcal.commands.train_arguments import Options
     from jaxcal.learning.training.config import TrainConfig
     from jaxcal.learning.training.run import Report
 
@@ -51,9 +51,9 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
         cache.keep_compiled_programs()
         try:
             with needs("policy", "training"):
-                from jaxcal.commands.train_arguments import parser
+                from jaxcal.commands.train_arguments import read
             with told():
-                return _run(parser(prog).parse_args(given), prog)
+                return _run(read(prog, given), prog)
         except (ValueError, OSError, MissingExtraError) as error:
             return refused(prog, error)
 
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
     return processes.run_job(prog, given, alone, advice)
 
 
-def _run(arguments: argparse.Namespace, prog: str) -> int:
+def _run(arguments: Options, prog: str) -> int:
     """Train, say how it went; of several processes the first speaks for all."""
     from jaxcal.commands.train_arguments import preset_of
     from jaxcal.learning.runtime import devices
@@ -112,9 +112,7 @@ def _run(arguments: argparse.Namespace, prog: str) -> int:
     return 0
 
 
-def _train(
-    config: Any, arguments: argparse.Namespace, out: pathlib.Path, stop: Stop
-) -> int:
+def _train(config: Any, arguments: Options, out: pathlib.Path, stop: Stop) -> int:
     """Updates made."""
     import numpy as np
 
@@ -158,11 +156,12 @@ def _train(
     return int(np.max(state.num_updates))
 
 
-def _num_runs(arguments: argparse.Namespace, out: pathlib.Path) -> int:
+def _num_runs(arguments: Options, out: pathlib.Path) -> int:
     """Of what to begin or to go on with; what is wrong is refused later."""
     from jaxcal.learning.config import runs_of
 
-    seeds, sweep = arguments.num_seeds or 1, arguments.sweep
+    seeds = arguments.values.get("num_seeds") or 1
+    sweep: Sequence[Any] = arguments.sweep
     if arguments.resume:
         from jaxcal.adaptive.policy.run import SCHEMA
         from jaxcal.learning.training import checkpoint
@@ -177,18 +176,18 @@ def _num_runs(arguments: argparse.Namespace, out: pathlib.Path) -> int:
 # -- what to train ---------------------------------------------------------------------
 
 
-def _configuration(arguments: argparse.Namespace, out: pathlib.Path) -> TrainConfig:
+def _configuration(arguments: Options, out: pathlib.Path) -> TrainConfig:
     """Of postures: from the flags, or from the run to go on with."""
     from jaxcal.commands.train_arguments import (
         candidates_of,
+        given_to,
         preset_of,
         trained_on,
-        values_of,
     )
     from jaxcal.learning.training import checkpoint, presets
     from jaxcal.learning.training.config import TrainConfig
 
-    given = values_of(arguments, task=False)
+    given = given_to(arguments, task=False)
     path = arguments.candidates
     candidates = candidates_of(path) if path else None
     config = presets.load(preset_of(arguments))
@@ -211,7 +210,7 @@ def _configuration(arguments: argparse.Namespace, out: pathlib.Path) -> TrainCon
         config = presets.with_values(config, given)
     else:
         config = trained_on(config, candidates, given)
-    config = dataclasses.replace(config, sweep=arguments.sweep)
+    config = dataclasses.replace(config, sweep=tuple(arguments.sweep))
     if config.num_runs > 1 and arguments.no_validation:
         raise ValueError(
             "--seeds and --sweep need the validation by which the best is known: leave "
@@ -222,7 +221,7 @@ def _configuration(arguments: argparse.Namespace, out: pathlib.Path) -> TrainCon
 
 
 def _for_brax(
-    config: TrainConfig, arguments: argparse.Namespace, given: dict[str, Any]
+    config: TrainConfig, arguments: Options, given: dict[str, Any]
 ) -> TrainConfig:
     """A preset as brax trains it; what brax does not read is refused."""
     import jax
@@ -232,8 +231,9 @@ def _for_brax(
     with needs("study", "--trainer brax"):
         from jaxcal.learning.training import brax_ppo
 
-    for name in ("resume", "num_seeds", "sweep"):
-        if getattr(arguments, name):
+    refused = {"resume": arguments.resume, "sweep": arguments.sweep}
+    for name, value in (refused | given).items():
+        if value and name in ("resume", "sweep", "num_seeds"):
             raise ValueError(f"{flag_of(name)} works with --trainer jaxcal only")
     if jax.process_count() > 1:
         raise ValueError("--trainer brax works in a single process only")
@@ -247,19 +247,18 @@ def _for_brax(
     return brax_ppo.adapted(config)
 
 
-def _task_configuration(
-    arguments: argparse.Namespace, out: pathlib.Path
-) -> PolicyConfig:
+def _task_configuration(arguments: Options, out: pathlib.Path) -> PolicyConfig:
     """Of a task: from the flags, or from the run to go on with."""
     from jaxcal.adaptive.policy import run
     from jaxcal.adaptive.policy.config import PolicyConfig
     from jaxcal.adaptive.tasks import registry
-    from jaxcal.commands.train_arguments import TASK_PARTS, values_of
+    from jaxcal.commands.train_arguments import TASK_PARTS, given_to
     from jaxcal.learning.settings import settings_of
     from jaxcal.learning.training import checkpoint
 
+    assert arguments.task is not None  # it is what this function is for
     entry = registry.load(arguments.task)
-    given = values_of(arguments, task=True)
+    given = given_to(arguments, task=True)
     if arguments.resume:
         more = {"with": arguments.with_} if arguments.with_ else {}
         _refuse_with_resume(given | more | _swept(arguments), out)
@@ -284,7 +283,7 @@ def _task_configuration(
     base = entry.rules.get("state") or _tuned(entry, options[0])
     config = PolicyConfig(task=arguments.task, base=base, options=options, **own)
     changed = dataclasses.replace(config.ppo, **ppo)
-    return dataclasses.replace(config, ppo=changed, sweep=arguments.sweep)
+    return dataclasses.replace(config, ppo=changed, sweep=tuple(arguments.sweep))
 
 
 def _tuned(entry: Entry, options: Mapping[str, Any]) -> StateRule:
@@ -296,7 +295,7 @@ def _tuned(entry: Entry, options: Mapping[str, Any]) -> StateRule:
     return tune(entry.make(**options), StateRule(), episodes=1024, seed=1)
 
 
-def _swept(arguments: argparse.Namespace) -> dict[str, Any]:
+def _swept(arguments: Options) -> dict[str, Any]:
     return {"sweep": arguments.sweep} if arguments.sweep else {}
 
 
@@ -396,7 +395,6 @@ def _compare_runs(
     """What every seed reached with every swept value, where they were several."""
     import numpy as np
 
-    from jaxcal.learning.config import runs_of
     from jaxcal.learning.training import checkpoint
 
     if config.num_runs == 1:
@@ -405,7 +403,7 @@ def _compare_runs(
     values = np.array([[each[name] for name in measured] for each in progress["seeds"]])
     if not len(values):
         return
-    runs = runs_of(config.seed, config.num_seeds, config.sweep)
+    runs = config.runs
     names, best = runs[0], progress["best"]
     wide = {name: max(len(name), 9) for name in names}
     print(

@@ -6,29 +6,31 @@ import argparse
 import dataclasses
 import pathlib
 import textwrap
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.tasks import registry
-from jaxcal.arguments import Parser, number_type, typed_line
+from jaxcal.arguments import Parser, number_type, typed_line, values_of
 from jaxcal.commands.pools import holds_sets, read_pool
 from jaxcal.learning.config import TRACED, StreamsConfig
 from jaxcal.learning.environments.task import GivenCandidates
 from jaxcal.learning.runtime import processes
-from jaxcal.learning.settings import settings_of
+from jaxcal.learning.settings import Setting, settings_of
 from jaxcal.learning.training import presets
 from jaxcal.learning.training.config import TrainConfig
 
 __all__ = [
     "TASK_PARTS",
+    "Options",
     "candidates_of",
     "flag_of",
-    "parser",
+    "given_to",
     "preset_of",
+    "read",
     "trained_on",
-    "values_of",
 ]
 
 _EPILOG = """\
@@ -68,6 +70,22 @@ TASK_PARTS: dict[str, type] = {"ppo": StreamsConfig, "policy": PolicyConfig}
 _NAMES = {"num_episodes": "episodes", "num_updates": "updates", "num_seeds": "seeds"}
 
 
+Swept = tuple[str, tuple[float, ...]]
+
+
+def _swept(text: str) -> Swept:
+    """Name and values of ``NAME=X,Y``."""
+    name, _, values = text.partition("=")
+    number = number_type(float)
+    try:
+        held = tuple(number(value) for value in values.split(","))
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(
+            f"must be NAME=X,Y with numbers, got {text!r}"
+        ) from error
+    return name.replace("-", "_"), held
+
+
 @dataclasses.dataclass
 class Options:
     """What is trained and where it is kept."""
@@ -93,6 +111,15 @@ class Options:
         bool, "do not measure the gap to the proven optimum while training"
     ] = False
     devices: Annotated[int | None, "devices of each process [all]"] = None
+    sweep: Annotated[
+        tuple[Swept, ...],
+        _swept,
+        "values side by side, every combination for every seed, in one table: of "
+        + ", ".join(TRACED),
+        "NAME=X,Y",
+    ] = ()
+    # What the other flags set: field of a configuration to value.
+    values: dict[str, Any] = dataclasses.field(default_factory=dict, init=False)
 
 
 def flag_of(name: str) -> str:
@@ -100,9 +127,66 @@ def flag_of(name: str) -> str:
     return "--" + _NAMES.get(name, name).replace("_", "-")
 
 
-def parser(prog: str) -> Parser:
-    """All flags; ``prog`` is what was typed, "train.py" or "jaxcal train"."""
-    out = Parser(
+def _held(name: str) -> Any:
+    """The value of compact, or of tasks."""
+    config = presets.load("compact")
+    parts = (config, config.ppo, config.network, config.tasks[0].environment, PPO)
+    return next(
+        getattr(part, name)
+        for part in (*parts, PolicyConfig)
+        if name in part.__dataclass_fields__
+    )
+
+
+def _flags(title: str, settings: Iterable[Setting]) -> type:
+    """A dataclass of settings, None where one is not given, as ``Parser.of`` reads."""
+    shown = {int: "N", float: "X", str: "NAME", bool: ""}
+    fields = []
+    for field in settings:
+        kind: Any = field.kind | None
+        said = Annotated[kind, f"{field.help} [{_held(field.name)}]", shown[field.kind]]
+        default = dataclasses.field(default=None)
+        fields.append((_NAMES.get(field.name, field.name), said, default))
+    about = "in brackets the value of compact"
+    return dataclasses.make_dataclass(
+        "Settings", fields, namespace={"TITLE": title, "ABOUT": about}
+    )
+
+
+_POSTURES = {f.name: f for part in presets.PARTS.values() for f in settings_of(part)}
+_TASKS = {f.name: f for part in TASK_PARTS.values() for f in settings_of(part)}
+_BOTH = [field for name, field in _POSTURES.items() if name in _TASKS]
+Shared = _flags("of postures and tasks", _BOTH)
+OfPostures = _flags(
+    "of postures, in presets of one task",
+    [field for name, field in _POSTURES.items() if name not in _TASKS],
+)
+OfTasks = _flags(
+    "of tasks", [field for name, field in _TASKS.items() if name not in _POSTURES]
+)
+
+
+def asked(
+    options: Options,
+    job: processes.Job,
+    shared: Shared,  # type: ignore[valid-type]  # made of the configurations
+    postures: OfPostures,  # type: ignore[valid-type]
+    tasks: OfTasks,  # type: ignore[valid-type]
+) -> Options:
+    """The options, with the settings that were given; the flags of ``train``."""
+    fields = {flag: name for name, flag in _NAMES.items()}
+    for part in (shared, postures, tasks):
+        options.values |= {
+            fields.get(name, name): value
+            for name, value in vars(part).items()
+            if value is not None
+        }
+    return options
+
+
+def read(prog: str, argv: Sequence[str]) -> Options:
+    """The command line; ``prog`` is what was typed, "train.py" or "jaxcal train"."""
+    parser = Parser(
         prog=prog,
         usage="%(prog)s [--preset NAME | --task NAME] [--out DIR] [flags below]",
         description="Train a policy, and save it with all it needs: one that selects "
@@ -113,69 +197,23 @@ def parser(prog: str) -> Parser:
             presets=_abouts(),
             tasks=_tasks(),
         ),
-    ).of(Options)
-    processes.add_arguments(out)
-    postures = {f.name: f for part in presets.PARTS.values() for f in settings_of(part)}
-    tasks = {f.name: f for part in TASK_PARTS.values() for f in settings_of(part)}
-    groups = (
-        ("of postures and tasks", postures.keys() & tasks.keys()),
-        ("of postures, in presets of one task", postures.keys() - tasks.keys()),
-        ("of tasks", tasks.keys() - postures.keys()),
-    )
-    for title, names in groups:
-        group = out.add_argument_group(title, "in brackets the value of compact")
-        for field in (f for name, f in (tasks | postures).items() if name in names):
-            line = f"{field.help} [{_held(field.name)}]".replace("%", "%%")
-            flag = flag_of(field.name)
-            if field.kind is bool:
-                yes_no = argparse.BooleanOptionalAction
-                group.add_argument(flag, action=yes_no, help=line)
-            else:
-                metavar = {int: "N", float: "X", str: "NAME"}[field.kind]
-                kind = field.kind if field.kind is str else number_type(field.kind)
-                group.add_argument(
-                    flag, type=kind, metavar=metavar, help=line, dest=field.name
-                )
-    out.add_argument(
-        "--sweep", nargs="+", type=_swept, default=(), metavar="NAME=X,Y",
-        help="values side by side, every combination for every seed, in one table: "
-        f"of {', '.join(TRACED)}",
-    )  # fmt: skip
-    return out
+    ).of(asked)
+    return asked(**values_of(parser.parse_args(argv)))
 
 
-def _swept(text: str) -> tuple[str, tuple[float, ...]]:
-    name, _, values = text.partition("=")
-    number = number_type(float)
-    try:
-        held = tuple(number(value) for value in values.split(","))
-    except argparse.ArgumentTypeError as error:
-        raise argparse.ArgumentTypeError(
-            f"must be NAME=X,Y with numbers, got {text!r}"
-        ) from error
-    return name.replace("-", "_"), held
-
-
-def preset_of(arguments: argparse.Namespace) -> str:
+def preset_of(arguments: Options) -> str:
     """That which was given; else the smallest."""
     return arguments.preset or "compact"
 
 
-def values_of(arguments: argparse.Namespace, task: bool) -> dict[str, Any]:
+def given_to(arguments: Options, task: bool) -> dict[str, Any]:
     """The fields of a configuration that were given: name to value.
 
     Raises:
         ValueError: a flag is given that a task, or a preset, does not read.
     """
-    own = {f.name for part in TASK_PARTS.values() for f in settings_of(part)}
-    other = presets.field_names()
-    read = own if task else other
-    given = {
-        name: value
-        for name in own | other
-        if (value := getattr(arguments, name)) is not None
-    }
-    unread = {flag_of(name) for name in set(given) - read}
+    given, read = arguments.values, _TASKS if task else _POSTURES
+    unread = {flag_of(name) for name in set(given) - set(read)}
     if task:
         unread |= {"--preset"} if arguments.preset else set()
         unread |= {"--candidates"} if arguments.candidates else set()
@@ -200,17 +238,6 @@ def _abouts() -> str:
 def _tasks() -> str:
     return "\n".join(
         f"  {name:9} {registry.load(name).about}" for name in registry.names()
-    )
-
-
-def _held(name: str) -> Any:
-    """The value of compact, or of tasks."""
-    config = presets.load("compact")
-    parts = (config, config.ppo, config.network, config.tasks[0].environment, PPO)
-    return next(
-        getattr(part, name)
-        for part in (*parts, PolicyConfig)
-        if name in part.__dataclass_fields__
     )
 
 

@@ -5,12 +5,20 @@ from __future__ import annotations
 import abc
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from jaxcal.learning.settings import require, setting
 
-__all__ = ["TRACED", "EpisodesConfig", "PPOConfig", "StreamsConfig", "Sweep", "runs_of"]
+__all__ = [
+    "TRACED",
+    "EpisodesConfig",
+    "PPOConfig",
+    "RunConfig",
+    "StreamsConfig",
+    "Sweep",
+    "runs_of",
+]
 
 TRACED = (
     "learning_rate", "final_learning_rate", "clip_range", "value_coefficient",
@@ -171,3 +179,52 @@ class StreamsConfig(PPOConfig):
     def rows_per_update(self) -> int:
         """Streams of an update."""
         return self.decisions_per_update // self.stream_length
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunConfig(abc.ABC):
+    """What every run has beside what it trains: seeds, swept values, how often it
+    validates and saves. Subclasses have a field ``ppo``."""
+
+    seed: int = setting(0, "of everything random")
+    num_seeds: int = setting(1, "runs side by side: seed, seed + 1, ...")
+    sweep: Sweep = ()  # side by side too: every combination, for every seed
+    validate_every: float = 15.0  # seconds between validations
+    save_every: float = 60.0  # seconds between checkpoints
+
+    def __post_init__(self) -> None:
+        require(self, "0 or more", lambda v: v >= 0, "seed")
+        require(self, "at least 1", lambda v: v >= 1, "num_seeds")
+        ppo: PPOConfig = self.ppo  # type: ignore[attr-defined]  # of the subclass
+        ppo.require_sweep(self.sweep)
+
+    @property
+    @abc.abstractmethod
+    def learners(self) -> tuple[Any, ...]:
+        """Learners; update u trains number u modulo theirs."""
+
+    @property
+    def runs(self) -> list[dict[str, Any]]:
+        """``seed`` and the swept values of each run side by side."""
+        return runs_of(self.seed, self.num_seeds, self.sweep)
+
+    @property
+    def num_runs(self) -> int:
+        """Runs side by side: seeds times swept values."""
+        return len(self.runs)
+
+    def as_meta(self) -> dict[str, Any]:
+        """Plain JSON values; subclasses add theirs."""
+        return {
+            "ppo": dataclasses.asdict(self.ppo),  # type: ignore[attr-defined]
+            "seed": self.seed,
+            "num_seeds": self.num_seeds,
+            "sweep": [[name, list(values)] for name, values in self.sweep],
+        }
+
+    @staticmethod
+    def held_in(meta: Mapping[str, Any]) -> dict[str, Any]:
+        """The fields that ``as_meta`` described, but for ``ppo``."""
+        sweep = tuple((name, tuple(values)) for name, values in meta.get("sweep", ()))
+        own = {name: meta[name] for name in ("seed", "num_seeds")}
+        return own | {"sweep": sweep}

@@ -88,7 +88,7 @@ class PaperNetwork(Network):
         features: Candidates,
         chosen: jax.Array,
         available: jax.Array,
-        count: int | jax.Array,
+        count: jax.typing.ArrayLike,
     ) -> Decision:
         return Decision(context_features(features.poses, chosen), available)
 

@@ -19,9 +19,9 @@ import re
 import signal
 import socket
 import time
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from jaxcal.jsonlines import flock, until
 from rig.journal.errors import Refused
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ FOLDER = pathlib.Path(
     os.environ.get("JAXCAL_RIG_LOCKS", f"/var/tmp/jaxcal-rig-{os.getuid()}")
 )
 PATIENCE_S = 0.2  # a `holder` of another process keeps the flock for an instant
-LOOK_S = 0.02
 
 
 class BusLock:
@@ -233,23 +232,6 @@ def _identity(settings: BusSettings) -> str:
     if address == "::1" or address.startswith("127."):
         address = "localhost"
     return f"{address}:{settings.port}"
-
-
-def until(seconds: float, holds: Callable[[], bool]) -> bool:
-    """Wait at most so long for something to hold; whether it does."""
-    end = time.monotonic() + seconds
-    while not (held := holds()) and time.monotonic() < end:
-        time.sleep(LOOK_S)
-    return held
-
-
-def flock(fd: int, kind: int) -> bool:
-    """Take the flock of an open file, unless another holds it; whether it was taken."""
-    try:
-        fcntl.flock(fd, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 def _content(fd: int) -> dict[str, Any]:

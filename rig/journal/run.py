@@ -1,9 +1,4 @@
-"""An append-only journal of JSON lines that survives the death of its writer.
-
-One record a line, numbered. A posture is on the disk (fsync) before the next begins. A
-torn last line, as SIGKILL or a full disk leave it, is dropped by the reader and cut off
-by the next writer; any other damage is an error, never a guess.
-"""
+"""The journal of a run: numbered records, a posture on the disk before the next."""
 
 from __future__ import annotations
 
@@ -14,47 +9,41 @@ import json
 import os
 import pathlib
 import sys
-import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from jaxcal.files import write_text
+from jaxcal.jsonlines import DamagedError, JsonLines, Record, flock, read_records
 from rig.journal.errors import JournalError
-from rig.journal.lock import PATIENCE_S, flock, until
+from rig.journal.lock import PATIENCE_S
 
 if TYPE_CHECKING:
     from rig.config import RigConfig
 
-Record = dict[str, Any]
+
+def _whole(number: int, record: Record) -> bool:
+    """Records are numbered."""
+    return bool(record["seq"] == number)
 
 
-def _parse(data: bytes, path: pathlib.Path) -> tuple[list[Record], int]:
-    """Records and the length in bytes of the undamaged part."""
-    records: list[Record] = []
-    good = 0
-    *lines, tail = data.split(b"\n")
-    for number, line in enumerate(lines):
-        try:
-            record = json.loads(line)
-            whole = record["seq"] == number
-        except (ValueError, KeyError, TypeError):
-            whole = False
-        if not whole:
-            if number == len(lines) - 1 and not tail:
-                break  # the last line, whole but mangled: also torn
-            raise JournalError(f"{path}: line {number + 1} is damaged; begin a new run")
-        records.append(record)
-        good += len(line) + 1
-    return records, good
+@contextlib.contextmanager
+def _told(path: pathlib.Path) -> Iterator[None]:
+    """JournalError for whatever is wrong with the file."""
+    try:
+        yield
+    except OSError as error:
+        raise JournalError(f"{path}: {error.strerror or error}") from None
+    except DamagedError as error:
+        raise JournalError(f"{error}; begin a new run") from None
+    except ValueError as error:
+        raise JournalError(str(error)) from None
 
 
 def read_journal(path: pathlib.Path) -> list[Record]:
     """All whole records; JournalError where one before the last is damaged."""
-    try:
-        return _parse(path.read_bytes(), path)[0]
-    except OSError as error:
-        raise JournalError(f"{path}: {error.strerror or error}") from None
+    with _told(path):
+        return read_records(path, _whole)[0]
 
 
 def is_written(path: pathlib.Path) -> bool:
@@ -81,23 +70,12 @@ class Journal:
 
     def __init__(self, path: pathlib.Path) -> None:
         self.path = path
-        self._lock = threading.Lock()
-        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
-        try:
-            self._fd = os.open(path, flags, 0o644)
-        except OSError as error:
-            raise JournalError(f"{path}: {error.strerror or error}") from None
-        try:
+        with _told(path):
             # A live page that asks `is_written` holds it for an instant.
-            if not until(PATIENCE_S, lambda: flock(self._fd, fcntl.LOCK_EX)):
-                raise JournalError(f"{path}: a running session is writing it")
-            self.records, self._size = _parse(path.read_bytes(), path)
-            os.ftruncate(self._fd, self._size)
-            last = self.records[-1]["time"] if self.records else 0.0
-            self._clock = max(time.time(), last) - time.monotonic()
-        except BaseException:
-            self.close()
-            raise
+            self._lines = JsonLines(path, _whole, patience_s=PATIENCE_S)
+        self.records = self._lines.records
+        last = self.records[-1]["time"] if self.records else 0.0
+        self._clock = max(time.time(), last) - time.monotonic()
 
     def write(self, event: str, *, sync: bool = False, **fields: Any) -> Record:
         """Append one record; with ``sync`` it is on the disk when this returns.
@@ -105,35 +83,24 @@ class Journal:
         Raises:
             JournalError: the disk is full or gone; the journal keeps its whole lines.
         """
-        with self._lock:
+
+        def make() -> Record:
             # A wall clock that is set meanwhile must not exchange two visits.
             now = round(self._clock + time.monotonic(), 4)
-            record = {"seq": len(self.records), "time": now, "event": event, **fields}
-            line = json.dumps(record, allow_nan=False, separators=(",", ":")) + "\n"
-            data = line.encode()
-            try:
-                written = 0
-                while written < len(data):
-                    written += os.write(self._fd, data[written:])
-                if sync:
-                    os.fsync(self._fd)
-            except BaseException as error:  # a signal's too, while nothing is armed
-                with contextlib.suppress(OSError):  # or the next writer cuts it off
-                    os.ftruncate(self._fd, self._size)
-                if not isinstance(error, OSError):
-                    raise
-                raise JournalError(
-                    f"cannot write {self.path}: {error.strerror or error}"
-                ) from None
-            self._size += len(data)
-            self.records.append(record)
-            return record
+            return {"seq": len(self.records), "time": now, "event": event, **fields}
+
+        try:
+            return self._lines.append(make, sync=sync)
+        except OSError as error:
+            raise JournalError(
+                f"cannot write {self.path}: {error.strerror or error}"
+            ) from None
 
     def events(self, event: str) -> list[Record]:
         return [record for record in self.records if record["event"] == event]
 
     def close(self) -> None:
-        os.close(self._fd)
+        self._lines.close()
 
 
 JOURNAL = "journal.jsonl"

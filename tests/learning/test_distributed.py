@@ -198,7 +198,10 @@ ALL = ["--num-processes", "2", "--process-id", "1", "--coordinator", "a:1"]
         ([*ALL, "--coordinator", "n1"], "--coordinator must be HOST:PORT, got 'n1'"),
         (["--process-id", "0"], "--num-processes and --process-id must come together"),
         (["--num-processes", "2"], "--coordinator, --num-processes and --process-id"),
-        (["--process-id", "x"], "argument --process-id: invalid int value: 'x'"),
+        (
+            ["--process-id", "x"],
+            "argument --process-id: must be a whole number, got 'x'",
+        ),
     ],
 )
 @pytest.mark.parametrize("command", ["train.py"])

@@ -12,6 +12,9 @@ from jaxcal.learning import small_matrices
 from jaxcal.learning.policies import geometry
 from jaxcal.selection.policy.policy_kernel import look_ahead
 
+# One program for every depth; op by op it would be many.
+lookahead = jax.jit(geometry.lookahead, static_argnums=1)
+
 
 def log_det(rows: np.ndarray) -> float:
     return float(np.linalg.slogdet(rows.T @ rows)[1])
@@ -38,11 +41,11 @@ def test_of_many_candidates_those_of_largest_gain_are_looked_ahead_from(
     y = rng.normal(size=(1100, 3)).astype(np.float32)
     active = rng.random(1100) < 0.9
     y[~active] = 0.0
-    few = geometry.lookahead(jnp.asarray(y), True, jnp.asarray(active), 3)
+    few = lookahead(jnp.asarray(y), True, jnp.asarray(active), 3)
     values = np.empty((4, 1100))
     given = np.ascontiguousarray(y.T, np.float64)
     look_ahead(given, active, True, 3, False, None, values)
-    for mine, theirs in zip(few, values[:3], strict=True):
+    for mine, theirs in zip(few, values, strict=True):
         np.testing.assert_allclose(mine, theirs, atol=1e-4)
     assert (np.asarray(few[1]) > -30.0).sum() == 512
     monkeypatch.setattr(geometry, "_ALL_START", 10**6)
@@ -76,17 +79,17 @@ def test_whitening_leaves_unusable_candidates_out(rng):
 def test_projection_leaves_the_schur_complement(rng):
     _, x, _ = whitened(rng)
     x32 = jnp.asarray(x, jnp.float32)
-    y, _ = geometry.projected(x32, x32[:2])
+    y, _ = geometry.projected(x32, x32[:2], 2)
     kernel = x @ x.T
     expected = kernel - kernel[:, :2] @ np.linalg.solve(kernel[:2, :2], kernel[:2])
     np.testing.assert_allclose(np.asarray(y @ y.T), expected, atol=1e-5)
-    _, volume = geometry.projected(x32, x32[:3])
+    _, volume = geometry.projected(x32, x32[:3], 3)
     assert float(volume) == pytest.approx(np.linalg.slogdet(kernel[:3, :3])[1], 1e-4)
 
 
 def test_a_repeated_direction_leaves_nothing_and_breaks_nothing():
     x = jnp.asarray([[1.0, 0.0], [1.0, 0.0], [0.0, 2.0]])
-    y, _ = geometry.projected(x, x[:2])
+    y, _ = geometry.projected(x, x[:2], 2)
     np.testing.assert_allclose(y, [[0.0, 0.0], [0.0, 0.0], [0.0, 2.0]], atol=1e-6)
 
 
@@ -110,10 +113,10 @@ def test_lookahead_before_the_space_is_spanned_is_greedy(rng, chosen):
     depth = 4 - chosen
     active = np.arange(12) >= chosen
     y, _ = geometry.projected(
-        jnp.asarray(x, jnp.float32), jnp.asarray(x[:chosen], jnp.float32)
+        jnp.asarray(x, jnp.float32), jnp.asarray(x[:chosen], jnp.float32), chosen
     )
     y = y * active[:, None]
-    values = np.stack(geometry.lookahead(y, False, jnp.asarray(active), depth))
+    values = np.stack(lookahead(y, False, jnp.asarray(active), depth))
 
     def volume(picked):
         return np.linalg.slogdet(kernel[np.ix_(picked, picked)])[1] if picked else 0.0
@@ -134,7 +137,7 @@ def test_lookahead_after_it_is_greedy_too_and_never_repeats(rng):
         jnp.asarray(x, jnp.float32), jnp.asarray(x[:4], jnp.float32), 0.0
     )
     active = np.arange(8) >= 4
-    values = np.stack(geometry.lookahead(y * active[:, None], True, active, 4))
+    values = np.stack(lookahead(y * active[:, None], True, active, 4))
     base = log_det(x[:4])
     for start in range(4, 8):
         picked = [0, 1, 2, 3, start]
@@ -156,7 +159,7 @@ def test_compiled_and_shared_over_a_mapped_axis_it_is_the_same(rng):
 
     def project(index):
         chosen = jnp.take_along_axis(x, index[..., None], axis=-2)
-        return geometry.projected(x, chosen)[0]
+        return geometry.projected(x, chosen, 3)[0]
 
     compiled = jax.jit(jax.vmap(project))(which)
     plain = jnp.stack([project(which[0]), project(which[1])])

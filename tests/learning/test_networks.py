@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from jaxcal.learning.core import network as networks
-from jaxcal.learning.policies import decoding
+from jaxcal.learning.policies import scorer
 from jaxcal.learning.policies.compact import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training import checkpoint
@@ -115,9 +115,7 @@ def test_a_network_can_begin_as_the_look_ahead_rule(rng, k):
     params = networks.initial(network, jax.random.key(0), 12, 3, k)
     points = jnp.asarray(rng.uniform(size=(50, 12, 3)), jnp.float32)
     free = jnp.ones((50, 12), bool)
-    nothing = jnp.zeros((50, 0), jnp.int32)
-    key = jax.random.key(0)
-    own = decoding.choose(network, params, points, free, nothing, key, k=k)
+    own = scorer.choose(network, params, points, free, k=k)
     features = network.candidate_features(points, free)
 
     @jax.jit
@@ -132,7 +130,7 @@ def test_a_network_can_begin_as_the_look_ahead_rule(rng, k):
 
     picks = rule()
     # The members of one set tie; which of them comes first is rounding.
-    reached = [decoding.log_det_of(points, picked) for picked in (own, picks)]
+    reached = [scorer.log_det_of(points, picked) for picked in (own, picks)]
     np.testing.assert_allclose(*reached, atol=1e-4)
     assert (np.sort(own) == np.sort(picks)).all(axis=1).mean() > 0.9
 
@@ -155,16 +153,7 @@ def test_the_shipped_policy_chooses_what_it_always_chose(name, n, mask, how):
     rng = np.random.default_rng([20, n, k, 0])
     sets = rng.uniform(size=(batch, 20, n)).astype(np.float32)
     free = rng.uniform(size=(batch, 20)) >= mask
-    found = decoding.choose(
-        policy.network,
-        policy.params,
-        jnp.asarray(sets),
-        jnp.asarray(free),
-        jnp.zeros((batch, 0), jnp.int32),
-        jax.random.key(0),
-        k=k,
-        **how,
-    )
+    found = scorer.choose(policy.network, policy.params, sets, free, k=k, **how)
     # The best of the last pair comes first; where they tie, rounding decides.
     assert (np.sort(found) == np.sort(picks)).all(axis=1).mean() > 0.98
 
@@ -178,15 +167,9 @@ def test_the_last_pair_is_the_best_one_unless_little_is_spanned(rng, k, close):
     points = rng.uniform(size=(batch, m, 3)).astype(np.float32)
     if close:
         points[:, : k - 2] = points[:, :1] + 0.03 * points[:, : k - 2]
-    found = decoding.choose(
-        network,
-        params,
-        jnp.asarray(points),
-        jnp.ones((batch, m), bool),
-        jnp.tile(jnp.arange(k - 2), (batch, 1)),
-        jax.random.key(0),
-        k=k,
-        num_required=k - 2,
+    begun = np.tile(np.arange(k - 2), (batch, 1))
+    found = scorer.choose(
+        network, params, points, np.ones((batch, m), bool), begun, k=k
     )
 
     def log_det(sets):

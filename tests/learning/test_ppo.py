@@ -258,10 +258,11 @@ class Probe:
 
 
 PROBE = Probe(dataclasses.replace(TINY, learning_rate=0.3, entropy_start=0.0))
+train = jax.jit(ppo.make_train(PROBE))
 
 
 def test_value_and_policy_are_learned_in_a_probe_environment():
-    state, metrics = jax.jit(ppo.make_train(PROBE))(jax.random.key(0))
+    state, metrics = train(jax.random.key(0))
     rewards = metrics["reward_mean"]
     assert metrics["rewards"].shape == (40, 64)
     # At random 1/2; the largest of six uniform numbers is 6/7 on average.
@@ -271,19 +272,26 @@ def test_value_and_policy_are_learned_in_a_probe_environment():
 
 def test_training_maps_over_seeds():
     """Each of several in one program is what it is alone, and no two are the same."""
-    train = ppo.make_train(PROBE)
     keys = jax.random.split(jax.random.key(5), 3)
-    several, _ = jax.jit(jax.vmap(train))(keys)
+    several, _ = jax.jit(jax.vmap(ppo.make_train(PROBE)))(keys)
     slopes = several.average["slope"]
     assert len(set(np.asarray(slopes).tolist())) == 3
-    alone, _ = jax.jit(train)(keys[1])
+    alone, _ = train(keys[1])
     np.testing.assert_allclose(slopes[1], alone.average["slope"], rtol=1e-4)
 
 
-def test_a_run_trains_what_the_pure_function_does(tmp_path):
+@pytest.mark.parametrize(
+    "tasks",
+    [
+        (Pick(),),
+        pytest.param((Pick(), Pick(payment=0.5)), marks=pytest.mark.slow),
+    ],
+)
+def test_a_run_trains_what_the_pure_function_does(tmp_path, tasks):
     """Also where two tasks take turns."""
-    config = Probe(PROBE.ppo, (Pick(), Pick(payment=0.5)))
-    pure, metrics = jax.jit(ppo.make_train(config))(jax.random.key(3))
+    config = Probe(PROBE.ppo, tasks)
+    pure = train if config == PROBE else jax.jit(ppo.make_train(config))
+    pure, metrics = pure(jax.random.key(3))
     recipe = Recipe(config, ((),), "probe", (), (), validate=None)
     state = run(recipe, tmp_path)
     for one, other in zip(
@@ -312,15 +320,15 @@ def test_an_update_in_slices_is_that_of_the_whole(size):
 
 def test_cutting_a_run_into_calls_changes_no_bit_and_a_seed_compiles_nothing():
     config, (learner,) = PROBE.ppo, PROBE.learners
-    update = updates(config, learner, None, 8)
-    assert updates(config, learner, None, 8) is update
+    update = updates(config, learner, None, 16)  # as ``run`` asks for it
+    assert updates(config, learner, None, 16) is update
     ends = []
     for counts in ((1,) * 6, (6,), (2, 4)):
         state = ppo.begin(config, learner, jax.random.key(3))
         rows = []
         for count in counts:
             state, metrics = update(state, jnp.int32(count))
-            assert metrics["rewards"].shape == (8, 64)
+            assert metrics["rewards"].shape == (16, 64)
             rows += list(np.asarray(metrics["reward_mean"])[:count])
         ends.append((state, np.array(rows)))
     for one, other in zip(*(jax.tree.leaves(end) for end in ends[:2]), strict=True):

@@ -79,16 +79,20 @@ def streams(config=SHORT, **environment):
     return Streams(config, Late(**environment), Linear())
 
 
+PLAYED = streams(dataclasses.replace(SHORT, gae_lambda=0.0, decisions_per_update=32))
+play = jax.jit(PLAYED.gather)  # op by op it would be hundreds of programs
+
+
 def test_two_updates_of_a_length_play_what_one_of_twice_the_length_does():
-    short = streams(dataclasses.replace(SHORT, gae_lambda=0.0, decisions_per_update=32))
+    short = PLAYED
     long = short.having(
         dataclasses.replace(short.config, stream_length=16, decisions_per_update=64)
     )
     params = short.init(jax.random.key(0), 1.0)
     begun = short.begin(jax.random.split(jax.random.key(1), 4), 1.0)
-    first, middle, _ = short.gather(params, begun, 1.0)
-    second, end, _ = short.gather(params, middle, 1.0)
-    whole, last, _ = long.gather(params, begun, 1.0)
+    first, middle, _ = play(params, begun, 1.0)
+    second, end, _ = play(params, middle, 1.0)
+    whole, last, _ = jax.jit(long.gather)(params, begun, 1.0)
     for name in ("seen", "action", "log_prob", "target"):
         parts = [getattr(batch, name) for batch in (first, second)]
         np.testing.assert_allclose(
@@ -100,12 +104,11 @@ def test_two_updates_of_a_length_play_what_one_of_twice_the_length_does():
 
 def test_metrics_are_means_over_the_sessions_that_ended():
     """By hand from the actions: 13 decisions a session, 8 of them an update."""
-    learner = streams()
-    params = learner.init(jax.random.key(0), 1.0)
-    playing = learner.begin(jax.random.split(jax.random.key(1), 8), 1.0)
+    params = PLAYED.init(jax.random.key(0), 1.0)
+    playing = PLAYED.begin(jax.random.split(jax.random.key(1), 4), 1.0)
     actions, found = [], []
     for _ in range(4):
-        batch, playing, metrics = learner.gather(params, playing, 1.0)
+        batch, playing, metrics = play(params, playing, 1.0)
         actions.append(np.asarray(batch.action))
         found.append({name: float(value) for name, value in metrics.items()})
     played = np.concatenate(actions, axis=1)
@@ -161,8 +164,7 @@ def test_a_run_resumes_bit_for_bit_in_the_middle_of_sessions(tmp_path):
 
 def test_a_run_that_diverges_keeps_its_last_finite_state(tmp_path):
     """Its second task pays infinity: the first update is finite, the second is not."""
-    config = Config(dataclasses.replace(SHORT, num_updates=40))
-    tasks = jnp.float32(1.0), jnp.float32(np.inf)
+    config, tasks = Config(), (jnp.float32(1.0), jnp.float32(np.inf))
     with pytest.raises(
         DivergedError, match="loss is nan in update 2; the state of update 1"
     ):

@@ -15,15 +15,14 @@ import numpy as np
 import pytest
 
 from jaxcal.extras import MissingExtraError
-from jaxcal.learning.core import network as networks
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.policies import decoding
+from jaxcal.learning.policies import scorer
 from jaxcal.learning.policies.compact import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.training import checkpoint
 from jaxcal.selection.policy import select_batch
-from jaxcal.selection.policy.compact import CompactNetwork, _Sets
+from jaxcal.selection.policy.compact import CompactNetwork
 from jaxcal.selection.policy.policy_kernel import look_ahead
 from jaxcal.selection.problem import make_problems
 
@@ -77,15 +76,13 @@ def test_the_picks_are_those_of_jax(rng, m, n, k, masked, required, how):
     policy = checkpoint.load()
     with jax.enable_x64(True):  # in float32 it picks another of two near ties
         double = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), policy.params)
-        expected = decoding.choose(
+        expected = scorer.choose(
             policy.network,
             double,
-            jnp.asarray(whitened(problems)),
-            jnp.asarray(available),
-            jnp.asarray(kept, jnp.int32),
-            jax.random.key(0),
+            whitened(problems),
+            available,
+            kept,
             k=k,
-            num_required=required,
             decoding=how,
             num=4,
         )
@@ -128,27 +125,17 @@ def test_the_scores_are_those_of_jax_in_double_precision(rng, config, n, k, made
     free = available.copy()
     free[:, :made] = False
 
-    @jax.jit  # operation by operation takes three times as long to compile
-    def scored(points, usable, chosen, free):
-        view = network.candidate_features(points, usable)
-        memory = networks.encode(network, double, view)
-        return memory, decoding.logits_at(
-            network, double, view, memory, chosen, free, made
-        )[0]
-
     with jax.enable_x64(True):
         double = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
-        memory, logits = scored(
-            jnp.asarray(whitened(problems)),
-            jnp.asarray(available),
-            jnp.asarray(chosen, jnp.int32),
-            jnp.asarray(free),
-        )
+        points = whitened(problems)
+        regressors = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1)
+        theirs = scorer.NetworkScorer(network, double)
+        memory = theirs.encode(regressors, available)
+        logits = theirs.scores(memory, chosen, free, made)
     ours = CompactNetwork(dataclasses.asdict(config), weights.flat(params))
-    x = np.stack([p.rows.T * np.sqrt(p.available.sum()) for p in problems])
-    own = ours._encoded(np.ascontiguousarray(x), available)
-    np.testing.assert_allclose(own, memory, rtol=1e-4, atol=1e-4)
-    scores = ours._scores(_Sets(x, own, chosen, free), made)
+    own = ours.encode(np.stack([p.rows for p in problems]), available)
+    np.testing.assert_allclose(own.encoded, memory[1], rtol=1e-4, atol=1e-4)
+    scores = ours.scores(own, chosen, free, made)
     assert np.isneginf(scores[~free]).all()
     np.testing.assert_allclose(
         scores[free], np.asarray(logits)[free], rtol=1e-4, atol=1e-4
@@ -185,24 +172,6 @@ def test_of_many_candidates_the_512_of_largest_gain_are_starts(rng):
     assert started.sum() == 512
     square = (y**2).sum(axis=0)
     assert square[started].min() > square[~started].max()
-
-
-def test_samples_are_drawn_from_the_policy(rng):
-    config = NetworkConfig(width=4, encoder_rounds=1)
-    network = build(config)
-    problems, _, available, _ = drawn(rng, 1, 6, 2, 3)
-    begin = jnp.zeros((1, 6, 2)), jnp.ones((1, 6), bool), jnp.full((1, 3), -1)
-    params = drawn_parameters(network, *begin)
-    policy = CompactNetwork(dataclasses.asdict(config), weights.flat(params))
-    picks = policy(problems * 4000, "samples", 1, seed=1)
-    x = np.ascontiguousarray(problems[0].rows.T)[None] * np.sqrt(6)
-    memory = policy._encoded(x, available)
-    none = np.full((1, 3), -1)
-    scores = policy._scores(_Sets(x, memory, none, available), 0)[0]
-    expected = np.exp(scores - scores.max())
-    expected /= expected.sum()
-    share = np.bincount(picks[:, 0], minlength=6) / 4000
-    np.testing.assert_allclose(share, expected, atol=0.03)
 
 
 def test_what_is_chosen_depends_on_no_other_set(rng):

@@ -10,7 +10,7 @@ from jaxcal.adaptive import rules
 from jaxcal.adaptive.policy.network import Network
 from jaxcal.adaptive.policy.sessions import Sessions
 from jaxcal.adaptive.rules import Scored
-from jaxcal.learning.config import StreamsConfig, Sweep, runs_of
+from jaxcal.learning.config import RunConfig, StreamsConfig
 from jaxcal.learning.core.streams import Streams
 from jaxcal.learning.settings import require, setting
 
@@ -33,7 +33,7 @@ PPO = StreamsConfig(
 
 
 @dataclasses.dataclass(frozen=True)
-class PolicyConfig:
+class PolicyConfig(RunConfig):
     """Task, base rule, network and optimisation of a run."""
 
     task: str  # as registered
@@ -42,26 +42,16 @@ class PolicyConfig:
     per_group: int = setting(6, "options of a group that the network sees")
     width: int = setting(64, "of the network's layers")
     ppo: StreamsConfig = PPO
-    seed: int = setting(0, "of everything random")
-    num_seeds: int = setting(1, "runs side by side: seed, seed + 1, ...")
-    sweep: Sweep = ()  # side by side too: every combination, for every seed
-    validate_every: float = 30.0  # seconds between validations
-    save_every: float = 60.0  # seconds between checkpoints
+    validate_every: float = dataclasses.field(default=30.0, kw_only=True)  # seconds
 
     def __post_init__(self) -> None:
-        require(self, "at least 1", lambda v: v >= 1, "per_group", "width", "num_seeds")
-        require(self, "0 or more", lambda v: v >= 0, "seed")
-        self.ppo.require_sweep(self.sweep)
+        require(self, "at least 1", lambda v: v >= 1, "per_group", "width")
+        super().__post_init__()
         if not isinstance(self.base, _RULES):
             known = ", ".join(rule.__name__ for rule in _RULES)
             raise ValueError(
                 f"base must be one of {known}, got {type(self.base).__name__}"
             )
-
-    @property
-    def num_runs(self) -> int:
-        """Runs side by side: seeds times swept values."""
-        return len(runs_of(self.seed, self.num_seeds, self.sweep))
 
     @property
     def learners(self) -> tuple[Streams, ...]:
@@ -74,15 +64,11 @@ class PolicyConfig:
             field.name: float(getattr(self.base, field.name))
             for field in dataclasses.fields(self.base)  # type: ignore[arg-type]  # flax
         }
-        return {
+        return super().as_meta() | {
             "task": self.task,
             "options": [dict(options) for options in self.options],
             "network": {"width": self.width, "per_group": self.per_group},
             "base": {"rule": type(self.base).__name__, **constants},
-            "ppo": dataclasses.asdict(self.ppo),
-            "seed": self.seed,
-            "num_seeds": self.num_seeds,
-            "sweep": [[name, list(values)] for name, values in self.sweep],
         }
 
     @staticmethod
@@ -99,10 +85,6 @@ class PolicyConfig:
                 for options in meta["options"]
             ),
             ppo=StreamsConfig(**meta["ppo"]),
-            seed=meta["seed"],
-            num_seeds=meta["num_seeds"],
-            sweep=tuple(
-                (name, tuple(values)) for name, values in meta.get("sweep", ())
-            ),
+            **RunConfig.held_in(meta),
             **meta["network"],
         )

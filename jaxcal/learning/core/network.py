@@ -14,6 +14,7 @@ choices; leading axes ``...``.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import flax.linen as nn
@@ -43,7 +44,7 @@ class Network(nn.Module):
         features: Any,
         chosen: jax.Array,
         available: jax.Array,
-        count: int,
+        count: jax.typing.ArrayLike,
     ) -> Any:
         """Features of the decision after ``count`` choices.
 
@@ -51,7 +52,7 @@ class Network(nn.Module):
             features: from ``candidate_features``.
             chosen: (..., K) int, -1 from ``count`` on.
             available: (..., M) bool.
-            count: choices made.
+            count: () choices made; traced, so that decisions share a program.
         """
         raise NotImplementedError(_OWN)  # abstract
 
@@ -78,9 +79,14 @@ class Network(nn.Module):
 
 def initial(network: Network, key: jax.Array, m: int, n: int, k: int) -> Any:
     """Fresh parameters for M candidates of n inputs and K choices."""
-    init = jax.jit(network.init)  # eager, it would compile two hundred small programs
+    return _initial(network, key, m, n, k)
+
+
+# Eager, it would compile two hundred small programs.
+@functools.partial(jax.jit, static_argnums=(0, 2, 3, 4))
+def _initial(network: Network, key: jax.Array, m: int, n: int, k: int) -> Any:
     blank = jnp.zeros((1, m, n)), jnp.ones((1, m), bool), jnp.full((1, k), -1)
-    return init(key, *blank)["params"]
+    return network.init(key, *blank)["params"]
 
 
 def encode(network: Network, params: Any, features: Any) -> Any:

@@ -165,11 +165,13 @@ class Postures:
         features = network.candidate_features(start.candidates, start.available)
         memory = encode(network, params, features)
 
-        def score(state: Any, count: int) -> tuple[Any, jax.Array, jax.Array]:
+        def score(
+            state: Any, count: jax.typing.ArrayLike, learns: bool
+        ) -> tuple[Any, jax.Array, jax.Array]:
             decision = network.decision_features(
                 features, state.chosen, state.available, count
             )
-            if count < learned:
+            if learns:
                 return decision, *decode(network, params, memory, decision)
             return decision, *network.lookahead_logits(decision)
 
@@ -186,25 +188,34 @@ class Postures:
                 "reward": reward,
             }
 
-        state, decisions, records = start, [], []
-        shape = (task.num_decisions, self.config.episodes_per_set)
-        for count, keys in enumerate(jax.random.split(key_actions, shape)):
-            decide, axis = functools.partial(score, count=count), None
-            if count > 0:  # the first decision is the same for every episode
-                decide, axis = functools.partial(_mapped, decide, at_once), 0
-            decision, logits, value = decide(state)
-            each = jax.vmap(act, in_axes=(axis, axis, axis, 0))
-            state, record = each(state, logits, value, keys)
-            decisions.append(decision)
-            records.append(record)
+        def decide(learns: bool, state: Any, now: Any) -> tuple[Any, tuple[Any, ...]]:
+            count, keys = now
+            each = functools.partial(score, count=count, learns=learns)
+            decision, logits, value = _mapped(each, at_once, state)
+            state, record = jax.vmap(act)(state, logits, value, keys)
+            return state, (decision if learns else None, record)
 
-        stack = functools.partial(jax.tree.map, lambda *leaves: jnp.stack(leaves))
-        played = stack(*records)  # leaves (K, G)
+        shape = (task.num_decisions, self.config.episodes_per_set)
+        keys = jax.random.split(key_actions, shape)
+        counts = jnp.arange(task.num_decisions)
+        # The first decision is the same for every episode.
+        first, logits, value = score(start, 0, learned > 0)
+        begin = jax.vmap(act, in_axes=(None, None, None, 0))
+        state, record = begin(start, logits, value, keys[0])
+        records = [jax.tree.map(lambda leaf: leaf[None], record)]
+        later = None
+        for begins, ends, learns in ((1, learned, True), (learned, len(keys), False)):
+            if begins < ends:
+                now = counts[begins:ends], keys[begins:ends]
+                step = functools.partial(decide, learns)
+                state, (seen, record) = jax.lax.scan(step, state, now)
+                records.append(record)
+                # The last choices, which the look-ahead makes, are not trained on.
+                later = seen if learns else later
+        played = jax.tree.map(lambda *x: jnp.concatenate(x), *records)  # leaves (K, G)
         advantage, target = self._advantages_and_targets(played)
-        # The last choices, which the look-ahead makes, are not trained on.
-        later = stack(*decisions[1:learned]) if learned > 1 else None
         batch = Batch(
-            seen=Seen(features, decisions[0], later),
+            seen=Seen(features, first, later),
             action=played["action"][:learned],
             log_prob=played["log_prob"][:learned],
             advantage=advantage[:learned],

@@ -132,7 +132,7 @@ class CompactNetwork(Network):
         features: CandidateFeatures,
         chosen: jax.Array,
         available: jax.Array,
-        count: int,
+        count: jax.typing.ArrayLike,
     ) -> DecisionFeatures:
         """The geometry of a decision; arguments as in ``Network``."""
         config = self.config

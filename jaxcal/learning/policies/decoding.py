@@ -1,138 +1,154 @@
-"""Turning a policy into a choice: greedy, sampled, best of the likeliest first picks.
+"""Turning scores into a choice: greedy, sampled, best of the likeliest first picks.
 
-Functions take the network, its parameters and a batch of candidate sets, and return
-indices; they compile once for each shape.
+Written once over a ``Scorer``: the network in JAX (``policies.scorer``) is one, the
+compact network in numpy (``jaxcal.selection.policy.compact``) another. Needs no JAX.
+
+Letters: B candidate sets, E episodes (a set and the choices made from it), M
+candidates, K choices in all, p regressors of a candidate.
 """
 
 from __future__ import annotations
 
-import functools
-from typing import Any
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Protocol
 
-import jax
-import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
 
-from jaxcal.learning.core import network as networks
-from jaxcal.learning.core.network import Network
-from jaxcal.learning.small_matrices import log_det_gram
+__all__ = ["Scorer", "choose", "in_pieces"]
 
-__all__ = ["choose", "complete", "log_det_of", "logits_at"]
-
-
-def log_det_of(candidates: jax.Array, indices: jax.Array) -> jax.Array:
-    """(...,) log det(Z.T Z) of the subsets ``indices`` (..., K) of (..., M, n)."""
-    return log_det_gram(jnp.take_along_axis(candidates, indices[..., None], axis=-2))
+Array = NDArray[Any]
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 
-def complete(
-    network: Network,
-    params: Any,
-    features: Any,
-    memory: Any,
-    chosen: jax.Array,
-    available: jax.Array,
-    first: int,
-    key: jax.Array | None,
-) -> jax.Array:
-    """Choose from position ``first`` to the end: sampled with a key, else greedy."""
-    m = available.shape[-1]
-    for position in range(first, chosen.shape[-1]):
-        logits, _ = logits_at(
-            network, params, features, memory, chosen, available, position
-        )
-        if key is None:
-            action = jnp.argmax(logits, axis=-1)
-        else:
-            key, key_action = jax.random.split(key)
-            action = jax.random.categorical(key_action, logits)
-        chosen = chosen.at[:, position].set(action.astype(chosen.dtype))
-        available = available & ~jax.nn.one_hot(action, m, dtype=bool)
-    return chosen
+class Scorer(Protocol):
+    """A network as decoding sees it."""
+
+    @property
+    def piece_rows(self) -> int | None:
+        """Candidates of all tries that are scored at a time, the pieces on every core;
+        None where one call takes all."""
+
+    def encode(self, rows: Array, usable: Mask) -> Any:
+        """What ``scores`` needs of sets: rows (B, M, p), of which the last column is 1
+        before whitening, and usable (B, M), available or required."""
+
+    def part(self, memory: Any, sets: Indices) -> Any:
+        """The memory of E episodes on the ``sets`` (E,) of an encoded batch."""
+
+    def scores(
+        self, memory: Any, chosen: Indices, free: Mask, count: int, best_only: bool
+    ) -> Array:
+        """(E, M) unnormalised log-probabilities of the choice after ``count`` choices.
+
+        Args:
+            memory: of E episodes.
+            chosen: (E, K), -1 from ``count`` on.
+            free: (E, M) True where a candidate may be chosen.
+            count: choices made.
+            best_only: all but the largest may be too low where nothing is learned.
+        """
 
 
-def logits_at(
-    network: Network,
-    params: Any,
-    features: Any,
-    memory: Any,
-    chosen: jax.Array,
-    available: jax.Array,
-    count: int,
-) -> tuple[jax.Array, jax.Array]:
-    """(B, M) logits and (B,) value of the decision after ``count`` choices.
-
-    The look-ahead makes the last ``network.num_unlearned`` choices.
-    """
-    decision = network.decision_features(features, chosen, available, count)
-    if chosen.shape[-1] - count <= network.num_unlearned:
-        return network.lookahead_logits(decision)
-    return networks.decode(network, params, memory, decision)
-
-
-@functools.partial(
-    jax.jit, static_argnames=("network", "k", "num_required", "decoding", "num")
-)
 def choose(
-    network: Network,
-    params: Any,
-    candidates: jax.Array,
-    available: jax.Array,
-    required: jax.Array,
-    key: jax.Array,
-    *,
+    scorer: Scorer,
+    rows: Array,
+    available: Mask,
+    required: Indices,
     k: int,
-    num_required: int = 0,
+    *,
     decoding: str = "greedy",
     num: int = 16,
-) -> jax.Array:
+    generators: Sequence[np.random.Generator] = (),
+) -> Indices:
     """Choose k of M candidates for every set of a batch.
 
     Args:
-        network: from ``policies.networks.build``.
-        params: its parameters.
-        candidates: (B, M, n).
-        available: (B, M) bool; required postures count as available to the encoder.
-        required: (B, num_required) int, chosen before the policy begins.
-        key: PRNG key, spent by ``samples`` only.
-        k: postures to choose in all.
+        scorer: the network.
+        rows: (B, M, p) regressors of the candidates.
+        available: (B, M) bool.
+        required: (B, r) distinct indices, chosen before the policy begins.
+        k: candidates to choose in all.
         decoding: ``greedy``: the likeliest at every step, one pass; ``samples``: the
             best of ``num`` sampled passes; ``first``: the best of the ``num`` likeliest
             first picks, each completed greedily.
         num: passes for ``samples`` and ``first``.
+        generators: one a set, for ``samples``; else none.
 
     Returns:
-        (B, k) int32, required postures first.
+        (B, k) required candidates first, then in the order of choice.
     """
-    batch, m = available.shape
-    rows = jnp.arange(batch)[:, None]
-    chosen = jnp.full((batch, k), -1, jnp.int32)
-    chosen = chosen.at[:, :num_required].set(required.astype(jnp.int32))
-    usable = available.at[rows, required].set(True)
-    free = available.at[rows, required].set(False)
-    features = network.candidate_features(candidates, usable)
-    memory = networks.encode(network, params, features)
-    completed = functools.partial(complete, network, params, features, memory)
-    if decoding == "greedy" or num_required == k:
-        return completed(chosen, free, num_required, None)
-    if decoding == "samples":
-        keys = jax.random.split(key, num)
-        tries = jax.vmap(lambda key: completed(chosen, free, num_required, key))(keys)
-    else:
-        logits, _ = logits_at(
-            network, params, features, memory, chosen, free, num_required
-        )
-        _, firsts = jax.lax.top_k(logits, min(num, m))
-        # With fewer than ``num`` candidates available, ``firsts`` ends in masked ones:
-        # replace these by the best.
-        valid = jnp.take_along_axis(free, firsts, axis=-1)
-        firsts = jnp.where(valid, firsts, firsts[:, :1]).astype(jnp.int32)
+    batch, r = required.shape
+    chosen = np.full((batch, k), -1, np.int64)
+    chosen[:, :r] = required
+    usable, free = available.copy(), available.copy()
+    np.put_along_axis(usable, required, True, axis=1)
+    np.put_along_axis(free, required, False, axis=1)
+    memory = scorer.encode(rows, usable)
+    if decoding == "greedy" or r == k:
+        return _completed(scorer, memory, chosen, free, r, ())
+    begun = r
+    if decoding == "first":
+        scores = np.where(free, scorer.scores(memory, chosen, free, r, False), -np.inf)
+        firsts = np.argsort(-scores, axis=1, kind="stable")[:, :num]
+        # Fewer than num are left: try the best again, not one that is masked.
+        valid = np.take_along_axis(free, firsts, axis=1)
+        firsts = np.where(valid, firsts, firsts[:, :1])
+        num, generators, begun = firsts.shape[1], (), r + 1
+    sets = np.repeat(np.arange(batch), num)
+    chosen, free = chosen[sets], free[sets]
+    if decoding == "first":
+        chosen[:, r] = firsts.ravel()
+        np.put_along_axis(free, firsts.reshape(-1, 1), False, axis=1)
 
-        def with_first(first: jax.Array) -> jax.Array:
-            begun = chosen.at[:, num_required].set(first)
-            rest = free & ~jax.nn.one_hot(first, m, dtype=bool)
-            return completed(begun, rest, num_required + 1, None)
+    def piece(part: slice) -> Indices:
+        some = scorer.part(memory, sets[part])
+        return _completed(scorer, some, chosen[part], free[part], begun, generators)
 
-        tries = jax.vmap(with_first)(firsts.T)
-    values = jax.vmap(lambda tried: log_det_of(candidates, tried))(tries)
-    best = jnp.argmax(values, axis=0)
-    return jnp.take_along_axis(tries, best[None, :, None], axis=0)[0]
+    size = len(sets)
+    if scorer.piece_rows is not None and not generators:
+        size = max(1, scorer.piece_rows // rows.shape[1])
+    tries = in_pieces(piece, len(sets), size).reshape(batch, num, k)
+    picked = np.take_along_axis(rows[:, None], tries[..., None], axis=2)
+    sign, value = np.linalg.slogdet(np.matrix_transpose(picked) @ picked)
+    best = np.where(sign > 0, value, -np.inf).argmax(axis=1)
+    return tries[np.arange(batch), best]
+
+
+def _completed(
+    scorer: Scorer,
+    memory: Any,
+    chosen: Indices,
+    free: Mask,
+    begun: int,
+    generators: Sequence[np.random.Generator],
+) -> Indices:
+    """``chosen``, written, as ``free`` is, from position ``begun`` to the end.
+
+    The likeliest candidate at every step or, where generators are given, a draw from
+    the policy; each generator serves as many episodes in a row.
+    """
+    episodes = np.arange(len(chosen))
+    for count in range(begun, chosen.shape[1]):
+        scores = scorer.scores(memory, chosen, free, count, not generators)
+        if generators:
+            shape = (len(episodes) // len(generators), free.shape[1])
+            # The largest of scores plus Gumbel noise is a draw from their softmax.
+            scores = scores + np.concatenate([g.gumbel(size=shape) for g in generators])
+        pick = np.where(free, scores, -np.inf).argmax(axis=1)
+        chosen[:, count] = pick
+        free[episodes, pick] = False
+    return chosen
+
+
+def in_pieces(call: Callable[[slice], Indices], count: int, size: int) -> Indices:
+    """``call`` on slices of ``size`` of ``count``, on every core, joined."""
+    parts = [slice(begin, begin + size) for begin in range(0, count, size)]
+    if len(parts) == 1:
+        return call(parts[0])
+    # The kernel and numpy's products release the interpreter.
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        return np.concatenate(list(pool.map(call, parts)))

@@ -80,43 +80,47 @@ def decision_features(
     features: CandidateFeatures,
     chosen: jax.Array,
     available: jax.Array,
-    count: int,
+    count: jax.typing.ArrayLike,
     lookahead: int,
     close_up: bool,
 ) -> DecisionFeatures:
     """Features of the decision after ``count`` choices, one count for the whole batch.
 
+    ``count`` may be traced: one program serves every decision of an episode.
+
     Args:
         features: of the set.
         chosen: (..., K) int, of which the first ``count`` are chosen, the rest -1.
         available: (..., M) bool.
-        count: choices made.
+        count: () choices made.
         lookahead: most greedy choices to look ahead.
         close_up: as for ``vector_features``.
     """
     x = features.whitened
     p, total = x.shape[-1], chosen.shape[-1]
+    count = jnp.asarray(count)
     left = total - count
-    which = jax.nn.one_hot(chosen[..., :count], x.shape[-2], dtype=x.dtype)
+    which = jax.nn.one_hot(chosen, x.shape[-2], dtype=x.dtype)
     picked = jnp.einsum(
         "...km,...mp->...kp", which, x, precision=jax.lax.Precision.HIGHEST
     )
     # A choice multiplies the determinant by |y|^2, or by 1 + |y|^2.
     if total == p:
         # Every choice is a new direction: exact projections.
-        y, so_far = geometry.projected(x, picked)
+        y, so_far = geometry.projected(x, picked, count)
     else:
         # The metric of the chosen; until they span the space, with a ridge small
         # beside what a posture contributes.
-        y, so_far = geometry.normalised_by(x, picked, _RIDGE if count < p else 0.0)
-    depth = min(lookahead, left)
+        ridge = jnp.where(count < p, _RIDGE, 0.0)
+        y, so_far = geometry.normalised_by(x, picked, ridge)
+    depth = jnp.minimum(lookahead, left)
     vectors = vector_features(y, total != p, available, depth, close_up)
     ends = (left == 1, left == 2, left == 3, 1.0 / left)
-    shares = (count / p, min(left / p, 3.0), total > p)
-    numbers = jnp.asarray([*ends, *shares], x.dtype)
+    shares = (count / p, jnp.minimum(left / p, 3.0), total > p)
+    numbers = jnp.stack([jnp.asarray(x, y.dtype) for x in (*ends, *shares)])
     return DecisionFeatures(
         vectors,
-        chosen=which.sum(-2) / max(count, 1),
+        chosen=which.sum(-2) / jnp.maximum(count, 1).astype(x.dtype),
         reached=features.offset + so_far + vectors.best[..., -1],
         progress=jnp.broadcast_to(numbers, (*so_far.shape, len(numbers))),
     )
@@ -128,7 +132,11 @@ def close_up_of(ahead: jax.Array) -> jax.Array:
 
 
 def vector_features(
-    y: jax.Array, spanned: bool, active: jax.Array, depth: int, close_up: bool
+    y: jax.Array,
+    spanned: bool,
+    active: jax.Array,
+    depth: jax.typing.ArrayLike,
+    close_up: bool,
 ) -> VectorFeatures:
     """Features of vectors y (..., M, p); arguments as in ``geometry.lookahead``.
 
@@ -140,8 +148,7 @@ def vector_features(
     mean_square = jnp.maximum(square.sum(-1) / number, 1e-8)
     unit = y * jax.lax.rsqrt(mean_square)[..., None, None]
     moments = _second_moments(unit) * jax.lax.rsqrt(number)[..., None, None]
-    steps = geometry.lookahead(y, spanned, active, depth)
-    ahead = jnp.stack([steps[min(d, depth) - 1] for d in (1, 2, 3, depth)], axis=-1)
+    ahead = jnp.stack(geometry.lookahead(y, spanned, active, depth), axis=-1)
     best = ahead.max(-2)
     ahead = jnp.maximum(ahead - best[..., None, :], -30.0)
     level = jnp.log(jnp.maximum(square, 1e-6) / mean_square[..., None])

@@ -9,6 +9,8 @@ of choosing it. All functions broadcast over leading axes.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -24,6 +26,7 @@ __all__ = [
 _LOWEST = -30.0  # log-volume of a candidate that is not active
 _ALL_START = 1024  # M up to which all are looked ahead from
 _STARTS = 512  # of more, those of largest gain that are
+_TAKEN = -1e9  # gain of a candidate that cannot be chosen
 _LEAST_GAIN = 1e-5  # of whitened vectors; smaller gains are float32 rounding errors
 
 
@@ -52,14 +55,18 @@ def whiten(candidates: jax.Array, usable: jax.Array) -> tuple[jax.Array, jax.Arr
     return jnp.concatenate([white, weight[..., None]], axis=-1), offset
 
 
-def projected(x: jax.Array, chosen: jax.Array) -> tuple[jax.Array, jax.Array]:
+def projected(
+    x: jax.Array, chosen: jax.Array, count: jax.typing.ArrayLike
+) -> tuple[jax.Array, jax.Array]:
     """Components of every vector orthogonal to the chosen ones.
 
     A chosen vector in the span of those before it is not projected out again.
 
     Args:
         x: (..., M, p).
-        chosen: (..., c, p) vectors chosen so far, c <= p.
+        chosen: (..., c, p) of which the first ``count`` are chosen so far, c <= p; the
+            others are zero.
+        count: () vectors chosen.
 
     Returns:
         (..., M, p), whose squared lengths are the Schur-complement gains; and (...,)
@@ -75,7 +82,8 @@ def projected(x: jax.Array, chosen: jax.Array) -> tuple[jax.Array, jax.Array]:
             along = _dot(v, e)
             v = [a - along * b for a, b in zip(v, e, strict=True)]
         square = _dot(v, v)
-        volume = volume + jnp.log(jnp.maximum(square, 1e-9))
+        grown = jnp.log(jnp.maximum(square, 1e-9))
+        volume = volume + jnp.where(j < jnp.asarray(count), grown, 0.0)
         independent = square > 1e-9 * scale
         factor = jax.lax.rsqrt(jnp.where(independent, square, 1.0))
         basis.append([a * jnp.where(independent, factor, 0.0) for a in v])
@@ -94,14 +102,14 @@ def _dot(a: list[jax.Array], b: list[jax.Array]) -> jax.Array:
 
 
 def normalised_by(
-    x: jax.Array, chosen: jax.Array, ridge: float
+    x: jax.Array, chosen: jax.Array, ridge: jax.typing.ArrayLike
 ) -> tuple[jax.Array, jax.Array]:
     """Every vector in the metric of the chosen: ``|y_i|^2 = x_i.T G^-1 x_i``.
 
     Args:
         x: (..., M, p).
-        chosen: (..., c, p) vectors chosen so far.
-        ridge: ``G = C.T C + ridge I``; 0 needs vectors that span the space.
+        chosen: (..., c, p) vectors chosen so far; zeros count nothing.
+        ridge: () ``G = C.T C + ridge I``; 0 needs vectors that span the space.
 
     Returns:
         (..., M, p) vectors y: choosing i multiplies det G by ``1 + |y_i|^2``; and
@@ -113,13 +121,14 @@ def normalised_by(
     )
     gram = jnp.broadcast_to(gram, (*x.shape[:-2], p, p))
     eye = jnp.eye(p, dtype=x.dtype)
-    lower = cholesky(gram + max(ridge, 1e-6) * jnp.broadcast_to(eye, gram.shape))
+    least = jnp.maximum(jnp.asarray(ridge, x.dtype), 1e-6)
+    lower = cholesky(gram + least * jnp.broadcast_to(eye, gram.shape))
     log_det = 2.0 * jnp.log(jnp.diagonal(lower, axis1=-2, axis2=-1)).sum(-1)
     return solve_lower(lower, x), log_det
 
 
 def lookahead(
-    y: jax.Array, spanned: bool, active: jax.Array, depth: int
+    y: jax.Array, spanned: bool, active: jax.Array, depth: jax.typing.ArrayLike
 ) -> list[jax.Array]:
     """Log gain of the determinant from each candidate and greedy choices after it.
 
@@ -129,26 +138,25 @@ def lookahead(
         spanned: True where choosing i multiplies the determinant by ``1 + |y_i|^2``,
             False where by ``|y_i|^2``.
         active: (..., M) bool.
-        depth: number of choices, that candidate included; at least 1.
+        depth: () number of choices, that candidate included; at least 1.
 
     Returns:
-        ``depth`` arrays (..., M): the log of the factor by which the determinant grows
-        over the first 1, 2, ... choices; -30 where not active. The first is the gain.
-        The second is the gain of the best pair, exactly; later ones are what greedy
-        choices reach. Cost: ``depth - 1`` products of (M, p) with (p, M). Of more than
-        1,024 candidates only the 512 of largest gain are looked ahead from, as in
+        Four arrays (..., M): the log of the factor by which the determinant grows over
+        the first 1, 2, 3 and ``depth`` choices, all of them where there are fewer; -30
+        where not active. The first is the gain. The second is the gain of the best
+        pair, exactly; later ones are what greedy choices reach. Cost: ``depth - 1``
+        products of (M, p) with (p, M). Of more than 1,024 candidates only the 512 of
+        largest gain are looked ahead from, as in
         ``selection/policy/policy_kernel.py``: of the others all but the first are -30.
     """
-    m = y.shape[-2]
+    m, p = y.shape[-2:]
     base = 1.0 if spanned else 0.0
     square = (y * y).sum(-1)
-    first = jnp.log(jnp.maximum(base + square, _LEAST_GAIN))
-    values = [jnp.where(active, first, _LOWEST)]
-    if depth == 1:
-        return values
+    gain = jnp.log(jnp.maximum(base + square, _LEAST_GAIN))
+    first = jnp.where(active, gain, _LOWEST)
     # For every start i (axis -2): the gains of all j (axis -1) after its choices.
     starts = jnp.broadcast_to(jnp.arange(m), square.shape)
-    picked, reached, begins = y, values[0], active  # of each start, its newest choice
+    picked, reached, begins = y, first, active  # of each start, its newest choice
     if m > _ALL_START:
         starts = jax.lax.top_k(jnp.where(active, square, -1.0), _STARTS)[1]
         picked = jnp.take_along_axis(y, starts[..., None], axis=-2)
@@ -156,43 +164,45 @@ def lookahead(
             jnp.take_along_axis(x, starts, axis=-1) for x in (reached, begins)
         )
     shape = (*starts.shape, m)
-    gains = jnp.broadcast_to(square[..., None, :], shape)
-    itself = jax.nn.one_hot(starts, m, dtype=bool)
-    rest = jnp.broadcast_to(active[..., None, :], shape) & ~itself
-    along: list[tuple[jax.Array, jax.Array]] = []  # directions, and how far they shrink
-    for _ in range(1, depth):
-        size = jnp.maximum((picked * picked).sum(-1), _LEAST_GAIN)
-        unit = picked * jax.lax.rsqrt(size)[..., None]
-        # A choice removes its direction; where the chosen span all, it shortens it.
-        keep = jax.lax.rsqrt(1.0 + size) if spanned else jnp.zeros_like(size)
-        along.append((unit, 1.0 - keep))
-        # The direction in y's own coordinates, through the earlier ones, newest first.
-        back = unit
-        for before, shrink in reversed(along[:-1]):
-            back = back - ((back * before).sum(-1) * shrink)[..., None] * before
-        inner = jnp.einsum(
-            "...ip,...jp->...ij", back, y, precision=jax.lax.Precision.HIGHEST
-        )
-        gains = gains - inner * inner * (1.0 - keep * keep)[..., None]
-        ranked = jnp.where(rest, gains, -1.0)
-        best = jnp.argmax(ranked, axis=-1)
-        gain = jnp.maximum(ranked.max(-1), 0.0)
-        step = jnp.log(jnp.maximum(base + gain, _LEAST_GAIN))
-        which = jax.nn.one_hot(best, m, dtype=bool)
-        rest = rest & ~which
-        reached = jnp.where(begins, reached + step, _LOWEST)
-        of_all = reached
-        if m > _ALL_START:
-            lowest = jnp.full_like(square, _LOWEST)
-            of_all = jnp.put_along_axis(lowest, starts, reached, -1, inplace=False)
-        values.append(of_all)
-        picked = jnp.einsum(
-            "...ij,...jp->...ip",
-            which.astype(y.dtype),
-            y,
-            precision=jax.lax.Precision.HIGHEST,
-        )
-        for before, shrink in along:
-            overlap = (picked * before).sum(-1) * shrink
-            picked = picked - overlap[..., None] * before
-    return values
+    column = jnp.broadcast_to(jnp.arange(m), shape)
+    gains = jnp.where(active, square, _TAKEN)[..., None, :]
+    eye = jnp.broadcast_to(jnp.eye(p, dtype=y.dtype), (*starts.shape, p, p))
+    parts = [y[..., None, :, i] for i in range(p)]
+
+    def further(d: jax.Array, carry: Any) -> Any:
+        """One more greedy choice of every start; ``metric`` (..., S, p, p) turns inner
+        products into those of what its choices have left."""
+        gains, metric, picked, newest, values = carry
+        back = (metric * picked[..., None, :]).sum(-1)
+        size = jnp.maximum((back * picked).sum(-1), _LEAST_GAIN)
+        shrink = 1.0 / (base + size)
+        inner = _dot([back[..., i, None] for i in range(p)], parts)
+        gains = gains - inner * inner * shrink[..., None]
+        gains = jnp.where(column == newest[..., None], _TAKEN, gains)
+        along = back[..., :, None] * back[..., None, :]
+        metric = metric - shrink[..., None, None] * along
+        newest = jnp.argmax(gains, axis=-1)
+        grown = jnp.maximum(base + jnp.maximum(gains.max(-1), 0.0), _LEAST_GAIN)
+        reached = values[3] + jnp.log(grown)
+        ends = (d < 2, d < 3, jnp.array(True))  # the pair, the triple, the last
+        later = [
+            jnp.where(end, reached, value)
+            for end, value in zip(ends, values[1:], strict=True)
+        ]
+        picked = jnp.take_along_axis(y, newest[..., None], axis=-2)
+        return gains, metric, picked, newest, [values[0], *later]
+
+    carry = (jnp.broadcast_to(gains, shape), eye, picked, starts, [reached] * 4)
+    # A loop: as many copies of it as choices would take ten times as long to compile.
+    *_, values = jax.lax.fori_loop(1, depth, further, carry)
+    values = [jnp.where(begins, value, _LOWEST) for value in values[1:]]
+    if m > _ALL_START:
+        lowest = jnp.full_like(square, _LOWEST)
+        some = jnp.asarray(depth) > 1
+        values = [
+            jnp.where(
+                some, jnp.put_along_axis(lowest, starts, x, -1, inplace=False), first
+            )
+            for x in values
+        ]
+    return [first, *values]

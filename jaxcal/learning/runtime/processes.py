@@ -10,15 +10,19 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from typing import Annotated, ClassVar
+
+from jaxcal.arguments import Parser, values_of
 
 __all__ = [
     "EXIT_LOST",
     "HEARTBEAT_SECONDS",
-    "add_arguments",
+    "Job",
     "collective",
     "expected",
     "local_device_ids",
@@ -31,19 +35,21 @@ _CONNECT_SECONDS = 300  # for all processes to come together
 _LEAVE_SECONDS = 3600  # for process 0 to write its files when the others are done
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The three flags that name a job."""
-    group = parser.add_argument_group(
-        "several processes", "found by itself under SLURM, Open MPI and on Cloud TPU"
-    )
-    group.add_argument(
-        "--coordinator", metavar="HOST:PORT", help="of process 0; the same everywhere"
-    )
-    group.add_argument("--num-processes", type=int, metavar="N")
-    group.add_argument("--process-id", type=int, metavar="I", help="0 to N - 1")
+@dataclasses.dataclass
+class Job:
+    """The flags that name a job."""
+
+    TITLE: ClassVar = "several processes"
+    ABOUT: ClassVar = "found by itself under SLURM, Open MPI and on Cloud TPU"
+
+    coordinator: Annotated[
+        str | None, "of process 0; the same everywhere", "HOST:PORT"
+    ] = None
+    num_processes: int | None = None
+    process_id: Annotated[int | None, "0 to N - 1", "I"] = None
 
 
-def expected(job: argparse.Namespace, environ: Mapping[str, str] = os.environ) -> bool:
+def expected(job: Job, environ: Mapping[str, str] = os.environ) -> bool:
     """Whether this process is one of several, or may be.
 
     Raises:
@@ -112,12 +118,9 @@ def run_job(
         work: the command itself.
         advice: how to go on when a process was lost.
     """
-    flags = argparse.ArgumentParser(
-        add_help=False, allow_abbrev=False, exit_on_error=False
-    )
-    add_arguments(flags)
+    flags = Parser(add_help=False, exit_on_error=False).of(Job)
     try:
-        job, _ = flags.parse_known_args(argv)
+        job = values_of(flags.parse_known_args(argv)[0])["options"]
         if not expected(job):
             return work()
     except (ValueError, argparse.ArgumentError) as error:
@@ -163,7 +166,7 @@ def collective() -> Iterator[None]:
         raise RuntimeError(str(error)) from error
 
 
-def _connect(job: argparse.Namespace) -> None:
+def _connect(job: Job) -> None:
     """Join the job; must be called before JAX is initialised.
 
     Raises:

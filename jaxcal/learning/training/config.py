@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import field
 from typing import Any
 
-from jaxcal.learning.config import EpisodesConfig, Sweep, runs_of
+from jaxcal.learning.config import EpisodesConfig, RunConfig
 from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.compact import build
@@ -15,12 +15,12 @@ from jaxcal.learning.settings import require, setting
 
 __all__ = ["TrainConfig"]
 
-_PLAIN = ("preset", "imitation", "seed", "num_seeds")  # fields that JSON holds as is
+_PLAIN = ("preset", "imitation")  # fields that JSON holds as is
 
 
 @dataclasses.dataclass(frozen=True)
-class TrainConfig:
-    """Network, optimisation and tasks of a run; how often it validates and saves."""
+class TrainConfig(RunConfig):
+    """Network, optimisation and tasks of a run that trains on postures."""
 
     preset: str = "compact"
     network: NetworkConfig = field(default_factory=NetworkConfig)
@@ -29,23 +29,11 @@ class TrainConfig:
     imitation: float = setting(
         0.0, "share of the updates, from the first on, that imitate the solvers"
     )
-    seed: int = setting(0, "of everything random")
-    num_seeds: int = setting(1, "runs side by side: seed, seed + 1, ...")
-    sweep: Sweep = ()  # side by side too: every combination, for every seed
-    validate_every: float = 15.0  # seconds between validations
-    save_every: float = 60.0  # seconds between checkpoints
     about: str = ""  # one line for --help, of a preset
 
     def __post_init__(self) -> None:
-        require(self, "0 or more", lambda v: v >= 0, "seed")
-        require(self, "at least 1", lambda v: v >= 1, "num_seeds")
+        super().__post_init__()
         require(self, "in [0, 1]", lambda v: 0.0 <= v <= 1.0, "imitation")
-        self.ppo.require_sweep(self.sweep)
-
-    @property
-    def num_runs(self) -> int:
-        """Runs side by side: seeds times swept values."""
-        return len(runs_of(self.seed, self.num_seeds, self.sweep))
 
     @property
     def num_imitated(self) -> int:
@@ -60,11 +48,9 @@ class TrainConfig:
 
     def as_meta(self) -> dict[str, Any]:
         """Plain JSON values; ``from_meta`` reads them back."""
-        return {
+        return super().as_meta() | {
             **{name: getattr(self, name) for name in _PLAIN},
             "network": dataclasses.asdict(self.network),
-            "ppo": dataclasses.asdict(self.ppo),
-            "sweep": [[name, list(values)] for name, values in self.sweep],
             "tasks": [task.as_meta() for task in self.tasks],
         }
 
@@ -73,10 +59,8 @@ class TrainConfig:
         """The configuration a checkpoint was trained with."""
         return TrainConfig(
             **{name: meta[name] for name in _PLAIN},
+            **RunConfig.held_in(meta),
             network=NetworkConfig(**meta["network"]),
             ppo=EpisodesConfig(**meta["ppo"]),
-            sweep=tuple(
-                (name, tuple(values)) for name, values in meta.get("sweep", ())
-            ),
             tasks=tuple(Task.from_meta(task) for task in meta["tasks"]),
         )

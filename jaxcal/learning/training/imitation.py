@@ -135,27 +135,30 @@ class Imitation:
         task, network = self.postures.task, self.postures.network
         features = network.candidate_features(lesson.candidates, lesson.available)
         memory = encode(network, params, features)
-        chosen = jnp.full((len(lesson.best), task.num_decisions), -1, jnp.int32)
-        free, wanted = lesson.available, lesson.wanted
-        decisions, wants, counts = [], [], []
-        for count in range(task.num_decisions - network.num_unlearned):
+        m, learned = lesson.available.shape[-1], task.num_decisions
+        learned -= network.num_unlearned
+
+        def decide(state: Any, count: jax.Array) -> tuple[Any, tuple[Any, ...]]:
+            chosen, free, wanted = state
             seen = network.decision_features(features, chosen, free, count)
             logits, _ = decode(network, params, memory, seen)
-            decisions.append(seen)
-            wants.append(wanted)
-            counts.append(count >= lesson.length)
             likeliest = jnp.argmax(mask_logits(logits, wanted), axis=-1)
-            action = jnp.where(count < lesson.length, lesson.given[:, count], likeliest)
+            given = jax.lax.dynamic_index_in_dim(lesson.given, count, 1, keepdims=False)
+            action = jnp.where(count < lesson.length, given, likeliest)
             chosen = chosen.at[:, count].set(action.astype(jnp.int32))
-            taken = jax.nn.one_hot(action, free.shape[-1], dtype=bool)
-            free, wanted = free & ~taken, wanted & ~taken
-        counted = jnp.stack(counts, axis=1).astype(memory.dtype)
+            taken = jax.nn.one_hot(action, m, dtype=bool)
+            after = chosen, free & ~taken, wanted & ~taken
+            return after, (seen, wanted, count >= lesson.length)
+
+        chosen = jnp.full((len(lesson.best), task.num_decisions), -1, jnp.int32)
+        begun = chosen, lesson.available, lesson.wanted
+        _, played = jax.lax.scan(decide, begun, jnp.arange(learned))
+        decisions, wanted, counts = jax.tree.map(lambda x: x.swapaxes(0, 1), played)
+        counted = counts.astype(memory.dtype)
         attempt = Attempt(
             features=features,
-            decisions=jax.tree.map(
-                lambda *leaves: jnp.stack(leaves, axis=1), *decisions
-            ),
-            wanted=jnp.stack(wants, axis=1),
+            decisions=decisions,
+            wanted=wanted,
             weight=counted / jnp.maximum(counted.mean(), 1e-6),
             best=lesson.best,
         )

@@ -8,12 +8,11 @@ import pathlib
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.learning.core.network import Network
 from jaxcal.learning.core.ppo import Learner, TrainState
-from jaxcal.learning.policies import decoding
+from jaxcal.learning.policies import scorer
 from jaxcal.learning.runtime import devices
 from jaxcal.learning.training import checkpoint, imitation
 from jaxcal.learning.training.config import TrainConfig
@@ -35,15 +34,12 @@ class Validation:
 
     def measure(self, network: Network, params: Any, k: int) -> tuple[float, float]:
         """Mean det S / det S* and the share of optima hit, by greedy decoding."""
-        candidates = jnp.asarray(self.candidates, jnp.float32)
-        free = jnp.ones(candidates.shape[:2], bool)
-        if self.available is not None:
-            free = jnp.asarray(self.available)
-        nothing, unused = jnp.zeros((len(free), 0), jnp.int32), jax.random.key(0)
-        indices = decoding.choose(
-            network, params, candidates, free, nothing, unused, k=k
-        )
-        gap = np.asarray(decoding.log_det_of(candidates, indices)) - self.best
+        candidates = np.asarray(self.candidates, np.float32)
+        free = self.available
+        if free is None:
+            free = np.ones(candidates.shape[:2], bool)
+        indices = scorer.choose(network, params, candidates, free, k=k)
+        gap = np.asarray(scorer.log_det_of(candidates, indices)) - self.best
         # float32 values against a float64 optimum: equal to a few units in the last
         # place counts as hit; evaluate.py compares in float64.
         return (

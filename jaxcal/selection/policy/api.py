@@ -68,9 +68,7 @@ def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Network:
 
 def _through_jax(path: pathlib.Path) -> Network:
     """A network that reads the candidates' own coordinates, compiled for each shape."""
-    import jax
-
-    from jaxcal.learning.policies import decoding as decoders
+    from jaxcal.learning.policies import scorer
     from jaxcal.learning.training import checkpoint
 
     policy = checkpoint.load(path)
@@ -78,7 +76,6 @@ def _through_jax(path: pathlib.Path) -> Network:
     def choose(
         problems: Sequence[Problem], decoding: str, num: int, seed: int
     ) -> Indices:
-        k, required = problems[0].k, len(problems[0].required)
         m, tries = len(problems[0].available), 1 if decoding == "greedy" else num
         # A power of two, filled up by repeating the last set: few shapes to compile.
         most = max(1, min(_LARGEST_CALL, _CELLS // (m * m * tries)))
@@ -87,19 +84,18 @@ def _through_jax(path: pathlib.Path) -> Network:
         for begin in range(0, len(problems), size):
             part = list(problems[begin : begin + size])
             filled = part + part[-1:] * (size - len(part))
-            indices = decoders.choose(
+            indices = scorer.choose(
                 policy.network,
                 policy.params,
                 np.stack([_in_unit_range(problem) for problem in filled]),
                 np.stack([problem.available for problem in filled]),
-                np.stack([problem.required for problem in filled]).astype(np.int32),
-                jax.random.fold_in(jax.random.key(seed), begin),
-                k=k,
-                num_required=required,
+                np.stack([problem.required for problem in filled]),
+                k=problems[0].k,
+                seeds=[(seed, b) for b in range(begin, begin + size)],
                 decoding=decoding,
                 num=tries,
             )
-            chosen.append(np.asarray(indices, np.int64)[: len(part)])
+            chosen.append(indices[: len(part)])
         return np.concatenate(chosen)
 
     return choose

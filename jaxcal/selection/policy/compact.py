@@ -6,18 +6,17 @@ candidates, K choices in all, p regressors, w width of the network. Weights are 
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.learning.policies.decoding import choose, in_pieces
 from jaxcal.selection.policy.policy_kernel import CLOSE, describe
 from jaxcal.selection.problem import Problem
 
-__all__ = ["CompactNetwork"]
+__all__ = ["CompactNetwork", "Memory"]
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -32,17 +31,11 @@ _ONE = np.float32(1.0)
 _ONE_THREAD = 2**18  # multiplications up to which OpenBLAS uses one thread
 
 
-class _Sets(NamedTuple):
-    """Candidate sets, one an episode, with the choices made from them."""
+class Memory(NamedTuple):
+    """Candidate sets, one an episode."""
 
     x: Array  # (E, p, M) whitened regressors with mean square 1, 0 where masked
-    memory: Array32  # (E, M, w) what the encoder made of them
-    chosen: Indices  # (E, K), written as choices are made
-    free: Mask  # (E, M) True where a candidate may be chosen, written likewise
-
-    def repeated(self, times: int) -> _Sets:
-        """Every episode ``times`` times in a row."""
-        return _Sets._make(np.repeat(part, times, axis=0) for part in self)
+    encoded: Array32  # (E, M, w) what the encoder made of them
 
 
 class _Decision(NamedTuple):
@@ -52,16 +45,6 @@ class _Decision(NamedTuple):
     moments: Array32  # (E, p (p + 1) / 2, M)
     ahead: Array  # (E, M)
     active: Array32  # (E, M) 1 or 0
-
-
-def _in_pieces(call: Callable[[slice], Indices], count: int, size: int) -> Indices:
-    """``call`` on slices of ``size`` of ``count``, on every core, joined."""
-    parts = [slice(begin, begin + size) for begin in range(0, count, size)]
-    if len(parts) == 1:
-        return call(parts[0])
-    # The kernel and numpy's products release the interpreter.
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        return np.concatenate(list(pool.map(call, parts)))
 
 
 def _product(a: Array32, b: Array32) -> Array32:
@@ -77,10 +60,14 @@ def _product(a: Array32, b: Array32) -> Array32:
 class CompactNetwork:
     """Chooses for problems of one shape, in pieces, on every core.
 
+    It is the ``Scorer`` that ``learning.policies.decoding`` asks.
+
     Args:
         config: fields of a ``NetworkConfig`` of kind "compact".
         arrays: weights by flat name.
     """
+
+    piece_rows = _ROWS
 
     def __init__(self, config: Mapping[str, Any], arrays: Mapping[str, Array32]):
         self._lookahead: int = config["lookahead"]
@@ -102,7 +89,7 @@ class CompactNetwork:
             streams = [np.random.default_rng((seed, b)) for b in draws]
             return self._choose(problems[part], decoding, num, streams)
 
-        return _in_pieces(piece, len(problems), size)
+        return in_pieces(piece, len(problems), size)
 
     def _choose(
         self,
@@ -112,84 +99,51 @@ class CompactNetwork:
         generators: Sequence[np.random.Generator],
     ) -> Indices:
         """(B, k) indices; one generator a problem for "samples", else none."""
-        k = problems[0].k
-        rows = np.stack([problem.rows for problem in problems])
-        available = np.stack([problem.available for problem in problems])
-        required = np.stack([problem.required for problem in problems])
-        batch, r = required.shape
+        rows, available, required = (
+            np.stack([getattr(problem, name) for problem in problems])
+            for name in ("rows", "available", "required")
+        )
+        return choose(
+            self,
+            rows,
+            available,
+            required,
+            problems[0].k,
+            decoding=decoding,
+            num=num,
+            generators=generators,
+        )
+
+    def encode(self, rows: Array, usable: Mask) -> Memory:
+        """The sets as the network sees them; 0 where not usable."""
         x = np.ascontiguousarray(np.matrix_transpose(rows))
-        x *= np.sqrt(available.sum(axis=1))[:, None, None]
-        chosen = np.full((batch, k), -1, np.int64)
-        chosen[:, :r] = required
-        free = available.copy()
-        np.put_along_axis(free, required, False, axis=1)
-        sets = _Sets(x, self._encoded(x, available), chosen, free)
-        if decoding == "greedy" or r == k:
-            return self._completed(sets, r, ())
-        first = r
-        if decoding == "first":
-            firsts = np.argsort(-self._scores(sets, r), axis=1, kind="stable")[:, :num]
-            # Fewer than num are left: try the best again, not one that is masked.
-            valid = np.take_along_axis(free, firsts, axis=1)
-            firsts = np.where(valid, firsts, firsts[:, :1])
-            num, generators, first = firsts.shape[1], (), r + 1
-        sets = sets.repeated(num)
-        if decoding == "first":
-            sets.chosen[:, r] = firsts.ravel()
-            np.put_along_axis(sets.free, firsts.reshape(-1, 1), False, axis=1)
-
-        def piece(part: slice) -> Indices:
-            some = _Sets._make(each[part] for each in sets)
-            return self._completed(some, first, generators)
-
-        size = batch * num if generators else max(1, _ROWS // x.shape[2])
-        tries = _in_pieces(piece, batch * num, size).reshape(batch, num, k)
-        picked = np.take_along_axis(rows[:, None], tries[..., None], axis=2)
-        sign, value = np.linalg.slogdet(np.matrix_transpose(picked) @ picked)
-        best = np.where(sign > 0, value, -np.inf).argmax(axis=1)
-        return tries[np.arange(batch), best]
-
-    def _completed(
-        self, sets: _Sets, first: int, generators: Sequence[np.random.Generator]
-    ) -> Indices:
-        """``sets.chosen``, written from position ``first`` to the end.
-
-        The likeliest candidate at every step or, where generators are given, a draw
-        from the policy; each generator serves as many episodes in a row.
-        """
-        chosen, free = sets.chosen, sets.free
-        each = np.arange(len(chosen))
-        for count in range(first, chosen.shape[1]):
-            scores = self._scores(sets, count, best_only=not generators)
-            if generators:
-                shape = (len(each) // len(generators), free.shape[1])
-                # The largest of scores plus Gumbel noise is a draw from their softmax.
-                scores += np.concatenate([g.gumbel(size=shape) for g in generators])
-            pick = np.where(free, scores, -np.inf).argmax(axis=1)
-            chosen[:, count] = pick
-            free[each, pick] = False
-        return chosen
-
-    def _encoded(self, x: Array, available: Mask) -> Array32:
-        """(B, M, w) of x (B, p, M) and available (B, M); 0 where not available."""
+        x *= np.sqrt(usable.sum(axis=1))[:, None, None]
         batch, p, _ = x.shape
         none = np.zeros((batch, 0), np.int64)
-        seen = self._described(x, none, available, p, p)
+        seen = self._described(x, none, usable, p, p)
         scalars = np.empty((batch, 2), np.float32)
-        scalars[:, 0] = np.log(available.sum(axis=1) / 50.0) / 3.0
+        scalars[:, 0] = np.log(usable.sum(axis=1) / 50.0) / 3.0
         scalars[:, 1] = p / 4.0 - 1.0
         h = self._dense("embed", seen.features, scalars)
         h *= seen.active[..., None]
         for name in self._encoder:
             h = self._round(name, h, seen)
-        return h
+        return Memory(x, h)
 
-    def _scores(self, sets: _Sets, count: int, best_only: bool = False) -> Array:
-        """(E, M) scores of the next choice after ``count``; lowest where not free.
+    def part(self, memory: Memory, sets: Indices) -> Memory:
+        """The memory of episodes on ``sets``."""
+        return Memory(memory.x[sets], memory.encoded[sets])
 
-        With ``best_only`` all but the best may be too low where nothing is learned.
-        """
-        x, h, chosen, free = sets
+    def scores(
+        self,
+        memory: Memory,
+        chosen: Indices,
+        free: Mask,
+        count: int,
+        best_only: bool = False,
+    ) -> Array:
+        """(E, M) scores of the choice after ``count``; lowest where not free."""
+        x, h = memory
         p, k = x.shape[1], chosen.shape[1]
         left = k - count
         exact = left <= self._unlearned

@@ -1,0 +1,125 @@
+"""A network in JAX as decoding sees it: two programs for a shape, whatever K."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.learning.core import network as networks
+from jaxcal.learning.core.network import Network
+from jaxcal.learning.policies import decoding as decoders
+from jaxcal.learning.small_matrices import log_det_gram
+
+__all__ = ["NetworkScorer", "choose", "log_det_of", "scores_of"]
+
+
+class NetworkScorer:
+    """The ``decoding.Scorer`` of a ``Network`` and its parameters."""
+
+    piece_rows = None  # XLA has threads of its own
+
+    def __init__(self, network: Network, params: Any) -> None:
+        self._network, self._params = network, params
+
+    def encode(self, rows: NDArray[Any], usable: NDArray[np.bool_]) -> Any:
+        """Features and memory of sets; rows are [command, 1]."""
+        return _encoded(self._network, self._params, rows[..., :-1], usable)
+
+    def part(self, memory: Any, sets: NDArray[np.int64]) -> Any:
+        """The memory of episodes on ``sets``."""
+        return jax.tree.map(lambda leaf: leaf[sets], memory)
+
+    def scores(
+        self,
+        memory: Any,
+        chosen: NDArray[np.int64],
+        free: NDArray[np.bool_],
+        count: int,
+        best_only: bool = False,
+    ) -> NDArray[Any]:
+        """(E, M) logits."""
+        learned = chosen.shape[1] - count > self._network.num_unlearned
+        made = chosen.astype(np.int32)
+        return np.asarray(
+            scores_of(self._network, self._params, memory, made, free, count, learned)
+        )
+
+
+@functools.partial(jax.jit, static_argnames="network")
+def _encoded(
+    network: Network, params: Any, candidates: jax.Array, usable: jax.Array
+) -> Any:
+    features = network.candidate_features(candidates, usable)
+    return features, networks.encode(network, params, features)
+
+
+@functools.partial(jax.jit, static_argnames=("network", "learned"))
+def scores_of(
+    network: Network,
+    params: Any,
+    memory: Any,
+    chosen: jax.Array,
+    free: jax.Array,
+    count: jax.typing.ArrayLike,
+    learned: bool,
+) -> jax.Array:
+    """(E, M) logits of the decision after ``count`` choices.
+
+    ``learned`` is False for the last ``network.num_unlearned`` choices, which the
+    look-ahead makes.
+    """
+    features, encoded = memory
+    decision = network.decision_features(features, chosen, free, count)
+    if not learned:
+        return network.lookahead_logits(decision)[0]
+    logits: jax.Array = networks.decode(network, params, encoded, decision)[0]
+    return logits
+
+
+def choose(
+    network: Network,
+    params: Any,
+    candidates: ArrayLike,
+    available: ArrayLike,
+    required: ArrayLike | None = None,
+    *,
+    k: int,
+    seeds: Sequence[Any] | None = None,
+    decoding: str = "greedy",
+    num: int = 16,
+) -> NDArray[np.int64]:
+    """(B, k) indices of (B, M, n) candidates; see ``decoding.choose``.
+
+    ``seeds`` (B,) are of the sets, for ``samples``; their numbers when None.
+    """
+    points, free = np.asarray(candidates), np.asarray(available)
+    rows = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1)
+    kept = np.zeros((len(free), 0)) if required is None else required
+    drawn = decoding == "samples"
+    return decoders.choose(
+        NetworkScorer(network, params),
+        rows,
+        free,
+        np.asarray(kept, np.int64),
+        k,
+        decoding=decoding,
+        num=num,
+        generators=[
+            np.random.default_rng(seed)
+            for seed in (range(len(free)) if seeds is None else seeds)
+        ]
+        if drawn
+        else (),
+    )
+
+
+def log_det_of(candidates: ArrayLike, indices: ArrayLike) -> jax.Array:
+    """(...,) log det(Z.T Z) of the subsets ``indices`` (..., K) of (..., M, n)."""
+    points, chosen = jnp.asarray(candidates), jnp.asarray(indices)[..., None]
+    return log_det_gram(jnp.take_along_axis(points, chosen, axis=-2))
