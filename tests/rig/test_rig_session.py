@@ -375,7 +375,9 @@ def test_verify_says_when_it_is_time_to_recalibrate(finished, tmp_path, capsys):
     given = [str(tmp_path), "--config", str(path), "--simulate", *QUIET]
     code = main(["verify", *given, "--count", "2", "--out", str(tmp_path / "v")])
     assert code == 1
-    assert "RECALIBRATE" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "RECALIBRATE" in said and "then `jaxcal-rig calibrate`" in said
+    assert "good; next" not in said
 
 
 @pytest.mark.slow

@@ -149,8 +149,14 @@ def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
         lines.append(f"WARNING: {summary['orders']['warning']}")
     if reasons := recalibrate(summary, limit_deg):
         lines.append(
-            f"RECALIBRATE: {' and '.join(reasons)}. Do not use this calibration before "
-            "the cause is known"
+            f"RECALIBRATE: {' and '.join(reasons)}. Do not use this calibration; next: "
+            "find the cause (report.html shows each posture), then `jaxcal-rig "
+            "calibrate`"
+        )
+    else:
+        lines.append(
+            "good; next: `jaxcal-rig export` writes it for a controller, `jaxcal-rig "
+            "verify` checks it again later"
         )
     return lines
 
@@ -167,10 +173,10 @@ def recalibrate(summary: dict[str, Any], limit_deg: float) -> list[str]:
     reasons = []
     what, worst = held_out(summary)
     if worst > limit_deg:
-        limit = f"session.verify_limit_deg ({limit_deg:g})"
-        reasons.append(f"the error {what} exceeds {limit}")
+        limit = f"session.verify_limit_deg ({limit_deg:g} deg)"
+        reasons.append(f"the error {what}, {worst:.3g} deg, exceeds {limit}")
     if summary.get("drift") and summary["drift"]["over"]:
-        limit = f"session.drift_limit_deg ({summary['drift']['limit_deg']:g})"
+        limit = f"session.drift_limit_deg ({summary['drift']['limit_deg']:g} deg)"
         reasons.append(f"the drift of the zero that is left exceeds {limit}")
     return reasons
 
