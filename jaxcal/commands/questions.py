@@ -39,6 +39,7 @@ class Asked:
     scenarios: Annotated[
         int | None, "draws of the model's parameters; the mean over them counts", "N"
     ] = None
+    lost: Annotated[int, "1 or 2 rows that may fail: the worst loss counts", "L"] = 0
 
     def design(self, table: Table, of_arm: ArmOptions) -> Design:
         """Of these candidates."""
@@ -62,6 +63,7 @@ class Asked:
             required=self.required,
             max_replicates=self.replicates,
             scenarios=self.scenarios,
+            lost=self.lost,
             names=next(iter(table.labels.values()), None),
         )
         design.axes = names

@@ -43,6 +43,7 @@ __all__ = [
     "Ds",
     "I",
     "Joined",
+    "Lost",
     "Mean",
     "Worst",
     "criterion_of",
@@ -295,7 +296,7 @@ class Joined:
             design's own.
     """
 
-    word: ClassVar[str]
+    word: str
     least: ClassVar[bool]  # the worst scenario counts
     of_efficiency: bool = False
     each: Criterion  # of the first scenario
@@ -396,6 +397,20 @@ class Mean(Joined):
     """
 
     word, least = "mean", False
+
+
+class Lost(Joined):
+    """The criterion of what is left where the worst few of the chosen fail."""
+
+    least = True
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        self.word = f"{count} lost"
+
+    @property
+    def name(self) -> str:
+        return f"{self.each.name} with {self.word}"
 
 
 class Worst(Joined):

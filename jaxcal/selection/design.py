@@ -54,6 +54,10 @@ class Design(CandidateSet):
             by as well: a whole number of draws from the prior (seeded), (S, p), or
             ``(parameters, weights)``. A criterion is then ``jaxcal.Mean("D")``, as
             letters alone are, or ``jaxcal.Worst("D")``.
+        lost: measurements, 1 or 2, that may fail: what is best is what the worst such
+            loss leaves. Of several scenarios with ``jaxcal.Worst`` only.
+        reliability: (M,) probabilities that a candidate can be measured; the mean of
+            the criterion over 64 draws (seeded) of what arrives counts.
         names: (M,) names of the candidates, for the answers.
 
     Raises:
@@ -258,6 +262,8 @@ def select(
     required: ArrayLike | None = None,
     max_replicates: int = 1,
     scenarios: Any = None,
+    lost: int = 0,
+    reliability: ArrayLike | None = None,
     names: Any = None,
     **options: Any,
 ) -> Selection:
@@ -272,7 +278,7 @@ def select(
         blocks: (M, q, p), of scenarios (S, M, q, p), instead of candidates and model,
             as in ``Design.from_blocks``; ``prior`` is then a (p, p) precision.
         model, prior, noise, measured, available, required, max_replicates, scenarios,
-            names: of the problem, see ``Design``.
+            lost, reliability, names: of the problem, see ``Design``.
         criterion, region: what is best, see ``Design.select``.
         options: seed, restarts, time_limit, best, least_efficiency, checkpoint,
             decoding, num: those that the method reads, see ``Design.select``.
@@ -286,6 +292,7 @@ def select(
     rules: dict[str, Any] = {
         "prior": prior, "noise": noise, "measured": measured, "available": available,
         "required": required, "max_replicates": max_replicates, "names": names,
+        "lost": lost, "reliability": reliability,
     }  # fmt: skip
     checked_options(method, options)  # before any work
     if (candidates is None) == (blocks is None):

@@ -99,7 +99,7 @@ class Selection:
     @cached_property
     def in_scenarios(self) -> InScenarios | None:
         """Its efficiency in each scenario; None where there is one only."""
-        if not isinstance(self.problem, ScenarioProblem):
+        if not isinstance(self.problem, ScenarioProblem) or not self.problem.told:
             return None
         from jaxcal.selection.in_scenarios import in_scenarios
 
@@ -186,7 +186,7 @@ class Selection:
         side = "upper" if self.problem.criterion.larger_is_better else "lower"
         best = "proven optimal" if self.proven else f"{side} bound {self.bound:.6g}"
         share = f"{self.criterion}-efficiency"
-        if self.in_scenarios is not None:
+        if len(share) > 13:
             share = "efficiency"
         extra = "" if self.seed is None else f", seed {self.seed}"
         lines = [

@@ -94,8 +94,14 @@ def test_contacts_are_chosen_from_a_table(files, capsys):
     _, q, socket = contacts_of_a_panda("front")
     contacts = np.column_stack([np.degrees(q), socket])
     assert set(rows[:, 0]) == set(select(contacts, 12, "exchange", model=arm).indices)
+    several = ["--scenarios", "2", "--worst", "--criterion", "D"]
+    assert main([*given[:-1], *sensor, *several]) == 0
+    told = capsys.readouterr().out
+    assert "log det S, worst" in told and "scenarios     2" in told
     assert main([*given, *sensor[:-1]]) == 2
     assert "which look like radians" in capsys.readouterr().err
+    assert main([*given, *sensor, "--lost", "3"]) == 2
+    assert "lost must be at most 2" in capsys.readouterr().err
     assert main(["select", str(table), "-k", "4", "--radians"]) == 2
     assert "options of an arm need --model FILE.urdf" in capsys.readouterr().err
 

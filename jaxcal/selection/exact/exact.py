@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.selection.criteria import Joined
 from jaxcal.selection.exact.branch_and_bound import (
     BranchResult,
     Scenario,
@@ -25,7 +26,14 @@ from jaxcal.selection.exact.branch_and_bound import (
 )
 from jaxcal.selection.exact.volume import largest_volumes
 from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
-from jaxcal.selection.problem import Problem, ScenarioProblem, Solution, values
+from jaxcal.selection.exchange.rounds import in_rounds
+from jaxcal.selection.problem import (
+    LossProblem,
+    Problem,
+    ScenarioProblem,
+    Solution,
+    values,
+)
 
 __all__ = ["TIME_LIMIT", "relaxed", "solve", "solve_auto", "solve_exact", "upper_bound"]
 
@@ -38,6 +46,7 @@ _BLOCKS_LIMIT = 2.0  # of auto: what is not proven by then often takes minutes
 
 TOLERATED = 1e-9  # share by which rounding may change what is called proven
 
+_MOST_LOSSES = 500  # that branch and bound looks at together
 _CHEAP = 5_000_000  # subsets: the largest volume is found within milliseconds
 _LARGEST_HULL_DIMENSION = 4  # qhull's facets grow as M^(n // 2)
 
@@ -83,18 +92,20 @@ def solve_auto(
     started: dict[str, Any] = {"seed": seed, "restarts": restarts}
     if found.reason:  # rounding
         return dataclasses.replace(found, method="exact", **started)
-    name = f"{problem.criterion.name}-efficiency"
+    name = f"a {problem.criterion.name}-efficiency"
+    if isinstance(problem.criterion, Joined):
+        name = "an efficiency"
     proven_share = problem.criterion.efficiency(found.value, found.bound)
     method, reason = "exact", "the exact search proved this optimum"
     if not found.proven and proven_share >= least_efficiency:
         method = "exchange"
         reason = (
-            f"the bound proves a {name} of at least {proven_share:.6f}, and "
+            f"the bound proves {name} of at least {proven_share:.6f}, and "
             f"{least_efficiency:g} was asked for"
         )
     elif not found.proven:
         reason = (
-            f"the exact search ran out of time after {limit:g} s with a {name} "
+            f"the exact search ran out of time after {limit:g} s with {name} "
             f"of at least {proven_share:.6f} proven; {least_efficiency:g} was asked for"
         )
     return dataclasses.replace(found, method=method, reason=reason, **started)
@@ -119,6 +130,8 @@ def solve_exact(
         restarts, seed: of the exchange that starts branch and bound.
         enough: efficiency in (0, 1] at which to stop, unless the proof is cheap.
     """
+    if isinstance(problem, LossProblem):
+        return _with_losses(problem, best, deadline, restarts, seed, enough)
     if problem.simplex:
         pool = _pool(problem, hull=best == 1)
         free = problem.k - len(problem.required)
@@ -150,6 +163,36 @@ def solve_exact(
     return _found(problem, subsets, best, bound, searched.nodes)
 
 
+def _with_losses(
+    problem: LossProblem,
+    best: int,
+    deadline: float | None,
+    restarts: int,
+    seed: int,
+    enough: float | None,
+) -> Solution:
+    """``solve_exact`` where the worst few of the chosen fail."""
+    if best > 1:  # every loss at once
+        every = problem.losses_of(np.flatnonzero(problem.available))
+        if len(every) > _MOST_LOSSES:
+            raise ValueError(
+                f"best must be 1 with lost of more than {_MOST_LOSSES} candidates or "
+                f"pairs of them, got {len(every)}"
+            )
+        return solve_exact(problem.among(every), best, deadline, restarts, seed, enough)
+
+    def solve_some(some: Problem) -> Solution:
+        return solve_exact(some, 1, _half(deadline), restarts, seed, enough)
+
+    start = greedy_indices(problem.unlost)
+    solution = in_rounds(problem, solve_some, start, deadline, enough)
+    value, log_det = (float(x[0]) for x in values(problem, solution.indices[None]))
+    return dataclasses.replace(
+        solution, value=value, log_det=log_det,
+        alternatives=((solution.indices, value),),
+    )  # fmt: skip
+
+
 def _half(deadline: float | None) -> float | None:
     """When half of the time is over: a bound takes time as well."""
     return None if deadline is None else (time.perf_counter() + deadline) / 2.0
@@ -167,6 +210,10 @@ def upper_bound(problem: Problem) -> float:
             found = _enumerate(problem, pool, 1, None)
             assert found.bound is not None
             return found.bound
+    if isinstance(problem, LossProblem):
+        start = greedy_indices(problem)
+        some = problem.among(problem.losses_of(start))
+        return float(problem.criterion.reported(relaxed(some, start)))
     bound = relaxed(problem, greedy_indices(problem))
     return float(problem.criterion.reported(bound))
 

@@ -160,8 +160,11 @@ class _Search:
         time_limit: float,
         seed: int | np.random.Generator,
     ) -> None:
-        if design.scenarios is not None:
-            raise ValueError("scenarios must be left out with fastest and pareto")
+        if design.scenarios is not None or design.uncertain:
+            raise ValueError(
+                "scenarios, lost and reliability must be left out with fastest and "
+                "pareto"
+            )
         problem, points = design.problem(k, "D"), design.candidates
         if points is None:
             raise ValueError(

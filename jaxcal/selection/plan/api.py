@@ -162,6 +162,8 @@ def plan(
             ``max_k`` suffices, with the accuracy that can be reached.
     """
     begun = time.perf_counter()
+    if design.uncertain:
+        raise ValueError("lost and reliability must be left out with plan")
     one_of("criterion", criterion, tuple(_SUMMARIES))
     more, start = whole_number("more", more, 0), checked_seed(seed)
     how = "I" if criterion == "I" else "G"

@@ -12,13 +12,18 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import array_of, numbers, require_kind
+from jaxcal.checks import array_of, numbers, require_kind, whole_number
 from jaxcal.csvtable import COMMANDS, names_of, of_frame
 from jaxcal.information.blocks import coarseness
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, answered, as_model, by_name
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.criteria import Criterion, Joined, Mean, criterion_of
+from jaxcal.selection.problem.losses import (
+    checked_reliability,
+    with_arrivals,
+    with_losses,
+)
 from jaxcal.selection.problem.making import (
     check_available,
     filled,
@@ -39,6 +44,8 @@ from jaxcal.selection.problem.sources import (
 __all__ = ["CandidateSet"]
 
 Array = NDArray[np.float64]
+
+_MOST_LOST = 2  # measurements whose loss is counted on
 
 
 class CandidateSet:
@@ -63,6 +70,8 @@ class CandidateSet:
         max_replicates: int = 1,
         *,
         scenarios: Any = None,
+        lost: int = 0,
+        reliability: ArrayLike | None = None,
         names: Sequence[str] | None = None,
     ) -> None:
         if model is not None:
@@ -84,6 +93,7 @@ class CandidateSet:
         self._coarse = coarseness(candidates)
         noise = self.model.default_noise() if noise is None else noise
         self._set_rules(prior, noise, measured, required, max_replicates)
+        self._set_losses(lost, reliability)
         self.names, self.axes = _labels(candidates, names)
         self.scenarios = None
         if scenarios is not None:
@@ -118,6 +128,8 @@ class CandidateSet:
         commands: ArrayLike | None = None,
         names: Sequence[str] | None = None,
         weights: ArrayLike | None = None,
+        lost: int = 0,
+        reliability: ArrayLike | None = None,
     ) -> Self:
         """The problem of information blocks, of any model.
 
@@ -129,7 +141,8 @@ class CandidateSet:
             noise: of the readings, where it is not of unit variance.
             measured: (N, q, p) blocks that were measured already, of scenarios
                 (S, N, q, p).
-            available, required, max_replicates, names: as for candidates.
+            available, required, max_replicates, names, lost, reliability: as for
+                candidates.
             commands: (M, n) of the candidates, for travel between them and for tables.
             weights: (S,) of the scenarios, of sum 1; equal when not given.
         """
@@ -156,6 +169,7 @@ class CandidateSet:
             )
             design.candidates.flags.writeable = False
         design._set_rules(prior, noise, measured, required, max_replicates)
+        design._set_losses(lost, reliability)
         seen = design._measured
         if seen is not None and array.ndim == 4 and len(seen) != array.shape[1]:
             raise ValueError(
@@ -184,15 +198,40 @@ class CandidateSet:
         joined = criterion if isinstance(criterion, Joined) else Mean(criterion)
         default = "I" if self.model and not self.model.multiplicity else "D"
         of_one = criterion_of(joined.criterion, region, default)
+        if self.lost:
+            return self._with_losses(k, of_one, joined)
+        problem = self._joined(k, of_one, joined)
+        if self.reliability is None:
+            return problem
+        return with_arrivals(problem, self.reliability, joined)
+
+    def _with_losses(
+        self, k: int | None, criterion: Criterion, joined: Joined
+    ) -> Problem:
+        """The problem where the worst ``lost`` of the chosen fail."""
+        if self.reliability is not None:
+            raise ValueError("lost and reliability must not be given together")
+        if k is None:
+            return self._with_losses(
+                self._joined(None, criterion, joined).k + self.lost, criterion, joined
+            )
+        try:
+            self._joined(whole_number("k", k, 1) - self.lost, criterion, joined)
+        except ValueError as error:
+            raise ValueError(f"of k = {k} with {self.lost} lost: {error}") from None
+        return with_losses(self._joined(k, criterion, joined), self.lost)
+
+    def _joined(self, k: int | None, criterion: Criterion, joined: Joined) -> Problem:
+        """The problem in all scenarios."""
         if self.scenarios is None:
-            return self._problem(k, of_one)
+            return self._problem(k, criterion)
         members = []
         for s, one in enumerate(self.each()):
             try:
-                members.append(one._problem(k, of_one))
+                members.append(one._problem(k, criterion))
             except ValueError as error:
                 raise ValueError(f"in scenario {s}: {error}") from None
-        nominal = None if self.model is None else self._problem(k, of_one)
+        nominal = None if self.model is None else self._problem(k, criterion)
         return joined_problem(members, self.scenarios.weights, joined, nominal)
 
     def each(self) -> list[Self]:
@@ -256,6 +295,19 @@ class CandidateSet:
         other = copy.copy(self)
         other.noise = noise
         return other
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether it counts on measurements that fail."""
+        return self.lost > 0 or self.reliability is not None
+
+    def _set_losses(self, lost: int, reliability: ArrayLike | None) -> None:
+        self.lost, self.reliability = whole_number("lost", lost, 0), None
+        if self.lost > _MOST_LOST:
+            raise ValueError(f"lost must be at most {_MOST_LOST}, got {lost}")
+        if reliability is not None:
+            count = len(self.available)
+            self.reliability = checked_reliability(reliability, count)
 
     def _set_rules(
         self,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from jaxcal.selection.criteria import Joined
 from jaxcal.selection.problem.problem import Problem, values_of_one
 
-__all__ = ["ScenarioProblem", "joined_problem"]
+__all__ = ["ScenarioProblem", "fields_of", "joined_problem"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -34,6 +34,7 @@ class ScenarioProblem(Problem):
     weights: Array = dataclasses.field(default_factory=lambda: np.zeros(0))  # (S,)
     optima: Array | None = None  # (S,) reported values, of a worst efficiency
     nominal: Problem | None = None  # at the model's nominal, where there is a model
+    told: bool = True  # whether each scenario is worth a line: losses are not
 
     @property
     def joined(self) -> Joined:
@@ -98,6 +99,11 @@ class ScenarioProblem(Problem):
         return self.joined.terms(criteria, self.optima)
 
 
+def fields_of(problem: Problem) -> dict[str, Any]:
+    """What every problem has."""
+    return {f.name: getattr(problem, f.name) for f in dataclasses.fields(Problem)}
+
+
 def joined_problem(
     members: Sequence[Problem],
     weights: Array,
@@ -126,8 +132,7 @@ def joined_problem(
     if len(kept) == 1:
         return kept[0]
     first = kept[0]
-    fields = {f.name: getattr(first, f.name) for f in dataclasses.fields(Problem)}
-    fields["criterion"] = criterion.within(first.criterion)
+    fields = fields_of(first) | {"criterion": criterion.within(first.criterion)}
     problem = ScenarioProblem(
         **fields, members=tuple(kept), weights=np.array(shares), nominal=nominal
     )

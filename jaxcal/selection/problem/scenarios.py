@@ -58,20 +58,17 @@ def _parameters(given: ArrayLike, model: Model) -> Array:
 
 
 def _drawn(count: int, model: Model, prior: Prior | None) -> Array:
-    """(S, p) draws from the prior."""
+    """(S, p) draws from the prior; what it says nothing of stays at its mean."""
     known = (model.default_prior() if prior is None else prior).resolve(model)
-    precision = np.diagonal(known.precision)
-    unknown = known.free & (precision == 0.0)
-    if unknown.any():
-        names = [str(model.names[i]) for i in np.flatnonzero(unknown)]
+    precision = np.where(known.free, np.diagonal(known.precision), 0.0)
+    drawn = precision > 0.0
+    if not drawn.any():
         raise ValueError(
-            "scenarios that are drawn must come with a prior of finite std for every "
-            f"parameter, got none of {', '.join(names)}; give prior=jaxcal.Prior(...), "
-            "or the parameters (S, p) themselves"
+            "scenarios that are drawn must come with a prior of finite std, got none "
+            f"for {', '.join(map(str, model.names))}; give prior=jaxcal.Prior(...), or "
+            "the parameters (S, p) themselves"
         )
-    std = np.where(
-        known.free, 1.0 / np.sqrt(np.where(unknown | ~known.free, 1.0, precision)), 0.0
-    )
+    std = np.where(drawn, 1.0 / np.sqrt(np.where(drawn, precision, 1.0)), 0.0)
     normal = np.random.default_rng(0).standard_normal((count, len(std)))
     return np.asarray(known.mean + std * normal)
 
