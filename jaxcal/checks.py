@@ -140,6 +140,7 @@ def levels(name: str, values: ArrayLike, count: int) -> Array:
     given = one_or_each(name, values, count)
     require_finite(name, given)
     require_none(given <= 0.0, given, f"{name} must be positive")
+    given.flags.writeable = False
     return given
 
 
