@@ -84,16 +84,16 @@ def _arguments(function: Callable[..., Any]) -> Iterator[tuple[Any, ...]]:
         yield from _options("options", function)
         return
     hints = typing.get_type_hints(function, include_extras=True)
-    for name, found in inspect.signature(function).parameters.items():
+    for name, parameter in inspect.signature(function).parameters.items():
         if dataclasses.is_dataclass(kind := hints[name]):
             yield from _options(name, kind)
         else:
-            option = found.kind is found.KEYWORD_ONLY
-            yield None, name, hints[name], found.default, option
+            option = parameter.kind is parameter.KEYWORD_ONLY
+            yield None, name, hints[name], parameter.default, option
 
 
 def _options(parameter: str, kind: Any) -> Iterator[tuple[Any, ...]]:
-    """The same of the fields of a dataclass, those of its bases last."""
+    """Options from the fields of a dataclass, those of its bases last."""
     hints = typing.get_type_hints(kind, include_extras=True)
     fields = {each.name: each for each in dataclasses.fields(kind) if each.init}
     bases = [vars(base).get("__annotations__", {}) for base in inspect.getmro(kind)]

@@ -32,19 +32,23 @@ def kernel(name: str) -> Any:
 def _load(name: str) -> Any:
     import scipy
 
-    names = [f"scipy.linalg.cython_{each}" for each in ("blas", "lapack")]
-    alone = [each for each in names if each not in sys.modules]
+    names = [
+        f"scipy.linalg.cython_{scipy_module}" for scipy_module in ("blas", "lapack")
+    ]
+    alone = [scipy_module for scipy_module in names if scipy_module not in sys.modules]
     try:
-        for each in () if name in sys.modules else alone:
-            spec = PathFinder.find_spec(each, [f"{scipy.__path__[0]}/linalg"])
+        for scipy_module in () if name in sys.modules else alone:
+            spec = PathFinder.find_spec(scipy_module, [f"{scipy.__path__[0]}/linalg"])
             if spec is not None and spec.loader is not None:
                 module = importlib.util.module_from_spec(spec)
                 spec.loader.exec_module(module)
-                sys.modules[each] = module  # whole: another thread may look for it
+                sys.modules[scipy_module] = (
+                    module  # whole: another thread may look for it
+                )
         return importlib.import_module(name)
     finally:
-        for each in alone:
-            sys.modules.pop(each, None)
+        for scipy_module in alone:
+            sys.modules.pop(scipy_module, None)
 
 
 def check(package: pathlib.Path) -> None:

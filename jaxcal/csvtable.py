@@ -156,19 +156,19 @@ class Table:
             )
             return self.names
         try:
-            found = columns_by_name(wanted, self.header, prefix, unit)
+            columns = columns_by_name(wanted, self.header, prefix, unit)
         except ValueError as error:
             choose = f"choose with {option}" if option else "rename one of them"
             raise ValueError(f"{self.source}: {error}; {choose}") from None
         advice = f"; name those of {', '.join(wanted)} in that order with {option}"
         advice = advice if option else ""
-        if missing := [x for x, y in zip(wanted, found, strict=True) if y is None]:
+        if missing := [x for x, y in zip(wanted, columns, strict=True) if y is None]:
             raise ValueError(
                 f"{self.source}: there is no column {', '.join(map(repr, missing))}, "
                 f"with {prefix} or without; columns: {', '.join(self.header)}" + advice
             )
-        self.say(wanted, found, "by name")
-        return tuple(found)
+        self.say(wanted, columns, "by name")
+        return tuple(columns)
 
     def commands(
         self, chosen: str | None, option: str | None = "--columns", but: Any = ()
@@ -291,21 +291,21 @@ def columns_by_name(
     """
     exact = set(wanted) & set(header)
     rest = [(name, _bare(name, prefix, unit)) for name in header if name not in exact]
-    found: list[str | None] = []
+    matches: list[str | None] = []
     for name in wanted:
         like = [column for column, bare in rest if bare == _bare(name, prefix, unit)]
         if name not in exact and len(like) > 1:
             raise ValueError(
                 f"columns {' and '.join(map(repr, like))} could both be {name!r}"
             )
-        found.append(name if name in exact else next(iter(like), None))
-    for column in found:
-        if column is not None and found.count(column) > 1:
+        matches.append(name if name in exact else next(iter(like), None))
+    for column in matches:
+        if column is not None and matches.count(column) > 1:
             doubled = [
-                name for name, c in zip(wanted, found, strict=True) if c == column
+                name for name, c in zip(wanted, matches, strict=True) if c == column
             ]
             raise ValueError(f"column {column!r} could be {' or '.join(doubled)}")
-    return found
+    return matches
 
 
 def _bare(name: str, prefix: str, unit: str) -> str:
@@ -326,7 +326,7 @@ def names_of(frame: Any) -> tuple[str, ...]:
 
 
 def of_frame(argument: str, frame: Any, wanted: Sequence[str], prefix: str) -> Any:
-    """Of a data frame the columns that are wanted, by name; anything else as given.
+    """The ``wanted`` columns of a data frame, by name; anything else as given.
 
     Raises:
         ValueError: a name is missing, or could be either of two.
@@ -335,15 +335,15 @@ def of_frame(argument: str, frame: Any, wanted: Sequence[str], prefix: str) -> A
     if not header:
         return frame
     try:
-        found = columns_by_name(wanted, header, prefix)
+        columns = columns_by_name(wanted, header, prefix)
     except ValueError as error:
         raise ValueError(f"{argument}: {error}") from None
-    if None in found:
+    if None in columns:
         raise ValueError(
             f"{argument} must have the columns {', '.join(wanted)}, "
-            f"{wanted[found.index(None)]!r} is missing (columns: {', '.join(header)})"
+            f"{wanted[columns.index(None)]!r} is missing (columns: {', '.join(header)})"
         )
-    return frame[found]
+    return frame[columns]
 
 
 # -- reading ---------------------------------------------------------------------------

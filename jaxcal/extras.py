@@ -72,8 +72,10 @@ def _source() -> tuple[str, bool]:
     folder = pathlib.Path(__file__).parents[1]
     described = "{}"
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-        found = importlib.metadata.distribution("jaxcal").read_text("direct_url.json")
-        described = found or described
+        direct_url = importlib.metadata.distribution("jaxcal").read_text(
+            "direct_url.json"
+        )
+        described = direct_url or described
     origin = json.loads(described)
     editable = bool(origin.get("dir_info", {}).get("editable"))
     if not (folder / "pyproject.toml").exists():  # installed, not a checkout

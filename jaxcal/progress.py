@@ -37,8 +37,9 @@ class Progress:
             self._next = now + (_SILENT if self._terminal else _OF_LOG)
         elif not self._quiet and now >= self._next:
             self._next = now + (_OF_TERMINAL if self._terminal else _OF_LOG)
-            left = round((now - self._started) * (total - done) / max(done, 1))
-            text = f"{task}: {done:,} of {total:,}, {datetime.timedelta(0, left)} left"
+            remaining_s = round((now - self._started) * (total - done) / max(done, 1))
+            remaining = datetime.timedelta(0, remaining_s)
+            text = f"{task}: {done:,} of {total:,}, {remaining} left"
             self._line = self._terminal
             self._stream.write(_ERASED + text if self._terminal else text + "\n")
             self._stream.flush()

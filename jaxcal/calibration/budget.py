@@ -275,8 +275,8 @@ def _gain(calibration: Fit, width: int) -> Array:
     )
     rows = slopes * np.sqrt(weight)[..., None]
     rows = rows.reshape(-1, width)
-    known = np.sqrt(calibration.prior_precision[:width] * free)
-    whole = np.concatenate([rows, np.diag(known)])
+    prior_root = np.sqrt(calibration.prior_precision[:width] * free)
+    whole = np.concatenate([rows, np.diag(prior_root)])
     size = np.sqrt((whole**2).sum(axis=0))
     size[size == 0.0] = 1.0
     inverse = np.linalg.pinv(whole / size)[:, : len(rows)] / size[:, None]

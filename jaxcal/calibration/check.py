@@ -125,9 +125,12 @@ def check(
     rows = slopes.reshape(-1, p)
 
     def spread(misfit: bool) -> Array:
-        known, covariance = calibration.linear(commands, misfit=misfit)
-        known = known.reshape(len(rows), -1)
-        return np.diag(np.tile(noise**2, len(commands))) + known @ covariance @ known.T
+        prediction_slopes, covariance = calibration.linear(commands, misfit=misfit)
+        prediction_slopes = prediction_slopes.reshape(len(rows), -1)
+        return (
+            np.diag(np.tile(noise**2, len(commands)))
+            + prediction_slopes @ covariance @ prediction_slopes.T
+        )
 
     try:
         root = np.linalg.inv(np.linalg.cholesky(spread(True)))
@@ -140,12 +143,12 @@ def check(
     least = float(np.trace(root @ spread(False) @ root.T)) / len(rows)
     white, by = root @ off, root @ rows
     names = calibration.names
-    own = np.zeros(p, dtype=np.bool_)
+    placed = np.zeros(p, dtype=np.bool_)
     if placed_anew:
         if not model.placed:
             raise ValueError("placed_anew is of an arm whose sensor stands somewhere")
-        own = np.isin(names, model.placed)  # which says nothing now
-        white, by = without(by[:, own], white, by)
+        placed = np.isin(names, model.placed)  # which says nothing now
+        white, by = without(by[:, placed], white, by)
     freedom = len(white)
     if not freedom:
         raise ValueError("measured must hold a reading beside what was placed anew")
@@ -153,7 +156,7 @@ def check(
     dof = calibration.noise_dof or _KNOWN
     p_value = float(special.fdtrc(freedom, dof, square / freedom))
     needed = _needed(freedom, dof, least)
-    free = (calibration.free[:p] > 0.0) & ~own
+    free = (calibration.free[:p] > 0.0) & ~placed
     seen = np.sqrt((by**2).sum(axis=0))
     with np.errstate(divide="ignore"):
         size = np.sqrt(needed) / seen  # infinite where nothing shows it
@@ -311,8 +314,10 @@ def verification(
         raise ValueError(f"k must be in [1, {len(points)}], got {k}")
     noise = calibration.require_noise("verification")
     slopes = np.asarray(calibration.model.jacobian(points, calibration.parameters))
-    known, covariance = calibration.linear(points)
-    spread = known @ covariance @ np.matrix_transpose(known) + np.diag(noise**2)
+    prediction_slopes, covariance = calibration.linear(points)
+    spread = prediction_slopes @ covariance @ np.matrix_transpose(
+        prediction_slopes
+    ) + np.diag(noise**2)
     white = np.linalg.inv(np.linalg.cholesky(spread)) @ slopes
     seen = (white**2).sum(axis=1)  # (M, p) by a drift of one
     where = calibration.commands if region is None else table("region", region)

@@ -106,11 +106,11 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
             f"a calibration of version {content.get('version')!r}, this jaxcal reads "
             f"version {VERSION}: identify again from the measurements"
         )
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for key in (*_NUMBERS, *_NAMES, *_KINDS):
         if key not in content:
             raise ValueError(f'key "{key}" is missing')
-        found[key] = content[key]
+        values[key] = content[key]
 
     def require(holds: bool, key: str, rule: str) -> None:
         if not holds:
@@ -119,18 +119,20 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
     sizes: dict[str, int] = {}
     for key, hint in _NUMBERS.items():
         shape, least = (*hint.__metadata__, -np.inf)[:2]
-        if found[key] is None and type(None) in typing.get_args(hint.__origin__):
+        if values[key] is None and type(None) in typing.get_args(hint.__origin__):
             continue
-        array = _array(key, found[key], shape, sizes)
+        array = _array(key, values[key], shape, sizes)
         require(bool((array >= least).all()), key, f"be at least {least:g}")
-        found[key] = array if shape else float(array)
+        values[key] = array if shape else float(array)
     for key, letter in _NAMES.items():
-        kinds = [type(x) for x in found[key]] if isinstance(found[key], list) else None
+        kinds = (
+            [type(x) for x in values[key]] if isinstance(values[key], list) else None
+        )
         require(kinds == [str] * sizes[letter], key, f"hold {sizes[letter]} names")
-        found[key] = tuple(found[key])
+        values[key] = tuple(values[key])
     for key, (kind, what) in _KINDS.items():
-        require(isinstance(found[key], kind), key, f"be {what}")
-    require(found["loss"] in ("student", "gaussian"), "loss", "be student or gaussian")
+        require(isinstance(values[key], kind), key, f"be {what}")
+    require(values["loss"] in ("student", "gaussian"), "loss", "be student or gaussian")
     for key in ("model", "derived"):
         require(isinstance(content.get(key), dict), key, "be an object")
     names = content["derived"].get("parameter_names")
@@ -139,12 +141,12 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
         raise ValueError(
             f"model must have the parameters of the file, {names}, got {model.names}"
         )
-    size = len(found["estimate"])
+    size = len(values["estimate"])
     if size not in (len(names), len(model.with_misfit().names)):
         raise ValueError(f'"estimate" must have shape ({len(names)},)')
-    if (found["noise_std"] is None) != (found["joint_covariance"] is None):
+    if (values["noise_std"] is None) != (values["joint_covariance"] is None):
         raise ValueError('"noise_std" and "joint_covariance" contradict each other')
-    return found | {"model": model}
+    return values | {"model": model}
 
 
 def _array(key: str, value: Any, shape: str, sizes: dict[str, int]) -> Any:

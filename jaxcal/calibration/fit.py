@@ -81,7 +81,7 @@ class Fit:
 
     @property
     def num_measurements(self) -> int:
-        """Of positive weight."""
+        """Measurements of positive weight."""
         return int((self.loss_weights > 0.0).sum())
 
     @property
@@ -295,7 +295,7 @@ class Fit:
         return points
 
     def by_name(self, name: str, values: ArrayLike) -> Any:
-        """Of a data frame the calibration's columns in its order; else as given."""
+        """The calibration's columns of a data frame, in its order; else as given."""
         if name in ("desired", "measured"):
             return of_frame(name, values, self.output_names, MEASURED)
         return of_frame(name, values, self.input_names, COMMANDS)

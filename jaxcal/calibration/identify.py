@@ -153,7 +153,7 @@ def identify(
         loss = "gaussian"
         if isinstance(model, Affine):
             require_excited(commands[weight > 0.0], inputs)
-    found = fit_model(
+    fields = fit_model(
         commands,
         measured,
         weight,
@@ -163,7 +163,7 @@ def identify(
         loss=loss or "student",
         common_noise=common_noise,
     )
-    calibration = Calibration(**found, **about)
+    calibration = Calibration(**fields, **about)
     if not calibration.verdict.good and not _exact(calibration):
         warnings.warn(str(calibration.verdict), stacklevel=2)
     return calibration

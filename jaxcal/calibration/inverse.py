@@ -109,19 +109,23 @@ class _Search:
         self.affine = square and fit.affine is not None
         # What the machine answers at commands (R, n) if points ``rows`` are reached.
         self.goal = fit.model.targets(wanted, start)
-        known = fit.commands
-        self.spread = np.where(np.ptp(known, axis=0) > 0.0, known.std(axis=0), 1.0)
-        points, count = np.arange(len(wanted)), len(known)
-        there = self.goal(np.tile(known, (len(wanted), 1)), np.repeat(points, count))
-        outputs = predict(self.model, known, fit.estimate)
+        measured_at = fit.commands
+        self.spread = np.where(
+            np.ptp(measured_at, axis=0) > 0.0, measured_at.std(axis=0), 1.0
+        )
+        points, count = np.arange(len(wanted)), len(measured_at)
+        there = self.goal(
+            np.tile(measured_at, (len(wanted), 1)), np.repeat(points, count)
+        )
+        outputs = predict(self.model, measured_at, fit.estimate)
         there = there.reshape(len(wanted), count, -1) - outputs
-        there = self.model.wrapped(there, known)
+        there = self.model.wrapped(there, measured_at)
         # Relative outputs spread as what is wanted, seen from where it was measured.
         seen = np.concatenate(there) if fit.model.relative else outputs
         self.size = np.where(np.ptp(seen, axis=0) > 0.0, seen.std(axis=0), 1.0)
         with np.errstate(over="ignore"):
             order = np.argsort(((there / self.size) ** 2).sum(axis=-1), axis=1)
-        self.nearest = known[order[:, :_STARTS]]  # (P, starts, n)
+        self.nearest = measured_at[order[:, :_STARTS]]  # (P, starts, n)
 
     def outputs(self, commands: Array) -> Array:
         return predict(self.model, commands, self.fit.estimate, finite=False)
@@ -194,11 +198,11 @@ class _Search:
         slopes = fit.linear(commands)[0]
         for i, j in np.argwhere(depends(slopes, fit.unseen))[:1]:
             used = fit.commands[fit.loss_weights > 0.0]
-            known = fit.estimate, fit.prior_precision, fit.free > 0.0
+            where = fit.estimate, fit.prior_precision, fit.free > 0.0
             words = [
-                each.words
-                for each in unknown(self.model, used, *known)
-                if depends(slopes[i, j], each.vectors)
+                direction.words
+                for direction in unknown(self.model, used, *where)
+                if depends(slopes[i, j], direction.vectors)
             ]
             raise ValueError(
                 f"{fit.output_names[j]} at the command {in_words(commands[i])} depends "
@@ -245,14 +249,14 @@ class _Search:
         matrix, bias = self.model.affine(self.fit.estimate)  # type: ignore[misc]  # is affine
         scaled = matrix * self.spread
         unit = np.abs(scaled).max()
-        found = optimize.lsq_linear(
+        solution = optimize.lsq_linear(
             scaled / unit,
             (wanted - bias) / unit,
             (low / self.spread, high / self.spread),
             method="bvls",
             tol=1e-14,
         )
-        return np.clip(found.x * self.spread, low, high)
+        return np.clip(solution.x * self.spread, low, high)
 
     def bounded(
         self, i: int, free: Array, reached: bool, bounds: Array, clip: bool
@@ -267,7 +271,7 @@ class _Search:
         if self.affine:
             nearest = self._nearest_within(wanted, low, high)
         for begin in () if self.affine else (free, *self.nearest[i]):
-            found = optimize.least_squares(
+            solution = optimize.least_squares(
                 lambda command: -self.gap(command[None], at)[0],
                 np.clip(begin, low, high),
                 lambda command: self.slopes(command[None])[0] / self.spread,
@@ -275,10 +279,10 @@ class _Search:
                 x_scale=self.spread,
                 **dict.fromkeys(("ftol", "xtol", "gtol"), 1e-15),
             )
-            if self._arrived(found.fun[None])[0]:
-                return np.asarray(found.x)
-            if found.cost < least:
-                nearest, least = np.asarray(found.x), found.cost
+            if self._arrived(solution.fun[None])[0]:
+                return np.asarray(solution.x)
+            if solution.cost < least:
+                nearest, least = np.asarray(solution.x), solution.cost
         if clip:
             return nearest
         beyond = np.maximum(low - free, free - high) / self.spread

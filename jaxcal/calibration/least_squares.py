@@ -156,7 +156,7 @@ def apart(rows: Array) -> list[NDArray[np.intp]]:
 
 
 def singular(rows: Array) -> list[tuple[NDArray[np.intp], Array, Array]]:
-    """Of each group of ``apart`` columns (c,): these, singular values, right vectors.
+    """For each group of ``apart`` columns (c,): these, singular values, right vectors.
 
     The rows (R, F) must be F or more. The right singular vectors are (c, c).
     """

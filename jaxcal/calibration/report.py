@@ -215,8 +215,8 @@ def _of_predictions(
     names = [
         f"{output} at {row}" for row in rows for output in calibration.output_names
     ]
-    found = budget(calibration, commands[rows], sources=sources)
-    return dataclasses.replace(found, names=tuple(names))
+    of_rows = budget(calibration, commands[rows], sources=sources)
+    return dataclasses.replace(of_rows, names=tuple(names))
 
 
 def _sha256(path: pathlib.Path) -> str:
@@ -402,7 +402,7 @@ def _moved_section(
 
 def _residual_sections(calibration: Fit) -> list[pages.Section]:
     names, residuals = calibration.output_names, calibration.residuals
-    known = calibration.noise_std is not None
+    noise_known = calibration.noise_std is not None
     unit = f" ({calibration.measured_unit})" if calibration.measured_unit else ""
     rows = np.arange(len(residuals), dtype=float)
     by_row = _scatter(rows, residuals, names, "row", f"residual{unit}")
@@ -415,7 +415,7 @@ def _residual_sections(calibration: Fit) -> list[pages.Section]:
     ]
     head = ["row", *(f"residual {name}" for name in names), "weight"]
     columns = [*residuals.T, calibration.loss_weights]
-    if known:
+    if noise_known:
         head += ["leverage", *(f"held-out {name}" for name in names)]
         columns += [leverage(calibration), *left_out(calibration).T]
     table = pages.Table(
@@ -434,11 +434,11 @@ def _residual_sections(calibration: Fit) -> list[pages.Section]:
     ]
     nominal = _nominal_errors(calibration)
     if nominal is not None:
-        after = left_out(calibration) if known else residuals
+        after = left_out(calibration) if noise_known else residuals
         lengths = np.column_stack(
-            [np.linalg.norm(each, axis=1) for each in (nominal, after)]
+            [np.linalg.norm(errors, axis=1) for errors in (nominal, after)]
         )
-        labels = ("before", "after, held out" if known else "after")
+        labels = ("before", "after, held out" if noise_known else "after")
         picture = _scatter(rows, lengths, labels, "row", f"error{unit}", zero=True)
         means = lengths.mean(axis=0)
         text = f"Mean error {means[0]:.3g} before, {means[1]:.3g} {labels[1]}."

@@ -1,4 +1,4 @@
-"""Of an arm in a URDF file: its options on the command line, and models in files."""
+"""Options of an arm in a URDF file on the command line, and models in files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from jaxcal.csvtable import COMMANDS, Table
 from jaxcal.models import Model, SerialChain, from_dict
 from jaxcal.models.linear import input_letters
 from jaxcal.models.model import as_model
-from jaxcal.models.sensors import SENSORS, Placed, Socket
+from jaxcal.models.sensors import SENSORS, Landmarks, Socket
 
 __all__ = ["ArmOptions", "ModelPath", "in_degrees"]
 
@@ -41,7 +41,7 @@ def _of_joint(text: str) -> list[Any]:
 
 @dataclasses.dataclass
 class ArmOptions:
-    """Of an arm in a URDF file: its links, its sensor, the unit of its columns."""
+    """Links of an arm in a URDF file, its sensor, the unit of its columns."""
 
     sensor: Annotated[str, "of an arm, what its tip is measured with", _KINDS] = (
         "position"
@@ -69,7 +69,7 @@ class ArmOptions:
         """The arm in this file; things that it touches are given or in the table."""
         kind = SENSORS[self.sensor]
         given: dict[str, Any] = {}
-        if issubclass(kind, Placed):
+        if issubclass(kind, Landmarks):
             if places is not None:
                 if {len(place) for place in places} != {kind.width}:
                     raise ValueError(
@@ -160,7 +160,7 @@ class ArmOptions:
 
 
 def in_degrees(arm: SerialChain, commands: Array) -> Array:
-    """The same commands, of turning joints in degrees instead of radians."""
+    """Commands (N, n) in radians, made degrees where joints turn; changed in place."""
     turning = np.flatnonzero(np.array(arm.command_units) == "deg")
     commands[:, turning] = np.degrees(commands[:, turning])
     return commands

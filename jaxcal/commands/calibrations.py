@@ -26,7 +26,7 @@ from jaxcal.commands.tables import (
 from jaxcal.csvtable import COMMANDS, MEASURED, Table, read_table
 from jaxcal.extras import needs
 from jaxcal.models import SerialChain
-from jaxcal.models.sensors import SENSORS, Board, Placed
+from jaxcal.models.sensors import SENSORS, Board, Landmarks
 from jaxcal.selection import select
 
 __all__ = ["check", "command", "identify", "postures", "predict"]
@@ -102,16 +102,16 @@ def postures(
     Collisions are looked at as far as --floor, --approach and --clear say.
     """
     reached = None if measured is None else read_table(measured)
-    placed = issubclass(SENSORS[of_arm.sensor], Placed)
+    placed = issubclass(SENSORS[of_arm.sensor], Landmarks)
     arm = of_arm.read(model, reached, near if placed else None)
     header, done = (*arm.joint_names, *arm.sensor.inputs), None
     if reached is not None:
         done = of_arm.commands(arm, reached, reached.named(header, COMMANDS))
         arm.require_commands(done)
         arm = arm.located(done)
-    left = k - (0 if done is None else len(done))
-    if left < 1:
-        reason = f"-k must be more than the {k - left} that were reached"
+    more = k - (0 if done is None else len(done))
+    if more < 1:
+        reason = f"-k must be more than the {k - more} that were reached"
         raise ValueError(f"{reason}, got {k}")
     targets = None if placed else near
     if board is not None:
@@ -131,7 +131,7 @@ def postures(
         approach=approach,
         clear=clear or (),
     )
-    chosen = select(offered, left, "exchange", model=arm, measured=done).indices
+    chosen = select(offered, more, "exchange", model=arm, measured=done).indices
     plan = offered[chosen]
     plan = plan[arm.in_turn(plan)]
     if picture:
@@ -140,7 +140,7 @@ def postures(
 
         from jaxcal import plots
 
-        figure = Figure(figsize=(8, 2.2 * -(-left // 4)), layout="constrained")
+        figure = Figure(figsize=(8, 2.2 * -(-more // 4)), layout="constrained")
         plots.postures(figure, arm, plan).savefig(picture)
     if of_arm.radians:
         turning = [i for i, unit in enumerate(arm.command_units) if unit == "deg"]
@@ -211,25 +211,27 @@ def identify(
     if (model or "").lower().endswith(".urdf"):
         names = of_arm.columns(machine, table, inputs, "--inputs")
         commands = of_arm.commands(machine, table, names)
-        known = machine.sensor.outputs
+        readings = machine.sensor.outputs
         if machine.sensor.kind in _LENGTHS:  # files of this format are in metres
             measured_unit = measured_unit or "m"
         if machine.sensor.zeros:  # a contact needs no columns of readings
-            measured = np.zeros((len(commands), len(known)))
+            measured = np.zeros((len(commands), len(readings)))
         else:
-            known = table.named(known, MEASURED, chosen=outputs, option="--outputs")
-            measured = table.columns(known)
+            readings = table.named(
+                readings, MEASURED, chosen=outputs, option="--outputs"
+            )
+            measured = table.columns(readings)
         if as_urdf and os.path.exists(out) and not overwrite:
             raise ValueError(f"{out} is there already; --overwrite writes over it")
     else:
         if as_urdf:
             raise ValueError("--out FILE.urdf needs --model FILE.urdf")
-        known = table.outputs(outputs)
-        other = (*known, weights or "")
+        readings = table.outputs(outputs)
+        other = (*readings, weights or "")
         names = of_arm.columns(machine, table, inputs, "--inputs", other)
-        if both := sorted({*names} & {*known}):
+        if both := sorted({*names} & {*readings}):
             raise ValueError(f"--inputs and --outputs must differ, both hold {both[0]}")
-        commands, measured = table.columns(names), table.columns(known)
+        commands, measured = table.columns(names), table.columns(readings)
     calibration = identified(
         commands,
         measured,
@@ -237,7 +239,7 @@ def identify(
         noise_std=noise[0] if noise and len(noise) == 1 else noise,
         weights=table.columns([weights])[:, 0] if weights else None,
         input_names=names,
-        output_names=known,
+        output_names=readings,
         command_unit=command_unit,
         measured_unit=measured_unit,
         accuracy=accuracy,
@@ -296,20 +298,24 @@ def check(
     The table has the calibration's columns. Exit code 0: it holds; 1: it does not, or
     that cannot be told from these readings; 2: bad input.
     """
-    found, table = Calibration.load(calibration), read_table(file)
-    inputs, commands = _commands_for(found, table, option="")
-    unit = found.measured_unit
-    outputs = table.named(found.output_names, MEASURED, option="", unit=unit)
+    calibrated, table = Calibration.load(calibration), read_table(file)
+    inputs, commands = _commands_for(calibrated, table, option="")
+    unit = calibrated.measured_unit
+    outputs = table.named(calibrated.output_names, MEASURED, option="", unit=unit)
     if both := sorted({*inputs} & {*outputs}):
         raise ValueError(
             f"{file}: columns of commands and of readings must differ, both would be "
             f"{', '.join(both)}; begin their names with {COMMANDS} and {MEASURED}"
         )
     measured = table.columns(outputs)
-    told = found.check(commands, measured, tolerance=tolerance, placed_anew=placed_anew)
+    told = calibrated.check(
+        commands, measured, tolerance=tolerance, placed_anew=placed_anew
+    )
     if report:
         files = [path for path in (calibration, file) if os.path.isfile(path)]
-        found.report(report, check=told, readings=(commands, measured), files=files)
+        calibrated.report(
+            report, check=told, readings=(commands, measured), files=files
+        )
     if json:
         write_json("", dataclasses.asdict(told))
     else:
@@ -329,18 +335,18 @@ def predict(
     output: Output,
 ) -> None:
     """Where a calibrated machine goes for given commands."""
-    found = Calibration.load(calibration)
+    calibrated = Calibration.load(calibration)
     table = read_table(file)
-    _, commands = _commands_for(found, table, columns)
+    _, commands = _commands_for(calibrated, table, columns)
     if radians:
-        if not isinstance(found.model, SerialChain):
+        if not isinstance(calibrated.model, SerialChain):
             raise ValueError("--radians is of arms")
-        commands = in_degrees(found.model, commands)
-    found.model.require_commands(commands)
-    names, values = found.output_names, found.predict(commands)
+        commands = in_degrees(calibrated.model, commands)
+    calibrated.model.require_commands(commands)
+    names, values = calibrated.output_names, calibrated.predict(commands)
     if std:
         names = (*names, *(f"std_{name}" for name in names))
-        values = np.concatenate([values, found.predict_std(commands)], axis=1)
+        values = np.concatenate([values, calibrated.predict_std(commands)], axis=1)
     _emit(output, names, values)
 
 
@@ -362,16 +368,16 @@ def command(
 
     A command beyond its limits is refused; --clip moves it onto the limit instead.
     """
-    found = Calibration.load(calibration)
-    table, unit = read_table(file), found.measured_unit
-    names = table.named(found.output_names, MEASURED, chosen=columns, unit=unit)
+    calibrated = Calibration.load(calibration)
+    table, unit = read_table(file), calibrated.measured_unit
+    names = table.named(calibrated.output_names, MEASURED, chosen=columns, unit=unit)
     desired = table.columns(names)
     if clip and not limits:
         raise ValueError("--clip needs --limits")
     if limits and len(limits) == 1:
-        limits = limits * found.num_inputs
-    commands = found.command_for(desired, limits=limits or None, clip=clip)
-    _emit(output, found.input_names, commands)
+        limits = limits * calibrated.num_inputs
+    commands = calibrated.command_for(desired, limits=limits or None, clip=clip)
+    _emit(output, calibrated.input_names, commands)
 
 
 def _commands_for(

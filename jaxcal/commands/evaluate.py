@@ -154,7 +154,7 @@ class TaskOptions(Outputs):
 
 
 @dataclasses.dataclass(kw_only=True)
-class Options(Outputs):
+class EvaluateOptions(Outputs):
     """What is evaluated."""
 
     checkpoint: Annotated[
@@ -264,7 +264,7 @@ def _terminate(number: int, frame: object) -> NoReturn:
     raise _Terminated
 
 
-def _run(options: Options) -> None:
+def _run(options: EvaluateOptions) -> None:
     from jaxcal.evaluation.methods import DEFAULT_METHODS, POLICIES, check_methods
     from jaxcal.evaluation.report import json_document, text_table, write_report
     from jaxcal.progress import Progress
@@ -306,13 +306,13 @@ def _run(options: Options) -> None:
 
 
 def _whole(
-    options: Options, methods: Sequence[str], progress: Progress
+    options: EvaluateOptions, methods: Sequence[str], progress: Progress
 ) -> Iterator[tuple[Summary, Evaluation]]:
     """Every dataset, read or made before the first is evaluated."""
     from jaxcal.evaluation.methods import evaluate
 
     for dataset in [_dataset(name, options, progress) for name in options.datasets]:
-        found = evaluate(
+        evaluation = evaluate(
             dataset,
             options.k,
             methods,
@@ -323,10 +323,10 @@ def _whole(
             time_limit=options.time_limit,
             progress=progress,
         )
-        yield found.summarise(indices=options.indices), found
+        yield evaluation.summarise(indices=options.indices), evaluation
 
 
-def _dataset(name: str, options: Options, progress: Progress) -> Dataset:
+def _dataset(name: str, options: EvaluateOptions, progress: Progress) -> Dataset:
     """The first episodes of one of the paper's datasets, or of a file."""
     from jaxcal.commands.pools import draw_sets, holds_sets
     from jaxcal.evaluation.dataset import Dataset
@@ -358,7 +358,7 @@ def _dataset(name: str, options: Options, progress: Progress) -> Dataset:
 
 
 def _streamed(
-    options: Options, methods: Sequence[str], progress: Progress
+    options: EvaluateOptions, methods: Sequence[str], progress: Progress
 ) -> Iterator[tuple[Summary, None]]:
     """One dataset in parts."""
     assert options.stream is not None  # it was given
@@ -392,7 +392,7 @@ def _streamed(
     yield evaluate_stream(draw, options.episodes, options.stream, plan, progress), None
 
 
-def _check_outputs(options: Options) -> None:
+def _check_outputs(options: EvaluateOptions) -> None:
     """Refuse outputs that cannot be written before anything is computed."""
     options.require_writable()
     if options.stream is not None:
@@ -423,9 +423,9 @@ def _run_task(options: TaskOptions) -> None:
     entry = registry.load(options.task)
     methods = options.methods or list(entry.methods)
     if not methods:
-        known = [m for m in _TUNED.split(",") if m in entry.rules or options.retune]
+        tuned = [m for m in _TUNED.split(",") if m in entry.rules or options.retune]
         methods = _DECIDERS.split(",")
-        methods[5:5] = known
+        methods[5:5] = tuned
     if options.checkpoint is not None and "policy" not in methods:
         if options.methods:
             raise ValueError("--checkpoint is given, but policy is not among --methods")

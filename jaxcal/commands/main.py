@@ -109,7 +109,7 @@ def doctor(*, json: Annotated[bool, "print JSON"] = False) -> None:
     """Print versions and devices; nothing is changed and no port is opened."""
     from jaxcal.commands.tables import write_json
 
-    found = {
+    versions = {
         "python": f"{platform.python_version()} ({sys.executable})",
         "platform": platform.platform(),
         "cores": str(os.cpu_count()),
@@ -117,14 +117,14 @@ def doctor(*, json: Annotated[bool, "print JSON"] = False) -> None:
     }
     for package, extra in _required().items():
         more = f": {install(extra)}" if extra else ""
-        found[package] = _version(package, f"not installed{more}")
-    found["devices"] = _devices()
+        versions[package] = _version(package, f"not installed{more}")
+    versions["devices"] = _devices()
     cache = "JAX_COMPILATION_CACHE_DIR"
-    found[cache] = os.environ.get(cache, "not set")
+    versions[cache] = os.environ.get(cache, "not set")
     if json:
-        write_json("", found)
+        write_json("", versions)
         return
-    print("\n".join(aligned([*found.items()], "<")))
+    print("\n".join(aligned([*versions.items()], "<")))
 
 
 def _required() -> dict[str, str]:
@@ -134,11 +134,11 @@ def _required() -> dict[str, str]:
         asked = re.match(r"([\w.-]+)(?:.*extra == ['\"](\w+)['\"])?", line)
         if asked and asked[2] not in _OTHERS and asked[1] != "jaxcal":
             wanted.setdefault(asked[2] or "", []).append(asked[1])
-    found: dict[str, str] = {}
+    extras: dict[str, str] = {}
     for extra in sorted(wanted, key=lambda name: (name != "", len(wanted[name]))):
         for package in wanted[extra]:
-            found.setdefault(package, extra)
-    return found
+            extras.setdefault(package, extra)
+    return extras
 
 
 def _version(package: str, missing: str) -> str:

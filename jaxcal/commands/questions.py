@@ -25,7 +25,7 @@ Rows = Annotated[list[int] | None, several(int, "whole numbers")]
 
 
 @dataclasses.dataclass
-class Asked:
+class DesignOptions:
     """The problem that a table of candidates and these options describe."""
 
     columns: Annotated[str | None, "of commands; u_..., else all of numbers", "A,B"] = (
@@ -42,7 +42,7 @@ class Asked:
     lost: Annotated[int, "1 or 2 rows that may fail: the worst loss counts", "L"] = 0
 
     def design(self, table: Table, of_arm: ArmOptions) -> Design:
-        """Of these candidates."""
+        """The design of the candidates in a table."""
         model, mask = of_arm.machine(self.model, table), table.available()
         names = of_arm.columns(model, table, self.columns)
         candidates = of_arm.commands(model, table, names, mask)
@@ -71,7 +71,7 @@ class Asked:
 
 
 @dataclasses.dataclass
-class Judged:
+class CriterionOptions:
     """By which criterion."""
 
     criterion: Annotated[str | None, "D of affine models, else I", [*CRITERIA]] = None
@@ -93,8 +93,8 @@ class Judged:
 
 
 @dataclasses.dataclass
-class Options:
-    """Of methods."""
+class MethodOptions:
+    """Options of the methods of ``select``."""
 
     seed: Annotated[int | None, "for methods that draw at random; 0", "S"] = None
     restarts: Annotated[int | None, "random starts of the exchange"] = None
@@ -112,7 +112,7 @@ class Options:
 
 def select(
     file: TablePath,
-    asked: Asked,
+    of_design: DesignOptions,
     of_arm: ArmOptions,
     *,
     k: Annotated[int | None, "rows to choose", "K"] = None,
@@ -121,8 +121,8 @@ def select(
         "auto (the cheapest proof), exact, exchange, greedy, random, policy",
         "NAME",
     ] = "auto",
-    judged: Judged,
-    options: Options,
+    of_criterion: CriterionOptions,
+    of_method: MethodOptions,
     output: Output,
 ) -> None:
     """Choose the few rows of a table worth measuring.
@@ -131,16 +131,18 @@ def select(
     kept as labels. Without --k the fewest rows that identify the model are chosen.
     """
     table = read_table(file)
-    given = {name: x for name, x in vars(options).items() if x is not None}
-    selection = asked.design(table, of_arm).select(k, judged.by(), method, **given)
+    given = {name: x for name, x in vars(of_method).items() if x is not None}
+    selection = of_design.design(table, of_arm).select(
+        k, of_criterion.by(), method, **given
+    )
     _show(selection, table, output)
 
 
 def score(
     file: TablePath,
-    asked: Asked,
+    of_design: DesignOptions,
     of_arm: ArmOptions,
-    judged: Judged,
+    of_criterion: CriterionOptions,
     *,
     indices: Annotated[Rows, "rows, counted from 0", "I,J"] = None,
     subset: Annotated[str | None, "table that select --csv wrote", "FILE"] = None,
@@ -162,15 +164,15 @@ def score(
                 f"--indices {subset}"
             )
         rows = _rows_of(read_table(subset), table)
-    selection = asked.design(table, of_arm).score(
-        rows, judged.by(), reference=reference, time_limit=time_limit
+    selection = of_design.design(table, of_arm).score(
+        rows, of_criterion.by(), reference=reference, time_limit=time_limit
     )
     _show(selection, table, output)
 
 
 def plan(
     file: TablePath,
-    asked: Asked,
+    of_design: DesignOptions,
     of_arm: ArmOptions,
     *,
     accuracy: Annotated[
@@ -188,9 +190,9 @@ def plan(
     output: Output,
 ) -> None:
     """How many measurements a wanted accuracy takes."""
-    if asked.noise is None:
+    if of_design.noise is None:
         raise ValueError("--noise, the std of a measurement, must be given")
-    result = asked.design(read_table(file), of_arm).plan(
+    result = of_design.design(read_table(file), of_arm).plan(
         _one_or_all(accuracy), criterion=criterion, max_k=max_k, more=more
     )
     header = ("k", "distinct", "standard_error", "least_error")

@@ -46,8 +46,8 @@ class Output:
         if ending not in ("", ".csv", ".json", ".txt"):
             raise ValueError(f"--out must end in .csv or .json, got {self.out}")
         if self.json or ending == ".json":
-            each = [dict(zip(names, row, strict=True)) for row in rows]
-            write_json(self.out, each if document is None else document)
+            objects = [dict(zip(names, row, strict=True)) for row in rows]
+            write_json(self.out, objects if document is None else document)
         elif self.csv or self.out:
             write_rows(self.out, names, rows)
         else:

@@ -29,8 +29,8 @@ def fixed_validation(config: TrainConfig) -> Validation:
         )
         given = np.asarray(states.candidates, np.float64)
         free = np.asarray(states.available)
-        found = exact_batch(given, env.num_selected, available=free, num_outputs=1)
-        return Validation(given, np.asarray(found.log_det), env.num_outputs, free)
+        optima = exact_batch(given, env.num_selected, available=free, num_outputs=1)
+        return Validation(given, np.asarray(optima.log_det), env.num_outputs, free)
     rng = np.random.default_rng([20261121, env.num_candidates, env.num_inputs])
     sets = rng.uniform(size=(_VALIDATED, env.num_candidates, env.num_inputs))
     best = exact_batch(sets, env.num_selected, num_outputs=1).log_det
@@ -48,5 +48,5 @@ def teacher(
     """
     required = given if given.shape[1] else None
     solve = exact_batch if k == candidates.shape[2] + 1 else exchange_batch
-    found = solve(candidates, k, available=available, required=required, num_outputs=1)
-    return found.indices, found.log_det
+    solved = solve(candidates, k, available=available, required=required, num_outputs=1)
+    return solved.indices, solved.log_det

@@ -57,8 +57,14 @@ class Identifiability:
             f"{self.rank} of {len(self.names)} parameters can be identified from "
             f"{self.num_candidates} candidates (condition {self.condition:.3g})."
         ]
-        alone = [each.words for each in self.directions if len(each.names) == 1]
-        tied = [each.words for each in self.directions if len(each.names) > 1]
+        alone = [
+            direction.words
+            for direction in self.directions
+            if len(direction.names) == 1
+        ]
+        tied = [
+            direction.words for direction in self.directions if len(direction.names) > 1
+        ]
         if tied:
             lines += ["Seen only in combination:", *(f"  {words}" for words in tied)]
         if alone:
@@ -96,16 +102,16 @@ def identifiability(
     model = as_model(model)
     require_kind("noise", noise, Noise)
     require_kind("prior", prior, Prior)
-    known = None if prior is None else prior.resolve(model)
-    mean = model.nominal if known is None else known.mean
+    given = None if prior is None else prior.resolve(model)
+    mean = model.nominal if given is None else given.mean
     commands = commands[answered(model, commands, mean)]
     jacobian = _white(model, derivative(model, commands, mean), commands, mean, noise)
     rows = jacobian.reshape(-1, model.num_parameters)
     asked = np.ones(model.num_parameters, dtype=np.bool_)
     held: Sequence[str] = ()
-    if known is not None:
-        rows = np.vstack([rows, np.sqrt(known.precision)])
-        asked &= known.free
+    if given is not None:
+        rows = np.vstack([rows, np.sqrt(given.precision)])
+        asked &= given.free
     elif parameters is None:
         held = model.default_prior().fixed
         asked &= ~np.isin(model.names, list(held))
@@ -128,24 +134,24 @@ def identifiability(
     unit = columns / np.where(seen, lengths, 1.0)
     norms = np.where(seen, lengths * largest, 1.0)
     size, off = np.linalg.svd(unit, compute_uv=False), model.resolution
-    found: list[Array] = []
+    null: list[Array] = []
     if len(size) < len(at) or not significant(size, off=off).all():
-        found = [np.eye(len(at))[[i]] for i in np.flatnonzero(~seen)]
+        null = [np.eye(len(at))[[i]] for i in np.flatnonzero(~seen)]
         first, classes = _parallel(unit, np.flatnonzero(seen), off)
-        found += [each / norms for each in classes]
+        null += [each / norms for each in classes]
         for vector in _sparse_null(unit[:, first], off):
             full = np.zeros((1, len(at)))
             full[0, first] = vector / norms[first]
-            found.append(full)
+            null.append(full)
     directions = []
-    for local in found:
+    for local in null:
         full = np.zeros((len(local), model.num_parameters))
         full[:, at] = local * scale
         full /= np.linalg.norm(full, axis=1, keepdims=True)
         told = tuple(names[i] for i in np.flatnonzero(local.any(axis=0)))
         same = np.allclose(np.abs(full[np.abs(full) > 0.0]), np.sqrt(0.5))
         directions.append(Direction(told, _in_words(told, same), full))
-    rank = len(at) - sum(len(vectors) for vectors in found)
+    rank = len(at) - sum(len(vectors) for vectors in null)
     condition = float(size[0] / size[rank - 1]) if rank else np.inf
     order = {name: i for i, name in enumerate(names)}
     directions.sort(key=lambda direction: order[direction.names[0]])
@@ -214,7 +220,7 @@ def _in_words(names: tuple[str, ...], same: bool) -> str:
 def _parallel(
     unit: Array, at: NDArray[np.intp], off: float
 ) -> tuple[list[int], list[Array]]:
-    """Of columns ``at`` that are multiples of each other the first, and vectors (k, p)
+    """The first of columns ``at`` that are multiples of each other, and vectors (k, p)
     of each of the others against it."""
     first: list[int] = []
     classes: list[list[Array]] = []

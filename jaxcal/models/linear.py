@@ -168,9 +168,9 @@ class Linear(Model):
             "what features returns", self.features(commands), finite=False
         )
         right = features.ndim == 2 and len(features) == len(commands)
-        known = getattr(self, "terms", None)
-        if not right or (known and features.shape[1] != len(known)):
-            rule = f"({len(commands)}, {len(known) if known else 'r'})"
+        terms = getattr(self, "terms", None)
+        if not right or (terms and features.shape[1] != len(terms)):
+            rule = f"({len(commands)}, {len(terms) if terms else 'r'})"
             raise ValueError(
                 f"features must return {rule} for commands {commands.shape}, "
                 f"got {features.shape}"

@@ -314,7 +314,7 @@ class Model(abc.ABC):
         return ValueError(f"the model must be an arm, got {type(self).__name__}")
 
 
-class _Wrapped(Model):
+class _Adapter(Model):
     """A model of another class, with the defaults for what it has not."""
 
     def __init__(self, own: Any) -> None:
@@ -360,7 +360,7 @@ def as_model(model: Any) -> Model:
             f"jaxcal.models.Model, got {got}"
             + (f" without {missing[0]}" if missing else "")
         )
-    return model if isinstance(model, Model) else _Wrapped(model)
+    return model if isinstance(model, Model) else _Adapter(model)
 
 
 def as_commands(model: Any, commands: ArrayLike) -> Array:
@@ -379,7 +379,7 @@ def as_parameters(model: Model, parameters: ArrayLike | None) -> Array:
 
 
 def by_name(model: Any, commands: Any) -> Any:
-    """Of a data frame the columns that the model names, in its order; else as given."""
+    """The model's columns of a data frame, in its order; else as given."""
     inputs = getattr(model, "inputs", ())
     return of_frame("commands", commands, inputs, COMMANDS) if inputs else commands
 
@@ -394,19 +394,19 @@ def predict(
     shape = (len(commands), model.num_outputs)
     with np.errstate(all="ignore"):
         try:
-            found = np.asarray(model.predict(commands, parameters), dtype=np.float64)
+            outputs = np.asarray(model.predict(commands, parameters), dtype=np.float64)
         except ValueError:
             if finite:
                 raise
             return np.full(shape, np.nan)
-    _require_shape("predict", found, shape)
-    if finite and not np.isfinite(found).all():
-        bad = np.isfinite(found).all(axis=1).argmin()
+    _require_shape("predict", outputs, shape)
+    if finite and not np.isfinite(outputs).all():
+        bad = np.isfinite(outputs).all(axis=1).argmin()
         raise ValueError(
-            f"model.predict must be finite, got {in_words(found[bad])} for the "
+            f"model.predict must be finite, got {in_words(outputs[bad])} for the "
             f"command {in_words(commands[bad])}"
         )
-    return found
+    return outputs
 
 
 def derivative(
@@ -416,19 +416,19 @@ def derivative(
     method = "command_jacobian" if names else "jacobian"
     names = names or model.names
     with np.errstate(all="ignore"):
-        found = getattr(model, method)(commands, parameters)
-    found = np.asarray(found, dtype=np.float64)
-    _require_shape(method, found, (len(commands), model.num_outputs, len(names)))
-    if not np.isfinite(found).all():
-        bad = ~np.isfinite(found)
+        slopes = getattr(model, method)(commands, parameters)
+    slopes = np.asarray(slopes, dtype=np.float64)
+    _require_shape(method, slopes, (len(commands), model.num_outputs, len(names)))
+    if not np.isfinite(slopes).all():
+        bad = ~np.isfinite(slopes)
         row, output, column = np.argwhere(bad)[0]
         # A forward derivative may spoil the columns beside that of the one to blame.
         by = ", ".join(np.array(names)[bad[row, output]])
         raise ValueError(
-            f"model.{method} must be finite, got {found[row, output, column]} by {by} "
+            f"model.{method} must be finite, got {slopes[row, output, column]} by {by} "
             f"for the command {in_words(commands[row])}"
         )
-    return found
+    return slopes
 
 
 def answered(
@@ -468,12 +468,12 @@ def without_effect(jacobian: Array, sizes: Array) -> NDArray[np.bool_]:
     """
     largest = np.abs(jacobian).max(axis=0, initial=0.0)
     zero = ~largest.any(axis=0)
-    known = np.isfinite(sizes)
-    if not known.any():
+    sized = np.isfinite(sizes)
+    if not sized.any():
         return np.asarray(zero)
-    effect = largest * np.where(known, sizes, 0.0)
+    effect = largest * np.where(sized, sizes, 0.0)
     beside = effect.max(axis=1, keepdims=True)
-    return np.asarray(zero | (known & flat(effect, beside).all(axis=0)))
+    return np.asarray(zero | (sized & flat(effect, beside).all(axis=0)))
 
 
 def _require_shape(method: str, found: Array, shape: tuple[int, ...]) -> None:

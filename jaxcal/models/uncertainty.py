@@ -23,7 +23,7 @@ from jaxcal.information.singular import significant
 __all__ = ["Noise", "Prior", "ResolvedPrior"]
 
 Array = NDArray[np.float64]
-Named = ArrayLike | Mapping[str, float]
+PerParameter = ArrayLike | Mapping[str, float]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,8 +48,8 @@ class Prior:
             ``sized``.
     """
 
-    std: Named
-    mean: Named | None = None
+    std: PerParameter
+    mean: PerParameter | None = None
     fixed: Sequence[str] = ()
     by_data: bool = False
 
@@ -91,7 +91,7 @@ class Prior:
 
 
 def _by_name(
-    argument: str, values: Named | None, names: tuple[str, ...], default: Any
+    argument: str, values: PerParameter | None, names: tuple[str, ...], default: Any
 ) -> Array:
     """(p,) ``values`` in the order of ``names``; ``default`` where they are silent."""
     if values is None or isinstance(values, Mapping):
@@ -135,8 +135,8 @@ class Noise:
         spread = numbers("command_std", self.command_std, finite=False)
         rule = "command_std must not be negative (inf: unknown in every measurement)"
         require_none(~(spread >= 0.0), spread, rule)
-        known = np.isfinite(spread) & (spread > 0.0)
-        if self.std is None and self.covariance is None and known.any():
+        uncertain = np.isfinite(spread) & (spread > 0.0)
+        if self.std is None and self.covariance is None and uncertain.any():
             raise ValueError(
                 "command_std needs std or covariance of the readings beside it: "
                 "the two are added in the readings' units"
@@ -187,8 +187,8 @@ class Noise:
                 )
             derivative = array_of("command_jacobian", command_jacobian, *shape[:2], "n")
             spread = self.of_commands(derivative.shape[-1])
-            known = derivative * np.where(np.isinf(spread), 0.0, spread)
-            covariance = covariance + known @ np.matrix_transpose(known)
+            by_commands = derivative * np.where(np.isinf(spread), 0.0, spread)
+            covariance = covariance + by_commands @ np.matrix_transpose(by_commands)
             unknown = derivative[..., np.isinf(spread)]
         white = np.linalg.inv(np.linalg.cholesky(covariance))
         white = np.broadcast_to(white, shape)

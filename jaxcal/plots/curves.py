@@ -27,8 +27,8 @@ def against_count(
     Returns:
         ``axes``.
     """
-    for i, (name, each) in enumerate(values.items()):
-        axes.plot(counts, each, label=name, markersize=4, **numbered(i))
+    for i, (name, curve) in enumerate(values.items()):
+        axes.plot(counts, curve, label=name, markersize=4, **numbered(i))
     axes.set(xlabel="number of measurements K", ylabel=label)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend(frameon=False)

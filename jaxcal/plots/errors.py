@@ -36,14 +36,14 @@ def before_after(
     places = np.linspace(-0.2, 0.2, len(errors)) if len(errors) > 1 else [0.0]
     count = 0
     for i, (label, values) in enumerate(errors.items()):
-        each = np.atleast_2d(np.asarray(values, dtype=np.float64))
-        count = each.shape[1]
-        spread = np.linspace(-0.07, 0.07, len(each))[:, None]
+        rows = np.atleast_2d(np.asarray(values, dtype=np.float64))
+        count = rows.shape[1]
+        spread = np.linspace(-0.07, 0.07, len(rows))[:, None]
         at = np.arange(count) + places[i] + spread
-        rms = np.sqrt(np.mean(each**2))
+        rms = np.sqrt(np.mean(rows**2))
         shown = f"{rms:.3g}{unit}" if unit == "°" else f"{rms:.3g} {unit}".rstrip()
         axes.plot(
-            at.ravel(), each.ravel(), label=f"{label}: {shown} rms", **points(i) | look
+            at.ravel(), rows.ravel(), label=f"{label}: {shown} rms", **points(i) | look
         )
     axes.set_xticks(range(count), names or [str(i + 1) for i in range(count)])
     axes.set_ylabel(f"error ({unit})" if unit else "error")
@@ -72,16 +72,16 @@ def residuals(
     Returns:
         ``axes``.
     """
-    each = np.asarray(values, dtype=np.float64)
-    each = each[:, None] if each.ndim == 1 else each
+    table = np.asarray(values, dtype=np.float64)
+    table = table[:, None] if table.ndim == 1 else table
     axes.axhline(0.0, color=BLACK, linewidth=0.8)
-    for i, column in enumerate(each.T):
+    for i, column in enumerate(table.T):
         label = names[i] if names else f"output {i + 1}"
         places = np.arange(1, len(column) + 1)
         axes.plot(places, column, label=label, **points(i) | look)
     axes.set_xlabel("measurement")
     axes.set_ylabel(f"measured - fitted ({unit})" if unit else "measured - fitted")
-    if each.shape[1] > 1:
+    if table.shape[1] > 1:
         axes.legend(frameon=False)
     plain_axes(axes)
     return axes

@@ -41,7 +41,7 @@ def as_files(figure: Figure, *suffixes: str) -> list[bytes]:
     The constrained layout makes room for the tick labels of the drawing before, so the
     first drawing of a figure can cut a label off: it is laid out twice, and then stays.
     """
-    found = []
+    files = []
     with rc_context({"svg.hashsalt": "jaxcal"}):
         figure.draw_without_rendering()
         figure.draw_without_rendering()
@@ -51,8 +51,8 @@ def as_files(figure: Figure, *suffixes: str) -> list[bytes]:
             metadata: dict[str, Any] = {"Date": None} if suffix == "svg" else {}
             figure.savefig(buffer, format=suffix, dpi=150, metadata=metadata)
             data = buffer.getvalue()
-            found.append(_dark_too(data) if suffix == "svg" else data)
-    return found
+            files.append(_dark_too(data) if suffix == "svg" else data)
+    return files
 
 
 def _dark_too(svg: bytes) -> bytes:
@@ -82,8 +82,8 @@ def panels(
     """A figure of ``size`` inches and its axes; ``rest`` is for ``Figure.subplots``."""
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(*shape, **rest)
-    for each in np.ravel(axes):
-        plain_axes(each)
+    for axis in np.ravel(axes):
+        plain_axes(axis)
     if title:
         figure.suptitle(title, fontsize=10)
     return figure, axes

@@ -6,7 +6,7 @@ from jaxcal.models.sensors.gravity import Gravity
 from jaxcal.models.sensors.plane import Plane
 from jaxcal.models.sensors.pose import Pose
 from jaxcal.models.sensors.position import Position
-from jaxcal.models.sensors.sensor import Placed, Reading, Sensor, Tip, hats
+from jaxcal.models.sensors.sensor import Landmarks, Reading, Sensor, Tip, hats
 from jaxcal.models.sensors.several import Several
 from jaxcal.models.sensors.socket import Socket
 from jaxcal.models.sensors.wrench import Wrench
@@ -16,6 +16,7 @@ __all__ = [
     "Board",
     "Distance",
     "Gravity",
+    "Landmarks",
     "Placed",
     "Plane",
     "Pose",
@@ -28,6 +29,8 @@ __all__ = [
     "Wrench",
     "hats",
 ]
+
+Placed = Landmarks  # as it was called in 0.2
 
 # By their names in files and on the command line; a sensor of one's own is added here.
 SENSORS: dict[str, type[Sensor]] = {

@@ -10,7 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, numbers, one_of
 from jaxcal.models.sensors.pose import rotation_vector_rate
-from jaxcal.models.sensors.sensor import BASE, Named, Reading, Sensor, Tip, hats, turns
+from jaxcal.models.sensors.sensor import (
+    BASE,
+    HasNames,
+    Reading,
+    Sensor,
+    Tip,
+    hats,
+    turns,
+)
 
 __all__ = ["Board"]
 
@@ -111,7 +119,7 @@ class Board(Sensor):
     def usual_noise(self, length: float) -> ArrayLike:
         return [1e-3 * length] * 3 + [0.1] * 3 if self.corners is None else 0.3
 
-    def unseen(self, arm: Named) -> tuple[str, ...]:
+    def unseen(self, arm: HasNames) -> tuple[str, ...]:
         return BASE
 
     def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:

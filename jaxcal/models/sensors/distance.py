@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.models.sensors.sensor import Placed, Reading, Tip
+from jaxcal.models.sensors.sensor import Landmarks, Reading, Tip
 
 __all__ = ["Distance"]
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Distance(Placed):
+class Distance(Landmarks):
     """One length: the tip's distance from its anchor, less the zero of the wire.
 
     Where the arm stands is not shown, so ``base`` is held. ``places`` are rows (x, y,
@@ -76,14 +76,14 @@ class Distance(Placed):
             loose = np.linalg.lstsq(rows, square, rcond=1e-6)[0][[0, 1, 2, 4]]
 
             def apart(at: Array, p: Array = points, r: Array = far) -> Array:
-                each = np.linalg.norm(p - at[:3], axis=1) - r - at[3:].sum()
-                return np.asarray(each, dtype=float)
+                gaps = np.linalg.norm(p - at[:3], axis=1) - r - at[3:].sum()
+                return np.asarray(gaps, dtype=float)
 
             def fit(*starts: Array) -> Array:
-                found = [
+                fits = [
                     optimize.least_squares(apart, one, method="lm") for one in starts
                 ]
-                return min(found, key=lambda each: each.cost).x
+                return min(fits, key=lambda one: one.cost).x
 
             starts = near, along / size * far.mean()
             best = fit(*starts)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import in_words, numbers
-from jaxcal.models.sensors.sensor import Named, Reading, Sensor, Tip, hats
+from jaxcal.models.sensors.sensor import HasNames, Reading, Sensor, Tip, hats
 
 __all__ = ["Gravity"]
 
@@ -60,7 +60,7 @@ class Gravity(Sensor):
     def usual_noise(self, length: float) -> ArrayLike:
         return 1e-3 * self.magnitude
 
-    def unseen(self, arm: Named) -> tuple[str, ...]:
+    def unseen(self, arm: HasNames) -> tuple[str, ...]:
         about = "xyz"[int(np.abs(self.up).argmax())]
         hidden = [
             name

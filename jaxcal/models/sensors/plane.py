@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.models.sensors.sensor import Placed, Reading, Tip
+from jaxcal.models.sensors.sensor import Landmarks, Reading, Tip
 
 __all__ = ["Plane"]
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Plane(Placed):
+class Plane(Landmarks):
     """One zero a touch: the tip's height above its plane.
 
     What is measured is zero; a constant, such as the radius of the probe, belongs to

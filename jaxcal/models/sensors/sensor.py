@@ -16,8 +16,8 @@ from jaxcal.models.periods import within_half
 
 __all__ = [
     "BASE",
-    "Named",
-    "Placed",
+    "HasNames",
+    "Landmarks",
     "Reading",
     "Sensor",
     "Tip",
@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 BASE = tuple(f"base {axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
 
 
-class Named(Protocol):
+class HasNames(Protocol):
     """An arm, by its parameters."""
 
     @property
@@ -128,7 +128,7 @@ class Sensor(abc.ABC):
     def usual_noise(self, length: float) -> ArrayLike:
         """() or (q,) standard deviation of a reading, for an arm of this length."""
 
-    def unseen(self, arm: Named) -> tuple[str, ...]:
+    def unseen(self, arm: HasNames) -> tuple[str, ...]:
         """Parameters that no posture shows; held unless a prior says otherwise."""
         return ()
 
@@ -187,7 +187,7 @@ class Sensor(abc.ABC):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Placed(Sensor):
+class Landmarks(Sensor):
     """A sensor with things that stand around the arm: sockets, planes, anchors.
 
     Attributes:
@@ -230,7 +230,7 @@ class Placed(Sensor):
             return np.zeros(self.count * len(self.axes))
         return self.places.ravel()
 
-    def unseen(self, arm: Named) -> tuple[str, ...]:
+    def unseen(self, arm: HasNames) -> tuple[str, ...]:
         return BASE
 
     def of_rows(self, inputs: Array) -> NDArray[np.int64]:

@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, table
-from jaxcal.models.sensors.sensor import Named, Reading, Sensor, Tip, hats, label, turns
+from jaxcal.models.sensors.sensor import (
+    HasNames,
+    Reading,
+    Sensor,
+    Tip,
+    hats,
+    label,
+    turns,
+)
 
 __all__ = ["Several"]
 
@@ -74,17 +82,17 @@ class Several(Sensor):
     def _named(self) -> list[tuple[str, str]]:
         """Own parameters and their units: mounting, then own, sensor after sensor."""
         kinds = [one.kind for one in self.sensors]
-        found = []
+        named = []
         for i, one in enumerate(self.sensors):
             title = one.kind if kinds.count(one.kind) == 1 else f"{one.kind} {i}"
             for axis in one.tool if i else ():
-                found.append(
+                named.append(
                     (f"{title} tool {axis}", "deg" if "r" in axis else "length")
                 )
             for name, unit in zip(one.names, one.units, strict=True):
                 alone = title == one.kind
-                found.append((name if alone else f"{title}: {name}", unit))
-        return found
+                named.append((name if alone else f"{title}: {name}", unit))
+        return named
 
     @property
     def nominal(self) -> Array:
@@ -113,7 +121,7 @@ class Several(Sensor):
     def usual_noise(self, length: float) -> ArrayLike:
         return 1.0
 
-    def unseen(self, arm: Named) -> tuple[str, ...]:
+    def unseen(self, arm: HasNames) -> tuple[str, ...]:
         """What none of them sees."""
         hidden = [set(one.unseen(arm)) for one in self.sensors]
         return tuple(name for name in arm.names if all(name in h for h in hidden))
@@ -154,13 +162,13 @@ class Several(Sensor):
             size = len(one.tool) if i else 0
             last = first + size + len(one.names)
             mount, width = own[first : first + size], len(one.outputs)
-            found = one.read(
+            reading = one.read(
                 self._tip(i, tip, rows, mount), columns, own[first + size : last]
             )
             scale = one.stds(tip.length)[:, None]
-            values[rows, :width] = found.values / scale[:, 0]
-            seen = found.by_tip / scale
-            by_own[rows, :width, first + size : last] = found.by_own / scale
+            values[rows, :width] = reading.values / scale[:, 0]
+            seen = reading.by_tip / scale
+            by_own[rows, :width, first + size : last] = reading.by_own / scale
             if i:
                 shift, _, axes = self._mount(i, mount)
                 rotation = tip.rotation[rows]
@@ -241,16 +249,18 @@ class Several(Sensor):
         ):
             commands = table(f"commands of {one.kind}", given)
             joints = commands.shape[1] - len(one.inputs)
-            own = np.zeros((len(commands), len(columns)))
-            own[:, 0] = i
-            own[:, [columns.index(name) for name in one.inputs]] = commands[:, joints:]
+            labels = np.zeros((len(commands), len(columns)))
+            labels[:, 0] = i
+            labels[:, [columns.index(name) for name in one.inputs]] = commands[
+                :, joints:
+            ]
             measured = np.zeros((len(commands), q))
             width = len(one.outputs)
             if read is not None:
                 what = f"measured of {one.kind}"
                 values = array_of(what, read, len(commands), width)
                 measured[:, :width] = values / one.stds(length)
-            all_commands.append(np.hstack([commands[:, :joints], own]))
+            all_commands.append(np.hstack([commands[:, :joints], labels]))
             all_measured.append(measured)
         if len({rows.shape[1] for rows in all_commands}) > 1:
             raise ValueError("commands of all sensors must have the same joints")

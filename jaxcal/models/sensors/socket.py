@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers
-from jaxcal.models.sensors.sensor import Placed, Reading, Tip
+from jaxcal.models.sensors.sensor import Landmarks, Reading, Tip
 
 __all__ = ["Socket"]
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Socket(Placed):
+class Socket(Landmarks):
     """Three zeros a contact: the ball's centre less that of its socket.
 
     What is measured is zero. Contacts do not show where the arm stands, so ``base`` is
@@ -51,8 +51,8 @@ class Socket(Placed):
                 f"last two positive, got {self.distances!r}"
             )
         one, two = pairs = rows[:, :2].T
-        known = (pairs == pairs.round()) & (pairs >= 0.0) & (pairs < self.count)
-        if not known.all() or (one == two).any():
+        exists = (pairs == pairs.round()) & (pairs >= 0.0) & (pairs < self.count)
+        if not exists.all() or (one == two).any():
             raise ValueError(
                 f"distances must name two of {self.count} sockets, from 0, got "
                 f"{self.distances!r}"

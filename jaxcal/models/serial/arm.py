@@ -69,7 +69,7 @@ class Arm:
 
     @functools.cached_property
     def length(self) -> float:
-        """Of the links and the tool together; 0 where the table holds no length."""
+        """Length of the links and the tool together; 0 where the table holds none."""
         links = np.hypot(self.table[:, 0], self.table[:, 2]).sum()
         return float(links + np.linalg.norm(self.tool[:3, 3]))
 
@@ -195,11 +195,11 @@ class Arm:
         sine, cosine = np.sin(angles), np.cos(angles)
         rate = np.radians([[[1.0]], [[2.0]]])
         shape = (len(at), 4, len(commands))
-        each = np.stack([sine, cosine], axis=2).reshape(shape)
+        by_waves = np.stack([sine, cosine], axis=2).reshape(shape)
         rates = (rate * np.stack([cosine, -sine], axis=2)).reshape(shape)
         goes = np.ones((len(self.joints), len(commands)))
         goes[at] += np.einsum("hk,hkn->hn", waves, rates)
-        return each, goes
+        return by_waves, goes
 
     def _moves(self, commands: Array) -> Array:
         """(N, n) how far each joint moves, before its gear."""
@@ -214,8 +214,8 @@ class Arm:
             kept = tuple(map(np.copy, key)), find()
             if len(key[0]) < _MANY:
                 self.__dict__[name] = kept
-        found: tuple[Array, ...] = kept[1]
-        return found
+        arrays: tuple[Array, ...] = kept[1]
+        return arrays
 
     def _chain(self, commands: Array, parameters: Array) -> tuple[Array, ...]:
         """The tool's frame (4, 3, N), axis and origin (S, 3, N) of each step."""
@@ -228,7 +228,7 @@ class Arm:
     def _after(
         self, commands: Array, parameters: Array, links: int | None = None
     ) -> tuple[Array, ...]:
-        """The same up to the tool, or only to the end of some links."""
+        """Frame, axes and origins up to the tool, or only to the end of some links."""
         n = len(self.joints)
         gears, compliance, waves = self._drives(parameters)
         moves = gears[:, None] * self._moves(commands).T
@@ -248,8 +248,8 @@ class Arm:
         values[self._steps_of_joints] += moves
         kinds, fixed = self._steps
         end = None if links is None else len(_BASE) + len(_ROW) * links
-        found: tuple[Array, ...] = forward(kinds[:end], values[:end], fixed)
-        return found
+        frames: tuple[Array, ...] = forward(kinds[:end], values[:end], fixed)
+        return frames
 
     def _tip_at(self, commands: Array, frame: Array) -> Tip:
         return Tip(frame, lambda: self._nominal_rotations(commands), self.length)
@@ -269,11 +269,11 @@ class Arm:
         motion[turns, 3:] = about
         motion[~turns, :3] = axes[at[~turns]]
         tip, inputs = self._tip_at(commands, frame), commands[:, self.num_joints :]
-        found = self.sensor.read(tip, inputs, self._split(parameters)[2])
-        return found.by_tip @ motion.transpose(2, 1, 0), found.by_own
+        reading = self.sensor.read(tip, inputs, self._split(parameters)[2])
+        return reading.by_tip @ motion.transpose(2, 1, 0), reading.by_own
 
     def _torque(self, commands: Array) -> tuple[Array, ...]:
-        """Of the loads on the compliant joints of the nominal arm, and its derivative.
+        """Torques of the loads on the compliant joints of the nominal arm, and slopes.
 
         A joint's torque is the work of the loads per radian, so its derivative by
         another joint is a second derivative of their positions: ``w_i x J_j``, i before

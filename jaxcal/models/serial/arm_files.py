@@ -86,11 +86,11 @@ def _urdf_text(nominal: Arm, calibrated: Arm) -> tuple[str, str]:
     name, links, joints = f"{tip}_calibrated", links_of(text), joints_of(text)
     while name in links or f"{name}_joint" in joints:  # a file calibrated before
         name += "_again"
-    numbers, own = _pose(extra), quoteattr(name)
+    numbers, quoted = _pose(extra), quoteattr(name)
     more = (
-        f"  <link name={own}/>\n"
+        f"  <link name={quoted}/>\n"
         f'  <joint name={quoteattr(f"{name}_joint")} type="fixed">\n'
-        f"    <parent link={quoteattr(tip)}/>\n    <child link={own}/>\n"
+        f"    <parent link={quoteattr(tip)}/>\n    <child link={quoted}/>\n"
         f'    <origin xyz="{numbers["xyz"]}" rpy="{numbers["rpy"]}"/>\n  </joint>\n'
     )
     return _with_origins(text, origins, more), name
@@ -203,7 +203,7 @@ def _steps(nominal: Arm, calibrated: Arm) -> tuple[list[list[_Part]], list[Array
 def _origins(nominal: Arm, calibrated: Arm) -> tuple[dict[str, Array], Array | None]:
     """New origins by joint, and what no joint before the tip can hold, if anything."""
     assert nominal.source is not None  # the caller has looked
-    found: dict[str, Array] = {}
+    origins: dict[str, Array] = {}
     extra = None
     for i, (gap, matrix) in enumerate(zip(*_steps(nominal, calibrated), strict=True)):
         if np.abs(matrix - _product(gap)).max() < _SAME:
@@ -220,8 +220,8 @@ def _origins(nominal: Arm, calibrated: Arm) -> tuple[dict[str, Array], Array | N
         at = driving[-1] if driving else len(gap) - 1
         before, after = _product(gap[:at]), _product(gap[at + 1 :])
         held = np.linalg.inv(before) @ matrix @ np.linalg.inv(after)
-        found[gap[at].joint.name] = gap[at].origin_for(held)
-    return found, extra
+        origins[gap[at].joint.name] = gap[at].origin_for(held)
+    return origins, extra
 
 
 def _gaps(source: Mapping[str, Any]) -> list[list[_Part]]:
@@ -304,13 +304,14 @@ def _with_origins(text: str, origins: Mapping[str, Array], more: str = "") -> st
 
 
 def _places(data: bytes) -> tuple[dict[str, tuple[int, int | None]], int, str]:
-    """Of each joint where its tag begins, and its origin's; the robot's end; encoding.
+    """Where tags begin in a URDF file, in bytes, and its encoding.
 
-    Places are bytes.
+    Returns:
+        For each joint its tag and its origin's; the end of the robot; the encoding.
     """
     parser = expat.ParserCreate()
     path: list[str] = []
-    found: dict[str, tuple[int, int | None]] = {}
+    places: dict[str, tuple[int, int | None]] = {}
     name, last, encoding = "", 0, "utf-8"
 
     def declared(_version: str, of_file: str | None, _alone: int) -> None:
@@ -322,9 +323,9 @@ def _places(data: bytes) -> tuple[dict[str, tuple[int, int | None]], int, str]:
         path.append(tag)
         if path == ["robot", "joint"]:
             name = attributes["name"]
-            found[name] = (parser.CurrentByteIndex, None)
-        elif path == ["robot", "joint", "origin"] and found[name][1] is None:
-            found[name] = (found[name][0], parser.CurrentByteIndex)
+            places[name] = (parser.CurrentByteIndex, None)
+        elif path == ["robot", "joint", "origin"] and places[name][1] is None:
+            places[name] = (places[name][0], parser.CurrentByteIndex)
 
     def end(tag: str) -> None:
         nonlocal last
@@ -335,7 +336,7 @@ def _places(data: bytes) -> tuple[dict[str, tuple[int, int | None]], int, str]:
     parser.StartElementHandler = start
     parser.EndElementHandler = end
     parser.Parse(data, True)
-    return found, last, encoding
+    return places, last, encoding
 
 
 def _end_of_tag(data: bytes, start: int) -> int:

@@ -163,7 +163,6 @@ class SerialChain(Arm, Model):
             compliance = turning if sensor.compliant else ()
         number = joint_numbers("compliance", compliance, joints, "R")
         bent = joint_numbers("harmonics", harmonics, joints, "R")
-        known = np.zeros(len(number)) if yields is None else yields
         swings = np.zeros((len(bent), 4)) if waves is None else numbers("waves", waves)
         if swings.size != 4 * len(bent):
             raise ValueError(f"waves must have shape ({len(bent)}, 4)")
@@ -180,7 +179,11 @@ class SerialChain(Arm, Model):
             sensor,
             joint_numbers("gears", gears, joints),
             number,
-            array_of("yields", known, len(number)),
+            array_of(
+                "yields",
+                np.zeros(len(number)) if yields is None else yields,
+                len(number),
+            ),
             bent,
             swings.reshape(-1, 4),
             tuple(load(each, n) for each in given),
@@ -233,7 +236,7 @@ class SerialChain(Arm, Model):
         return cls.from_dh(**arm, sensor=sensor, **options)
 
     def measured_with(self, sensor: Sensor) -> Self:
-        """The same arm with another sensor."""
+        """This arm with another sensor."""
         return dataclasses.replace(self, sensor=sensor)
 
     def with_misfit(self) -> Self:
@@ -502,15 +505,15 @@ class SerialChain(Arm, Model):
         low, high = np.where(np.isfinite(limits), limits, seen).T
         rng = np.random.default_rng(0)
         postures = rng.uniform(low, high, (_POSTURES, len(low)))
-        own = self.calibrated(parameters).predict(postures)
+        tips = self.calibrated(parameters).predict(postures)
         wanted = np.asarray(other.predict(postures))
         turn, _ = Rotation.align_vectors(
-            wanted - wanted.mean(axis=0), own - own.mean(axis=0)
+            wanted - wanted.mean(axis=0), tips - tips.mean(axis=0)
         )
         at = [self.names.index(f"base {axis}") for axis in _BASE]
         base = pose_matrix(parameters[at])
         moved = parameters.copy()
-        place = turn.apply(base[:3, 3] - own.mean(axis=0)) + wanted.mean(axis=0)
+        place = turn.apply(base[:3, 3] - tips.mean(axis=0)) + wanted.mean(axis=0)
         turned = (turn * Rotation.from_matrix(base[:3, :3])).as_euler("XYZ", True)
         moved[at] = np.concatenate([place, turned])
         return moved
@@ -667,9 +670,9 @@ class SerialChain(Arm, Model):
         kinds = []
         for name, column in zip(self.joint_names, self.drive.T, strict=True):
             # A column drives itself by one, its gear ratio apart.
-            own = int(np.abs(np.abs(column) - 1.0).argmin())
-            kind = self.joints[own]
-            if column[own] != 1.0 and self.source is not None:
+            joint = int(np.abs(np.abs(column) - 1.0).argmin())
+            kind = self.joints[joint]
+            if column[joint] != 1.0 and self.source is not None:
                 from jaxcal.models.serial.urdf import joints_of
 
                 kind = joints_of(self.source["text"])[name].kind
@@ -725,7 +728,9 @@ class SerialChain(Arm, Model):
         """(N, q, p)."""
         commands = as_commands(self, commands)
         parameters = as_parameters(self, parameters)
-        columns, own = self._motion(commands, parameters, self._steps_of_parameters)
+        columns, by_sensor = self._motion(
+            commands, parameters, self._steps_of_parameters
+        )
         first = 5 * len(self.joints)
         last = first + len(self.gears)
         at = [i - 1 for i in self.gears]
@@ -738,11 +743,11 @@ class SerialChain(Arm, Model):
             torque = self._torque(commands)[0].T
             columns[..., last : last + len(self.compliance)] *= torque[:, None]
         if not self.harmonics:
-            return np.concatenate([columns, own], axis=-1)
+            return np.concatenate([columns, by_sensor], axis=-1)
         waves = swing.reshape(self.waves.size, -1).T[:, None]
         waves = waves * columns[..., -self.waves.size :]
         columns = columns[..., : -self.waves.size]
-        return np.concatenate([columns, own, waves], axis=-1)
+        return np.concatenate([columns, by_sensor, waves], axis=-1)
 
     def command_jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
@@ -762,8 +767,8 @@ class SerialChain(Arm, Model):
             at = [i - 1 for i in self.compliance]
             rate = compliance[:, None, None] * self._torque(commands)[1]
             result += np.einsum("nqc,cjn->nqj", columns[..., at], rate)
-        own = np.zeros((*result.shape[:2], len(self.sensor.inputs)))
-        return np.concatenate([result @ self.drive, own], axis=-1)
+        by_inputs = np.zeros((*result.shape[:2], len(self.sensor.inputs)))
+        return np.concatenate([result @ self.drive, by_inputs], axis=-1)
 
     def wrapped(self, off: Array, commands: Array) -> Array:
         """(N, q) differences of readings, those of the sensor that wrap within half a
@@ -777,10 +782,12 @@ class SerialChain(Arm, Model):
             (F,) how far off it is and (F, p) its derivative, in standard deviations.
         """
         parameters = as_parameters(self, parameters)
-        own = self._split(parameters)[2]
-        off, rows = self.sensor.facts(own)
+        of_sensor = self._split(parameters)[2]
+        off, rows = self.sensor.facts(of_sensor)
         after = np.zeros((len(off), self.waves.size))
-        before = np.zeros((len(off), len(parameters) - len(own) - self.waves.size))
+        before = np.zeros(
+            (len(off), len(parameters) - len(of_sensor) - self.waves.size)
+        )
         return off, np.hstack([before, rows, after])
 
     def default_noise(self) -> Noise:
@@ -832,7 +839,7 @@ class SerialChain(Arm, Model):
     def targets(
         self, desired: Array, start: Array | None
     ) -> Callable[[Array, NDArray[np.intp]], Array]:
-        """Of a pose its turns from the nominal orientation at any command."""
+        """What to reach; of a pose its turns from the nominal orientation there."""
         if not self.relative:
             return super().targets(desired, start)
         if start is None:

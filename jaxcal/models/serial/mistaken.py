@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.models.sensors import Placed
+from jaxcal.models.sensors import Landmarks
 
 __all__ = ["mistaken_columns"]
 
@@ -73,7 +73,7 @@ def _error(arm: Chain, commands: Array, measured: Array) -> float:
     except ValueError:  # no such arm
         return np.inf
     off = measured - at.predict(commands)
-    if isinstance(at.sensor, Placed):  # a socket's place is no merit of the arm
+    if isinstance(at.sensor, Landmarks):  # a socket's place is no merit of the arm
         which = at.sensor.of_rows(commands[:, at.num_joints :])
         for i in np.unique(which):
             off[which == i] -= np.median(off[which == i], axis=0)

@@ -82,14 +82,14 @@ def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
                 f"commands must have contacts of socket {missing.pop()}, whose "
                 "distance from another is given"
             )
-        found = float(np.linalg.norm(middles[int(one)] - middles[int(other)]))
-        off = abs(found - distance) / arm.length
-        unit = off > _OTHER_UNIT and not 0.1 < found / distance < 10.0
+        distance_seen = float(np.linalg.norm(middles[int(one)] - middles[int(other)]))
+        off = abs(distance_seen - distance) / arm.length
+        unit = off > _OTHER_UNIT and not 0.1 < distance_seen / distance < 10.0
         if off > _APART or unit:
             raise ValueError(
                 f"sockets {int(one)} and {int(other)} must be {distance:g} apart, but "
-                f"the arm as described puts them {found:.3g} apart: rows of another "
-                "place or another unit?"
+                f"the arm as described puts them {distance_seen:.3g} apart: rows of "
+                "another place or another unit?"
             )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, in_words, numbers, whole_number
-from jaxcal.models.sensors import Board, Placed, Plane, Several, Socket
+from jaxcal.models.sensors import Board, Landmarks, Plane, Several, Socket
 
 __all__ = ["Room", "View", "in_turn", "postures"]
 
@@ -185,23 +185,23 @@ def postures(
         raise ValueError("limits of sliding joints must be known: limits=...")
     low, high = np.maximum(low, -180.0), np.minimum(high, 180.0)
     unit = np.where(turns, 1.0, (high - low) / 100.0)
-    found = np.zeros((0, arm.num_inputs))
+    kept = np.zeros((0, arm.num_inputs))
     lost: Counter[str] = Counter()
     tried = 0
-    num_places = arm.sensor.count if isinstance(arm.sensor, Placed) else 1
+    num_places = arm.sensor.count if isinstance(arm.sensor, Landmarks) else 1
     reached = np.zeros(num_places, dtype=int)
     refused: list[Counter[str]] = [Counter() for _ in reached]
     for batch in range(_ROUNDS):
         if batch == _VAIN and not reached.all():
             break
-        size = max(2 * (count - len(found)), 64)
-        if len(found):  # more where few were any good: a board is seldom in view
-            size = max(size, min(size * tried // (4 * len(found)), _BATCH))
+        size = max(2 * (count - len(kept)), 64)
+        if len(kept):  # more where few were any good: a board is seldom in view
+            size = max(size, min(size * tried // (4 * len(kept)), _BATCH))
         tried += size
         starts = rng.uniform(low, high, (size, arm.num_joints))
         labels = np.zeros((size, len(arm.sensor.inputs)))
-        if isinstance(arm.sensor, Placed) and arm.sensor.count > 1:
-            labels[:, 0] = (len(found) + np.arange(size)) % arm.sensor.count
+        if isinstance(arm.sensor, Landmarks) and arm.sensor.count > 1:
+            labels[:, 0] = (len(kept) + np.arange(size)) % arm.sensor.count
         commands = np.hstack([starts, labels])
         if view is not None:
             trial, reason = _pictured(arm, commands, low, high, view, rng)
@@ -216,11 +216,11 @@ def postures(
         )
         for row, why, place in zip(trial, reason, which, strict=True):
             joints = row[: arm.num_joints]
-            if len(found) == count and reached[place]:
+            if len(kept) == count and reached[place]:
                 continue  # enough; of the other places one posture is looked for
             if not why:
-                apart = np.abs((found[:, : arm.num_joints] - joints) / unit)
-                if len(found) and apart.max(axis=1).min() < _APART:
+                apart = np.abs((kept[:, : arm.num_joints] - joints) / unit)
+                if len(kept) and apart.max(axis=1).min() < _APART:
                     why = "are next to another one"
                 elif allowed is not None and not allowed(joints.copy()):
                     why = "are not allowed"
@@ -229,10 +229,10 @@ def postures(
                 refused[place][why] += 1
                 continue
             reached[place] += 1
-            if len(found) < count:
-                found = np.vstack([found, row])
-        if len(found) == count and reached.all():
-            return found[in_turn(found, arm.num_joints)]
+            if len(kept) < count:
+                kept = np.vstack([kept, row])
+        if len(kept) == count and reached.all():
+            return kept[in_turn(kept, arm.num_joints)]
     for place in np.flatnonzero(reached == 0)[:1] if num_places > 1 else ():
         where = ""
         if arm.sensor.places is not None:
@@ -243,14 +243,14 @@ def postures(
             f"{refused[place].total()} postures tried {why}"
         )
     reasons = ", ".join(f"{number} {why}" for why, number in lost.most_common())
-    if not len(found):
+    if not len(kept):
         target = "what the sensor reads" if near is None else f"near = {near}"
         raise ValueError(
             f"no posture reaches {target} (of {tried} tried {reasons}): is it in the "
             "unit of the arm's lengths, and in the frame of its base?"
         )
     raise ValueError(
-        f"count must be at most {len(found)} for this arm and sensor, got {count}: of "
+        f"count must be at most {len(kept)} for this arm and sensor, got {count}: of "
         f"{tried} postures tried {reasons}"
     )
 
@@ -387,8 +387,8 @@ def _pictured(
     centre = np.column_stack([(aim - [cx, cy]) / [fx, fy], np.ones(count)])
     centre *= (far / np.linalg.norm(centre, axis=1))[:, None]
     # A board that faces the camera, turned about its axis, then tilted.
-    known = view.side or sensor.side
-    side = np.full(count, known) if known else rng.choice([-1.0, 1.0], count)
+    known_side = view.side or sensor.side
+    side = np.full(count, known_side) if known_side else rng.choice([-1.0, 1.0], count)
     facing = Rotation.from_rotvec(
         np.where(side[:, None] > 0.0, [np.pi, 0.0, 0.0], [0.0, 0.0, 0.0])
     )
@@ -422,7 +422,7 @@ def _pictured(
     why[flat] = "see the board too much from the side"
     why[(away < ends[0]) | (away > ends[1])] = "are too near or too far"
     why[~inside.all(axis=1)] = "do not have the whole board in the picture"
-    if known:
+    if known_side:
         why[face * side <= 0.0] = "see the board from behind"
     return commands, why.tolist()
 
@@ -448,15 +448,17 @@ def _solved(arm: Chain, commands: Array, low: Array, high: Array) -> Array:
     return commands
 
 
-def in_turn(found: Array, joints: int) -> NDArray[np.int64]:
+def in_turn(postures: Array, joints: int) -> NDArray[np.int64]:
     """Socket after socket, and in each the nearest posture next: rows in that order."""
     order: list[int] = []
-    left = list(range(len(found)))
-    while left:
-        last = found[order[-1]] if order else found[left[0]]
-        other = (found[left, joints:] != last[joints:]).any(axis=1)
-        other = other if found.shape[1] - joints == 1 else np.zeros(len(left), bool)
-        far = np.abs(found[left, :joints] - last[:joints]).max(axis=1)
+    remaining = list(range(len(postures)))
+    while remaining:
+        last = postures[order[-1]] if order else postures[remaining[0]]
+        other = (postures[remaining, joints:] != last[joints:]).any(axis=1)
+        other = (
+            other if postures.shape[1] - joints == 1 else np.zeros(len(remaining), bool)
+        )
+        far = np.abs(postures[remaining, :joints] - last[:joints]).max(axis=1)
         nearest = int(np.lexsort((far, other))[0])
-        order.append(left.pop(nearest))
+        order.append(remaining.pop(nearest))
     return np.array(order)

@@ -78,7 +78,7 @@ def at_rest(
     most = np.full(joints.shape[1], _WITHIN if within is None else within)
     if within is None:
         most = np.maximum(most, _JITTER * noise)
-    found: list[Array] = []
+    resting: list[Array] = []
     first = 0
     low, high = joints[0], joints[0]
     for i in range(1, len(joints) + 1):
@@ -96,8 +96,10 @@ def at_rest(
                 or (np.abs(drift) <= _WITHIN + 4.0 * noise * np.sqrt(2.0 / third)).all()
             )
             mean = stretch.mean(axis=0)
-            if still and not (found and (np.abs(mean - found[-1]) <= 2.0 * most).all()):
-                found.append(mean)
+            if still and not (
+                resting and (np.abs(mean - resting[-1]) <= 2.0 * most).all()
+            ):
+                resting.append(mean)
         if i < len(joints):
             first, low, high = i, joints[i], joints[i]
-    return np.array(found).reshape(-1, joints.shape[1])
+    return np.array(resting).reshape(-1, joints.shape[1])

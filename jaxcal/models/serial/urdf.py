@@ -198,8 +198,8 @@ def _read_joint(element: ElementTree.Element) -> Joint:
     kind = element.get("type", "none")
     ends = {}
     for end in ("parent", "child"):
-        found = element.find(end)
-        link = None if found is None else found.get("link")
+        child = element.find(end)
+        link = None if child is None else child.get("link")
         if not link:
             raise ValueError(f"joint {name} has no <{end} link=...>")
         ends[end] = link
@@ -228,7 +228,7 @@ def _read_joint(element: ElementTree.Element) -> Joint:
         mimic = (leader, float(times), float(plus))
     (low,) = _numbers(element, "limit", "lower", (0.0,), name)
     (high,) = _numbers(element, "limit", "upper", (0.0,), name)
-    known = kind in ("revolute", "prismatic") and low < high
+    limited = kind in ("revolute", "prismatic") and low < high
     return Joint(
         name,
         _KINDS.get(kind, kind),
@@ -237,7 +237,7 @@ def _read_joint(element: ElementTree.Element) -> Joint:
         origin,
         axis / (length or 1.0),
         mimic,
-        (float(low), float(high)) if known else (-np.inf, np.inf),
+        (float(low), float(high)) if limited else (-np.inf, np.inf),
     )
 
 

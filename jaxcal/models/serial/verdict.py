@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from jaxcal.information.singular import depends
 from jaxcal.models import verdict as models
-from jaxcal.models.sensors import Placed, Pose, Position, Socket
+from jaxcal.models.sensors import Landmarks, Pose, Position, Socket
 from jaxcal.models.sensors.sensor import hats
 from jaxcal.models.serial.mistaken import mistaken_columns
 from jaxcal.models.verdict import UNLIKELY, outlying
@@ -130,10 +130,12 @@ def verdict(calibration: Fit) -> Verdict:
         reasons.append(f"measurement {row} fits {model.sensor.kind} {other} instead")
     loose = [row for row in calibration.outliers if row not in swapped]
     reasons += [outlying(calibration, row) for row in loose]
-    for left in np.flatnonzero(calibration.loss_weights == 0.0):
-        same = (commands == calibration.commands[left]).all(axis=1)
+    for doubled in np.flatnonzero(calibration.loss_weights == 0.0):
+        same = (commands == calibration.commands[doubled]).all(axis=1)
         if model.sensor.zeros and same.any():
-            reasons.append(f"measurement {left} is {used[same][0]} again, counted once")
+            reasons.append(
+                f"measurement {doubled} is {used[same][0]} again, counted once"
+            )
     right = ~np.isin(used, list(swapped))
     exchanged = _exchanged(calibration, model)
     moved = _moved(calibration, model, commands[right], residuals[right], used[right])
@@ -290,7 +292,7 @@ def _other_tip(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
         return [], False
     std = float(np.sqrt(variance)) / far
     allowed = 2.0 / np.sqrt(calibration.prior_precision[at].max() + 1e-300)
-    by = ", ".join(f"{each:.3g}" for each in moved)
+    by = ", ".join(f"{shift:.3g}" for shift in moved)
     return [
         f"the tip is {far:.3g}{_in(calibration)} from where the arm's description has "
         f"it (tool {by}), known to {std:.2g}: is it another tip?"
@@ -299,16 +301,20 @@ def _other_tip(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
 
 def _other_distances(calibration: Fit, model: Chain) -> list[str]:
     """Distances that were given and that the contacts contradict."""
-    known = getattr(model.sensor, "distances", ())
-    if not len(known):
+    distances = getattr(model.sensor, "distances", ())
+    if not len(distances):
         return []
     off, rows = model.facts(calibration.parameters)
     spread = rows @ np.asarray(calibration.covariance)
     share = np.minimum((spread * rows).sum(axis=1), 1.0 - 1e-9)
     said, unit = [], _in(calibration)
-    for (first, second, distance, std), left, h in zip(known, off, share, strict=True):
-        free = distance - std * left / (1.0 - h)  # fitted without it, to first order
-        sure = abs(left) > _APART * np.sqrt(1.0 - h) and h < 1.0 - _ALONE
+    for (first, second, distance, std), residual, h in zip(
+        distances, off, share, strict=True
+    ):
+        free = distance - std * residual / (
+            1.0 - h
+        )  # fitted without it, to first order
+        sure = abs(residual) > _APART * np.sqrt(1.0 - h) and h < 1.0 - _ALONE
         if not sure or abs(free - distance) < _SHORT * model.length:
             continue
         said.append(
@@ -341,11 +347,11 @@ def _other_links(calibration: Fit, model: Chain) -> list[str]:
     sure = np.where(np.isfinite(std), off - 2.0 * std, 0.0)[: model.table.size]
     lengths = units[: model.table.size] == "length"
     most = np.full(model.table.size, _LINK * model.length)
-    found = []
+    reasons = []
     if not isinstance(model.sensor, Position):
         far = np.flatnonzero(lengths & (sure > most))
         if far.size:
-            found.append(
+            reasons.append(
                 f"{', '.join(names[far])}: to {off[far].max():.3g}"
                 f"{_in(calibration)} from the arm's "
                 "description: readings of another arm, in another unit, of a board of "
@@ -353,11 +359,11 @@ def _other_links(calibration: Fit, model: Chain) -> list[str]:
             )
     turned = [name.startswith("theta") for name in names[: model.table.size]]
     for i in np.flatnonzero(turned & (sure > _ZERO)):
-        found.append(
+        reasons.append(
             f"{names[i]} is {off[i]:.3g} degrees from the arm's description: is the "
             "joint's zero another, or its sign?"
         )
-    return found
+    return reasons
 
 
 def _anywhere(calibration: Fit, model: Chain, commands: Array) -> float:
@@ -397,8 +403,8 @@ def _exchanged(calibration: Fit, model: Chain) -> list[str]:
     sensor = model.sensor
     if not isinstance(sensor, Socket) or sensor.places is None:
         return []
-    own = calibration.parameters[[model.names.index(name) for name in sensor.names]]
-    apart = np.linalg.norm(own.reshape(-1, 1, 3) - sensor.places, axis=-1)
+    places = calibration.parameters[[model.names.index(name) for name in sensor.names]]
+    apart = np.linalg.norm(places.reshape(-1, 1, 3) - sensor.places, axis=-1)
     nearest = apart.argmin(axis=1)
     return [
         f"socket {i} was found where socket {j} was said to be: are their rows "
@@ -410,7 +416,7 @@ def _exchanged(calibration: Fit, model: Chain) -> list[str]:
 
 def _groups(model: Chain, commands: Array) -> list[NDArray[np.intp]]:
     """Rows of each socket, plane or anchor, in the order of measuring."""
-    if not isinstance(model.sensor, Placed):
+    if not isinstance(model.sensor, Landmarks):
         return []
     which = model.sensor.of_rows(commands[:, model.num_joints :])
     return [np.flatnonzero(which == i) for i in range(model.sensor.count)]
@@ -424,7 +430,7 @@ def _moved(
     names: NDArray[np.intp],
 ) -> list[str]:
     """Sockets and planes whose first and last contacts lie apart."""
-    found, unit = [], _in(calibration)
+    reasons, unit = [], _in(calibration)
     rng = np.random.default_rng(0)
     for i, rows in enumerate(_groups(model, commands)):
         if len(rows) < 2 * _FEW:
@@ -437,11 +443,11 @@ def _moved(
         ]
         if gain > np.quantile(shuffled, 0.99):
             first, last = names[rows[:at]], names[rows[at:]]
-            found.append(
+            reasons.append(
                 f"{model.sensor.kind} {i} seems to have moved by {apart:.3g}{unit} "
                 f"between measurements {first[-1]} and {last[0]}"
             )
-    return found
+    return reasons
 
 
 def _split(values: Array) -> tuple[float, int, float, float]:
@@ -464,11 +470,11 @@ def _swapped(
 ) -> dict[int, int]:
     """Outliers that fit another socket or plane, as if their column were wrong."""
     sensor = model.sensor
-    if not (isinstance(sensor, Placed) and sensor.zeros and sensor.count > 1):
+    if not (isinstance(sensor, Landmarks) and sensor.zeros and sensor.count > 1):
         return {}
     noise = np.asarray(calibration.noise_std)
     at = np.array(list(calibration.outliers), dtype=np.intp)
-    found: dict[int, int] = {}
+    swaps: dict[int, int] = {}
     if at.size:
         trial = np.repeat(calibration.commands[None, at], sensor.count, axis=0)
         own = trial[..., model.num_joints].copy()
@@ -477,7 +483,7 @@ def _swapped(
         for other, row in np.argwhere(
             (off < 4.0) & (own != trial[..., model.num_joints])
         ):
-            found[int(at[row])] = int(other)
+            swaps[int(at[row])] = int(other)
     if isinstance(sensor, Socket) and not explains:
         # So many that none is an outlier: by the arm as described, where that can tell.
         joints, columns = np.split(calibration.commands[used], [model.num_joints], 1)
@@ -489,5 +495,5 @@ def _swapped(
         if np.median(own) < 0.5 * np.median(apart.max(axis=1)):
             wrong = np.flatnonzero(nearest < 0.8 * own)
             fits = labels[apart[wrong].argmin(axis=1)]
-            found |= dict(zip(used[wrong].tolist(), fits.tolist(), strict=True))
-    return dict(sorted(found.items()))
+            swaps |= dict(zip(used[wrong].tolist(), fits.tolist(), strict=True))
+    return dict(sorted(swaps.items()))
