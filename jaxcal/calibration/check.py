@@ -106,48 +106,20 @@ def check(
     """
     from scipy import special
 
-    commands = _postures(calibration, "commands", commands)
-    shape = len(commands), calibration.num_outputs
-    rule = ": as many rows as commands"
-    measured = calibration.by_name("measured", measured)
-    measured = array_of("measured", measured, *shape, rule=rule)
-    model = calibration.model
-    distinct = model.distinct(commands, measured)
-    commands, measured = commands[distinct], measured[distinct]
+    commands, measured = _distinct(calibration, commands, measured)
     noise = calibration.require_noise("check")
-    theta = calibration.parameters
-    slopes = np.asarray(model.jacobian(commands, theta))
-    p = slopes.shape[-1]
     predicted = calibration.predict(commands)
-    measured = predicted + model.wrapped(measured - predicted, commands)
-    _require_unit(calibration, measured, predicted, noise)
-    off = (measured - predicted).ravel()
-    rows = slopes.reshape(-1, p)
-
-    def spread(misfit: bool) -> Array:
-        prediction_slopes, covariance = calibration.linear(commands, misfit=misfit)
-        prediction_slopes = prediction_slopes.reshape(len(rows), -1)
-        return (
-            np.diag(np.tile(noise**2, len(commands)))
-            + prediction_slopes @ covariance @ prediction_slopes.T
-        )
-
-    try:
-        root = np.linalg.inv(np.linalg.cholesky(spread(True)))
-    except np.linalg.LinAlgError:
-        raise ValueError(
-            "the calibration must predict what is checked, but its uncertainty there "
-            "is beyond rounding: see calibration.verdict"
-        ) from None
-    # Misfit that is allowed for may not be there, and hides a drift all the same.
-    least = float(np.trace(root @ spread(False) @ root.T)) / len(rows)
-    white, by = root @ off, root @ rows
-    names = calibration.names
+    off = calibration.model.wrapped(measured - predicted, commands)
+    _require_unit(calibration, predicted + off, predicted, noise)
+    slopes = np.asarray(calibration.model.jacobian(commands, calibration.parameters))
+    p, names = slopes.shape[-1], calibration.names
+    root, least = _whitening(calibration, commands, noise)
+    white, by = root @ off.ravel(), root @ slopes.reshape(-1, p)
     placed = np.zeros(p, dtype=np.bool_)
     if placed_anew:
-        if not model.placed:
+        if not calibration.model.placed:
             raise ValueError("placed_anew is of an arm whose sensor stands somewhere")
-        placed = np.isin(names, model.placed)  # which says nothing now
+        placed = np.isin(names, calibration.model.placed)  # which says nothing now
         white, by = without(by[:, placed], white, by)
     freedom = len(white)
     if not freedom:
@@ -179,6 +151,46 @@ def check(
         tolerance=tolerance,
         unit=calibration.measured_unit,
     )
+
+
+def _distinct(
+    calibration: Fit, commands: ArrayLike, measured: ArrayLike
+) -> tuple[Array, Array]:
+    """Commands (N, n) and readings (N, m), checked, those that are doubled left out."""
+    postures = _postures(calibration, "commands", commands)
+    shape = len(postures), calibration.num_outputs
+    readings = array_of(
+        "measured",
+        calibration.by_name("measured", measured),
+        *shape,
+        rule=": as many rows as commands",
+    )
+    rows = calibration.model.distinct(postures, readings)
+    return postures[rows], readings[rows]
+
+
+def _whitening(calibration: Fit, commands: Array, noise: Array) -> tuple[Array, float]:
+    """What whitens differences from predictions, and their least mean variance then.
+
+    Returns:
+        (N m, N m) for noise and all uncertainty of the predictions; the variance, of 1,
+        that is left where the misfit that they allow for is not there.
+    """
+
+    def covariance(misfit: bool) -> Array:
+        slopes, parameters = calibration.linear(commands, misfit=misfit)
+        rows = slopes.reshape(-1, slopes.shape[-1])
+        return np.diag(np.tile(noise**2, len(commands))) + rows @ parameters @ rows.T
+
+    try:
+        root = np.linalg.inv(np.linalg.cholesky(covariance(True)))
+    except np.linalg.LinAlgError:
+        raise ValueError(
+            "the calibration must predict what is checked, but its uncertainty there "
+            "is beyond rounding: see calibration.verdict"
+        ) from None
+    # Misfit that is allowed for may not be there, and hides a drift all the same.
+    return root, float(np.trace(root @ covariance(False) @ root.T)) / len(root)
 
 
 def _require_unit(

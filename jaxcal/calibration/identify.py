@@ -113,22 +113,7 @@ def identify(
     if weights is not None:
         weight = array_of("weights", weights, len(commands))
         require_none(weight < 0.0, weight, "weights must not be negative")
-    require_kind("noise", noise, Noise)
-    if not (common_noise is None or isinstance(common_noise, bool)):
-        raise ValueError(f"common_noise must be True or False, got {common_noise!r}")
-    if noise is not None:
-        if noise_std is not None:
-            raise ValueError("noise_std is short for noise: give one of them")
-        plain = noise.covariance is None and noise.command_std is None
-        if plain and np.ndim(0.0 if noise.std is None else noise.std) < 2:
-            noise_std, noise = noise.std, None
-    level = None if noise_std is None else levels("noise_std", noise_std, m)
-    of_readings = (noise.std, noise.covariance) if noise is not None else (level,)
-    if common_noise is not None and any(one is not None for one in of_readings):
-        raise ValueError(
-            "common_noise says how to estimate the noise, and noise says what it is: "
-            "give one of them"
-        )
+    noise, plain_noise = _noise(noise, noise_std, common_noise, m)
     for name, unit in (
         ("command_unit", command_unit),
         ("measured_unit", measured_unit),
@@ -148,7 +133,7 @@ def identify(
         about["provenance"]["accuracy"] = float(accuracy)
     model = Affine(n, m) if model is None else model
     model = require_fitting(model, commands, measured)
-    plain = prior is None and noise is None and loss in (None, "gaussian")
+    plain = prior is None and plain_noise and loss in (None, "gaussian")
     if plain and model.affine(model.nominal) is not None:
         loss = "gaussian"
         if isinstance(model, Affine):
@@ -159,7 +144,7 @@ def identify(
         weight,
         model=model,
         prior=prior,
-        noise=Noise(std=level) if noise is None and level is not None else noise,
+        noise=noise,
         loss=loss or "student",
         common_noise=common_noise,
     )
@@ -173,6 +158,37 @@ def _exact(calibration: Calibration) -> bool:
     """y = A u + b of as many rows as it needs, which the summary says is unchecked."""
     affine = calibration.affine is not None
     return affine and calibration.noise_std is None and calibration.dof < 0.5
+
+
+def _noise(
+    noise: Noise | None,
+    noise_std: ArrayLike | None,
+    common_noise: bool | None,
+    num_outputs: int,
+) -> tuple[Noise | None, bool]:
+    """The noise as given, and whether that is at most a level of each output."""
+    require_kind("noise", noise, Noise)
+    if not (common_noise is None or isinstance(common_noise, bool)):
+        raise ValueError(f"common_noise must be True or False, got {common_noise!r}")
+    if noise is not None and noise_std is not None:
+        raise ValueError("noise_std is short for noise: give one of them")
+    plain = noise is None or (
+        noise.covariance is None
+        and noise.command_std is None
+        and np.ndim(0.0 if noise.std is None else noise.std) < 2
+    )
+    if plain:
+        level = noise_std if noise is None else noise.std
+        noise = None
+        if level is not None:
+            noise = Noise(std=levels("noise_std", level, num_outputs))
+    known = noise is not None and not (noise.std is None and noise.covariance is None)
+    if common_noise is not None and known:
+        raise ValueError(
+            "common_noise says how to estimate the noise, and noise says what it is: "
+            "give one of them"
+        )
+    return noise, plain
 
 
 def _provenance(

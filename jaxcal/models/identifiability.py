@@ -125,24 +125,7 @@ def identifiability(
     names = tuple(model.names[i] for i in at)
     std = np.sqrt(np.diagonal(model.default_prior().resolve(model).precision))[at]
     scale = 1.0 / np.where(std > 0.0, std, 1.0)
-    columns = rows[:, at] * scale
-    largest = np.abs(columns).max(axis=0, initial=0.0)
-    seen = largest > 0.0
-    # A triangle of p rows holds all that is needed of the N q.
-    columns = triangle(columns / np.where(seen, largest, 1.0))
-    lengths = np.linalg.norm(columns, axis=0)
-    unit = columns / np.where(seen, lengths, 1.0)
-    norms = np.where(seen, lengths * largest, 1.0)
-    size, off = np.linalg.svd(unit, compute_uv=False), model.resolution
-    null: list[Array] = []
-    if len(size) < len(at) or not significant(size, off=off).all():
-        null = [np.eye(len(at))[[i]] for i in np.flatnonzero(~seen)]
-        first, classes = _parallel(unit, np.flatnonzero(seen), off)
-        null += [each / norms for each in classes]
-        for vector in _sparse_null(unit[:, first], off):
-            full = np.zeros((1, len(at)))
-            full[0, first] = vector / norms[first]
-            null.append(full)
+    null, size = _null_space(rows[:, at] * scale, model.resolution)
     directions = []
     for local in null:
         full = np.zeros((len(local), model.num_parameters))
@@ -158,6 +141,32 @@ def identifiability(
     return Identifiability(
         names, rank, tuple(directions), condition, len(commands), tuple(held)
     )
+
+
+def _null_space(columns: Array, resolution: float) -> tuple[list[Array], Array]:
+    """Changes (k, p) that columns (R, p) do not show, those that go together in one.
+
+    Returns:
+        These; and the singular values of the columns, each of length 1.
+    """
+    largest = np.abs(columns).max(axis=0, initial=0.0)
+    seen, p = largest > 0.0, columns.shape[1]
+    # A triangle of p rows holds all that is needed of the R.
+    columns = triangle(columns / np.where(seen, largest, 1.0))
+    lengths = np.linalg.norm(columns, axis=0)
+    unit = columns / np.where(seen, lengths, 1.0)
+    norms = np.where(seen, lengths * largest, 1.0)
+    size = np.asarray(np.linalg.svd(unit, compute_uv=False), np.float64)
+    if len(size) == p and significant(size, off=resolution).all():
+        return [], size
+    first, classes = _parallel(unit, np.flatnonzero(seen), resolution)
+    null = [np.eye(p)[[i]] for i in np.flatnonzero(~seen)]
+    null += [vectors / norms for vectors in classes]
+    for vector in _sparse_null(unit[:, first], resolution):
+        full = np.zeros((1, p))
+        full[0, first] = vector / norms[first]
+        null.append(full)
+    return null, size
 
 
 def _white(
