@@ -58,6 +58,25 @@ class Calibration(Fit):
             + (f" ({fixed} fixed)" if fixed else "")
             + f", {self.loss} loss"
         ]
+        lines += [f"  {line}" for line in aligned(self._parameter_rows(), "<")]
+        unit = f" {self.measured_unit}" if self.measured_unit else ""
+        size = np.sqrt(np.mean(self.residuals**2, axis=0))
+        lack = self.lack_of_fit()
+        lines.append(
+            f"residuals {in_words(size)}{unit} root mean square, {self.dof:.4g} "
+            "degrees of freedom"
+            + ("" if lack is None else f"; lack-of-fit p = {lack:.3g}")
+        )
+        if self.noise_std is not None:
+            source = "as given" if self.noise_known else "from the residuals"
+            lines.append(f"noise std {in_words(self.noise_std)}{unit}, {source}")
+            if self.dof < 0.5:
+                lines.append("no residual degree of freedom: the noise is not checked")
+        lines += str(self.verdict).splitlines()
+        return "\n".join(lines)
+
+    def _parameter_rows(self) -> list[tuple[str, ...]]:
+        """Cells of the summary's table, its head first: a row for each parameter."""
         cells = {"": list(self.names)}
         if means := self.model.meanings(self.input_names, self.output_names):
             cells["meaning"] = means
@@ -75,23 +94,7 @@ class Calibration(Fit):
         if any(units):
             cells["unit"] = list(units)
         table = [[name, *column] for name, column in cells.items()]
-        rows = [*zip(*table, strict=True)]
-        lines += [f"  {line}" for line in aligned(rows, "<")]
-        unit = f" {self.measured_unit}" if self.measured_unit else ""
-        size = np.sqrt(np.mean(self.residuals**2, axis=0))
-        lack = self.lack_of_fit()
-        lines.append(
-            f"residuals {in_words(size)}{unit} root mean square, {self.dof:.4g} "
-            "degrees of freedom"
-            + ("" if lack is None else f"; lack-of-fit p = {lack:.3g}")
-        )
-        if self.noise_std is not None:
-            source = "as given" if self.noise_known else "from the residuals"
-            lines.append(f"noise std {in_words(self.noise_std)}{unit}, {source}")
-            if self.dof < 0.5:
-                lines.append("no residual degree of freedom: the noise is not checked")
-        lines += str(self.verdict).splitlines()
-        return "\n".join(lines)
+        return [*zip(*table, strict=True)]
 
     # -- can it be trusted -------------------------------------------------------------
 
@@ -139,21 +142,29 @@ class Calibration(Fit):
         kept = np.isin(self.names, plain.names)
         if kept.all() and not self.estimate[len(self.names) :].any():
             return parameters
-        unit = f" {self.measured_unit}" if self.measured_unit else ""
         if not kept.all():
-            parameters[~kept] = 0.0
-            parameters = self.model.standing_as(self.arm, parameters, self.commands)
-            file = self.model.calibrated(parameters)
-            joints = self.commands[:, : file.num_inputs]
-            off = file.predict(joints) - self.arm.predict(joints)
-            warnings.warn(
-                "the file has stiff joints and round gears: the arm without compliance "
-                "and harmonics, moved as a whole, whose tip at the measured postures "
-                f"is {np.linalg.norm(off, axis=1).mean():.3g}{unit} from the "
-                "calibration's on average",
-                stacklevel=3,
-            )
-            return parameters
+            return self._moved_as_a_whole(np.where(kept, parameters, 0.0))
+        parameters[kept], parameters[~kept] = self._without_harmonics(plain), 0.0
+        return parameters
+
+    def _moved_as_a_whole(self, parameters: Array) -> Array:
+        """(p,) parameters, the machine moved to where this arm is; with a warning."""
+        parameters = self.model.standing_as(self.arm, parameters, self.commands)
+        file = self.model.calibrated(parameters)
+        joints = self.commands[:, : file.num_inputs]
+        off = file.predict(joints) - self.arm.predict(joints)
+        unit = f" {self.measured_unit}" if self.measured_unit else ""
+        warnings.warn(
+            "the file has stiff joints and round gears: the arm without compliance "
+            "and harmonics, moved as a whole, whose tip at the measured postures "
+            f"is {np.linalg.norm(off, axis=1).mean():.3g}{unit} from the "
+            "calibration's on average",
+            stacklevel=4,
+        )
+        return parameters
+
+    def _without_harmonics(self, plain: Model) -> Array:
+        """(p,) fitted again for the ``plain`` model, with a warning how far off."""
         fields = fit_model(
             self.commands,
             self.residuals + self.predict(self.commands),
@@ -165,8 +176,8 @@ class Calibration(Fit):
             common_noise=None,
         )
         again = dataclasses.replace(self, **fields)
-        parameters[kept], parameters[~kept] = again.parameters, 0.0
         moved = self.predict(self.commands) - again.predict(self.commands)
+        unit = f" {self.measured_unit}" if self.measured_unit else ""
         told = (
             "its predictions at the measured postures are "
             f"{np.linalg.norm(moved, axis=1).mean():.3g}{unit} from the calibration's "
@@ -181,9 +192,9 @@ class Calibration(Fit):
         warnings.warn(
             "the file has stiff joints and round gears and was fitted without "
             f"harmonics: {told}",
-            stacklevel=3,
+            stacklevel=4,
         )
-        return parameters
+        return again.parameters
 
     # -- from a file -------------------------------------------------------------------
 

@@ -182,8 +182,8 @@ def _noise(
         noise = None
         if level is not None:
             noise = Noise(std=levels("noise_std", level, num_outputs))
-    known = noise is not None and not (noise.std is None and noise.covariance is None)
-    if common_noise is not None and known:
+    given = noise is not None and not (noise.std is None and noise.covariance is None)
+    if common_noise is not None and given:
         raise ValueError(
             "common_noise says how to estimate the noise, and noise says what it is: "
             "give one of them"

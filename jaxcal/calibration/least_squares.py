@@ -203,11 +203,6 @@ class FitSolution:
         self.num_readings = q - int(np.isinf(problem.command_std).sum())
         # From where another search ended, the derivatives are right far enough.
         self.damping, self.grow = 1e-3 if start is None else 1e-10, 2.0
-        readings = _times(problem.white, problem.measured)
-        largest = np.abs(readings).max(axis=0)
-        largest = np.where(largest > 0.0, largest, largest.max())
-        # (q,) of contacts, whose readings are zero, in their usual noise.
-        self.floor = np.where(largest > 0.0, 1e-13 * largest, 1e-6)
         self.basis: Array | None = None  # (F, r) directions of a linear model
         self.freedom = np.zeros(q)
         self.shared = problem.levels
@@ -223,15 +218,10 @@ class FitSolution:
             self.residuals = problem.measured
         else:
             self._predict()
-            readings = _times(problem.white, self.residuals)
         # The last step of the logarithms of the levels, and how much of one is taken.
         self.climbed, self.trust = np.zeros(q), 1.0
         if start is None:
-            self.weights, self.level = np.ones(count), np.ones(q)
-            if not problem.noise_known:
-                same = self.shared[:, None] == self.shared
-                mean = same @ (readings**2).sum(axis=0) / (count * same.sum(axis=1))
-                self.level = np.maximum(np.sqrt(mean), (same * self.floor).max(axis=1))
+            self.weights, self.level = np.ones(count), self._first_level()
         else:
             self.weights, self.level = start.weights, start.level
         self._linearise()
@@ -244,6 +234,23 @@ class FitSolution:
     def sizes(self) -> Array:
         """(P,) of the parameters."""
         return self.problem.model.parameter_sizes()
+
+    @functools.cached_property
+    def floor(self) -> Array:
+        """(q,) least level; of contacts, whose readings are zero, in usual noise."""
+        readings = _times(self.problem.white, self.problem.measured)
+        largest = np.abs(readings).max(axis=0)
+        largest = np.where(largest > 0.0, largest, largest.max())
+        return np.where(largest > 0.0, 1e-13 * largest, 1e-6)
+
+    def _first_level(self) -> Array:
+        """(q,) root mean square of the residuals, of the outputs that share a level."""
+        if self.problem.noise_known:
+            return np.ones(len(self.shared))
+        square = _times(self.problem.white, self.residuals) ** 2
+        same = self.shared[:, None] == self.shared
+        mean = same @ square.sum(axis=0) / (len(square) * same.sum(axis=1))
+        return np.maximum(np.sqrt(mean), (same * self.floor).max(axis=1))
 
     def _predict(self) -> None:
         """Residuals at the present parameters and commands."""

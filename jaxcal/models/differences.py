@@ -154,11 +154,11 @@ def _noise(
         factor = math.factorial(k) ** 2 / math.factorial(2 * k)
         square = (table**2).mean(axis=(0, 1)) if table.size else np.zeros(len(size))
         levels.append(np.sqrt(factor * square))
-    found = np.array(levels)  # (6, q)
-    noise = found[-1].copy()
-    for q in range(found.shape[1]):
-        for k in range(1, len(found) - 2):
-            near = found[k : k + 3, q]
+    by_order = np.array(levels)  # (6, q)
+    noise = by_order[-1].copy()
+    for q in range(by_order.shape[1]):
+        for k in range(1, len(by_order) - 2):
+            near = by_order[k : k + 3, q]
             if near.max() <= 4.0 * near.min():
                 noise[q] = near[0]
                 break

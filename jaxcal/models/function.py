@@ -214,7 +214,7 @@ class FromFunction(Model):
         return self.scale
 
     def default_noise(self) -> Noise | None:
-        """As given."""
+        """The noise as given."""
         return self._noise
 
     @property
@@ -331,8 +331,8 @@ class FromFunction(Model):
         pilots: list[int] = []
         for first in range(0, len(rows), _PILOTS):
             trial = order[first : first + _PILOTS]
-            found = self.predict(rows[trial], theta)
-            pilots += trial[np.isfinite(found).all(axis=1)].tolist()
+            outputs = self.predict(rows[trial], theta)
+            pilots += trial[np.isfinite(outputs).all(axis=1)].tolist()
             if len(pilots) >= _PILOTS:
                 break
         if not pilots:
@@ -383,13 +383,13 @@ class _Memory:
     ) -> Array:
         """Results (N, ...) at rows, those made that are not known."""
         key = what, theta.tobytes()
-        known = self._sets.pop(key, {})
-        self._sets[key] = known  # the newest
+        results = self._sets.pop(key, {})
+        self._sets[key] = results  # the newest
         while len(self._sets) > 3 * _SETS:
             del self._sets[next(iter(self._sets))]
         labels = [row.tobytes() for row in rows]
-        new = list(dict.fromkeys(x for x in labels if x not in known))
+        new = list(dict.fromkeys(x for x in labels if x not in results))
         if new:
             first = [labels.index(x) for x in new]
-            known |= dict(zip(new, make(rows[first]), strict=True))
-        return np.array([known[x] for x in labels])
+            results |= dict(zip(new, make(rows[first]), strict=True))
+        return np.array([results[x] for x in labels])

@@ -129,7 +129,7 @@ class Runs:
                 ) from None
 
     def __call__(self, jobs: Sequence[Job]) -> tuple[list[Array], list[dict[int, str]]]:
-        """Of each job readings (N, q), NaN where a run failed, and why by row."""
+        """Readings (N, q) of each job, NaN where a run failed, and why by row."""
         answers: list[list[Answer | None]] = [[None] * len(rows) for rows, _ in jobs]
         if self._kept is not None:
             answers = [self._kept.read(*job) for job in jobs]
@@ -137,8 +137,8 @@ class Runs:
         total, done = sum(len(rows) for _, rows in pieces), 0
         self._progress("runs of f", 0, total)
         try:
-            for (j, rows), found in self._answered(jobs, pieces):
-                for i, answer in zip(rows, found, strict=True):
+            for (j, rows), of_piece in self._answered(jobs, pieces):
+                for i, answer in zip(rows, of_piece, strict=True):
                     answers[j][i] = self._checked(answer, jobs[j][0][i])
                 if self._kept is not None:
                     self._kept.write(jobs[j], rows, answers[j])
@@ -221,15 +221,15 @@ class Runs:
                     broken.append(futures[future])
             # A run that ends its process takes those beside it along: one by one.
             for j, rows in broken:
-                found: list[Answer] = []
+                answers: list[Answer] = []
                 for i in rows:
                     self.close()
                     try:
-                        found += self._submit(jobs[j][0][[i]], jobs[j][1]).result()
+                        answers += self._submit(jobs[j][0][[i]], jobs[j][1]).result()
                     except BrokenProcessPool:
-                        found.append("its process ended")
+                        answers.append("its process ended")
                 self.close()
-                yield (j, rows), found
+                yield (j, rows), answers
         except BaseException:
             self.close()
             raise
@@ -269,35 +269,37 @@ class Runs:
 def _answer(
     f: Callable[..., Any], batch: bool, commands: Array, parameters: Array
 ) -> list[Answer]:
-    """Of each command its readings, or why it has none."""
+    """The readings of each command, or why it has none."""
     if batch and len(commands) > 1:
         try:
             with np.errstate(all="ignore"):
-                found = f(commands.copy(), parameters.copy())
+                result = f(commands.copy(), parameters.copy())
         except Exception:  # of which command, each by itself will say
-            found = None
-        if found is not None:
-            return [*_readings(found, len(commands))]
+            result = None
+        if result is not None:
+            return [*_readings(result, len(commands))]
     answers: list[Answer] = []
     for command in commands:
         given = command[None] if batch else command
         try:
             with np.errstate(all="ignore"):
-                found = f(given.copy(), parameters.copy())
+                result = f(given.copy(), parameters.copy())
         except Exception as error:
             name = "" if isinstance(error, _Failed) else f"{type(error).__name__}: "
             answers.append(f"{name}{error}".splitlines()[0])
             continue
-        answers.append(_readings(found, 1 if batch else 0)[0])
+        answers.append(_readings(result, 1 if batch else 0)[0])
     return answers
 
 
-def _readings(found: Any, rows: int) -> Array:
+def _readings(result: Any, rows: int) -> Array:
     """(N, q) of what f returned for ``rows`` commands, 0: for one without an axis."""
     try:
-        array = np.asarray(found, dtype=np.float64)
+        array = np.asarray(result, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"f must return numbers, got {type(found).__name__}") from None
+        raise ValueError(
+            f"f must return numbers, got {type(result).__name__}"
+        ) from None
     if not rows and array.ndim <= 1 and array.size:
         return array.reshape(1, -1)
     if rows and array.ndim == 1 and len(array) == rows:

@@ -100,7 +100,7 @@ class RobotConfig:
 
     @property
     def timestep_s(self) -> float:
-        """Of an integration step: play's hard stops want shorter ones."""
+        """Seconds of an integration step: play's hard stops want shorter ones."""
         return 0.005 if self.play.any() else 0.01
 
 

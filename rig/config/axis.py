@@ -51,7 +51,7 @@ class Scale(Section):
 
     @classmethod
     def of(cls, described: dict[str, Any]) -> "Scale":
-        """Of an axis as a journal describes it."""
+        """The scale of an axis as a journal describes it."""
         names = Scale.model_fields.keys() & described.keys()
         return cls(**{name: described[name] for name in names})
 

@@ -126,22 +126,22 @@ class RigConfig(Section):
 
     @property
     def axis_names(self) -> tuple[str, ...]:
-        """Of the axes, in the order of every command."""
+        """Names of the axes, in the order of every command."""
         return tuple(axis.name for axis in self.axes)
 
     @property
     def axis_unit(self) -> str:
-        """Of the commands: deg or mm, or both."""
+        """Unit of the commands: deg or mm, or both."""
         return ", ".join(dict.fromkeys(axis.unit_name for axis in self.axes))
 
     @property
     def output_names(self) -> tuple[str, ...]:
-        """Of what is measured, in the order of every measurement."""
+        """Names of what is measured, in the order of every measurement."""
         return self.axis_names
 
     @property
     def output_unit(self) -> str:
-        """Of what is measured."""
+        """Unit of what is measured."""
         return "deg"
 
     @property

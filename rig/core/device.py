@@ -333,7 +333,7 @@ class Device:
         return self.frame is not None and self.imu.connections == self.heard
 
     def statuses(self) -> list[Status]:
-        """Of all drives; raises MotionFault on a fault bit."""
+        """Status of every drive; raises MotionFault on a fault bit."""
         return [drive.sound() for drive in self.drives]
 
     def attitude(self, since: float = 0.0) -> Array:

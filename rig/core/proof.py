@@ -63,7 +63,7 @@ class Turns(NamedTuple):
 
     @classmethod
     def of(cls, record: DeviceRecord) -> Turns | None:
-        """As `axes` saw them; None where the record does not say."""
+        """The columns that `axes` saw; None where the record does not say."""
         told = (record.state(SIGN_CHECKED) or {}).get("turns")
         return told and cls(np.array(told["pulses"]), np.array(told["deg"]))
 
@@ -73,7 +73,7 @@ class Turns(NamedTuple):
         return [float(size) for size in np.linalg.norm(self.deg, axis=0)]
 
     def at(self, config: RigConfig, pulses: Pulses) -> Array:
-        """The same columns where the device counts other pulses.
+        """These columns where the device counts other pulses.
 
         In the phone's frame a joint's axis turns with the joints that it carries.
         """

@@ -312,7 +312,7 @@ def _withdraw(run: RunFolder) -> None:
 
 
 def _ended_there(device: Device, ended: Record) -> bool:
-    """The same axis ended short at the same place before, on the way to a posture."""
+    """Whether this axis ended short at this place before, on the way to a posture."""
     axis = next(axis for axis in device.config.axes if axis.name == ended["axis"])
     return any(
         (record["name"], record["axis"]) == (ended["name"], ended["axis"])

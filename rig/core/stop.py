@@ -165,7 +165,7 @@ def stay(drives: list[Drive], results: list[UnitStop], seconds: float) -> list[s
 
 
 def _restarted(pairs: Pairs, end: float) -> list[UnitStop]:
-    """Of drives that stood those that move again before a time."""
+    """Drives that stood and move again before a time."""
     while time.monotonic() < end:
         time.sleep(LOOK_S)
         moved = []

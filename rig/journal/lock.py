@@ -217,7 +217,7 @@ def held_by(told: dict[str, Any]) -> str:
 
 
 def _identity(settings: BusSettings) -> str:
-    """The same text for every name of a bus."""
+    """One text for every name of a bus."""
     if settings.transport == "rtu":
         return os.path.realpath(settings.device)
     try:

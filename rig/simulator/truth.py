@@ -47,7 +47,7 @@ class Truth:
 
     @classmethod
     def of_axes(cls, count: int, outputs: int | None = None, **more: Any) -> Truth:
-        """Of so many axes, and of as many measurements unless said otherwise."""
+        """A truth of ``count`` axes, and of as many outputs unless said otherwise."""
         shape, known = (outputs or count, count), cls()
         matrix = 0.01 * np.cos(np.arange(shape[0] * count)).reshape(shape)
         matrix += 0.8 * np.eye(*shape)

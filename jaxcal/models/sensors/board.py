@@ -147,8 +147,8 @@ class Board(Sensor):
             gap = Rotation.from_matrix(board @ np.matrix_transpose(seen))
             off = np.asarray(gap.as_rotvec())
             rate = np.degrees(rotation_vector_rate(off))
-            for each in (by_tip, by_own):
-                each[:, 3:] = rate @ each[:, 3:]
+            for slopes in (by_tip, by_own):
+                slopes[:, 3:] = rate @ slopes[:, 3:]
             values = np.hstack([where - inputs[:, :3], np.degrees(off)])
             return Reading(values, by_tip, by_own)
         spokes = self.corners @ np.matrix_transpose(board)  # (N, C, 3)

@@ -144,7 +144,7 @@ def _inner(
 
 @dataclasses.dataclass(frozen=True)
 class Findings:
-    """Of the drives in the order of the configuration's axes, unless said otherwise."""
+    """Findings by drive, in the order of the configuration's axes if not said."""
 
     joints: tuple[int, ...]  # for each drive: the axis that it turns
     deg_per_pulse: Array  # (n,) of the phone, > 0 where pulses turn the joint positive

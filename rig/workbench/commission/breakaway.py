@@ -27,7 +27,7 @@ class Estimate(NamedTuple):
 
     @property
     def width(self) -> float:
-        """Of the interval."""
+        """Width of the interval."""
         return self.high - self.low
 
 

@@ -207,7 +207,7 @@ def _kept(found: Estimate) -> dict[str, float]:
 
 
 def _mean(values: list[float], sigma: float) -> Estimate:
-    """Of differences of two readings, each with at least this standard deviation."""
+    """Mean difference of two readings, each with at least this standard deviation."""
     spread = max(2.0**0.5 * sigma, float(np.std(values, ddof=1))) / len(values) ** 0.5
     half = float(special.stdtrit(len(values) - 1, 0.5 + LEVEL / 2)) * spread
     mean = max(0.0, float(np.mean(values)))

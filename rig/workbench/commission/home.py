@@ -25,7 +25,7 @@ POLL_S = 0.05
 
 
 def unlimited(config: RigConfig) -> RigConfig:
-    """The same without soft limits, for drives whose counts mean nothing yet."""
+    """``config`` without soft limits, for drives whose counts mean nothing yet."""
     axes = tuple(
         axis.model_copy(update={"min_deg": -NO_LIMIT_DEG, "max_deg": NO_LIMIT_DEG})
         for axis in config.axes
@@ -164,7 +164,7 @@ def _check_homing(
 
 
 def identity(drives: list[Drive]) -> dict[str, dict[str, int | str]]:
-    """Of each axis the identity registers of its drive that do not change.
+    """The identity registers of each axis's drive that do not change.
 
     Signed registers are left out: they are measurements, such as a temperature.
 

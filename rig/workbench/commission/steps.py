@@ -175,7 +175,7 @@ def go_home(place: Place, here: bool) -> int:
 
 
 def number_of(config: RigConfig, name: str) -> int:
-    """Of an axis by its name; Refused where there is none."""
+    """Number of an axis by its name; Refused where there is none."""
     if name not in config.axis_names:
         raise Refused(f"no axis {name!r}: have {', '.join(config.axis_names)}")
     return config.axis_names.index(name)

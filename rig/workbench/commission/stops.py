@@ -195,7 +195,7 @@ def _wait_until_still(device: Device) -> list[Status]:
 
 
 def _look(device: Device, statuses: list[Status]) -> list[Status]:
-    """Of drives that stand, after the time within which one might go on."""
+    """Look at drives that stand, after the time within which one might go on."""
     for drive, status in zip(device.drives, statuses, strict=True):
         drive.hold(status.position)
     end = time.monotonic() + stop.stand_s(device.drives)
@@ -209,7 +209,7 @@ def _look(device: Device, statuses: list[Status]) -> list[Status]:
 
 
 def _reset_alarms(run: Run, device: Device, name: str) -> None:
-    """Of drives that raise one when they stop themselves."""
+    """Reset alarms of drives that raise one when they stop themselves."""
     for drive in device.drives:
         if not drive.status().fault:
             continue

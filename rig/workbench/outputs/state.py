@@ -194,17 +194,17 @@ class RunState:
 
     @property
     def names(self) -> tuple[list[str], list[str]]:
-        """Of the axes, and of what is measured."""
+        """Names of the axes, and of what is measured."""
         return names_of(self.start.get("config", {}))
 
     @property
     def axis_unit(self) -> str:
-        """Of the commands."""
+        """Unit of the commands."""
         return units_of(self.start.get("config", {}))[0]
 
     @property
     def unit(self) -> str:
-        """Of what is measured."""
+        """Unit of what is measured."""
         return units_of(self.start.get("config", {}))[1]
 
     @property

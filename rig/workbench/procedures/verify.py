@@ -112,7 +112,7 @@ def verify(run: Run, calibration: Any, count: int) -> int:
 def telling(
     config: RigConfig, calibration: Any, count: int
 ) -> list[tuple[Pulses, Pulses]]:
-    """Of many held-out targets those that show best that the calibration is wrong."""
+    """Held-out targets, of many, that show best that the calibration is wrong."""
     offered = draw_held_out(config, calibration, _OFFERED * count)
     if calibration.noise_std is None or len(offered) <= count:
         return offered[:count]
