@@ -53,13 +53,14 @@ class Parser(argparse.ArgumentParser):
         a function's own come before those of its dataclasses."""
         self.set_defaults(function=function)
         groups: dict[type, Any] = {}
-        for owner, *one in sorted(_arguments(function), key=lambda each: bool(each[0])):
+        arguments = sorted(_arguments(function), key=lambda one: bool(one[0]))
+        for owner, *option in arguments:
             kind = owner and owner[1]
             if kind not in groups:
                 title = getattr(kind, "TITLE", None)
                 about = getattr(kind, "ABOUT", None)
                 groups[kind] = self.add_argument_group(title, about) if title else self
-            _add(groups[kind], *one)
+            _add(groups[kind], *option)
         return self
 
     def error(self, message: str) -> NoReturn:

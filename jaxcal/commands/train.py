@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jaxcal.adaptive.policy.config import PolicyConfig
     from jaxcal.adaptive.rules import StateRule
     from jaxcal.adaptive.tasks.registry import Entry
-    from jaxcal.commands.train_arguments import Options
+    from jaxcal.commands.train_arguments import TrainOptions
     from jaxcal.learning.training.config import TrainConfig
     from jaxcal.learning.training.run import Report
 
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
     return processes.run_job(prog, given, alone, advice)
 
 
-def _run(arguments: Options, prog: str) -> int:
+def _run(arguments: TrainOptions, prog: str) -> int:
     """Train, say how it went; of several processes the first speaks for all."""
     from jaxcal.commands.train_arguments import preset_of
     from jaxcal.learning.runtime import devices
@@ -112,7 +112,7 @@ def _run(arguments: Options, prog: str) -> int:
     return 0
 
 
-def _train(config: Any, arguments: Options, out: pathlib.Path, stop: Stop) -> int:
+def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) -> int:
     """Updates made."""
     import numpy as np
 
@@ -156,8 +156,8 @@ def _train(config: Any, arguments: Options, out: pathlib.Path, stop: Stop) -> in
     return int(np.max(state.num_updates))
 
 
-def _num_runs(arguments: Options, out: pathlib.Path) -> int:
-    """Of what to begin or to go on with; what is wrong is refused later."""
+def _num_runs(arguments: TrainOptions, out: pathlib.Path) -> int:
+    """How many runs begin or go on together; what is wrong is refused later."""
     from jaxcal.learning.config import runs_of
 
     seeds = arguments.values.get("num_seeds") or 1
@@ -176,8 +176,8 @@ def _num_runs(arguments: Options, out: pathlib.Path) -> int:
 # -- what to train ---------------------------------------------------------------------
 
 
-def _configuration(arguments: Options, out: pathlib.Path) -> TrainConfig:
-    """Of postures: from the flags, or from the run to go on with."""
+def _configuration(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
+    """Configuration of postures: from the flags, or from the run to go on with."""
     from jaxcal.commands.train_arguments import (
         candidates_of,
         given_to,
@@ -221,7 +221,7 @@ def _configuration(arguments: Options, out: pathlib.Path) -> TrainConfig:
 
 
 def _for_brax(
-    config: TrainConfig, arguments: Options, given: dict[str, Any]
+    config: TrainConfig, arguments: TrainOptions, given: dict[str, Any]
 ) -> TrainConfig:
     """A preset as brax trains it; what brax does not read is refused."""
     import jax
@@ -247,8 +247,8 @@ def _for_brax(
     return brax_ppo.adapted(config)
 
 
-def _task_configuration(arguments: Options, out: pathlib.Path) -> PolicyConfig:
-    """Of a task: from the flags, or from the run to go on with."""
+def _task_configuration(arguments: TrainOptions, out: pathlib.Path) -> PolicyConfig:
+    """Configuration of a task: from the flags, or from the run to go on with."""
     from jaxcal.adaptive.policy import run
     from jaxcal.adaptive.policy.config import PolicyConfig
     from jaxcal.adaptive.tasks import registry
@@ -295,7 +295,7 @@ def _tuned(entry: Entry, options: Mapping[str, Any]) -> StateRule:
     return tune(entry.make(**options), StateRule(), episodes=1024, seed=1)
 
 
-def _swept(arguments: Options) -> dict[str, Any]:
+def _swept(arguments: TrainOptions) -> dict[str, Any]:
     return {"sweep": arguments.sweep} if arguments.sweep else {}
 
 

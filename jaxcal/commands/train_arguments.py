@@ -24,7 +24,7 @@ from jaxcal.learning.training.config import TrainConfig
 
 __all__ = [
     "TASK_PARTS",
-    "Options",
+    "TrainOptions",
     "candidates_of",
     "flag_of",
     "given_to",
@@ -87,7 +87,7 @@ def _swept(text: str) -> Swept:
 
 
 @dataclasses.dataclass
-class Options:
+class TrainOptions:
     """What is trained and where it is kept."""
 
     preset: Annotated[str | None, "of postures, see below [compact]", "NAME"] = None
@@ -167,12 +167,12 @@ OfTasks = _flags(
 
 
 def asked(
-    options: Options,
+    options: TrainOptions,
     job: processes.Job,
     shared: Shared,  # type: ignore[valid-type]  # made of the configurations
     postures: OfPostures,  # type: ignore[valid-type]
     tasks: OfTasks,  # type: ignore[valid-type]
-) -> Options:
+) -> TrainOptions:
     """The options, with the settings that were given; the flags of ``train``."""
     fields = {flag: name for name, flag in _NAMES.items()}
     for part in (shared, postures, tasks):
@@ -184,7 +184,7 @@ def asked(
     return options
 
 
-def read(prog: str, argv: Sequence[str]) -> Options:
+def read(prog: str, argv: Sequence[str]) -> TrainOptions:
     """The command line; ``prog`` is what was typed, "train.py" or "jaxcal train"."""
     parser = Parser(
         prog=prog,
@@ -201,12 +201,12 @@ def read(prog: str, argv: Sequence[str]) -> Options:
     return asked(**values_of(parser.parse_args(argv)))
 
 
-def preset_of(arguments: Options) -> str:
+def preset_of(arguments: TrainOptions) -> str:
     """That which was given; else the smallest."""
     return arguments.preset or "compact"
 
 
-def given_to(arguments: Options, task: bool) -> dict[str, Any]:
+def given_to(arguments: TrainOptions, task: bool) -> dict[str, Any]:
     """The fields of a configuration that were given: name to value.
 
     Raises:

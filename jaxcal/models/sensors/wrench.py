@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, in_words, numbers
-from jaxcal.models.sensors.sensor import Named, Reading, Sensor, Tip, hats
+from jaxcal.models.sensors.sensor import HasNames, Reading, Sensor, Tip, hats
 
 __all__ = ["Wrench"]
 
@@ -76,7 +76,7 @@ class Wrench(Sensor):
     def usual_noise(self, length: float) -> ArrayLike:
         return [0.1] * 3 + [0.1 * 0.05 * length] * 3
 
-    def unseen(self, arm: Named) -> tuple[str, ...]:
+    def unseen(self, arm: HasNames) -> tuple[str, ...]:
         about = "xyz"[int(np.abs(self.up).argmax())]
         seen = {f"base r{axis}" for axis in "xyz" if axis != about}
         seen |= {*self.names, *(f"tool {axis}" for axis in self.tool)}
