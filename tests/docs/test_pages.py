@@ -129,7 +129,7 @@ def parse(words: list[str]) -> None:
     """Refused by exit code 2 where a flag or a value is wrong."""
     from jaxcal.commands.evaluate import parser as evaluate_parser
     from jaxcal.commands.main import _parser
-    from jaxcal.commands.train_arguments import parser as train_parser
+    from jaxcal.commands.train_arguments import read as read_train
     from rig.commands import make_parser
 
     ends = [i for i, word in enumerate(words) if word in ("|", ">", "&&")]
@@ -138,9 +138,11 @@ def parse(words: list[str]) -> None:
     if program == "jaxcal-rig":
         make_parser().parse_args([name, *rest])
     elif name in ("train", "evaluate"):
-        made = train_parser(name) if name == "train" else evaluate_parser(name, name)
-        if "--task" not in rest:
-            made.parse_args([word for word in rest if word != "--help"])
+        flags = [word for word in rest if word != "--help"]
+        if name == "train":
+            read_train(name, flags)
+        elif "--task" not in rest:
+            evaluate_parser(name, name).parse_args(flags)
     else:
         _parser([name]).parse_args([name, *rest])
 
