@@ -7,7 +7,7 @@ from jaxcal.extras import needs
 
 with needs("plots", "jaxcal.plots"):
     from jaxcal.plots.arm import postures
-    from jaxcal.plots.curves import against_count, pareto, plan
+    from jaxcal.plots.curves import against_count, pareto, plan, scenarios
     from jaxcal.plots.errors import before_after, residuals
     from jaxcal.plots.scatter import ellipsoid, selection
     from jaxcal.plots.style import as_bytes
@@ -21,5 +21,6 @@ __all__ = [
     "plan",
     "postures",
     "residuals",
+    "scenarios",
     "selection",
 ]

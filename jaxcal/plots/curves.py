@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from jaxcal.plots.style import BLACK, COLOURS, GREY, MARKERS, numbered, plain_axes
 
-__all__ = ["against_count", "pareto", "plan"]
+__all__ = ["against_count", "pareto", "plan", "scenarios"]
 
 
 def against_count(
@@ -61,6 +62,29 @@ def pareto(axes: Any, fronts: dict[str, Any]) -> Any:
         )
     axes.set_xlabel("D-efficiency against the optimum")
     axes.set_ylabel("time of the run (s): travel and settling")
+    axes.legend(frameon=False)
+    plain_axes(axes)
+    return axes
+
+
+def scenarios(axes: Any, report: Any) -> Any:
+    """Efficiency in each scenario, the worst first, beside that of the nominal's own.
+
+    Args:
+        axes: matplotlib axes.
+        report: ``Selection.in_scenarios``, of a selection over scenarios.
+
+    Returns:
+        ``axes``.
+    """
+    count = np.arange(1, len(report.weights) + 1)
+    curves = {"this design": report.efficiencies}
+    if report.nominal_efficiencies is not None:
+        curves["made at the nominal"] = report.nominal_efficiencies
+    for i, (name, shares) in enumerate(curves.items()):
+        axes.plot(count, np.sort(shares), label=name, markersize=4, **numbered(i))
+    axes.set(xlabel="scenarios, the worst first", ylabel="efficiency", ylim=(0.0, 1.05))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend(frameon=False)
     plain_axes(axes)
     return axes

@@ -377,7 +377,12 @@ class Joined:
         if self.kind == "trace":
             scale = units * criteria[0].times
         else:
-            scale = 1.0 / units
+            scale = 1.0 / np.maximum(units, 1e-320)
+        if not (np.isfinite(scale) & (scale > 0.0)).all():
+            raise ValueError(
+                f"criterion {self.name} must be a number in double precision in every "
+                "scenario, but is not in these units; give the commands in others"
+            )
         return (scale if optima is None else scale / optima), np.zeros(len(scale))
 
     def reported(self, joined: Array | float) -> Any:

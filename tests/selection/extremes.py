@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 import jaxcal
-from jaxcal.models import Polynomial
+from jaxcal.models import Polynomial, SerialChain
 
 
 def ask(question: Callable[[], object]) -> None:
@@ -47,5 +47,69 @@ def main() -> None:
             ))  # fmt: skip
 
 
+def scenarios_and_losses() -> None:
+    rng = np.random.default_rng(1)
+    for e in (-300, -155, -12, 0, 12, 155, 300):
+        blocks = rng.random((3, 70, 2, 3)) * 10.0**e  # two groups of the exchange
+        blocks[1] *= 1e6
+        design = jaxcal.Design.from_blocks(blocks, required=[69])
+        for name in "DAEI":
+            for joined in (jaxcal.Mean(name), jaxcal.Worst(name)):
+                for method in ("greedy", "exchange", "exact"):
+                    more = {"time_limit": 0.2} if method == "exact" else {}
+                    ask(lambda m=method, j=joined, o=more, d=design: d.select(
+                        4, j, m, **o
+                    ))  # fmt: skip
+        few = jaxcal.Design.from_blocks(blocks[0, :9], lost=1)
+        ask(lambda d=few: d.select(4, "A", "exact", time_limit=0.2))
+
+
+def arms() -> None:
+    rng = np.random.default_rng(2)
+    table = [(0, 90, 90, 0), (-425, 0, 0, 0), (-390, 0, 0, 0)]
+    for size in (1e-300, 1e-12, 1.0, 1e12, 1e300):
+        arm = SerialChain.from_dh([(a * size, *rest) for a, *rest in table])
+        for turn in (0.0, 1.0, 1e9, 1e300):
+            for count in (1, 7, 2100):
+                poses = turn * rng.uniform(-1.0, 1.0, (count, 3))
+                ask(lambda m=arm, u=poses: m.predict(u))
+                ask(lambda m=arm, u=poses: m.jacobian(u))
+
+
+def trees() -> None:
+    """Look-ahead on tables of every size, with outcomes that cannot be."""
+    from jaxcal.adaptive.search_kernel import Tree
+
+    rng = np.random.default_rng(3)
+    for designs, outcomes, states in ((1, 1, 1), (3, 2, 5), (17, 4, 40), (8, 3, 2)):
+        likelihood = rng.random((designs, outcomes, states)).astype(np.float32)
+        likelihood[0] = 0.0
+        likelihood[0, 0] = 1.0
+        likelihood /= likelihood.sum(axis=1, keepdims=True)
+        for price in (1e-30, 1.0, 1e30):
+            for effort in (0.0, 1e6):
+                tables = np.full((outcomes, designs), price, np.float32)
+                tree = Tree(
+                    likelihood, np.full((designs, designs), price, np.float32), tables,
+                    np.ones((outcomes, designs), np.float32),
+                    np.zeros((designs, outcomes), np.int32), tables[0], tables[0],
+                    np.ones(designs, np.float32), 6, [1.0, 1.0, 1.0, 1.0, 1.0, 0.3],
+                    np.ones((1, designs), np.float32), effort,
+                )  # fmt: skip
+                beliefs = np.zeros((4, states), np.float32)
+                beliefs[0] = 1.0 / states
+                beliefs[1, 0] = 1.0  # and two that sum to nothing, or to more
+                beliefs[3] = 1e30
+                seconds = np.array([10.0, 1e30, 0.0, -1.0], np.float32)
+                whole = np.array([0, 3, 1, 2], np.int32)
+                tree.choose(
+                    beliefs, np.zeros(4, np.int32), seconds, whole, whole,
+                    np.zeros(4, np.int32),
+                )  # fmt: skip
+
+
 main()
+scenarios_and_losses()
+arms()
+trees()
 print("end")

@@ -6,8 +6,9 @@ import itertools
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
-from jaxcal import Design, I, Mean, Prior, Worst, select
+from jaxcal import Design, I, Mean, Prior, Worst, plots, select
 from jaxcal.models import Affine
 from jaxcal.models.model import Model
 from jaxcal.selection.problem import ScenarioProblem
@@ -165,6 +166,11 @@ def test_a_worst_case_design_pays_at_the_nominal_and_is_worth_it_elsewhere() -> 
     text = str(answer)
     assert "scenarios     3" in text and "nominal's" in text
     assert len(report.table().splitlines()) == 4
+    axes = plots.scenarios(Figure().add_subplot(), report)
+    np.testing.assert_array_equal(
+        axes.lines[0].get_ydata(), np.sort(report.efficiencies)
+    )
+    assert len(axes.lines) == 2
     assert answer.to_dict()["in_scenarios"]["efficiencies"][0] > 0.0
 
 
@@ -200,6 +206,13 @@ def test_bad_scenarios_are_named(scenarios, says) -> None:
     x = np.linspace(0.05, 5.0, 10)[:, None]
     with pytest.raises(ValueError, match=says):
         Design(x, MichaelisMenten(), Prior(np.inf), scenarios=scenarios).select(2)
+
+
+def test_units_beyond_double_precision_are_refused_by_name() -> None:
+    blocks = np.random.default_rng(0).standard_normal((2, 6, 1, 3)) * 1e200
+    with pytest.raises(ValueError, match=r"criterion Mean.A. must be a number in dou"):
+        Design.from_blocks(blocks).select(4, "A")
+    assert Design.from_blocks(blocks * 1e-300).select(4, "D").proven
 
 
 def test_bad_blocks_of_scenarios_are_named() -> None:
