@@ -89,7 +89,10 @@ def write_report(
         How many figures there are.
     """
     from jaxcal.evaluation.figures import evaluation_figures
-    from jaxcal.evaluation.training_figure import training_curves
+    from jaxcal.evaluation.training_figure import (
+        training_curves,
+        training_diagnostics,
+    )
 
     sections: dict[str, Part] = {}
     prefixes = file_prefixes([found.dataset.name for found in evaluations])
@@ -101,8 +104,11 @@ def write_report(
         figures = {f"{prefix}_{name}": figure for name, figure in drawn}
         sections[_heading(shown)] = blocks, figures
     if runs:
-        curves = training_curves({run.name: run for run in runs})
-        sections["Training"] = (), {"training_curves": curves}
+        folders = {run.name: run for run in runs}
+        curves = {"training_curves": training_curves(folders)}
+        if (diagnostics := training_diagnostics(folders)) is not None:
+            curves["training_diagnostics"] = diagnostics
+        sections["Training"] = (), curves
     title = "Posture selection against the proven optimum"
     return write_folder(folder, title, sections, command, _ABOUT)
 

@@ -16,6 +16,7 @@ from jaxcal.learning.policies import scorer
 from jaxcal.learning.runtime import devices
 from jaxcal.learning.training import checkpoint, imitation
 from jaxcal.learning.training.config import TrainConfig
+from jaxcal.learning.training.room import require_room
 from jaxcal.learning.training.run import Recipe, run
 
 __all__ = ["MEASURED", "Validation", "train"]
@@ -79,7 +80,8 @@ def train(
     Raises:
         CheckpointError: nothing to resume from, or damaged.
         ValueError: the devices do not divide a minibatch or the seeds evenly, the
-            teacher is missing, or the look-ahead makes every choice.
+            teacher is missing, the look-ahead makes every choice, or an update does
+            not fit the memory.
         OSError: the folder cannot be written.
     """
     rows = config.ppo.rows_per_minibatch
@@ -127,4 +129,5 @@ def train(
         imitate=imitate,
     )
     with contextlib.closing(imitation.Lessons(lesson, imitated)) as lessons:
+        require_room(recipe, mesh)
         return run(recipe, folder, mesh=mesh, num_updates=last, **rest)
