@@ -223,7 +223,10 @@ def given_to(arguments: TrainOptions, task: bool) -> dict[str, Any]:
         unread.add("--with")
     if unread:
         who = f"--task {arguments.task}" if task else f"preset {preset_of(arguments)}"
-        raise ValueError(f"{who} does not read {', '.join(sorted(unread))}: leave out")
+        it = "it" if len(unread) == 1 else "them"
+        raise ValueError(
+            f"{who} does not read {', '.join(sorted(unread))}: leave {it} out"
+        )
     return given
 
 
