@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         Motion,
         Selection,
         Worst,
+        optimise,
         select,
     )
 
@@ -49,6 +50,7 @@ __all__ = [
     "identifiability",
     "identify",
     "log_det_information",
+    "optimise",
     "regression_matrix",
     "select",
 ]
@@ -73,6 +75,7 @@ _HOME = {
     "Motion": "jaxcal.selection",
     "Selection": "jaxcal.selection",
     "Worst": "jaxcal.selection",
+    "optimise": "jaxcal.selection",
     "select": "jaxcal.selection",
 }
 

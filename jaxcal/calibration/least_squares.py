@@ -20,6 +20,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.checks import in_words
 from jaxcal.information.blocks import triangle
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model, derivative, predict, without_effect
@@ -465,6 +466,12 @@ class FitSolution:
                 return False
             if self.damping > 1e9:  # rounding is all that is left, or
                 slope = np.abs(rows.T @ right).max() / np.linalg.norm(right)
+                if slope > 1e-3 and not np.isfinite(after):
+                    raise ValueError(
+                        "model.predict must answer where the fit goes, but it fails "
+                        f"next to the parameters {in_words(self.parameters)}: narrow "
+                        "the prior, or begin nearer, with Prior(mean=...)"
+                    )
                 if slope > 1e-3:
                     raise ValueError(
                         "model.jacobian must be the derivative of model.predict: no "

@@ -2,9 +2,12 @@
 
 Noise: the values at seven points so close together that f is a polynomial there; what
 their higher differences leave is the noise of f. Step: derivatives of fourth order at
-steps halved again and again; the step taken is the one where the change from one step
-to the next, and what noise does to it, are least together. Parameters that may go to
-one side only, as a friction of zero, get differences to that side.
+steps halved until noise is all that changes them. The step taken is the one where the
+change from one step to the next and what noise does to it are least together, or the
+shortest one where both are below 1e-8: the shorter a step, the fewer kinks of f it
+meets.
+Parameters that may go to one side only, as a friction of zero, get differences to that
+side.
 
 Sources: Moré and Wild, Estimating computational noise, 2011; Ridders, 1982.
 """
@@ -27,7 +30,7 @@ Array = NDArray[np.float64]
 Evaluate = Callable[[Array], Array]  # points (S, p) -> values (S, N, q), NaN: refused
 
 _FIRST, _RUNGS = 0.25, 22  # of the scale, the largest step; halvings tried
-_WORSE = 3  # steps in a row that are worse than the best one end the search
+_EXACT = 1e-8  # share of a derivative: errors below it are as good as none
 _POINTS, _CLOSE = 7, 1e-7  # of the noise; of the scale, their distance
 _EPS = float(np.finfo(np.float64).eps)
 
@@ -183,7 +186,6 @@ class _Ladder:
         values: dict[float, Array] = {}
         for side, stencil in STENCILS.items():
             rungs: list[tuple[float, Array]] = []
-            best, worse = np.inf, 0
             for i in range(_RUNGS):
                 step = _FIRST * self.scale * 2.0**-i
                 if step < least and rungs:
@@ -200,11 +202,9 @@ class _Ladder:
                     continue
                 rungs.append((step, slope))
                 if len(rungs) > 1:
-                    change = np.abs(rungs[-1][1] - rungs[-2][1]).max()
-                    worse = worse + 1 if change >= best else 0
-                    best = min(best, change)
-                    if worse == _WORSE or change == 0.0:
-                        break
+                    change = np.abs(rungs[-1][1] - rungs[-2][1]).max(axis=0)
+                    if (change <= stencil.amplifies * noise / step).all():
+                        break  # noise is all that changes
             if len(rungs) > 1:
                 self.side, self.rungs = side, rungs
                 return
@@ -223,12 +223,13 @@ class _Ladder:
         if not self.rungs:
             return 1e-3 * self.scale, self.side, np.inf
         amplifies = STENCILS[self.side].amplifies
+        size = float(np.sqrt(((self.rungs[-1][1] * weights) ** 2).mean()))
         best = (np.inf, *self.rungs[0])
         for (step, slope), (_, finer) in zip(self.rungs, self.rungs[1:], strict=False):
             change = float(np.sqrt((((slope - finer) * weights) ** 2).mean()))
             of_noise = float(np.sqrt(((self.noise * weights) ** 2).mean()))
             error = change + amplifies * of_noise / step
-            if error < best[0]:
+            if error < max(best[0], _EXACT * size):
                 best = (error, step, slope)
         error, step, slope = best
         size = float(np.sqrt(((slope * weights) ** 2).mean()))

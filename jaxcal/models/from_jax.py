@@ -101,6 +101,35 @@ class FromJax(Model):
         """(N, q, n)."""
         return self._run(2, commands, parameters)
 
+    def leverage_slopes(
+        self, commands: Array, parameters: Array, white: Array, metric: Array
+    ) -> Array:
+        """(N, n) by JAX."""
+        commands = as_commands(self, commands)
+        import jax
+
+        with jax.enable_x64(True):
+            return np.array(self._leverage(commands, parameters, white, metric))
+
+    @functools.cached_property
+    def _leverage(self) -> Callable[..., Any]:
+        import jax
+        import jax.numpy as jnp
+
+        def f(command: jax.Array, parameters: jax.Array) -> jax.Array:
+            return jnp.atleast_1d(self.f(command, parameters))
+
+        def leverage(
+            command: jax.Array,
+            parameters: jax.Array,
+            white: jax.Array,
+            metric: jax.Array,
+        ) -> jax.Array:
+            block = white @ jax.jacfwd(f, argnums=1)(command, parameters)
+            return (block @ metric * block).sum()
+
+        return jax.jit(jax.vmap(jax.grad(leverage), in_axes=(0, None, None, None)))
+
     def to_dict(self) -> dict[str, Any]:
         """The function itself cannot be written."""
         return {

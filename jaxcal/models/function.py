@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -271,14 +271,32 @@ class FromFunction(Model):
     def _by_parameters(self, rows: Array, theta: Array) -> Array:
         steps = self._steps_for("parameters", rows, theta)
 
-        def jobs() -> Iterator[tuple[Array, Array]]:
-            for j, offsets in enumerate(self._offsets(steps)):
-                for offset in offsets:
+        def jobs(at: Array, columns: Sequence[int], side: str = "") -> list[Any]:
+            moved = []
+            for j in columns:
+                for offset in STENCILS[side or steps.sides[j]].offsets * steps.steps[j]:
                     point = theta.copy()
                     point[j] += offset
-                    yield rows, point
+                    moved.append((at, point))
+            return moved
 
-        return self._slopes(steps, rows, self._run([*jobs()]))
+        values = self._run(jobs(rows, range(len(theta))))
+        sides = [[side] * len(rows) for side in steps.sides]
+        failed = np.asarray(np.isnan(np.array(values)).any(axis=(0, 2)))
+        if failed.any():
+            failed[failed] = ~np.isnan(self.predict(rows[failed], theta)).any(axis=1)
+        for j in range(len(theta)):  # at an edge of what f takes, to the other side
+            its = values[4 * j : 4 * j + 4]
+            for side in ("forward", "backward"):
+                lost = failed & np.isnan(np.array(its)).any(axis=(0, 2))
+                if not lost.any():
+                    break
+                tried = self._run(jobs(rows[lost], [j], side))
+                for old, new in zip(its, tried, strict=True):
+                    old[lost] = new
+                for i in np.flatnonzero(lost):
+                    sides[j][i] = side
+        return self._slopes(steps, rows, values, sides)
 
     def _by_commands(self, rows: Array, theta: Array) -> Array:
         steps = self._steps_for("commands", rows, theta)
@@ -289,24 +307,42 @@ class FromFunction(Model):
                 moved[:, i] += offset
                 points.append(moved)
         values = self._run([(np.concatenate(points), theta)])[0]
-        return self._slopes(steps, rows, [*values.reshape(len(points), len(rows), -1)])
+        values = values.reshape(len(points), len(rows), -1)
+        sides = [[side] * len(rows) for side in steps.sides]
+        return self._slopes(steps, rows, [*values], sides)
 
     @staticmethod
     def _offsets(steps: Differences) -> list[Array]:
         pairs = zip(steps.sides, steps.steps, strict=True)
         return [STENCILS[side].offsets * step for side, step in pairs]
 
-    def _slopes(self, steps: Differences, rows: Array, values: list[Array]) -> Array:
-        """(N, q, p) of the values at the offsets, four for each parameter."""
-        columns, rough = [], []
-        for j, (side, step) in enumerate(zip(steps.sides, steps.steps, strict=True)):
-            stack, stencil = np.array(values[4 * j : 4 * j + 4]), STENCILS[side]
-            columns.append(combined(stack, stencil.fine, self.periods) / step)
-            rough.append(combined(stack, stencil.coarse, self.periods) / step)
-        slopes = np.stack(columns, axis=-1)
+    def _slopes(
+        self,
+        steps: Differences,
+        rows: Array,
+        values: list[Array],
+        sides: list[list[str]],
+    ) -> Array:
+        """(N, q, p) of the values at the offsets, four for each parameter.
+
+        Args:
+            steps: of the differences.
+            rows: (N, n) commands.
+            values: 4 p times (N, q).
+            sides: p times N.
+        """
+        slopes = np.empty((*values[0].shape, len(steps.steps)))
+        rough = np.empty_like(slopes)
+        for j, step in enumerate(steps.steps):
+            stack = np.array(values[4 * j : 4 * j + 4])
+            for side in {*sides[j]}:
+                at, stencil = np.array(sides[j]) == side, STENCILS[side]
+                for weights, into in ((stencil.fine, slopes), (stencil.coarse, rough)):
+                    found = combined(stack[:, at], weights, self.periods)
+                    into[at, :, j] = found / step
         with np.errstate(invalid="ignore"):
             largest = np.nanmax(np.abs(slopes), axis=0, initial=0.0)  # (q, p)
-            apart = np.abs(slopes - np.stack(rough, axis=-1))
+            apart = np.abs(slopes - rough)
             floor = np.maximum(_ROUGH * largest, 8.0 * steps.rounding())
             jumps = np.argwhere((apart > floor).any(axis=1))
         if len(jumps):

@@ -104,6 +104,15 @@ class Model(abc.ABC):
     ) -> Array:
         """(N, q, n) derivative of the outputs by the commands."""
 
+    def leverage_slopes(
+        self, commands: Array, parameters: Array, white: Array, metric: Array
+    ) -> Array | None:
+        """(N, n) slopes by commands of ``trace(B metric B.T)``, ``B = white @ J``.
+
+        J is the Jacobian (q, p) at a command, white (q, q). None: by differences.
+        """
+        return None
+
     # -- names -------------------------------------------------------------------------
 
     @functools.cached_property  # which an attribute may replace

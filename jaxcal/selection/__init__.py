@@ -6,6 +6,7 @@ from jaxcal.selection.batch import (
     greedy_batch,
     random_batch,
 )
+from jaxcal.selection.continuous import Refinement, optimise
 from jaxcal.selection.criteria import As, Ds, I, Mean, Worst
 from jaxcal.selection.design import Design, select
 from jaxcal.selection.fastest.motion import Motion
@@ -23,6 +24,7 @@ __all__ = [
     "Mean",
     "Motion",
     "Problem",
+    "Refinement",
     "Selection",
     "Subset",
     "Worst",
@@ -30,6 +32,7 @@ __all__ = [
     "exchange_batch",
     "greedy_batch",
     "make_problems",
+    "optimise",
     "random_batch",
     "select",
 ]

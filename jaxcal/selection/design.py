@@ -16,6 +16,7 @@ from jaxcal.checks import (
 )
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
+from jaxcal.selection.continuous import Refinement, refine
 from jaxcal.selection.exact.exact import TIME_LIMIT, solve_exact
 from jaxcal.selection.fastest.run import fastest, pareto
 from jaxcal.selection.in_scenarios import with_optima
@@ -178,6 +179,47 @@ class Design(CandidateSet):
     plan = plan
     fastest = fastest
     pareto = pareto
+
+    def refine(
+        self,
+        selection: Selection | ArrayLike,
+        limits: ArrayLike | None = None,
+        *,
+        criterion: Any = None,
+        region: ArrayLike | None = None,
+        allowed: Any = None,
+        starts: int = 4,
+        seed: int = 0,
+        time_limit: float | None = None,
+    ) -> Refinement:
+        """The chosen commands moved between the candidates to a better design.
+
+        Args:
+            selection: what to begin with, or its (k,) indices; the answer is never
+                worse.
+            limits: (n, 2) least and greatest command of each input; the range of the
+                available candidates when not given.
+            criterion: that of the selection when not given.
+            region: of I; the available candidates when not given.
+            allowed: f(u (n,)) -> whether a command may be given.
+            starts: of the search, the selection among them.
+            seed: of points that are drawn.
+            time_limit: seconds, 60 when not given; the best so far is returned.
+
+        Raises:
+            ValueError: naming the argument, the rule and the value.
+        """
+        return refine(
+            self,
+            selection,
+            limits,
+            criterion=criterion,
+            region=region,
+            allowed=allowed,
+            starts=starts,
+            seed=seed,
+            time_limit=time_limit,
+        )
 
     def _judged(
         self, problem: Problem, found: Solution, method: str, start: float

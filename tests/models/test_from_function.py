@@ -51,9 +51,9 @@ def test_derivatives_are_those_by_hand_in_any_unit(unit):
         np.array(SCALE) * [unit, 1.0, 1.0],
     )
     scale = np.array([1.0, unit, unit])
-    np.testing.assert_allclose(one.jacobian(U * unit), exact * scale, atol=2e-11 * unit)
-    np.testing.assert_allclose(one.command_jacobian(U * unit), by_command, atol=1e-10)
-    assert one.resolution < 1e-10
+    np.testing.assert_allclose(one.jacobian(U * unit), exact * scale, atol=1e-7 * unit)
+    np.testing.assert_allclose(one.command_jacobian(U * unit), by_command, atol=1e-7)
+    assert one.resolution <= 1e-8
 
 
 @pytest.mark.parametrize("noise", [1e-10, 1e-6, 1e-3])
@@ -282,6 +282,29 @@ def test_it_is_measured_one_by_one():
 
 
 def test_a_jump_is_told():
-    jumps = FromFunction(lambda u, t: float(t[0] > 1.0 + 1e-5) + t[0] * u[0], [1.0])
-    with pytest.warns(UserWarning, match="f is not smooth in t1"):
+    jumps = FromFunction(lambda u, t: (t[0] > 1.0 and u[0] == 2.0) + t[0] * u[0], [1.0])
+    with pytest.warns(UserWarning, match=r"f is not smooth in t1 at the command \(2\)"):
         jumps.jacobian(U)
+
+
+def test_near_an_edge_the_other_side_is_taken():
+    def friction(u, theta):
+        if theta[0] < 0.0:
+            raise ValueError("friction below zero")
+        return np.exp(-theta[0] * u[0])
+
+    one = FromFunction(friction, [0.5], [0.1])
+    one.jacobian(U)  # whose steps are to both sides
+    found = one.jacobian(U, [1e-9])[:, 0, 0]
+    np.testing.assert_allclose(found, -U[:, 0], atol=1e-7)
+
+
+def test_a_fit_that_ends_where_f_fails_says_so():
+    def walled(u, theta):
+        if theta[0] < 0.5:
+            raise ValueError("below .5")
+        return theta[0] * u[0]
+
+    one = FromFunction(walled, [1.0], [0.1])
+    with pytest.raises(ValueError, match="fails next to the parameters"):
+        jaxcal.identify(U, 0.1 * U, model=one, noise_std=0.01)

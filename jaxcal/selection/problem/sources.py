@@ -51,6 +51,13 @@ class Source(Protocol):
         """Commands of predictions, where their blocks are not those of readings."""
         return None
 
+    def leverage_slopes(self, commands: Array, metric: Array) -> Array | None:
+        """(N, n) slopes of ``trace(B metric B.T)`` by commands, where a model has them.
+
+        B are the blocks of readings (q, p) and ``metric`` is (p, p).
+        """
+        return None
+
 
 def shares_regressor(model: Model, prior: Prior | None, noise: Noise | None) -> bool:
     """Is one block [u, 1] / std, counted once per output, all there is to know?"""
@@ -187,6 +194,15 @@ class ModelSource(Source):
     def predicted(self) -> Array | None:
         same = self._read is self._noise and self._noise.command_std is None
         return None if same else self.used
+
+    def leverage_slopes(self, commands: Array, metric: Array) -> Array | None:
+        if self._read.command_std is not None:
+            return None
+        p = len(self._free)
+        whole = np.zeros((p, p))
+        whole[np.ix_(self._free, self._free)] = metric
+        white = self._read.whitening(1, self._model.num_outputs)[0]
+        return self._model.leverage_slopes(commands, self._mean, white, whole)
 
     def require_identified(self, measured: ArrayLike | None) -> None:
         if np.diagonal(self._precision).all():

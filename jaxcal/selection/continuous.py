@@ -1,0 +1,752 @@
+"""Designs whose commands are any within limits: ``optimise`` and ``Design.refine``.
+
+A criterion phi is a concave function of the information M of all k commands. With G its
+gradient at M, the slope of phi by one command u is that of ``d(u) = trace(B G B.T)``, B
+the block there. So all commands climb together, from
+several starts; then single ones are moved to where d is largest, and those that must
+stay where ``allowed`` says move by trial.
+
+How good: with M0 and G0 of any weighted design, no k commands are better than
+
+    phi(M0) + trace(G0 (P - M0)) + k max of d0(u),
+
+which is tight where M0 is the best weighted design (the equivalence theorem of Kiefer
+and Wolfowitz). That maximum over the limits is found by a search, so the bound is no
+proof, but for y = A u + b, where d is convex and a corner is its largest.
+
+Sources: Pukelsheim, Optimal Design of Experiments; Meyer and Nachtsheim, 1995.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import (
+    aligned,
+    array_of,
+    in_words,
+    require_none,
+    seconds,
+    whole_number,
+)
+from jaxcal.models.affine import Affine
+from jaxcal.models.model import Model, as_model
+from jaxcal.models.uncertainty import Noise, Prior
+from jaxcal.selection.criteria import CRITERIA
+from jaxcal.selection.exchange.exchange import exchange_indices
+from jaxcal.selection.problem import (
+    CandidateSet,
+    Problem,
+    ScenarioProblem,
+    values,
+)
+from jaxcal.selection.result import Selection
+
+__all__ = ["Refinement", "optimise", "refine"]
+
+Array = NDArray[np.float64]
+Allowed = Callable[[Array], Any]
+
+_POOL, _SEARCH = 512, 2048  # points that starts, and the largest d, are looked for in
+_ASCENTS = 12  # of the best points, for the largest d
+_ROUNDS, _SWAPS = 12, 6  # of the bound; of moving single commands
+_TRIALS, _SMALLEST = 24, 1e-6  # of a command, in a round of trial; share of the limits
+_PAIRED, _GAIN = 6, 1e-7  # inputs up to which differences are tried; of log efficiency
+_STEP = 1e-5  # share of the limits, of differences where a model has no derivative
+_ROUGH = 1e-3  # the same where derivatives are differences already
+_CORNERS = 14  # inputs up to which all corners are looked at
+_DRAWS = 200  # batches of points, until enough are allowed
+_TOLD = 1e-4  # efficiency that another round of the bound must gain
+_MINUTE = 60.0  # seconds where no limit is given
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Refinement(Selection):
+    """Commands between the candidates, and how good they are; printed, a table.
+
+    Its ``indices`` count the rows of ``problem.candidates``, of which the first k are
+    the commands.
+    """
+
+    began: float = np.nan  # value of the design that it began with
+    search_error: float = np.nan  # share by which two searches for the bound disagree
+    certain: bool = False  # the bound is proven
+
+    @property
+    def commands(self) -> Array:
+        """(k, n)."""
+        assert self.problem.candidates is not None
+        return self.problem.candidates[self.indices]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, text and lists, as a JSON file takes them."""
+        content = super().to_dict()
+        del content["indices"], content["labels"]
+        content["commands"] = content.pop("candidates")
+        return content | {
+            "began": None if np.isnan(self.began) else self.began,
+            "search_error": self.search_error,
+            "bound_is_proven": self.certain,
+        }
+
+    def __str__(self) -> str:
+        rows = [[f"{x:.6g}" for x in row] for row in self.commands]
+        side = "upper" if self.problem.criterion.larger_is_better else "lower"
+        proof = (
+            "proven"
+            if self.certain
+            else f"by a search, not a proof; two differ by {self.search_error:.1g}"
+        )
+        name = self.criterion
+        lines = [
+            f"{len(rows)} commands, method {self.method}",
+            *aligned([self._axes(), *rows]),
+            f"{CRITERIA[name].says:13} {self.value:.6g}"
+            + ("" if np.isnan(self.began) else f" (began at {self.began:.6g})"),
+            f"{side + ' bound':13} {self.bound:.6g} ({proof})",
+            f"{name + '-efficiency':13} {self.efficiency:.6f} or more",
+            f"{'without one':13} {self._lost()}",
+            f"time          {self.seconds:.3g} s, seed {self.seed}",
+        ]
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+def optimise(
+    limits: ArrayLike,
+    k: int | None = None,
+    model: Model | None = None,
+    *,
+    prior: Prior | None = None,
+    noise: Noise | None = None,
+    criterion: Any = None,
+    region: ArrayLike | None = None,
+    measured: ArrayLike | None = None,
+    allowed: Allowed | None = None,
+    starts: int = 8,
+    seed: int = 0,
+    time_limit: float | None = None,
+) -> Refinement:
+    """The k commands within limits whose measurements say most about the parameters.
+
+    Args:
+        limits: (n, 2) least and greatest command of each input.
+        k: commands to choose, which may repeat; the fewest that identify when None.
+        model: of ``jaxcal.models``; ``y = A u + b`` when not given.
+        prior, noise, criterion, measured: as of ``Design`` and ``select``.
+        region: (R, n) commands of criterion I; spread over the limits when not given.
+        allowed: f(u (n,)) -> whether the command may be given.
+        starts: of the search.
+        seed: of points that are drawn.
+        time_limit: seconds, 60 when not given; the best so far is returned.
+
+    Returns:
+        The commands, the value, and a bound by a search.
+
+    Raises:
+        ValueError: naming the argument, the rule and the value.
+    """
+    box = _limits(limits)
+    model = as_model(model) if model is not None else Affine(len(box), len(box))
+    pool = _drawn(box, _POOL, allowed, seed)
+    design = CandidateSet(pool, model, prior, noise, measured, max_replicates=_POOL)
+    search = _Search(design, box, allowed, k, criterion, region, seed, time_limit)
+    return search.run(None, whole_number("starts", starts, 1))
+
+
+def refine(
+    design: CandidateSet,
+    selection: Any,
+    limits: ArrayLike | None = None,
+    *,
+    criterion: Any = None,
+    region: ArrayLike | None = None,
+    allowed: Allowed | None = None,
+    starts: int = 4,
+    seed: int = 0,
+    time_limit: float | None = None,
+) -> Refinement:
+    """See ``jaxcal.Design.refine``."""
+    if design.model is None or design.candidates is None:
+        raise ValueError("refine needs candidates and a model, not blocks")
+    rows = selection.indices if isinstance(selection, Selection) else selection
+    rows = array_of("selection", rows, "k").astype(np.int64)
+    outside = (rows < 0) | (rows >= len(design.candidates))
+    require_none(outside, rows, f"selection must lie in [0, {len(design.candidates)})")
+    if criterion is None and isinstance(selection, Selection):
+        criterion = _asked(selection)
+    usable = design.candidates[design.available]
+    given = limits
+    if given is None:
+        given = np.stack([usable.min(axis=0), usable.max(axis=0)], axis=1)
+    box = _limits(given)
+    begun = design.candidates[rows]
+    beyond = (begun < box[:, 0]) | (begun > box[:, 1])
+    require_none(beyond, begun, "selection must be within the limits")
+    if allowed is not None:
+        bad = ~_permitted(allowed, begun)
+        if bad.any():
+            raise ValueError(
+                "allowed must hold for the commands that are refined, got False for "
+                f"{in_words(begun[bad][0])}"
+            )
+    search = _Search(
+        design, box, allowed, len(begun), criterion, region, seed, time_limit
+    )
+    return search.run(begun, whole_number("starts", starts, 1))
+
+
+def _asked(selection: Selection) -> Any:
+    """The criterion of a selection, asked for again."""
+    name = selection.criterion
+    if name in ("Ds", "As"):
+        raise ValueError(
+            f"criterion {name} must be given again, with its parameters: "
+            f"refine(..., criterion=jaxcal.{name}([...]))"
+        )
+    return name
+
+
+def _limits(limits: ArrayLike) -> Array:
+    box = array_of("limits", limits, "n", 2)
+    if not len(box) or not (box[:, 0] < box[:, 1]).all():
+        bad = box[~(box[:, 0] < box[:, 1])]
+        raise ValueError(
+            "limits must be (n, 2), least below greatest, got "
+            f"{in_words(bad[0]) if len(bad) else 'none'}"
+        )
+    return box
+
+
+def _permitted(allowed: Allowed | None, commands: Array) -> NDArray[np.bool_]:
+    if allowed is None:
+        return np.ones(len(commands), dtype=np.bool_)
+    return np.array([bool(allowed(row.copy())) for row in commands], dtype=np.bool_)
+
+
+def _drawn(box: Array, count: int, allowed: Allowed | None, seed: int) -> Array:
+    """(count, n) allowed points that fill the limits evenly, corners among them.
+
+    Where few are, points next to them too: a thin set is found by its neighbours.
+    """
+    n, rng = len(box), np.random.default_rng(seed)
+    # The sequence of Roberts (2018): shares of the root of x^(n + 1) = x + 1.
+    root = 2.0
+    for _ in range(60):
+        root = (1.0 + root) ** (1.0 / (n + 1.0))
+    shares, shift = root ** -np.arange(1.0, n + 1.0), rng.random(n)
+
+    def even(first: int, size: int) -> Array:
+        return (shift + np.arange(first, first + size)[:, None] * shares) % 1.0
+
+    corners = np.zeros((0, n))
+    if 1 << n <= count // 2:
+        corners = np.array(np.meshgrid(*[[0.0, 1.0]] * n)).reshape(n, -1).T
+    found, size = np.zeros((0, n)), count
+    unit = np.concatenate([corners, even(0, size)])
+    for batch in range(_DRAWS):
+        points = box[:, 0] + unit * np.ptp(box, axis=1)
+        found = np.concatenate([found, points[_permitted(allowed, points)]])
+        if len(found) >= count:
+            return found[:count]
+        if len(found) and batch % 2:
+            near = found[rng.integers(len(found), size=size)] - box[:, 0]
+            near = near / np.ptp(box, axis=1) + rng.normal(0.0, 0.05, (size, n))
+            unit = near.clip(0.0, 1.0)
+        else:
+            unit = even((batch + 1) * size, size)
+    if not len(found):
+        raise ValueError(
+            f"allowed must hold somewhere within the limits, but is False at all "
+            f"{_DRAWS * size} points tried"
+        )
+    return found
+
+
+def _descended(
+    down: Callable[[Array], tuple[float, Array]],
+    x: Array,
+    low: float,
+    high: float,
+    iterations: int,
+) -> Array:
+    """The lowest point on the way down from x between low and high.
+
+    Spectral projected gradients (Birgin, Martinez and Raydan, 2000): steps as long as
+    the last change of the gradient says, that need not go down each. Unlike L-BFGS of
+    scipy it calls no BLAS, whose threads wait for each other.
+    """
+    value, slope = down(x)
+    best, least, history = x, value, [value]
+    length = 0.1 / max(float(np.abs(slope).max()), 1e-300)
+    for _ in range(iterations):
+        step = (x - length * slope).clip(low, high) - x
+        gain = float(slope @ step)
+        if gain > -1e-14 * max(1.0, abs(value)):
+            break
+        share = 1.0
+        for _ in range(30):
+            trial = x + share * step
+            new_value, new_slope = down(trial)
+            if new_value <= max(history) + 1e-4 * share * gain:
+                break
+            share *= 0.3
+        else:
+            break
+        moved, turned = trial - x, new_slope - slope
+        bent = float(moved @ turned)
+        square = float(moved @ moved)
+        length = min(max(square / bent, 1e-10), 1e10) if bent > 0.0 else 10.0 * length
+        x, value, slope = trial, new_value, new_slope
+        history = [*history[-6:], value]
+        if value < least:
+            best, least = x, value
+    return best
+
+
+def _filled(commands: Array) -> Array:
+    """Commands and copies of the last up to a power of two: JAX compiles by number."""
+    more = (1 << (len(commands) - 1).bit_length()) - len(commands)
+    return np.concatenate([commands, np.repeat(commands[-1:], more, axis=0)])
+
+
+class _Search:
+    """Blocks of any command, the criterion, and the moves of a search."""
+
+    def __init__(
+        self,
+        design: CandidateSet,
+        box: Array,
+        allowed: Allowed | None,
+        k: int | None,
+        criterion: Any,
+        region: ArrayLike | None,
+        seed: int,
+        time_limit: float | None,
+    ) -> None:
+        self.started = time.perf_counter()
+        limit = _MINUTE if time_limit is None else seconds("time_limit", time_limit)
+        self.end = self.started + limit
+        self.design, self.box, self.allowed, self.seed = design, box, allowed, seed
+        self.low, self.span = box[:, 0], np.ptp(box, axis=1)
+        assert design.candidates is not None and design.model is not None
+        n = design.candidates.shape[1]
+        if len(box) != n:
+            raise ValueError(f"limits must be ({n}, 2) for this model, got {box.shape}")
+        noise = design.noise or Noise()
+        for given, axes in ((noise.std, 1), (noise.covariance, 2)):
+            if given is not None and np.ndim(given) > axes:
+                raise ValueError(
+                    "noise must be the same for all commands, got one for each of "
+                    "the candidates"
+                )
+        self.asked, self.region = criterion, region
+        problem = design.problem(k, criterion, region)
+        if isinstance(problem, ScenarioProblem):
+            raise ValueError("refine is of one set of parameters, got scenarios")
+        self.problem: Problem = problem
+        self.k, self.objective = problem.k, problem.criterion
+        of_one = self.objective.name
+        by_name = CRITERIA[of_one].by_name
+        self.source = design.source(by_name, CRITERIA[of_one].of_region)
+        self.rough = _ROUGH if design.model.resolution else _STEP
+
+    # -- the criterion -----------------------------------------------------------------
+
+    def blocks(self, commands: Array) -> Array:
+        """(N, q, p) whitened."""
+        return self.problem.white.of(
+            self.source.at("commands", _filled(commands), True)
+        )[: len(commands)]
+
+    def information(self, blocks: Array) -> Array:
+        rows = blocks.reshape(-1, blocks.shape[-1])
+        return rows.T @ rows + self.problem.prior
+
+    def phi(self, information: Array) -> Array:
+        return np.asarray(self.objective.value(information))
+
+    def gradient(self, information: Array) -> Array:
+        """(p, p) of phi by the information."""
+        root, kind = self.objective.root, self.objective.kind
+        half = np.linalg.solve(information, root.T)  # M^-1 C.T
+        covariance = root @ half
+        if kind == "det":
+            return np.asarray(half @ np.linalg.solve(covariance, half.T))
+        if kind == "trace":
+            return np.asarray(half @ half.T)
+        values, vectors = np.linalg.eigh(covariance)
+        along = half @ vectors[:, -1]
+        return np.outer(along, along) / values[-1] ** 2
+
+    def score(self, phi: float) -> tuple[float, float]:
+        """What is climbed, in which a hundredth is a percent, and its slope by phi."""
+        if self.objective.kind == "det":
+            size = len(self.objective.root)
+            return phi / size, 1.0 / size
+        if self.objective.kind == "trace":
+            return -float(np.log(-phi)), -1.0 / phi
+        return float(np.log(phi)), 1.0 / phi
+
+    @staticmethod
+    def leverage(blocks: Array, metric: Array) -> Array:
+        """(N,) d."""
+        return np.einsum("nqa,ab,nqb->n", blocks, metric, blocks)
+
+    def slopes(self, commands: Array, metric: Array) -> Array:
+        """(N, n) of d by the commands, in shares of the limits."""
+        exact = self._exact_slopes(commands, metric)
+        if exact is not None:
+            return exact * self.span
+        count, n = commands.shape
+        step = self.rough * self.span * np.eye(n)
+        ahead = np.minimum(commands[:, None] + step, self.box[:, 1])
+        back = np.maximum(commands[:, None] - step, self.box[:, 0])
+        both = np.concatenate([ahead, back]).reshape(-1, n)
+        d = self.leverage(self.blocks(both), metric).reshape(2, count, n)
+        apart = np.einsum("nii->ni", ahead - back) / self.span
+        return np.asarray((d[0] - d[1]) / apart)
+
+    def _exact_slopes(self, commands: Array, metric: Array) -> Array | None:
+        """(N, n) by the model's own derivative, where it has one."""
+        basis = self.problem.white.basis
+        metric = basis @ metric @ basis.T
+        found = self.source.leverage_slopes(_filled(commands), metric)
+        return None if found is None else found[: len(commands)]
+
+    # -- the search --------------------------------------------------------------------
+
+    def run(self, begun: Array | None, starts: int) -> Refinement:
+        """From ``begun`` (k, n), and other starts."""
+        rng = np.random.default_rng(self.seed)
+        began, best, best_phi = np.nan, begun, -np.inf
+        if begun is not None:
+            best_phi = float(self.phi(self.information(self.blocks(begun))))
+        first_phi = best_phi
+        for start in self._starts(begun, starts, rng):
+            commands, phi = self._climbed(start)
+            if phi > best_phi:
+                best, best_phi = commands, phi
+            if self._late():
+                break
+        if best is None or not np.isfinite(best_phi):
+            raise ValueError(
+                "limits must allow a design that identifies every parameter, but the "
+                "best found is singular"
+            )
+        best, best_phi = self._swapped(best, best_phi)
+        bound, error, certain = self._bound(best, best_phi)
+        if begun is not None:
+            began = self._judged(begun)[1]
+        problem, value, log_det = self._judged(best)
+        assert begun is None or best_phi >= first_phi
+        return Refinement(
+            indices=np.arange(self.k),
+            value=value,
+            log_det=log_det,
+            method="optimise" if begun is None else "refine",
+            proven=False,
+            seconds=time.perf_counter() - self.started,
+            problem=problem,
+            seed=self.seed,
+            known_bound=float(self.objective.reported(bound)),
+            axes=self.design.axes or getattr(self.design.model, "inputs", None) or None,
+            began=began,
+            search_error=error,
+            certain=certain,
+        )
+
+    def _late(self) -> bool:
+        return time.perf_counter() > self.end
+
+    def _starts(self, begun: Array | None, count: int, rng: np.random.Generator) -> Any:
+        """Designs (k, n), the best guesses first; none of them singular."""
+        if begun is not None:
+            yield begun
+            count -= 1
+        candidates = self.design.candidates
+        assert candidates is not None
+        usable = np.flatnonzero(self.design.available)
+        if self.allowed is not None and begun is not None:
+            usable = usable[_permitted(self.allowed, candidates[usable])]
+        for i in range(count):
+            share = usable
+            if i:  # another part of the pool
+                few = max(4 * self.problem.num_regressors, 2 * self.k, 24)
+                share = rng.permutation(usable)[: min(few, len(usable))]
+            one = dataclasses.replace(
+                self.problem,
+                available=np.isin(np.arange(len(candidates)), share),
+                required=np.zeros(0, dtype=np.int64),
+                max_replicates=self.k,
+            )
+            try:
+                yield candidates[exchange_indices(one, 10, self.seed + i)]
+            except ValueError:  # singular: another part
+                continue
+
+    def _climbed(self, commands: Array) -> tuple[Array, float]:
+        """All commands together up to a local optimum, never lower than they were."""
+        shape = commands.shape
+        best, best_phi = (
+            commands,
+            float(self.phi(self.information(self.blocks(commands)))),
+        )
+        if not np.isfinite(best_phi):
+            return best, best_phi
+
+        def down(x: Array) -> tuple[float, Array]:
+            at = self.low + x.reshape(shape) * self.span
+            information = self.information(self.blocks(at))
+            phi = float(self.phi(information))
+            if not np.isfinite(phi) or self._late():
+                return 1e10, np.zeros_like(x)
+            score, rate = self.score(phi)
+            return -score, -rate * self.slopes(at, self.gradient(information)).ravel()
+
+        start = ((commands - self.low) / self.span).clip(0.0, 1.0).ravel()
+        found = _descended(down, start, 0.0, 1.0, 300)
+        there = self.low + found.reshape(shape) * self.span
+        there = there.clip(self.box[:, 0], self.box[:, 1])
+        phi = float(self.phi(self.information(self.blocks(there))))
+        if phi > best_phi and _permitted(self.allowed, there).all():
+            best, best_phi = there, phi
+        if self.allowed is not None or self.objective.kind == "least":
+            best, best_phi = self._tried(best, best_phi)
+        return best, best_phi
+
+    def _tried(self, commands: Array, phi: float) -> tuple[Array, float]:
+        """Commands moved one by one by trial, where they are allowed."""
+        rng = np.random.default_rng(self.seed)
+        commands = commands.copy()
+        radius = np.full(len(commands), 0.1)
+        ahead = np.zeros_like(commands)  # the way that was last taken
+        blocks = self.blocks(commands)
+        while radius.max() > _SMALLEST and not self._late():
+            for i in np.flatnonzero(radius > _SMALLEST):
+                information = self.information(blocks)
+                metric = self.gradient(information)
+                slope = self.slopes(commands[[i]], metric)[0]
+                trial = self._trials(commands[i], radius[i], slope, ahead[i], rng)
+                radius[i] *= 0.5
+                if not len(trial):
+                    continue
+                new = self.blocks(trial)
+                rest = information - blocks[i].T @ blocks[i]
+                phis = self.phi(rest + np.matrix_transpose(new) @ new)
+                j = int(np.argmax(phis))
+                if phis[j] > phi:
+                    gained = self.score(float(phis[j]))[0] - self.score(phi)[0]
+                    ahead[i] = (trial[j] - commands[i]) / self.span
+                    commands[i], blocks[i], phi = trial[j], new[j], float(phis[j])
+                    if gained > _GAIN:
+                        radius[i] = min(4.0 * radius[i], 0.3)
+        return commands, phi
+
+    def _trials(
+        self, command: Array, radius: float, slope: Array, ahead: Array, rng: Any
+    ) -> Array:
+        """(T, n) allowed commands about one, at a distance of the radius in limits.
+
+        Along the slope, along it beside what is not allowed, on as before, along axes
+        and their differences, and anywhere.
+        """
+        n = len(command)
+        ways = [slope, ahead, *np.eye(n), *-np.eye(n), *rng.normal(size=(_TRIALS, n))]
+        if n <= _PAIRED:
+            pairs = np.eye(n)[:, None] - np.eye(n)
+            ways += [*pairs.reshape(-1, n)]
+        unit = np.array(ways)
+        unit = unit[unit.any(axis=1)]
+        unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+        trial = command + radius * unit * self.span
+        trial = trial.clip(self.box[:, 0], self.box[:, 1])
+        free = _permitted(self.allowed, trial)
+        if free.all() or not free.any():
+            return trial[free]
+        across = unit[free].mean(axis=0) - unit[~free].mean(axis=0)
+        size = across @ across
+        along = slope - (slope @ across) / (size or 1.0) * across
+        more = command + np.outer(radius * np.array([1.0, 0.3, 0.1]), along) * (
+            self.span / (np.linalg.norm(along) or 1.0)
+        )
+        more = more.clip(self.box[:, 0], self.box[:, 1])
+        return np.concatenate([trial[free], more[_permitted(self.allowed, more)]])
+
+    def _swapped(self, commands: Array, phi: float) -> tuple[Array, float]:
+        """Single commands moved to where d is largest, then all together, again."""
+        for _ in range(_SWAPS):
+            blocks = self.blocks(commands)
+            information = self.information(blocks)
+            peaks, _, _ = self._peaks(self.gradient(information))
+            new = self.blocks(peaks)
+            rest = information - np.matrix_transpose(blocks) @ blocks  # (k, p, p)
+            gained = self.phi(rest[:, None] + (np.matrix_transpose(new) @ new)[None])
+            i, j = np.unravel_index(np.argmax(gained), gained.shape)
+            if not gained[i, j] > phi or self._late():
+                break
+            trial = commands.copy()
+            trial[i] = peaks[j]
+            there, higher = self._climbed(trial)
+            if self.score(higher)[0] < self.score(phi)[0] + 1e-9:
+                break
+            commands, phi = there, higher
+        return commands, phi
+
+    # -- the bound ---------------------------------------------------------------------
+
+    @functools.cached_property
+    def _spread(self) -> Array:
+        """(R, n) points over the limits, where d is looked at."""
+        count = _SEARCH if not self.design.model.resolution else _POOL  # type: ignore[union-attr]
+        return _drawn(self.box, count, self.allowed, self.seed + 1)
+
+    @functools.cached_property
+    def _spread_blocks(self) -> Array:
+        return self.blocks(self._spread)
+
+    def _peaks(self, metric: Array) -> tuple[Array, Array, float]:
+        """Local maxima (A, n) of d, d there, and by how much two searches disagree."""
+        d = self.leverage(self._spread_blocks, metric)
+        order = np.argsort(-d)
+        starts: list[int] = []
+        for row in order:  # far from each other
+            apart = [
+                np.abs((self._spread[row] - self._spread[other]) / self.span).max()
+                for other in starts
+            ]
+            if not apart or min(apart) > 0.05:
+                starts.append(int(row))
+            if len(starts) == 2 * _ASCENTS:
+                break
+        ends, heights = self._ascents(self._spread[starts], metric)
+        halves = [heights[half::2].max(initial=-np.inf) for half in (0, 1)]
+        most = max(halves)
+        error = float(most - min(halves)) if np.isfinite(min(halves)) else float(most)
+        return ends, heights, error
+
+    def _ascents(self, points: Array, metric: Array) -> tuple[Array, Array]:
+        """Ends (A, n) of climbs from points, and d there."""
+        shape = points.shape
+        d = self.leverage(self.blocks(points), metric)
+        size = float(d.max()) or 1.0
+
+        def down(x: Array) -> tuple[float, Array]:
+            at = self.low + x.reshape(shape) * self.span
+            value = self.leverage(self.blocks(at), metric).sum() / size
+            return -value, -self.slopes(at, metric).ravel() / size
+
+        start = ((points - self.low) / self.span).clip(0.0, 1.0).ravel()
+        found = _descended(down, start, 0.0, 1.0, 150)
+        there = self.low + found.reshape(shape) * self.span
+        there = there.clip(self.box[:, 0], self.box[:, 1])
+        higher = self.leverage(self.blocks(there), metric)
+        kept = (higher > d) & _permitted(self.allowed, there)
+        return np.where(kept[:, None], there, points), np.where(kept, higher, d)
+
+    def _bound(self, commands: Array, phi: float) -> tuple[float, float, bool]:
+        """Upper bound on phi of k commands; share two searches differ by; is it proven.
+
+        The best weighted design of the commands and the peaks found so far gives M0.
+        """
+        assert self.design.model is not None
+        convex = self.design.model.affine(self.design.model.nominal) is not None
+        certain = convex and len(self.box) <= _CORNERS
+        support, blocks = commands, self.blocks(commands)
+        weights = np.ones(len(commands)) / len(commands)
+        best, error = np.inf, 0.0
+        for _ in range(_ROUNDS):
+            weights = self._weights(blocks, weights)
+            rows = (np.sqrt(self.k * weights)[:, None, None] * blocks).reshape(
+                -1, blocks.shape[-1]
+            )
+            information = rows.T @ rows + self.problem.prior
+            at = float(self.phi(information))
+            if not np.isfinite(at):
+                break
+            metric = self.gradient(information)
+            off = float((metric * (self.problem.prior - information)).sum())
+            if certain:
+                corners = np.array(np.meshgrid(*self.box)).reshape(len(self.box), -1).T
+                peaks, differ = corners, 0.0
+                heights = self.leverage(self.blocks(corners), metric)
+            else:
+                peaks, heights, differ = self._peaks(metric)
+                of_support = self.leverage(blocks, metric)
+                heights = np.append(heights, of_support)
+                peaks = np.concatenate([peaks, support])
+            bound = at + off + self.k * float(heights.max())
+            before = best
+            if bound < best:
+                best, error = bound, differ / max(float(heights.max()), 1e-300)
+            gap = self._share(phi, best)
+            if gap > 1.0 - 1e-9 or self._late():
+                break
+            if np.isfinite(before) and gap - self._share(phi, before) < _TOLD:
+                slack = self.k * float(heights.max()) + off
+                if slack < 1e-6 * max(abs(at), 1.0):
+                    break
+            fresh = np.argsort(-heights)[: 2 * self.problem.num_regressors]
+            new = peaks[fresh]
+            far = (np.abs((new[:, None] - support) / self.span).max(axis=2) > 1e-6).all(
+                1
+            )
+            if not far.any():
+                break
+            support = np.concatenate([support, new[far]])
+            blocks = np.concatenate([blocks, self.blocks(new[far])])
+            fill = np.full(int(far.sum()), 0.02 / int(far.sum()))
+            weights = np.concatenate([0.98 * weights, fill])
+        return max(best, phi), error, certain
+
+    def _share(self, phi: float, bound: float) -> float:
+        reported = self.objective.reported
+        return float(
+            self.objective.efficiency(float(reported(phi)), float(reported(bound)))
+        )
+
+    def _weights(self, blocks: Array, weights: Array) -> Array:
+        """(S,) of sum 1, near the best for k commands at these blocks (S, q, p)."""
+        grams = self.k * np.matrix_transpose(blocks) @ blocks
+
+        def down(z: Array) -> tuple[float, Array]:
+            e = np.exp(z - z.max())
+            w = e / e.sum()
+            information = np.tensordot(w, grams, 1) + self.problem.prior
+            phi = float(self.phi(information))
+            if not np.isfinite(phi):
+                return 1e10, np.zeros_like(z)
+            score, rate = self.score(phi)
+            slope = rate * (grams * self.gradient(information)).sum(axis=(1, 2))
+            return -score, -w * (slope - w @ slope)
+
+        start = np.log(np.maximum(weights, 1e-9))
+        found = _descended(down, start, -np.inf, np.inf, 300)
+        e = np.exp(found - found.max())
+        return np.asarray(e / e.sum())
+
+    # -- the answer --------------------------------------------------------------------
+
+    def _judged(self, commands: Array) -> tuple[Problem, float, float]:
+        """The problem of commands and all candidates; value and log det of them."""
+        design = self.design
+        assert design.candidates is not None
+        pool = design.candidates[design.available]
+        region = self.region
+        if region is None and CRITERIA[self.objective.name].of_region:
+            region = pool
+        own = CandidateSet(
+            np.concatenate([commands, pool]), design.model, design.prior, design.noise,
+            design._measured,
+        )  # fmt: skip
+        problem = own.problem(self.k, self.asked, region)
+        value, log_det = values(problem, np.arange(self.k)[None])
+        return problem, float(value[0]), float(log_det[0])
