@@ -27,8 +27,8 @@ from typing import Any
 from rig.config import RigConfig, parse_config
 from rig.config.config import EXAMPLES
 from rig.core.device import Device, Posture
-from rig.core.faults import Fault, StopRequested
 from rig.core.motion import move
+from rig.faults import Fault, StopRequested
 from rig.signals import Signals
 from rig.simulator import Simulator, Truth, parse_fault
 
@@ -71,7 +71,7 @@ def session(transport: str, dead: bool, rng: random.Random) -> float:
         checked: Any = SimpleNamespace(missing=lambda *_: None, state=lambda _: None)
         with Signals() as signals:
             device = Device(served, run, checked, signals)
-            with device.imu as imu, device.bus:
+            with device.imu as imu, device.line:
                 simulator.start_phone(imu.port)
                 imu.wait_for_stream(10)
                 device.arm()

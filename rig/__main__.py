@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from jaxcal.arguments import values_of
 from jaxcal.extras import install
 from rig.commands import make_parser
-from rig.core.faults import EXIT_BAD_INPUT, EXIT_FAULT, EXIT_INTERRUPTED, told
+from rig.faults import EXIT_BAD_INPUT, EXIT_FAULT, EXIT_INTERRUPTED, told
 from rig.journal.errors import JournalError
 
 # Looked for before any port opens; finding is quicker than importing.

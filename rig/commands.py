@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from jaxcal.arguments import Parser
-from rig.core.faults import EXIT_FAULT, EXIT_OK, EXIT_RECALIBRATE, Refused
+from rig.faults import EXIT_FAULT, EXIT_OK, EXIT_RECALIBRATE, Refused
 
 if TYPE_CHECKING:
     from rig.config import RigConfig
@@ -197,7 +197,10 @@ def scan(given: Target, *, bus: BusName = "", units: Units = 16) -> int:
     else:
         with _place(given) as place:
             maps = tuple(axis.map for axis in place.config.axes)
-            found = scanning.scan(place.config.bus, units, _say, maps)
+            # Units of other lines than Modbus are those of rig.toml.
+            found = list[Any](maps)
+            if place.config.bus.transport in scanning.OF_BUS:
+                found = list(scanning.scan(place.config.bus, units, _say, maps))
             if found:
                 steps.identify(place)
     return EXIT_OK if found else EXIT_FAULT
@@ -376,7 +379,7 @@ def watch(run: RunPath) -> int:
 
 def identify(given: Target) -> int:
     """read identity and status of every drive; write nothing"""
-    from rig.core.bus import BusError
+    from rig.drives.line import BusError
 
     code = EXIT_OK
     with _place(given) as place, place.bus("identify") as drives:
@@ -385,15 +388,16 @@ def identify(given: Target) -> int:
             unit = f"{axis.name} (unit {axis.unit}"
             try:
                 status, alarm = drive.status(), drive.alarm()
-                identity = drive.identity()
+                identity = drive.ids()
             except BusError as error:
                 code = EXIT_FAULT
                 print(f"{unit}): {error}")
                 continue
-            flags = axis.map.status.flags(status.word)
-            words = " ".join(name for name, on in flags.items() if on)
+            flags = ("enabled", "done", "moving", "fault")
+            words = " ".join(name for name in flags if getattr(status, name))
+            word = "" if status.word is None else f"0x{status.word:04X} "
             print(
-                f"{unit}, {axis.map.title}): status 0x{status.word:04X} {words}, "
+                f"{unit}, {axis.map.title}): status {word}{words}, "
                 f"position {status.position} pulses = "
                 f"{axis.to_deg(status.position):.4f} {axis.unit_name}"
                 + (alarm and f", {alarm}"),
@@ -516,13 +520,13 @@ def simulate(
     config = given.load(simulated=True)
     with given.simulator(config) as simulator:
         served = simulator.start(config.bus.port if bus_port is None else bus_port)
-        phone = f"listens on 127.0.0.1:{served.imu.port}"
-        if config.imu.transport == "listen":
-            port = config.imu.port or 2055
+        phone = f"listens on 127.0.0.1:{served.source.port}"
+        if config.source.transport in ("listen", "udp"):
+            port = config.source.port or 2055
             simulator.start_phone(port)
             phone = f"sends to 127.0.0.1:{port}"
         print(f"drives: {served.bus.where}; units {[a.unit for a in config.axes]}")
-        print(f"phone: {config.imu.format}, {phone}")
+        print(f"{'phone: ' + config.imu.format if config.imu else 'sensor'}, {phone}")
         print("Ctrl-C ends", flush=True)
         with contextlib.suppress(KeyboardInterrupt):
             while True:

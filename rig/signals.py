@@ -9,7 +9,7 @@ import time
 from types import FrameType
 from typing import Any
 
-from rig.core.faults import Requests
+from rig.faults import Requests
 
 # What ends or suspends a program: a session that moves stops its drives first.
 STOPS = (

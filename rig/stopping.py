@@ -18,7 +18,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from rig.core.faults import EXIT_FAULT, EXIT_OK, Fault, Refused
+from rig.faults import EXIT_FAULT, EXIT_OK, Fault, Refused
 from rig.journal.lock import BusLock, armed_files, held_by, read_armed
 
 if TYPE_CHECKING:
@@ -35,7 +35,14 @@ class Target:
     """One bus: its lock, and what of it was armed last."""
 
     def __init__(self, bus: dict[str, Any]) -> None:
-        known = {"transport": "", "host": "", "port": 502, "device": ""} | bus
+        known = {
+            "transport": "",
+            "host": "",
+            "port": 502,
+            "device": "",
+            "interface": "",
+        }
+        known |= bus
         where = known["device"] or f"{known['host']}:{known['port']}"
         settings: Any = SimpleNamespace(**known, where=where)  # pydantic's are heavy
         self.lock = BusLock(settings)
@@ -105,7 +112,9 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
             _say(f"{lack}: stopping all that sessions of this user have armed")
         for target in found:
             target.ask()
-        from rig.core import drive, stop  # noqa: F401  # while those asked have time
+        # While those asked have time.
+        from rig.core import stop  # noqa: F401
+        from rig.drives import modbus  # noqa: F401
 
         results: list[UnitStop] = []
         faults: list[Fault] = []
@@ -190,8 +199,8 @@ def _stop_units(
     Who was asked to is waited for first. ``stay``: look whether they stay, too.
     """
     from rig.core import stop
-    from rig.core.bus import Bus, BusError
-    from rig.core.drive import Drive
+    from rig.drives import make_drives
+    from rig.drives.line import BusError
 
     target.end()
     settings, silence_s, axes = _drives(target.armed, path)
@@ -200,13 +209,12 @@ def _stop_units(
             stack.enter_context(target.lock.acquire("stop"))
         except (OSError, Refused):  # stop without the lock
             _say(f"{target.lock.where} is not free: its drives are stopped anyway")
-        bus = Bus(settings, silence_s)
+        line, drives = make_drives(settings, axes, silence_s)
         try:
-            bus.open()
+            line.open()
         except BusError as error:
             raise BusError(f"{NOTHING}: {error}", LAST_RESORT) from None
-        with bus:
-            drives = [Drive(bus, axis) for axis in axes]
+        with line:
             results = stop.stop_all(drives)
             named = ", ".join(f"{axis.name} (unit {axis.unit})" for axis in axes)
             _say(f"stopping {named} on {target.lock.where}")
@@ -223,8 +231,8 @@ def _drives(
     """Bus, silence and axes: of what is armed, else of the file, else as armed last."""
     from rig.config.axis import Axis
     from rig.config.config import load_config
-    from rig.config.maps import RegisterMap
-    from rig.config.schema import ConfigError, parse
+    from rig.config.maps import parse_map
+    from rig.config.schema import ConfigError
     from rig.config.settings import BusSettings
 
     if path is not None and (armed is None or armed["standing"]):
@@ -237,7 +245,11 @@ def _drives(
             _say(f"{error}\nstopping the drives that were armed last instead")
     assert armed is not None
     axes = [
-        Axis.unmoved(each["name"], each["unit"], parse(RegisterMap, each["map"], "map"))
+        Axis.unmoved(
+            each["name"],
+            each["unit"],
+            parse_map(each["map"], "map", pathlib.Path(each.get("folder", ""))),
+        )
         for each in armed["drives"]
     ]
     return BusSettings.model_validate(armed["bus"]), armed["silence_s"], axes

@@ -49,7 +49,8 @@ def configuration() -> str:
             "",
             "`jaxcal-rig setup` writes it; [Calibrate a device](../rig.md).",
             "",
-            "`axes.*` are the three `[[axes]]` tables.",
+            "`axes.*` are the `[[axes]]` tables, 1 to 6. A device has `[imu]` or",
+            "`[readings]`.",
             "",
             table(RigConfig, advanced=False),
             "",
@@ -87,7 +88,7 @@ def table(model: Any, nested: bool = True, advanced: bool = False) -> str:
         for name, described in keys["properties"].items():
             inner = resolved(described, root)
             if inner.get("type") == "array" and name == "axes":
-                inner = resolved(inner["prefixItems"][0], root)
+                inner = resolved(inner["items"], root)
                 name = "axes.*"
             if nested and "properties" in inner:
                 add(inner, f"{prefix}{name}.")

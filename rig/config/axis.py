@@ -12,7 +12,7 @@ from pydantic import (
     model_validator,
 )
 
-from rig.config.maps import RegisterMap, encode, load_map
+from rig.config.maps import DriveMap, Units, encode, load_map
 from rig.config.schema import Section, advanced, key
 
 AXIS_NAMES = ("pitch", "yaw", "roll")  # of the device that `setup` begins with
@@ -83,7 +83,7 @@ class Scale(Section):
         return pulses / self.pulses_per_deg
 
 
-def _map(name: Any, info: ValidationInfo) -> RegisterMap:
+def _map(name: Any, info: ValidationInfo) -> DriveMap:
     if not isinstance(name, str) or not name:
         raise ValueError(f"must be the name of a map or of a file, got {name!r}")
     return load_map(name, (info.context or {}).get("folder"))
@@ -114,8 +114,8 @@ class Axis(Scale):
     )
     unit: int = key("Modbus unit id", ..., 1, 247)
     map: Annotated[
-        RegisterMap, BeforeValidator(_map), WithJsonSchema({"type": "string"})
-    ] = key("register map: a name, or a .toml file relative to this one")
+        DriveMap, BeforeValidator(_map), WithJsonSchema({"type": "string"})
+    ] = key("of its drive: a name, or a .toml file relative to this one")
     min_deg: JointAngle = key("soft limit", ..., -10_000, 10_000)
     max_deg: JointAngle = key("soft limit", ..., -10_000, 10_000)
     speed_deg_s: float = key("of every move", ..., 1e-3, 5000)
@@ -143,9 +143,9 @@ class Axis(Scale):
         return next((new for new, old in pairs if old == name), name)
 
     @classmethod
-    def unmoved(cls, name: str, unit: int, register_map: RegisterMap) -> "Axis":
+    def unmoved(cls, name: str, unit: int, drive_map: DriveMap) -> "Axis":
         """A drive that is read or stopped and never moved: nothing else is known."""
-        return cls.model_construct(name=name, rotates="X", unit=unit, map=register_map)
+        return cls.model_construct(name=name, rotates="X", unit=unit, map=drive_map)
 
     @property
     def min_pulses(self) -> int:
@@ -159,10 +159,9 @@ class Axis(Scale):
         """A tolerance in degrees as whole pulses, at least one."""
         return max(1, round(angle_deg * abs(self.pulses_per_deg)))
 
-    @property
-    def _counts_per_deg(self) -> tuple[float, float]:
+    def _counts_per_deg(self, units: Units) -> tuple[float, float]:
         """Register counts of 1 deg/s and of 1 deg/s^2 (of its inverse for a time)."""
-        units, turns = self.map.units, self.turns_per_deg
+        turns = self.turns_per_deg
         per_deg = {
             "rev_per_s": turns, "rev_per_s2": turns, "s_per_rev_per_s": 1.0 / turns,
             "pulse_per_s": abs(self.pulses_per_deg),
@@ -172,21 +171,25 @@ class Axis(Scale):
         return speed * units.speed_per_unit, accel * units.accel_per_unit
 
     def motion_counts(self) -> dict[str, int]:
-        """Speed and ramps as register values, never faster than configured.
+        """Speed and ramps as register values, never faster than configured; none of a
+        drive that takes them as they are.
 
         Raises:
             ValueError: ``key: rule, value`` where the drive cannot move so slowly, or
                 the register cannot hold the value.
         """
-        per_speed, per_accel = self._counts_per_deg
+        if (units := self.map.register_units) is None:
+            return {}
+        place_of = self.map.place_of
+        per_speed, per_accel = self._counts_per_deg(units)
         counts = {"speed": math.floor(self.speed_deg_s * per_speed * (1.0 + ROUNDING))}
-        if self.map.units.accel == "s_per_rev_per_s":  # longer is gentler
+        if units.accel == "s_per_rev_per_s":  # longer is gentler
             accel = math.ceil(per_accel / self.accel_deg_s2 * (1.0 - ROUNDING))
         else:
             accel = math.floor(self.accel_deg_s2 * per_accel * (1.0 + ROUNDING))
         counts["accel"] = counts["decel"] = accel
         for name, count in counts.items():
-            place = self.map.move.place_of(name)
+            place = place_of(name)
             if place is None:
                 continue
             key_name, unit, per = "accel_deg_s2", "deg/s^2", per_accel
@@ -199,7 +202,7 @@ class Axis(Scale):
                     f"of the drive's register, got {getattr(self, key_name):g}"
                 )
             try:
-                encode(count, place[1], self.map.word_order)
+                encode(count, place[1], "big")
             except ValueError as error:
                 name = self.key_of(key_name)
                 raise ValueError(f"{name}: the drive's register: {error}") from None
@@ -207,10 +210,15 @@ class Axis(Scale):
 
     @property
     def drive_motion(self) -> tuple[float, float]:
-        """Speed in deg/s and acceleration in deg/s^2 that the registers come to."""
-        (per_speed, per_accel), counts = self._counts_per_deg, self.motion_counts()
+        """Speed in deg/s and acceleration in deg/s^2 that the drive is told."""
+        if (units := self.map.register_units) is None:
+            return self.speed_deg_s, self.accel_deg_s2
+        (per_speed, per_accel), counts = (
+            self._counts_per_deg(units),
+            self.motion_counts(),
+        )
         accel = counts["accel"] / per_accel
-        if self.map.units.accel == "s_per_rev_per_s":
+        if units.accel == "s_per_rev_per_s":
             accel = per_accel / counts["accel"]
         return counts["speed"] / per_speed, accel
 
@@ -226,6 +234,6 @@ class Axis(Scale):
             self.motion_counts()
         except ValueError as error:
             yield str(error)
-        if self.comm_timeout_s is not None and self.map.comm_timeout is None:
+        if self.comm_timeout_s is not None and not self.map.watches_line:
             lack = f"the map {self.map.name} has no register for it"
             yield f"comm_timeout_s: {lack}; leave it out and use the maker's tool"

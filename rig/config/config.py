@@ -24,6 +24,7 @@ from rig.config.settings import (
     ImuSettings,
     MechanismSettings,
     MotionSettings,
+    ReadingsSettings,
     SessionSettings,
     SettleSettings,
 )
@@ -37,11 +38,13 @@ POLLS, HICCUP_S = 4, 0.5  # of the motion loop's heartbeat
 PHONE = (
     "format", "columns", "quaternion_columns", "unit", "order", "signs", "mounting_deg"
 )  # fmt: skip
+SENSOR = ("names", "unit", "registers", "columns", "factors")
 # Where bus and phone are reached, and when a session gives up or says that it is good,
 # may change between a run and its resumption.
 UNMEASURED = (
     "bus.", "imu.host", "imu.port", "imu.transport", "imu.allow", "imu.stale_s",
-    "imu.heading", "motion.poll_s", "motion.stall_s",
+    "imu.heading", "readings.host", "readings.port", "readings.device",
+    "readings.stale_s", "motion.poll_s", "motion.stall_s",
     "motion.envelope_margin_deg", "motion.mirror_limits",
     "settle.timeout_s", "session.verify_limit_deg",
     "session.reference_tolerance_deg", "session.max_unreachable",
@@ -97,7 +100,10 @@ STOPS = ("status", "stop", "broadcast_stop", "hold", "restart_s", "comm_timeout"
 def _digest(register_map: str, names: tuple[str, ...]) -> str:
     """Digest of parts of a map's text."""
     data = tomllib.loads(register_map)
+    # What other kinds of drives have was added to the digest later.
+    more = ("drive", "settings")
     parts = [data.get(name) for name in names]
+    parts += [data[name] for name in more if name in data]
     text = json.dumps(parts, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
@@ -107,7 +113,8 @@ class RigConfig(Section):
 
     bus: BusSettings
     axes: tuple[Axis, ...]
-    imu: ImuSettings
+    imu: ImuSettings | None = None  # the phone, or
+    readings: ReadingsSettings | None = None  # numbers
     mechanism: MechanismSettings = MechanismSettings()
     settle: SettleSettings = SettleSettings()
     motion: MotionSettings = MotionSettings()
@@ -137,12 +144,25 @@ class RigConfig(Section):
     @property
     def output_names(self) -> tuple[str, ...]:
         """Names of what is measured, in the order of every measurement."""
-        return self.axis_names
+        return self.readings.names if self.readings else self.axis_names
 
     @property
     def output_unit(self) -> str:
         """Unit of what is measured."""
-        return "deg"
+        return self.readings.unit if self.readings else "deg"
+
+    @property
+    def source(self) -> ImuSettings | ReadingsSettings:
+        """The phone, or the sensor."""
+        found = self.readings or self.imu
+        assert found is not None  # a rule
+        return found
+
+    @property
+    def phone(self) -> ImuSettings:
+        """The phone, of what is asked only where there is one."""
+        assert self.imu is not None
+        return self.imu
 
     @property
     def k(self) -> int:
@@ -201,7 +221,7 @@ class RigConfig(Section):
         return {
             axis.name: axis.comm_timeout_s or default
             for axis in self.axes
-            if axis.map.comm_timeout
+            if axis.map.watches_line
         }
 
     @property
@@ -260,6 +280,10 @@ class RigConfig(Section):
             family = f"{axis.map.name} ({_digest(axis.map.text, PLACES)})"
             values = {"map": family, **scale}
             found |= {f"axes.{axis.name}.{name}": values[name] for name in values}
+        if self.imu is None:
+            assert self.readings is not None
+            data = self.readings.model_dump(mode="json", include=set(SENSOR))
+            return found | {f"readings.{name}": data[name] for name in SENSOR}
         found["mechanism.order"] = self.mechanism.order
         imu = self.imu.model_dump(mode="json", include=set(PHONE))
         return found | {f"imu.{name}": imu[name] for name in PHONE}
@@ -280,14 +304,17 @@ class RigConfig(Section):
         if self.k <= len(self.axes):
             fewest = len(self.axes) + 1
             yield f"session.k: must be at least {fewest}, axes and one, got {self.k}"
-        for axis in self.axes:
+        if (self.imu is None) == (self.readings is None):
+            yield "imu: either [imu] or [readings] is required, and not both"
+            return
+        for axis in self.axes if self.imu else ():
             if axis.kind != "rotation" or axis.rotates is None:
                 yield (
                     f"axes.{axis.name}.rotates: missing; a phone measures rotations "
                     "about X, Y, Z"
                 )
                 return
-        for middle in self.axes:
+        for middle in self.axes if self.imu else ():
             within = -90.0 < middle.min_deg and middle.max_deg < 90.0
             if within or middle.rotates != self.mechanism.order[1]:
                 continue
@@ -311,7 +338,7 @@ class RigConfig(Section):
             if axis.comm_timeout_s is not None and axis.comm_timeout_s <= slowest:
                 least = f"bus.timeout_s x (read_retries + 1) = {slowest:g} s"
                 yield f"{at}.comm_timeout_s: must exceed {least}"
-            if motion.mirror_limits and axis.map.limits is None:
+            if motion.mirror_limits and not axis.map.mirrors_limits:
                 lack = f"the map {axis.map.name} of {axis.name} has no limit registers"
                 yield f"motion.mirror_limits: {lack}"
             if low >= high:
@@ -351,7 +378,7 @@ def _repeated(data: dict[str, Any]) -> Iterator[str]:
     axes = [{"rotates": DEFAULT_ROTATES.get(str(a.get("name"))), **a} for a in axes]
     if isinstance(given, list) and not 1 <= len(given) <= MOST_AXES:
         yield f"axes: must be 1 to {MOST_AXES} tables, got {len(given)}"
-    for name in ("name", "unit", "rotates"):
+    for name in ("name", "unit", *(["rotates"] if "readings" not in data else [])):
         values = [str(a[name]) for a in axes if a.get(name) is not None]
         if len(set(values)) < len(values):
             yield f"axes: {name} must differ between them, got {', '.join(values)}"

@@ -5,6 +5,7 @@ It says where a drive keeps its status, position and alarm, and which registers 
 to move, stop, enable. Nothing here opens a port.
 """
 
+import contextlib
 import hashlib
 import json
 import pathlib
@@ -13,7 +14,13 @@ import tomllib
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import BeforeValidator, Field, PlainValidator, WithJsonSchema
+from pydantic import (
+    BeforeValidator,
+    Field,
+    PlainValidator,
+    PrivateAttr,
+    WithJsonSchema,
+)
 
 from rig.config.schema import Section, key, parse, read_text
 
@@ -247,18 +254,84 @@ class Units(Section):
     accel_per_unit: Positive
 
 
-class RegisterMap(Section):
-    """One drive family."""
+class DriveMap(Section):
+    """One drive family, of whatever kind."""
 
     schema_: Literal[1] = key("version of this schema", alias="schema")
+    drive: str = key(
+        "kind of its drives: modbus, gcode, cia402, or the class of one's own as "
+        "`FILE.py:CLASS`, relative to the map, or `MODULE:CLASS`", "modbus",
+    )  # fmt: skip
     name: str = key("name of the map", min_length=1)
     title: str = key("drives it is for", min_length=1)
-    sources: str = key("where the addresses are from", min_length=1)
-    confidence: str = key("how far they were checked", "")
+    sources: str = key("where what it says is from", min_length=1)
+    confidence: str = key("how far that was checked", "")
+    restart_s: float = key(
+        "after a stop a drive may go on by itself within this time: it is looked at "
+        "for so long", 2.0, 2.0, 60,
+    )  # fmt: skip
+    absolute_encoder: bool = key("the position outlasts a loss of power", False)
+    ready_s: float = key(
+        "the drive takes at most so long to enable, and to reset an alarm", 1.0, 0, 30
+    )
+    inter_frame_s: float = key("silence the drive wants between frames", 0.0, 0, 1)
+    settings: dict[str, str | int | float | bool] = key(
+        "of a kind that is not modbus: what its class reads", {}
+    )
+    _folder: pathlib.Path = PrivateAttr(pathlib.Path())
+
+    @property
+    def folder(self) -> pathlib.Path:
+        """That the file of a class is relative to."""
+        return self._folder
+
+    @property
+    def register_units(self) -> Units | None:
+        """Of registers for speed and acceleration, where there are any."""
+        return None
+
+    def place_of(self, name: str) -> tuple[int, Kind] | None:
+        """Register of a value of a move, and its type, where there is one."""
+        return None
+
+    @property
+    def watches_line(self) -> bool:
+        """It stops by itself where the line is silent, after a time that can be set."""
+        return False
+
+    @property
+    def mirrors_limits(self) -> bool:
+        """It takes the soft limits too."""
+        return False
+
+    @property
+    def homes(self) -> bool:
+        """It has a homing of its own."""
+        return False
+
+    @property
+    def tells_homed(self) -> bool:
+        """It says whether it is homed."""
+        return False
+
+    @property
+    def digest(self) -> str:
+        known = tomllib.loads(self.text)
+        data = json.dumps(known, sort_keys=True, default=str)
+        return hashlib.sha256(data.encode()).hexdigest()
+
+
+class RegisterMap(DriveMap):
+    """One family of Modbus drives, by its registers."""
+
+    drive: Literal["modbus"] = "modbus"
     word_order: Literal["big", "little"] = key(
         "of 32-bit pairs; big: high word first, little: low word first"
     )
     inter_frame_s: float = key("silence the drive wants between frames", ..., 0, 1)
+    settings: dict[str, str | int | float | bool] = key(
+        "none: registers are keys of their own", {}, max_length=0
+    )
     serial: dict[str, int | str] = key("the maker's default line format", {})
     units: Units = key(
         "`speed`, `accel` of the registers; `speed_per_unit`, `accel_per_unit` counts"
@@ -278,10 +351,6 @@ class RegisterMap(Section):
         "where it stands, so that nothing is left to go on to after a stop",
         None,
     )
-    restart_s: float = key(
-        "after a stop a drive may go on by itself within this time: it is looked at "
-        "for so long", 2.0, 2.0, 60,
-    )  # fmt: skip
     broadcast_stop: bool = key("every unit of a serial line obeys its stop to 0", False)
     enable: Writes | None = key("`write`: switch the power stage on", None)
     alarm_reset: Writes | None = key("`write`: reset an alarm", None)
@@ -311,21 +380,34 @@ class RegisterMap(Section):
     homed: Predicate | None = key(
         "bits of the status word that are on from homing until the power fails", None
     )
-    absolute_encoder: bool = key("the position outlasts a loss of power", False)
-    ready_s: float = key(
-        "the drive takes at most so long to enable, and to reset an alarm", 1.0, 0, 30
-    )
+
+    @property
+    def register_units(self) -> Units:
+        return self.units
+
+    def place_of(self, name: str) -> tuple[int, Kind] | None:
+        return self.move.place_of(name)
+
+    @property
+    def watches_line(self) -> bool:
+        return self.comm_timeout is not None
+
+    @property
+    def mirrors_limits(self) -> bool:
+        return self.limits is not None
+
+    @property
+    def homes(self) -> bool:
+        return self.home is not None
+
+    @property
+    def tells_homed(self) -> bool:
+        return self.homed is not None
 
     @property
     def home_place(self) -> tuple[int, str] | None:
         """Where ``set_zero`` takes the count that home becomes; None: it becomes 0."""
         return self.set_zero.place_of("home") if self.set_zero else None
-
-    @property
-    def digest(self) -> str:
-        known = tomllib.loads(self.text)
-        data = json.dumps(known, sort_keys=True, default=str)
-        return hashlib.sha256(data.encode()).hexdigest()
 
     def broken_rules(self) -> Iterator[str]:
         if self.stop.place_of("position"):
@@ -338,7 +420,7 @@ def available_maps() -> list[str]:
     return sorted(path.stem for path in MAP_FOLDER.glob("*.toml"))
 
 
-def load_map(name: str, folder: pathlib.Path | None = None) -> RegisterMap:
+def load_map(name: str, folder: pathlib.Path | None = None) -> DriveMap:
     """Read a map by name (one that ships) or by path, relative to ``folder``.
 
     Raises:
@@ -353,4 +435,19 @@ def load_map(name: str, folder: pathlib.Path | None = None) -> RegisterMap:
             f"no register map {name!r}: have {', '.join(available_maps())}, "
             "or give the path of a .toml file"
         )
-    return parse(RegisterMap, read_text(path), path.name)
+    return parse_map(read_text(path), path.name, path.parent)
+
+
+def parse_map(text: str, source: str, folder: pathlib.Path) -> DriveMap:
+    """The text of a map; ``folder`` is where the file of a class is looked for.
+
+    Raises:
+        ConfigError: not TOML, or the schema is broken; lists every fault.
+    """
+    kind: type[DriveMap] = RegisterMap
+    with contextlib.suppress(tomllib.TOMLDecodeError):  # which `parse` words
+        if tomllib.loads(text).get("drive", "modbus") != "modbus":
+            kind = DriveMap
+    found = parse(kind, text, source)
+    found._folder = folder.resolve()
+    return found

@@ -1,12 +1,14 @@
 """The tables of rig.toml but for its axes: one class a table, one field a key."""
 
 import ipaddress
+import re
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
 from rig.config.axis import Range
+from rig.config.maps import Kind, registers_of
 from rig.config.schema import Section, advanced, key
 
 Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
@@ -17,16 +19,21 @@ Angle = Annotated[float, Field(ge=-360, le=360)]
 # key(what it means, default (... where required), lowest, highest)
 
 
-class BusSettings(Section):
-    """One Modbus line for all drives."""
+NETWORK = ("tcp", "rtu_tcp")  # transports that have a host
 
-    transport: Literal["tcp", "rtu_tcp", "rtu"] = key(
-        "rtu: serial port; tcp: Modbus TCP; rtu_tcp: RTU frames over TCP"
+
+class BusSettings(Section):
+    """One line for all drives."""
+
+    transport: Literal["tcp", "rtu_tcp", "rtu", "serial", "can"] = key(
+        "rtu: Modbus on a serial port; tcp: Modbus TCP; rtu_tcp: RTU frames over TCP; "
+        "serial: lines of text on a serial port; can: a CAN bus"
     )
     host: str = key("address of a tcp or rtu_tcp bus", "")
     port: int = key("TCP port of the same", 502, 1, 65535)
-    device: str = key("serial port of an rtu bus", "")
-    baudrate: int = key("of an rtu bus", 115200, 1200, 3_000_000)
+    device: str = key("serial port; channel of a CAN bus, such as can0", "")
+    interface: str = key("of python-can, of a CAN bus", "socketcan")
+    baudrate: int = key("of a serial port or a CAN bus", 115200, 1200, 3_000_000)
     parity: Literal["N", "E", "O"] = key("of an rtu bus", "N")
     stopbits: int = key("of an rtu bus", 1, 1, 2)
     bytesize: int = key("of an rtu bus", 8, 7, 8)
@@ -37,12 +44,12 @@ class BusSettings(Section):
 
     @property
     def where(self) -> str:
-        if self.transport == "rtu":
+        if self.transport not in NETWORK:
             return f"{self.device} at {self.baudrate} baud"
         return f"{self.host}:{self.port} ({self.transport})"
 
     def broken_rules(self) -> Iterator[str]:
-        wanted = "device" if self.transport == "rtu" else "host"
+        wanted = "host" if self.transport in NETWORK else "device"
         if not getattr(self, wanted):
             yield f"{wanted}: missing; transport {self.transport!r} needs one"
 
@@ -126,6 +133,73 @@ class ImuSettings(Section):
         if len(self.separator) != 1 or self.separator in "0123456789+-.eE\r\n":
             got = repr(self.separator)
             yield f"separator: must be one character that no number has, got {got}"
+
+
+class ReadingRegister(Section):
+    """A value of a Modbus device that measures."""
+
+    unit: int = key("Modbus unit id", 1, 0, 255)
+    address: int = key("of the register, from 0", ..., 0, 0xFFFF)
+    type: Kind = key("of its value", "i32")
+    word_order: Literal["big", "little"] = key("of 32-bit pairs", "big")
+
+    @property
+    def count(self) -> int:
+        return registers_of(self.type)
+
+
+class ReadingsSettings(Section):
+    """Numbers that a sensor sends, in place of a phone."""
+
+    names: tuple[str, ...] = key(
+        "of what is measured, 1 to 12; one that is an axis's rises with it",
+        min_length=1,
+    )
+    unit: str = key("of all of them", "mm", min_length=1)
+    transport: Literal["tcp", "listen", "udp", "serial", "modbus"] = key(
+        "tcp: lines of a sensor at host and port; listen: it connects to this "
+        "computer; "
+        "udp: it sends datagrams here; serial: lines on a serial port; modbus: "
+        "registers"
+    )
+    host: str = key("tcp, modbus: the sensor's; else this computer's", "127.0.0.1")
+    port: int = key("of the same", 502, 0, 65535)
+    device: str = key("serial port, of serial, or of Modbus RTU", "")
+    baudrate: int = key("of a serial port", 115200, 1200, 3_000_000)
+    parity: Literal["N", "E", "O"] = key("of the same", "N")
+    stopbits: int = key("of the same", 1, 1, 2)
+    bytesize: int = key("of the same", 8, 7, 8)
+    registers: tuple[ReadingRegister, ...] = key("of modbus, one for each name", ())
+    columns: tuple[Column, ...] = key("of the numbers in a line", (), max_length=12)
+    separator: str = key("between columns", ",", min_length=1, max_length=1)
+    factors: tuple[float, ...] = key("unit for each count that is sent", ())
+    request: str = advanced("sent before each line, where the sensor waits for one", "")
+    period_s: float = advanced("between two polls of registers", 0.02, 0.001, 1)
+    scale: float = key(
+        "change that is surely seen, and is sure to do no harm: nine times this is as "
+        "far as the readings may go while nothing is proved", ..., 1e-9, 1e9,
+    )  # fmt: skip
+    most_jump: float = advanced("between two readings", 1e9, 1e-9, 1e12)
+    stale_s: float = key("older than this while moving: stop", 0.4, 0.02, 10)
+
+    def broken_rules(self) -> Iterator[str]:
+        if len(set(self.names)) < len(self.names):
+            yield f"names: must differ, got {', '.join(self.names)}"
+        for name in self.names:
+            if not re.fullmatch("[a-z][a-z0-9_]{0,23}", name):
+                yield f"names: must be small letters, digits and _, got {name!r}"
+        modbus = self.transport == "modbus"
+        for key_name, wanted in (
+            ("registers", modbus), ("columns", False), ("factors", False)
+        ):  # fmt: skip
+            count = len(getattr(self, key_name))
+            if count != len(self.names) and (count or wanted):
+                yield f"{key_name}: must be {len(self.names)}, as names, got {count}"
+        if self.transport == "serial" and not self.device:
+            yield "device: missing; transport 'serial' needs one"
+        if self.separator in "0123456789+-.eE\r\n":
+            got = repr(self.separator)
+            yield f"separator: must be a character that no number has, got {got}"
 
 
 class MechanismSettings(Section):

@@ -18,15 +18,16 @@ import numpy as np
 
 from rig.config.axis import Pulses
 from rig.config.config import RigConfig
-from rig.config.maps import Read
-from rig.core.attitude import Array, Frame
-from rig.core.bus import Bus, BusError, Rejected
-from rig.core.drive import Drive, Status
-from rig.core.faults import LimitError, MotionFault, Requests, StopRequested
-from rig.core.phone import Imu
 from rig.core.proof import Proof, Turns
 from rig.core.stop import Stopper
+from rig.drives import Drive, make_drives
+from rig.drives.drive import Status
+from rig.drives.line import BusError
+from rig.faults import LimitError, MotionFault, Requests, StopRequested
 from rig.journal import SIGN_CHECKED, DeviceRecord, Record, RunFolder
+from rig.readings import make_source
+from rig.readings.attitude import Array
+from rig.readings.geometry import Frame, geometry_of
 
 LOOK_S = 0.002  # between two looks for a reading
 OVERDUE_S = 0.3  # of a stop that was asked for and that no loop has answered
@@ -143,25 +144,25 @@ class LineWatch:
             BusError: no valid reply.
         """
         for drive in self._drives:
-            name, watch = drive.axis.name, drive.axis.map.comm_timeout
-            assert watch is not None
-            place = watch.place_of("timeout") or (watch.write[0].address, "u16")
+            name = drive.axis.name
             try:
-                before = drive.read(Read(address=place[0], type=place[1]))
-            except Rejected as error:
+                before = drive.watch()
+            except BusError as error:
+                if not error.refused:
+                    raise
                 raise MotionFault(
                     f"{name}: its communication timeout cannot be read, so it could "
                     f"not be put back: {error}. Correct [comm_timeout] of the map "
                     f"{drive.axis.map.name}, or leave it out"
                 ) from None
-            counts = max(1, math.ceil(self._timeouts_s[name] * watch.per_s - 1e-9))
+            counts = drive.watch_counts(self._timeouts_s[name])
             left = self._left.get(name)
             if left and before == left["counts"]:  # a killed session's, not the drive's
                 before = left["before"]
             lent = {"axis": name, "before": before, "counts": counts}
             self._emit("comm_timeout", sync=True, **lent)
             self._before[name] = before
-            drive.write(watch, timeout=counts)
+            drive.set_watch(counts)
 
     def restore(self, standing: set[str]) -> None:
         """Give back what was there, of the axes that stand; never raises.
@@ -174,8 +175,8 @@ class LineWatch:
                 continue
             if name in standing:
                 try:
-                    with drive.bus.urgent():
-                        drive.write(drive.axis.map.comm_timeout, timeout=counts)
+                    with drive.line.urgent():
+                        drive.set_watch(counts)
                     error = ""
                 except Exception as caught:
                     error = str(caught)
@@ -202,7 +203,8 @@ class Seen:
 
 
 class Device:
-    """Drives and a phone: armed explicitly, and never moved once stopped."""
+    """Drives and what they are measured with: armed explicitly, and never moved once
+    stopped."""
 
     def __init__(
         self,
@@ -218,15 +220,17 @@ class Device:
         self.run = run
         self.record = record
         self.emit = run.emit
-        self.bus = Bus(config.bus, config.silence_s, run.emit)
-        self.imu = Imu(config.imu, report=run.emit)
-        self.drives = [Drive(self.bus, axis) for axis in config.axes]
+        self.line, self.drives = make_drives(
+            config.bus, config.axes, config.silence_s, run.emit
+        )
+        self.imu = make_source(config, run.emit)
+        self.geometry = geometry_of(config)
         self.stopper = Stopper(self.drives, run.emit)
         self.requests = requests or Requests()
         self.simulated = simulated
         turns, checked = Turns.of(record), not record.missing(config, SIGN_CHECKED)
-        gains = turns.gains if turns and checked else [None] * len(config.axes)
-        self.proof = Proof(config.axes, checked, simulated, gains)
+        gains = turns.gains if turns and checked else None
+        self.proof = Proof(config.axes, self.geometry, checked, simulated, gains)
         self.shown = False  # each axis has turned the phone as `axes` saw it
         self.paces: dict[str, Pace] = {}  # by axis
         self.last_move: tuple[str, Pulses, Pulses] | None = None  # label, from, to
@@ -242,14 +246,14 @@ class Device:
         self.seen = Seen(np.zeros(len(config.axes)), np.zeros(len(config.output_names)))
         self.line_watch = LineWatch(self.drives, run)
         self.heartbeat = Heartbeat(self.stopper, self.requests, config)
-        self.bus.check = self._before_exchange
+        self.line.check = self._before_exchange
 
     def arm(self, reset_alarms: bool = False) -> None:
         """Check everything that must hold before anything may move.
 
         Raises:
             MotionFault: an alarm, a moving or disabled drive, a position outside the
-                limits. ImuError: no fresh reading.
+                limits. ReadingError: no fresh reading.
         """
         self.stopper.check()
         for drive in self.drives:
@@ -263,8 +267,8 @@ class Device:
 
     def _check_fit(self, drive: Drive, reset_alarms: bool) -> None:
         axis, status = drive.axis, drive.status()
-        if status.fault and reset_alarms and axis.map.alarm_reset:
-            status = drive.bring(axis.map.alarm_reset, lambda s: not s.fault)
+        if status.fault and reset_alarms and drive.can_reset:
+            status = drive.bring(drive.reset, lambda s: not s.fault)
         if status.fault:
             raise MotionFault(
                 f"{axis.name} is in alarm: {drive.alarm() or 'no code given'}. Find "
@@ -275,8 +279,7 @@ class Device:
                 f"{axis.name} is already moving. Stop the other controller, then run "
                 "`jaxcal-rig stop`"
             )
-        enable = axis.map.enable
-        if not (status.enabled or drive.bring(enable, lambda s: s.enabled).enabled):
+        if not (status.enabled or drive.bring(drive.arm, lambda s: s.enabled).enabled):
             raise MotionFault(
                 f"{axis.name} does not enable its power stage. Check its supply and "
                 "its enable and STO inputs"
@@ -337,15 +340,29 @@ class Device:
         return [drive.sound() for drive in self.drives]
 
     def attitude(self, since: float = 0.0) -> Array:
-        """(3, 3) of the phone, measured at or after a monotonic time.
+        """A reading, (3, 3) of a phone, measured at or after a monotonic time.
 
         Raises:
-            ImuError: it is stale. StopRequested: a stop was asked for meanwhile.
+            ReadingError: it is stale. StopRequested: a stop was asked for meanwhile.
         """
         while (reading := self.imu.latest()).time < since:
             self.guard()
             time.sleep(LOOK_S)
-        return reading.matrix
+        return reading.value
+
+    def moved(self, change: Array) -> Array | None:
+        """(n,) by which the axes moved, of an (m,) change of what is measured.
+
+        Of a phone these are its joint angles; of numbers, what `axes` saw explains
+        them by. None where that is not known, or does not tell.
+        """
+        if self.config.imu:
+            return change
+        turns = Turns.of(self.record)
+        if turns is None or np.linalg.matrix_rank(turns.deg) < len(self.config.axes):
+            return None
+        moved: Array = np.linalg.pinv(turns.deg).astype(np.float64) @ change
+        return moved
 
     def positions(self) -> Pulses:
         return tuple(drive.status().position for drive in self.drives)
@@ -355,5 +372,5 @@ class Device:
         self.heartbeat.close()
         self.armed = False
         self.line_watch.restore({r.axis for r in self.stopper.results if r.standing})
-        self.bus.close()
+        self.line.close()
         self.imu.close()

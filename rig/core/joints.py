@@ -8,15 +8,14 @@ which must turn the phone as `axes` saw: as far within a third, about the same a
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from rig.core.attitude import Array
 from rig.core.device import Device, Posture
-from rig.core.faults import MotionFault
 from rig.core.measure import measure
 from rig.core.motion import move
 from rig.core.proof import Turns
+from rig.faults import MotionFault
 from rig.journal import SIGN_CHECKED
+from rig.readings.attitude import Array
 
 SHOWN_DEG = 3.0  # that each axis is moved, from a third of it to the whole
 RATIO = (2 / 3, 4 / 3)  # of what `axes` saw
@@ -48,8 +47,7 @@ def show(device: Device) -> None:
             posture = Posture(f"shown:{axis.name}", place)
             seen.append(measure(move(device, posture)))
         attitudes = [np.array(each["attitude"]) for each in seen]
-        moved = Rotation.from_matrix(attitudes[0].T @ attitudes[1])
-        turn = moved.as_rotvec(degrees=True) / axis.to_deg(far - near)
+        turn = device.geometry.way(*attitudes) / axis.to_deg(far - near)
         noise = max(max(each["std_deg"]) / each["samples"] ** 0.5 for each in seen)
         _compare(device, j, turn, expected[:, j], noise / abs(axis.to_deg(far - near)))
         move(device, Posture("shown", start))
@@ -57,10 +55,13 @@ def show(device: Device) -> None:
 
 
 def _compare(device: Device, j: int, turn: Array, then: Array, noise: float) -> None:
-    """(3,) turns for a degree of axis j, now and at `axes`; the noise of each part."""
+    """(3,) turns for a degree of axis j, or (m,) of numbers, now and at `axes`; the
+    noise of each part."""
     size, before = float(np.linalg.norm(turn)), float(np.linalg.norm(then))
     share, axis = size / before, device.config.axes[j]
-    aside = np.degrees(np.arctan2(np.linalg.norm(np.cross(turn, then)), turn @ then))
+    along = float(turn @ then)
+    across = max(size**2 * before**2 - along**2, 0.0) ** 0.5
+    aside = np.degrees(np.arctan2(across, along))
     device.emit(
         "shown", sync=True, axis=axis.name, ratio=round(size, 4),
         before=round(before, 4), aside_deg=round(float(aside), 2),

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from rig.config.axis import Pulses
-from rig.core.attitude import Array, Frame, Reading, frame_at, mean_rotation, raw_fields
 from rig.core.device import Device, Posture, Seen
-from rig.core.drive import Status
-from rig.core.faults import MotionFault, NotFollowing
 from rig.core.motion import Standing
+from rig.drives.drive import Status
+from rig.faults import MotionFault, NotFollowing
+from rig.readings.attitude import Array, Reading
+from rig.readings.geometry import Frame
 
 DISAGREEMENT_DEG = 45.0  # between IMU and command at a posture, at most
 FOLLOW_MIN_DEG = 3.0  # a commanded change this large must be seen by the IMU
@@ -42,7 +43,7 @@ def measure(standing: Standing, samples: int | None = None) -> dict[str, Any]:
 
     Raises:
         MotionFault: it does not settle in time, or the IMU disagrees with the drives.
-        ImuError, BusError, StopRequested: stop everything.
+        ReadingError, BusError, StopRequested: stop everything.
     """
     device, target = standing.device, standing.posture.pulses
     settle = device.config.settle
@@ -54,12 +55,12 @@ def measure(standing: Standing, samples: int | None = None) -> dict[str, Any]:
         device.emit("phase", phase="measuring")
         readings = _collect(device, samples or settle.samples)
         if readings:
-            frame, matrices = _frame(device, readings), [r.matrix for r in readings]
-            raw = frame.angles(matrices)
+            frame, values = _frame(device, readings), [r.value for r in readings]
+            raw = frame.angles(values)
             std = raw.std(axis=0, ddof=1) if len(raw) > 1 else np.zeros(raw.shape[1])
             if (std > settle.std_deg).any():
                 readings = []
-    attitude = mean_rotation(matrices)
+    attitude = device.geometry.mean(values)
     angles, commanded = frame.angles(attitude), device.config.to_deg(target)
     feedback = [status.position for status in statuses]
     _check_position(device, target, feedback)
@@ -73,13 +74,13 @@ def measure(standing: Standing, samples: int | None = None) -> dict[str, Any]:
         "std_deg": std.round(6).tolist(),
         "samples": len(readings),
         "attitude": attitude.round(12).tolist(),
-        **raw_fields(readings),
+        **device.geometry.raw(readings),
     }
 
 
 def _frame(device: Device, readings: list[Reading]) -> Frame:
     """Before the zero is taken, the first of the readings stands for it."""
-    return device.frame or frame_at(device.config, readings[0].matrix)
+    return device.frame or device.geometry.frame(readings[0].value)
 
 
 def _settled(device: Device, deadline: float) -> list[Status]:
@@ -108,7 +109,7 @@ def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
     newest = readings[-1].time if readings else now
     before = sum(reading.time <= newest - settle.window_s for reading in readings)
     first = min(before - 1, len(readings) - settle.min_samples)
-    hint = f"Check the phone's app and its Wi-Fi{device.imu.dropped}"
+    hint = f"{device.imu.lost}{device.imu.dropped}"
     if first < 0:
         span = newest - readings[0].time if readings else 0.0
         return (
@@ -116,16 +117,16 @@ def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
             f"{settle.min_samples} over {settle.window_s:g} s). {hint}"
         )
     readings = readings[first:]
-    if now - readings[-1].time > device.config.imu.stale_s:
-        return f"the phone's readings are stale. {hint}"
-    names = device.config.output_names
-    angles = _frame(device, readings).angles([reading.matrix for reading in readings])
+    if now - readings[-1].time > device.imu.stale_s:
+        return f"{device.imu.whose}'s readings are stale. {hint}"
+    names, told = device.config.output_names, device.config.output_unit
+    angles = _frame(device, readings).angles([reading.value for reading in readings])
     times = np.array([reading.time for reading in readings])
     times = times - times.mean()
     slope = np.abs(times @ (angles - angles.mean(axis=0)) / (times @ times))
     for what, found, limit, unit in (
-        ("std_deg", angles.std(axis=0, ddof=1), settle.std_deg, "deg"),
-        ("slope_deg_s", slope, settle.slope_deg_s, "deg/s"),
+        ("std_deg", angles.std(axis=0, ddof=1), settle.std_deg, told),
+        ("slope_deg_s", slope, settle.slope_deg_s, f"{told}/s"),
     ):
         worst = int(np.argmax(found))
         if found[worst] > limit:
@@ -149,7 +150,7 @@ def _collect(device: Device, wanted: int) -> list[Reading]:
             return readings[:wanted]
         now = time.monotonic()
         newest = readings[-1].time if readings else start
-        if now - newest > config.imu.stale_s or now > deadline:
+        if now - newest > imu.stale_s or now > deadline:
             return []
         if now - polled > config.motion.poll_s:
             polled = now
@@ -175,18 +176,20 @@ def _check_position(device: Device, target: Pulses, feedback: list[int]) -> None
 
 def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
     """The joints are where the drives say, roughly, and moved when they moved."""
-    apart, names = np.abs(measured - commanded), device.config.axis_names
-    if (apart > DISAGREEMENT_DEG).any():
-        worst = int(np.argmax(apart))
+    names, seen = device.config.axis_names, device.seen
+    # Numbers are no angles of joints, and are compared by how they change alone.
+    apart = measured - commanded if device.config.imu else np.zeros(1)
+    if (np.abs(apart) > DISAGREEMENT_DEG).any():
+        worst = int(np.argmax(np.abs(apart)))
         raise MotionFault(
-            f"the IMU reads {names[worst]} {apart[worst]:.1f} deg away from "
+            f"the IMU reads {names[worst]} {abs(apart[worst]):.1f} deg away from "
             f"the command (limit {DISAGREEMENT_DEG:g}). Check the zero posture, then "
             "run `jaxcal-rig axes`"
         )
-    seen = device.seen
     way = commanded - seen.commanded
     asked = np.abs(way)
-    followed = np.sign(way) * (measured - seen.measured)
+    moved = device.moved(measured - seen.measured)
+    followed = np.sign(way) * (way if moved is None else moved)
     leading = max(FOLLOW_MIN_DEG, FOLLOW_LEADING * float(asked.max()))
     for index, name in enumerate(names):
         if asked[index] >= leading and followed[index] < FOLLOW_SHARE * asked[index]:

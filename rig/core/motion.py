@@ -8,10 +8,10 @@ import time
 from typing import NamedTuple
 
 from rig.config.axis import Axis, Pulses
-from rig.core.bus import BusError, Rejected
 from rig.core.device import Device, Pace, Posture, approach, check_plan
-from rig.core.drive import START_S, STILL_COUNTS, Drive, Status, refusal
-from rig.core.faults import EndedShort, MotionFault, Unreachable
+from rig.drives.drive import START_S, STILL_COUNTS, Drive, Status
+from rig.drives.line import BusError
+from rig.faults import EndedShort, MotionFault, Unreachable
 
 DEADLINE_FACTOR, DEADLINE_SLACK_S = 2.0, 2.0  # of a move's computed time, and more
 FOLLOWING_DEG = 3.0  # a drive may leave its way by
@@ -34,7 +34,7 @@ def move(device: Device, posture: Posture) -> Standing:
         LimitError: the target leaves the limits; nothing was sent.
         Unreachable: a drive refused the target.
         EndedShort: a drive ended short of it.
-        MotionFault, BusError, ImuError, StopRequested: stop everything.
+        MotionFault, BusError, ReadingError, StopRequested: stop everything.
     """
     if not device.armed:
         raise MotionFault("not armed")
@@ -98,11 +98,11 @@ def _send(device: Device, drive: Drive, start: Status, pulses: int) -> None:
     tolerance = axis.pulses_within(motion.position_tolerance_deg)
     for left in reversed(range(1 + device.config.bus.read_retries)):
         try:
-            return drive.move(pulses)
+            return drive.go(pulses)
         except BusError as error:
-            if isinstance(error, Rejected) and error.code in (2, 3):
+            if error.out_of_reach:
                 raise Unreachable(f"{axis.name} to {pulses} pulses: {error}") from None
-            if refusal(error):
+            if error.refused:
                 drive.sound()  # an alarm says more than a refusal
                 raise
             took = drive.took(pulses, start, tolerance)
@@ -120,10 +120,12 @@ def _watch(
 ) -> None:
     """Poll until all stand on their targets, or something is wrong."""
     motion, begun, most_s = device.config.motion, time.monotonic(), 0.0
+    in_turn = device.line.in_turn
     here = tuple(start.position for start in starts)
     for drive, a, b in zip(device.drives, here, target, strict=True):
         speed, accel = drive.axis.drive_motion
-        most_s = max(most_s, abs(drive.axis.to_deg(b - a)) / speed + speed / accel)
+        needed_s = abs(drive.axis.to_deg(b - a)) / speed + speed / accel
+        most_s = most_s + needed_s if in_turn else max(most_s, needed_s)
     most_s = DEADLINE_FACTOR * most_s + DEADLINE_SLACK_S
     last = [(position, begun) for position in here]
     seen = [[start] for start in starts]
@@ -154,6 +156,8 @@ def _watch(
                 )
             if abs(status.position - last[index][0]) > STILL_COUNTS:
                 last[index] = (status.position, status.time)
+                if in_turn:  # who waits for it does not stall
+                    last = [(place, status.time) for place, _ in last]
             elif (stood := status.time - last[index][1]) > motion.stall_s:
                 left = abs(end - angle)
                 moved = abs(status.position - start) > tolerance
@@ -214,11 +218,11 @@ def _check_attitude(device: Device, connection: int) -> None:
     device.meanwhile()
     reading = device.imu.latest()
     if device.imu.connections == connection:  # its heading is another since
-        device.proof.watch(reading.matrix)
-    if device.frame is None or not device.oriented:
-        return
+        device.proof.watch(reading.value)
+    if device.frame is None or not device.oriented or device.config.imu is None:
+        return  # numbers are no angles of joints
     margin = device.config.motion.envelope_margin_deg
-    angles = device.frame.angles(reading.matrix)
+    angles = device.frame.angles(reading.value)
     for axis, angle in zip(device.config.axes, angles, strict=True):
         low, high = axis.min_deg - margin, axis.max_deg + margin
         if not low <= angle <= high:

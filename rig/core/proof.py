@@ -25,11 +25,12 @@ from scipy.spatial.transform import Rotation
 
 from rig.config import RigConfig
 from rig.config.axis import Axis, Pulses
-from rig.config.settings import ImuSettings
-from rig.core.attitude import Array, angle_between_deg, matrix_to_euler
-from rig.core.faults import MotionFault
-from rig.core.phone import Imu
+from rig.config.settings import ImuSettings, ReadingsSettings
+from rig.faults import MotionFault
 from rig.journal import SIGN_CHECKED, DeviceRecord
+from rig.readings.attitude import Array, matrix_to_euler
+from rig.readings.geometry import Geometry
+from rig.readings.source import Source
 
 FIRST_MOTOR_DEG = 0.36
 UNSEEN_MOTOR_DEG = 36.0
@@ -76,7 +77,10 @@ class Turns(NamedTuple):
         """These columns where the device counts other pulses.
 
         In the phone's frame a joint's axis turns with the joints that it carries.
+        Numbers are taken to change alike everywhere.
         """
+        if config.imu is None:
+            return self.deg
         turns, away = self.deg.copy(), config.to_deg(np.subtract(pulses, self.pulses))
         chain = [config.letters.index(letter) for letter in config.joint_order]
         for place, joint in enumerate(chain):
@@ -86,13 +90,19 @@ class Turns(NamedTuple):
         return turns
 
 
-def unit_proved(imu: ImuSettings, attitude: Array) -> bool:
+def unit_proved(imu: ImuSettings | ReadingsSettings, attitude: Array) -> bool:
     """Whether a phone's (3, 3) attitude can only have come in the configured unit.
 
-    A quaternion has none. A number over 2 pi is no angle in radians. Degrees that are
+    Of numbers it is whatever it is called. A quaternion has none. A number over 2 pi is
+    no angle in radians. Degrees that are
     read as radians turn 57.3 times too far, which the first move shows.
     """
-    if imu.format == "sensorlogger" or imu.quaternion_columns or imu.unit == "rad":
+    if (
+        isinstance(imu, ReadingsSettings)
+        or imu.format == "sensorlogger"
+        or imu.quaternion_columns
+        or imu.unit == "rad"
+    ):
         return True
     sent = matrix_to_euler(attitude, str(imu.order))
     return bool(np.abs(sent).max() > LARGEST_RAD)
@@ -107,8 +117,10 @@ class Reach:
         factor: float = 1.0,
         checked: bool = False,
         gain: float | None = None,
+        scale: float = 1.0,
     ) -> None:
         self.axis = axis
+        self.scale = scale  # of a degree, in the unit of the readings
         self.gain = gain  # degrees of the phone for a commanded one, as `axes` saw
         self.checked = checked
         self.factor = factor  # RADIANS where the phone's unit is not proved
@@ -177,7 +189,7 @@ class Reach:
             return self.axis
         per_s = max(1.0, abs(pulses), self.longest * bool(self.deg_per_pulse)) / LOOK_S
         if self.deg_per_pulse:
-            per_s = min(per_s, SLOW_DEG_S / self.deg_per_pulse)
+            per_s = min(per_s, self.scale * SLOW_DEG_S / self.deg_per_pulse)
         return slowed(self.axis, per_s / abs(self.axis.pulses_per_deg))
 
 
@@ -187,14 +199,18 @@ class Proof:
     def __init__(
         self,
         axes: Sequence[Axis],
+        geometry: Geometry,
         checked: bool,
         simulated: bool = False,
-        gains: Sequence[float | None] = (),
+        gains: Sequence[float] | None = None,
     ) -> None:
-        self.axes, gains = axes, gains or [None] * len(axes)
+        self.axes, self._geometry = axes, geometry
+        self._scale = geometry.scale
+        told: Sequence[float | None] = gains or [None] * len(axes)
+        self._gained = gains is not None or self._scale == 1.0
         self.reaches = [
-            Reach(axis, checked=checked, gain=gain)
-            for axis, gain in zip(axes, gains, strict=True)
+            Reach(axis, checked=checked, gain=gain, scale=self._scale)
+            for axis, gain in zip(axes, told, strict=True)
         ]
         self._paced = not simulated  # what is not real need not be slow
         self.ceiling_deg_s: float | None = None  # of the speed of every axis
@@ -210,16 +226,16 @@ class Proof:
     def renew(self, index: int, unit_is_proved: bool = True) -> Reach:
         """Nothing is proved of an axis any more: it is to be checked."""
         factor = 1.0 if unit_is_proved else RADIANS
-        self.reaches[index] = Reach(self.axes[index], factor)
+        self.reaches[index] = Reach(self.axes[index], factor, scale=self._scale)
         self._start, self._unit_seen = None, True
         return self.reaches[index]
 
     def stay_near(self, attitude: Array, allowed_deg: float = ALLOWED_DEG) -> None:
         """The phone may turn so far away from this attitude; more is a fault."""
-        self._near = attitude, allowed_deg
+        self._near = attitude, allowed_deg * self._scale
         self._start = None
 
-    def begin(self, imu: Imu, attitude: Array, here: Pulses, goal: Pulses) -> Pulses:
+    def begin(self, imu: Source, attitude: Array, here: Pulses, goal: Pulses) -> Pulses:
         """The next piece of the way from here to a goal; it ends where it may end.
 
         Raises:
@@ -230,7 +246,8 @@ class Proof:
             self.stay_near(attitude)
         if not self._unit_seen:
             self._unit_seen = True
-            for reach in unproved if not unit_proved(imu.settings, attitude) else ():
+            known = unit_proved(imu.settings, attitude)
+            for reach in unproved if not known else ():
                 reach.factor = RADIANS
         self._start = self._start or here
         most = math.inf if self._near is None else self._near[1]
@@ -253,7 +270,7 @@ class Proof:
         )
         connection, world = self._heading
         same = imu.connections == connection and imu.world is world
-        if unproved:
+        if unproved or not self._gained:
             self._last = None
         elif self._last and same:  # or its heading is another one
             self._last = self._before, self._last[2] + way, way
@@ -277,32 +294,34 @@ class Proof:
         """At every poll of a move; MotionFault where the phone turns too far in it."""
         limits = [self._near] if self._near else []
         if self._last:
-            limits.append((self._last[0], TOO_FAR * self._last[1] + MARGIN_DEG))
+            limits.append(
+                (self._last[0], TOO_FAR * self._last[1] + MARGIN_DEG * self._scale)
+            )
         for since, most in limits:
-            turned = angle_between_deg(since, attitude)
+            turned = self._geometry.apart(since, attitude)
             if turned > most:
-                raise MotionFault(
-                    f"the phone turned {turned:.1f} deg in a move that may turn it "
-                    f"{most:.1f}. Check pulses_per_rev and reduction, and that the "
-                    "phone is fixed"
-                )
+                raise MotionFault(self._geometry.too_far(turned, most))
 
     def saw(self, here: Pulses, end: Pulses, attitude: Array) -> None:
         """The phone once the move from here has ended."""
         self.watch(attitude)
-        turned = angle_between_deg(self._before, attitude)
+        turned = self._geometry.apart(self._before, attitude)
         alone = [i for i in range(len(here)) if here[i] != end[i]]
         if len(alone) == 1:
             self._compare(alone[0], abs(end[alone[0]] - here[alone[0]]), turned)
         for reach, a, b in zip(self.reaches, here, end, strict=True):
             if a != b:
-                reach.saw(abs(b - a), turned, NOISE_DEG)
+                reach.saw(abs(b - a), turned, NOISE_DEG * self._scale)
 
     def _compare(self, index: int, pulses: int, turned_deg: float) -> None:
         """A move of one checked axis turned the phone no further than `axes` saw."""
         reach, (most, margin) = self.reaches[index], SAME
         expected = pulses * reach.deg_per_pulse
-        if reach.checked and reach.gain and turned_deg > most * expected + margin:
+        if (
+            reach.checked
+            and reach.gain
+            and turned_deg > (most * expected + margin * self._scale)
+        ):
             raise MotionFault(
                 f"{reach.axis.name} turned the phone by {turned_deg:.2f} deg in a move "
                 f"that turned it by {expected:.2f} when `axes` looked: its drive, its "

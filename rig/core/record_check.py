@@ -13,18 +13,17 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.config.config import differences
-from rig.core.attitude import Array, angle_between_deg, frame_at
-from rig.core.bus import BusError
-from rig.core.drive import Drive
-from rig.core.faults import MotionFault, Refused
+from rig.drives import Drive
+from rig.drives.line import BusError
+from rig.faults import MotionFault, Refused
 from rig.journal import HOMED, IDENTIFIED, DeviceRecord
+from rig.readings.attitude import Array
+from rig.readings.geometry import geometry_of
 
-UNSEEN_DEG = 15.0  # an axis this near to the vertical hardly changes the tilt
 TOLD_SHARE = 0.2  # of the largest: an axis that moved less is left out of the words
 
 
@@ -66,14 +65,14 @@ def _exchanged(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
     """What of a drive's identity differs from the record's."""
     evidence = record.state(IDENTIFIED) or {}
     known = evidence.get("identity", {}).get(drive.axis.name, {})
-    found = drive.identity() if known else {}
+    found = drive.ids() if known else {}
     changed = differences(known, {key: found.get(key) for key in known})
     return f"another drive ({'; '.join(changed)})" if changed else ""
 
 
 def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
     """Why the drive's pulses may no longer mean the place that they meant."""
-    axis, status = drive.axis, drive.standing()
+    axis, status = drive.axis, drive.steady()
     pulses, homed = record.left()
     left = pulses.get(axis.name, status.position)
     if axis.map.absolute_encoder:
@@ -114,8 +113,8 @@ def leave(drives: Sequence[Drive], record: DeviceRecord) -> None:
     homed: list[str] = []
     for drive in drives:
         try:
-            with drive.bus.urgent():  # also after a stop, when nothing else is sent
-                status = drive.standing(retries=0)
+            with drive.line.urgent():  # also after a stop, when nothing else is sent
+                status = drive.steady(retries=0)
                 alarm = drive.alarm() or "no code given" if status.fault else ""
         except BusError:
             positions[drive.axis.name] = None
@@ -146,42 +145,26 @@ class KeptZero(NamedTuple):
         """
         off = config.to_deg(np.subtract(pulses, self.pulses))
         if np.abs(off).max() > config.session.reference_tolerance_deg:
+            told = axes_text(config.axis_names, config.axis_unit, off)
             raise MotionFault(
                 "in its zero posture the device counts other pulses than for "
-                f"{self.whose}: {axes_text(config, off)}. Either this is not the zero "
+                f"{self.whose}: {told}. Either this is not the zero "
                 "posture, or the drives have lost their origin: home them"
             )
         return check_zero(config, self.attitude, attitude, self.whose)
 
 
 def moved(config: RigConfig, then: Array, now: Array) -> tuple[float, Array]:
-    """How far one attitude of the zero posture stands from another, (3, 3) each.
+    """How far one reading of the zero posture stands from another.
 
     Returns:
-        The angle in degrees, and as (n,) joint angles. Without an absolute heading the
-        turn about the vertical that comes last is taken out of both.
+        How far they are apart, in the unit of what is measured, and (m,) of that.
+        Without an absolute heading the turn of a phone about the vertical that comes
+        last is taken out of both.
     """
-    now = heading_turn(config, then, now) @ now
-    return angle_between_deg(then, now), frame_at(config, then).angles(now)
-
-
-def heading_turn(config: RigConfig, then: Array, now: Array) -> Array:
-    """(3, 3) turn about the vertical that takes ``now`` nearest to ``then``, both
-    (3, 3); none where the heading can be trusted."""
-    if config.imu.heading == "absolute":
-        return np.eye(3)
-    _, _, z, w = Rotation.from_matrix(now @ then.T).as_quat()
-    return Rotation.from_quat([0.0, 0.0, -z, w] if z or w else [0, 0, 0, 1]).as_matrix()
-
-
-def unseen(config: RigConfig, zero: Array) -> list[str]:
-    """Names of the axes of which a turn at the zero posture cannot be seen."""
-    if config.imu.heading == "absolute":
-        return []
-    upright = np.abs((zero @ frame_at(config, zero).mounting.T)[2])
-    least = np.cos(np.radians(UNSEEN_DEG))
-    pairs = zip(config.axis_names, config.letters, strict=True)
-    return [name for name, letter in pairs if upright["XYZ".index(letter)] > least]
+    geometry = geometry_of(config)
+    now = geometry.aligned(then, now)
+    return geometry.apart(then, now), geometry.frame(then).angles(now)
 
 
 def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:
@@ -197,21 +180,23 @@ def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:
     """
     limit = config.session.reference_tolerance_deg
     angle, joints = moved(config, then, now)
-    blind = unseen(config, then)
+    blind, unit = geometry_of(config).unseen(then), config.output_unit
     but = f"; not seen: {', '.join(blind)}, about the vertical" * bool(blind)
     if angle <= limit:
-        return f"zero posture stands {angle:.3f} deg from that of {whose}{but}"
+        return f"zero posture stands {angle:.3f} {unit} from that of {whose}{but}"
+    told = axes_text(config.output_names, unit, joints)
     raise MotionFault(
-        f"the zero posture is not that of {whose}: {axes_text(config, joints)} (limit "
+        f"the zero posture is not that of {whose}: "
+        f"{told} (limit "
         f"session.reference_tolerance_deg = {limit:g}){but}. Drives that were without "
         "power have lost their origin: home them. Where the phone or the base was "
         "moved, calibrate again"
     )
 
 
-def axes_text(config: RigConfig, joints: Sequence[float] | Array) -> str:
-    """(n,) degrees in words, of the axes that moved most."""
-    least = TOLD_SHARE * np.abs(joints).max()
-    pairs = zip(config.axis_names, joints, strict=True)
-    told = [f"{name} {angle:+.2f}" for name, angle in pairs if abs(angle) >= least]
-    return f"{', '.join(told)} deg from where it stood"
+def axes_text(names: Sequence[str], unit: str, values: Sequence[float] | Array) -> str:
+    """What moved most, in words, of values by their names."""
+    least = TOLD_SHARE * np.abs(values).max()
+    pairs = zip(names, values, strict=True)
+    told = [f"{name} {value:+.2f}" for name, value in pairs if abs(value) >= least]
+    return f"{', '.join(told)} {unit} from where it stood"

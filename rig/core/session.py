@@ -21,10 +21,12 @@ import numpy as np
 from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.core import record_check
-from rig.core.attitude import Array, angle_between_deg, frame_at
 from rig.core.device import Device, Posture, check_plan
-from rig.core.drive import Drive
-from rig.core.faults import (
+from rig.core.joints import show
+from rig.core.measure import measure, zeroed
+from rig.core.motion import Standing, move
+from rig.drives import Drive
+from rig.faults import (
     EndedShort,
     MotionFault,
     NotFollowing,
@@ -32,11 +34,10 @@ from rig.core.faults import (
     Unreachable,
     ending,
 )
-from rig.core.joints import show
-from rig.core.measure import measure, zeroed
-from rig.core.motion import Standing, move
-from rig.core.phone import ImuError
 from rig.journal import ZEROED, BusLock, DeviceRecord, Record, RunFolder
+from rig.readings.attitude import Array, angle_between_deg
+from rig.readings.geometry import Attitudes
+from rig.readings.source import ReadingError
 
 STREAM_WAIT_S = 60.0  # time to start the app on the phone
 LEAST_TURN_DEG = 0.05  # of the phone's heading: less is its noise
@@ -69,7 +70,7 @@ def open_device(
         reset_alarms: of drives that are in alarm.
 
     Raises:
-        MotionFault, BusError, ImuError, Refused: not fit to move.
+        MotionFault, BusError, ReadingError, Refused: not fit to move.
     """
     device = Device(config, run, record, requests, simulated=simulated)
     requests, lock = device.requests, BusLock(config.bus)
@@ -81,8 +82,9 @@ def open_device(
         reason, latch = "", False
         try:
             device.imu.open()
-            device.emit("listening", port=device.imu.port, format=config.imu.format)
-            device.bus.open()
+            kind = "numbers" if config.imu is None else config.imu.format
+            device.emit("listening", port=device.imu.port, format=kind)
+            device.line.open()
             check(config, device.drives, record)
             for other in beside:
                 stack.enter_context(other(device))
@@ -118,9 +120,9 @@ def _last_move(device: Device) -> Record:
     config, (label, start, end) = device.config, device.last_move
     stands = [result.position for result in device.stopper.results]
     phone = None
-    with contextlib.suppress(ImuError):
+    with contextlib.suppress(ReadingError):
         if device.oriented and device.frame:
-            phone = device.frame.angles(device.imu.latest().matrix).round(3).tolist()
+            phone = device.frame.angles(device.imu.latest().value).round(3).tolist()
     return {
         "label": label,
         "axes": list(config.axis_names),
@@ -138,7 +140,7 @@ def _close(device: Device) -> None:
     """Nothing more will move: note where the drives stand, close bus and phone."""
     if device.requests.armed:
         try:
-            with device.bus.urgent():  # also after a stop that latched
+            with device.line.urgent():  # also after a stop that latched
                 record_check.leave(device.drives, device.record)
         except OSError as error:
             text = f"{device.record.path} cannot be written: {error}"
@@ -169,7 +171,7 @@ def take_zero(
         if run.postures():
             show(device)
             attitude = np.array(zeros[-1]["attitude"])
-            zeroed(device, frame_at(config, attitude), before)
+            zeroed(device, device.geometry.frame(attitude), before)
             return _check_reference(device, before)
         at = at or before.pulses
     elif at is None and config.session.zero == "drive":
@@ -192,9 +194,9 @@ def take_zero(
     attitude = np.array(found["attitude"])
     _compare_zero(device, zero.pulses, attitude, kept)
     device.emit("zero", sync=True, **found)
-    zeroed(device, frame_at(config, attitude), zero)
+    zeroed(device, device.geometry.frame(attitude), zero)
     show(device)
-    zeroed(device, frame_at(config, attitude), zero)
+    zeroed(device, device.geometry.frame(attitude), zero)
 
 
 def _compare_zero(
@@ -222,9 +224,11 @@ def _check_reference(device: Device, zero: Posture) -> None:
     limit = device.config.session.reference_tolerance_deg
     device.emit("reference", sync=True, angles=angles, limit=limit)
     if max(map(abs, angles)) > limit:
+        config = device.config
+        moved = record_check.axes_text(config.output_names, config.output_unit, angles)
         raise MotionFault(
             "the zero posture of this run has moved: "
-            f"{record_check.axes_text(device.config, angles)} (limit {limit:g}): the "
+            f"{moved} (limit {limit:g}): the "
             "drives lost their origin, or the phone or the device was moved. Start a "
             "new run"
         )
@@ -250,7 +254,8 @@ def _reorient(device: Device) -> None:
             continue
         now = np.array(found["attitude"])
         told = record_check.check_zero(config, frame.zero, now, "this run")
-        turn = record_check.heading_turn(config, frame.zero, now)
+        assert isinstance(device.geometry, Attitudes)  # numbers stay as they are
+        turn = device.geometry.heading_turn(frame.zero, now)
         if (turned := angle_between_deg(np.eye(3), turn)) > LEAST_TURN_DEG:
             device.imu.turn(turn)
         zeroed(device, frame, zero)

@@ -15,13 +15,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from rig.core.bus import Bus
-from rig.core.drive import STILL_COUNTS, Drive
-from rig.core.faults import EXIT_FAULT, StopRequested
+from rig.drives.drive import STILL_COUNTS, Drive
+from rig.faults import EXIT_FAULT, StopRequested
 
 ROUNDS = 3  # times a stop is sent to a unit that does not acknowledge
-QUICK_S = 0.05  # for a reply in the first round, besides the time of the frames
-FRAME_BITS = 2 * 24 * 11  # of a stop and its reply on a serial line, at most
 VERIFY_S = 3.0  # for all units together to come to rest
 POLL_S = 0.02
 LOOK_S = 0.1  # between two looks at drives that stand
@@ -63,9 +60,9 @@ def stop_all(drives: list[Drive]) -> list[UnitStop]:
     results = [UnitStop(d.axis.name, d.axis.unit) for d in drives]
     if not drives:
         return results
-    bus, pairs = drives[0].bus, list(zip(drives, results, strict=True))
-    with bus.urgent():
-        with bus.urgent(_quick_s(bus)):
+    line, pairs = drives[0].line, list(zip(drives, results, strict=True))
+    with line.urgent():
+        with line.urgent(line.quick_s):
             broadcast(drives)
             _send(pairs)
         for _ in range(ROUNDS - 1):
@@ -74,29 +71,14 @@ def stop_all(drives: list[Drive]) -> list[UnitStop]:
     return results
 
 
-def _quick_s(bus: Bus) -> float:
-    return QUICK_S + FRAME_BITS / bus.settings.baudrate
-
-
 def _responsive_first(pairs: Pairs) -> Pairs:
-    return sorted(pairs, key=lambda pair: pair[0].axis.unit in pair[0].bus.silent)
-
-
-def takes_broadcast(drives: list[Drive]) -> bool:
-    """Whether one frame stops all: a serial line, and all of a family that takes it."""
-    bus, family = drives[0].bus, drives[0].axis.map
-    alike = all(drive.axis.map.stop == family.stop for drive in drives)
-    return bus.settings.transport != "tcp" and alike and family.broadcast_stop
+    return sorted(pairs, key=lambda pair: pair[0].axis.unit in pair[0].line.silent)
 
 
 def broadcast(drives: list[Drive]) -> None:
     """Stop all by one frame, where they take it."""
-    bus, family = drives[0].bus, drives[0].axis.map
-    if takes_broadcast(drives):
-        with contextlib.suppress(Exception):  # an extra: each gets its own as well
-            for frame in family.stop.write:
-                words = frame.registers(family.word_order)
-                bus.broadcast(frame.address, frame.function, words)
+    with contextlib.suppress(Exception):  # an extra: each gets its own as well
+        drives[0].line.stop_at_once(drives)
 
 
 def _send(pairs: Pairs) -> None:
@@ -117,10 +99,10 @@ def _verify(pairs: Pairs) -> None:
     before: dict[str, int] = {}
     while moving := [pair for pair in pairs if not pair[1].standing]:
         for drive, result in _responsive_first(moving):
-            bus = drive.bus
-            wait_s = _quick_s(bus) if drive.axis.unit in bus.silent else None
+            line = drive.line
+            wait_s = line.quick_s if drive.axis.unit in line.silent else None
             try:
-                with bus.urgent(wait_s):
+                with line.urgent(wait_s):
                     status = drive.status(retries=0)
             except Exception as error:
                 result.detail = str(error)
@@ -153,7 +135,7 @@ def stay(drives: list[Drive], results: list[UnitStop], seconds: float) -> list[s
     for _ in range(ROUNDS):
         standing = [pair for pair in pairs if pair[1].standing]
         for drive, result in standing:
-            with contextlib.suppress(Exception), drive.bus.urgent():
+            with contextlib.suppress(Exception), drive.line.urgent():
                 drive.hold(result.position or 0)
         again = _restarted(standing, time.monotonic() + seconds)
         if not again:
@@ -170,8 +152,8 @@ def _restarted(pairs: Pairs, end: float) -> list[UnitStop]:
         time.sleep(LOOK_S)
         moved = []
         for drive, result in pairs:
-            with contextlib.suppress(Exception), drive.bus.urgent():
-                status = drive.standing()
+            with contextlib.suppress(Exception), drive.line.urgent():
+                status = drive.steady()
                 powered = status.enabled and not status.fault
                 way = abs(status.position - (result.position or 0))
                 if powered and (status.moving or way > STILL_COUNTS):

@@ -132,7 +132,12 @@ class BusLock:
             "device": str(config.device_path.resolve()),
             "stand_s": max(axis.map.restart_s for axis in config.axes),
             "drives": [
-                {"name": axis.name, "unit": axis.unit, "map": axis.map.text}
+                {
+                    "name": axis.name,
+                    "unit": axis.unit,
+                    "map": axis.map.text,
+                    "folder": str(axis.map.folder),
+                }
                 for axis in config.axes
             ],
         }
@@ -218,8 +223,10 @@ def held_by(told: dict[str, Any]) -> str:
 
 def _identity(settings: BusSettings) -> str:
     """One text for every name of a bus."""
-    if settings.transport == "rtu":
+    if settings.transport in ("rtu", "serial"):
         return os.path.realpath(settings.device)
+    if settings.transport == "can":
+        return f"{settings.interface}:{settings.device}"
     try:
         found = socket.getaddrinfo(
             settings.host, settings.port, type=socket.SOCK_STREAM

@@ -11,6 +11,7 @@ from rig.config.maps import (
     FLAGS,
     VALUES,
     Read,
+    RegisterMap,
     Write,
     Writes,
     decode,
@@ -50,6 +51,7 @@ class SimDrive:
         speedup: float = 1.0,
         at_deg: float = 0.0,
     ) -> None:
+        assert isinstance(axis.map, RegisterMap)  # others have simulators of their own
         self.map = axis.map
         self.truth = truth or Truth()
         set_to = self.truth.drive_pulses_per_rev

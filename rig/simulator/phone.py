@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rig.config.settings import ImuSettings
-from rig.core.attitude import Array, euler_to_matrix, matrix_to_euler
+from rig.readings.attitude import Array, euler_to_matrix, matrix_to_euler
 from rig.simulator.faults import FaultInjector
 
 INTRUSION_S = 0.15  # that another sender is heard, where it is let

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rig.config.config import RigConfig
-from rig.core.attitude import Array, euler_to_matrix
+from rig.readings.attitude import Array, euler_to_matrix
 from rig.simulator.drive import SimDrive
 from rig.simulator.faults import FaultInjector
 from rig.simulator.truth import Truth
@@ -41,7 +41,8 @@ class Plant:
         self._joint = self._drive_deg.copy()  # behind the friction too
         self._sliding = np.zeros(len(drives), dtype=bool)
         self._centre = self._drive_deg + truth.dead_centre_deg
-        self._mounting = euler_to_matrix(config.imu.mounting_deg, "ZYX")
+        mounting = config.imu.mounting_deg if config.imu else (0.0, 0.0, 0.0)
+        self._mounting = euler_to_matrix(mounting, "ZYX")
 
     def _commanded(self) -> Array:
         """(n,) degrees by which the motors turn the joints."""
@@ -93,6 +94,11 @@ class Plant:
         zone = self.truth.dead_zone_deg / 2.0
         past = np.sign(off) * np.maximum(np.abs(off) - zone, 0.0)
         return self._matrix @ (self._centre + past) + self._bias
+
+    def numbers(self) -> Array:
+        """(m,) of what a sensor measures now."""
+        noise = self._rng.normal(0.0, self.truth.noise_deg, len(self._bias))
+        return self.joints() + noise
 
     def attitude(self) -> Array:
         """(3, 3) attitude of the phone in its world, as its sensors see it."""

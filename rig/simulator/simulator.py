@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from rig.config.config import RigConfig
-from rig.core.attitude import Array
+from rig.readings.attitude import Array
 from rig.simulator.drive import SimDrive
 from rig.simulator.faults import FaultInjector, FaultSpec
 from rig.simulator.phone import Phone
 from rig.simulator.plant import Plant
+from rig.simulator.sensor import Sensor
 from rig.simulator.server import ModbusServer
 from rig.simulator.truth import Truth
 
@@ -45,7 +46,12 @@ class Simulator:
         units = dict(zip((a.unit for a in config.axes), self.drives, strict=True))
         seed = self.truth.seed
         self.server = ModbusServer(units, self.faults, seed, self.truth.latency_s)
-        self.phone = Phone(config.imu, self._attitude, self.faults, rate_hz, seed)
+        self.phone: Phone | Sensor
+        if config.imu:
+            self.phone = Phone(config.imu, self._attitude, self.faults, rate_hz, seed)
+        else:
+            assert config.readings is not None
+            self.phone = Sensor(config.readings, self._numbers, self.faults, rate_hz)
 
     def start(self, port: int = 0) -> RigConfig:
         """Serve the drives; the phone starts with ``start_phone``."""
@@ -56,13 +62,16 @@ class Simulator:
             port = self.server.serve_tcp(port, rtu=self.transport == "rtu_tcp")
             bus |= {"host": "127.0.0.1", "port": port}
         phone_port = 0
-        if self.config.imu.transport == "connect":
+        if self.config.source.transport in ("connect", "tcp"):
             phone_port = self.start_phone(0)
-        imu = {"host": "127.0.0.1", "port": phone_port, "allow": ("127.0.0.1",)}
+        source: dict[str, Any] = {"host": "127.0.0.1", "port": phone_port}
+        which = "readings"
+        if self.config.imu:
+            source["allow"], which = ("127.0.0.1",), "imu"
         return self.config.model_copy(
             update={
                 "bus": self.config.bus.model_copy(update=bus),
-                "imu": self.config.imu.model_copy(update=imu),
+                which: self.config.source.model_copy(update=source),
             }
         )
 
@@ -95,6 +104,11 @@ class Simulator:
                     drive.halt()
                 if drive.travels and (fault := self.faults.take("sto", axis)):
                     drive.cut(1.05 if fault.seconds is None else fault.seconds)
+
+    def _numbers(self) -> Array:
+        self._alarms()
+        with self.server.lock:
+            return self.plant.numbers()
 
     def _attitude(self) -> Array:
         self._alarms()

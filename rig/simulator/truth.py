@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rig.core.attitude import Array
+from rig.readings.attitude import Array
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable, Iterator
 from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.core.device import Device
-from rig.core.faults import EXIT_FAULT, PlanOnly, Refused, ending
 from rig.core.record_check import KeptZero, check_drives
 from rig.core.session import Beside, Check, open_device, take_zero
+from rig.faults import EXIT_FAULT, PlanOnly, Refused, ending
 from rig.journal import DeviceRecord, JournalError, Record, RunFolder
 from rig.signals import Signals
 

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from rig.config import RigConfig, load_config, parse_config
-from rig.core.faults import Refused
 from rig.core.record_check import KeptZero
+from rig.faults import Refused
 from rig.journal import (
     JOURNAL,
     STOP_PROVED,

@@ -40,8 +40,7 @@ from harness import (
 )
 
 from rig.config import RigConfig, parse_config
-from rig.core.bus import Bus
-from rig.core.drive import Drive
+from rig.drives.modbus import Bus, ModbusDrive
 from rig.journal import (
     HOMED,
     IDENTIFIED,
@@ -316,7 +315,7 @@ def _move_from_elsewhere(sim: Simulator, run: Run, served: RigConfig) -> None:
     axis, drive = served.axes[1], sim.drives[1]
     target = round(drive.position / 2)
     with Bus(served.bus) as bus:
-        Drive(bus, axis).move(target)
+        ModbusDrive(bus, axis).go(target)
     drive.executions.remove(target)  # it is in no journal of ours
 
 

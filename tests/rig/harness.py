@@ -20,6 +20,7 @@ import numpy as np
 from rig import simulator as simulators
 from rig.config import RigConfig, parse_config
 from rig.config.config import EXAMPLES
+from rig.config.maps import RegisterMap, available_maps, load_map
 from rig.core import motion, stop
 from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, STOP_PROVED, DeviceRecord
 from rig.journal.lock import BusLock
@@ -36,6 +37,7 @@ stop.stand_s = lambda drives: 0.05
 motion.TOO_FAST *= 3.0  # as fast as the simulated drives are
 
 RATE_HZ = 250.0
+MODBUS_MAPS = [n for n in available_maps() if isinstance(load_map(n), RegisterMap)]
 SPEEDUP = 3.0  # of the drives over what the configuration says of them
 ENTERED = "entered"  # the file by which a session says that it is in the phase
 HOST_FAULTS = ("sigint", "sigint_twice", "sigterm", "sigkill", "full_disk")
@@ -87,6 +89,40 @@ def axes_text(axes: dict[str, str], order: str = "ZXY", session: str = SESSION) 
     ]
     tail = last[last.index("[imu]") :].replace('order = "ZXY"', f'order = "{order}"')
     return head + "".join(tables) + tail
+
+
+LINEAR = """[[axes]]
+name = "{name}"
+kind = "{kind}"
+unit = {unit}
+map = "leadshine_pr"
+pulses_per_rev = 10000
+reduction = {reduction}
+{lead}min_{u} = -20
+max_{u} = 20
+speed_{u}_s = 400
+accel_{u}_s2 = 8000
+
+"""
+
+
+def measured_text(axes: dict[str, str], transport: str = "tcp") -> str:
+    """Of axes by name and kind, measured by a sensor's lines, a number for each."""
+    text = fast_text()
+    tables = "".join(
+        LINEAR.format(
+            name=name, kind=kind, unit=unit, u="mm" if kind == "translation" else "deg",
+            reduction=1 if kind == "translation" else 10,
+            lead="lead_mm = 10\n" if kind == "translation" else "",
+        )
+        for unit, (name, kind) in enumerate(axes.items(), 1)
+    )  # fmt: skip
+    readings = (
+        f'[readings]\nnames = {list(axes)}\nunit = "mm"\ntransport = "{transport}"\n'
+        "scale = 1.0\nstale_s = 1.0\n\n"
+    )
+    head, tail = text.split("[[axes]]")[0], text[text.index("[motion]") :]
+    return head + tables + readings + tail
 
 
 def changed(settings, **changes):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rig.core.attitude import (
+from rig.readings.attitude import (
     ORDERS,
     Frame,
     angle_between_deg,

@@ -5,7 +5,14 @@ import json
 import numpy as np
 import pytest
 from commission import device
-from harness import RATE_HZ, SPEEDUP, Simulator, axes_text, session
+from harness import (
+    RATE_HZ,
+    SPEEDUP,
+    Simulator,
+    axes_text,
+    measured_text,
+    session,
+)
 
 import jaxcal
 from rig.__main__ import main
@@ -16,6 +23,7 @@ from rig.workbench.outputs.export import load_inverse
 
 TABLE = {"table": "Z"}
 GIMBAL = {"pan": "Z", "tilt": "X"}
+STAGE = {"x": "translation", "y": "translation", "tilt": "rotation", "turn": "rotation"}
 
 
 def simulated(config, **more):
@@ -55,6 +63,46 @@ def test_a_turntable_is_calibrated_with_two_postures(tmp_path):
 def test_a_gimbal_is_calibrated_with_three(tmp_path):
     _, summary, said = calibrated(parse_config(axes_text(GIMBAL)), tmp_path)
     assert len(summary["postures"]) == 3 and "all six at once" in " ".join(said)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("transport", ["tcp", "listen", "udp"])
+def test_four_axes_are_calibrated_by_lines_of_numbers(tmp_path, transport):
+    config = parse_config(measured_text(STAGE, transport))
+    calibration, summary, said = calibrated(config, tmp_path)
+    assert summary["unit"] == "mm" and len(summary["postures"]) == 5
+    assert summary["after"]["max"] < 0.02 < summary["before"]["max"]
+    assert "the phone" not in "\n".join(said)
+    exported = load_inverse(tmp_path, read_journal(tmp_path / "journal.jsonl"))
+    assert exported["outputs"] == exported["axes"] == list(STAGE)
+    assert exported["axis_unit"] == "mm, deg" and len(exported["follow"]) == 16
+    command = np.array(exported["matrix"]) @ np.ones(4) + exported["offset_deg"]
+    np.testing.assert_allclose(command, calibration.command_for(np.ones(4)), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_four_axes_are_commissioned_by_numbers(at, capsys):
+    """One of them moves the other way, and its file is corrected."""
+    truth = Truth.of_axes(4, noise_deg=0.002, reversed=(False, True, False, False))
+    with device(truth, config=parse_config(measured_text(STAGE, "listen"))) as (
+        _,
+        bus,
+        port,
+    ):
+        text = measured_text(STAGE, "listen").replace(
+            "port = 5020", f"port = {bus.rpartition(':')[2]}"
+        )
+        text = text.replace("scale = 1.0", f"scale = 1.0\nport = {port}")
+        (at / "rig.toml").write_text(text)
+        for command in (["scan", "--units", "4"], ["home", "--here", "--yes"]):
+            assert main(command) == 0
+        assert main(["axes", "--yes"]) == 0
+        assert main(["jog", "x", "-2", "--yes"]) == 0
+        assert main(["calibrate", "--arm", "--zero"]) == 0
+    now = parse_config((at / "rig.toml").read_text())
+    assert [axis.direction for axis in now.axes] == [1, -1, 1, 1]
+    record = DeviceRecord.load(at / "device.json")
+    assert np.shape(record.state(SIGN_CHECKED)["turns"]["deg"]) == (4, 4)
 
 
 @pytest.mark.slow

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rig.config import AXIS_NAMES
-from rig.core.attitude import ORDERS, angle_between_deg, euler_to_matrix
-from rig.core.faults import MotionFault
+from rig.faults import MotionFault
+from rig.readings.attitude import ORDERS, angle_between_deg, euler_to_matrix
 from rig.workbench.commission.axis_check import (
     Stand,
     corner_name,

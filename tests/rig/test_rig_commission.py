@@ -12,8 +12,8 @@ from harness import changed, fast_config, simulator
 
 from rig.__main__ import main
 from rig.config import load_config
-from rig.core.faults import Refused
 from rig.core.record_check import check_drives
+from rig.faults import Refused
 from rig.journal import HOMED, SIGN_CHECKED, ZEROED, DeviceRecord
 from rig.simulator import Truth
 from rig.simulator.drive import SimDrive

@@ -11,17 +11,16 @@ import threading
 import time
 
 import pytest
-from harness import HASTY, changed, fast_config, fast_text, simulator
+from harness import HASTY, MODBUS_MAPS, changed, fast_config, fast_text, simulator
 from hypothesis import given
 from hypothesis import strategies as st
 from recorder import Recorder, axis_with, rtu_over_tcp
 
 from rig.config import ConfigError, parse_config
-from rig.config.maps import available_maps, load_map
+from rig.config.maps import load_map
 from rig.config.settings import BusSettings
-from rig.core.bus import Bus, BusError, Rejected
-from rig.core.drive import Drive
 from rig.core.stop import stop_all
+from rig.drives.modbus import Bus, BusError, ModbusDrive, Rejected
 from rig.simulator import parse_fault
 from rig.simulator.server import crc16
 
@@ -76,7 +75,7 @@ def test_a_ramp_register_holds_a_time_that_is_rounded_up():
 
 
 @given(
-    name=st.sampled_from(available_maps()),
+    name=st.sampled_from(MODBUS_MAPS),
     speed=st.floats(1e-3, 5000),
     accel=st.floats(1e-3, 1e5),
     reduction=st.floats(0.01, 500),
@@ -114,9 +113,9 @@ def test_three_drives_move_on_every_transport(transport):
     config = fast_config()
     with simulator(config, transport=transport) as sim:
         with Bus(sim.start().bus) as bus:
-            drives = [Drive(bus, axis) for axis in config.axes]
+            drives = [ModbusDrive(bus, axis) for axis in config.axes]
             for drive, target in zip(drives, (1000, -2000, 555), strict=True):
-                drive.move(target)
+                drive.go(target)
             end = time.monotonic() + 10
             while not all(drive.status().done for drive in drives):
                 assert time.monotonic() < end
@@ -127,10 +126,10 @@ def test_three_drives_move_on_every_transport(transport):
 def test_a_target_outside_the_limits_never_reaches_the_bus():
     config = fast_config()
     with simulator(config) as sim, Bus(sim.start().bus) as bus:
-        drive = Drive(bus, config.axes[0])
+        drive = ModbusDrive(bus, config.axes[0])
         for pulses in (config.axes[0].max_pulses + 1, config.axes[0].min_pulses - 1):
             with pytest.raises(ValueError, match="leave the limits"):
-                drive.move(pulses)
+                drive.go(pulses)
         assert sim.server.requests == 0
 
 
@@ -140,7 +139,7 @@ def test_a_target_outside_the_limits_never_reaches_the_bus():
 def test_reads_are_retried(fault):
     config = fast_config(HASTY)
     with simulator(config) as sim, Bus(sim.start().bus) as bus:
-        drive = Drive(bus, config.axes[0])
+        drive = ModbusDrive(bus, config.axes[0])
         sim.faults.add(parse_fault(f"{fault},count=2"))
         assert drive.status().position == round(sim.drives[0].position)
         sim.faults.add(parse_fault(fault))
@@ -157,7 +156,7 @@ def test_a_move_whose_reply_is_lost_is_executed_once_and_reported(transport):
     ):
         sim.faults.add(parse_fault("lost_write_reply,count=1"))
         with pytest.raises(BusError):
-            Drive(bus, config.axes[0]).move(1234)
+            ModbusDrive(bus, config.axes[0]).go(1234)
         assert sim.executions()[0] == [1234]
 
 
@@ -165,7 +164,7 @@ def test_exception_replies_are_errors_with_their_name():
     config = fast_config()
     with simulator(config, travel_deg=(-5, 5)) as sim, Bus(sim.start().bus) as bus:
         with pytest.raises(Rejected, match="illegal value") as caught:
-            Drive(bus, config.axes[0]).move(5000)
+            ModbusDrive(bus, config.axes[0]).go(5000)
         assert caught.value.code == 3
         with pytest.raises(Rejected, match="illegal address"):
             bus.read_words(1, 0x7777, 1)
@@ -248,18 +247,18 @@ def test_identify_only_reads():
         Bus(sim.start().bus, emit=lambda event, **fields: frames.append(event)) as bus,
     ):
         for axis in config.axes:
-            drive = Drive(bus, axis)
+            drive = ModbusDrive(bus, axis)
             drive.status(), drive.alarm()
-            assert drive.identity()["pulses_per_rev"] == 10000
+            assert drive.ids()["pulses_per_rev"] == 10000
         assert frames == []
 
 
 def test_stop_reaches_the_others_when_one_unit_is_dead():
     config = fast_config(HASTY)
     with simulator(config) as sim, Bus(sim.start().bus) as bus:
-        drives = [Drive(bus, axis) for axis in config.axes]
+        drives = [ModbusDrive(bus, axis) for axis in config.axes]
         for drive in drives:
-            drive.move(5000 if drive.axis.name != "yaw" else -5000)
+            drive.go(5000 if drive.axis.name != "yaw" else -5000)
         sim.faults.add(parse_fault("dead_drive,axis=yaw"))
         pitch, yaw, roll = stop_all(drives)
         assert pitch.acknowledged and pitch.standing
@@ -319,7 +318,7 @@ def test_against_pymodbus_own_server_on_tcp():
             assert bus.read_words(1, 10, 3) == [0xFFFE, 0xEE8F, 3]
             bus.write(1, 20, 6, [77])
             assert bus.read_words(1, 20, 1) == [77]
-            Drive(bus, axis).move(-321)
+            ModbusDrive(bus, axis).go(-321)
             assert bus.read_words(1, 0x20, 2) == [0xFFFF, 0x10000 - 321]
             assert bus.read_words(1, 0x28, 1) == [1]
 
@@ -328,6 +327,6 @@ def test_only_one_file_opens_a_drive_port():
     import rig
 
     for path in pathlib.Path(rig.__file__).parent.rglob("*.py"):
-        if path.name not in ("bus.py", "__main__.py"):  # it asks whether it is there
+        if path.name not in ("modbus.py", "__main__.py"):  # it asks whether it is there
             assert "import pymodbus" not in path.read_text(), path.name
             assert "from pymodbus" not in path.read_text(), path.name

@@ -16,8 +16,8 @@ from harness import changed, fast_config
 from scipy.spatial.transform import Rotation
 
 from rig.config.settings import BusSettings
-from rig.core.bus import Bus, BusError
-from rig.core.stream import MAX_LINE, LineSplitter, Parser
+from rig.drives.modbus import Bus, BusError
+from rig.readings.stream import MAX_LINE, LineSplitter, Parser
 from rig.simulator.server import crc16
 
 IMU = changed(fast_config().imu, max_jump_deg=180.0)
@@ -92,7 +92,7 @@ def test_mutated_imu_lines(count):
                 right = judged(piece)
                 assert right is not None, piece
                 np.testing.assert_allclose(
-                    reading.matrix, right.as_matrix(), atol=1e-9, err_msg=str(piece)
+                    reading.value, right.as_matrix(), atol=1e-9, err_msg=str(piece)
                 )
                 accepted += 1
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -111,7 +111,7 @@ def test_random_imu_streams_keep_no_memory(count):
         if rng.random() < 0.3:
             data = bytes(rng.choice(b"0123456789.,-+eE\r\n#") for _ in range(400))
         for reading in parser.lines(splitter.feed(data), number * 0.1):
-            assert np.isfinite(reading.matrix).all()
+            assert np.isfinite(reading.value).all()
         assert len(splitter._tail) <= MAX_LINE
     assert len(parser.counts) < 20
 
@@ -132,7 +132,7 @@ def test_mutated_sensor_logger_messages(count):
             given = entry.get("values", entry)
             numbers = [float(given[key]) for key in ("qx", "qy", "qz", "qw")]
             right = Rotation.from_quat(numbers).as_matrix()
-            np.testing.assert_allclose(reading.matrix, right, atol=1e-9)
+            np.testing.assert_allclose(reading.value, right, atol=1e-9)
 
 
 class Replies:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from harness import fast_config
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import special
@@ -10,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from rig.config import AXIS_NAMES
-from rig.core.attitude import ORDERS, Frame, Reading, euler_to_matrix, raw_fields
+from rig.readings.attitude import ORDERS, Frame, Reading, euler_to_matrix, raw_fields
+from rig.readings.geometry import Attitudes
 from rig.simulator import Truth
 from rig.workbench.identification.conclusion import estimate_drift, without_drift
 from rig.workbench.identification.fit import uncertainty
@@ -26,6 +28,13 @@ def seen(frame, joints_deg):
     places = [frame.letters.index(letter) for letter in frame.order]
     turned = euler_to_matrix(np.asarray(joints_deg)[..., places], frame.order)
     return frame.zero @ frame.mounting.T @ turned @ frame.mounting
+
+
+def reading(frame):
+    """Attitudes that are read in a frame, whatever the configuration says."""
+    geometry = Attitudes(fast_config())
+    geometry.frame = lambda zero: frame
+    return geometry
 
 
 def autoregression(rng, phi, n, size=3):
@@ -129,11 +138,11 @@ def test_a_linear_drift_of_the_phones_world_is_taken_out(order, rate, joints):
     """Of attitudes, so also where the joint angles do not shift by equal amounts."""
     frame, rate = a_frame(order), np.array(rate)
     visits = [visit(t, np.zeros(3), frame, rate * t) for t in (0.0, 0.6, 1.0)]
-    drift = estimate_drift(visits, frame, 0.2)
+    drift = estimate_drift(visits, reading(frame), 0.2)
     assert drift["corrected"] and not drift["over"]
     moved = visit(0.8, joints, frame, 0.8 * rate)
     assert np.abs(np.subtract(moved["measured_deg"], joints)).max() > 0.02
-    mended = without_drift(moved, drift["turn_deg_per_min"], visits[0], frame)
+    mended = without_drift(moved, drift["turn_deg_per_min"], visits[0], reading(frame))
     np.testing.assert_allclose(mended["measured_deg"], joints, atol=2e-3)
 
 
@@ -144,12 +153,12 @@ def test_a_drift_that_is_not_linear_stays_and_is_judged():
         visit(t, np.zeros(3), frame, turn)
         for t, turn in zip((0, 0.5, 1), turns, strict=True)
     ]
-    drift = estimate_drift(visits, frame, 0.2)
+    drift = estimate_drift(visits, reading(frame), 0.2)
     assert not drift["corrected"] and drift["over"]
     told = {"drift": drift}
     assert "session.drift_limit_deg (0.2)" in " ".join(recalibrate(told, 0.5))
     assert "not linear" in drift_text(drift, AXIS_NAMES)
-    assert not estimate_drift(visits, frame, 0.6)["over"]
+    assert not estimate_drift(visits, reading(frame), 0.6)["over"]
 
 
 def test_a_drift_within_the_noise_or_under_a_tenth_of_the_limit_is_left_alone():
@@ -158,17 +167,17 @@ def test_a_drift_within_the_noise_or_under_a_tenth_of_the_limit_is_left_alone():
         visits = [
             visit(t, np.zeros(3), frame, (0, 0, end * t), std) for t in (0, 0.5, 1)
         ]
-        drift = estimate_drift(visits, frame, 0.2)
+        drift = estimate_drift(visits, reading(frame), 0.2)
         assert not drift["corrected"] and not drift["over"]
 
 
 def test_two_visits_say_how_far_and_not_whether_in_a_line():
     frame = a_frame()
     visits = [visit(t, np.zeros(3), frame, (0, 0, 0.5 * t)) for t in (0, 1)]
-    drift = estimate_drift(visits, frame, 0.2)
+    drift = estimate_drift(visits, reading(frame), 0.2)
     assert drift["size_deg"] == pytest.approx(0.5, rel=0.3)
     assert not drift["corrected"] and drift["over"]
-    assert estimate_drift(visits[:1], frame, 0.2) is None
+    assert estimate_drift(visits[:1], reading(frame), 0.2) is None
 
 
 # Raw data

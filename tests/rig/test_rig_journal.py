@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from rig.core.faults import StopRequested
+from rig.faults import StopRequested
 from rig.journal import Journal, JournalError, read_journal
 
 

@@ -10,8 +10,7 @@ import time
 import pytest
 from harness import changed, fast_config, simulator
 
-from rig.core.bus import Bus, BusError
-from rig.core.drive import Drive
+from rig.drives.modbus import Bus, BusError, ModbusDrive
 from rig.simulator import parse_fault
 from rig.simulator.drive import DriveException
 
@@ -31,7 +30,7 @@ def line(request):
         settings = changed(sim.start().bus, timeout_s=TIMEOUT_S, read_retries=2)
         sim.drives[0].position = PLACE
         with Bus(settings, config.silence_s) as bus:
-            yield sim, bus, Drive(bus, config.axes[0])
+            yield sim, bus, ModbusDrive(bus, config.axes[0])
 
 
 def position_after_a_late_status(line, late_s):

@@ -23,9 +23,8 @@ from scipy.spatial.transform import Rotation
 from rig.__main__ import main
 from rig.config import parse_config
 from rig.config.settings import BusSettings
-from rig.core.bus import Bus, BusError
-from rig.core.drive import Drive
 from rig.core.stop import stop_all
+from rig.drives.modbus import Bus, BusError, ModbusDrive
 
 SOURCE = pathlib.Path(__file__).with_name("libmodbus_slave.c")
 MATRIX = np.array([[0.95, 0.03, -0.02], [0.01, 1.04, 0.02], [-0.015, 0.01, 0.9]])
@@ -159,7 +158,7 @@ def test_every_family_enables_moves_and_stops(program, register_map, family):
     axis, port = parse_config(text).axes[1], _free_port()
     settings = BusSettings(transport="tcp", host="127.0.0.1", port=port, timeout_s=0.5)
     with Slave(program, "tcp", str(port), family) as slave, Bus(settings) as bus:
-        drive = Drive(bus, axis)
+        drive = ModbusDrive(bus, axis)
         if axis.map.enable:
             assert not drive.status().enabled
             assert drive.bring(axis.map.enable, lambda s: s.enabled).enabled
@@ -167,7 +166,7 @@ def test_every_family_enables_moves_and_stops(program, register_map, family):
         start = drive.status()
         assert start.enabled and start.done and not start.moving and not start.fault
         assert drive.took(-4321, start, 14) is False
-        drive.move(-4321)
+        drive.go(-4321)
         assert drive.took(-4321, start, 14) is True
         end = time.monotonic() + 5
         while not (status := drive.status()).done:
@@ -206,9 +205,9 @@ def test_one_drive_over_rtu_on_a_pseudo_terminal(program):
             Slave(program, "rtu", os.ttyname(theirs[1])) as slave,
             Bus(settings) as bus,
         ):
-            drive = Drive(bus, axis)
-            assert drive.identity()["pulses_per_rev"] == 10000
-            drive.move(-4321)
+            drive = ModbusDrive(bus, axis)
+            assert drive.ids()["pulses_per_rev"] == 10000
+            drive.go(-4321)
             end = time.monotonic() + 5
             while not drive.status().done:
                 assert time.monotonic() < end

@@ -13,7 +13,7 @@ import urllib.request
 
 import pytest
 
-from rig.core.faults import Refused
+from rig.faults import Refused
 from rig.journal import Journal
 from rig.journal.run import SCHEMA
 from rig.signals import PAUSE
@@ -136,7 +136,7 @@ def test_buttons_reach_the_process_that_holds_the_journal_and_no_other(tmp_path)
 # A session that moves, whose loop is slow to say that it was asked to pause.
 MOVES = """
 import time
-from rig.core.faults import StopRequested
+from rig.faults import StopRequested
 from rig.signals import Signals
 with Signals() as signals:
     signals.armed = True

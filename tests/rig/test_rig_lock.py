@@ -13,7 +13,7 @@ from harness import fast_text
 
 from rig.__main__ import main
 from rig.config.settings import BusSettings
-from rig.core.faults import Refused
+from rig.faults import Refused
 from rig.journal import lock
 from rig.journal.lock import BusLock
 

@@ -7,15 +7,22 @@ import time
 import numpy as np
 import pytest
 from fault_matrix import calibration, uninterrupted
-from harness import HASTY, Simulator, fast_config, fast_text, session, simulator
+from harness import (
+    HASTY,
+    MODBUS_MAPS,
+    Simulator,
+    fast_config,
+    fast_text,
+    session,
+    simulator,
+)
 from test_rig_motion import bench
 
 from rig.config import ConfigError, parse_config
-from rig.config.maps import MAP_FOLDER, RegisterMap, available_maps
+from rig.config.maps import MAP_FOLDER, RegisterMap
 from rig.config.schema import parse
-from rig.core.bus import Bus, BusError
-from rig.core.drive import Drive
-from rig.core.faults import MotionFault, StopRequested
+from rig.drives.modbus import Bus, BusError, ModbusDrive
+from rig.faults import MotionFault, StopRequested
 from rig.journal import read_journal
 from rig.simulator import Truth, parse_fault
 
@@ -54,7 +61,7 @@ def once(fault):
     )
 
 
-@pytest.mark.parametrize("register_map", available_maps())
+@pytest.mark.parametrize("register_map", MODBUS_MAPS)
 @pytest.mark.parametrize(
     ("fault", "outcome"),
     [("lost_write_reply", "obeyed"), ("lost_request", "not taken")],
@@ -85,15 +92,15 @@ def test_a_move_that_the_drive_already_finished_counts_as_taken():
             assert len(ran) == len(set(ran)) > 0
 
 
-@pytest.mark.parametrize("register_map", available_maps())
+@pytest.mark.parametrize("register_map", MODBUS_MAPS)
 def test_a_drive_shows_whether_it_took_a_move(register_map):
     config = hasty(register_map)
     with simulator(config, speedup=0.05) as sim, Bus(sim.start().bus) as bus:
-        drive, start = Drive(bus, config.axes[0]), sim.drives[0].position
+        drive, start = ModbusDrive(bus, config.axes[0]), sim.drives[0].position
         before = drive.status()
         assert drive.took(2000, before, 14) is False
         assert drive.took(round(start), before, 14) is True  # it stands there
-        drive.move(2000)
+        drive.go(2000)
         assert drive.took(2000, before, 14) is True
         assert drive.took(1000, before, 14) is None  # it goes elsewhere
         assert len(sim.drives[0].executions) == 1
@@ -165,7 +172,7 @@ def test_a_move_that_waited_for_the_line_while_it_was_stopped_is_not_sent():
         device, held = motion.device, threading.Event()
 
         def stop():
-            with device.bus.urgent():  # as the stop path holds it
+            with device.line.urgent():  # as the stop path holds it
                 held.set()
                 time.sleep(0.1)
                 device.stopper.reason = "stopped by another thread"
@@ -174,7 +181,7 @@ def test_a_move_that_waited_for_the_line_while_it_was_stopped_is_not_sent():
         thread.start()
         held.wait()
         with pytest.raises(StopRequested):
-            device.drives[0].move(100)
+            device.drives[0].go(100)
         thread.join()
         assert motion.sim.executions()[0] == []
 
@@ -184,12 +191,12 @@ def test_only_what_may_be_written_twice_is_retried():
     config = fast_config(HASTY)
     with simulator(config) as sim, Bus(sim.start().bus) as bus:
         axis = config.axes[0]
-        drive, table = Drive(bus, axis), axis.map
+        drive, table = ModbusDrive(bus, axis), axis.map
         for name in ("enable", "alarm_reset", "limits"):
             sim.faults.add(parse_fault("lost_write_reply,count=2"))
             drive.write(getattr(table, name), min=-9000, max=9000)
             sim.faults.clear()
-        for act in (lambda: drive.write(table.home), drive.stop, lambda: drive.move(9)):
+        for act in (lambda: drive.write(table.home), drive.stop, lambda: drive.go(9)):
             sim.faults.add(parse_fault("lost_write_reply,count=1"))
             with pytest.raises(BusError):
                 act()

@@ -8,8 +8,7 @@ shares nothing with the one that is tested.
 import pytest
 from recorder import Recorder, axis_with, rtu_over_tcp
 
-from rig.core.bus import Bus
-from rig.core.drive import Drive
+from rig.drives.modbus import Bus, ModbusDrive
 from rig.simulator.server import crc16
 
 
@@ -53,7 +52,7 @@ def spoken():
         peer = Recorder(answer or echo)
         made.append(peer)
         with Bus(rtu_over_tcp(peer.port, retries=0, timeout_s=1.0)) as bus:
-            result = act(Drive(bus, axis_with(map_name, unit=unit, **changes)))
+            result = act(ModbusDrive(bus, axis_with(map_name, unit=unit, **changes)))
         return peer.received, result
 
     yield say
@@ -102,7 +101,7 @@ def test_leadshine_registers_are_those_of_a_recorded_session(spoken):
     ]
     # reduction 10: 600 rpm are 360 deg/s; 1000 rpm in 50 ms are 12000 deg/s^2
     sent, _ = spoken(
-        "leadshine_pr", 1, lambda d: d.move(200000), speed_deg_s=360.0,
+        "leadshine_pr", 1, lambda d: d.go(200000), speed_deg_s=360.0,
         accel_deg_s2=12000.0, max_deg=2e4,
     )  # fmt: skip
     assert sent[:7] == bytes.fromhex("01 10 62 00 00 08 10")
@@ -112,7 +111,7 @@ def test_leadshine_registers_are_those_of_a_recorded_session(spoken):
 
 
 def test_leadshine_stop_and_homing(spoken):
-    stop, _ = spoken("leadshine_pr", 1, Drive.stop)
+    stop, _ = spoken("leadshine_pr", 1, ModbusDrive.stop)
     assert stop == frame("01 06 60 02 00 40", "37 FA")
     home, _ = spoken("leadshine_pr", 1, lambda d: d.write(d.axis.map.home))
     assert home == frame("01 06 60 02 00 20")
@@ -132,7 +131,7 @@ def test_leadshine_status_and_position(word, flags, spoken):
         frame("01 03 10 03 00 01"): frame(f"01 03 02 {word}"),
         frame("01 03 60 2C 00 02"): frame("01 03 04 FF FE EE 8F"),
     }
-    sent, status = spoken("leadshine_pr", 1, Drive.status, replies.__getitem__)
+    sent, status = spoken("leadshine_pr", 1, ModbusDrive.status, replies.__getitem__)
     assert sent == b"".join(replies)
     assert status.position == -70001
     homed = axis_with("leadshine_pr").map.homed.holds(status.word)
@@ -155,7 +154,7 @@ def test_oriental_move_is_the_direct_data_operation_of_the_manual(spoken):
     )
     absolute = printed[:13] + b"\x00\x01" + printed[15:-2]
     sent, _ = spoken(
-        "oriental_az", 1, lambda d: d.move(8500), pulses_per_rev=1000, reduction=1.0,
+        "oriental_az", 1, lambda d: d.go(8500), pulses_per_rev=1000, reduction=1.0,
         speed_deg_s=720.0, accel_deg_s2=540.0, max_deg=2e4,
     )  # fmt: skip
     assert sent == absolute + check_bytes(absolute)
@@ -164,15 +163,15 @@ def test_oriental_move_is_the_direct_data_operation_of_the_manual(spoken):
 def test_oriental_pairs_have_the_high_word_first(spoken):
     """The maker's FAQ 0331: -1000 to 1802h and 1803h is FFFFh, FC18h."""
     sent, _ = spoken(
-        "oriental_az", 1, lambda d: d.bus.write(1, 0x1802, 16, [0xFFFF, 0xFC18])
+        "oriental_az", 1, lambda d: d.line.write(1, 0x1802, 16, [0xFFFF, 0xFC18])
     )
     assert sent == frame("01 10 18 02 00 02 04 FF FF FC 18")
-    sent, _ = spoken("oriental_az", 1, lambda d: d.move(-1000))
+    sent, _ = spoken("oriental_az", 1, lambda d: d.go(-1000))
     assert sent[15:19] == bytes.fromhex("FF FF FC 18")
 
 
 def test_oriental_stop_is_given_and_taken_back(spoken):
-    sent, _ = spoken("oriental_az", 3, Drive.stop)
+    sent, _ = spoken("oriental_az", 3, ModbusDrive.stop)
     assert sent == frame("03 06 00 7D 00 20") + frame("03 06 00 7D 00 00")
 
 
@@ -207,7 +206,7 @@ def test_applied_motion_move_is_what_a_running_machine_sends(spoken):
         frame("05 03 00 06 00 02"): frame("05 03 04 00 00 00 00"),
     }
     sent, _ = spoken(
-        "applied_motion", 5, lambda d: d.move(228580),
+        "applied_motion", 5, lambda d: d.go(228580),
         lambda sent: replies.get(sent) or echo(sent), speed_deg_s=252.0,
         accel_deg_s2=21600.0, max_deg=2e4,
     )  # fmt: skip
@@ -222,7 +221,7 @@ def test_applied_motion_counts_from_where_home_was_set(spoken):
     }
 
     def move(drive):
-        drive.move(1000)
+        drive.go(1000)
         return drive.last.position, drive.origin
 
     sent, found = spoken(
@@ -239,7 +238,7 @@ def test_applied_motion_counts_from_where_home_was_set(spoken):
 
 def test_applied_motion_opcodes(spoken):
     """Opcodes of the host command reference: SK E1, ME 9F, AR BA; all to 40125."""
-    stop, _ = spoken("applied_motion", 32, Drive.stop)
+    stop, _ = spoken("applied_motion", 32, ModbusDrive.stop)
     assert stop == frame("20 06 00 7C 00 E1")
     enable, _ = spoken("applied_motion", 32, lambda d: d.write(d.axis.map.enable))
     assert enable == frame("20 06 00 7C 00 9F")
@@ -253,7 +252,7 @@ def test_applied_motion_status_and_position(spoken):
         frame("20 03 00 01 00 01"): frame("20 03 02 00 09"),
         frame("20 03 00 06 00 02"): frame("20 03 04 00 03 7C E4"),
     }
-    sent, status = spoken("applied_motion", 32, Drive.status, replies.__getitem__)
+    sent, status = spoken("applied_motion", 32, ModbusDrive.status, replies.__getitem__)
     assert sent == b"".join(replies)
     assert status.enabled and status.done and not status.moving and not status.fault
     assert status.position == 228580

@@ -14,20 +14,21 @@ from harness import HASTY, UNSETTLED, WATCHED, fast_config, fast_text, simulator
 from rig.config import parse_config
 from rig.core import measure as measuring
 from rig.core import motion as moving
-from rig.core.attitude import Reading, euler_to_matrix
 from rig.core.device import Device, Posture, approach, check_plan
-from rig.core.drive import HOME
-from rig.core.faults import (
+from rig.core.measure import _unquiet, measure
+from rig.core.motion import Standing, move
+from rig.core.proof import FIRST_DEG, GROWTH
+from rig.drives.drive import HOME
+from rig.faults import (
     LimitError,
     MotionFault,
     PauseRequested,
     StopRequested,
     Unreachable,
 )
-from rig.core.measure import _unquiet, measure
-from rig.core.motion import Standing, move
-from rig.core.phone import ImuError
-from rig.core.proof import FIRST_DEG, GROWTH
+from rig.readings.attitude import Reading, euler_to_matrix
+from rig.readings.geometry import geometry_of
+from rig.readings.phone import ReadingError
 from rig.signals import Signals
 from rig.simulator import Truth, parse_fault
 from rig.workbench.commission.home import unlimited
@@ -46,7 +47,7 @@ def bench(config=None, arm=True, **options):
         )
         checked = SimpleNamespace(missing=lambda *_: None, state=lambda _: None)
         device = Device(served, run, checked, Signals())
-        with device.imu as imu, device.bus:
+        with device.imu as imu, device.line:
             sim.start_phone(imu.port)
             imu.wait_for_stream(5)
             if arm:
@@ -96,7 +97,7 @@ def test_an_alarm_or_a_silent_phone_keeps_it_from_arming():
     with bench(fast_config(HASTY), arm=False) as motion:
         motion.sim.faults.add(parse_fault("imu_gap"))
         time.sleep(motion.config.imu.stale_s + 0.1)
-        with pytest.raises(ImuError, match="reading is"):
+        with pytest.raises(ReadingError, match="reading is"):
             motion.device.arm()
 
 
@@ -144,7 +145,7 @@ def test_soft_limits_are_mirrored_in_drives_that_have_them():
                "[motion]": "[motion]\nmirror_limits = true"}  # fmt: skip
     with bench(parse_config(fast_text(changes))) as motion:
         axis = motion.config.axes[0]
-        words = motion.device.bus.read_words(axis.unit, 0x2C, 4)
+        words = motion.device.line.read_words(axis.unit, 0x2C, 4)
         low, high = (a << 16 | b for a, b in (words[:2], words[2:]))
         assert (low - 2**32, high) == (axis.min_pulses, axis.max_pulses)
 
@@ -155,7 +156,7 @@ def test_before_home_is_set_the_drives_own_limits_leave_it_room():
                "[motion]": "[motion]\nmirror_limits = true"}  # fmt: skip
     with bench(unlimited(parse_config(fast_text(changes)))) as motion:
         unit = motion.config.axes[0].unit
-        words = motion.device.bus.read_words(unit, 0x2C, 4)
+        words = motion.device.line.read_words(unit, 0x2C, 4)
         low, high = (a << 16 | b for a, b in (words[:2], words[2:]))
         assert low - 2**32 <= 0 < HOME <= high
 
@@ -224,7 +225,7 @@ def test_a_gearing_that_was_changed_since_is_seen_in_the_first_degree():
         begin = motion.sim.plant.joints()
         with pytest.raises(MotionFault, match=r"the phone turned .* that may turn it"):
             motion.move_to(motion.config.to_pulses([10.0, -10.0, 10.0]), "far")
-        assert np.abs(motion.sim.plant.joints() - begin).max() < 12.5
+        assert np.abs(motion.sim.plant.joints() - begin).max() < 5.0
 
 
 def test_every_posture_is_approached_from_one_side():
@@ -279,8 +280,9 @@ def test_readings_that_come_in_bursts_settle_over_more_than_the_window(moves):
     turns = [[5.0 * moves * (time < 0.25), 0.0, 0.0] for time in times]
     matrices = euler_to_matrix(turns, "ZYX")
     readings = [Reading(*each) for each in zip(times, matrices, strict=True)]
-    imu = SimpleNamespace(dropped="")
-    device = SimpleNamespace(config=config, frame=None, imu=imu)
+    imu = SimpleNamespace(dropped="", lost="", whose="the phone", stale_s=0.4)
+    geometry = geometry_of(config)
+    device = SimpleNamespace(config=config, frame=None, imu=imu, geometry=geometry)
     found = _unquiet(device, readings, now=0.35)
     assert "std_deg" in found if moves else found == ""
     assert "10 readings over 0.00 s" in _unquiet(device, readings[-10:], now=0.35)
@@ -378,7 +380,7 @@ def test_a_lost_heartbeat_stops_the_drives():
         for drive, pulses in zip(
             motion.device.drives, motion.config.to_pulses([15, 15, 15]), strict=True
         ):
-            drive.move(pulses)
+            drive.go(pulses)
         motion.device.heartbeat.feed(moving=True)  # and then the loop falls silent
         end = time.monotonic() + 60
         while not motion.device.stopper.reason:
@@ -398,7 +400,7 @@ def test_a_drives_own_watch_stops_it_when_the_host_is_gone():
         motion.device.heartbeat.close()
         target = motion.config.to_pulses([15, 15, 15])
         for drive, pulses in zip(motion.device.drives, target, strict=True):
-            drive.move(pulses)
+            drive.go(pulses)
         time.sleep(1.2)  # nothing is said on the bus
         for sim, pulses in zip(motion.sim.drives, target, strict=True):
             with motion.sim.server.lock:

@@ -10,9 +10,9 @@ from test_rig_motion import bench
 
 from rig.config import parse_config
 from rig.config.maps import MAP_FOLDER
-from rig.core.drive import Drive
-from rig.core.faults import MotionFault
 from rig.core.stop import stop_all
+from rig.drives.modbus import ModbusDrive
+from rig.faults import MotionFault
 from rig.simulator import Truth, parse_fault
 
 
@@ -58,7 +58,7 @@ def test_it_waits_as_long_as_the_map_says_and_no_longer(delays, says, tmp_path):
 def test_a_look_that_took_longer_than_the_wait_is_not_the_last(monkeypatch):
     """A spoilt frame held it up: it tells of the time before the drive was ready."""
     with realistic(enable_delay_s=0.1) as motion:
-        drive, real = motion.device.drives[0], Drive.status
+        drive, real = motion.device.drives[0], ModbusDrive.status
         drive.axis = changed(drive.axis, map=changed(drive.axis.map, ready_s=0.05))
 
         def held_up(drive, retries=None):
@@ -67,8 +67,8 @@ def test_a_look_that_took_longer_than_the_wait_is_not_the_last(monkeypatch):
                 time.sleep(0.2)
             return status
 
-        monkeypatch.setattr(Drive, "status", held_up)
-        found = drive.bring(drive.axis.map.enable, lambda status: status.enabled)
+        monkeypatch.setattr(ModbusDrive, "status", held_up)
+        found = drive.bring(drive.arm, lambda status: status.enabled)
         assert found.enabled
 
 

@@ -7,7 +7,7 @@ from harness import fast_config
 
 from rig.config import parse_config
 from rig.config.config import differences
-from rig.core.faults import Refused
+from rig.faults import Refused
 from rig.journal import (
     HOMED,
     IDENTIFIED,

@@ -16,9 +16,8 @@ from rig import stopping
 from rig.__main__ import main
 from rig.config import ConfigError, parse_config
 from rig.config.maps import load_map
-from rig.core.bus import Bus
-from rig.core.drive import Drive
 from rig.core.record_check import check_drives
+from rig.drives.modbus import Bus, ModbusDrive
 from rig.journal import HOMED, STOP_PROVED, Journal, lock
 from rig.journal.lock import BusLock
 from rig.workbench.identification.conclusion import conclude
@@ -123,7 +122,9 @@ def test_one_mangled_position_voids_no_home(tmp_path):
 
         drive.read = read
         with Bus(config.bus) as bus:
-            check_drives(config, [Drive(bus, axis) for axis in config.axes], record)
+            check_drives(
+                config, [ModbusDrive(bus, axis) for axis in config.axes], record
+            )
         assert calls and record.state(HOMED) is not None
 
 

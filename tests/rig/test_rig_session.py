@@ -30,7 +30,7 @@ from scipy import special
 import jaxcal
 from rig.__main__ import main
 from rig.config import parse_config
-from rig.core.faults import Refused
+from rig.faults import Refused
 from rig.journal import read_journal
 from rig.simulator import Truth
 from rig.workbench.identification.conclusion import order_residuals
@@ -333,14 +333,11 @@ def test_the_wrong_euler_order_is_named(finished):
                if r["event"] == "posture"]  # fmt: skip
     zero = next(r for r in read_journal(finished[0] / "journal.jsonl")
                 if r["event"] == "zero")  # fmt: skip
-    from rig.core.attitude import Frame
-
     config = fast_config()
-    frame = Frame(np.array(zero["attitude"]), np.eye(3), "ZXY", config.letters)
-    right = order_residuals(config, frame, records)
+    right = order_residuals(config, zero, records)
     assert min(right["rms"], key=right["rms"].get) == "ZXY" and not right["warning"]
     wrong_config = parse_config(fast_text({'order = "ZXY"': 'order = "XYZ"'}))
-    wrong = order_residuals(wrong_config, frame, records)
+    wrong = order_residuals(wrong_config, zero, records)
     assert "the order ZXY leaves" in wrong["warning"]
 
 

@@ -13,7 +13,7 @@ from harness import fast_text, no_figures
 from rig.__main__ import main
 from rig.config import load_config, parse_config
 from rig.config.config import EXAMPLES
-from rig.core.faults import Refused
+from rig.faults import Refused
 from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED, DeviceRecord
 from rig.simulator import Truth
 from rig.workbench.commission import setup, steps

@@ -8,9 +8,8 @@ import pytest
 from harness import Simulator, fast_config, fast_text
 
 from rig.commands import make_parser
-from rig.config import parse_config
-from rig.core.bus import Bus
-from rig.core.drive import Drive
+from rig.config import AXIS_NAMES, parse_config
+from rig.drives.modbus import Bus, ModbusDrive
 from rig.simulator import Truth, truth_of
 from rig.simulator.drive import COMM_ALARM, SimDrive
 
@@ -51,7 +50,7 @@ def test_another_gearing_is_seen_in_the_joints_and_said_by_the_drive():
     np.testing.assert_allclose(found, np.array(truth.matrix) @ [5, 0, 0], atol=2e-3)
     config = fast_config()
     with Simulator(config, truth) as sim, Bus(sim.start().bus) as bus:
-        said = [Drive(bus, axis).identity()["pulses_per_rev"] for axis in config.axes]
+        said = [ModbusDrive(bus, axis).ids()["pulses_per_rev"] for axis in config.axes]
     assert said == [4000, 10000, 10000]
 
 
@@ -74,7 +73,7 @@ def test_homing_finds_the_origin_again_and_power_loss_forgets_it():
     config = fast_config()
     truth = Truth(lost_origin_deg=(1.4, 1.4, 1.4), **STILL)
     with Simulator(config, truth, speedup=20) as sim, Bus(sim.start().bus) as bus:
-        drive, axis = Drive(bus, config.axes[0]), config.axes[0]
+        drive, axis = ModbusDrive(bus, config.axes[0]), config.axes[0]
         sim.drives[0].position += axis.to_pulses(3.0)
         assert not axis.map.homed.holds(drive.status().word)
         drive.write(axis.map.home)
@@ -140,25 +139,25 @@ def test_replies_take_their_time():
     config = fast_config()
     with Simulator(config, Truth(latency_s=0.03)) as sim, Bus(sim.start().bus) as bus:
         begun = time.monotonic()
-        Drive(bus, config.axes[0]).status()  # two replies
+        ModbusDrive(bus, config.axes[0]).status()  # two replies
         assert time.monotonic() - begun >= 0.06
 
 
 def test_options_of_the_command_line_describe_a_device():
     args = make_parser().parse_args(["simulate", "--noise", "0"])
     plain = vars(args)
-    assert truth_of(plain, 3) == Truth(noise_deg=0.0, seed=3)
+    assert truth_of(plain, 3, AXIS_NAMES, 3) == Truth(noise_deg=0.0, seed=3)
     odd = {
         "reversed": ["roll"], "swapped": ["pitch", "yaw"], "gearing": 4000,
         "lost_origin": 1.4, "realistic": True,
     }  # fmt: skip
-    truth = truth_of(plain | odd, 0)
+    truth = truth_of(plain | odd, 0, AXIS_NAMES, 3)
     assert truth.reversed == (False, False, True) and truth.swapped == (1, 0, 2)
     assert truth.drive_pulses_per_rev == (4000,) * 3
     assert truth.lost_origin_deg == (1.4,) * 3
     assert truth.jitter_counts == 1 and truth.idle_watchdog and truth.enable_delay_s
     with pytest.raises(ValueError, match="swapped must name two axes"):
-        truth_of(plain | {"swapped": ["yaw"]}, 0)
+        truth_of(plain | {"swapped": ["yaw"]}, 0, AXIS_NAMES, 3)
 
 
 def test_a_drive_ends_on_its_target_and_never_passes_it(monkeypatch):

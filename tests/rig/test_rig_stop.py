@@ -23,10 +23,9 @@ from test_rig_motion import bench
 
 from rig.__main__ import main
 from rig.config import load_config
-from rig.core.bus import Bus, BusError
-from rig.core.drive import Drive
-from rig.core.faults import StopRequested
 from rig.core.stop import stop_all
+from rig.drives.modbus import Bus, BusError, ModbusDrive
+from rig.faults import StopRequested
 from rig.journal import lock
 from rig.journal.lock import BusLock, read_armed
 from rig.signals import Signals
@@ -63,7 +62,7 @@ def text_for(port, **changes):
 def set_moving(sim, served):
     with Bus(served.bus) as bus:
         for axis, drive in zip(served.axes, sim.drives, strict=True):
-            Drive(bus, axis).move(
+            ModbusDrive(bus, axis).go(
                 axis.to_pulses(0) + (5000 if drive.position < 0 else 0)
             )
 
@@ -88,7 +87,7 @@ def heard(sim):
 def test_units_that_answered_are_told_before_one_that_did_not():
     config = fast_config(HASTY)
     with simulator(config) as sim, Bus(sim.start().bus) as bus:
-        drives = [Drive(bus, axis) for axis in config.axes]
+        drives = [ModbusDrive(bus, axis) for axis in config.axes]
         sim.faults.add(parse_fault("dead_drive,axis=pitch"))
         with pytest.raises(BusError):
             drives[0].status(retries=0)
@@ -104,7 +103,7 @@ def test_one_short_wait_lies_between_a_dead_first_unit_and_the_others(
     """Nothing is known of it yet: the others wait for it once, and not for long."""
     config = fast_config()  # bus.timeout_s = 0.5
     with simulator(config, transport=transport) as sim, Bus(sim.start().bus) as bus:
-        drives = [Drive(bus, axis) for axis in config.axes]
+        drives = [ModbusDrive(bus, axis) for axis in config.axes]
         sim.faults.add(parse_fault("dead_drive,axis=pitch"))
         order, waited = heard(sim), []
         send = bus._send
@@ -130,7 +129,7 @@ def test_a_family_that_takes_a_broadcast_hears_one_first_on_a_serial_line(transp
     with simulator(config, transport=transport) as sim:
         served, order = sim.start(), heard(sim)
         with Bus(served.bus) as bus:
-            results = stop_all([Drive(bus, axis) for axis in config.axes])
+            results = stop_all([ModbusDrive(bus, axis) for axis in config.axes])
         assert order == ([] if transport == "tcp" else [0]) + [1, 2, 3]
         assert all(result.acknowledged for result in results)
         expected = 1 if transport == "tcp" else 2
@@ -146,7 +145,7 @@ def test_families_that_differ_are_told_one_by_one():
     with simulator(config, transport="rtu_tcp") as sim:
         served, order = sim.start(), heard(sim)
         with Bus(served.bus) as bus:
-            stop_all([Drive(bus, axis) for axis in config.axes])
+            stop_all([ModbusDrive(bus, axis) for axis in config.axes])
         assert order == [1, 2, 3]
 
 
@@ -154,7 +153,7 @@ def test_a_signal_is_looked_at_before_every_frame():
     with bench(fast_config(HASTY)) as motion, motion.signals as signals:
         signals.armed = True
         asked = []
-        send = motion.device.bus._send
+        send = motion.device.line._send
 
         def noted(function, unit, *args, **more):
             asked.append(unit)
@@ -162,7 +161,7 @@ def test_a_signal_is_looked_at_before_every_frame():
             signal.raise_signal(signal.SIGTERM)
             return reply
 
-        motion.device.bus._send = noted
+        motion.device.line._send = noted
         with pytest.raises(StopRequested):
             motion.device.statuses()
         assert asked == [1]  # one frame, where a look at three drives has six
@@ -177,14 +176,14 @@ def test_between_the_tries_of_a_dead_unit_a_signal_is_looked_at():
         signals.armed = True
         motion.sim.faults.add(parse_fault("dead_drive,axis=pitch"))
         asked = []
-        send = motion.device.bus._send
+        send = motion.device.line._send
 
         def noted(function, unit, *args, **more):
             asked.append(unit)
             signals.request_stop("SIGTERM", 143)
             return send(function, unit, *args, **more)
 
-        motion.device.bus._send = noted
+        motion.device.line._send = noted
         with pytest.raises(StopRequested):
             motion.device.statuses()
         assert asked == [1]
@@ -198,11 +197,11 @@ def test_a_loop_that_waited_for_the_line_sends_nothing_after_the_stop():
 
         def move():
             try:
-                device.drives[0].move(target)
+                device.drives[0].go(target)
             except StopRequested as error:
                 caught.append(error)
 
-        with device.bus.urgent():  # as a stop holds it
+        with device.line.urgent():  # as a stop holds it
             thread = threading.Thread(target=move)
             thread.start()
             time.sleep(0.05)
@@ -262,7 +261,7 @@ def test_stop_ends_the_session_that_moves_and_then_stops_every_unit(
     assert all(len(drive.stops) >= 2 for drive in rig.drives)
 
 
-LOADS = "import rig.core.stop, rig.core.drive, rig.config.config"
+LOADS = "import rig.core.stop, rig.drives.drive, rig.config.config"
 
 
 @pytest.mark.parametrize("transport", ["tcp", "rtu"])
@@ -351,7 +350,7 @@ def test_a_loop_that_does_not_answer_to_a_stop_is_not_waited_for():
     with bench(fast_config(HASTY)) as motion, motion.signals as signals:
         signals.armed = True
         device, hangs = motion.device, threading.Event()
-        motion.device.bus._tell = lambda event, **fields: hangs.wait(10)
+        motion.device.line._tell = lambda event, **fields: hangs.wait(10)
         device.stopper._emit = lambda event, **fields: hangs.wait(10)
         signals.request_stop("SIGTERM", 143)  # as the second thread would
         end = time.monotonic() + 3.0

@@ -12,10 +12,10 @@ import pytest
 from harness import changed, fast_config
 from scipy.spatial.transform import Rotation
 
-from rig.core import phone
-from rig.core.attitude import angle_between_deg, euler_to_matrix, matrix_to_euler
-from rig.core.phone import Imu, ImuError
-from rig.core.stream import MAX_LINE, LineSplitter, Parser
+from rig.readings import receiver
+from rig.readings.attitude import angle_between_deg, euler_to_matrix, matrix_to_euler
+from rig.readings.phone import Imu, ReadingError
+from rig.readings.stream import MAX_LINE, LineSplitter, Parser
 
 HYPER = changed(fast_config().imu, max_jump_deg=180.0, host="127.0.0.1")
 PLAIN = changed(
@@ -37,10 +37,10 @@ def test_hyperimu_line_as_published_is_androids_orientation():
     """
     readings, _ = feed(HYPER, "1700000000000,350.5,-10.25,5.125")
     expected = euler_to_matrix([-350.5, -5.125, 10.25], "ZYX")
-    np.testing.assert_allclose(readings[0].matrix, expected, atol=1e-12)
+    np.testing.assert_allclose(readings[0].value, expected, atol=1e-12)
     pitched, _ = feed(HYPER, "1700000000000,0,-110.0,0")  # pitch may pass 90, roll not
     np.testing.assert_allclose(
-        pitched[0].matrix, euler_to_matrix([110.0, 0, 0], "XYZ"), atol=1e-12
+        pitched[0].value, euler_to_matrix([110.0, 0, 0], "XYZ"), atol=1e-12
     )
 
 
@@ -83,7 +83,7 @@ def test_a_malformed_line_is_dropped_and_counted(line):
 def test_a_line_may_write_every_angle_in_0_to_360():
     readings, _ = feed(PLAIN, "350,355,359.5", "-10,-5,-0.5", "350,180,0", "0,361,0")
     assert len(readings) == 2
-    assert angle_between_deg(readings[0].matrix, readings[1].matrix) < 1e-9
+    assert angle_between_deg(readings[0].value, readings[1].value) < 1e-9
 
 
 def test_a_decimal_comma_is_a_wrong_number_of_columns_not_another_angle():
@@ -142,14 +142,14 @@ def test_a_reading_that_waited_in_a_buffer_is_as_old_as_it_is():
 def test_radians_signs_and_quaternion_columns():
     settings = changed(PLAIN, unit="rad", signs=(1, -1, 1))
     readings, _ = feed(settings, "0.1,0.2,0.3")
-    read = np.radians(matrix_to_euler(readings[0].matrix, "ZXY"))
+    read = np.radians(matrix_to_euler(readings[0].value, "ZXY"))
     np.testing.assert_allclose(read, [0.1, -0.2, 0.3], atol=1e-9)
     settings = changed(PLAIN, quaternion_columns=(0, 1, 2, 3), column_count=4)
     readings, parser = feed(settings, "0,0,0.7071068,0.7071068", "0,0,0.5,0.5")
     assert len(readings) == 1
     assert parser.counts["a quaternion that is not of length one"] == 1
     np.testing.assert_allclose(
-        readings[0].matrix, euler_to_matrix([90, 0, 0], "ZYX"), atol=1e-6
+        readings[0].value, euler_to_matrix([90, 0, 0], "ZYX"), atol=1e-6
     )
 
 
@@ -164,7 +164,7 @@ def test_sensor_logger_message_as_published(nested):
                "payload": [other, entry]}  # fmt: skip
     readings = Parser(HYPER).body(json.dumps(message).encode(), 5.0)
     assert len(readings) == 1
-    turned = matrix_to_euler(readings[0].matrix, "ZYX")
+    turned = matrix_to_euler(readings[0].value, "ZYX")
     np.testing.assert_allclose(
         turned, [np.degrees(2 * np.arcsin(0.6)), 0, 0], atol=1e-9
     )
@@ -201,7 +201,7 @@ def test_a_phone_that_comes_back_on_a_new_connection_is_heard():
                 wait_for(
                     lambda a=angle: (
                         imu.since(0)
-                        and abs(matrix_to_euler(imu.since(0)[-1].matrix, "ZXY")[0] - a)
+                        and abs(matrix_to_euler(imu.since(0)[-1].value, "ZXY")[0] - a)
                         < 1e-6
                     )
                 )
@@ -224,15 +224,15 @@ def test_a_half_open_connection_is_given_up_for_the_next():
 
 def test_a_stale_stream_is_an_error_and_a_silent_one_names_the_port():
     with Imu(changed(PLAIN, port=0, stale_s=0.1)) as imu:
-        with pytest.raises(ImuError, match="no reading yet"):
+        with pytest.raises(ReadingError, match="no reading yet"):
             imu.latest()
         with connect(imu) as phone:
             phone.sendall(b"?\r\n1,2,3\r\n")
             wait_for(lambda: imu.since(0))
             time.sleep(0.15)
-            with pytest.raises(ImuError, match="old"):
+            with pytest.raises(ReadingError, match="old"):
                 imu.latest()
-            with pytest.raises(ImuError, match=f":{imu.port}"):
+            with pytest.raises(ReadingError, match=f":{imu.port}"):
                 imu.wait_for_stream(0.05)
 
 
@@ -248,7 +248,7 @@ def test_stamps_of_another_unit_are_named_as_the_cause():
             time.sleep(0.01)
             try:
                 imu.latest()
-            except ImuError as error:
+            except ReadingError as error:
                 said = str(error)
         assert "stamps are not those configured" in said
 
@@ -256,7 +256,7 @@ def test_stamps_of_another_unit_are_named_as_the_cause():
 def test_a_taken_port_is_one_clear_error():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         settings = changed(PLAIN, port=taken.getsockname()[1])
-        with pytest.raises(ImuError, match="cannot open the IMU port"):
+        with pytest.raises(ReadingError, match="cannot open the IMU port"):
             Imu(settings).open()
 
 
@@ -285,7 +285,7 @@ def test_http_push_is_received_and_an_oversized_one_refused():
         web = http.client.HTTPConnection("127.0.0.1", imu.port, timeout=2)
         web.request("POST", "/data", json.dumps({"payload": payload}))
         assert web.getresponse().status == 200
-        assert angle_between_deg(imu.since(0)[-1].matrix, turned) < 1e-6
+        assert angle_between_deg(imu.since(0)[-1].value, turned) < 1e-6
         web.close()
         web.putrequest("POST", "/data")
         web.putheader("Content-Length", str(1 << 40))
@@ -316,7 +316,7 @@ def streaming(imu, angle, source="127.0.0.1", seconds=30.0):
 
 
 def angles_of(imu):
-    return {round(float(matrix_to_euler(r.matrix, "ZXY")[0]), 3) for r in imu.since(0)}
+    return {round(float(matrix_to_euler(r.value, "ZXY")[0]), 3) for r in imu.since(0)}
 
 
 @pytest.mark.parametrize("second", ["127.0.0.1", "127.0.0.2"])
@@ -345,7 +345,7 @@ def test_only_an_address_that_is_allowed_is_heard():
     settings, told = changed(PLAIN, port=0, allow=("127.0.0.2",)), []
     with Imu(settings, lambda event, **more: told.append(more)) as imu:
         assert streaming(imu, 40).wait(5.0)
-        with pytest.raises(ImuError, match=r"senders refused: 127\.0\.0\.1"):
+        with pytest.raises(ReadingError, match=r"senders refused: 127\.0\.0\.1"):
             imu.wait_for_stream(0.05)
         ended = streaming(imu, 10, "127.0.0.2")
         wait_for(lambda: imu.sender)
@@ -432,18 +432,18 @@ def test_strangers_are_refused_before_a_byte_is_read_and_cost_no_thread():
 
 def test_connections_that_send_nothing_are_few_and_make_way(monkeypatch):
     """Without imu.allow anybody may be the phone, until one is."""
-    monkeypatch.setattr(phone, "PATIENCE_S", 600.0)
+    monkeypatch.setattr(receiver, "PATIENCE_S", 600.0)
     settings = changed(HYPER, format="sensorlogger", port=0)
     with Imu(settings) as imu, contextlib.ExitStack() as stack:
         idle = [stack.enter_context(connect(imu)) for _ in range(20)]
         assert push(imu, 10) == 200
-        for each in idle[: 20 - phone.MOST_OPEN]:
+        for each in idle[: 20 - receiver.MOST_OPEN]:
             with contextlib.suppress(ConnectionError):
                 assert each.recv(64) == b""
 
 
 def test_connections_that_send_nothing_are_short(monkeypatch):
-    monkeypatch.setattr(phone, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(receiver, "PATIENCE_S", 0.1)
     with Imu(changed(PLAIN, port=0)) as imu, connect(imu) as idle:
         with contextlib.suppress(ConnectionError):
             assert idle.recv(64) == b""

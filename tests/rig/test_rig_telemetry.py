@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from harness import fast_config, session, simulator
 
-from rig.core.attitude import Reading, euler_to_matrix
-from rig.core.drive import Status
-from rig.core.measure import frame_at
+from rig.drives.drive import Status
 from rig.journal import read_journal
+from rig.readings.attitude import Reading, euler_to_matrix, frame_at
 from rig.workbench.outputs import telemetry
 
 

@@ -25,10 +25,8 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from rig.__main__ import main
 from rig.config import example_text, parse_config
-from rig.core.attitude import euler_to_matrix, frame_at
-from rig.core.faults import MotionFault, Refused
-from rig.core.phone import Imu
-from rig.core.record_check import KeptZero, check_zero, moved, unseen
+from rig.core.record_check import KeptZero, check_zero, moved
+from rig.faults import MotionFault, Refused
 from rig.journal import (
     HOMED,
     IDENTIFIED,
@@ -38,6 +36,9 @@ from rig.journal import (
     DeviceRecord,
     read_journal,
 )
+from rig.readings.attitude import euler_to_matrix, frame_at
+from rig.readings.geometry import geometry_of
+from rig.readings.phone import Imu
 from rig.simulator import Truth
 from rig.simulator.faults import FaultInjector
 from rig.simulator.phone import Phone
@@ -252,11 +253,11 @@ def test_gravity_resolves_the_axes_it_can(rng):
             angle, joints = moved(config, zero, other @ now)  # another north
             assert angle == pytest.approx(LOST)
             np.testing.assert_allclose(joints, LOST * np.eye(3)[axis], atol=1e-6)
-        assert unseen(config, zero) == ["yaw"]
+        assert geometry_of(config).unseen(zero) == ["yaw"]
     lying = Rotation.from_euler("x", 90, degrees=True).as_matrix()
-    assert unseen(config, lying) == ["roll"]
+    assert geometry_of(config).unseen(lying) == ["roll"]
     tilted = Rotation.from_euler("x", 45, degrees=True).as_matrix()
-    assert unseen(config, tilted) == []
+    assert geometry_of(config).unseen(tilted) == []
     for _ in range(50):  # noise of a phone is no fault
         noise = Rotation.from_rotvec(rng.normal(0, 0.1, 3), degrees=True).as_matrix()
         check_zero(config, tilted, tilted @ noise, "it")

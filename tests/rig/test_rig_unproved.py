@@ -13,8 +13,8 @@ from rig.__main__ import main
 from rig.config import ConfigError, load_config, parse_config
 from rig.config.config import EXAMPLES
 from rig.core import proof
-from rig.core.faults import MotionFault, Refused
 from rig.core.proof import GROWTH, Reach
+from rig.faults import MotionFault, Refused
 from rig.simulator import Truth, parse_fault
 from rig.simulator.drive import SimDrive
 from rig.workbench.commission import steps

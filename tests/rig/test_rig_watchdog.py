@@ -15,7 +15,7 @@ from rig.config.config import EXAMPLES
 from rig.config.maps import decode
 from rig.core import stop
 from rig.core.device import timeouts_left
-from rig.core.faults import MotionFault
+from rig.faults import MotionFault
 from rig.journal import read_journal
 from rig.simulator import Truth, parse_fault
 from rig.workbench.run import Run

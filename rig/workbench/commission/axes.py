@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from rig.core.device import Device, Posture
-from rig.core.faults import MotionFault, Refused
 from rig.core.motion import move
 from rig.core.proof import FIRST_MOTOR_DEG, unit_proved
+from rig.faults import MotionFault, Refused
 from rig.journal import SIGN_CHECKED
 from rig.workbench.commission.axis_check import (
     CLEAR,
     Change,
     Stand,
+    check_numbers,
     corner_name,
     corners_of,
     find,
@@ -23,7 +24,6 @@ from rig.workbench.commission.axis_check import (
     require_gearing,
     require_unit,
     stand_at,
-    turn,
 )
 from rig.workbench.commission.stops import prove_stops
 from rig.workbench.run import Run
@@ -45,17 +45,35 @@ def check_axes(run: Run, device: Device) -> list[Change]:
     Where nothing is to be corrected the device is SIGN_CHECKED, and once every way to
     stop it has been tried, STOP_PROVED.
     """
-    stands, names = measure_axes(run, device), run.config.axis_names
+    stands = measure_axes(run, device)
+    if run.config.imu is None:
+        changes, ratios = check_numbers(run.config, stands)
+        return _conclude(run, device, stands, changes, ratios, {})
     found = find(run.config, stands)
     told = [drive.pulses_per_rev() for drive in device.drives]
     ratios = ratios_of(run.config, found)
-    if run.config.imu.unit == "rad":
+    if run.config.phone.unit == "rad":
         require_unit(run.config, ratios, proved=True)
     require_gearing(run.config, ratios, told)
     changes = proposals(run.config, found, told)
+    run.say(*lines(run.config, found))
+    more = {"phone_turned_deg": round(found.turned_deg, 2)}
+    return _conclude(run, device, stands, changes, ratios, more)
+
+
+def _conclude(
+    run: Run,
+    device: Device,
+    stands: dict[str, Stand],
+    changes: list[Change],
+    ratios: list[float],
+    more: dict[str, float],
+) -> list[Change]:
+    """Keep what was seen, where nothing is to be corrected, and prove the stops."""
+    names = run.config.axis_names
     evidence = {
         "ratio": dict(zip(names, np.round(ratios, 4).tolist(), strict=True)),
-        "phone_turned_deg": round(found.turned_deg, 2),
+        **more,
         "run": run.folder.name,
     }
     scales = np.array([axis.pulses_per_deg for axis in run.config.axes])
@@ -64,11 +82,11 @@ def check_axes(run: Run, device: Device) -> list[Change]:
         "deg": (rates_of(run.config, stands) * scales).round(6).tolist(),
     }
     run.emit("axes", sync=True, **evidence, changes=[str(change) for change in changes])
-    run.say(*lines(run.config, found))
+    units = {axis.name: axis.unit_name for axis in run.config.axes}
     for name, pace in device.paces.items():
         run.say(
-            f"  {name}: {pace.seen_deg_s:.3g} deg/s at least, {pace.asked_deg_s:.3g} "
-            "asked"
+            f"  {name}: {pace.seen_deg_s:.3g} {units[name]}/s at least, "
+            f"{pace.asked_deg_s:.3g} asked"
         )
     if not changes:
         run.record.reach(SIGN_CHECKED, run.config, **evidence, turns=turns)
@@ -104,7 +122,9 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
         stands[name] = stand_at(run, device, Posture(name, target), samples)
         return stands[name]
 
-    names, corners = config.axis_names, corners_of(len(config.axes))
+    names, geometry = config.axis_names, device.geometry
+    # Of numbers it does not matter which axis carries which.
+    corners = corners_of(len(config.axes)) if config.imu else []
     run.say(
         f"axes: about {1 + 7 * len(names) + len(corners)} places; each axis first by "
         f"{FIRST_MOTOR_DEG:g} deg of its motor, then as far as the phone's turn "
@@ -116,21 +136,21 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
     wanted = [axis.to_pulses(REACH_DEG) for axis in config.axes]
 
     def turned(stand: Stand) -> float:
-        return float(np.linalg.norm(turn(base.attitude, stand.attitude)))
+        return geometry.apart(base.attitude, stand.attitude)
 
     def grow(j: int, unit: bool, samples: int = 0) -> tuple[int, ...]:
         """Move an axis further and further; pulses of the last two places."""
         reach = device.proof.renew(j, unit)
         way, counts = int(np.sign(wanted[j])), [0]
         while True:
-            count = reach.pulses(wanted[j], REACH_DEG)
+            count = reach.pulses(wanted[j], REACH_DEG * geometry.scale)
             if count <= FAR_ENOUGH * counts[-1]:
                 return way * counts[-2], way * counts[-1]
             look = visit(f"{names[j]}:plus", {j: way * count}, samples)
             reach.saw(count, turned(look), noise)
             counts.append(count)
 
-    proved = unit_proved(config.imu, base.attitude)
+    proved = unit_proved(config.source, base.attitude)
     if not proved:
         run.say(
             "  no angle of the phone is over 6.3, so degrees are not told from "
@@ -151,10 +171,13 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
         look, far = grow(j, True)
         plus = stands[f"{name}:plus"]
         way = turned(plus)
-        if way < max(SEEN_DEG, SEEN_SIGMA * base.std_deg / plus.samples**0.5):
+        least = SEEN_SIGMA * base.std_deg / plus.samples**0.5
+        if way < max(SEEN_DEG * geometry.scale, least):
             raise MotionFault(
-                f"unit {axis.unit} turned its motor by {abs(axis.to_deg(far)):g} deg "
-                f"of {name}, and the phone turned {way:.3f}. Look for a loose "
+                f"unit {axis.unit} turned its motor by {abs(axis.to_deg(far)):g} "
+                f"{axis.unit_name} of {name}, and {geometry.told} {way:.3g}. Look for "
+                "a "
+                "loose "
                 "coupling, a stream that does not change, or a reduction that is far "
                 "too small"
             )
@@ -169,8 +192,8 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
         most = min(CORNER_DEG, room[j])
         corner[j] = round(far * min(REACH_DEG / way, most / abs(axis.to_deg(far))))
         run.say(
-            f"  {name}: {abs(axis.to_deg(far)):.2f} deg commanded, the phone turned "
-            f"{way:.3f}"
+            f"  {name}: {abs(axis.to_deg(far)):.2f} {axis.unit_name} commanded, "
+            f"{geometry.told} {way:.3g}"
         )
     clear = CLEAR * base.std_deg / CORNER_STD_DEG
     clear = int(np.ceil(clear**2 / max(1, len(corners))))

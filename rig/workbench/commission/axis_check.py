@@ -22,12 +22,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rig.config import RigConfig
-from rig.core.attitude import Array, euler_to_matrix, matrix_to_euler
 from rig.core.device import Device, Posture
-from rig.core.faults import MotionFault
 from rig.core.measure import measure
 from rig.core.motion import move
 from rig.core.proof import RADIANS
+from rig.faults import MotionFault
+from rig.readings.attitude import Array, euler_to_matrix, matrix_to_euler
+from rig.readings.geometry import geometry_of
 from rig.workbench.run import Run
 
 CLEAR = 4.0  # standard deviations that make a difference a finding
@@ -92,18 +93,19 @@ def turn(base: Array, attitude: Array) -> Array:
 
 
 def rates_of(config: RigConfig, stands: Mapping[str, Stand]) -> Array:
-    """(3, n) columns: rotation vector for one pulse of each drive."""
-    base, rates = stands["start"].attitude, np.empty((3, len(config.axes)))
+    """(3, n) columns: rotation vector for one pulse of each drive; (m, n) of "
+    "numbers."""
+    base, columns, way = stands["start"].attitude, [], geometry_of(config).way
     for j, name in enumerate(config.axis_names):
         parts = ("look", "plus", "back", "minus")
         places = [stands[f"{name}:{part}"] for part in parts]
-        look, plus, back, minus = (turn(base, each.attitude) for each in places)
+        look, plus, back, minus = (way(base, each.attitude) for each in places)
         at = [each.pulses[j] for each in places]
         # On the way up and on the way down the play is taken up: no reversal between.
         moved = np.array([at[1] - at[0], at[3] - at[2]])
         each = np.array([plus - look, minus - back]) / moved[:, None]
-        rates[:, j] = np.average(each, axis=0, weights=abs(moved))
-    return rates
+        columns.append(np.average(each, axis=0, weights=abs(moved)))
+    return np.column_stack(columns)
 
 
 def _inner(
@@ -140,6 +142,41 @@ def _inner(
             return []
         inner[a if seen > 0 else b] += 1
     return inner if sorted(inner) == [*range(count)] else []
+
+
+def check_numbers(
+    config: RigConfig, stands: Mapping[str, Stand]
+) -> tuple[list[Change], list[float]]:
+    """What the places say of axes that are measured by numbers.
+
+    A number of the name of an axis rises with that axis; where it has its unit too, it
+    changes about as far.
+
+    Returns:
+        Corrections of directions, and what a commanded unit of each axis changes.
+
+    Raises:
+        MotionFault: it changes by far more, or less.
+    """
+    rates, changes, low, high = rates_of(config, stands), [], *SOUND_RATIO
+    ratios = []
+    for j, axis in enumerate(config.axes):
+        per_unit = rates[:, j] * axis.pulses_per_deg
+        ratios.append(float(np.linalg.norm(per_unit)))
+        if axis.name not in config.output_names:
+            continue
+        own = per_unit[config.output_names.index(axis.name)]
+        same = config.output_unit == axis.unit_name
+        if same and not low <= abs(own) <= high:
+            raise MotionFault(
+                f"{axis.name} was measured to move {abs(own):.3g} {axis.unit_name} for "
+                f"each that it was commanded; sound is {low:g} to {high:g}. {BY_PLATE}"
+            )
+        if own < 0:
+            reason = f"what is measured as {axis.name} falls as it is commanded up"
+            key = f"axes.{axis.name}.direction"
+            changes.append(Change(key, axis.direction, -axis.direction, reason))
+    return changes, ratios
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,7 +227,7 @@ def find(
             "direction is wrong or imu.signs. Raise settle.samples, then run "
             "`jaxcal-rig axes` again"
         )
-    told = euler_to_matrix(config.imu.mounting_deg, "ZYX")
+    told = euler_to_matrix(config.phone.mounting_deg, "ZYX")
     turned = float(np.linalg.norm(turn(told, mounting)))
     return Findings(joints, signs * size, mounting, turned, order)
 
@@ -208,7 +245,7 @@ def _directions(config: RigConfig) -> Array:
 def _placed(config: RigConfig, axes: Array) -> tuple[tuple[int, ...], Array, Array]:
     """Joint and sign of each drive, and the mounting that fits them best."""
     expected = _expected(config)
-    told = euler_to_matrix(config.imu.mounting_deg, "ZYX")
+    told = euler_to_matrix(config.phone.mounting_deg, "ZYX")
     cosines = expected.T @ told @ axes  # rows: joints
     joints: tuple[int, ...] = max(
         itertools.permutations(range(len(cosines))),
@@ -277,7 +314,7 @@ def require_unit(
     Raises:
         MotionFault: it is the other unit, or that is not clear.
     """
-    unit = config.imu.unit
+    unit = config.phone.unit
     other, factor = ("rad", RADIANS) if unit == "deg" else ("deg", 1.0 / RADIANS)
     seen, (low, high) = _seen(config, ratios), NEAR_UNIT
     if all(low <= ratio * factor <= high for ratio in ratios):
@@ -367,7 +404,7 @@ def proposals(
                 changes.append(Change(f"axes.{axis.name}.{name}", *each))
     if found.turned_deg > MOUNTING_DEG:
         angles = matrix_to_euler(found.mounting, "ZYX").round(2) + 0.0
-        before, reason = list(config.imu.mounting_deg), "the axes put the phone"
+        before, reason = list(config.phone.mounting_deg), "the axes put the phone"
         reason += f" {found.turned_deg:.1f} deg from there"
         changes.append(Change("imu.mounting_deg", before, angles.tolist(), reason))
     if found.order not in (None, config.joint_order):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-from rig.core.attitude import Array
+from rig.readings.attitude import Array
 
 OUTLIERS = 1e-3  # share of tests that carry no information
 

@@ -17,13 +17,12 @@ import math
 import numpy as np
 from scipy import special
 
-from rig.core.attitude import mean_rotation
 from rig.core.device import Device, Posture
-from rig.core.faults import MotionFault, Refused
 from rig.core.motion import move
 from rig.core.proof import ALLOWED_DEG
+from rig.faults import MotionFault, Refused
 from rig.workbench.commission.axes import ROOM_DEG, SEEN_DEG
-from rig.workbench.commission.axis_check import Stand, stand_at, turn
+from rig.workbench.commission.axis_check import Stand, stand_at
 from rig.workbench.commission.breakaway import Breakaway, Estimate
 from rig.workbench.run import Run
 
@@ -49,6 +48,7 @@ class Probe:
 
     def __init__(self, run: Run, device: Device, axis: int) -> None:
         self.run, self.device = run, device
+        self.geometry = device.geometry
         self.axis, self.name = axis, run.config.axis_names[axis]
         self.scale = run.config.axes[axis]
         self.start = device.positions()
@@ -63,7 +63,7 @@ class Probe:
             )
         self.count = 0  # measurements
         self._base = device.attitude()  # (3, 3) that readings are from
-        self._line, self._rate = np.zeros(3), 1.0
+        self._line, self._rate = np.zeros(1), 1.0
         device.proof.stay_near(self._base, max(ALLOWED_DEG, 2.0 * up))
 
     def stand(self, label: str, *ways_deg: float) -> Stand:
@@ -87,7 +87,9 @@ class Probe:
 
     def read(self, found: Stand) -> float:
         """Commanded degrees along the axis, by the phone."""
-        return float(turn(self._base, found.attitude) @ self._line / self._rate)
+        return float(
+            self.geometry.way(self._base, found.attitude) @ self._line / self._rate
+        )
 
     def off(self, label: str, *ways_deg: float) -> float:
         """Reading less command at the last of the ways, degrees of the commands."""
@@ -103,8 +105,8 @@ class Probe:
         at, far = BASE_DEG, FAR_DEG
         up = [self.stand("up", at - far, at), self.stand("top", at + far)]
         down = [self.stand("down", at), self.stand("bottom", at - far)]
-        self._base = mean_rotation([up[0].attitude, down[0].attitude])
-        turns = [turn(self._base, each.attitude) for each in [*up, *down]]
+        self._base = self.geometry.mean([up[0].attitude, down[0].attitude])
+        turns = [self.geometry.way(self._base, each.attitude) for each in [*up, *down]]
         deg = (self.way(up[1]) - self.way(up[0]) + self.way(down[0])) / 2.0
         deg -= self.way(down[1]) / 2.0
         each = (turns[1] - turns[0] + turns[2] - turns[3]) / 2.0 / deg

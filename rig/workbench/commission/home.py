@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 
 from rig.config import RigConfig
-from rig.core.attitude import Array, Reading, angle_between_deg
-from rig.core.bus import BusError
 from rig.core.device import Device
-from rig.core.drive import HOME, Drive
-from rig.core.faults import MotionFault, Refused
 from rig.core.proof import NOISE_DEG
+from rig.drives.drive import HOME, Drive
+from rig.drives.line import BusError
+from rig.faults import MotionFault, Refused
 from rig.journal import HOMED
+from rig.readings.attitude import Array, Reading
 from rig.workbench.run import Run
 
 NO_LIMIT_DEG = 1e9
@@ -35,7 +35,7 @@ def unlimited(config: RigConfig) -> RigConfig:
 
 def can_home(config: RigConfig) -> bool:
     """Whether every drive has a homing of its own."""
-    return all(axis.map.home is not None for axis in config.axes)
+    return all(axis.map.homes for axis in config.axes)
 
 
 def home(run: Run, device: Device, config: RigConfig, here: bool) -> None:
@@ -61,13 +61,13 @@ def home(run: Run, device: Device, config: RigConfig, here: bool) -> None:
 
 
 def _set_zero(run: Run, device: Device, drive: Drive) -> None:
-    if drive.axis.map.set_zero is None:
+    if not drive.can_set_zero:
         run.say(
             f"  {drive.axis.name}: the map {drive.axis.map.name} has no register for "
             f"it; home is at its count of {drive.status().position}"
         )
         return
-    if drive.axis.map.home_place is not None:
+    if drive.counts_from_home:
         if _counts_from(device, drive, HOME) is None:
             return
         run.say(
@@ -84,7 +84,7 @@ def _counts_from(device: Device, drive: Drive, origin: int) -> str | None:
     lost = ""
     for _ in range(SET_TRIES):  # the same once more where a frame was lost
         try:
-            drive.write(drive.axis.map.set_zero, home=origin)
+            drive.set_zero(origin)
         except BusError as error:
             lost = f" ({error})"
         end = time.monotonic() + SET_S
@@ -116,18 +116,18 @@ def _go_home(run: Run, device: Device, drive: Drive, range_deg: float) -> None:
     base, begun, gone = device.attitude(), time.monotonic(), 0
     device.proof.stay_near(base, range_deg + motion.envelope_margin_deg)
     last = drive.status().position
-    drive.write(axis.map.home)
+    drive.home()
     while True:
         device.guard(moving=True)
         status = drive.sound()
         reading = device.imu.latest()
-        device.proof.watch(reading.matrix)
+        device.proof.watch(reading.value)
         _check_homing(device, drive, reading, base, gone)
         way = abs(status.position - last)
         gone += way if way < axis.pulses_per_rev else 0  # or it counts anew
         last = status.position
         waited = time.monotonic() - begun
-        done = axis.map.homed is None or drive.says_homed
+        done = not drive.tells_homed or drive.says_homed
         if not status.moving and waited > ANSWER_S and done:
             break
         if waited > HOME_S:
@@ -146,15 +146,17 @@ def _check_homing(
     """The phone has turned in so many pulses, and no faster than it may."""
     axis, most = drive.axis, device.config.motion.max_speed_deg_s
     recent = device.imu.since(reading.time - RATE_S)
-    turned = angle_between_deg(recent[0].matrix, reading.matrix)
-    if turned > most * RATE_S + NOISE_DEG:
+    apart, scale = device.geometry.apart, device.geometry.scale
+    turned = apart(recent[0].value, reading.value)
+    # Numbers have no speed of a joint.
+    if device.config.imu and turned > most * RATE_S + NOISE_DEG:
         raise MotionFault(
             f"{axis.name} homes at {turned / RATE_S:.0f} deg a second by the phone, "
             f"more than motion.max_speed_deg_s = {most:g}. Set the drive's homing to a "
             "lower speed"
         )
     if abs(axis.to_deg(gone)) > BLIND_DEG and (
-        angle_between_deg(base, reading.matrix) < SEEN_DEG
+        apart(base, reading.value) < SEEN_DEG * scale
     ):
         raise MotionFault(
             f"the drive of {axis.name} has turned {abs(axis.to_deg(gone)):.0f} deg on "
@@ -164,9 +166,7 @@ def _check_homing(
 
 
 def identity(drives: list[Drive]) -> dict[str, dict[str, int | str]]:
-    """The identity registers of each axis's drive that do not change.
-
-    Signed registers are left out: they are measurements, such as a temperature.
+    """What tells the drive of each axis from another, and does not change.
 
     Raises:
         Refused: a unit does not answer as the family that is configured.
@@ -175,24 +175,17 @@ def identity(drives: list[Drive]) -> dict[str, dict[str, int | str]]:
     for drive in drives:
         axis = drive.axis
         try:
-            values = drive.identity()
+            values = drive.ids()
             drive.status()
         except BusError as error:
             raise Refused(
                 f"{axis.name} (unit {axis.unit}) does not answer as {axis.map.name} "
                 f"does: {error}. Run `jaxcal-rig scan`"
             ) from None
-        for name, (low, high) in axis.map.recognise.items():
-            value = values[name]
-            if isinstance(value, int) and not low <= value <= high:
-                raise Refused(
-                    f"{axis.name} (unit {axis.unit}) is no {axis.map.name}: {name} is "
-                    f"{value}, not in [{low}, {high}]. Run `jaxcal-rig scan`"
-                )
-        kinds = axis.map.identity
-        found[axis.name] = {
-            name: value
-            for name, value in values.items()
-            if kinds[name].type.startswith("u")
-        }
+        if fault := drive.foreign(values):
+            raise Refused(
+                f"{axis.name} (unit {axis.unit}) is no {axis.map.name}: {fault}. Run "
+                "`jaxcal-rig scan`"
+            )
+        found[axis.name] = drive.lasting(values)
     return found

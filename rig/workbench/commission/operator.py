@@ -6,7 +6,7 @@ import contextlib
 import sys
 from collections.abc import Callable
 
-from rig.core.faults import Refused
+from rig.faults import Refused
 
 
 class Operator:

@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rig.config.settings import ImuSettings
-from rig.core.attitude import angle_between_deg, mean_rotation
-from rig.core.phone import Imu
+from rig.config.settings import ImuSettings, ReadingsSettings
+from rig.readings.geometry import Attitudes, Geometry
+from rig.readings.source import Source
 
 LOOK_S = 1.0
 # Below these a session's settle window would hardly ever fill.
@@ -28,11 +28,27 @@ def addresses_text(settings: ImuSettings, port: int) -> str:
     return f"type into the phone's app ({settings.format}): {host} port {port}"
 
 
-def watch(imu: Imu, seconds: float, wait_s: float, say: Callable[[str], None]) -> None:
+def sensor_text(settings: ReadingsSettings, port: int) -> str:
+    """Where a sensor's numbers come from."""
+    if settings.transport in ("listen", "udp"):
+        host = settings.host
+        if host in ("0.0.0.0", "::"):
+            host = own_address() or "(this computer has no network address)"
+        return f"waiting for the sensor on {host} port {port}"
+    return f"readings from {settings.device or f'{settings.host}:{settings.port}'}"
+
+
+def watch(
+    imu: Source,
+    geometry: Geometry,
+    seconds: float,
+    wait_s: float,
+    say: Callable[[str], None],
+) -> None:
     """Wait for an open stream and look at it for so long, telling each second.
 
     Raises:
-        ImuError: nothing came, or the stream is not to be trusted.
+        ReadingError: nothing came, or the stream is not to be trusted.
     """
     start, spent = imu.wait_for_stream(wait_s).time, 0.0
     while spent < seconds:
@@ -40,23 +56,25 @@ def watch(imu: Imu, seconds: float, wait_s: float, say: Callable[[str], None]) -
         imu.latest()
         readings, spent = imu.since(start), time.monotonic() - start
         gaps = np.diff([reading.time for reading in readings])
-        matrices = [reading.matrix for reading in readings[-500:]]
-        mean = mean_rotation(matrices)
-        apart = [angle_between_deg(mean, matrix) for matrix in matrices]
-        scatter = float(np.sqrt(np.mean(np.square(apart)) / 3.0))
-        tilt = float(np.degrees(np.arccos(np.clip(mean[2, 2], -1.0, 1.0))))
+        values = [reading.value for reading in readings[-500:]]
+        mean = geometry.mean(values)
+        apart = [geometry.apart(mean, value) for value in values]
+        scatter = float(np.sqrt(np.mean(np.square(apart)) / len(mean)))
+        stands = "reads " + " ".join(f"{value:.6g}" for value in np.ravel(mean))
+        if isinstance(geometry, Attitudes):
+            tilt = np.degrees(np.arccos(np.clip(mean[2, 2], -1.0, 1.0)))
+            stands = f"tilt {tilt:.1f} deg"
         dropped = [f"{n} {why}" for why, n in imu.counts.items() if why != "accepted"]
         rate, gap = len(readings) / spent, float(gaps.max(initial=0.0)) or spent
         say(
             f"  {rate:.0f} readings per s, longest gap {gap:.2f} s, scatter "
-            f"{scatter:.3f} deg, tilt {tilt:.1f} deg, dropped: "
-            + (", ".join(dropped) or "none")
+            f"{scatter:.3g}, {stands}, dropped: " + (", ".join(dropped) or "none")
         )
     if rate < SLOW_HZ or gap > LONG_GAP_S:
         say(
             f"  note: sessions want {SLOW_HZ:g} readings per s without gaps over "
-            f"{LONG_GAP_S:g} s. Raise the app's rate, keep the phone awake and near "
-            "the Wi-Fi; or raise imu.stale_s and settle.window_s"
+            f"{LONG_GAP_S:g} s. {imu.lost}, raise its rate; or raise "
+            f"{imu.table}.stale_s and settle.window_s"
         )
 
 

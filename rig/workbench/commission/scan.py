@@ -9,11 +9,11 @@ import re
 from collections.abc import Callable
 
 from rig.config.axis import Axis
-from rig.config.maps import RegisterMap, available_maps, load_map
+from rig.config.maps import DriveMap, RegisterMap, available_maps, load_map
 from rig.config.schema import ConfigError, parse
 from rig.config.settings import BusSettings
-from rig.core.bus import Bus, BusError, Rejected
-from rig.core.drive import Drive
+from rig.drives.line import BusError
+from rig.drives.modbus import Bus, ModbusDrive, Rejected
 from rig.journal import BusLock
 
 # For each absent unit, three times; a drive answers within 25 ms at 9600 baud.
@@ -70,14 +70,15 @@ def scan(
     settings: BusSettings,
     units: int,
     say: Callable[[str], None],
-    maps: tuple[RegisterMap, ...] = (),
+    maps: tuple[DriveMap, ...] = (),
 ) -> list[Found]:
     """Ask units 1 to ``units`` for their identity; ``maps`` beside those that ship.
 
     It holds the lock of the bus until it ends.
     """
-    known = [*maps, *(load_map(name) for name in available_maps())]
-    known = list({each.name: each for each in known}.values())
+    every = [*maps, *(load_map(name) for name in available_maps())]
+    named = {each.name: each for each in every}.values()
+    known = [each for each in named if isinstance(each, RegisterMap)]
     short = settings.model_copy(
         update={
             "timeout_s": min(settings.timeout_s, SCAN_TIMEOUT_S),
@@ -104,9 +105,9 @@ def scan(
 def _ask(bus: Bus, unit: int, known: list[RegisterMap]) -> Found | None:
     """What a unit is; None where it is silent, or a gateway says that it is."""
     there = False
-    fitting: list[tuple[tuple[int, int], Drive, dict[str, int]]] = []
+    fitting: list[tuple[tuple[int, int], ModbusDrive, dict[str, int]]] = []
     for each in known:
-        drive = Drive(bus, Axis.unmoved("", unit, each))
+        drive = ModbusDrive(bus, Axis.unmoved("", unit, each))
         try:
             drive.status(RETRIES)
         except Rejected as refusal:
@@ -119,7 +120,7 @@ def _ask(bus: Bus, unit: int, known: list[RegisterMap]) -> Found | None:
         there = True
         identity: dict[str, int] = {}
         with contextlib.suppress(BusError):  # registers that a model lacks are left out
-            told = drive.identity().items()
+            told = drive.ids().items()
             identity = {name: value for name, value in told if isinstance(value, int)}
         proofs = [
             (identity[n], *each.recognise[n]) for n in each.recognise if n in identity

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from jaxcal.files import write_text
 from rig.config import AXIS_NAMES, RigConfig, load_config, parse_config
 from rig.config.axis import DEFAULT_ROTATES
-from rig.core.faults import EXIT_OK, Refused
+from rig.faults import EXIT_OK, Refused
 from rig.journal import HOMED, IDENTIFIED, STOP_PROVED, ZEROED
 from rig.workbench.commission import steps
 from rig.workbench.commission.home import can_home
@@ -63,7 +63,7 @@ def simulated(simulator: Simulator, given: Given) -> Given:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     simulator.start_phone(port)
-    imu = simulator.config.imu
+    imu = simulator.config.phone
     values: dict[str, Any] = {"imu.host": "127.0.0.1", "imu.stale_s": imu.stale_s}
     for axis in simulator.config.axes:
         for name in ("reduction", "speed_deg_s", "accel_deg_s2"):
@@ -199,7 +199,8 @@ def go(place: steps.Place, given: Given) -> int:
 
 def pin(place: steps.Place, sender: str) -> None:
     """Only this phone is listened to from now on."""
-    if place.path is None or not sender or sender in place.config.imu.allow:
+    phone = place.config.imu
+    if place.path is None or not sender or phone is None or sender in phone.allow:
         return
     place.operator.confirm(
         f"imu: listen to {sender} only, and to no other sender", "listen"

@@ -11,15 +11,12 @@ from collections.abc import Callable, Iterator
 
 from rig.config import RigConfig
 from rig.core import session
-from rig.core.attitude import angle_between_deg
-from rig.core.bus import Bus
 from rig.core.device import Device, Posture
-from rig.core.drive import Drive
-from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
 from rig.core.motion import move
-from rig.core.phone import Imu
 from rig.core.proof import ALLOWED_DEG, slowed
 from rig.core.record_check import check_drives
+from rig.drives import Drive, make_drives
+from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
 from rig.journal import (
     HOMED,
     IDENTIFIED,
@@ -29,11 +26,13 @@ from rig.journal import (
     new_run_folder,
 )
 from rig.journal.lock import BusLock
+from rig.readings import make_source
+from rig.readings.geometry import geometry_of
 from rig.workbench.commission.axes import check_axes
 from rig.workbench.commission.axis_check import Change
 from rig.workbench.commission.home import can_home, home, identity, unlimited
 from rig.workbench.commission.operator import Operator
-from rig.workbench.commission.phone import addresses_text, watch
+from rig.workbench.commission.phone import addresses_text, sensor_text, watch
 from rig.workbench.outputs.console import listen
 from rig.workbench.run import Run, run_safely
 from rig.workbench.toml import edit
@@ -63,9 +62,10 @@ class Place:
 
     def take(self, written: RigConfig) -> None:
         """A configuration that was edited, reached as the one before."""
-        where = {name: getattr(self.config.imu, name) for name in ("host", "port")}
-        imu = written.imu.model_copy(update=where)
-        update = {"bus": self.config.bus, "imu": imu}
+        where = {name: getattr(self.config.source, name) for name in ("host", "port")}
+        source = written.source.model_copy(update=where)
+        which = "imu" if written.imu else "readings"
+        update = {"bus": self.config.bus, which: source}
         self.config = written.model_copy(update=update)
 
     def command(self, words: str) -> str:
@@ -78,11 +78,9 @@ class Place:
     def bus(self, what: str) -> Iterator[list[Drive]]:
         """The drives, to be read, under the lock of the bus."""
         config = self.config
-        with (
-            BusLock(config.bus).acquire(what),
-            Bus(config.bus, config.silence_s) as bus,
-        ):
-            yield [Drive(bus, axis) for axis in config.axes]
+        line, drives = make_drives(config.bus, config.axes, config.silence_s)
+        with BusLock(config.bus).acquire(what), line:
+            yield drives
 
     def run(
         self,
@@ -136,15 +134,21 @@ def identify(place: Place) -> None:
 
 def look_at_phone(place: Place, seconds: float = WATCH_S) -> str:
     """Wait for the phone and tell what it sends; its address."""
-    settings = place.config.imu
-    with Imu(settings) as imu:
+    config = place.config
+    with make_source(config) as imu:
+        where = (
+            addresses_text(config.imu, imu.port)
+            if config.imu
+            else sensor_text(config.source, imu.port)  # type: ignore[arg-type]
+        )
         place.say(
-            f"imu: {addresses_text(settings, imu.port)}; then start its stream "
+            f"imu: {where}; then start its stream "
             f"(waiting for it up to {session.STREAM_WAIT_S:g} s)"
         )
         for listener in place.listeners:
             listener({"event": "listening", "port": imu.port})
-        watch(imu, seconds, session.STREAM_WAIT_S, place.say)
+        geometry = geometry_of(config)
+        watch(imu, geometry, seconds, session.STREAM_WAIT_S, place.say)
         return imu.sender
 
 
@@ -152,7 +156,7 @@ def go_home(place: Place, here: bool) -> int:
     """Make the counts mean a place: HOMED."""
     names = [axis.name for axis in place.config.axes]
     if not here and not can_home(place.config):
-        without = {a.map.name for a in place.config.axes if a.map.home is None}
+        without = {a.map.name for a in place.config.axes if not a.map.homes}
         raise Refused(
             f"the map {', '.join(sorted(without))} has no homing. Put the device into "
             "its home posture, then run `jaxcal-rig home --here`"
@@ -204,8 +208,8 @@ def jog(place: Place, name: str, way_deg: float) -> int:
         device.proof.stay_near(base, max(ALLOWED_DEG, 2.0 * abs(way_deg)))
 
         def look() -> None:
-            turned = angle_between_deg(base, device.imu.latest().matrix)
-            if turned > abs(way_deg) and not checked:
+            turned = device.geometry.apart(base, device.imu.latest().value)
+            if turned > device.geometry.scale * abs(way_deg) and not checked:
                 raise Enough(f"{turned:.1f}")
 
         device.meanwhile = look

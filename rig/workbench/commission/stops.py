@@ -1,25 +1,26 @@
 """Every way that the software has to stop the drives, tried in a slow move.
 
-The axes move together, 3 degrees either side of where they stood, and are stopped
-on the way: by the frame to each unit, by the broadcast where the map has one, and by
-the drives' own watch of the line where they have one. Each must stand short of its
-target, by its drive and by the phone, and must stay there.
+The axes move together, 3 degrees (or mm) either side of where they stood, or one after
+another where their line moves them in turn, and are stopped on the way: by the frame to
+each unit, by the broadcast where the map has one, and by the drives' own watch of the
+line where they have one. Each must stand short of its target, by its drive and by the
+phone, and must stay there.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
 from rig.config.axis import Pulses
 from rig.core import stop
-from rig.core.attitude import angle_between_deg
 from rig.core.device import Device, Posture
-from rig.core.drive import STILL_COUNTS, Drive, Status
-from rig.core.faults import MotionFault
 from rig.core.motion import move
+from rig.drives import Drive
+from rig.drives.drive import STILL_COUNTS, Status
+from rig.faults import MotionFault
 from rig.journal import STOP_PROVED
 from rig.workbench.run import Run
 
@@ -43,7 +44,8 @@ def prove_stops(run: Run, device: Device) -> None:
     Raises:
         MotionFault: an axis went on, or moved again.
     """
-    start, evidence = device.positions(), {}
+    start = device.positions()
+    evidence: dict[str, dict[str, float]] = {}
     offsets = [axis.to_pulses(REACH_DEG) for axis in run.config.axes]
     low = tuple(int(p) for p in np.subtract(start, offsets))
     high = tuple(int(p) for p in np.add(start, offsets))
@@ -51,7 +53,7 @@ def prove_stops(run: Run, device: Device) -> None:
     ways: dict[str, tuple[Callable[[], None], float]] = {
         "the stop of each unit": (lambda: _stop_units(device), SPEED_DEG_S)
     }
-    if stop.takes_broadcast(device.drives):
+    if device.line.stops_at_once(device.drives):
         ways["the broadcast stop"] = (
             lambda: stop.broadcast(device.drives),
             SPEED_DEG_S,
@@ -62,12 +64,25 @@ def prove_stops(run: Run, device: Device) -> None:
         silent = timeout_s + SILENCE_S
         ways["their watch of the line"] = (lambda: _be_silent(device, silent), slow)
     for name, (act, speed) in ways.items():
-        evidence[name] = _prove(run, device, name, act, speed, low, high)
+        for moved in _together(device):
+            end = tuple(b if i in moved else a for i, (a, b) in _numbered(low, high))
+            gone = _prove(run, device, name, act, speed, low, end)
+            evidence[name] = evidence.get(name, {}) | gone
     device.proof.ceiling_deg_s = None
     move(device, Posture("back", start))
     run.emit("stop_proved", sync=True, ways=evidence)
     run.record.reach(STOP_PROVED, run.config, ways=evidence, run=run.folder.name)
     run.say(f"the drives stop, and stay: {', '.join(evidence)}")
+
+
+def _together(device: Device) -> list[list[int]]:
+    """Axes that move at the same time."""
+    every = [*range(len(device.drives))]
+    return [[i] for i in every] if device.line.in_turn else [every]
+
+
+def _numbered(low: Pulses, high: Pulses) -> Iterator[tuple[int, tuple[int, int]]]:
+    return enumerate(zip(low, high, strict=True))
 
 
 def _prove(
@@ -98,8 +113,9 @@ def _prove(
     statuses = _wait_until_still(device)
     at = [status.position for status in statuses]
     gone = _shares(device, low, high, at)
-    names = [axis.name for axis in run.config.axes]
-    went_on = [n for n, share in zip(names, gone, strict=True) if share > 1.0 - SHORT]
+    names = run.config.axis_names
+    going = [names[i] for i, (a, b) in _numbered(low, high) if a != b]
+    went_on = [n for n, share in zip(going, gone, strict=True) if share > 1.0 - SHORT]
     seen = device.attitude(time.monotonic())
     after = _look(device, statuses)
     moved = [
@@ -107,7 +123,7 @@ def _prove(
         for name, status, then in zip(names, after, at, strict=True)
         if abs(status.position - then) > STILL_COUNTS and status.enabled
     ]
-    turned = angle_between_deg(seen, device.attitude(time.monotonic()))
+    turned = device.geometry.apart(seen, device.attitude(time.monotonic()))
     _reset_alarms(run, device, name)
     device.untrack()
     if went_on:
@@ -116,18 +132,21 @@ def _prove(
             "cannot stop it. Correct [stop], broadcast_stop or [comm_timeout] of the "
             "map; until then the emergency stop alone stops the device"
         )
-    if moved or turned > TURNED_DEG:
+    if moved or turned > TURNED_DEG * device.geometry.scale:
         raise MotionFault(
             f"{', '.join(moved) or 'the phone'} moved again after {name} (the phone "
             f"turned by {turned:.2f} deg). Set the drive so that it does not go on by "
             "itself after a stop"
         )
-    pairs = zip(run.config.axes, places, at, strict=True)
-    after_deg = {str(axis.name): round(axis.to_deg(b - a), 3) for axis, a, b in pairs}
+    after_deg = {
+        axis.name: round(axis.to_deg(b - a), 3)
+        for axis, a, b in zip(run.config.axes, places, at, strict=True)
+        if axis.name in going
+    }
     run.say(
         f"  {name}: stood after "
         + ", ".join(f"{axis} {abs(deg):.2f}" for axis, deg in after_deg.items())
-        + f" deg, and {stop.stand_s(device.drives):g} s later"
+        + f" {run.config.axis_unit}, and {stop.stand_s(device.drives):g} s later"
     )
     return after_deg
 
@@ -158,8 +177,8 @@ def _last(drive: Drive) -> Status:
 def _shares(
     device: Device, low: Pulses, high: Pulses, at: Sequence[int]
 ) -> list[float]:
-    """Shares of the way that the axes have gone."""
-    return [(p - a) / (b - a) for a, b, p in zip(low, high, at, strict=True)]
+    """Shares of the way that those axes have gone that move."""
+    return [(p - a) / (b - a) for a, b, p in zip(low, high, at, strict=True) if a != b]
 
 
 def _stop_units(device: Device) -> None:
@@ -201,11 +220,11 @@ def _look(device: Device, statuses: list[Status]) -> list[Status]:
     end = time.monotonic() + stop.stand_s(device.drives)
     while time.monotonic() < end:
         device.guard()
-        now = [drive.standing() for drive in device.drives]
+        now = [drive.steady() for drive in device.drives]
         if any(status.moving for status in now):
             return _wait_until_still(device)
         time.sleep(stop.LOOK_S)
-    return [drive.standing() for drive in device.drives]
+    return [drive.steady() for drive in device.drives]
 
 
 def _reset_alarms(run: Run, device: Device, name: str) -> None:
@@ -213,14 +232,12 @@ def _reset_alarms(run: Run, device: Device, name: str) -> None:
     for drive in device.drives:
         if not drive.status().fault:
             continue
-        reset = drive.axis.map.alarm_reset
-        if not reset or drive.bring(reset, lambda status: not status.fault).fault:
+        known = drive.can_reset
+        if not known or drive.bring(drive.reset, lambda status: not status.fault).fault:
             raise MotionFault(
                 f"{drive.axis.name} stays in alarm after {name}: {drive.alarm()}. "
                 "Reset it, then run `jaxcal-rig axes` again"
             )
         run.say(f"  {drive.axis.name}: its alarm after {name} was reset")
-        if not drive.bring(
-            drive.axis.map.enable, lambda status: status.enabled
-        ).enabled:
+        if not drive.bring(drive.arm, lambda status: status.enabled).enabled:
             raise MotionFault(f"{drive.axis.name} does not enable after {name}")

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from rig.config import RigConfig
-from rig.core.attitude import ORDERS, Frame, frame_at
-from rig.core.faults import MotionFault
+from rig.faults import MotionFault
 from rig.journal import Record, measured_postures
+from rig.readings.attitude import ORDERS, frame_at
+from rig.readings.geometry import Attitudes, Geometry, geometry_of
 from rig.workbench.identification.fit import (
     held_out_errors,
     identify,
@@ -42,14 +42,16 @@ def conclude(
     """
     last = {record["event"]: record for record in records}
     zero, held = last["zero"], last.get("held_out", {"pairs": []})["pairs"]
-    frame = frame_at(config, np.array(zero["attitude"]))
+    geometry = geometry_of(config)
     postures = measured_postures(records)
     references = [r for r in postures.values() if r["role"] == "reference"]
     visits = sorted([zero, *references], key=lambda record: record["seq"])
-    drift = estimate_drift(visits, frame, config.session.drift_limit_deg)
+    drift = estimate_drift(visits, geometry, config.session.drift_limit_deg)
     if drift and drift["corrected"]:
         turn = drift["turn_deg_per_min"]
-        postures = {n: without_drift(r, turn, zero, frame) for n, r in postures.items()}
+        postures = {
+            n: without_drift(r, turn, zero, geometry) for n, r in postures.items()
+        }
     chosen = [r for r in postures.values() if r["role"] == "select"]
     held_out, errors = held_out_errors(config, held, postures, identify(config, chosen))
     zero_share = chosen[0]["samples"] / zero["samples"]
@@ -83,14 +85,14 @@ def conclude(
         "b": np.asarray(calibration.bias).tolist(),
         **limits,
         **shared,
-        "orders": order_residuals(config, frame, chosen + held_out),
+        "orders": order_residuals(config, zero, chosen + held_out),
         **errors,
         "drift": drift,
     }
 
 
 def estimate_drift(
-    visits: list[Record], frame: Frame, limit_deg: float
+    visits: list[Record], geometry: Geometry, limit_deg: float
 ) -> dict[str, Any] | None:
     """How far the phone's zero drifted; None where it was visited once.
 
@@ -101,7 +103,7 @@ def estimate_drift(
 
     Args:
         visits: the zero, then postures measured there, in order of time.
-        frame: of the zero.
+        geometry: of the readings.
         limit_deg: ``session.drift_limit_deg``.
 
     Returns:
@@ -116,10 +118,8 @@ def estimate_drift(
     later = [visit["measured_deg"] for visit in visits[1:]]
     seen = np.array([np.zeros(len(later[0])), *later])
     attitudes = np.array([visit["attitude"] for visit in visits])
-    turns = Rotation.from_matrix(attitudes @ attitudes[0].T).as_rotvec(degrees=True)
-    away = minutes - minutes.mean()
-    turn = away @ turns / max(float(away @ away), 1e-12)
-    rest = [without_drift(visit, turn, zero, frame) for visit in visits[1:]]
+    turn = geometry.drift(attitudes, minutes)
+    rest = [without_drift(visit, turn, zero, geometry) for visit in visits[1:]]
     bend = np.abs([visit["measured_deg"] for visit in rest]).max(axis=0)
     noise = sum(np.square(v["std_deg"]) / v["samples"] for v in (zero, visits[-1]))
     least = np.maximum(SIGNIFICANT * np.sqrt(noise), LEAST * limit_deg)
@@ -140,18 +140,18 @@ def estimate_drift(
 
 
 def without_drift(
-    record: Record, turn: ArrayLike, zero: Record, frame: Frame
+    record: Record, turn: ArrayLike, zero: Record, geometry: Geometry
 ) -> Record:
-    """A record without a turn of (3,) degrees a minute of the phone's world."""
+    """A record without a drift: (3,) degrees a minute of the phone's world, or (m,)."""
     minutes = (record["time"] - zero["time"]) / 60.0
-    back = Rotation.from_rotvec(-minutes * np.asarray(turn), degrees=True)
-    attitude = back.as_matrix() @ np.array(record["attitude"])
+    attitude = geometry.without(np.array(record["attitude"]), turn, minutes)
+    frame = geometry.frame(np.array(zero["attitude"]))
     measured = frame.angles(attitude).tolist()
     return {**record, "attitude": attitude.tolist(), "measured_deg": measured}
 
 
 def order_residuals(
-    config: RigConfig, frame: Frame, records: list[Record]
+    config: RigConfig, zero: Record, records: list[Record]
 ) -> dict[str, Any]:
     """Residual of the linear fit under each of the six mechanism orders.
 
@@ -161,7 +161,10 @@ def order_residuals(
     Returns:
         rms (order to degrees), configured, warning (empty where all is well).
     """
-    configured = config.mechanism.order
+    configured, geometry = config.mechanism.order, geometry_of(config)
+    if not isinstance(geometry, Attitudes):
+        return {"rms": {}, "configured": "", "warning": ""}
+    frame = frame_at(config, np.array(zero["attitude"]))
     count = len(config.axes) + 1
     if len(records) < count + 2:
         return {"rms": {}, "configured": configured, "warning": ""}

@@ -9,8 +9,8 @@ import numpy as np
 from scipy import special
 
 from rig.config import RigConfig
-from rig.core.attitude import Array
 from rig.journal import Record
+from rig.readings.attitude import Array
 
 
 def pairs(records: list[Record]) -> tuple[Array, Array]:

@@ -17,7 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal.files import write_text
 from rig.config import RigConfig, parse_config
-from rig.core.attitude import (
+from rig.faults import EXIT_OK, MotionFault, Refused
+from rig.journal import Record, RunFolder, measured_postures, new_run_folder
+from rig.readings.attitude import (
     DIGITS,
     Array,
     euler_to_matrix,
@@ -25,8 +27,6 @@ from rig.core.attitude import (
     matrix_to_euler,
     mean_rotation,
 )
-from rig.core.faults import EXIT_OK, MotionFault, Refused
-from rig.journal import Record, RunFolder, measured_postures, new_run_folder
 from rig.workbench.identification.conclusion import check_matrix, conclude
 from rig.workbench.outputs.report import save_result
 from rig.workbench.toml import set_values
@@ -56,16 +56,19 @@ def reread(records: list[Record], then: RigConfig, now: RigConfig) -> list[Recor
             f"the run holds {len(chosen)} of the {then.k} chosen postures that "
             "a calibration takes. Finish it first with `jaxcal-rig resume`"
         )
-    same = (then.imu.order, then.imu.signs) == (now.imu.order, now.imu.signs)
-    signs = np.array(then.imu.signs) * np.array(now.imu.signs)
+    if then.imu is None or now.imu is None:
+        raise Refused("the run was measured by numbers, which are read in one way only")
+    phone, new = then.phone, now.phone
+    same = (phone.order, phone.signs) == (new.order, new.signs)
+    signs = np.array(phone.signs) * np.array(new.signs)
     frame = None
 
     def read(record: Record) -> Record:
         nonlocal frame
         turned = attitudes(record)
         if not same:
-            sent = matrix_to_euler(turned, str(then.imu.order))
-            turned = euler_to_matrix(sent * signs, str(now.imu.order))
+            sent = matrix_to_euler(turned, str(phone.order))
+            turned = euler_to_matrix(sent * signs, str(new.order))
         attitude = mean_rotation(turned)
         frame = frame or frame_at(now, attitude)  # of the zero, which comes first
         spread = frame.angles(turned)
@@ -105,6 +108,8 @@ def refit(
         Refused: the run does not allow it; nothing was written.
     """
     start, imu, described = held[0], then.imu, held[0]["config"]
+    if imu is None:
+        raise Refused("the run was measured by numbers, which are read in one way only")
     old = {k: described[k.partition(".")[0]][k.partition(".")[2]] for k in wanted}
     new = {k: v for k, v in wanted.items() if v is not None and v != old[k]}
     quaternions = imu.format == "sensorlogger" or imu.quaternion_columns is not None

@@ -24,7 +24,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from rig.core.faults import Fault, Refused
+from rig.faults import Fault, Refused
 from rig.signals import PAUSE
 from rig.workbench.live import HOST
 from rig.workbench.live.page import make_page

@@ -13,8 +13,8 @@ import time
 from collections import deque
 from typing import Any
 
-from rig.core.faults import Refused
 from rig.core.stop import UnitStop
+from rig.faults import Refused
 from rig.journal import JOURNAL, Record, is_written
 from rig.signals import PAUSE
 from rig.stopping import stop_run

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from rig.config import RigConfig
-from rig.core.attitude import Array
 from rig.journal import Record
+from rig.readings.attitude import Array
 from rig.workbench.outputs.state import RunState
 from rig.workbench.outputs.telemetry import telemetry
 from rig.workbench.outputs.words import choice_text, event_lines, numbers

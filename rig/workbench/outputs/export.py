@@ -20,9 +20,9 @@ import numpy as np
 
 from rig.config.axis import Scale
 from rig.config.config import names_of, units_of
-from rig.core.attitude import Array
-from rig.core.faults import Refused
+from rig.faults import Refused
 from rig.journal import Record
+from rig.readings.attitude import Array
 from rig.workbench.outputs.words import recalibrate
 
 NUMBERS = ("matrix", "offset_deg", "min_deg", "max_deg", "pulses_per_deg", "min_pulses",

@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxcal.extras import install
 from jaxcal.pages import Code, Figure, Page, Section, Table, Text, write_page
-from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE
+from rig.faults import EXIT_OK, EXIT_RECALIBRATE
 from rig.journal import JOURNAL, Record, RunFolder, is_written, measured_postures
 from rig.workbench.outputs.state import RunState
 from rig.workbench.outputs.view import headline, trouble, verdict

@@ -78,7 +78,7 @@ def sample(device: Device) -> dict[str, Any]:
         record["age"] = round(now - readings[-1].time, 3)
         record["rate"] = round((len(readings) - 1) / span, 1) if span > 0 else 0.0
     if readings and device.frame is not None:
-        angles = device.frame.angles([reading.matrix for reading in readings])
+        angles = device.frame.angles([reading.value for reading in readings])
         record["deg"] = angles[-1].round(4).tolist()
         if len(readings) > 2:
             record["std"] = angles.std(axis=0, ddof=1).round(5).tolist()

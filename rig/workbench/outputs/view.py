@@ -6,8 +6,8 @@ import math
 import shlex
 from typing import Any
 
-from rig.core.faults import EXIT_RECALIBRATE
 from rig.core.stop import UnitStop
+from rig.faults import EXIT_RECALIBRATE
 from rig.workbench.outputs.state import ACTIVE, SESSIONS, Posture, Record, RunState
 from rig.workbench.outputs.words import error_text, event_lines, summary_lines
 

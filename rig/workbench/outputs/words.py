@@ -75,7 +75,11 @@ def _stop(record: Record) -> str:
 SENTENCES: dict[str, str | Callable[[Record], str]] = {
     "start": "{mode} begun",
     "resume": "resumed after an interruption",
-    "listening": "IMU: waiting for the phone on port {port} ({format})",
+    "listening": lambda r: (
+        "waiting for the sensor"
+        if r["format"] == "numbers"
+        else "IMU: waiting for the phone on port {port} ({format})".format_map(r)
+    ),
     "armed": "armed: {drives} drives on {where}",
     "note": "{text}",
     "reference": _reference,

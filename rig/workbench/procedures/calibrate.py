@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from rig.core.attitude import Array
 from rig.core.device import Device, Posture, check_plan
-from rig.core.faults import MotionFault
 from rig.core.session import visit
+from rig.faults import MotionFault
 from rig.journal import SIGN_CHECKED
+from rig.readings.attitude import Array
 from rig.workbench.identification.conclusion import check_matrix, conclude
 from rig.workbench.identification.fit import identify
 from rig.workbench.outputs.console import plan_lines

@@ -6,8 +6,8 @@ import numpy as np
 
 from jaxcal.files import atomic_write
 from rig.core.device import Posture
-from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE
 from rig.core.session import visit
+from rig.faults import EXIT_OK, EXIT_RECALIBRATE
 from rig.workbench.identification.fit import pairs
 from rig.workbench.outputs.words import numbers
 from rig.workbench.procedures.calibrate import END

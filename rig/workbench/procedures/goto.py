@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from rig.config import RigConfig
-from rig.core.attitude import Frame
 from rig.core.device import Posture
-from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
-from rig.core.record_check import unseen
 from rig.core.session import visit
+from rig.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
+from rig.readings.geometry import Frame, geometry_of
 from rig.workbench.run import Run
 
 
@@ -66,10 +65,10 @@ def unchecked(
     where it was left there, its count says nothing. That of ``told`` axes does, whose
     home is at a count of its own.
     """
-    seen = [] if frame is None else unseen(config, frame.zero)
+    seen = [] if frame is None else geometry_of(config).unseen(frame.zero)
     return [
         axis.name
         for axis in config.axes
         if axis.name in seen
-        and not (axis.map.homed or axis.map.absolute_encoder or axis.name in told)
+        and not (axis.map.tells_homed or axis.map.absolute_encoder or axis.name in told)
     ]

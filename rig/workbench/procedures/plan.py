@@ -12,7 +12,7 @@ from jaxcal.models import Affine
 from jaxcal.selection.fastest import Motion, fastest_tour, travel_times
 from rig.config import RigConfig
 from rig.config.axis import Pulses
-from rig.core.attitude import Array
+from rig.readings.attitude import Array
 
 EXACT_LIMIT_S = 20.0  # for the proof that the choice is (or is not) the optimum
 REPLAN_LIMIT_S = 5.0  # the same while the drives stand armed

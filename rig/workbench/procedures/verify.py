@@ -10,8 +10,8 @@ import numpy as np
 from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.config.config import differences
-from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
 from rig.core.record_check import KeptZero
+from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
 from rig.workbench.identification.fit import held_out_errors, pairs
 from rig.workbench.outputs.words import error_text, numbers
 from rig.workbench.procedures.calibrate import pair_names, visit_pairs

@@ -1,4 +1,5 @@
-"""The phone's stream over a socket, received on one thread into a bounded ring."""
+"""Who is heard on the phone's port, and who is not: one phone, whoever else "
+"connects."""
 
 from __future__ import annotations
 
@@ -6,20 +7,31 @@ import asyncio
 import contextlib
 import dataclasses
 import http
-import itertools
 import socket
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
-from typing import Any
-
-import numpy as np
+from typing import Any, Protocol
 
 from rig.config.settings import ImuSettings
-from rig.core.attitude import Array, Reading
-from rig.core.faults import Fault
-from rig.core.stream import MAX_BODY, LineSplitter, Parser
+from rig.readings.stream import MAX_BODY, LineSplitter
+
+
+class Hearer(Protocol):
+    """Whoever takes what one phone sends."""
+
+    settings: ImuSettings
+    report: Callable[..., object]
+
+    def begin(self) -> None:
+        """Lines come over another connection from now on."""
+
+    def take_lines(self, lines: list[bytes], now: float) -> bool:
+        """Lines that came at a monotonic time; whether a reading of them was used."""
+
+    def take_body(self, body: bytes) -> tuple[bool, bool]:
+        """A message; whether it was used, and whether it is another device's."""
+
 
 RECONNECT_S = 0.2
 MOST_OPEN = 4  # connections at a time
@@ -27,11 +39,6 @@ BACKLOG = 128  # connections that wait for an answer; past that a phone waits 1 
 PATIENCE_S = 5.0  # of a connection for a line, or a whole message
 MAX_HEAD = 8192  # bytes of a message before its body
 LOOK_S = 0.05  # between two looks at whether to end
-RING = 8192  # readings kept: over half a minute at 200 Hz
-
-
-class ImuError(Fault):
-    """The phone's stream is stale, closed, or not to be trusted."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -58,7 +65,7 @@ class Receiver:
     connection is another sender.
     """
 
-    def __init__(self, imu: Imu) -> None:
+    def __init__(self, imu: Hearer) -> None:
         """OSError where the port cannot be opened."""
         self._imu = imu
         self._settings = s = imu.settings
@@ -207,151 +214,3 @@ def _answer(code: int, stays: bool) -> bytes:
     closes = "" if stays else "Connection: close\r\n"
     phrase = http.HTTPStatus(code).phrase
     return f"HTTP/1.1 {code} {phrase}\r\nContent-Length: 0\r\n{closes}\r\n".encode()
-
-
-class Imu:
-    """The attitude of the phone, now and over the last seconds."""
-
-    def __init__(
-        self,
-        settings: ImuSettings,
-        report: Callable[..., object] = lambda event, **fields: None,
-    ) -> None:
-        """``report`` gets an event and its fields, on the receiving thread."""
-        self.settings = settings
-        self.connections = 0
-        self.world = np.eye(3)  # (3, 3) by which readings are turned
-        self.report = report
-        self._parser = Parser(settings)
-        self._ring: deque[Reading] = deque(maxlen=RING)
-        self._lock = threading.Lock()
-        self._receiver: Receiver | None = None
-        self._arrived = 0.0
-
-    def open(self) -> Imu:
-        """Listen, or begin to connect; ImuError where the port cannot be opened."""
-        try:
-            self._receiver = Receiver(self)
-        except OSError as error:
-            where = f"{self.settings.host}:{self.settings.port}"
-            reason = error.strerror or error
-            raise ImuError(
-                f"cannot open the IMU port {where}: {reason}. End the program that "
-                "uses it, or change imu.host and imu.port"
-            ) from None
-        return self
-
-    def close(self) -> None:
-        if self._receiver is not None:
-            self._receiver.close()
-
-    @property
-    def port(self) -> int:
-        return self._receiver.port if self._receiver else self.settings.port
-
-    @property
-    def sender(self) -> str:
-        """Address of the phone that is heard; empty while there is none."""
-        return self._receiver.phone if self._receiver else ""
-
-    def __enter__(self) -> Imu:
-        return self.open()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def latest(self) -> Reading:
-        """The newest reading; ImuError where none is fresh."""
-        with self._lock:
-            reading = self._ring[-1] if self._ring else None
-        if reading is None:
-            raise ImuError("the phone has sent no reading yet: start its app")
-        now, limit = time.monotonic(), self.settings.stale_s
-        if now - reading.time > limit:
-            hint = "Check its Wi-Fi, and that its app is in front"
-            if now - self._arrived < limit:
-                hint = "It arrives late, or its stamps are not those configured"
-            raise ImuError(
-                f"the phone's last reading is {now - reading.time:.2f} s old (limit "
-                f"imu.stale_s = {limit:g} s). {hint}{self.dropped}"
-            )
-        return reading
-
-    def since(self, start: float) -> list[Reading]:
-        """Readings measured at or after a monotonic time, oldest first."""
-        with self._lock:
-            newest = reversed(self._ring)
-            recent = itertools.takewhile(lambda r: r.time >= start, newest)
-            return [*recent][::-1]
-
-    def turn(self, world: Array) -> None:
-        """Turn all readings by (3, 3), those that were received too."""
-        with self._lock:
-            self.world = world @ self.world
-            turned = [Reading(r.time, world @ r.matrix) for r in self._ring]
-            self._ring = deque(turned, maxlen=RING)
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Records that were accepted, and those dropped by reason."""
-        with self._lock:
-            return dict(self._parser.counts)
-
-    @property
-    def dropped(self) -> str:
-        """What was dropped, in words; empty where nothing was."""
-        counts = {
-            reason: n for reason, n in self.counts.items() if reason != "accepted"
-        }
-        each = (f"{count} {reason}" for reason, count in counts.items())
-        return f"; records dropped: {', '.join(each)}" if counts else ""
-
-    def wait_for_stream(self, timeout_s: float) -> Reading:
-        """The first fresh reading; ImuError where none came in time."""
-        end = time.monotonic() + timeout_s
-        while True:
-            try:
-                return self.latest()
-            except ImuError:
-                if time.monotonic() > end:
-                    detail = self.dropped
-                    if self._receiver and self._receiver.refused:
-                        names = ", ".join(self._receiver.refused)
-                        detail += f"; senders refused: {names}"
-                    raise ImuError(
-                        f"no usable reading from the phone in {timeout_s:g} s on "
-                        f"{self.settings.host}:{self.port} ({self.connections} "
-                        f"connections{detail}). Start its app, and check the address, "
-                        "port and [imu] format"
-                    ) from None
-            time.sleep(0.01)
-
-    # On the receiving thread
-
-    def begin(self) -> None:
-        """Lines come over another connection from now on."""
-        self.connections += 1
-        with self._lock:
-            self._parser.reconnected()
-
-    def take_lines(self, lines: list[bytes], now: float) -> bool:
-        """Lines that came at a monotonic time; whether a reading of them was used."""
-        with self._lock:
-            return self._store(self._parser.lines(lines, now))
-
-    def take_body(self, body: bytes) -> tuple[bool, bool]:
-        """A message; whether it was used, and whether it is another device's."""
-        with self._lock:
-            used = self._store(self._parser.body(body, time.monotonic()))
-            self.connections = max(1, self._parser.sessions)
-            return used, self._parser.foreign
-
-    def _store(self, readings: list[Reading]) -> bool:
-        if readings:
-            self._arrived = time.monotonic()
-        for reading in readings:
-            last = self._ring[-1].time if self._ring else reading.time
-            if reading.time > last - 1e-3:
-                turned = self.world @ reading.matrix
-                self._ring.append(Reading(max(last, reading.time), turned))
-        return bool(readings)

@@ -16,7 +16,7 @@ from typing import Any
 from scipy.spatial.transform import Rotation
 
 from rig.config.settings import ImuSettings
-from rig.core.attitude import Array, Reading, angle_between_deg, euler_to_matrix
+from rig.readings.attitude import Array, Reading, angle_between_deg, euler_to_matrix
 
 MAX_LINE = 1024  # bytes; a phone's line has under 200
 MAX_BODY = 1 << 20  # bytes of one pushed message

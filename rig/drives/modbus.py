@@ -1,4 +1,4 @@
-"""The Modbus line. This is the only file that opens a drive port.
+"""Modbus: the line, and drives by their register maps.
 
 pymodbus does the framing. What it leaves to its caller is done here: exception replies
 are errors, replies are checked against their request, the silence between frames is
@@ -13,32 +13,26 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from rig.config.settings import BusSettings
-from rig.core.faults import Fault
+from rig.config.axis import HIGHEST, LOWEST, Axis
+from rig.config.maps import Read, RegisterMap, Writes, decode
+from rig.config.settings import BusSettings, ReadingRegister
+from rig.drives.drive import Drive, Look
+from rig.drives.line import BusError, Line
 
 METHODS = {3: "read_holding_registers", 6: "write_register", 16: "write_registers"}
 TURNAROUND_S = 0.05  # for the units to act on a broadcast, which none answers
 GATEWAY_CODES = (10, 11)  # the unit behind the gateway is silent
+PASSING = (5, 6, 8, 10, 11)  # exceptions: acknowledge, busy, CRC; silence at a gateway
+OUT_OF_REACH = (2, 3)  # of the target of a move
+FRAME_BITS = 2 * 24 * 11  # of a stop and its reply on a serial line, at most
 PROBES = 6  # questions of another length to a unit whose replies come late
 LATEST_S = 10.0  # no gateway keeps a reply for so long
-
-
-class BusError(Fault):
-    """No valid reply: silence, noise, a closed port, or a reply to something else."""
-
-    def __init__(
-        self,
-        text: str,
-        advice: str = "Check the unit's power, cable and id, and the line's settings",
-    ) -> None:
-        self.advice = advice
-        super().__init__(text)
 
 
 class Rejected(BusError):
@@ -48,6 +42,8 @@ class Rejected(BusError):
         from pymodbus.constants import ExcCodes
 
         self.code = code
+        self.refused = code not in PASSING
+        self.out_of_reach = code in OUT_OF_REACH
         name = next((each.name for each in ExcCodes if each == code), "unknown")
         name = name.lower().replace("_", " ")
         super().__init__(
@@ -56,8 +52,10 @@ class Rejected(BusError):
         )
 
 
-class Bus:
+class Bus(Line):
     """One Modbus line with any number of units; safe to use from several threads."""
+
+    transports = ("tcp", "rtu_tcp", "rtu")
 
     def __init__(
         self,
@@ -65,16 +63,10 @@ class Bus:
         silence_s: float = 0.0,
         emit: Callable[..., Any] = lambda event, **fields: None,
     ) -> None:
-        self.settings = settings
         # On Modbus TCP the gateway keeps the line's silence.
-        self.silence_s = 0.0 if settings.transport == "tcp" else silence_s
-        self.check: Callable[[], None] = lambda: None  # before each exchange; may raise
-        self.silent: set[int] = set()  # units that did not answer the last time
-        self._tell = emit  # told of every write before it is sent, of a stop's after
-        self._untold: list[dict[str, Any]] = []
-        self._lock = threading.RLock()
-        self._urgent = False
-        self._timeout_s = settings.timeout_s
+        super().__init__(
+            settings, (settings.transport != "tcp" and silence_s) or 0.0, emit
+        )
         self._quiet_until = 0.0
         # Of a unit: registers in each reply that may still come, 0 of a write, and
         # when it was asked; and an address that was read well.
@@ -95,47 +87,35 @@ class Bus:
         line = s.model_dump(include={"baudrate", "parity", "stopbits", "bytesize"})
         return ModbusSerialClient(s.device, **line, **how)
 
-    def open(self) -> Bus:
-        """Open the port; BusError where it is absent, refused or held by another."""
-        with self._lock:
-            self._client = self._client or self._make_client()
-            if not self._client.connect():
-                why, advice = _why_closed(self.settings)
-                raise BusError(f"cannot open {self.settings.where}: {why}", advice)
-        return self
+    def connect(self) -> None:
+        self._client = self._client or self._make_client()
+        if not self._client.connect():
+            why, advice = _why_closed(self.settings)
+            raise BusError(f"cannot open {self.settings.where}: {why}", advice)
 
     def close(self) -> None:
-        """Close the port; opening it again is possible."""
         with self._lock:
             if self._client is not None:
                 self._client.close()
                 self._client = None
 
-    @contextlib.contextmanager
-    def urgent(self, timeout_s: float | None = None) -> Iterator[None]:
-        """Keep the line for a stop: no exchange of another thread, no ``check``.
+    @property
+    def quick_s(self) -> float:
+        return super().quick_s + FRAME_BITS / self.settings.baudrate
 
-        A reply is waited for ``timeout_s``, or as configured where that is shorter.
-        """
-        with self._lock:
-            before = self._urgent, self._timeout_s
-            outermost = not self._urgent
-            configured = self.settings.timeout_s
-            self._urgent = True
-            self._timeout_s = min(timeout_s or configured, configured)
-            try:
-                yield
-            finally:
-                self._urgent, self._timeout_s = before
-                untold, self._untold = (self._untold, []) if outermost else ([], [])
-        for fields in untold if outermost else ():
-            self._tell("write", **fields)
+    def stops_at_once(self, drives: Sequence[Drive]) -> bool:
+        """On a serial line, where all are of a family that takes a broadcast."""
+        maps = [drive.map for drive in drives if isinstance(drive, ModbusDrive)]
+        alike = all(each.stop == maps[0].stop for each in maps)
+        return self.settings.transport != "tcp" and alike and maps[0].broadcast_stop
 
-    def __enter__(self) -> Bus:
-        return self.open()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def stop_at_once(self, drives: Sequence[Drive]) -> None:
+        if self.stops_at_once(drives):
+            assert isinstance(drives[0], ModbusDrive)
+            family = drives[0].map
+            for frame in family.stop.write:
+                words = frame.registers(family.word_order)
+                self.broadcast(frame.address, frame.function, words)
 
     def read_words(
         self, unit: int, address: int, count: int, retries: int | None = None
@@ -171,7 +151,7 @@ class Bus:
             BusError: no valid reply; whether the drive obeyed is unknown.
             Rejected: the drive refused.
         """
-        self._emit(unit, address, words)
+        self.tell(unit, address=address, words=words)
         if not self._urgent:  # an acknowledgement of a stop tells of a stop, also late
             self._catch_up(unit, self._readable.get(unit))
         reply = self._exchange(function, unit, address, words)
@@ -230,18 +210,10 @@ class Bus:
 
     def broadcast(self, address: int, function: int, words: list[int]) -> None:
         """Write registers of every unit on a serial line; no unit answers."""
-        self._emit(0, address, words)
+        self.tell(0, address=address, words=words)
         with self._lock:
             self._send(function, 0, address, words, no_response_expected=True)
             self._quiet_until += TURNAROUND_S
-
-    def _emit(self, unit: int, address: int, words: list[int]) -> None:
-        """Tell of a write. A journal on a disk that hangs must not hold up a stop."""
-        fields = {"unit": unit, "address": address, "words": words}
-        if self._urgent:
-            self._untold.append(fields | {"sent": round(time.time(), 4)})
-        else:
-            self._tell("write", **fields)
 
     def _exchange(self, function: int, unit: int, address: int, asked: Any) -> Any:
         """The reply to one request, for a number of registers or with words to write.
@@ -332,3 +304,181 @@ def _why_closed(settings: BusSettings) -> tuple[str, str]:
     if not os.access(settings.device, os.R_OK | os.W_OK):
         return "this user may not open it", "Join its group, often dialout"
     return "held by another program", "Close that program"
+
+
+class ModbusDrive(Drive):
+    """What a register map means, spoken over the bus."""
+
+    line_type = Bus
+    axis: Axis
+    line: Bus
+
+    @property
+    def map(self) -> RegisterMap:
+        """The registers of its family."""
+        found = self.axis.map
+        assert isinstance(found, RegisterMap)
+        return found
+
+    @property
+    def counts_from_home(self) -> bool:  # type: ignore[override]  # of the map
+        return self.map.home_place is not None
+
+    @property
+    def can_reset(self) -> bool:  # type: ignore[override]  # of the map
+        return self.map.alarm_reset is not None
+
+    @property
+    def can_home(self) -> bool:  # type: ignore[override]  # of the map
+        return self.map.home is not None
+
+    @property
+    def can_set_zero(self) -> bool:  # type: ignore[override]  # of the map
+        return self.map.set_zero is not None
+
+    @property
+    def tells_homed(self) -> bool:  # type: ignore[override]  # of the map
+        return self.map.homed is not None
+
+    @property
+    def says_homed(self) -> bool:  # type: ignore[override]  # of the status word
+        bits = self.map.homed
+        word = self.last.word if self.last else None
+        return bits is not None and word is not None and bits.holds(word)
+
+    def ids(self) -> dict[str, int | str]:
+        """What the map calls identity; a register that refuses says so."""
+        found: dict[str, int | str] = {}
+        for name, read in self.map.identity.items():
+            try:
+                found[name] = self.read(read)
+            except Rejected as error:
+                found[name] = f"exception {error.code}"
+        return found
+
+    def lasting(self, ids: dict[str, int | str]) -> dict[str, int | str]:
+        """Without signed registers, which are measurements, such as a temperature."""
+        kinds = self.map.identity
+        return {n: value for n, value in ids.items() if kinds[n].type.startswith("u")}
+
+    def foreign(self, ids: dict[str, int | str]) -> str:
+        for name, (low, high) in self.map.recognise.items():
+            value = ids[name]
+            if isinstance(value, int) and not low <= value <= high:
+                return f"{name} is {value}, not in [{low}, {high}]"
+        return ""
+
+    def arm(self) -> None:
+        self.write(self.map.enable)
+
+    def look(self, retries: int) -> Look:
+        word = self.read(self.map.status, retries)
+        count = self.read(self.map.position, retries)
+        return Look(position=count, **self.map.status.flags(word), word=word)
+
+    def position(self) -> int:
+        return self.read(self.map.position)
+
+    def standing(self) -> bool:
+        flags = self.map.status.flags(self.read(self.map.status))
+        return flags["done"] and not flags["moving"]
+
+    def alarm(self) -> str:
+        """The alarm in words, empty where there is none or no register for it."""
+        if not (read := self.map.alarm) or not (code := self.read(read)):
+            return ""
+        name = read.names.get(code)
+        return f"alarm 0x{code:X}" + (f" ({name})" if name else "")
+
+    def move(self, count: int, speed: float, accel: float) -> None:
+        """Every frame is sent exactly once; speed and ramps as registers hold them."""
+        self.write(self.map.move, position=count, **self.axis.motion_counts())
+
+    def stop(self) -> None:
+        """Quick stop; torque stays on."""
+        self.write(self.map.stop)
+
+    def reset(self) -> None:
+        self.write(self.map.alarm_reset)
+
+    def hold(self, pulses: int) -> None:
+        self.write(self.map.hold, position=pulses + self.origin)
+
+    def held(self) -> int | None:
+        """The target register as it reads, None where it cannot be read."""
+        read = self.map.target
+        with contextlib.suppress(Rejected):
+            return self.read(read) if read else None
+        return None
+
+    def home(self) -> None:
+        self.write(self.map.home)
+
+    def set_zero(self, count: int) -> None:
+        self.write(self.map.set_zero, home=count)
+
+    def mirror_limits(self) -> None:
+        """Write the axis's soft limits into the drive, as far as it can count."""
+        low, high = (
+            min(max(pulses + self.origin, LOWEST), HIGHEST)
+            for pulses in (self.axis.min_pulses, self.axis.max_pulses)
+        )
+        self.write(self.map.limits, min=low, max=high)
+
+    def pulses_per_rev(self) -> int | None:
+        if read := self.map.pulses_per_rev:
+            with contextlib.suppress(Rejected):  # a model of the family without it
+                return self.read(read) or None
+        return None
+
+    def watch(self) -> int:
+        watch = self.map.comm_timeout
+        assert watch is not None  # the map has one, or it is not asked
+        place = watch.place_of("timeout") or (watch.write[0].address, "u16")
+        return self.read(Read(address=place[0], type=place[1]))
+
+    def set_watch(self, counts: int) -> None:
+        self.write(self.map.comm_timeout, timeout=counts)
+
+    def watch_counts(self, seconds: float) -> int:
+        assert self.map.comm_timeout is not None
+        return max(1, math.ceil(seconds * self.map.comm_timeout.per_s - 1e-9))
+
+    def write(self, table: Writes | None, **values: int) -> None:
+        """Send the frames of one of the map's tables; none where the map lacks it.
+
+        What moves the drive, or stops it, is sent once; the rest may be written twice,
+        and is retried as reads are.
+        """
+        once = any(
+            table is each for each in (self.map.move, self.map.home, self.map.stop)
+        )
+        tries = 1 if once else 1 + self.line.settings.read_retries
+        for left in reversed(range(tries)):
+            try:
+                return self._write(table, values)
+            except BusError as error:
+                if not left or error.refused:
+                    raise
+
+    def _write(self, table: Writes | None, values: dict[str, int]) -> None:
+        for frame in table.write if table else ():
+            words = frame.registers(self.map.word_order, **values)
+            self.line.write(self.axis.unit, frame.address, frame.function, words)
+
+    def read(self, read: Read, retries: int | None = None) -> int:
+        """The value of one or two registers."""
+        order = self.map.word_order
+        return decoded(self.line, read, self.axis.unit, order, retries)
+
+
+def decoded(
+    bus: Bus,
+    read: Read | ReadingRegister,
+    unit: int,
+    word_order: str,
+    retries: int | None = None,
+) -> int:
+    """The value of one or two registers of a unit."""
+    words = bus.read_words(unit, read.address, read.count, retries)
+    return decode(words, read.type, word_order)

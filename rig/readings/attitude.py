@@ -27,10 +27,10 @@ DIGITS = 8  # of a quaternion: 1e-6 degrees
 
 @dataclasses.dataclass(frozen=True)
 class Reading:
-    """One accepted attitude on the computer's clock."""
+    """One accepted reading on the computer's clock."""
 
-    time: float  # monotonic seconds at which the phone measured, as far as known
-    matrix: Array  # (3, 3)
+    time: float  # monotonic seconds at which it was measured, as far as known
+    value: Array  # (3, 3) of an attitude, (m,) of numbers
 
 
 def euler_to_matrix(angles_deg: ArrayLike, order: str) -> Array:
@@ -81,7 +81,7 @@ class Frame:
 
 def raw_fields(readings: Sequence[Reading]) -> dict[str, Any]:
     """``quaternions`` (samples, 4), x y z w, and ``stamps`` (samples,), Unix time."""
-    turns = Rotation.from_matrix([reading.matrix for reading in readings])
+    turns = Rotation.from_matrix([reading.value for reading in readings])
     clock = time.time() - time.monotonic()
     return {
         "quaternions": turns.as_quat(canonical=True).round(DIGITS).tolist(),
@@ -91,5 +91,5 @@ def raw_fields(readings: Sequence[Reading]) -> dict[str, Any]:
 
 def frame_at(config: RigConfig, zero: Array) -> Frame:
     """The frame in which the (3, 3) attitude ``zero`` of the phone is the zero."""
-    mounting = euler_to_matrix(config.imu.mounting_deg, "ZYX")
+    mounting = euler_to_matrix(config.phone.mounting_deg, "ZYX")
     return Frame(zero, mounting, config.mechanism.order, config.letters)

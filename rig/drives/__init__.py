@@ -1,0 +1,85 @@
+"""What moves: drives on their line, by the kind that each axis's map names.
+
+``line`` and ``drive`` are what motion and stop ask; ``modbus``, ``gcode`` and
+``cia402`` are kinds. A kind of one's own is a class that a map names.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rig.config.axis import Axis
+from rig.config.maps import DriveMap
+from rig.config.settings import BusSettings
+from rig.drives.drive import Drive
+from rig.drives.line import Line
+from rig.faults import Refused
+
+KINDS = {
+    "modbus": "rig.drives.modbus:ModbusDrive",
+    "gcode": "rig.drives.gcode:GCodeDrive",
+    "cia402": "rig.drives.cia402:Cia402Drive",
+}
+
+
+def kind_of(drive_map: DriveMap) -> type[Drive]:
+    """The class of a map's drives.
+
+    Raises:
+        Refused: there is no such class.
+    """
+    place, _, name = KINDS.get(drive_map.drive, drive_map.drive).partition(":")
+    try:
+        if place.endswith(".py"):
+            path = drive_map.folder / place
+            spec = importlib.util.spec_from_file_location(path.stem, path)
+            assert spec is not None and spec.loader is not None  # it ends with .py
+            module = importlib.util.module_from_spec(spec)
+            spec.loader.exec_module(module)
+        else:
+            module = importlib.import_module(place)
+        found = getattr(module, name)
+        if not issubclass(found, Drive):
+            raise TypeError(f"{name} is no subclass of rig.drives.Drive")
+    except Exception as error:  # whatever the import of foreign code raises
+        raise Refused(
+            f"the map {drive_map.name} names drive = {drive_map.drive!r}, which cannot "
+            f"be loaded: {type(error).__name__}: {error}. It must be one of "
+            f"{', '.join(KINDS)}, FILE.py:CLASS or MODULE:CLASS"
+        ) from None
+    return found
+
+
+def make_drives(
+    settings: BusSettings,
+    axes: Sequence[Axis],
+    silence_s: float = 0.0,
+    emit: Callable[..., Any] = lambda event, **fields: None,
+) -> tuple[Line, list[Drive]]:
+    """The line of a device, to be opened, and the drive of each axis on it.
+
+    Raises:
+        Refused: the drives are of several kinds of line, or of none on this bus.
+    """
+    kinds: dict[str, type[Drive]] = {}
+    for axis in axes:
+        if axis.map.drive not in kinds:
+            kinds[axis.map.drive] = kind_of(axis.map)
+    lines = {kind.line_type for kind in kinds.values()}
+    if len(lines) > 1:
+        raise Refused(f"the drives of one device share a line: got {', '.join(kinds)}")
+    line_type = lines.pop()
+    if settings.transport not in line_type.transports:
+        wanted = ", ".join(line_type.transports)
+        raise Refused(
+            f"bus.transport: must be {wanted} for drives of kind {', '.join(kinds)}, "
+            f"got {settings.transport!r}"
+        )
+    line = line_type(settings, silence_s, emit)
+    return line, [kinds[axis.map.drive](line, axis) for axis in axes]
+
+
+__all__ = ["Drive", "Line", "kind_of", "make_drives"]

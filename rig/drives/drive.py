@@ -1,0 +1,292 @@
+"""A drive, as motion, proof and stop know it: one axis of one line.
+
+A kind of drive writes ``ids``, ``arm``, ``position``, ``move``, ``standing``, ``stop``
+and ``alarm``; what follows from them is here, and is the same for every kind. Counts
+are the drive's own; pulses are counts from its origin.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+from rig.config.axis import Axis
+from rig.drives.line import BusError, Line
+from rig.faults import LimitError, MotionFault
+
+POLL_S = 0.05
+START_S = 0.2  # a drive that has taken a move shows it within this time
+STILL_COUNTS = 2  # between two readings of a position that flickers by one count
+LOOKS = 4  # for two readings that agree
+HOME = 2**30  # a count that no drive shows when it is switched on
+
+
+class Look(NamedTuple):
+    """What a drive says when it is looked at."""
+
+    position: int  # counts
+    enabled: bool
+    done: bool  # its last move has ended
+    moving: bool
+    fault: bool
+    word: int | None = None  # its status word, where it has one
+
+
+@dataclasses.dataclass(frozen=True)
+class Status:
+    """What a drive says about itself."""
+
+    word: int | None
+    position: int  # pulses
+    asked: float  # monotonic seconds before it was asked, ...
+    time: float  # ... and once it had answered
+    enabled: bool
+    done: bool
+    moving: bool
+    fault: bool
+
+
+class Drive:
+    """One axis's drive on its line."""
+
+    line_type: ClassVar[type[Line]]
+    can_reset = can_home = can_set_zero = False
+    counts_from_home = False  # its origin is told from its count: HOME or 0
+    tells_homed = says_homed = False  # whether it can say so, and as last read
+
+    def __init__(self, line: Any, axis: Axis) -> None:
+        self.line = line
+        self.axis = axis
+        self.last: Status | None = None  # as last read
+        self._origin: int | None = None
+        self.forget_origin()
+
+    # Of a kind of drive: what it must know. BusError where there is no valid reply.
+
+    def ids(self) -> dict[str, int | str]:
+        """What tells this drive from another, and does not change."""
+        raise NotImplementedError
+
+    def arm(self) -> None:
+        """Switch its power stage on, where it is off."""
+        raise NotImplementedError
+
+    def position(self) -> int:
+        """Its own count, by its encoder or of the steps it has made."""
+        raise NotImplementedError
+
+    def move(self, count: int, speed: float, accel: float) -> None:
+        """Start an absolute move, and return.
+
+        Sent once: whether a move without a reply was taken is found out by looking.
+
+        Args:
+            count: where to.
+            speed, accel: counts a second, and a second squared; no faster.
+        """
+        raise NotImplementedError
+
+    def standing(self) -> bool:
+        """Whether its last move has ended, at its target or not."""
+        raise NotImplementedError
+
+    def stop(self) -> None:
+        """Stop as fast as it may, with its torque on; to be sent at any time."""
+        raise NotImplementedError
+
+    def alarm(self) -> str:
+        """The fault that it is in, in words; empty where there is none."""
+        raise NotImplementedError
+
+    # What it may know besides
+
+    def enabled(self) -> bool:
+        """Whether its power stage is on."""
+        return True
+
+    def look(self, retries: int) -> Look:
+        """All that ``status`` needs; in one exchange, where the drive can."""
+        for left in reversed(range(1 + retries)):
+            try:
+                standing, alarm = self.standing(), self.alarm()
+                return Look(
+                    self.position(), self.enabled(), standing, not standing, bool(alarm)
+                )
+            except BusError as error:
+                if error.refused or not left:
+                    raise
+        raise AssertionError("unreachable")
+
+    def reset(self) -> None:
+        """Clear an alarm, where ``can_reset``."""
+
+    def hold(self, pulses: int) -> None:
+        """Make a place where it stands the target that it holds, without a move."""
+
+    def held(self) -> int | None:
+        """The target that it holds, as a count; None where it cannot be read."""
+        return None
+
+    def home(self) -> None:
+        """Start its own homing, where ``can_home``."""
+
+    def set_zero(self, count: int) -> None:
+        """Count from ``count`` where it stands, where ``can_set_zero``."""
+
+    def mirror_limits(self) -> None:
+        """Write the axis's soft limits into the drive, where its map can."""
+
+    def pulses_per_rev(self) -> int | None:
+        """Pulses for one motor turn by the drive's own word; None where it has none."""
+        return None
+
+    def watch(self) -> int:
+        """Its timeout of the line, as its register holds it, where it has one."""
+        raise NotImplementedError
+
+    def set_watch(self, counts: int) -> None:
+        """Set that register."""
+        raise NotImplementedError
+
+    def watch_counts(self, seconds: float) -> int:
+        """What that register holds of so many seconds, or of a little more."""
+        raise NotImplementedError
+
+    def lasting(self, ids: dict[str, int | str]) -> dict[str, int | str]:
+        """Of its ids those that do not change."""
+        return ids
+
+    def foreign(self, ids: dict[str, int | str]) -> str:
+        """Why a drive with these ids is not of the map's family; empty where it is."""
+        return ""
+
+    # What follows
+
+    @property
+    def origin(self) -> int:
+        """What the drive itself counts at home: HOME where it was set so, else 0.
+
+        All pulses here are from it. It is told from the count as first read and holds
+        from then on: a drive that loses its count meanwhile is seen far away.
+        """
+        if self._origin is None:
+            self.status()
+        return self._origin or 0
+
+    def forget_origin(self) -> None:
+        """The next reading tells the origin, as one does that was set anew."""
+        self._origin = None if self.counts_from_home else 0
+
+    def status(self, retries: int | None = None) -> Status:
+        """Read status and position.
+
+        Args:
+            retries: of each read. Where not given they are twice those configured:
+                spoilt frames now and then spoil all of them.
+        """
+        if retries is None:
+            retries = 2 * self.line.settings.read_retries + 1
+        asked = time.monotonic()
+        look = self.look(retries)
+        if self._origin is None:
+            self._origin = HOME if look.position > HOME // 2 else 0
+        self.last = Status(
+            look.word, look.position - self._origin, asked, time.monotonic(),
+            look.enabled, look.done, look.moving, look.fault,
+        )  # fmt: skip
+        return self.last
+
+    def steady(self, retries: int | None = None) -> Status:
+        """Status of a drive that stands: two readings of its position that agree.
+
+        One reading may be mangled and look whole. Where no two agree it is the last.
+        """
+        new = self.last is None
+        status = self.status(retries)
+        for _ in range(LOOKS):
+            before, status = status, self.status(retries)
+            if abs(status.position - before.position) <= STILL_COUNTS:
+                break
+            if new:  # or the mangled one has told the origin
+                self.forget_origin()
+        return status
+
+    def sound(self) -> Status:
+        """Status; MotionFault where the fault bit is set, or the power stage is off."""
+        status = self.status()
+        if status.fault:
+            text = ""
+            with contextlib.suppress(BusError):  # the bit alone is reason enough
+                text = self.alarm()
+            text = text or "fault bit set"
+            raise MotionFault(
+                f"{self.axis.name}: {text}. The drive has stopped itself. Find the "
+                "cause in its manual, then go on with --reset-alarms"
+            )
+        if not status.enabled:
+            raise MotionFault(
+                f"the power stage of {self.axis.name} was switched off while armed. "
+                "Look for an emergency stop, STO, its supply or another controller"
+            )
+        return status
+
+    def go(self, pulses: int) -> None:
+        """Start an absolute move; every frame is sent exactly once.
+
+        Raises:
+            LimitError: the target leaves the axis's limits.
+            BusError: a frame was not acknowledged.
+        """
+        axis = self.axis
+        if not axis.min_pulses <= pulses <= axis.max_pulses:
+            raise LimitError(
+                f"{axis.name}: {pulses} pulses leave the limits "
+                f"{axis.min_pulses}..{axis.max_pulses}"
+            )
+        per_deg = abs(axis.pulses_per_deg)
+        speed, accel = axis.drive_motion
+        self.move(pulses + self.origin, speed * per_deg, accel * per_deg)
+
+    def took(self, pulses: int, start: Status, tolerance: int) -> bool | None:
+        """Whether the drive obeys a move whose reply was lost; None: unknown.
+
+        A drive that obeys moves, has left ``start`` by more than ``tolerance`` pulses,
+        or stands at its target. One that does not holds another target, or has stood
+        idle at ``start`` for START_S.
+
+        Raises:
+            MotionFault: it is in alarm. BusError: it does not answer.
+        """
+        begun = time.monotonic()
+        while True:
+            status, held = self.sound(), self.held()
+            other = held is not None and held - self.origin != pulses
+            idle = status.done and not status.moving
+            if idle and abs(status.position - pulses) <= tolerance:
+                return True
+            if status.moving or abs(status.position - start.position) > tolerance:
+                return None if other else True
+            if idle and other:
+                return False
+            if time.monotonic() - begun > START_S:
+                return False if idle else None
+            time.sleep(POLL_S)
+
+    def bring(
+        self, act: Callable[[], object], ready: Callable[[Status], bool]
+    ) -> Status:
+        """Act and poll until the effect shows, at most the map's ready_s.
+
+        The last look begins after that time: a look before it may have waited for the
+        tries of a spoilt frame, and tells of the time before them.
+        """
+        act()
+        end = time.monotonic() + self.axis.map.ready_s
+        while True:
+            last = time.monotonic() > end
+            if ready(status := self.status()) or last:
+                return status
+            time.sleep(POLL_S)

@@ -1,0 +1,27 @@
+"""What is measured: a phone's attitude, or the numbers of a sensor.
+
+``source`` is what motion and measurement ask; ``phone`` with ``receiver``, ``stream``
+and ``attitude``, and ``numbers`` are its kinds; ``geometry`` is how two readings
+compare.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rig.config import RigConfig
+from rig.readings.source import Source
+
+
+def make_source(
+    config: RigConfig,
+    report: Callable[..., object] = lambda event, **fields: None,
+) -> Source:
+    """What a device is measured with; to be opened. ``report`` gets its events."""
+    if config.readings is not None:
+        from rig.readings.numbers import Sensor
+
+        return Sensor(config.readings, report)
+    from rig.readings.phone import Imu
+
+    return Imu(config.phone, report)

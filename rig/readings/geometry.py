@@ -1,0 +1,197 @@
+"""What readings are: attitudes of a phone, or numbers; and how two of them compare.
+
+Motion, proof and measurement know readings by these functions alone. ``scale`` is what
+a degree of a phone's attitude is in the unit of the readings: that much is looked for
+and allowed where nothing is proved.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from rig.config.config import RigConfig
+from rig.readings.attitude import (
+    Array,
+    Reading,
+    angle_between_deg,
+    frame_at,
+    mean_rotation,
+    raw_fields,
+)
+
+UNSEEN_DEG = 15.0  # an axis this near to the vertical hardly changes the tilt
+
+
+class Frame(Protocol):
+    """What is measured against a zero posture."""
+
+    @property
+    def zero(self) -> Array:
+        """The reading there."""
+
+    def angles(self, readings: ArrayLike) -> Array:
+        """(..., m) of what is measured, of readings as they are; zero at the zero."""
+
+
+class Geometry(Protocol):
+    """What readings are."""
+
+    scale: float
+    told: str  # how far it moved, in words before the figure
+
+    def apart(self, first: ArrayLike, second: ArrayLike) -> float:
+        """How far one reading is from another."""
+
+    def too_far(self, way: float, most: float) -> str:
+        """That it moved further than it may, in words."""
+
+    def way(self, first: Array, second: Array) -> Array:
+        """(3,) or (m,) from one reading to another, as the first one sees it."""
+
+    def mean(self, readings: Sequence[Array]) -> Array:
+        """Of several readings."""
+
+    def frame(self, zero: Array) -> Frame:
+        """What is measured where ``zero`` was read at the zero posture."""
+
+    def aligned(self, then: Array, now: Array) -> Array:
+        """``now`` without what readings do not tell, such as a phone's heading, as near
+        to ``then`` as that can be."""
+
+    def unseen(self, zero: Array) -> list[str]:
+        """Names of the axes of which a move at the zero posture cannot be seen."""
+
+    def raw(self, readings: Sequence[Reading]) -> dict[str, Any]:
+        """Every single reading, for the journal."""
+
+    def drift(self, readings: Array, minutes: Array) -> Array:
+        """Rate per minute of readings of one posture, by a straight line."""
+
+    def without(self, reading: Array, rate: ArrayLike, minutes: float) -> Array:
+        """A reading without what drifted since."""
+
+
+class Attitudes:
+    """(3, 3) matrices, phone to its world; ways are rotation vectors in degrees."""
+
+    scale = 1.0
+    told = "the phone turned"
+
+    def __init__(self, config: RigConfig) -> None:
+        self._config = config
+
+    apart = staticmethod(angle_between_deg)
+    mean = staticmethod(mean_rotation)
+    raw = staticmethod(raw_fields)
+
+    def too_far(self, way: float, most: float) -> str:
+        return (
+            f"the phone turned {way:.1f} deg in a move that may turn it {most:.1f}. "
+            "Check pulses_per_rev and reduction, and that the phone is fixed"
+        )
+
+    def way(self, first: Array, second: Array) -> Array:
+        return Rotation.from_matrix(first.T @ second).as_rotvec(degrees=True)
+
+    def frame(self, zero: Array) -> Frame:
+        return frame_at(self._config, zero)
+
+    def heading_turn(self, then: Array, now: Array) -> Array:
+        """(3, 3) turn about the vertical that takes ``now`` nearest to ``then``; none
+        where the heading can be trusted."""
+        if self._config.phone.heading == "absolute":
+            return np.eye(3)
+        _, _, z, w = Rotation.from_matrix(now @ then.T).as_quat()
+        quat = [0.0, 0.0, -z, w] if z or w else [0, 0, 0, 1]
+        return Rotation.from_quat(quat).as_matrix()
+
+    def aligned(self, then: Array, now: Array) -> Array:
+        return self.heading_turn(then, now) @ now
+
+    def unseen(self, zero: Array) -> list[str]:
+        config = self._config
+        if config.phone.heading == "absolute":
+            return []
+        upright = np.abs((zero @ frame_at(config, zero).mounting.T)[2])
+        least = np.cos(np.radians(UNSEEN_DEG))
+        pairs = zip(config.axis_names, config.letters, strict=True)
+        return [name for name, letter in pairs if upright["XYZ".index(letter)] > least]
+
+    def drift(self, readings: Array, minutes: Array) -> Array:
+        """Of the phone's world: a heading that drifts turns that."""
+        turned = Rotation.from_matrix(readings @ readings[0].T)
+        return _slope(turned.as_rotvec(degrees=True), minutes)
+
+    def without(self, reading: Array, rate: ArrayLike, minutes: float) -> Array:
+        back = Rotation.from_rotvec(-minutes * np.asarray(rate), degrees=True)
+        return back.as_matrix() @ reading
+
+
+@dataclasses.dataclass(frozen=True)
+class Offset:
+    """Numbers less those at the zero posture."""
+
+    zero: Array  # (m,)
+
+    def angles(self, readings: ArrayLike) -> Array:
+        return np.asarray(readings, dtype=np.float64) - self.zero
+
+
+class Numbers:
+    """(m,) vectors; ways are their differences."""
+
+    told = "the readings changed by"
+
+    def __init__(self, scale: float) -> None:
+        self.scale = scale
+
+    def apart(self, first: ArrayLike, second: ArrayLike) -> float:
+        return float(np.linalg.norm(np.subtract(second, first)))
+
+    def too_far(self, way: float, most: float) -> str:
+        return (
+            f"the readings changed by {way:.3g} in a move that may change them by "
+            f"{most:.3g}. Check pulses_per_rev, reduction and lead_mm, and the sensor"
+        )
+
+    def way(self, first: Array, second: Array) -> Array:
+        return second - first
+
+    def mean(self, readings: Sequence[Array]) -> Array:
+        return np.mean(readings, axis=0)
+
+    def frame(self, zero: Array) -> Frame:
+        return Offset(zero)
+
+    def aligned(self, then: Array, now: Array) -> Array:
+        return now
+
+    def unseen(self, zero: Array) -> list[str]:
+        return []
+
+    def raw(self, readings: Sequence[Reading]) -> dict[str, Any]:
+        return {"readings": [reading.value.tolist() for reading in readings]}
+
+    def drift(self, readings: Array, minutes: Array) -> Array:
+        return _slope(readings, minutes)
+
+    def without(self, reading: Array, rate: ArrayLike, minutes: float) -> Array:
+        return reading - minutes * np.asarray(rate)
+
+
+def _slope(values: Array, minutes: Array) -> Array:
+    away = minutes - minutes.mean()
+    return away @ values / max(float(away @ away), 1e-12)
+
+
+def geometry_of(config: RigConfig) -> Geometry:
+    """Of a device's readings."""
+    if config.readings is None:
+        return Attitudes(config)
+    return Numbers(config.readings.scale)

@@ -1,0 +1,233 @@
+"""Numbers of a sensor: lines over TCP, UDP or a serial port, or Modbus registers.
+
+A dial gauge, a digital level, an encoder, a load cell. A reading is accepted only if
+its record is whole: as many columns as named, plain decimal numbers, no impossible
+jump. Everything else is counted and dropped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rig.config.settings import BusSettings, ReadingsSettings
+from rig.drives.modbus import Bus, decoded
+from rig.readings.attitude import Array, Reading
+from rig.readings.source import ReadingError, Source
+
+NUMBER = re.compile(r"[+-]?[0-9]{1,15}(?:\.[0-9]{0,17})?(?:[eE][+-]?[0-9]{1,2})?")
+MAX_LINE = 1024  # bytes
+RECONNECT_S = 0.2
+LOOK_S = 0.1  # between two looks at whether to end
+REJOIN = 5  # readings in a row near each other after a jump
+
+
+class Sensor(Source):
+    """Numbers as they come in, on one thread."""
+
+    whose = "the sensor"
+
+    def __init__(
+        self,
+        settings: ReadingsSettings,
+        report: Callable[..., object] = lambda event, **fields: None,
+    ) -> None:
+        super().__init__(settings.stale_s, report)
+        self.settings: ReadingsSettings = settings
+        self.connections = 1  # numbers are the same whoever connects again
+        self.sender = ""  # address that is heard
+        self._port = settings.port
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="sensor", daemon=True)
+        self._socket: socket.socket | None = None
+        self._last: Array | None = None
+        self._far: list[Array] = []
+
+    @property
+    def port(self) -> int:
+        return self._port
+
+    @property
+    def where(self) -> str:
+        s = self.settings
+        return s.device or f"{s.host}:{self.port}"
+
+    def open(self) -> Sensor:
+        s = self.settings
+        try:
+            if s.transport == "listen":
+                self._socket = socket.create_server((s.host, s.port))
+            elif s.transport == "udp":
+                self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+                self._socket.bind((s.host, s.port))
+        except OSError as error:
+            raise ReadingError(
+                f"cannot open {self.where} for readings: {error.strerror or error}. "
+                "End "
+                "the program that uses it, or change readings.host and readings.port"
+            ) from None
+        if self._socket is not None:
+            self._socket.settimeout(LOOK_S)
+            self._port = int(self._socket.getsockname()[1])
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        self._closing.set()
+        if self._thread.is_alive():
+            self._thread.join(2.0)
+        if self._socket is not None:
+            self._socket.close()
+
+    # On the thread
+
+    def _run(self) -> None:
+        ways = {"udp": self._datagrams, "modbus": self._registers}
+        way = ways.get(self.settings.transport, self._lines)
+        while not self._closing.is_set():
+            with contextlib.suppress(OSError, ReadingError):
+                way()
+            self._closing.wait(RECONNECT_S)
+
+    def _lines(self) -> None:
+        """Lines of one connection, until it ends."""
+        with contextlib.ExitStack() as stack:
+            read, write = self._connected(stack)
+            request = self.settings.request.encode().decode("unicode_escape").encode()
+            tail, skip = (
+                b"",
+                not request,
+            )  # the first may be the end of one begun before
+            while not self._closing.is_set():
+                if request:
+                    write(request)
+                data = read()
+                if data is None:
+                    continue
+                if not data:
+                    return
+                *whole, tail = re.split(rb"[\r\n]+", tail + data)
+                tail = tail if len(tail) <= MAX_LINE else b""
+                for line in whole:
+                    if not skip and line:
+                        self._take(line)
+                    skip = False
+
+    def _connected(
+        self, stack: contextlib.ExitStack
+    ) -> tuple[Callable[[], bytes | None], Callable[[bytes], object]]:
+        """How to read what came, None for nothing yet and b"" for the end; and "
+        "write."""
+        s = self.settings
+        if s.transport == "serial":
+            import serial  # type: ignore[import-untyped]  # no stubs
+
+            port = serial.Serial(
+                s.device, s.baudrate, s.bytesize, s.parity, s.stopbits, timeout=LOOK_S
+            )
+            stack.enter_context(port)
+            return lambda: port.read(max(1, port.in_waiting)) or None, port.write
+        if self._socket is not None:
+            while True:
+                try:
+                    connection, (address, *_) = self._socket.accept()
+                    break
+                except TimeoutError:
+                    if self._closing.is_set():
+                        raise
+        else:
+            connection, address = (
+                socket.create_connection((s.host, s.port), 1.0),
+                s.host,
+            )
+        stack.enter_context(connection)
+        connection.settimeout(LOOK_S)
+        if not self._hears(address):
+            raise ReadingError(address)
+
+        def read() -> bytes | None:
+            try:
+                return connection.recv(4096)
+            except TimeoutError:
+                return None
+
+        return read, connection.sendall
+
+    def _datagrams(self) -> None:
+        assert self._socket is not None
+        while not self._closing.is_set():
+            with contextlib.suppress(TimeoutError):
+                data, (address, *_) = self._socket.recvfrom(65536)
+                if self._hears(address):
+                    for line in re.split(rb"[\r\n]+", data):
+                        if line:
+                            self._take(line)
+
+    def _registers(self) -> None:
+        """Poll the registers."""
+        with self._bus() as bus:
+            while not self._closing.wait(self.settings.period_s):
+                asked = time.monotonic()
+                values = [
+                    decoded(bus, each, each.unit, each.word_order, 1)
+                    for each in self.settings.registers
+                ]
+                self._accept(np.array(values, dtype=np.float64), asked)
+
+    def _bus(self) -> Bus:
+        s = self.settings
+        given: dict[str, Any] = {"transport": "tcp", "host": s.host, "port": s.port}
+        if s.device:
+            given = {"transport": "rtu", "device": s.device, "baudrate": s.baudrate}
+            given |= {"parity": s.parity, "stopbits": s.stopbits}
+        return Bus(BusSettings(**given, timeout_s=max(s.stale_s / 2, 0.05)))
+
+    def _hears(self, address: str) -> bool:
+        """One sender is heard: the first."""
+        self.sender = self.sender or address
+        if address != self.sender:
+            self._counts["of another sender"] += 1
+        return address == self.sender
+
+    def _take(self, line: bytes) -> None:
+        s = self.settings
+        now, text = time.monotonic(), line.decode("ascii", "replace")
+        fields = [field.strip() for field in text.split(s.separator)]
+        columns = s.columns or range(len(s.names))
+        if len(fields) <= max(columns):
+            return self._drop("too short")
+        used = [fields[column] for column in columns]
+        if not all(NUMBER.fullmatch(field) for field in used):
+            return self._drop("not numbers")
+        self._accept(np.array(used, dtype=np.float64), now)
+
+    def _accept(self, values: Array, now: float) -> None:
+        s = self.settings
+        factors = s.factors or (1.0,) * len(s.names)
+        values = values * factors
+        if not np.isfinite(values).all():
+            return self._drop("not numbers")
+        if self._last is not None and self._jumps(self._last, values):
+            if self._far and self._jumps(self._far[-1], values):
+                self._far.clear()
+            self._far.append(values)
+            if len(self._far) < REJOIN:
+                return self._drop("an impossible jump")
+        self._far, self._last = [], values
+        with self._lock:
+            self._counts["accepted"] += 1
+            self.store([Reading(now, values)])
+
+    def _jumps(self, before: Array, now: Array) -> bool:
+        return bool(np.abs(now - before).max() > self.settings.most_jump)
+
+    def _drop(self, reason: str) -> None:
+        with self._lock:
+            self._counts[reason] += 1

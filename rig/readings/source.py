@@ -1,0 +1,156 @@
+"""A source of readings: what motion and measurement ask a phone or a sensor."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rig.faults import Fault
+from rig.readings.attitude import Array, Reading
+
+RING = 8192  # readings kept: over half a minute at 200 Hz
+
+
+class ReadingError(Fault):
+    """Readings are stale, their line is closed, or they are not to be trusted."""
+
+
+class Source:
+    """Readings, now and over the last seconds.
+
+    A kind opens its port, receives on a thread of its own, and gives each accepted
+    reading to ``store``; see docs/rig/readings.md.
+    """
+
+    whose = "the sensor"
+    table = "readings"  # of rig.toml
+    start = "switch it on"
+    lost = "Check its power and cable"
+    settings: Any  # ImuSettings, ReadingsSettings
+    sender = ""  # address that is heard
+    connections = 0  # a heading may be another one after a new connection
+    world: Array = np.eye(3)  # by which attitudes are turned
+
+    def __init__(
+        self,
+        stale_s: float,
+        report: Callable[..., object] = lambda event, **fields: None,
+    ) -> None:
+        """``report`` gets an event and its fields, on the receiving thread."""
+        self.stale_s = stale_s
+        self.report = report
+        self._lock = threading.Lock()
+        self._ring: deque[Reading] = deque(maxlen=RING)
+        self._counts: Counter[str] = Counter()
+        self._arrived = 0.0
+
+    # Of a kind
+
+    def open(self) -> Any:
+        """Begin to receive; ReadingError where the port cannot be opened."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """End it."""
+        raise NotImplementedError
+
+    @property
+    def where(self) -> str:
+        """Where it is heard, in words."""
+        raise NotImplementedError
+
+    @property
+    def port(self) -> int:
+        """TCP or UDP port, where there is one."""
+        return 0
+
+    @property
+    def refused(self) -> list[str]:
+        """Addresses that were not let in."""
+        return []
+
+    def turn(self, world: Array) -> None:
+        """Turn all readings, those that were received too; of attitudes alone."""
+        raise NotImplementedError
+
+    def store(self, readings: list[Reading]) -> bool:
+        """Keep what was accepted, under the lock; whether anything was."""
+        if readings:
+            self._arrived = time.monotonic()
+        for reading in readings:
+            last = self._ring[-1].time if self._ring else reading.time
+            if reading.time > last - 1e-3:
+                self._ring.append(Reading(max(last, reading.time), reading.value))
+        return bool(readings)
+
+    # Of all of them
+
+    def __enter__(self) -> Any:
+        return self.open()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def latest(self) -> Reading:
+        """The newest reading; ReadingError where none is fresh."""
+        with self._lock:
+            reading = self._ring[-1] if self._ring else None
+        if reading is None:
+            raise ReadingError(f"{self.whose} has sent no reading yet: {self.start}")
+        now, limit = time.monotonic(), self.stale_s
+        if now - reading.time > limit:
+            hint = self.lost
+            if now - self._arrived < limit:
+                hint = "It arrives late, or its stamps are not those configured"
+            raise ReadingError(
+                f"{self.whose}'s last reading is {now - reading.time:.2f} s old (limit "
+                f"{self.table}.stale_s = {limit:g} s). {hint}{self.dropped}"
+            )
+        return reading
+
+    def since(self, start: float) -> list[Reading]:
+        """Readings measured at or after a monotonic time, oldest first."""
+        with self._lock:
+            newest = reversed(self._ring)
+            recent = itertools.takewhile(lambda r: r.time >= start, newest)
+            return [*recent][::-1]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Records that were accepted, and those dropped by reason."""
+        with self._lock:
+            return dict(self._counts)
+
+    @property
+    def dropped(self) -> str:
+        """What was dropped, in words; empty where nothing was."""
+        counts = {
+            reason: n for reason, n in self.counts.items() if reason != "accepted"
+        }
+        each = (f"{count} {reason}" for reason, count in counts.items())
+        return f"; records dropped: {', '.join(each)}" if counts else ""
+
+    def wait_for_stream(self, timeout_s: float) -> Reading:
+        """The first fresh reading; ReadingError where none came in time."""
+        end = time.monotonic() + timeout_s
+        while True:
+            try:
+                return self.latest()
+            except ReadingError:
+                if time.monotonic() > end:
+                    detail = self.dropped
+                    if self.refused:
+                        detail += f"; senders refused: {', '.join(self.refused)}"
+                    raise ReadingError(
+                        f"no usable reading from {self.whose} in {timeout_s:g} s on "
+                        f"{self.where} ({self.connections} connections{detail}). "
+                        f"{self.start[0].upper()}{self.start[1:]}, and check the "
+                        f"address, port and [{self.table}]"
+                    ) from None
+            time.sleep(0.01)

@@ -1,0 +1,284 @@
+"""Drives of other kinds than Modbus: the same code proves the same of them."""
+
+import contextlib
+import json
+import time
+import types
+
+import numpy as np
+import pytest
+from gcode_controller import Controller
+from harness import changed, session
+from other_drives import MATRIX, place_of, sensed, stage_text
+
+import jaxcal
+from rig.config import parse_config
+from rig.drives import make_drives
+from rig.drives.line import BusError, Refusal
+from rig.faults import LimitError, Refused
+from rig.journal import SIGN_CHECKED, STOP_PROVED
+from rig.workbench.commission import steps
+
+KINDS = ("grbl", "marlin", "cia402")
+CAN = 'transport = "can"\ninterface = "virtual"\ndevice = "{}"'
+SERIAL = 'transport = "serial"\ndevice = "{}"'
+
+
+def device(kind, channel="rig"):
+    """A simulated controller of a kind, how its bus is reached, counts a millimetre."""
+    if kind == "cia402":
+        pytest.importorskip("canopen", reason="the extra canopen is not installed")
+        from can_nodes import Nodes
+
+        return Nodes(channel), lambda made: CAN.format(channel), 1000
+    counts = 1000 if kind == "grbl" else 80
+    return Controller(kind), lambda made: SERIAL.format(made.device), counts
+
+
+def until(holds, seconds=3.0):
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_drive_moves_stops_and_says_what_it_is(kind):
+    made, bus, counts = device(kind, "quick")
+    with made:
+        config = parse_config(stage_text(bus(made), kind, 1, counts))
+        line, drives = make_drives(config.bus, config.axes)
+        with line:
+            x, y = drives
+            assert x.ids() != y.ids() and not x.alarm()
+            for drive in drives:
+                if not drive.status().enabled:
+                    drive.bring(drive.arm, lambda status: status.enabled)
+                assert drive.sound().done
+            x.go(2 * counts)
+            assert x.status().moving
+            until(lambda: x.status().done)
+            assert abs(made.places()[0] - 2.0) < 1e-3
+            assert x.status().position == 2 * counts
+            x.go(-19 * counts)
+            until(lambda: x.status().position < counts)
+            x.stop()
+            until(lambda: x.status().done)
+            stood = x.steady().position
+            x.hold(stood)
+            time.sleep(0.1)
+            assert -18 * counts < x.steady().position == stood
+            y.go(-counts)  # from there: a stop is no lock, and leaves nothing queued
+            until(lambda: y.status().position == -counts)
+            assert x.steady().position == stood
+            with pytest.raises(LimitError):
+                x.go(21 * counts)
+
+
+def test_a_refused_target_is_told_from_a_silent_controller():
+    with Controller("grbl") as made:
+        text = stage_text(SERIAL.format(made.device), "grbl", 1)
+        config = parse_config(text.replace("max_mm = 20", "max_mm = 200"))
+        line, (x, _) = make_drives(config.bus, config.axes)
+        with line:
+            with pytest.raises(Refusal) as told:
+                x.go(150_000)
+            assert told.value.refused and told.value.out_of_reach
+            made.lost = 1
+            with pytest.raises(BusError) as told:
+                x.move(1000, 1000, 1000)
+            assert not told.value.refused and x.took(1000, x.status(), 2)
+
+
+OWN = """
+from rig.drives import Drive, Line
+
+
+class Wire(Line):
+    transports = ("serial",)
+
+    def connect(self):
+        pass
+
+    def close(self):
+        pass
+
+
+class Mine(Drive):
+    line_type = Wire
+    at = 0
+
+    def ids(self):
+        return {"serial": self.axis.map.settings["serial"]}
+
+    def arm(self):
+        pass
+
+    def position(self):
+        return self.at
+
+    def move(self, count, speed, accel):
+        with self.line.exchange(self.axis.unit):
+            self.at = count
+
+    def standing(self):
+        return True
+
+    def stop(self):
+        pass
+
+    def alarm(self):
+        return ""
+"""
+MAP = """
+schema = 1
+drive = "mine.py:Mine"
+name = "mine"
+title = "of one's own"
+sources = "none"
+[settings]
+serial = 7
+"""
+
+
+def test_a_class_of_ones_own_is_a_drive(tmp_path):
+    (tmp_path / "mine.py").write_text(OWN)
+    (tmp_path / "mine.toml").write_text(MAP)
+    text = stage_text(SERIAL.format("x"), "mine.toml", 1)
+    config = parse_config(text, tmp_path)
+    line, (x, _) = make_drives(config.bus, config.axes)
+    with line:
+        x.go(1234)
+        assert x.sound().position == 1234 and x.ids() == {"serial": 7}
+    (tmp_path / "mine.toml").write_text(MAP.replace("mine.py:Mine", "mine.py:Yours"))
+    config = parse_config(text, tmp_path)
+    with pytest.raises(Refused, match=r"mine\.py:Yours.*cannot be loaded"):
+        make_drives(config.bus, config.axes)
+
+
+def test_drives_of_two_lines_and_of_another_bus_are_refused():
+    config = parse_config(stage_text(SERIAL.format("x"), "grbl", 1))
+    other = parse_config(stage_text(CAN.format("x"), "cia402", 1))
+    with pytest.raises(Refused, match="share a line"):
+        make_drives(config.bus, [config.axes[0], other.axes[1]])
+    with pytest.raises(Refused, match=r"bus\.transport: must be serial"):
+        make_drives(other.bus, config.axes)
+
+
+# A device of each kind, commissioned once and then spoilt
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def stage(request, tmp_path_factory):
+    folder, said = tmp_path_factory.mktemp(request.param), []
+    made, bus, counts = device(request.param, f"stage {request.param}")
+    with made, sensed(made.places) as (port, gain):
+        config = parse_config(stage_text(bus(made), request.param, port, counts))
+        place = place_of(config, folder, said)
+        steps.identify(place)
+        assert steps.go_home(place, here=True) == 0, said
+        assert steps.axes(place) == 0, said
+        yield types.SimpleNamespace(
+            kind=request.param, made=made, gain=gain, config=config, folder=folder,
+            place=place, said=said,
+        )  # fmt: skip
+
+
+def run(stage, name, listeners=(), speed=100):
+    said = []
+    folder = stage.folder / name
+    axes = [changed(axis, speed_deg_s=speed) for axis in stage.config.axes]
+    config = changed(stage.config, axes=tuple(axes))
+    code = session(config, folder, None, said, listeners, record=stage.place.record)
+    return code, "\n".join(said), folder
+
+
+def back(stage):
+    """Whoever mends it puts it where it was commissioned."""
+    made = stage.made
+    with getattr(made, "_lock", contextlib.nullcontext()):
+        if isinstance(made, Controller):
+            made.at, made.queue, made.held = dict.fromkeys("XY", 0.0), [], False
+    for node in getattr(made, "nodes", ()):
+        with node._lock:
+            node.position = node.velocity = 0.0
+            node.target, node.reached = 0, True
+    stage.place.record.left_at({"x": 0, "y": 0})
+
+
+@pytest.mark.slow
+def test_it_is_commissioned_and_calibrated(stage):
+    record = stage.place.record
+    assert np.shape(record.state(SIGN_CHECKED)["turns"]["deg"]) == (2, 2)
+    assert list(record.state(STOP_PROVED)["ways"]) == ["the stop of each unit"]
+    code, said, folder = run(stage, "calibrate")
+    assert code == 0, said
+    calibration = jaxcal.Calibration.load(folder / "calibration.json")
+    np.testing.assert_allclose(calibration.matrix, MATRIX, atol=2e-3)
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["after"]["max"] < 0.02
+
+
+@pytest.mark.slow
+def test_a_halt_from_outside_is_a_fault_and_nothing_moves_again(stage):
+    halt = getattr(stage.made, "halt", None) or (
+        lambda: [node.halt() for node in stage.made.nodes]
+    )
+    done = []
+
+    def listen(run, phase):
+        if phase == "moving" and len(run.postures()) == 2 and not done:
+            import threading
+
+            done.append(True)
+            threading.Timer(0.1, halt).start()
+
+    code, said, _ = run(stage, "halted", [listen])
+    assert code == 3 and "short of its target" in said, said
+    places = stage.made.places()
+    time.sleep(0.5)
+    assert stage.made.places() == pytest.approx(places, abs=1e-6)
+    assert all(f"{name} (unit" in said for name in "xy") and "NOT" not in said
+
+
+@pytest.mark.slow
+def test_a_drive_that_is_far_too_fast_is_named(stage):
+    made = stage.made
+    for each in getattr(made, "nodes", [made]):
+        each.speed = 20.0
+    code, said, _ = run(stage, "fast", speed=20)
+    back(stage)
+    for each in getattr(made, "nodes", [made]):
+        each.speed = 1.0
+    assert code == 3 and "was told to move at" in said, said
+
+
+@pytest.mark.slow
+def test_a_stop_that_does_nothing_is_found(stage):
+    back(stage)
+    made, said = stage.made, stage.said
+    for each in getattr(made, "nodes", [made]):
+        each.faults.add("deaf")
+    del said[:]
+    record = stage.place.record
+    assert steps.axes(stage.place) == 3
+    for each in getattr(made, "nodes", [made]):
+        each.faults.clear()
+    assert "went on to the target" in "\n".join(said)
+    assert record.state(STOP_PROVED) is None
+
+
+@pytest.mark.slow
+def test_another_gearing_is_found_before_it_is_far(stage):
+    back(stage)
+    assert steps.axes(stage.place) == 0, stage.said
+    stage.gain[0] = 3.0
+    far = []
+
+    def listen(run, phase):
+        far.append(np.abs(np.array(stage.made.places()) * stage.gain))
+
+    code, said, _ = run(stage, "regeared", [listen])
+    stage.gain[0] = 1.0
+    assert code == 3 and "x turned the phone by" in said, said
+    assert np.max(far) < 21.0
