@@ -42,6 +42,7 @@ import numpy as np
 import optax
 from numpy.typing import NDArray
 
+from jaxcal.deadline import Deadline
 from jaxcal.files import write_text
 from jaxcal.selection import Design
 from jaxcal.selection.exact.exact import solve_exact
@@ -168,8 +169,7 @@ def headroom(problem: Problem, shape: str) -> Case:
     best = exchange_indices(problem, starts, 12345)
     case = Case(problem, shape, log_dets(problem, best), False, {}, {}, [])
     if len(problem.blocks) <= 100:
-        deadline = time.perf_counter() + 0.5
-        result = solve_exact(problem, deadline=deadline)
+        result = solve_exact(problem, deadline=Deadline(0.5))
         case.proven = result.proven
         case.best = max(case.best, float(result.value or 0.0))
     greedy = greedy_indices(problem)

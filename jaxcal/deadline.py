@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 
-__all__ = ["Deadline"]
+__all__ = ["NEVER", "Deadline"]
 
 
 class Deadline:
@@ -37,3 +37,6 @@ class Deadline:
     def part(self, share: float) -> Deadline:
         """A deadline after ``share`` of the time left, for one stage of a search."""
         return Deadline(share * self.remaining_s)
+
+
+NEVER = Deadline()

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxcal.checks import whole_number
+from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.exchange import exchange
 from jaxcal.selection.problem import Problem, Solution, log_dets, make_problems
@@ -73,7 +74,7 @@ def exact_batch(
     ``time_limit`` is in seconds for the whole batch, after which the remaining sets
     return the best found with ``proven`` False; there is no limit when it is None.
     """
-    deadline = None if time_limit is None else time.perf_counter() + time_limit
+    deadline = NEVER if time_limit is None else Deadline(time_limit)
     one = functools.partial(solve_exact, deadline=deadline)
 
     def solve(problems: list[Problem]) -> Iterable[Solution]:

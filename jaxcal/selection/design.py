@@ -14,6 +14,7 @@ from jaxcal.checks import (
     require_none,
     seconds,
 )
+from jaxcal.deadline import Deadline
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.continuous import Refinement, refine
@@ -167,7 +168,7 @@ class Design(CandidateSet):
         found = Solution(subset.astype(np.int64))
         if reference == "bound":
             return self._judged(problem, found, "score", start)
-        optimum = solve_exact(problem, deadline=time.perf_counter() + limit)
+        optimum = solve_exact(problem, deadline=Deadline(limit))
         value = float(values(problem, found.indices[None])[0][0])
         assert optimum.bound is not None
         near = abs(value - optimum.bound) <= _PROVEN * max(1.0, abs(optimum.bound))

@@ -8,12 +8,12 @@ efficiency is at least what is said.
 from __future__ import annotations
 
 import dataclasses
-import time
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.checks import aligned
+from jaxcal.deadline import Deadline
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.problem import Problem, ScenarioProblem
 
@@ -88,7 +88,7 @@ class InScenarios:
 
 def _optimum(problem: Problem, limit: float) -> tuple[Indices, float, bool]:
     """A good selection, the value that none betters, and whether that is proven."""
-    deadline = time.perf_counter() + limit
+    deadline = Deadline(limit)
     solution = solve_exact(problem, deadline=deadline, restarts=8, enough=_ENOUGH)
     assert solution.value is not None and solution.bound is not None
     share = problem.criterion.efficiency(solution.value, solution.bound)

@@ -12,6 +12,7 @@ from questions import make_block_problem, make_problem, of
 from scipy.linalg import hadamard
 from scipy.optimize import minimize
 
+from jaxcal.deadline import Deadline
 from jaxcal.models import Affine
 from jaxcal.selection import select
 from jaxcal.selection.criteria import CRITERIA, Criterion
@@ -89,7 +90,9 @@ def test_branch_and_bound_is_brute_force(
     assert (found.counts >= lower).all() and (found.counts <= upper).all()
     assert (found.counts.sum(axis=1) == k).all()
     assert len(np.unique(found.counts, axis=0)) == len(wanted)
-    late = branch_and_bound(*arguments, deadline=0.0)  # a limit of no time at all
+    late = branch_and_bound(
+        *arguments, deadline=Deadline(0.0)
+    )  # a limit of no time at all
     assert late.nodes == 1
     assert late.bound >= values.max() - 1e-8 * max(1.0, abs(values.max()))
 

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxcal.commands.main import main
+from jaxcal.deadline import Deadline
 from jaxcal.selection import select
 from jaxcal.selection.criteria import CRITERIA, Criterion
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
@@ -100,14 +101,14 @@ def test_a_time_limit_is_kept_while_nodes_are_slow() -> None:
     criterion = CRITERIA["A"].of_rows(np.eye(60))
     arguments = (blocks, 1e-2 * np.eye(60), criterion, 0 * whole)
     start = np.bincount(np.arange(15), minlength=120)
-    first = branch_and_bound(*arguments, whole, start, deadline=0.0)
+    first = branch_and_bound(*arguments, whole, start, deadline=Deadline(0.0))
     assert first.nodes == 1
     found, limit = first, 0.25
     while found.nodes == 1:  # a loaded machine gives less of its time
         assert limit < 60.0
         limit *= 2.0
-        began, later = time.thread_time(), time.perf_counter() + limit
-        found = branch_and_bound(*arguments, whole, start, deadline=later)
+        began, deadline = time.thread_time(), Deadline(limit)
+        found = branch_and_bound(*arguments, whole, start, deadline=deadline)
         assert time.thread_time() - began < limit + 0.1
     assert not found.proven
     assert found.values[0] < found.bound <= first.bound

@@ -74,7 +74,7 @@ def test_the_seed_decides_and_is_recorded():
     np.testing.assert_array_equal(one.indices, same.indices)
     assert (one.seed, one.restarts) == (5, 1)
     problem = make_problem(uniform(1, 60), 4)  # the first starts are greedy, not drawn
-    climbs = [Climbs(problem, s, None) for s in range(20)]
+    climbs = [Climbs(problem, s) for s in range(20)]
     picks = {tuple(sorted(c.climbed(c.random_start())[0].tolist())) for c in climbs}
     assert len(picks) > 1
     assert select(candidates, 10, "exchange", seed=2**70).log_det >= one.log_det - 1e-9

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection import select
 from jaxcal.selection.exact import volume
 from jaxcal.selection.exact.volume import Volumes, largest_volumes
@@ -38,7 +39,7 @@ def brute_force(vectors: Array) -> float:
 
 
 def prepared(
-    monkeypatch: pytest.MonkeyPatch, vectors: Array, deadline: float | None = None
+    monkeypatch: pytest.MonkeyPatch, vectors: Array, deadline: Deadline = NEVER
 ) -> Volumes:
     """From a known volume, however few subsets there are."""
     with monkeypatch.context() as patch:
@@ -137,7 +138,7 @@ def test_the_search_for_pairs_ends_on_the_clock() -> None:
     angles = np.random.default_rng(0).uniform(0, np.pi, 200_000)
     vectors = np.column_stack([np.cos(angles), np.sin(angles)])
     begun = time.perf_counter()
-    found = largest_volumes(vectors, 3, begun + 1.0)
+    found = largest_volumes(vectors, 3, Deadline(1.0))
     assert time.perf_counter() - begun < 5.0  # all pairs: 20 s
     assert not found.complete and found.bound >= found.volumes[0]
     assert found.volumes[0] > 0.9 or not found.examined  # a busy machine got no turn
@@ -149,8 +150,7 @@ def test_a_deadline_leaves_an_honest_bound(
 ) -> None:
     vectors = rows(sphere(4, 200, 6))
     optimum = prepared(monkeypatch, vectors).volumes[0]
-    deadline = time.perf_counter() + seconds
-    found = prepared(monkeypatch, vectors, deadline=deadline)
+    found = prepared(monkeypatch, vectors, deadline=Deadline(seconds))
     if seconds == 0.0:
         assert not found.complete and found.examined == 0
     assert found.volumes[0] <= optimum * (1 + 1e-12) and optimum <= found.bound

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal import compiled
+from jaxcal.deadline import NEVER, Deadline
 from jaxcal.information.blocks import gram, largest_rank
 from jaxcal.selection.criteria import Criterion, Joined
 
@@ -52,7 +52,7 @@ def branch_and_bound(
     upper: Indices,
     start: Indices,
     best: int = 1,
-    deadline: float | None = None,
+    deadline: Deadline = NEVER,
     enough: float | None = None,
     root_only: bool = False,
 ) -> BranchResult:
@@ -66,7 +66,7 @@ def branch_and_bound(
         upper: (M,) largest counts.
         start: (M,) counts of a good selection, sum k.
         best: how many selections.
-        deadline: ``time.perf_counter()`` at which to stop with what there is.
+        deadline: when to stop with what there is.
         enough: share of the best possible (its efficiency) at which to stop, once the
             proof has had a fair try.
         root_only: stop at the bound of the relaxation.
@@ -101,7 +101,7 @@ def joint_branch_and_bound(
     upper: Indices,
     start: Indices,
     best: int = 1,
-    deadline: float | None = None,
+    deadline: Deadline = NEVER,
     enough: float | None = None,
     root_only: bool = False,
 ) -> BranchResult:
@@ -170,7 +170,7 @@ def _searched(
     begun: Array,
     units: tuple[float, float, float],
     work: int,
-    deadline: float | None,
+    deadline: Deadline,
     enough: tuple[float, float] | None,
     root_only: bool,
 ) -> BranchResult:
@@ -188,7 +188,7 @@ def _searched(
     best_counts, best_values, order = incumbents
     (low, high, counts), (scale, shift, trivial) = begun, units
     num_blocks = len(low)
-    search.offer(low, high, counts, _left(deadline))
+    search.offer(low, high, counts, deadline.remaining_s)
     nodes, bounds = np.empty((64, 3, num_blocks)), np.full(64, np.inf)
     nodes[0] = low, high, counts
     good = (0.0, np.inf) if root_only else (0.0, -np.inf)
@@ -203,7 +203,7 @@ def _searched(
             bounds = np.concatenate([bounds, np.full(len(bounds), np.inf)])
         size, more, going = search.run(
             nodes, bounds, size, TOLERANCE, max(256, _MEMORY // (24 * num_blocks)),
-            max(1, tries - done), _left(deadline), *good,
+            max(1, tries - done), deadline.remaining_s, *good,
         )  # fmt: skip
         done += more
     if size:
@@ -217,11 +217,6 @@ def _searched(
         done,
         size == 0,
     )
-
-
-def _left(deadline: float | None) -> float:
-    """Seconds until ``deadline``."""
-    return np.inf if deadline is None else deadline - time.perf_counter()
 
 
 def _near_one(

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection.criteria import Joined
 from jaxcal.selection.exact.branch_and_bound import (
     BranchResult,
@@ -60,7 +60,7 @@ def solve(
     best: int,
 ) -> Solution:
     """The solver "exact"; 10 s where no time limit is given."""
-    deadline = time.perf_counter() + (time_limit or TIME_LIMIT)
+    deadline = Deadline(time_limit or TIME_LIMIT)
     restarts = restarts or STARTING_RESTARTS
     found = solve_exact(problem, best, deadline, restarts, seed)
     return dataclasses.replace(found, seed=seed, restarts=restarts)
@@ -85,7 +85,7 @@ def solve_auto(
     limit, "exchange" where the bound proved enough before.
     """
     limit = time_limit or (TIME_LIMIT if problem.rank_one else _BLOCKS_LIMIT)
-    deadline = time.perf_counter() + limit
+    deadline = Deadline(limit)
     restarts = restarts or STARTING_RESTARTS
     found = solve_exact(problem, 1, deadline, restarts, seed, least_efficiency)
     assert found.value is not None and found.bound is not None
@@ -114,7 +114,7 @@ def solve_auto(
 def solve_exact(
     problem: Problem,
     best: int = 1,
-    deadline: float | None = None,
+    deadline: Deadline = NEVER,
     restarts: int = STARTING_RESTARTS,
     seed: int = 0,
     enough: float | None = None,
@@ -126,7 +126,7 @@ def solve_exact(
     Args:
         problem: what to choose from.
         best: how many selections to prove.
-        deadline: ``time.perf_counter()`` at which to stop.
+        deadline: when to stop.
         restarts, seed: of the exchange that starts branch and bound.
         enough: efficiency in (0, 1] at which to stop, unless the proof is cheap.
     """
@@ -139,7 +139,7 @@ def solve_exact(
         if best == 1 or cheap:
             if enough and not cheap:  # the relaxation may do without
                 start = np.sort(
-                    exchange_indices(problem, restarts, seed, _half(deadline))
+                    exchange_indices(problem, restarts, seed, deadline.part(0.5))
                 )
                 root_bound = relaxed(problem, start, deadline)
                 found = _found(problem, [start], best, root_bound, 1)
@@ -147,7 +147,8 @@ def solve_exact(
                 if problem.criterion.efficiency(found.value, found.bound) >= enough:
                     return found
             return _enumerate(problem, pool, best, deadline)
-    start = exchange_indices(problem, restarts, seed, _half(deadline))
+    # Half of the time: a bound takes time as well.
+    start = exchange_indices(problem, restarts, seed, deadline.part(0.5))
     keep, first = _groups(problem, merge=best == 1)
     counts = np.bincount(start, minlength=len(problem.blocks))
     low, high, begun = (
@@ -166,7 +167,7 @@ def solve_exact(
 def _with_losses(
     problem: LossProblem,
     best: int,
-    deadline: float | None,
+    deadline: Deadline,
     restarts: int,
     seed: int,
     enough: float | None,
@@ -182,7 +183,7 @@ def _with_losses(
         return solve_exact(problem.among(every), best, deadline, restarts, seed, enough)
 
     def solve_some(some: Problem) -> Solution:
-        return solve_exact(some, 1, _half(deadline), restarts, seed, enough)
+        return solve_exact(some, 1, deadline.part(0.5), restarts, seed, enough)
 
     start = greedy_indices(problem.unlost)
     solution = in_rounds(problem, solve_some, start, deadline, enough)
@@ -191,11 +192,6 @@ def _with_losses(
         solution, value=value, log_det=log_det,
         alternatives=((solution.indices, value),),
     )  # fmt: skip
-
-
-def _half(deadline: float | None) -> float | None:
-    """When half of the time is over: a bound takes time as well."""
-    return None if deadline is None else (time.perf_counter() + deadline) / 2.0
 
 
 def upper_bound(problem: Problem) -> float:
@@ -207,7 +203,7 @@ def upper_bound(problem: Problem) -> float:
         pool = _pool(problem, hull=True)
         free = problem.k - len(problem.required)
         if math.comb(len(pool), free) <= _CHEAP:
-            found = _enumerate(problem, pool, 1, None)
+            found = _enumerate(problem, pool, 1, NEVER)
             assert found.bound is not None
             return found.bound
     if isinstance(problem, LossProblem):
@@ -218,7 +214,7 @@ def upper_bound(problem: Problem) -> float:
     return float(problem.criterion.reported(bound))
 
 
-def relaxed(problem: Problem, start: Indices, deadline: float | None = None) -> float:
+def relaxed(problem: Problem, start: Indices, deadline: Deadline = NEVER) -> float:
     """Upper bound on phi of the criterion, from a selection (k,) to climb from."""
     keep = np.flatnonzero(problem.available)
     counts = np.bincount(start, minlength=len(problem.blocks))
@@ -268,7 +264,7 @@ def _pool(problem: Problem, hull: bool) -> Indices:
 
 
 def _enumerate(
-    problem: Problem, pool: Indices, best: int, deadline: float | None
+    problem: Problem, pool: Indices, best: int, deadline: Deadline
 ) -> Solution:
     """Largest volumes beside the required rows, in the space these leave free."""
     required = problem.rows[problem.required]

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal import compiled
+from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection.exact.volume_kernel import descend
 
 __all__ = ["Volumes", "largest_volumes"]
@@ -40,7 +40,7 @@ class Volumes:
 
 
 def largest_volumes(
-    vectors: Array, best: int = 1, deadline: float | None = None
+    vectors: Array, best: int = 1, deadline: Deadline = NEVER
 ) -> Volumes:
     """The ``best`` subsets of q vectors with the largest |det|.
 
@@ -50,7 +50,7 @@ def largest_volumes(
     Args:
         vectors: (h, q), h >= q.
         best: how many subsets.
-        deadline: ``time.perf_counter()`` at which the search stops.
+        deadline: when the search stops.
     """
     h, q = vectors.shape
     unit = float(np.abs(vectors).max(initial=0.0)) ** q
@@ -81,8 +81,9 @@ def largest_volumes(
     points, index = np.empty((q - 1, h, q)), np.empty((q - 1, h), dtype=np.int64)
     points[0], index[0] = vectors[kept], kept
     place = np.zeros(q - 1, dtype=np.int64)
-    seconds = math.inf if deadline is None else deadline - time.perf_counter()
-    complete, nodes = descend(points, index, place, subsets, volumes, seconds)
+    complete, nodes = descend(
+        points, index, place, subsets, volumes, deadline.remaining_s
+    )
     order = np.argsort(-volumes, kind="stable")
     order = order[: max(1, np.count_nonzero(volumes))]
     subsets, volumes = np.sort(subsets[order], axis=1), volumes[order]

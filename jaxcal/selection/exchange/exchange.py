@@ -12,13 +12,13 @@ still because two are equal.
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal import compiled
+from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection.criteria import Criterion
 from jaxcal.selection.exchange.rounds import in_rounds
 from jaxcal.selection.problem import (
@@ -81,7 +81,7 @@ def greedy_indices(problem: Problem) -> Indices:
     """
     if isinstance(problem, LossProblem):
         return _greedy_with_losses(problem)
-    climbs = Climbs(problem, 0, None)
+    climbs = Climbs(problem, 0)
     for share, swaps in ((climbs.share, 0), (_RANK_FIRST, 0), (climbs.share, 1)):
         chosen, phi = climbs.climbed(problem.required, share, swaps)
         if phi > -np.inf:
@@ -124,7 +124,7 @@ def default_restarts(problem: Problem) -> int:
 class Climbs:
     """A problem as the compiled kernel takes it; E is grown and climbed as A."""
 
-    def __init__(self, problem: Problem, seed: int, deadline: float | None) -> None:
+    def __init__(self, problem: Problem, seed: int, deadline: Deadline = NEVER) -> None:
         self._required, self._deadline = problem.required, deadline
         _, q, p = problem.blocks.shape
         self.share = _SHARE * min(1.0, problem.k * q / p) ** 6
@@ -158,12 +158,6 @@ class Climbs:
         joint.weigh(scale, shift)
         return joint
 
-    def _seconds(self) -> float:
-        """Left until the deadline."""
-        if self._deadline is None:
-            return np.inf
-        return max(self._deadline - time.perf_counter(), 0.0)
-
     def climbed(
         self, start: Indices, share: float = 0.0, swaps: int = 1
     ) -> tuple[Indices, float]:
@@ -171,7 +165,7 @@ class Climbs:
         if self._terms:
             self._climber.weigh(*self._terms[swaps == 2])
         found: tuple[Indices, float]
-        found = self._climber.climb(start, share, swaps, self._seconds())
+        found = self._climber.climb(start, share, swaps, self._deadline.remaining_s)
         return found
 
     def best_of(self, restarts: int) -> tuple[Indices, float]:
@@ -182,11 +176,13 @@ class Climbs:
             chosen, found = self.climbed(self._required, share)
             if not phi > -np.inf or found > phi + 1e-10 * max(1.0, abs(phi)):
                 best, phi = chosen, found
-            if not self._seconds() and phi > -np.inf:
+            if self._deadline.passed and phi > -np.inf:
                 break
         more = max(restarts - len(shares), 0 if phi > -np.inf else _MENDING)
         if more:
-            best, phi = self._climber.random_climbs(more, best, phi, self._seconds())
+            best, phi = self._climber.random_climbs(
+                more, best, phi, self._deadline.remaining_s
+            )
         return best, phi
 
     def best_least(self, problem: Problem, restarts: int) -> tuple[Indices, float]:
@@ -239,11 +235,11 @@ def exchange_indices(
     problem: Problem,
     restarts: int | None = None,
     seed: int = 0,
-    deadline: float | None = None,
+    deadline: Deadline = NEVER,
 ) -> Indices:
     """(k,) the best local optimum, required candidates first.
 
-    ``deadline`` is a ``time.perf_counter()`` after which no more swaps are made.
+    After ``deadline`` no more swaps are made.
     """
     if isinstance(problem, LossProblem):
         start = greedy_indices(problem.unlost)
@@ -289,4 +285,4 @@ def exchange_from(problem: Problem, indices: ArrayLike) -> Indices:
         rest.remove(i)
     start = np.array([*problem.required, *rest], dtype=np.int64)
     swaps = 2 if problem.criterion.kind == "least" else 1
-    return Climbs(problem, 0, None).climbed(start, swaps=swaps)[0]
+    return Climbs(problem, 0).climbed(start, swaps=swaps)[0]

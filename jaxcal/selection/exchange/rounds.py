@@ -8,12 +8,12 @@ answer, and where its selection keeps its value the answer is proven.
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection.problem import LossProblem, Problem, Solution
 
 __all__ = ["in_rounds"]
@@ -26,7 +26,7 @@ def in_rounds(
     problem: LossProblem,
     solve: Callable[[Problem], Solution],
     start: NDArray[np.int64],
-    deadline: float | None = None,
+    deadline: Deadline = NEVER,
     enough: float | None = None,
 ) -> Solution:
     """The best selection found over the rounds, with the bound of the last.
@@ -35,7 +35,7 @@ def in_rounds(
         problem: what to choose from.
         solve: of the problem where some losses are all there are.
         start: (k,) a selection, whose losses are the first.
-        deadline: ``time.perf_counter()`` after which no round begins.
+        deadline: after which no round begins.
         enough: efficiency in (0, 1] at which to stop.
     """
     criterion, losses = problem.criterion, problem.losses_of(start)
@@ -60,7 +60,7 @@ def in_rounds(
             ):
                 break
         new = problem.losses_of(chosen) - losses
-        over = deadline is not None and time.perf_counter() >= deadline
+        over = deadline.passed
         if not new or over or (solution.bound is None and tuple(chosen) in tried):
             break
         tried.add(tuple(chosen))

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, one_of, seconds, share
+from jaxcal.deadline import Deadline
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.fastest.motion import Motion, travel_times
@@ -200,7 +201,7 @@ class _Search:
             self.start = travel_times(where[None], points, motion)[0]
         self.settle = float(motion.settle) * self.k
         self.limit = seconds("time_limit", time_limit)
-        deadline = time.perf_counter() + self.limit
+        deadline = Deadline(self.limit)
         self.optimum = solve_exact(problem, deadline=deadline)
 
     def answer(self, least: float, above: float | None) -> FastSelection | None:
