@@ -338,8 +338,8 @@ class FromFunction(Model):
             for side in {*sides[j]}:
                 at, stencil = np.array(sides[j]) == side, STENCILS[side]
                 for weights, into in ((stencil.fine, slopes), (stencil.coarse, rough)):
-                    found = combined(stack[:, at], weights, self.periods)
-                    into[at, :, j] = found / step
+                    derivatives = combined(stack[:, at], weights, self.periods)
+                    into[at, :, j] = derivatives / step
         with np.errstate(invalid="ignore"):
             largest = np.nanmax(np.abs(slopes), axis=0, initial=0.0)  # (q, p)
             apart = np.abs(slopes - rough)

@@ -287,7 +287,7 @@ class DriveMap(Section):
 
     @property
     def register_units(self) -> Units | None:
-        """Of registers for speed and acceleration, where there are any."""
+        """Units of registers for speed and acceleration, where there are any."""
         return None
 
     def place_of(self, name: str) -> tuple[int, Kind] | None:

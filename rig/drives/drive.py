@@ -156,7 +156,7 @@ class Drive:
         raise NotImplementedError
 
     def lasting(self, ids: dict[str, int | str]) -> dict[str, int | str]:
-        """Of its ids those that do not change."""
+        """Its ids that do not change."""
         return ids
 
     def foreign(self, ids: dict[str, int | str]) -> str:

@@ -55,7 +55,7 @@ class Geometry(Protocol):
         """(3,) or (m,) from one reading to another, as the first one sees it."""
 
     def mean(self, readings: Sequence[Array]) -> Array:
-        """Of several readings."""
+        """The mean of several readings."""
 
     def frame(self, zero: Array) -> Frame:
         """What is measured where ``zero`` was read at the zero posture."""
@@ -124,7 +124,7 @@ class Attitudes:
         return [name for name, letter in pairs if upright["XYZ".index(letter)] > least]
 
     def drift(self, readings: Array, minutes: Array) -> Array:
-        """Of the phone's world: a heading that drifts turns that."""
+        """Drift of the phone's world: a heading that drifts turns that."""
         turned = Rotation.from_matrix(readings @ readings[0].T)
         return _slope(turned.as_rotvec(degrees=True), minutes)
 
@@ -191,7 +191,7 @@ def _slope(values: Array, minutes: Array) -> Array:
 
 
 def geometry_of(config: RigConfig) -> Geometry:
-    """Of a device's readings."""
+    """The geometry of a device's readings."""
     if config.readings is None:
         return Attitudes(config)
     return Numbers(config.readings.scale)
