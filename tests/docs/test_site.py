@@ -32,6 +32,15 @@ def test_every_public_name_is_documented(hooks):
     assert [name for each in hooks.PUBLIC for name in hooks.undocumented(each)] == []
 
 
+def test_every_key_of_the_rig_is_in_its_table(hooks):
+    reference = importlib.import_module("reference")
+    config = importlib.import_module("rig.config").RigConfig
+    page = reference.table(config) + reference.table(config, advanced=True)
+    axis = config.model_json_schema()["$defs"]["Axis"]["properties"]
+    assert {name for name in axis if f"`axes.*.{name}`" not in page} == set()
+    assert "`session.verify_limit_deg`" in page
+
+
 def test_a_public_name_without_a_docstring_is_found(hooks, monkeypatch):
     module = types.ModuleType("bare", "A module.")
 
