@@ -9,26 +9,26 @@ from collections.abc import Iterator
 
 ROOT = pathlib.Path(__file__).parents[1]
 LEANING = re.compile(r'"""((?:The same|As|Of|Likewise)\b.*)')
-PRONOUN = re.compile(r"\b(each|found|known)\b(?:,| =|:| in | [+|&-]= )")
+# Where a file may bind one, which parsing tells.
+PRONOUN = re.compile(r"(?m)^ *[\w, (]*\b(each|found|known)\b(, \w+)*( [+|]?=|:| in) ")
 LONG = 10  # lines, beyond which a pronoun must be held in the head
-# Rooms that are not there yet.
+# Rooms whose variables are not there yet.
 LATER = ("adaptive", "evaluation", "information", "learning", "selection")
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
-def sources(*packages: str) -> Iterator[tuple[str, str]]:
-    for path in (path for name in packages for path in ROOT.glob(f"{name}/**/*.py")):
-        name = path.relative_to(ROOT)
-        if name.parts[1] not in LATER:
-            yield str(name), path.read_text()
+def sources(package: str) -> Iterator[tuple[str, str]]:
+    for path in ROOT.glob(f"{package}/**/*.py"):
+        if not path.name.endswith("_kernel.py"):  # a word there compiles it anew
+            yield path.relative_to(ROOT).as_posix(), path.read_text()
 
 
 def test_a_docstring_needs_no_neighbour() -> None:
     """Its first words say what comes out, also in an index and in ``help()``."""
     leaning = [
         f"{name}: {sentence}"
-        for name, text in sources("jaxcal", "rig")
+        for name, text in (*sources("jaxcal"), *sources("rig"))
         for sentence in LEANING.findall(text)
     ]
     assert not leaning
@@ -55,7 +55,7 @@ def test_a_variable_is_what_it_holds() -> None:
     riddles = [
         f"{name}:{node.lineno} {node.name}: {', '.join(words)}"
         for name, text in sources("jaxcal")
-        if PRONOUN.search(text)
+        if name.split("/")[1] not in LATER and PRONOUN.search(text)
         for node in ast.walk(ast.parse(text))
         if isinstance(node, Function) and node.end_lineno - node.lineno >= LONG
         if (words := sorted({"each", "found", "known"}.intersection(bound(node))))

@@ -268,7 +268,7 @@ def _nothing(size: int) -> Array:
 
 
 def largest_rank(blocks: Array) -> int:
-    """Of single blocks (N, q, p); the first is nearly always of full rank.
+    """Largest rank of single blocks (N, q, p); the first is nearly always of full rank.
 
     1 for one reading each, looked at or not: what is zero adds no direction anyway.
     """

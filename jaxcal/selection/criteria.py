@@ -134,7 +134,7 @@ class Criterion:
 
     @property
     def larger_is_better(self) -> bool:
-        """Of the reported value."""
+        """Whether a larger reported value is better."""
         return self.kind != "trace"
 
     def value(self, information: Array) -> Array:
@@ -250,7 +250,7 @@ class I(Criterion):  # noqa: E742 - the criterion's own name in the literature
 
 
 class _OfSome(Criterion):
-    """Of the parameters of interest; the others are nuisance.
+    """A criterion of the parameters of interest; the others are nuisance.
 
     Args:
         parameters: their names or indices, at least one.
@@ -317,7 +317,7 @@ class Joined:
 
     @property
     def name(self) -> str:
-        """As it is written: "Mean(D)"."""
+        """The name as it is written: "Mean(D)"."""
         return f"{type(self).__name__}({self.each.name})"
 
     @property
@@ -327,12 +327,12 @@ class Joined:
 
     @property
     def kind(self) -> str:
-        """Of the criterion of each scenario."""
+        """The kind of the criterion of each scenario."""
         return self.each.kind
 
     @property
     def larger_is_better(self) -> bool:
-        """Of the reported value."""
+        """Whether a larger reported value is better."""
         return self.of_efficiency or self.each.larger_is_better
 
     def efficiency(self, value: float, bound: float) -> float:

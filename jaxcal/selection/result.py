@@ -146,7 +146,7 @@ class Selection:
         }
 
     def _of_scenarios(self) -> dict[str, Any]:
-        """Of ``to_dict``."""
+        """What ``to_dict`` holds of the scenarios."""
         if self.in_scenarios is None:
             return {}
         fields = vars(self.in_scenarios).items()

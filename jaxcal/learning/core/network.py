@@ -65,7 +65,7 @@ class Network(nn.Module):
         raise NotImplementedError(_OWN)  # abstract
 
     def lookahead_logits(self, decision: Any) -> tuple[jax.Array, jax.Array]:
-        """As ``decode``, for one of the last ``num_unlearned`` choices."""
+        """Logits as of ``decode``, for one of the last ``num_unlearned`` choices."""
         raise NotImplementedError(_LAST)  # abstract
 
     def __call__(

@@ -99,7 +99,7 @@ class Postures:
         return initial(self.network, key, m, n, self.task.num_decisions)
 
     def having(self, config: EpisodesConfig) -> Postures:
-        """The same with another configuration."""
+        """This learner with another configuration."""
         return dataclasses.replace(self, config=config)
 
     def begin(self, keys: jax.Array) -> jax.Array:

@@ -58,7 +58,7 @@ class Learner(Protocol):
         """Hashable, as a static argument of ``jit``."""
 
     def having(self, config: Any) -> Learner:
-        """The same with another configuration, of which ``TRACED`` may be arrays."""
+        """This learner with a configuration of which ``TRACED`` may be arrays."""
 
     def init(self, key: jax.Array, *given: Any) -> Any:
         """Parameters before training."""
@@ -315,7 +315,7 @@ def make_update(
         rows = placed(jax.tree.map(cut, rows), mesh, "sets")
 
         def mean(function: Callable[[Any], Any], index: jax.Array) -> Any:
-            """Of a function of rows, those of each block at ``index`` (blocks, n)."""
+            """Mean of a function of rows, of each block at ``index`` (blocks, n)."""
 
             def of_part(part: jax.Array) -> Any:
                 pick = jax.vmap(lambda leaf, number: leaf[number])

@@ -45,7 +45,7 @@ class Step:
 
     @staticmethod
     def known(state: Any, reward: Any, ended: jax.Array) -> Step:
-        """Of an environment that knows the state that follows and no other."""
+        """The step of an environment that knows the state that follows and no other."""
         return Step(
             reward=jnp.asarray(reward, float),
             states=jax.tree.map(lambda leaf: leaf[None], state),
@@ -89,7 +89,7 @@ class Streams:
     network: nn.Module  # of what is observed: masked logits (..., A), values (...)
 
     def having(self, config: StreamsConfig) -> Streams:
-        """The same with another configuration."""
+        """This learner with another configuration."""
         return dataclasses.replace(self, config=config)
 
     def init(self, key: jax.Array, task: Any) -> Any:

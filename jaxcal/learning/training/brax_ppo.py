@@ -1,4 +1,4 @@
-"""The same environment trained by brax's own PPO: ``python train.py --trainer brax``.
+"""brax's own PPO on the environment of postures: ``python train.py --trainer brax``.
 
 The policy is the paper's architecture, because brax's trainer gives a network the
 observation and nothing else; it is masked by the availability in that observation.

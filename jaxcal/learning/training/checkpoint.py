@@ -61,7 +61,7 @@ class Policy:
 
     @property
     def weights(self) -> Weights:
-        """As plain arrays."""
+        """Weights as plain arrays."""
         return Weights(self.meta["network"], weights.flat(self.params), self.meta)
 
 
@@ -139,7 +139,7 @@ class _TolerantLoop(asyncio.SelectorEventLoop):
     def call_soon_threadsafe(  # type: ignore[override]  # generic in its arguments
         self, *arguments: Any, **options: Any
     ) -> Any:
-        """As asyncio's, but nothing where the loop is closed."""
+        """asyncio's function, but nothing where the loop is closed."""
         if self.is_closed():
             return None
         return super().call_soon_threadsafe(*arguments, **options)

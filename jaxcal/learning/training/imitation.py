@@ -117,7 +117,7 @@ class Imitation:
     postures: Postures
 
     def having(self, config: EpisodesConfig) -> Imitation:
-        """The same with another configuration."""
+        """This learner with another configuration."""
         return Imitation(self.postures.having(config))
 
     def init(self, key: jax.Array, lesson: Lesson) -> Any:
@@ -125,7 +125,7 @@ class Imitation:
         return self.postures.init(key)
 
     def begin(self, keys: jax.Array, lesson: Lesson) -> Any:
-        """As of ``postures``; a lesson reads none of it."""
+        """A state as of ``postures``; a lesson reads none of it."""
         return self.postures.begin(keys)
 
     def gather(

@@ -406,7 +406,7 @@ def _begin(
 
 
 def _mean(values: Any) -> float:
-    """Of those that are finite: a run that diverged is NaN from then on."""
+    """Mean of those that are finite: a run that diverged is NaN from then on."""
     finite = np.ravel(values)[np.isfinite(np.ravel(values))]
     return float(finite.mean()) if len(finite) else np.nan
 

@@ -291,7 +291,7 @@ class CandidateSet:
         )  # fmt: skip
 
     def with_noise(self, noise: Noise | None) -> Self:
-        """The same with other noise."""
+        """These candidates with other noise."""
         other = copy.copy(self)
         other.noise = noise
         return other

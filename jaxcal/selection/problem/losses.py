@@ -56,7 +56,7 @@ class LossProblem(Problem):
         return self.whole
 
     def of_size(self, k: int) -> Self:
-        """The same with k candidates to choose."""
+        """This problem with k candidates to choose."""
         return dataclasses.replace(self, k=k, whole=self.unlost.of_size(k))
 
     def uncertainty(self, indices: Indices) -> float:

@@ -146,7 +146,7 @@ class Problem:
         return _EPS * (of_blocks + len(rows) * largest / least)
 
     def of_size(self, k: int) -> Self:
-        """The same with k candidates to choose."""
+        """This problem with k candidates to choose."""
         return dataclasses.replace(self, k=k)
 
     def values(self, indices: Indices) -> tuple[Array, Array]:

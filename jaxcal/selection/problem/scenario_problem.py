@@ -53,7 +53,7 @@ class ScenarioProblem(Problem):
         return False
 
     def of_size(self, k: int) -> Self:
-        """The same with k candidates to choose."""
+        """This problem with k candidates to choose."""
         members = tuple(member.of_size(k) for member in self.members)
         nominal = None if self.nominal is None else self.nominal.of_size(k)
         return dataclasses.replace(self, k=k, members=members, nominal=nominal)
