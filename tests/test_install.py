@@ -41,6 +41,12 @@ except ImportError as error:
     print(error)
 """
 
+GYM = """
+import gymnasium
+envs = gymnasium.make_vec("jaxcal.learning.gym:jaxcal/Postures-v0", num_envs=3)
+print(envs.reset(seed=0)[0].shape)
+"""
+
 # extra: packages that must not come with it; commands and what their output must hold
 CASES = {
     "": (
@@ -61,6 +67,10 @@ CASES = {
         [
             (["jaxcal", "train", "--episodes", "2048", "--out", "run"], 0, "saved run"),
         ],
+    ),
+    "gym": (
+        ("brax", "mujoco", "matplotlib", "pymodbus"),
+        [(["python", "-c", GYM], 0, "(3, 210)")],
     ),
     "plots": (
         ("jax", "flax", "brax", "mujoco", "pymodbus"),

@@ -136,7 +136,7 @@ return {
   cut: [...document.querySelectorAll(".help code")].filter(
     e => e.scrollWidth > e.clientWidth + 1).map(e => e.textContent.slice(0, 40)),
   scrolled: [...document.querySelectorAll(
-    ".md-typeset__scrollwrap, .language-text code")]
+    ".md-typeset__scrollwrap, pre > code")]
     .filter(e => e.scrollWidth > e.clientWidth + 1)
     .map(e => e.className + e.textContent.trim().slice(0, 40)),
   wide: document.documentElement.scrollWidth - window.innerWidth,
