@@ -102,7 +102,7 @@ def plan(axes: Any, plan: Any) -> Any:
     """
     series = (
         ("standard_error", "design found", MARKERS[0], "-", COLOURS[0]),
-        ("least_error", "no design below", "", ":", GREY),
+        ("least_error", "lower bound", "", ":", GREY),
     )
     ks = [row.k for row in plan.rows]
     for field, label, marker, style, colour in series:

@@ -113,7 +113,7 @@ class Plan:
             what += f", noise {self.noise_std[worst]:g}"
         lines = [
             f"{what}, target {self.accuracy[worst]:g}",
-            "   K  distinct  standard error  no design below",
+            "   K  distinct  standard error      lower bound",
         ]
         for row in self.rows:
             mark = " <-" if row.k == self.k else ""
