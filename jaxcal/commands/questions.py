@@ -121,6 +121,9 @@ def select(
         "auto (the cheapest proof), exact, exchange, greedy, random, policy",
         "NAME",
     ] = "auto",
+    between: Annotated[
+        bool, "move the chosen between the candidates, within the range of these"
+    ] = False,
     of_criterion: CriterionOptions,
     of_method: MethodOptions,
     output: Output,
@@ -132,10 +135,20 @@ def select(
     """
     table = read_table(file)
     given = {name: x for name, x in vars(of_method).items() if x is not None}
-    selection = of_design.design(table, of_arm).select(
-        k, of_criterion.by(), method, **given
-    )
-    _show(selection, table, output)
+    design, criterion = of_design.design(table, of_arm), of_criterion.by()
+    selection = design.select(k, criterion, method, **given)
+    if not between:
+        _show(selection, table, output)
+        return
+    if of_arm.sensor != "position":
+        raise ValueError(
+            "--between is of sensors that read everywhere, not of --sensor "
+            f"{of_arm.sensor}; in Python: design.refine(..., allowed=arm.reachable())"
+        )
+    refined = design.refine(selection, criterion=criterion)
+    names = list(design.axes or ())
+    if not output.written(names, refined.commands.tolist(), refined.to_dict()):
+        print(refined)
 
 
 def score(

@@ -41,12 +41,7 @@ from jaxcal.models.model import Model, as_model
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.criteria import CRITERIA
 from jaxcal.selection.exchange.exchange import exchange_indices
-from jaxcal.selection.problem import (
-    CandidateSet,
-    Problem,
-    ScenarioProblem,
-    values,
-)
+from jaxcal.selection.problem import CandidateSet, Problem, values
 from jaxcal.selection.result import Selection
 
 __all__ = ["Refinement", "optimise", "refine"]
@@ -187,6 +182,10 @@ def refine(
     given = limits
     if given is None:
         given = np.stack([usable.min(axis=0), usable.max(axis=0)], axis=1)
+        own = np.asarray(getattr(allowed, "limits", np.zeros((0, 2))))  # of an arm
+        given[: len(own)] = own
+        still = given[:, 0] == given[:, 1]  # a column that holds one value
+        given[still, 1] += 1e-9 * np.maximum(np.abs(given[still, 1]), 1.0)
     box = _limits(given)
     begun = design.candidates[rows]
     beyond = (begun < box[:, 0]) | (begun > box[:, 1])
@@ -226,6 +225,15 @@ def _limits(limits: ArrayLike) -> Array:
     return box
 
 
+def _moved(allowed: Allowed | None, commands: Array) -> Array:
+    """(L, n) commands that are allowed; an arm's are moved to where it is measured."""
+    onto = getattr(allowed, "onto", None)
+    if onto is None:
+        return commands[_permitted(allowed, commands)]
+    moved, there = onto(commands)
+    return np.asarray(moved[there])
+
+
 def _permitted(allowed: Allowed | None, commands: Array) -> NDArray[np.bool_]:
     if allowed is None:
         return np.ones(len(commands), dtype=np.bool_)
@@ -254,7 +262,7 @@ def _drawn(box: Array, count: int, allowed: Allowed | None, seed: int) -> Array:
     unit = np.concatenate([corners, even(0, size)])
     for batch in range(_DRAWS):
         points = box[:, 0] + unit * np.ptp(box, axis=1)
-        found = np.concatenate([found, points[_permitted(allowed, points)]])
+        found = np.concatenate([found, _moved(allowed, points)])
         if len(found) >= count:
             return found[:count]
         if len(found) and batch % 2:
@@ -350,13 +358,18 @@ class _Search:
                 )
         self.asked, self.region = criterion, region
         problem = design.problem(k, criterion, region)
-        if isinstance(problem, ScenarioProblem):
-            raise ValueError("refine is of one set of parameters, got scenarios")
-        self.problem: Problem = problem
+        if type(problem) is not Problem:
+            raise ValueError(
+                "refine is of one set of parameters and of measurements that all "
+                "arrive, got a design with scenarios, lost or reliability"
+            )
+        self.problem = problem
         self.k, self.objective = problem.k, problem.criterion
         of_one = self.objective.name
         by_name = CRITERIA[of_one].by_name
         self.source = design.source(by_name, CRITERIA[of_one].of_region)
+        # Commands lie on a surface in the limits, as of an arm that touches something.
+        self.surface = hasattr(allowed, "onto")
         self.rough = _ROUGH if design.model.resolution else _STEP
 
     # -- the criterion -----------------------------------------------------------------
@@ -407,13 +420,16 @@ class _Search:
         if exact is not None:
             return exact * self.span
         count, n = commands.shape
-        step = self.rough * self.span * np.eye(n)
+        moving = len(self.allowed.limits) if self.surface else n  # type: ignore[union-attr]  # joints, then labels
+        step = (self.rough * self.span * np.eye(n))[:moving]
         ahead = np.minimum(commands[:, None] + step, self.box[:, 1])
         back = np.maximum(commands[:, None] - step, self.box[:, 0])
         both = np.concatenate([ahead, back]).reshape(-1, n)
-        d = self.leverage(self.blocks(both), metric).reshape(2, count, n)
-        apart = np.einsum("nii->ni", ahead - back) / self.span
-        return np.asarray((d[0] - d[1]) / apart)
+        d = self.leverage(self.blocks(both), metric).reshape(2, count, moving)
+        apart = np.einsum("nii->ni", (ahead - back)[..., :moving])
+        slopes = np.zeros((count, n))
+        slopes[:, :moving] = (d[0] - d[1]) / (apart / self.span[:moving])
+        return slopes
 
     def _exact_slopes(self, commands: Array, metric: Array) -> Array | None:
         """(N, n) by the model's own derivative, where it has one."""
@@ -512,6 +528,8 @@ class _Search:
             score, rate = self.score(phi)
             return -score, -rate * self.slopes(at, self.gradient(information)).ravel()
 
+        if self.surface:
+            return self._tried(best, best_phi)
         start = ((commands - self.low) / self.span).clip(0.0, 1.0).ravel()
         found = _descended(down, start, 0.0, 1.0, 300)
         there = self.low + found.reshape(shape) * self.span
@@ -569,6 +587,8 @@ class _Search:
         unit /= np.linalg.norm(unit, axis=1, keepdims=True)
         trial = command + radius * unit * self.span
         trial = trial.clip(self.box[:, 0], self.box[:, 1])
+        if self.surface:
+            return _moved(self.allowed, trial)
         free = _permitted(self.allowed, trial)
         if free.all() or not free.any():
             return trial[free]
@@ -606,7 +626,9 @@ class _Search:
     @functools.cached_property
     def _spread(self) -> Array:
         """(R, n) points over the limits, where d is looked at."""
-        count = _SEARCH if not self.design.model.resolution else _POOL  # type: ignore[union-attr]
+        assert self.design.model is not None
+        cheap = not (self.design.model.resolution or self.surface)
+        count = _SEARCH if cheap else _POOL
         return _drawn(self.box, count, self.allowed, self.seed + 1)
 
     @functools.cached_property
@@ -637,6 +659,8 @@ class _Search:
         """Ends (A, n) of climbs from points, and d there."""
         shape = points.shape
         d = self.leverage(self.blocks(points), metric)
+        if self.surface:
+            return self._wandered(points, d, metric)
         size = float(d.max()) or 1.0
 
         def down(x: Array) -> tuple[float, Array]:
@@ -651,6 +675,23 @@ class _Search:
         higher = self.leverage(self.blocks(there), metric)
         kept = (higher > d) & _permitted(self.allowed, there)
         return np.where(kept[:, None], there, points), np.where(kept, higher, d)
+
+    def _wandered(self, points: Array, d: Array, metric: Array) -> tuple[Array, Array]:
+        """Ends of climbs by trial, and d there."""
+        rng, points, d = np.random.default_rng(self.seed), points.copy(), d.copy()
+        for radius in 0.1 * 0.7 ** np.arange(20):
+            for i in range(len(points)):
+                ways = rng.normal(size=(8, points.shape[1]))
+                trial = points[i] + radius * ways * self.span
+                trial = trial.clip(self.box[:, 0], self.box[:, 1])
+                trial = _moved(self.allowed, trial)
+                if not len(trial):
+                    continue
+                heights = self.leverage(self.blocks(trial), metric)
+                j = int(heights.argmax())
+                if heights[j] > d[i]:
+                    points[i], d[i] = trial[j], heights[j]
+        return points, d
 
     def _bound(self, commands: Array, phi: float) -> tuple[float, float, bool]:
         """Upper bound on phi of k commands; share two searches differ by; is it proven.

@@ -167,3 +167,23 @@ def test_four_chosen_postures_weigh_a_tool_better_than_four_far_apart(tmp_path):
     found, _ = quick("wrench", tmp_path)
     for rule in ("wrist alone", "random", "far apart"):
         assert (rms(found["chosen (I)", 4]) < 0.95 * rms(found[rule, 4])).all()
+
+
+@pytest.mark.slow
+def test_five_chosen_trajectories_tell_more_than_five_at_random(tmp_path):
+    found, _ = quick("trajectories", tmp_path)
+    held = 2  # the upper arm's inertia
+    chosen, random = (np.delete(rms(found[x]), held) for x in ("chosen", "random"))
+    assert np.exp(np.log(chosen / random).mean()) < 0.9
+    assert (chosen < 0.01).all()
+
+
+def test_only_the_sum_of_rotor_and_upper_arm_moves_the_simulated_arm():
+    example = importlib.import_module("trajectories")
+    signal, moved = example.candidates()[17], 0.003  # kg m² from one to the other
+    theta = np.zeros(7)
+    theta[2] = np.log(1.0 - moved / example.DESIGNED[2])
+    theta[3] = np.log(1.0 + moved / example.DESIGNED[3])
+    angles = example.trajectory(signal, np.zeros(7))
+    assert np.ptp(angles) > 0.3
+    np.testing.assert_allclose(example.trajectory(signal, theta), angles, atol=1e-9)

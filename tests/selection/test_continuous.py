@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal.models import Affine, FromFunction, FromJax, Polynomial
+from jaxcal.models import (
+    Affine,
+    Board,
+    FromFunction,
+    FromJax,
+    Polynomial,
+    SerialChain,
+    Socket,
+)
 
 jnp = pytest.importorskip("jax.numpy")
 
@@ -174,3 +182,48 @@ def test_bad_input_is_named():
         design.refine([0, 1, 2], allowed=lambda u: False)
     with pytest.raises(ValueError, match="refine needs candidates and a model"):
         jaxcal.Design.from_blocks(np.ones((3, 1, 1))).refine([0])
+    careful = jaxcal.Design(np.random.default_rng(0).random((9, 2)), lost=1)
+    with pytest.raises(ValueError, match="got a design with scenarios, lost"):
+        careful.refine([0, 1, 2, 3])
+
+
+# -- arms ------------------------------------------------------------------------------
+
+UR5 = [
+    [0.0, 90.0, 89.2, 0.0],
+    [-425.0, 0.0, 0.0, 0.0],
+    [-392.0, 0.0, 0.0, 0.0],
+    [0.0, 90.0, 109.3, 0.0],
+    [0.0, -90.0, 94.75, 0.0],
+    [0.0, 0.0, 82.5, 0.0],
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensor", ["position", "socket", "board"])
+def test_postures_of_an_arm_are_refined_where_it_can_be_measured(sensor):
+    arm = SerialChain.from_dh(UR5)
+    rules = {"floor": -50.0}
+    if sensor == "socket":
+        place = np.array([[400.0, 200.0, 100.0], [300.0, -300.0, 150.0]])
+        arm = arm.measured_with(Socket(count=2, places=place))
+    elif sensor == "board":
+        place = np.eye(4)
+        place[:3, 3] = 500.0, 0.0, 0.0
+        arm = arm.measured_with(Board(place=place, extent=(150.0, 100.0)))
+        rules |= {"camera": (60.0, 45.0)}
+    where = arm.reachable(**rules)
+    candidates = arm.postures(40, **rules)
+    assert all(where(u) for u in candidates[:5])
+    design = jaxcal.Design(candidates, arm)
+    first = design.select(16 if sensor == "socket" else 9, method="greedy")
+    better = design.refine(first, allowed=where, starts=1, time_limit=20.0)
+    assert better.value < first.value  # the mean variance of predictions
+    j, (low, high) = arm.num_joints, where.limits.T
+    joints = better.commands[:, :j]
+    assert ((joints >= low - 1e-9) & (joints <= high + 1e-9)).all()
+    assert all(where(u) for u in better.commands)
+    if sensor == "socket":
+        assert (
+            np.abs(arm.predict(better.commands)).max() < 1e-3
+        )  # the ball in its place

@@ -318,17 +318,34 @@ class SerialChain(Arm, Model):
             ValueError: there are not so many, or a socket is reached by none; the
                 message says what became of the rest.
         """
-        from jaxcal.models.serial.postures import Room, View, postures
+        from jaxcal.models.serial.postures import asked, postures
 
-        view = None
-        if camera is not None:
-            view = View.of(camera, distance, tilt, side)
-        elif distance is not None or side is not None:
-            raise ValueError("distance and side need camera=")
-        room = None
-        if floor is not None or approach is not None or len(clear):
-            room = Room.of(floor, approach, clear, radius)
-        return postures(self, count, seed, near, allowed, view, room)
+        rules = asked(camera, distance, tilt, side, floor, approach, clear, radius)
+        return postures(self, count, seed, near, allowed, *rules)
+
+    def reachable(
+        self,
+        *,
+        near: ArrayLike | None = None,
+        allowed: Callable[[Array], bool] | None = None,
+        camera: ArrayLike | None = None,
+        distance: Sequence[float] | None = None,
+        tilt: float = 45.0,
+        side: str | None = None,
+        floor: float | None = None,
+        approach: ArrayLike | None = None,
+        clear: Sequence[ArrayLike] = (),
+        radius: float | None = None,
+    ) -> Any:
+        """Where the arm can be measured: ``allowed`` of ``Design.refine``.
+
+        Arguments as of ``postures``. Commands that a search tries are moved to where
+        the sensor reads: the ball into its socket, the board as the camera sees it.
+        """
+        from jaxcal.models.serial.postures import Reachable, asked
+
+        rules = asked(camera, distance, tilt, side, floor, approach, clear, radius)
+        return Reachable(self, near, allowed, *rules)
 
     def tip_axis(self, commands: ArrayLike) -> Array:
         """(N, 3) the tip's z axis in the measuring frame, of the nominal arm."""

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import array_of, in_words, numbers, whole_number
 from jaxcal.models.sensors import Board, Landmarks, Plane, Several, Socket
 
-__all__ = ["Room", "View", "in_turn", "postures"]
+__all__ = ["Reachable", "Room", "View", "asked", "in_turn", "postures"]
 
 Array = NDArray[np.float64]
 Chain = Any  # a SerialChain, whose module imports this one
@@ -160,6 +160,27 @@ class Room:
         return np.asarray(near.any(axis=1))
 
 
+def asked(
+    camera: ArrayLike | None,
+    distance: Sequence[float] | None,
+    tilt: float,
+    side: str | None,
+    floor: float | None,
+    approach: ArrayLike | None,
+    clear: Sequence[ArrayLike],
+    radius: float | None,
+) -> tuple[View | None, Room | None]:
+    """What must be seen and where the arm may be, of the arguments of ``postures``."""
+    view = room = None
+    if camera is not None:
+        view = View.of(camera, distance, tilt, side)
+    elif distance is not None or side is not None:
+        raise ValueError("distance and side need camera=")
+    if floor is not None or approach is not None or len(clear):
+        room = Room.of(floor, approach, clear, radius)
+    return view, room
+
+
 def postures(
     arm: Chain,
     count: int,
@@ -255,6 +276,62 @@ def postures(
     )
 
 
+class Reachable:
+    """Where an arm can be measured, for ``refine``; see ``SerialChain.reachable``."""
+
+    def __init__(
+        self,
+        arm: Chain,
+        near: ArrayLike | None,
+        allowed: Callable[[Array], bool] | None,
+        view: View | None,
+        room: Room | None,
+    ) -> None:
+        if isinstance(arm.sensor, Several):
+            raise ValueError(
+                "reachable is of one sensor at a time: "
+                "arm.measured_with(sensor).reachable()"
+            )
+        if view is not None and not isinstance(arm.sensor, Board):
+            raise ValueError("camera is of an arm with sensor=Board(...)")
+        self._arm, self._targets = _aimed(arm, near)
+        self._allowed, self._view, self._room = allowed, view, room
+        self._ends = None if view is None else _distances(arm.sensor, view)
+
+    @property
+    def limits(self) -> Array:
+        """(j, 2) of the joints, 180 degrees where there are none."""
+        turns = np.array(self._arm.command_units)[:, None] == "deg"
+        return np.where(turns, self._arm.limits.clip(-180.0, 180.0), self._arm.limits)
+
+    def __call__(self, command: Array) -> bool:
+        """Whether the arm can be measured at a command (n,)."""
+        moved, there = self.onto(command[None])
+        near = np.abs(moved[0] - command) <= 1e-6 * np.maximum(np.abs(command), 1.0)
+        return bool(there[0] and near.all())
+
+    def onto(self, commands: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """(N, n) commands moved to where the sensor reads, and (N,) whether it does."""
+        arm, commands = self._arm, commands.copy()
+        low, high = self.limits.T
+        j = arm.num_joints
+        commands[:, :j] = commands[:, :j].clip(low, high)
+        if isinstance(arm.sensor, Landmarks) and arm.sensor.count > 1:
+            labels = np.round(commands[:, j]).clip(0, arm.sensor.count - 1)
+            commands[:, j] = labels
+        if self._view is not None and self._ends is not None:
+            moved, reasons = _in_picture(arm, commands, self._view, self._ends)
+        else:
+            moved, reasons = _reach(arm, commands, low, high, self._targets)
+        there = np.array([not reason for reason in reasons], dtype=np.bool_)
+        if self._room is not None:
+            there &= self._room.reasons(arm, moved) == ""
+        if self._allowed is not None:
+            for i in np.flatnonzero(there):
+                there[i] = bool(self._allowed(moved[i, :j].copy()))
+        return moved, there
+
+
 def _aimed(arm: Chain, near: ArrayLike | None) -> tuple[Chain, Array | None]:
     """The arm with its sensor at ``near``, or points that the tip should be near."""
     sensor = arm.sensor
@@ -330,7 +407,9 @@ def _touching(
         trace = np.trace(gram, axis1=1, axis2=2)[:, None, None] + 1e-300
         gram = gram + 1e-6 * trace * np.eye(gram.shape[-1])
         step = np.linalg.solve(gram, -off[going][..., None])
-        step = (np.matrix_transpose(slopes) @ step)[..., 0]
+        with np.errstate(invalid="ignore"):  # where all joints are held
+            step = (np.matrix_transpose(slopes) @ step)[..., 0]
+        step = np.nan_to_num(step, nan=0.0, posinf=0.0, neginf=0.0)
         step *= 0.1 / np.maximum(np.abs(step).max(axis=1, keepdims=True), 0.1)
         commands[going, :j] = np.clip(at + step * scale, low, high)
     reached = np.linalg.norm(arm.predict(commands), axis=1) <= limit
@@ -372,16 +451,7 @@ def _pictured(
     points = sensor.outline
     middle = points.mean(axis=0)
     width, height, fx, fy, cx, cy = view.camera
-    size = 2.0 * np.linalg.norm(points - middle, axis=1).max()
-    ends = view.distance
-    if ends is None and size > 0.0:
-        small, large = _FILLED
-        ends = fx * size / (large * width), fx * size / (small * width)
-    if ends is None:
-        raise ValueError(
-            "distance must be given, (least, greatest) from the camera to the board, "
-            "where Board has neither corners nor extent"
-        )
+    ends = _distances(sensor, view)
     far = rng.uniform(*ends, count)
     aim = rng.uniform(0.25, 0.75, (count, 2)) * [width, height]
     centre = np.column_stack([(aim - [cx, cy]) / [fx, fy], np.ones(count)])
@@ -403,6 +473,35 @@ def _pictured(
     posed = arm.measured_with(dataclasses.replace(sensor, corners=None))
     wanted = np.hstack([commands[:, :j], shift, turn.as_rotvec(degrees=True)])
     commands = np.hstack([_solved(posed, wanted, low, high)[:, :j], commands[:, j:]])
+    return _in_picture(arm, commands, view, ends)
+
+
+def _distances(sensor: Any, view: View) -> tuple[float, float]:
+    """Least and greatest from the camera to the board's middle."""
+    points = sensor.outline
+    size = 2.0 * np.linalg.norm(points - points.mean(axis=0), axis=1).max()
+    if view.distance is not None:
+        return view.distance
+    if not size > 0.0:
+        raise ValueError(
+            "distance must be given, (least, greatest) from the camera to the board, "
+            "where Board has neither corners nor extent"
+        )
+    width, fx = view.camera[0], view.camera[2]
+    small, large = _FILLED
+    return fx * size / (large * width), fx * size / (small * width)
+
+
+def _in_picture(
+    arm: Chain, commands: Array, view: View, ends: tuple[float, float]
+) -> tuple[Array, list[str]]:
+    """Commands with what the camera sees of the board, and why it is of no use."""
+    from scipy.spatial.transform import Rotation
+
+    sensor, j, count = arm.sensor, arm.num_joints, len(commands)
+    points, known_side = sensor.outline, view.side or sensor.side
+    width, height, fx, fy, cx, cy = view.camera
+    posed = arm.measured_with(dataclasses.replace(sensor, corners=None))
     seen = posed.predict(np.hstack([commands[:, :j], np.zeros((count, 6))]))
     if sensor.corners is None:
         commands = np.hstack([commands[:, :j], seen])
@@ -423,7 +522,7 @@ def _pictured(
     why[(away < ends[0]) | (away > ends[1])] = "are too near or too far"
     why[~inside.all(axis=1)] = "do not have the whole board in the picture"
     if known_side:
-        why[face * side <= 0.0] = "see the board from behind"
+        why[face * known_side <= 0.0] = "see the board from behind"
     return commands, why.tolist()
 
 
