@@ -35,10 +35,12 @@ class UnitStop:
     standing: bool = False  # its status says so, and its position holds still
     detail: str = ""
     position: int | None = None  # pulses, as last read
+    stayed: bool = False  # and it stood for longer than it takes to go on by itself
 
     def __str__(self) -> str:
         state = "acknowledged" if self.acknowledged else "NOT acknowledged"
-        rest = "standing" if self.standing else "NOT seen standing"
+        rest = "standing" if self.stayed else "at rest"
+        rest = rest if self.standing else "NOT seen standing"
         detail = f" ({self.detail})" if self.detail else ""
         todo = "" if self.standing else ": use the emergency stop"
         return f"{self.axis} (unit {self.unit}): {state}, {rest}{detail}{todo}"
@@ -137,8 +139,10 @@ def stay(drives: list[Drive], results: list[UnitStop], seconds: float) -> list[s
         for drive, result in standing:
             with contextlib.suppress(Exception), drive.line.urgent():
                 drive.hold(result.position or 0)
-        again = _restarted(standing, time.monotonic() + seconds)
+        again, seen = _restarted(standing, time.monotonic() + seconds)
         if not again:
+            for result in seen:
+                result.stayed = True
             break
         words += [f"{result.axis} went on by itself after its stop" for result in again]
         for new, result in zip(stop_all(drives), results, strict=True):
@@ -146,21 +150,24 @@ def stay(drives: list[Drive], results: list[UnitStop], seconds: float) -> list[s
     return words
 
 
-def _restarted(pairs: Pairs, end: float) -> list[UnitStop]:
-    """Drives that stood and move again before a time."""
+def _restarted(pairs: Pairs, end: float) -> tuple[list[UnitStop], list[UnitStop]]:
+    """Drives that stood and move again before a time; and, where none does, those that
+    were seen to stand at its end."""
+    seen: list[UnitStop] = []
     while time.monotonic() < end:
         time.sleep(LOOK_S)
-        moved = []
+        moved: list[UnitStop] = []
+        seen = []
         for drive, result in pairs:
             with contextlib.suppress(Exception), drive.line.urgent():
                 status = drive.steady()
                 powered = status.enabled and not status.fault
                 way = abs(status.position - (result.position or 0))
-                if powered and (status.moving or way > STILL_COUNTS):
-                    moved.append(result)
+                went_on = powered and (status.moving or way > STILL_COUNTS)
+                (moved if went_on else seen).append(result)
         if moved:
-            return moved
-    return []
+            return moved, []
+    return [], seen
 
 
 def stand_s(drives: list[Drive]) -> float:

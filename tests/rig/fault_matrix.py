@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import os
 import pathlib
 import re
 import signal
@@ -136,7 +137,9 @@ CHANGED = (
     "regeared,axis=roll,factor=0.33",
     "phone_turned",
     "fast_drive,axis=yaw",
+    "near_limit",
 )
+NEAR_DEG, PAST_DEG = 19.4, 1.0  # of limits at 20: from where, and how far past them
 CHANGED_DEG = 5.0  # that a joint may be moved before that is found
 # How drives do not stop, found when the axes are checked.
 UNSTOPPED = ("stop_ignored", "stop_ignored,axis=yaw", "stop_resumes,seconds=0.02")
@@ -148,6 +151,7 @@ HOST_PHASES = {
     "sigkill_watched": ("moving", "measuring"),
     "second_session": ("zeroing",),
     "other_stop": ("moving", "measuring"),
+    "foreign_stop": ("moving",),
     "suspended_stop": ("moving", "measuring"),
 }
 COLUMNS = (*PHASES, "finishing", "axes", "start", "overnight")
@@ -398,7 +402,14 @@ def _changed_cell(fault: str, folder: pathlib.Path) -> Outcome:
     """A session of a device that is not as it was when its axes were checked."""
     said: list[str] = []
     folder.mkdir(parents=True)
-    with simulator(fast_config(), noise_deg=0.005) as sim:
+    near, more = fault == "near_limit", {}
+    if near:  # joints count as they are commanded, one of them close to its limit
+        fault, more = "regeared,axis=roll,factor=5", {"truth": Truth(
+            matrix=tuple(map(tuple, np.eye(3))), bias=(0.0,) * 3, noise_deg=0.005
+        )}  # fmt: skip
+    with simulator(fast_config(), noise_deg=0.005, **more) as sim:
+        if near:
+            sim.drives[2].position = sim.config.axes[2].to_pulses(NEAR_DEG)
         served = sim.start()
         record = DeviceRecord(folder / "device.json")
         for state in (IDENTIFIED, HOMED):
@@ -406,27 +417,33 @@ def _changed_cell(fault: str, folder: pathlib.Path) -> Outcome:
         record.reach(SIGN_CHECKED, served, turns=turns(sim, served))
         record.reach(STOP_PROVED, served)
         sim.faults.add(parse_fault(fault))
-        far = _watch_joints(sim)
+        far, away = _watch_joints(sim)
         code = session(served, folder, sim, said, record=record)
         reason = next((s for s in said if s.startswith("fault:")), "")
         assert code == 3, (code, said[-12:])
         assert far.max() < CHANGED_DEG, f"a joint went {far.max():.1f} deg"
+        if near:
+            fault, most = "near_limit", 20.0 + PAST_DEG
+            assert away.max() < most, f"a joint stood at {away.max():.1f} deg"
         check_invariants(folder, sim, alive=True, deaf=False)
     assert not (folder / "calibration.json").exists()
     return Outcome(fault, "start", code, 0, reason, 0.0, refused=True)
 
 
-def _watch_joints(sim: Simulator) -> np.ndarray:
-    """(3,) degrees that the joints have gone, kept up while the phone looks."""
-    start, far = sim.plant.joints(), np.zeros(3)
+def _watch_joints(sim: Simulator) -> tuple[np.ndarray, np.ndarray]:
+    """(3,) degrees that the joints have gone, and how far they stood from zero, kept up
+    while the phone looks."""
+    start, far, away = sim.plant.joints(), np.zeros(3), np.zeros(3)
     attitude = sim.plant.attitude
 
     def watched() -> np.ndarray:
-        far[:] = np.maximum(far, np.abs(sim.plant.joints() - start))
+        joints = sim.plant.joints()
+        far[:] = np.maximum(far, np.abs(joints - start))
+        away[:] = np.maximum(away, np.abs(joints))
         return attitude()
 
     sim.plant.attitude = watched  # type: ignore[method-assign]
-    return far
+    return far, away
 
 
 def _axes_cell(fault: str, folder: pathlib.Path) -> Outcome:
@@ -447,7 +464,7 @@ def _axes_cell(fault: str, folder: pathlib.Path) -> Outcome:
             record.reach(state, wrong)
         operator = Operator(yes=fault != ENTER, read=lambda _: "", say=said.append)
         place = Place(wrong, record, operator, listeners=(sim.answer,))
-        far = _watch_joints(sim)
+        far, _ = _watch_joints(sim)
         try:
             code = check_the_axes(place)
         except Refused as error:
@@ -516,6 +533,7 @@ FIRST_CODES = {
     "full_disk": (3,),
     "second_session": (0,),
     "other_stop": (143,),
+    "foreign_stop": (3,),
     "suspended_stop": (-9,),
 }
 
@@ -528,9 +546,8 @@ def _host_cell(
     given = fast_config(WATCHED if watched else None)
     device = Truth(noise_deg=0.0, idle_watchdog=watched)
     # Slow where a command from another terminal must come in time.
-    speedup = {"second_session": 0.3, "other_stop": 0.1, "suspended_stop": 0.1}.get(
-        fault, 1.0
-    )
+    slow = ("other_stop", "foreign_stop", "suspended_stop")
+    speedup = 0.3 if fault == "second_session" else 0.1 if fault in slow else 1.0
     with simulator(given, truth=device, speedup=speedup) as sim:
         served, phone_port = sim.start(), _free_port()
         text = fast_text(
@@ -590,13 +607,17 @@ def _elsewhere(
     command = {
         "second_session": ["calibrate", "--arm", "--zero", "--out", str(folder / "2")],
         "other_stop": ["stop"],
+        "foreign_stop": ["stop"],
         "suspended_stop": ["stop"],
     }[fault]
     if fault == "suspended_stop":
         child.send_signal(signal.SIGSTOP)
+    # Another user, or another computer behind the same gateway: no lock is shared.
+    foreign = {"JAXCAL_RIG_LOCKS": str(folder / "locks")} if "foreign" in fault else {}
     done = subprocess.run(
         [sys.executable, "-m", "rig", *command, "--config", str(config)],
         capture_output=True, text=True, timeout=60, check=False,
+        env=os.environ | foreign,
     )  # fmt: skip
     said = done.stdout + done.stderr
     if fault == "second_session":
@@ -604,7 +625,7 @@ def _elsewhere(
         assert not (folder / "2").exists(), "a second session was begun"
     else:
         assert done.returncode == 0, said
-        assert fault == "other_stop" or "it is killed now" in said, said
+        assert fault != "suspended_stop" or "it is killed now" in said, said
 
 
 def cells() -> list[tuple[str, str]]:
@@ -680,6 +701,9 @@ def table(outcomes: list[Outcome]) -> str:
         "for a second, without an alarm. `regeared`, `phone_turned`, `fast_drive` at "
         "*start*: a joint's gearing, the phone's place on its holder or a speed "
         f"is not as `axes` saw it; no joint goes {CHANGED_DEG:g} degrees. "
+        "`near_limit`: the same of a joint that stands close to its soft limit, which "
+        f"is not passed by more than {PAST_DEG:g} degree. `foreign_stop`: `stop` from "
+        "another lock folder, as another user or computer would. "
         "`stop_ignored`, `stop_resumes`: the drives acknowledge their stop and go on, "
         "or go on later; the device is not STOP_PROVED.",
         "",

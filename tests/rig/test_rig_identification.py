@@ -156,7 +156,7 @@ def test_a_drift_that_is_not_linear_stays_and_is_judged():
     drift = estimate_drift(visits, reading(frame), 0.2)
     assert not drift["corrected"] and drift["over"]
     told = {"drift": drift}
-    assert "session.drift_limit_deg (0.2)" in " ".join(recalibrate(told, 0.5))
+    assert "session.drift_limit_deg (0.2 deg)" in " ".join(recalibrate(told, 0.5))
     assert "not linear" in drift_text(drift, AXIS_NAMES)
     assert not estimate_drift(visits, reading(frame), 0.6)["over"]
 

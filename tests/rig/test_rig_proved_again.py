@@ -7,6 +7,7 @@ import re
 import threading
 import time
 
+import harness
 import numpy as np
 import pytest
 from commission import device, quick_text, turns
@@ -169,6 +170,14 @@ def test_a_place_where_an_axis_ends_twice_is_out_of_reach(at, capsys):
     assert furthest() not in measured and len(measured) >= 4
 
 
+def real_limits(monkeypatch):
+    """Speeds and looks as sessions of a device have them, not as the harness does."""
+    verify_s, stand_s, too_fast = harness.REAL
+    monkeypatch.setattr(stop, "VERIFY_S", verify_s)
+    monkeypatch.setattr(stop, "stand_s", stand_s)
+    monkeypatch.setattr(motion, "TOO_FAST", too_fast)
+
+
 # B, I: what a joint turns is not what it turned
 
 
@@ -216,6 +225,16 @@ def test_a_phone_that_was_turned_on_its_holder_is_found(at, capsys):
         assert code == 3 and "the phone or its holder was turned" in said
     record = DeviceRecord.load(at / "device.json")
     assert record.state(SIGN_CHECKED) is None
+
+
+@pytest.mark.slow
+def test_a_session_ends_well_at_the_limits_of_a_real_device(at, capsys, monkeypatch):
+    """The harness allows drives that are quicker than told, and looks briefly."""
+    real_limits(monkeypatch)
+    with proved(at, capsys, speedup=1.0):
+        code, said = session(capsys)
+        assert code == 0, said
+        assert said.count("acknowledged, at rest") == 3
 
 
 # C: speed
@@ -288,7 +307,7 @@ def test_a_session_that_was_stopped_looks_whether_its_drives_stay(
     at, capsys, monkeypatch
 ):
     """E: they went on to the old target a second later, when the session had ended."""
-    monkeypatch.setattr(stop, "stand_s", lambda drives: 1.0)
+    real_limits(monkeypatch)
     stopped = []
 
     def strike(run, event, emit=Run.emit, **fields):
@@ -302,10 +321,11 @@ def test_a_session_that_was_stopped_looks_whether_its_drives_stay(
 
     with proved(at, capsys, speedup=0.05) as sim:
         monkeypatch.setattr(Run, "emit", strike)
-        sim.faults.add(parse_fault("stop_resumes,seconds=0.5,count=3"))
+        sim.faults.add(parse_fault("stop_resumes,seconds=1.5,count=1"))
         code, said = session(capsys)
         assert code == 143 and stopped, said
         assert "went on by itself after its stop" in said
+        assert said.count("acknowledged, standing") == 3 and "at rest" in said
         time.sleep(1.0)
         stood = joints(sim)
         time.sleep(0.5)

@@ -150,6 +150,8 @@ class RunState:
                     self.current = None if self.current == name else self.current
             case "stop":
                 self.stop = record
+            case "stayed" if self.stop:
+                self.stop = self.stop | {"units": record["units"]}
             case "last_move":
                 self.last_move = record
             case "sender_refused" | "comm_restored":

@@ -150,9 +150,11 @@ def verdict(state: RunState, summary: dict[str, Any]) -> list[str]:
     if "A" in summary:
         return summary_lines(summary, limit)
     if "before" in summary:
-        return [f"{error_text(summary)}, limit {limit:g}"]
+        return [f"{error_text(summary, state.unit)}, limit {limit:g}"]
     if state.ended is None or state.ended["event"] != "end":
         return []
     if state.mode == "goto" and state.done:
-        return ["Reached " + " ".join(map(angle, state.done[-1].measured or [])) + "°"]
+        unit = "°" if state.unit == "deg" else f" {state.unit}"
+        places = " ".join(map(angle, state.done[-1].measured or []))
+        return [f"Reached {places}{unit}"]
     return [f"{len(state.done)} postures recorded"] * (state.mode == "collect")

@@ -40,15 +40,16 @@ def _comm_restored(record: Record) -> str:
 
 def _shown(record: Record) -> str:
     return (
-        f"  {record['axis']}: {record['ratio']:.3f} deg of the phone for a degree, "
-        f"{record['before']:.3f} at `axes`; {record['speed_deg_s']:.3g} deg/s at least"
+        f"  {record['axis']}: {record['ratio']:.3f} measured for each commanded, "
+        f"{record['before']:.3f} at `axes`; {record['speed_deg_s']:.3g} a second at "
+        "least"
     )
 
 
 def _stayed(record: Record) -> str:
     lines = [f"WARNING: {text}, and was stopped again" for text in record["went_on"]]
     units = [f"  {UnitStop(**unit)}" for unit in record["units"]]
-    return "\n".join(lines + units if lines else [])
+    return "\n".join([*lines, *units])
 
 
 def _last_move(record: Record) -> str:
@@ -141,14 +142,14 @@ def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
         f"{summary['basis']} ({summary['dof']} degrees of freedom each)"
     )
     if "after" in summary:
-        lines.append(f"held-out {error_text(summary)}")
+        lines.append(f"held-out {error_text(summary, unit)}")
     elif found := summary.get("prediction"):  # a refit: nothing was compensated by it
         lines.append(
-            f"held-out postures predicted to {found['rms']:.4f} deg rms "
+            f"held-out postures predicted to {found['rms']:.4f} {unit} rms "
             f"(max {found['max']:.4f})"
         )
     if summary.get("drift"):
-        lines.append(f"drift: {drift_text(summary['drift'], outputs)}")
+        lines.append(f"drift: {drift_text(summary['drift'], outputs, unit)}")
     if summary["orders"]["warning"]:
         lines.append(f"WARNING: {summary['orders']['warning']}")
     if reasons := recalibrate(summary, limit_deg):
@@ -174,29 +175,30 @@ def held_out(summary: dict[str, Any]) -> tuple[str, float]:
 
 def recalibrate(summary: dict[str, Any], limit_deg: float) -> list[str]:
     """Why a calibration is not to be used; nothing where all is well."""
-    reasons = []
+    reasons, unit = [], summary.get("unit", "deg")
     what, worst = held_out(summary)
     if worst > limit_deg:
-        limit = f"session.verify_limit_deg ({limit_deg:g} deg)"
-        reasons.append(f"the error {what}, {worst:.3g} deg, exceeds {limit}")
+        limit = f"session.verify_limit_deg ({limit_deg:g} {unit})"
+        reasons.append(f"the error {what}, {worst:.3g} {unit}, exceeds {limit}")
     if summary.get("drift") and summary["drift"]["over"]:
-        limit = f"session.drift_limit_deg ({summary['drift']['limit_deg']:g} deg)"
+        most = summary["drift"]["limit_deg"]
+        limit = f"session.drift_limit_deg ({most:g} {unit})"
         reasons.append(f"the drift of the zero that is left exceeds {limit}")
     return reasons
 
 
-def drift_text(drift: dict[str, Any], outputs: Sequence[str]) -> str:
+def drift_text(drift: dict[str, Any], outputs: Sequence[str], unit: str = "deg") -> str:
     """How far the zero drifted, and what was done about it."""
     worst = int(np.argmax(np.abs(drift["angles_deg"]).max(axis=0)))
     text = (
-        f"the zero posture read up to {drift['size_deg']:.4f} deg from zero "
+        f"the zero posture read up to {drift['size_deg']:.4f} {unit} from zero "
         f"({outputs[worst]}) on later visits (limit {drift['limit_deg']:g})"
     )
     if drift["corrected"]:
         rate = drift["angles_deg"][-1][worst] / drift["minutes"][-1]
         text += (
-            f"; linear, {rate:+.4f} deg/min, and taken out: {drift['left_deg']:.4f} "
-            "deg are left"
+            f"; linear, {rate:+.4f} {unit}/min, and taken out: {drift['left_deg']:.4f} "
+            f"{unit} are left"
         )
     if drift["over"]:
         kind = "It is not linear. " if len(drift["minutes"]) == 3 else ""
@@ -218,10 +220,10 @@ def choice_text(choice: dict[str, Any]) -> str:
     )
 
 
-def error_text(found: dict[str, Any]) -> str:
+def error_text(found: dict[str, Any], unit: str = "deg") -> str:
     """Errors at held-out postures, raw and compensated."""
     before, after = found["before"], found["after"]
     return (
-        f"error before {before['rms']:.4f} deg rms (max {before['max']:.4f}), after "
+        f"error before {before['rms']:.4f} {unit} rms (max {before['max']:.4f}), after "
         f"compensation {after['rms']:.4f} (max {after['max']:.4f})"
     )

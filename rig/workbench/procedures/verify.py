@@ -100,7 +100,7 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     again = found["after"]["max"] > limit
     run.save_pairs()
     run.save_summary({**found, "limit_deg": limit, "recalibrate": again})
-    run.say(f"{error_text(found)}, limit {limit:g}")
+    run.say(f"{error_text(found, config.output_unit)}, limit {limit:g}")
     if calibration.noise_std is not None:
         told = calibration.check(*pairs(records), tolerance=limit)
         run.say(f"a drift that moves it by {limit:g} is seen with {told.power:.0%}")
