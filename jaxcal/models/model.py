@@ -444,6 +444,7 @@ def answered(
     model: Model,
     commands: Array,
     parameters: Array | None,
+    rows: Rows | None = None,
     names: Sequence[str] | None = None,
 ) -> NDArray[np.bool_]:
     """(N,) where the model has a prediction; a warning names the others.
@@ -452,13 +453,17 @@ def answered(
         model: any.
         commands: (N, n).
         parameters: (p,), the nominal ones for None.
-        names: (N,) of the commands, their numbers when not given.
+        rows: (N,) their numbers; counted when not given.
+        names: of all rows, where they have some.
     """
     lost = model.unanswered(commands, parameters) if len(commands) else {}
     mask = np.ones(len(commands), dtype=np.bool_)
     if lost:
         mask[list(lost)] = False
-        named = [f"{names[i] if names else i} ({reason})" for i, reason in lost.items()]
+        named = []
+        for i, reason in lost.items():
+            row = i if rows is None else int(rows[i])
+            named.append(f"{row if names is None else names[row]} ({reason})")
         more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
         warnings.warn(
             f"{len(lost)} of {len(commands)} candidates are left out, the model fails "

@@ -56,6 +56,7 @@ _TRIALS, _SMALLEST = 24, 1e-6  # of a command, in a round of trial; share of the
 _PAIRED, _GAIN = 6, 1e-7  # inputs up to which differences are tried; of log efficiency
 _STEP = 1e-5  # share of the limits, of differences where a model has no derivative
 _ROUGH = 1e-3  # the same where derivatives are differences already
+_SHARP = (10.0, 50.0, 250.0)  # of the least eigenvalue, by one over it
 _CORNERS = 14  # inputs up to which all corners are looked at
 _DRAWS = 200  # batches of points, until enough are allowed
 _TOLD = 1e-4  # efficiency that another round of the bound must gain
@@ -400,6 +401,25 @@ class _Search:
         along = half @ vectors[:, -1]
         return np.outer(along, along) / values[-1] ** 2
 
+    def soft(self, information: Array, sharp: float) -> tuple[float, Array]:
+        """Of E a smooth value below phi, and its gradient W (p, p).
+
+        phi is the least ``trace(W M)`` over W of trace 1 in the criterion's own
+        coordinates, so with any such W that is above it.
+
+        Args:
+            information: (p, p).
+            sharp: how sharply the least eigenvalue stands out, by one over phi.
+        """
+        half = np.linalg.inv(self.objective.root)
+        values, vectors = np.linalg.eigh(half.T @ information @ half)
+        shares = np.exp(-sharp * (values - values[0]))
+        total = float(shares.sum())
+        along = half @ vectors
+        return float(values[0] - np.log(total) / sharp), (
+            along * (shares / total)
+        ) @ along.T
+
     def score(self, phi: float) -> tuple[float, float]:
         """What is climbed, in which a hundredth is a percent, and its slope by phi."""
         if self.objective.kind == "det":
@@ -519,12 +539,17 @@ class _Search:
         if not np.isfinite(best_phi):
             return best, best_phi
 
+        sharp = _SHARP[-1] / best_phi if self.objective.kind == "least" else 0.0
+
         def down(x: Array) -> tuple[float, Array]:
             at = self.low + x.reshape(shape) * self.span
             information = self.information(self.blocks(at))
             phi = float(self.phi(information))
             if not np.isfinite(phi) or self._late():
                 return 1e10, np.zeros_like(x)
+            if sharp:
+                value, metric = self.soft(information, sharp)
+                return -value / best_phi, -self.slopes(at, metric).ravel() / best_phi
             score, rate = self.score(phi)
             return -score, -rate * self.slopes(at, self.gradient(information)).ravel()
 
@@ -714,6 +739,9 @@ class _Search:
             if not np.isfinite(at):
                 break
             metric = self.gradient(information)
+            if self.objective.kind == "least":  # any W is a bound, a soft one is tight
+                metric = self.soft(information, _SHARP[-1] / at)[1]
+                at = float((metric * information).sum())
             off = float((metric * (self.problem.prior - information)).sum())
             if certain:
                 corners = np.array(np.meshgrid(*self.box)).reshape(len(self.box), -1).T
@@ -758,10 +786,21 @@ class _Search:
         """(S,) of sum 1, near the best for k commands at these blocks (S, q, p)."""
         grams = self.k * np.matrix_transpose(blocks) @ blocks
 
+        least = self.objective.kind == "least"
+        unit = 1.0
+        if least:
+            information = np.tensordot(weights, grams, 1) + self.problem.prior
+            unit = max(float(self.phi(information)), 1e-300)
+        sharp = _SHARP[0]
+
         def down(z: Array) -> tuple[float, Array]:
             e = np.exp(z - z.max())
             w = e / e.sum()
             information = np.tensordot(w, grams, 1) + self.problem.prior
+            if least:
+                value, metric = self.soft(information, sharp / unit)
+                slope = (grams * metric).sum(axis=(1, 2)) / unit
+                return -value / unit, -w * (slope - w @ slope)
             phi = float(self.phi(information))
             if not np.isfinite(phi):
                 return 1e10, np.zeros_like(z)
@@ -771,6 +810,9 @@ class _Search:
 
         start = np.log(np.maximum(weights, 1e-9))
         found = _descended(down, start, -np.inf, np.inf, 300)
+        for sharper in _SHARP[1:] if least else ():
+            sharp = sharper
+            found = _descended(down, found, -np.inf, np.inf, 300)
         e = np.exp(found - found.max())
         return np.asarray(e / e.sum())
 

@@ -119,6 +119,15 @@ def test_a_parabola_is_measured_as_a_grid_says(criterion):
         assert again.score([0, 1, 2, 3], criterion).value == pytest.approx(found.value)
 
 
+@pytest.mark.slow
+def test_the_bound_of_e_is_that_of_the_weighted_optimum():
+    """Of all quadratics on the square: a fifth of an eigenvalue for each command."""
+    model = Polynomial(2, 2)
+    found = jaxcal.optimise([[-1.0, 1.0]] * 2, 10, model, criterion="E", starts=3)
+    assert 2.0 - 1e-6 <= found.bound < 2.02 and found.value <= found.bound
+    assert found.value > 1.5
+
+
 def test_an_affine_map_is_measured_at_corners_and_that_is_proven():
     """Four of the cube's corners, of which no two share an edge: Hadamard's bound."""
     found = jaxcal.optimise([[0.0, 2.0], [-1.0, 1.0], [5.0, 7.0]], model=Affine(3, 1))

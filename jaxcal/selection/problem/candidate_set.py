@@ -110,8 +110,8 @@ class CandidateSet:
             cases += list(self.scenarios.parameters)
         for parameters in cases:
             rows = np.flatnonzero(self.available)
-            names = [str(i) if self.names is None else self.names[i] for i in rows]
-            kept = answered(self.model, self.candidates[rows], parameters, names)
+            asked = self.candidates[rows]
+            kept = answered(self.model, asked, parameters, rows, self.names)
             self.available[rows[~kept]] = False
 
     @classmethod
