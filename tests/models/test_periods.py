@@ -67,7 +67,7 @@ def test_everything_is_as_if_the_circle_were_cut_elsewhere(seed):
 
 
 def test_without_the_period_the_same_readings_do_not_fit():
-    _, u, y = readings(0.0, 0)
+    _, u, y = readings(0.0, 3)
     blind = FromFunction(seen, [1.0, 0.1, 0.1])
     try:
         fit = jaxcal.identify(u, y, model=blind, noise=NOISE)
