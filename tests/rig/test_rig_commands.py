@@ -169,6 +169,7 @@ def test_help_and_stop_load_no_heavy_module(tmp_path):
         )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_simulate_serves_a_session_in_another_process(tmp_path):
     """Two programs, as with real hardware: the simulator and the session."""
     from fault_matrix import _free_port

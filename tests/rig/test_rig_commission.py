@@ -158,7 +158,7 @@ def test_imu_pins_the_sender_and_tells_what_to_type(commissioned, capsys):
     [
         ("generic", True),
         ("applied_motion", True),
-        ("generic", False),
+        pytest.param("generic", False, marks=pytest.mark.slow),
         pytest.param("applied_motion", False, marks=pytest.mark.slow),
     ],
 )

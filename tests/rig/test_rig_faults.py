@@ -8,9 +8,7 @@ from harness import fast_config, session, simulator
 from rig.simulator import parse_fault
 
 QUICK = {  # cell: how its first session ends
-    ("lost_write_reply,count=1", "moving"): "ridden out",
     ("wrong_gearing", "start"): "refused",
-    ("lost_origin", "overnight"): "refused",
     ("imu_wrong_order", "zeroing"): "stopped",
     ("sigkill", "moving"): "killed",
 }

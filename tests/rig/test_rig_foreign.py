@@ -82,9 +82,28 @@ class Slave:
         for registers in self.registers.values():
             registers[0x10] = 0b1001  # enabled, done
         self.functions, self.moves, self.stops = set(), [], []
+        self.ways = {}  # of units that move: from, to, when, pulses a second
         threading.Thread(target=self._serve, daemon=True).start()
 
+    def advance(self, unit):
+        """Where it is by now, on a straight way at the speed that it was told."""
+        if unit not in self.ways:
+            return
+        begin, end, begun, speed = self.ways[unit]
+        gone = min(speed * (time.monotonic() - begun), abs(end - begin))
+        at = begin + round(gone if end > begin else -gone)
+        registers = self.registers[unit]
+        registers[0x12], registers[0x13] = struct.unpack(">HH", struct.pack(">i", at))
+        registers[0x10] = 0b1001 if at == end else 0b0101
+        if at == end:
+            del self.ways[unit]
+
+    def long(self, unit, address):
+        high, low = (self.registers[unit][address + i] for i in (0, 1))
+        return struct.unpack(">i", struct.pack(">HH", high, low))[0]
+
     def position(self, unit):
+        self.advance(unit)
         words = struct.pack(">HH", *(self.registers[unit][a] for a in (0x12, 0x13)))
         return struct.unpack(">i", words)[0] / PULSES_PER_DEG
 
@@ -117,6 +136,7 @@ class Slave:
         function, address = struct.unpack(">BH", pdu[:3])
         self.functions.add(function)
         registers = self.registers[unit]
+        self.advance(unit)
         if function == 3:
             (count,) = struct.unpack(">H", pdu[3:5])
             wanted = range(address, address + count)
@@ -132,10 +152,13 @@ class Slave:
             return bytes([0x80 | function, 1])
         for offset, word in enumerate(words):
             registers[address + offset] = word
-        if address == 0x28 and words[-1] == 1:  # go: there at once
-            registers[0x12], registers[0x13] = registers[0x20], registers[0x21]
-            self.moves.append((unit, self.position(unit)))
+        if address == 0x28 and words[-1] == 1:
+            way = self.long(unit, 0x12), self.long(unit, 0x20), time.monotonic()
+            self.ways[unit] = *way, self.long(unit, 0x22)
+            self.moves.append((unit, way[1] / PULSES_PER_DEG))
         if address == 0x28 and words[-1] == 2:
+            self.ways.pop(unit, None)
+            registers[0x10] = 0b1001
             self.stops.append(unit)
         return pdu[:5]
 

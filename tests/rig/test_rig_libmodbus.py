@@ -161,7 +161,7 @@ def test_every_family_enables_moves_and_stops(program, register_map, family):
         drive = ModbusDrive(bus, axis)
         if axis.map.enable:
             assert not drive.status().enabled
-            assert drive.bring(axis.map.enable, lambda s: s.enabled).enabled
+            assert drive.bring(drive.arm, lambda s: s.enabled).enabled
             assert slave.enabled == [2]
         start = drive.status()
         assert start.enabled and start.done and not start.moving and not start.fault

@@ -236,7 +236,7 @@ def test_stop_stops_all_drives(rig, browse):
     until(lambda: words(driver, "#head .now") == "Stopped on request")
     until(lambda: not shown(driver, "#stop"))
     told = words(driver, ".trouble")
-    assert "pitch (unit 1): acknowledged, at rest" in told
+    assert "pitch (unit 1): acknowledged, standing" in told
     assert "jaxcal-rig resume" in told
 
 

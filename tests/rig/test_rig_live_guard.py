@@ -258,6 +258,7 @@ def test_watch_shows_a_run_until_it_is_interrupted(tmp_path):
         assert watch.wait(30) == 0
 
 
+@pytest.mark.slow
 def test_a_page_without_a_viewer_ends(tmp_path):
     pytest.importorskip("nicegui")
     _journal(tmp_path, os.getpid()).close()

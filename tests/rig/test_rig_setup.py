@@ -65,7 +65,7 @@ def test_a_gearing_that_is_off_on_all_axes_and_that_no_register_tells_is_refused
     config = load_config_text(text)
     truth = Truth(noise_deg=0.005, drive_pulses_per_rev=(1000,) * 3)
     turned = []
-    with device(truth, config=config, speedup=20.0) as (sim, bus, port):
+    with device(truth, config=config, speedup=4.0) as (sim, bus, port):
         start = sim.plant.attitude()
         measure = sim.plant.attitude
 
