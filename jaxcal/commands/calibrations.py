@@ -49,8 +49,8 @@ def postures(
     ] = None,
     measured: Annotated[
         str | None,
-        "postures that were reached already: a table with columns named as the joints, "
-        "and the sensor's",
+        "table of postures that were measured already, with columns named as the "
+        "joints and as the sensor's",
         "FILE",
     ] = None,
     camera: Annotated[
@@ -88,9 +88,9 @@ def postures(
         several(float, "numbers"),
     ] = None,
     count: Annotated[int, "postures to choose from"] = 300,
-    seed: Annotated[int, "of these"] = 0,
+    seed: Annotated[int, "of the random draws of these postures"] = 0,
     picture: Annotated[
-        pathlib.Path | None, "draw the arm at each of them: .png, .pdf, .svg"
+        pathlib.Path | None, "draw the arm at each posture chosen: .png, .pdf, .svg"
     ] = None,
     output: Output,
 ) -> None:
@@ -177,8 +177,8 @@ def identify(
     of_arm: ArmOptions,
     noise: Annotated[Numbers, "std of a measurement, where it is known", "S"] = None,
     weights: Annotated[str | None, "column of relative weights", "W"] = None,
-    command_unit: Annotated[str, "stored with the result", "UNIT"] = "",
-    measured_unit: Annotated[str, "stored with the result", "UNIT"] = "",
+    command_unit: Annotated[str, "of the commands, stored and printed", "UNIT"] = "",
+    measured_unit: Annotated[str, "of the readings, stored and printed", "UNIT"] = "",
     out: Annotated[
         str,
         "save the calibration (.json), or of an arm the corrected file (.urdf)",
@@ -285,7 +285,9 @@ def check(
     file: TablePath,
     *,
     tolerance: Annotated[
-        float | None, "drift of the outputs that matters; three times the noise", "T"
+        float | None,
+        "drift of the outputs that matters; default three times the noise",
+        "T",
     ] = None,
     placed_anew: Annotated[
         bool, "of an arm: its sockets, planes or anchors stand elsewhere now"
@@ -293,7 +295,7 @@ def check(
     report: ReportFolder = "",
     json: Annotated[bool, "print JSON"] = False,
 ) -> int:
-    """Is a machine still as it was calibrated, by a few new readings.
+    """Whether a calibration still holds, by a few new readings.
 
     The table has the calibration's columns. Exit code 0: it holds; 1: it does not, or
     that cannot be told from these readings; 2: bad input.
@@ -330,7 +332,7 @@ def predict(
     file: Annotated[str, "commands: CSV, or -"],
     *,
     columns: Annotated[str | None, "columns of commands", "A,B"] = None,
-    std: Annotated[bool, "and the standard error of each output"] = False,
+    std: Annotated[bool, "add the standard error of each output"] = False,
     radians: Annotated[bool, "of an arm: joint columns are in radians"] = False,
     output: Output,
 ) -> None:
@@ -357,11 +359,11 @@ def command(
     columns: Annotated[str | None, "columns of desired outputs", "A,B"] = None,
     limits: Annotated[
         list[list[float]] | None,
-        "of every command, or once for each; inf where there is none",
+        "lowest and highest command; once for all inputs or for each; inf for none",
         "LOW,HIGH",
         several(float, "numbers"),
     ] = None,
-    clip: Annotated[bool, "move onto the limits"] = False,
+    clip: Annotated[bool, "move commands beyond the limits onto them"] = False,
     output: Output,
 ) -> None:
     """What to command to reach given outputs, the inverse map.

@@ -14,12 +14,18 @@ __all__ = ["loop"]
 def loop(
     task: Annotated[str, "a task's name, or a Python file that defines ENTRY"],
     *,
-    journal: Annotated[Path | None, "kept here; there already, it goes on"] = None,
+    journal: Annotated[
+        Path | None, "record of the session; a session that is in it goes on"
+    ] = None,
     socket: Annotated[Path | None, "answer on a local socket, not on a pipe"] = None,
     with_: Annotated[tuple[str, ...], "options of the task", "OPTION=VALUE"] = (),
-    seconds: Annotated[float | None, "budget; the task's", (0.0,)] = None,
-    uses: Annotated[int | None, "budget of what is countable; the task's", (1,)] = None,
-    seed: Annotated[int, "of random draws", "S", (0,)] = 0,
+    seconds: Annotated[
+        float | None, "time budget; the task's if not given", (0.0,)
+    ] = None,
+    uses: Annotated[
+        int | None, "budget of what the task counts; its own if not given", (1,)
+    ] = None,
+    seed: Annotated[int, "of the random draws", "S", (0,)] = 0,
 ) -> None:
     """Suggest measurements and take outcomes, as JSON in lines, for other programs.
 

@@ -21,12 +21,15 @@ _HERE = {  # command: one line of help, and the module with its flags and functi
     "select": ("choose the few rows of a table worth measuring", "questions"),
     "score": ("judge a choice made elsewhere", "questions"),
     "plan": ("how many measurements a wanted accuracy takes", "questions"),
-    "postures": ("where to put an arm to calibrate it, as a plan", "calibrations"),
+    "postures": ("the postures of an arm to measure, in order", "calibrations"),
     "identify": (
         "fit y = A u + b, or a model, to measurements and save the calibration",
         "calibrations",
     ),
-    "check": ("is a machine still as calibrated, by new readings", "calibrations"),
+    "check": (
+        "whether a calibration still holds, by a few new readings",
+        "calibrations",
+    ),
     "predict": ("where a calibrated machine goes for given commands", "calibrations"),
     "command": ("what to command to reach given outputs", "calibrations"),
     "loop": ("measure in a closed loop that another program drives", "loops"),

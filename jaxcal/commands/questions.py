@@ -28,12 +28,18 @@ Rows = Annotated[list[int] | None, several(int, "whole numbers")]
 class DesignOptions:
     """The problem that a table of candidates and these options describe."""
 
-    columns: Annotated[str | None, "of commands; u_..., else all of numbers", "A,B"] = (
-        None
-    )
+    columns: Annotated[
+        str | None,
+        "columns of commands; u_... where there are any, else all numbers",
+        "A,B",
+    ] = None
     model: ModelPath = None
-    outputs: Annotated[int | None, "of y = A u + b; as many as commands", "M"] = None
-    noise: Annotated[Numbers, "std of a measurement; or one per output", "S"] = None
+    outputs: Annotated[
+        int | None, "number of outputs of y = A u + b; as many as commands", "M"
+    ] = None
+    noise: Annotated[
+        Numbers, "standard deviation of a measurement, or one for each output", "S"
+    ] = None
     replicates: Annotated[int, "how often one row may be measured", "R"] = 1
     required: Annotated[Rows, "rows, counted from 0, that must be chosen", "I,J"] = None
     scenarios: Annotated[
@@ -74,8 +80,12 @@ class DesignOptions:
 class CriterionOptions:
     """By which criterion."""
 
-    criterion: Annotated[str | None, "D of affine models, else I", [*CRITERIA]] = None
-    parameters: Annotated[Names, "of Ds and As: those of interest", "A,B"] = None
+    criterion: Annotated[
+        str | None, "default D for affine models, else I", [*CRITERIA]
+    ] = None
+    parameters: Annotated[
+        Names, "with Ds and As: the parameters of interest", "A,B"
+    ] = None
     worst: Annotated[bool, "with --scenarios: the worst counts, not the mean"] = False
 
     def by(self) -> Any:
@@ -96,18 +106,22 @@ class CriterionOptions:
 class MethodOptions:
     """Options of the methods of ``select``."""
 
-    seed: Annotated[int | None, "for methods that draw at random; 0", "S"] = None
+    seed: Annotated[int | None, "of methods that draw at random; default 0", "S"] = None
     restarts: Annotated[int | None, "random starts of the exchange"] = None
-    time_limit: Annotated[float | None, "for auto and exact; 10", "SECONDS"] = None
+    time_limit: Annotated[
+        float | None, "that auto and exact may take; default 10", "SECONDS"
+    ] = None
     best: Annotated[int | None, "with exact: prove the B best choices", "B"] = None
     least_efficiency: Annotated[
-        float | None, "auto stops when this efficiency is proven; 0.999"
+        float | None, "auto stops once this efficiency is proven; default 0.999"
     ] = None
     checkpoint: Annotated[str | None, "a trained policy", "DIR"] = None
-    decoding: Annotated[str | None, "for policy: greedy, first, samples, exchange"] = (
-        None
-    )
-    num: Annotated[int | None, "tries with first and samples; 16"] = None
+    decoding: Annotated[
+        str | None, "with method policy: greedy, first, samples, exchange"
+    ] = None
+    num: Annotated[
+        int | None, "tries of the decodings first and samples; default 16"
+    ] = None
 
 
 def select(
@@ -115,7 +129,11 @@ def select(
     of_design: DesignOptions,
     of_arm: ArmOptions,
     *,
-    k: Annotated[int | None, "rows to choose", "K"] = None,
+    k: Annotated[
+        int | None,
+        "rows to choose; the fewest that identify the model if not given",
+        "K",
+    ] = None,
     method: Annotated[
         str,
         "auto (the cheapest proof), exact, exchange, greedy, random, policy",
@@ -160,9 +178,12 @@ def score(
     indices: Annotated[Rows, "rows, counted from 0", "I,J"] = None,
     subset: Annotated[str | None, "table that select --csv wrote", "FILE"] = None,
     reference: Annotated[
-        Literal["bound", "exact"], "bound or proven optimum"
+        Literal["bound", "exact"],
+        "what it is compared with: a bound, or the proven optimum",
     ] = "bound",
-    time_limit: Annotated[float | None, "of exact", "SECONDS"] = None,
+    time_limit: Annotated[
+        float | None, "that the search for the optimum may take", "SECONDS"
+    ] = None,
     output: Output,
 ) -> None:
     """Judge a choice made elsewhere."""
@@ -196,10 +217,10 @@ def plan(
     ],
     criterion: Annotated[
         Literal["G", "I"],
-        "of the candidates G: the largest standard error; I: the mean",
+        "G: the largest standard error over the candidates; I: the mean",
     ] = "G",
-    max_k: Annotated[int | None, "most measurements", "K"] = None,
-    more: Annotated[int, "rows beyond the answer"] = 0,
+    max_k: Annotated[int | None, "largest number of measurements tried", "K"] = None,
+    more: Annotated[int, "rows of the table beyond the answer"] = 0,
     output: Output,
 ) -> None:
     """How many measurements a wanted accuracy takes."""

@@ -31,7 +31,9 @@ class Output:
 
     json: Annotated[bool, "print JSON"] = False
     csv: Annotated[bool, "print CSV"] = False
-    out: Annotated[str, "write to FILE (.csv or .json) instead", "FILE"] = ""
+    out: Annotated[str, "write to FILE (.csv or .json) instead of printing", "FILE"] = (
+        ""
+    )
 
     def written(
         self, names: Sequence[str], rows: Sequence[Sequence[Any]], document: Any = None
