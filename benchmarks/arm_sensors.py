@@ -1,4 +1,4 @@
-"""Is each sensor's calibration of an arm as uncertain as it says? Six tables more.
+"""Is each sensor's calibration of an arm as uncertain as it says? Seven tables more.
 
     python -m benchmarks.arm_sensors [draws] [NAMES OF TABLES]
 
@@ -9,14 +9,15 @@ elsewhere of a fit with the right tolerances over that with sizes from the readi
 and over that of ``identify`` as it comes, with harmonics.
 ``misfit``: positions of arms that no table explains (cables, eccentric gears): the
 error elsewhere with and without harmonics of the joints. ``trial``: the simulated ones
-fitted as a real one was. ``checks``: what a few chosen postures and random ones can
-tell of a drift. ``contacts``: of real arms, trained on one place and judged at the
-others: 12 and 16 contacts that are random or chosen, and all; likewise with stiff
-joints, stated tolerances and noise (of the choice and the fit); and what is expected of
-those chosen, and at best (chosen for the very postures they are judged at), of a model
-without any error, with the noise and sizes that all contacts of the place show; then
-trained on two places and on three. ``distances``: how far apart sockets of other places
-are found, which were printed 50 mm (0.1) apart.
+fitted as a real one was. ``chance``: of a linear WAM whose misfit and sizes the choice
+knows exactly, how many random choices are better on one arm. ``checks``: what a few
+chosen postures and random ones can tell of a drift. ``contacts``: of real arms, trained
+on one place and judged at the others: 12 and 16 contacts that are random or chosen, and
+all; likewise with stiff joints, stated tolerances and noise (of the choice and the
+fit); and what is expected of those chosen, and at best (chosen for the very postures
+they are judged at), of a model without any error, with the noise and sizes that all
+contacts of the place show; then trained on two places and on three. ``distances``: how
+far apart sockets of other places are found, which were printed 50 mm (0.1) apart.
 """
 
 from __future__ import annotations
@@ -311,6 +312,75 @@ def _errors(
     return result
 
 
+def chance(draws: int) -> None:
+    """What the best choice gains on a WAM that is as the choice believes, linear.
+
+    Expected errors at 250 other poses; on one arm, how many random choices come out
+    better; how many random poses are as good, expected.
+    """
+    print(
+        "| poses | misfit | K | expected, of random | random better | as many random |"
+    )
+    print("| --- | --- | --- | --- | --- | --- |")
+    for paths, size in ((True, 0.3), (True, 2.0), (False, 0.3), (False, 2.0)):
+        for count in (8, 20, 40):
+            found = [_by_chance(paths, size, count, draw) for draw in range(draws)]
+            ratio, better, same = np.mean(found, axis=0)
+            print(
+                f"| {'along paths' if paths else 'anywhere'} | {size:g} mm | {count} | "
+                f"{ratio:.2f} | {better:.0%} | {same:.0f} |",
+                flush=True,
+            )
+
+
+def _by_chance(
+    paths: bool, size: float, count: int, draw: int
+) -> tuple[float, float, float]:
+    """Expected error over that of random ones, share of these that are better, K."""
+    model = table_of(7)
+    joints, _ = cable_driven(7, draw, paths=paths)
+    std = np.array(model.default_prior().std, dtype=np.float64)
+    std[: model.table.size] *= 0.7
+    std[model.table.size :] *= 0.1
+    angles = np.radians(joints)
+    turns = np.hstack([angles, 2.0 * angles])
+    waves = size * np.hstack([np.sin(turns), np.cos(turns)]) / np.sqrt(14.0)
+    smooth = np.einsum("nk,ab->nakb", waves, np.eye(3)).reshape(len(joints), 3, -1)
+    slopes = np.concatenate([model.jacobian(joints) * std, smooth], axis=-1)
+    noise, p = np.hypot(size, 0.1), slopes.shape[-1]
+    blocks, region = slopes[:150] / noise, slopes[150:]
+    design = jaxcal.Design.from_blocks(blocks, prior=np.eye(p))
+    best = design.select(count, jaxcal.I(region), "exchange").indices
+    rng = np.random.default_rng(draw)
+
+    def spread(rows: Array) -> tuple[Array, float]:
+        gram = np.eye(p) + np.einsum("nqi,nqj->ij", blocks[rows], blocks[rows])
+        covariance = np.linalg.inv(gram)
+        variance = np.einsum("nqi,ij,nqj->n", region, covariance, region)
+        return covariance, float(np.sqrt(variance + 3.0 * noise**2).mean())
+
+    def by_random(k: int) -> float:
+        return float(np.mean([spread(rng.permutation(150)[:k])[1] for _ in range(20)]))
+
+    sets = [best, *(rng.permutation(150)[:count] for _ in range(20))]
+    spreads = [spread(rows) for rows in sets]
+    shares = []
+    for _ in range(20):  # arms
+        truth = rng.normal(size=p)
+        read = slopes @ truth + noise * rng.normal(size=(len(joints), 3))
+        errors = []
+        for rows, (covariance, _) in zip(sets, spreads, strict=True):
+            found = covariance @ (blocks[rows].reshape(-1, p).T @ read[rows].ravel())
+            off = region @ found / noise - read[150:]
+            errors.append(np.linalg.norm(off, axis=1).mean())
+        shares.append(np.mean(np.array(errors[1:]) < errors[0]))
+    aim, same = spreads[0][1], count
+    while same < 150 and by_random(same) > aim:
+        same += max(1, count // 10)
+    ratio = aim / np.mean([each[1] for each in spreads[1:]])
+    return float(ratio), float(np.mean(shares)), float(same)
+
+
 def checks(draws: int) -> None:
     """Power against a drift by 0.15 mm, and parameters whose drift could hide."""
     model = table_of(6)
@@ -504,7 +574,7 @@ def distances(_: int) -> None:
 
 TABLES = {
     each.__name__: each
-    for each in (intervals, sizes, misfit, trial, checks, contacts, distances)
+    for each in (intervals, sizes, misfit, trial, chance, checks, contacts, distances)
 }
 
 if __name__ == "__main__":

@@ -27,7 +27,8 @@ def needs(extra: str, purpose: str) -> Iterator[None]:
     """Imports inside the block belong to an extra of jaxcal.
 
     Args:
-        extra: "gym", "live", "models", "plots", "policy", "rig", "ros" or "study".
+        extra: "gym", "lerobot", "live", "models", "plots", "policy", "rig", "ros" or
+            "study".
         purpose: what needs it, as the subject of a sentence: ``'method="policy"'``.
 
     Raises:

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import os
 import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from jaxcal.calibration.inverse import command_for
 from jaxcal.calibration.report import report
 from jaxcal.checks import aligned, in_words
 from jaxcal.models.model import Model
-from jaxcal.models.uncertainty import Noise
+from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.models.verdict import Verdict
 
 __all__ = ["Calibration"]
@@ -136,6 +137,63 @@ class Calibration(Fit):
         """Universal Robots' kinematics file, likewise."""
         self.model.write("ur", path, self._for_file(), force=force)
 
+    def to_lerobot(
+        self,
+        path: str | os.PathLike[str],
+        servos: str | os.PathLike[str],
+        *,
+        names: Mapping[str, str] | None = None,
+        force: bool = False,
+    ) -> dict[str, int]:
+        """LeRobot's calibration file of a servo arm with the zeros that were found.
+
+        The readings are fitted again by what such a file holds, zeros of the joints;
+        a warning says how far off the arm is then. See ``jaxcal.models.Servos``. A
+        corrected URDF file besides would have the zeros twice.
+
+        Args:
+            path: the file to write.
+            servos: the file that the postures were read with.
+            names: of motors that are not named as the joints: {"Rotation":
+                "shoulder_pan"}.
+            force: write over a file that is there.
+
+        Returns:
+            Steps by which the middle of each motor's range moved.
+        """
+        plain: Any = self.model.writable()
+        zeros = [name for name in plain.names if name.startswith("theta")]
+        own = (*zeros, *plain.sensor.names, *(n for n in plain.names if "tool" in n))
+        prior = plain.default_prior()
+        held = tuple(name for name in plain.names if name not in own)
+        fixed = tuple(dict.fromkeys((*prior.fixed, *held)))
+        again = self._again(plain, dataclasses.replace(prior, fixed=fixed))
+        steps: dict[str, int] = plain.write_servos(
+            path, again.parameters, servos, names or {}, force=force
+        )
+        if again.noise_std is not None:
+            told: Any = again.verdict
+            warnings.warn(
+                "the file holds zeros of the joints alone: held-out error "
+                f"{told.held_out:.3g}, nominal {told.nominal:.3g}",
+                stacklevel=2,
+            )
+        return steps
+
+    def _again(self, model: Any, prior: Prior) -> Calibration:
+        """The same readings, fitted by another model of the machine."""
+        fields = fit_model(
+            self.commands,
+            self.residuals + self.predict(self.commands),
+            (self.loss_weights > 0.0).astype(np.float64),
+            model=model,
+            prior=prior,
+            noise=Noise(std=self.noise_std) if self.noise_known else None,
+            loss=self.loss,
+            common_noise=None,
+        )
+        return dataclasses.replace(self, **fields)
+
     def _for_file(self) -> Array:
         """(p,) for a file: fitted without what no file holds, which is zero."""
         plain, parameters = self.model.writable(), np.array(self.parameters)
@@ -165,17 +223,7 @@ class Calibration(Fit):
 
     def _without_harmonics(self, plain: Model) -> Array:
         """(p,) fitted again for the ``plain`` model, with a warning how far off."""
-        fields = fit_model(
-            self.commands,
-            self.residuals + self.predict(self.commands),
-            (self.loss_weights > 0.0).astype(np.float64),
-            model=plain,
-            prior=plain.default_prior(),
-            noise=Noise(std=self.noise_std) if self.noise_known else None,
-            loss=self.loss,
-            common_noise=None,
-        )
-        again = dataclasses.replace(self, **fields)
+        again = self._again(plain, plain.default_prior())
         moved = self.predict(self.commands) - again.predict(self.commands)
         unit = f" {self.measured_unit}" if self.measured_unit else ""
         told = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.calibration.fit import Fit
 from jaxcal.checks import array_of, numbers, table, whole_number
 from jaxcal.information.blocks import without
+from jaxcal.models.model import recorded
+from jaxcal.models.recording import Recording
 
 __all__ = ["Check", "check", "verification"]
 
@@ -78,8 +81,8 @@ class Check:
 
 def check(
     calibration: Fit,
-    commands: ArrayLike,
-    measured: ArrayLike,
+    commands: ArrayLike | Recording | str | os.PathLike[str],
+    measured: ArrayLike | None = None,
     *,
     tolerance: float | None = None,
     placed_anew: bool = False,
@@ -91,8 +94,9 @@ def check(
 
     Args:
         calibration: what is checked.
-        commands: (N, n).
-        measured: (N, m) readings there.
+        commands: (N, n), or of an arm a ``Recording`` or its path.
+        measured: (N, m) readings there; contacts need none, nor does a recording that
+            has them.
         tolerance: how far, root mean square over the calibration's commands, the
             outputs may drift, in the unit of the first (an output of another noise
             counts in noise). When not given three times the standard deviation of these
@@ -106,7 +110,8 @@ def check(
     """
     from scipy import special
 
-    commands, measured = _distinct(calibration, commands, measured)
+    given, measured, _ = recorded(calibration.model, commands, measured)
+    commands, measured = _distinct(calibration, given, measured)
     noise = calibration.require_noise("check")
     predicted = calibration.predict(commands)
     off = calibration.model.wrapped(measured - predicted, commands)

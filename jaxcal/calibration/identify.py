@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import hashlib
 import json
+import os
 import platform
 import sys
 import warnings
@@ -27,7 +28,8 @@ from jaxcal.checks import (
 from jaxcal.csvtable import names_of
 from jaxcal.information.singular import require_excited
 from jaxcal.models.affine import Affine
-from jaxcal.models.model import Model, by_name
+from jaxcal.models.model import Model, by_name, recorded
+from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["identify"]
@@ -36,8 +38,8 @@ Array = NDArray[np.float64]
 
 
 def identify(
-    commands: ArrayLike,
-    measured: ArrayLike,
+    commands: ArrayLike | Recording | str | os.PathLike[str],
+    measured: ArrayLike | None = None,
     *,
     model: Model | None = None,
     prior: Prior | None = None,
@@ -61,8 +63,10 @@ def identify(
     unexcited.
 
     Args:
-        commands: (N, n) what the device was told, in any unit.
-        measured: (N, m) what it reached, in any unit.
+        commands: (N, n) what the device was told, in any unit; of an arm also a
+            ``Recording``, or the path of one: a bag, a LeRobot dataset.
+        measured: (N, m) what it reached, in any unit. Contacts need none, nor does a
+            recording that has the readings.
         model: of ``jaxcal.models``, or any object with its methods; affine when not
             given.
         prior: what is known beforehand; ``model.default_prior()`` when not given.
@@ -99,10 +103,13 @@ def identify(
         ValueError: naming the argument, the rule and the value; for commands that leave
             a direction unexcited, naming that direction.
     """
-    commands = by_name(model, commands)
-    input_names = input_names or names_of(commands) or None
+    given, measured, known = recorded(model, commands, measured)
+    if known:
+        input_names = input_names or getattr(model, "inputs", ()) or None
+    given = by_name(model, given)
+    input_names = input_names or names_of(given) or None
     output_names = output_names or names_of(measured) or None
-    commands = table("commands", commands)
+    commands = table("commands", given)
     rule = ": as many rows as commands"
     measured = table("measured", measured)
     measured = array_of("measured", measured, len(commands), "m", rule=rule)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import json
+import os
 import pathlib
 import sys
 from collections.abc import Sequence
@@ -15,12 +16,12 @@ from numpy.typing import NDArray
 
 from jaxcal.arguments import several
 from jaxcal.csvtable import COMMANDS, Table
-from jaxcal.models import Model, SerialChain, from_dict
+from jaxcal.models import Model, Recording, SerialChain, from_dict
 from jaxcal.models.linear import input_letters
 from jaxcal.models.model import as_model
 from jaxcal.models.sensors import SENSORS, Landmarks, Socket
 
-__all__ = ["ArmOptions", "ModelPath", "in_degrees"]
+__all__ = ["ArmOptions", "ModelPath", "RecordingOptions", "in_degrees"]
 
 Array = NDArray[np.float64]
 
@@ -103,6 +104,18 @@ class ArmOptions:
             limits=dict(self.limits or ()),
         )
 
+    def of_recording(self, path: str | None, which: Sequence[int] | None) -> Any:
+        """The arm of a recording whose rests are of ``which`` sockets."""
+        if not (path or "").lower().endswith(".urdf"):
+            return None
+        if self.radians:
+            raise ValueError("--radians is of tables, recordings say their unit")
+        if which is None:
+            return self.read(str(path), None)
+        column = np.array(which, dtype=np.float64)[:, None]
+        lines = tuple(range(1, 1 + len(column)))
+        return self.read(str(path), Table("", (self.sensor,), column, {}, lines))
+
     def machine(self, path: str | None, table: Table | None) -> Model | None:
         """The model in a file, an arm or another; None without one.
 
@@ -157,6 +170,60 @@ class ArmOptions:
         """(N, n) the columns of the commands, an arm's joints in degrees."""
         commands = table.columns(columns, used)
         return in_degrees(model, commands) if self.radians else commands
+
+
+def _counted(text: str) -> list[int]:
+    """Whole numbers separated by commas, "1x12" for twelve of them."""
+    numbers: list[int] = []
+    for part in text.split(","):
+        number, _, times = part.strip().partition("x")
+        numbers += [int(number)] * int(times or 1)
+    return numbers
+
+
+@dataclasses.dataclass
+class RecordingOptions:
+    """Of a bag or a LeRobot dataset in the place of a table."""
+
+    which: Annotated[
+        list[int] | None,
+        "of a recording, the socket, plane or wire of each rest: 0,0,1 or 0x12,1x12",
+        _counted,
+    ] = None
+    topic: Annotated[str, "of a recording, the topic of the sensor's readings"] = ""
+    servos: Annotated[
+        str | None,
+        "of a LeRobot dataset in -100 to 100, the arm's calibration file",
+        "FILE",
+    ] = None
+
+    def table(self, path: str, arm: Any) -> Table | None:
+        """The rests of a recording as a table, degrees; None where it is a table.
+
+        Args:
+            path: of a table or a recording.
+            arm: gives the arm of the recording; called with its ``which``.
+        """
+        recording = os.path.isdir(path) or path.lower().endswith((".mcap", ".db3"))
+        if not recording:
+            if self.which is not None or self.topic:
+                raise ValueError("--which and --topic are of a recording, not a table")
+            return None
+        model = arm(self.which)
+        if not isinstance(model, SerialChain):
+            raise ValueError(f"{path}: a recording needs an arm, --model FILE.urdf")
+        commands, read = model.recorded(
+            Recording(path, self.which, servos=self.servos, topic=self.topic)
+        )
+        names = (*model.joint_names, *model.sensor.inputs)
+        if read is None:
+            raise ValueError(
+                f"{path} has no readings of a {model.sensor.kind}: give the postures "
+                "that it rests at as a table with what was read"
+            )
+        values = np.hstack([commands, read])
+        lines = tuple(range(1, len(values) + 1))
+        return Table(path, (*names, *model.sensor.outputs), values, {}, lines)
 
 
 def in_degrees(arm: SerialChain, commands: Array) -> Array:

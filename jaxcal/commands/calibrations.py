@@ -15,11 +15,15 @@ from jaxcal.arguments import several
 from jaxcal.calibration import Calibration, Source
 from jaxcal.calibration import identify as identified
 from jaxcal.checks import aligned
-from jaxcal.commands.arms import ArmOptions, ModelPath, in_degrees
+from jaxcal.commands.arms import (
+    ArmOptions,
+    ModelPath,
+    RecordingOptions,
+    in_degrees,
+)
 from jaxcal.commands.questions import Numbers
 from jaxcal.commands.tables import (
     Output,
-    TablePath,
     write_json,
     write_rows,
 )
@@ -33,6 +37,9 @@ __all__ = ["check", "command", "identify", "postures", "predict"]
 
 Array = NDArray[np.float64]
 
+RecordPath = Annotated[
+    str, "CSV, or - (standard input); of an arm also a bag or a LeRobot dataset"
+]
 _LENGTHS = ("position", "socket", "plane", "distance")  # sensors that read lengths
 
 
@@ -169,12 +176,13 @@ CertificateSize = Annotated[
 
 
 def identify(
-    file: TablePath,
+    file: RecordPath,
     *,
     inputs: Annotated[str | None, "columns of commands", "A,B"] = None,
     outputs: Annotated[str | None, "columns of measurements", "C,D"] = None,
     model: ModelPath = None,
     of_arm: ArmOptions,
+    recording: RecordingOptions,
     noise: Annotated[Numbers, "std of a measurement, where it is known", "S"] = None,
     weights: Annotated[str | None, "column of relative weights", "W"] = None,
     command_unit: Annotated[str, "of the commands, stored and printed", "UNIT"] = "",
@@ -188,8 +196,13 @@ def identify(
         float | None,
         "of an arm, the held-out error that is enough, in the measured unit",
     ] = None,
-    overwrite: Annotated[bool, "write the .urdf over a file that is there"] = False,
+    overwrite: Annotated[bool, "write over an .urdf or servos file that is there"] = (
+        False
+    ),
     unproven: Annotated[bool, "write the .urdf of a fit that is not good"] = False,
+    servos_out: Annotated[
+        str, "write LeRobot's calibration, of --servos, with the zeros found", "FILE"
+    ] = "",
     report: ReportFolder = "",
     against: Earlier = None,
     certificate: CertificateSize = None,
@@ -204,9 +217,19 @@ def identify(
 
     Columns that begin with u_ are commands, those with y_ what was measured; --inputs
     and --outputs name others. Of an arm in a URDF file the commands are the columns
-    named as its joints, in any order, and what its sensor asks for.
+    named as its joints, in any order, and what its sensor asks for; a bag or a LeRobot
+    dataset does in the place of the table, with the postures at which the arm rested.
     """
-    table, as_urdf = read_table(file), out.lower().endswith(".urdf")
+    as_urdf = out.lower().endswith(".urdf")
+    table = recording.table(file, lambda which: of_arm.of_recording(model, which))
+    table = read_table(file) if table is None else table
+    if servos_out and as_urdf:
+        raise ValueError(
+            "one of --servos-out and --out FILE.urdf must be left out: either corrects "
+            "the zeros, both would twice"
+        )
+    if servos_out and not recording.servos:
+        raise ValueError("--servos-out needs --servos, the file that it corrects")
     machine: Any = of_arm.machine(model, table)
     if (model or "").lower().endswith(".urdf"):
         names = of_arm.columns(machine, table, inputs, "--inputs")
@@ -244,15 +267,22 @@ def identify(
         measured_unit=measured_unit,
         accuracy=accuracy,
     )
-    told, saved = calibration.verdict, f"saved {out}"
-    if as_urdf and not told.good and not unproven:
+    told, saved = calibration.verdict, [f"saved {out}"] if out else []
+    if (as_urdf or servos_out) and not told.good and not unproven:
         raise ValueError(
-            f"{out} is not written, --unproven writes it all the same:\n{told}"
+            f"{out if as_urdf else servos_out} is not written, --unproven writes it "
+            f"all the same:\n{told}"
         )
     if as_urdf:
-        saved += f", tip link {calibration.to_urdf(out, force=overwrite)}"
+        saved = [f"saved {out}, tip link {calibration.to_urdf(out, force=overwrite)}"]
     elif out:
         calibration.save(out)
+    if servos_out:
+        steps = calibration.to_lerobot(
+            servos_out, str(recording.servos), force=overwrite
+        )
+        moved = ", ".join(f"{name} {step:+d}" for name, step in steps.items())
+        saved.append(f"saved {servos_out}, steps: {moved}")
     good = True
     if report:
         good = calibration.report(
@@ -269,9 +299,7 @@ def identify(
     if json:
         write_json("", calibration.to_dict())
         return int(not good)
-    print(calibration.summary())
-    if out:
-        print(saved)
+    print("\n".join([calibration.summary(), *saved]))
     if report:
         print(f"report {os.path.join(report, 'index.html')}")
     return int(not good)
@@ -282,8 +310,9 @@ CalibrationPath = Annotated[str, "made by identify", "calibration.json"]
 
 def check(
     calibration: CalibrationPath,
-    file: TablePath,
+    file: RecordPath,
     *,
+    recording: RecordingOptions,
     tolerance: Annotated[
         float | None,
         "drift of the outputs that matters; default three times the noise",
@@ -297,10 +326,12 @@ def check(
 ) -> int:
     """Whether a calibration still holds, by a few new readings.
 
-    The table has the calibration's columns. Exit code 0: it holds; 1: it does not, or
-    that cannot be told from these readings; 2: bad input.
+    The table has the calibration's columns; of an arm a recording does. Exit code 0:
+    it holds; 1: it does not, or that cannot be told from these readings; 2: bad input.
     """
-    calibrated, table = Calibration.load(calibration), read_table(file)
+    calibrated = Calibration.load(calibration)
+    table = recording.table(file, lambda which: calibrated.model)
+    table = read_table(file) if table is None else table
     inputs, commands = _commands_for(calibrated, table, option="")
     unit = calibrated.measured_unit
     outputs = table.named(calibrated.output_names, MEASURED, option="", unit=unit)

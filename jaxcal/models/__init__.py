@@ -8,6 +8,7 @@ from jaxcal.models.function import FromFunction
 from jaxcal.models.identifiability import Direction, Identifiability, identifiability
 from jaxcal.models.linear import Linear, Polynomial
 from jaxcal.models.model import Model
+from jaxcal.models.recording import Recording
 from jaxcal.models.sensors import (
     Board,
     Distance,
@@ -22,7 +23,7 @@ from jaxcal.models.sensors import (
     Tip,
     Wrench,
 )
-from jaxcal.models.serial import SerialChain
+from jaxcal.models.serial import SerialChain, Servos
 from jaxcal.models.uncertainty import Noise, Prior, ResolvedPrior
 
 __all__ = [
@@ -44,9 +45,11 @@ __all__ = [
     "Position",
     "Prior",
     "Reading",
+    "Recording",
     "ResolvedPrior",
     "Sensor",
     "SerialChain",
+    "Servos",
     "Several",
     "Socket",
     "Tip",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import abc
 import functools
+import os
 import warnings
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,6 +21,7 @@ from jaxcal.checks import array_of, in_words
 from jaxcal.csvtable import COMMANDS, of_frame
 from jaxcal.information.singular import flat
 from jaxcal.models.periods import within_half
+from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.models.verdict import Verdict, verdict
 
@@ -33,6 +35,7 @@ __all__ = [
     "by_name",
     "derivative",
     "predict",
+    "recorded",
     "without_effect",
 ]
 
@@ -215,6 +218,10 @@ class Model(abc.ABC):
         """Refuse commands (N, n) that the machine cannot take, naming one."""
         return
 
+    def recorded(self, recording: Recording) -> tuple[Array, Array | None]:
+        """Commands (N, n) of a recording, and readings (N, q) if it has them."""
+        raise self._no_arm()
+
     def distinct(self, commands: Array, measured: Array) -> Rows:
         """(K,) the rows that count; the same contact written twice counts once."""
         return np.arange(len(commands))
@@ -391,6 +398,31 @@ def by_name(model: Any, commands: Any) -> Any:
     """The model's columns of a data frame, in its order; else as given."""
     inputs = getattr(model, "inputs", ())
     return of_frame("commands", commands, inputs, COMMANDS) if inputs else commands
+
+
+def recorded(model: Any, commands: Any, measured: Any) -> tuple[Any, Any, bool]:
+    """Commands and readings as given, or those of a ``Recording`` or of its path.
+
+    Returns:
+        Commands, readings, and whether the commands were recorded. Readings that are
+        given beside a recording count, and contacts need none.
+
+    Raises:
+        ValueError: there are no readings, or no such recording.
+    """
+    known = isinstance(commands, Recording)
+    if isinstance(commands, str | os.PathLike):
+        commands, known = Recording(commands), True
+    if known:
+        if model is None:
+            raise ValueError("model must be an arm where commands are a recording")
+        commands, read = as_model(model).recorded(commands)
+        measured = read if measured is None else measured
+    elif measured is None and getattr(getattr(model, "sensor", None), "zeros", False):
+        measured = np.zeros((len(commands), model.num_outputs))
+    if measured is None:
+        raise ValueError("measured must be given: what was read at each of commands")
+    return commands, measured, known
 
 
 def predict(

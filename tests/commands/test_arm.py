@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
 from jaxcal.commands.main import main
-from jaxcal.models import Position, SerialChain, Socket
+from jaxcal.models import Board, Position, SerialChain, Servos, Socket, Wrench
 from jaxcal.selection import select
 
 from ..models.arms import contacts_of_a_panda
+from ..models.test_recordings import write_bag
 
 
 @pytest.fixture
@@ -159,3 +162,113 @@ def test_postures_are_planned_and_the_rest_chosen_again(files, capsys):
     assert "which look like radians" in capsys.readouterr().err
     assert main([*given, *near, "--near=.4,.2", "-k", "7"]) == 2
     assert "--near must be 3 numbers for --sensor socket" in capsys.readouterr().err
+
+
+def _planned(files, sensor, *flags):
+    """Rows that the shell plans, and the arm of its file."""
+    out = files[2] / "plan.csv"
+    given = ["postures", str(files[0]), "--tip", "ball_link", "--sensor", sensor.kind,
+             "--count", "12", "-k", "4", "--out", str(out)]  # fmt: skip
+    assert main([*given, *flags]) == 0
+    rows = np.loadtxt(out, delimiter=",", skiprows=1)
+    return rows, SerialChain.from_urdf(files[0], tip="ball_link", sensor=sensor)
+
+
+def _among(rows, offered):
+    apart = np.abs(rows[:, None] - offered).max(axis=-1)
+    return apart.min(axis=1).max() < 1e-9
+
+
+def test_a_table_and_its_sockets_bound_what_is_planned(files, capsys):
+    """On the tips and joints themselves: none below, none near the box, from above."""
+    touching = Socket(1, [[0.45, 0.1, 0.2]])
+    flags = ["--near=.45,.1,.2", "--floor", "0.05", "--approach=0,0,-1,40"]
+    flags += ["--clear=-1,.3,0,1,.6,1"]
+    rows, arm = _planned(files, touching, *flags)
+    points = arm.skeleton(rows)
+    assert points[:, 2:, 2].min() >= 0.05 - 1e-9
+    inside = (points > [-1, 0.3, 0]) & (points < [1, 0.6, 1])
+    assert not inside.all(axis=-1).any()
+    comes = points[:, -1] - points[:, -2]
+    down = -comes[:, 2] / np.linalg.norm(comes, axis=1)
+    assert (down >= np.cos(np.radians(40.0)) - 1e-9).all()
+    box = [[-1.0, 0.3, 0.0, 1.0, 0.6, 1.0]]
+    options = {"floor": 0.05, "approach": [0, 0, -1, 40], "clear": box}
+    assert _among(rows, arm.postures(12, **options))
+    assert not _among(rows, arm.postures(12))
+
+
+def test_a_camera_bounds_what_is_planned(files, capsys):
+    place = np.array([[1, 0, 0, 0.4], [0, 1, 0, -0.1], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    board = Board("camera", place, extent=(0.2, 0.15))
+    arm = SerialChain.from_urdf(files[0], tip="ball_link", sensor=board)
+    views = arm.postures(3, seed=1)[:, :7]
+    seen = arm.predict(np.hstack([views, np.zeros((3, 6))]))
+    header = ",".join([*arm.joint_names, *arm.sensor.inputs])
+    np.savetxt(files[2] / "views.csv", np.hstack([views, seen]), delimiter=",",
+               header=header, comments="")  # fmt: skip
+    flags = ["--board", "0.2,0.15", "--camera", "640,480,600,600,320,240", "--tilt"]
+    flags += ["30", "--away", "0.35,0.7", "--side", "+z"]
+    measured = ["--measured", str(files[2] / "views.csv"), "-k", "7"]
+    rows, _ = _planned(files, board, *flags, *measured)
+    options = {"camera": (640, 480, 600, 600, 320, 240), "distance": (0.35, 0.7)}
+    offered = arm.postures(12, tilt=30.0, side="+z", **options)
+    rows, offered = rows[:, :7], offered[:, :7]
+    off = np.abs(rows[:, None] - offered).max(axis=-1).min(axis=1)
+    assert off.max() < 0.1 < np.abs(rows[:, None] - arm.postures(12)[:, :7]).max()
+    given = ["postures", str(files[0]), "--tip", "ball_link", "-k", "4"]
+    assert main([*given, "--board", "0.2,0.15"]) == 2
+    assert "--board WIDTH,HEIGHT is of --sensor board" in capsys.readouterr().err
+    assert main([*given, "--away", "0.3,0.7"]) == 2
+    assert "distance and side need camera=" in capsys.readouterr().err
+
+
+def test_a_recording_is_identified_and_checked_in_the_shell(files, capsys):
+    urdf, _, folder = files
+    arm = SerialChain.from_urdf(urdf, tip="ball_link", sensor=Wrench())
+    own = arm.names.index("mass")
+    theta = arm.nominal.copy()
+    theta[own : own + 5] = [1.4, 0.01, 0.02, 0.05, 3.0]
+    joints = np.random.default_rng(3).uniform(-60.0, 60.0, (6, 7))
+    joints[:, [3, 5]] += [-65.0, 100.0]
+    read = arm.predict(joints, theta)
+    read += 0.02 * np.random.default_rng(0).normal(size=read.shape)
+    write_bag(folder / "bag", joints, read)
+    saved = str(folder / "tool.json")
+    given = ["identify", str(folder / "bag"), "--model", str(urdf), "--tip",
+             "ball_link", "--sensor", "wrench"]  # fmt: skip
+    assert main([*given, "--out", saved]) == 0
+    assert "mass" in capsys.readouterr().out
+    assert main(["check", saved, str(folder / "bag")]) == 0
+    assert "holds" in capsys.readouterr().out
+    for more, message in (
+        (["--radians"], "recordings say their unit"),
+        (["--topic", "/none"], "got none of topic /none"),
+        (["--sensor", "socket", "--which", "0x3,1"], "of 6 rests which socket each"),
+        (
+            ["--sensor", "socket", "--which", "0x3,1x3", "--distance", "0,1,.05,.0001"],
+            "contacts of socket",
+        ),
+        (["--servos", "so101.json"], "servos are of a LeRobot dataset"),
+        (["--servos-out", "new.json"], "--servos-out needs --servos"),
+    ):
+        assert main([*given, *more]) == 2, more
+        assert message in capsys.readouterr().err, more
+    assert _run(files, "--which", "0,1") == 2
+    assert "are of a recording, not a table" in capsys.readouterr().err
+
+
+def test_zeros_are_written_for_lerobot_in_the_shell(files, capsys):
+    """A Panda whose joints are motors; its file then has no other zero."""
+    _, _, folder = files
+    names = SerialChain.from_urdf(files[0], tip="ball_link").joint_names
+    motors = {n: dict.fromkeys(("id", "drive_mode", "homing_offset"), 0) |
+              {"range_min": 500, "range_max": 3600} for n in names}  # fmt: skip
+    old, new = folder / "so.json", folder / "new.json"
+    old.write_text(json.dumps(motors))
+    flags = ["--radians", "--servos", str(old), "--servos-out", str(new)]
+    assert _run(files, *flags) == 0
+    assert f"saved {new}, steps: panda_joint1 +0" in capsys.readouterr().out
+    assert Servos.load(new).motors["panda_joint1"] == motors["panda_joint1"]
+    assert _run(files, *flags, "--out", str(folder / "a.urdf")) == 2
+    assert "both would twice" in capsys.readouterr().err

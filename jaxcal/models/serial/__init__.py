@@ -1,5 +1,6 @@
 """Serial arms: from a DH table or a URDF file."""
 
 from jaxcal.models.serial.chain import SerialChain
+from jaxcal.models.serial.servos import Servos
 
-__all__ = ["SerialChain"]
+__all__ = ["SerialChain", "Servos"]

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import array_of, axis_names, in_words, numbers, one_of
 from jaxcal.files import atomic_write
 from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
+from jaxcal.models.recording import Recording
 from jaxcal.models.sensors import SENSORS, Pose, Position, Sensor, Several
 from jaxcal.models.serial.arguments import (
     joint_numbers,
@@ -440,19 +441,89 @@ class SerialChain(Arm, Model):
         Raises:
             ValueError: the arm never stood still; it says how the joints jitter.
         """
-        from jaxcal.models.serial.recordings import at_rest, jitter, joint_states
+        recording = Recording(path, seconds=seconds, within=within)
+        return self._rests(recording).joints
 
-        times, joints = joint_states(path, self.joint_names)
-        turns = np.array(self.command_units) == "deg"
-        joints = np.where(turns, np.degrees(joints), joints)
-        rests = at_rest(times, joints, seconds, within)
-        if not len(rests):
+    def _rests(self, recording: Recording, kind: str = "") -> Any:
+        from jaxcal.models.serial.recordings import rests_of
+
+        turning = np.array(self.command_units) == "deg"
+        return rests_of(recording, self.joint_names, turning, kind)
+
+    def recorded(self, recording: Recording) -> tuple[Array, Array | None]:
+        """Commands (N, n) and readings (N, q) of a recording, the mean of each rest.
+
+        Readings are zeros of contacts, and None of a sensor whose readings no message
+        holds (a board's, a wire's), or of a LeRobot dataset.
+
+        Raises:
+            ValueError: the arm never stood still; ``which`` has not as many as there
+                were rests; there are no readings.
+        """
+        sensor = self.sensor
+        of_rows = tuple(sensor.inputs) in ((), (sensor.kind,))
+        if not of_rows:
             raise ValueError(
-                f"{os.fspath(path)} must hold {seconds:g} s of rest: the joints jitter "
-                f"by {in_words(jitter(joints).round(4))}; seconds= and within= say "
-                "what is a rest"
+                f"commands of a {sensor.kind} hold {', '.join(sensor.inputs)}, which "
+                "no recording has: take the postures by at_rest"
             )
-        return rests
+        found = self._rests(recording, sensor.kind)
+        commands, read = found.joints, found.readings
+        if sensor.inputs:
+            which = () if recording.which is None else recording.which
+            if len(which) != len(commands):
+                raise ValueError(
+                    f"which must say of {len(commands)} rests which {sensor.kind} each "
+                    f"is of, got {len(which)} numbers"
+                )
+            commands = np.column_stack([commands, numbers("which", which)])
+        if sensor.zeros:
+            return commands, np.zeros((len(commands), len(sensor.outputs)))
+        if read is not None and self.relative:
+            matrices = read[:, 3:].reshape(-1, 3, 3).transpose(0, 2, 1)
+            turned = self.rotation_vectors(commands, matrices)
+            read = np.hstack([read[:, :3], turned])
+        return commands, read
+
+    def write_servos(
+        self,
+        path: str | os.PathLike[str],
+        parameters: ArrayLike,
+        servos: str | os.PathLike[str],
+        names: Mapping[str, str],
+        *,
+        force: bool = False,
+    ) -> dict[str, int]:
+        """Write LeRobot's calibration file with the joints' zeros of ``parameters``.
+
+        Of a turning joint's zero alone: what lengths and axes do is not in it.
+
+        Args:
+            path: the file to write.
+            parameters: (p,).
+            servos: the file that is corrected.
+            names: of motors that are not named as the joints.
+            force: write over a file that is there.
+
+        Returns:
+            Steps by which the middle of each motor's range moved.
+        """
+        from jaxcal.models.serial.servos import Servos
+
+        theta = as_parameters(self, parameters)
+        rows = (theta - self.nominal)[: self.table.size].reshape(self.table.shape)
+        ahead = {}
+        for column, (name, unit) in enumerate(
+            zip(self.joint_names, self.command_units, strict=True)
+        ):
+            moved = np.flatnonzero(self.drive[:, column])
+            if unit == "deg" and len(moved) == 1:
+                zero = rows[moved[0], 3] / self.drive[moved[0], column]
+                ahead[names.get(name, name)] = float(zero)
+        old = Servos.load(servos)
+        new = old.moved(ahead)
+        new.save(path, force=force)
+        return {name: round(new.middle(name) - old.middle(name)) for name in ahead}
 
     def in_turn(self, commands: ArrayLike) -> NDArray[np.int64]:
         """(N,) the commands' rows in an order of little travel, socket after socket."""
@@ -834,6 +905,18 @@ class SerialChain(Arm, Model):
             fixed=self.sensor.unseen(self),
             by_data=True,
         )
+
+    def parameter_sizes(self) -> Array:
+        """(p,) of the default prior; where it says nothing the arm's length, a radian.
+
+        Where things stand is no size: a board may lie at a height of rounding.
+        """
+        sizes = super().parameter_sizes()
+        unknown = np.diagonal(self.default_prior().resolve(self).precision) == 0.0
+        units = np.array(self.units)
+        sizes[unknown & (units == "length")] = self.length or np.nan
+        sizes[unknown & (units == "deg")] = np.degrees(1.0)
+        return sizes
 
     def error_groups(self) -> ErrorGroups:
         """Lengths, turns of the axes, zeros of the joints, compliance, harmonics."""

@@ -1,17 +1,23 @@
-"""What a robot recorded: joint states at rest from a rosbag2 folder or MCAP file."""
+"""What a robot recorded: postures at rest and readings, of a bag or LeRobot dataset."""
 
 from __future__ import annotations
 
-import os
+import contextlib
+import dataclasses
+import json
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.checks import in_words
 from jaxcal.extras import needs
+from jaxcal.models.recording import Recording
+from jaxcal.models.serial.servos import Servos
 
-__all__ = ["at_rest", "jitter", "joint_states"]
+__all__ = ["Rests", "jitter", "rests", "rests_of"]
 
 Array = NDArray[np.float64]
 
@@ -20,36 +26,188 @@ _JITTER = 8.0  # standard deviations: no reading of a joint at rest is farther a
 _STATES = "sensor_msgs/msg/JointState"
 
 
-def joint_states(
-    path: str | os.PathLike[str], names: Sequence[str]
-) -> tuple[Array, Array]:
-    """Times (T,) in seconds and positions (T, J) as recorded, radians and metres.
+@dataclasses.dataclass(frozen=True)
+class Rests:
+    """Where a recorded arm stood still, and what its sensor read there."""
+
+    joints: Array  # (N, J) means, degrees and units of length
+    readings: Array | None  # (N, r) means as recorded, None where none were asked for
+
+
+def rests_of(
+    recording: Recording,
+    names: Sequence[str],
+    turning: NDArray[np.bool_],
+    kind: str = "",
+) -> Rests:
+    """Rests of the joints with these names.
+
+    Args:
+        recording: of them.
+        names: (J,) of the joints.
+        turning: (J,) which of them are in degrees.
+        kind: of the sensor whose messages are asked for, "" for none.
 
     Raises:
-        ValueError: no joint states are in it, or none with all of ``names``.
-        MissingExtraError: the extra ``ros`` is not installed.
+        ValueError: no such joints or messages are in it, or the arm never stood still;
+            it says how the joints jitter.
+        MissingExtraError: what reads it is not installed.
     """
+    given = {name: recording.names.get(name, name) for name in names}
+    path = pathlib.Path(recording.path)
+    if (path / "meta" / "info.json").is_file():
+        parts, messages = _dataset(path, [*given.values()], recording.servos), None
+    else:
+        if recording.servos is not None:
+            raise ValueError(f"servos are of a LeRobot dataset, {path} is none")
+        times, joints, messages = _bag(path, [*given.values()], kind, recording.topic)
+        parts = [(times, np.where(turning, np.degrees(joints), joints))]
+    found, spans = [], []
+    for times, joints in parts:
+        postures, between = rests(times, joints, recording.seconds, recording.within)
+        found.append(postures)
+        spans.append(between)
+    postures = np.concatenate(found)
+    if not len(postures):
+        raise ValueError(
+            f"{path} must hold {recording.seconds:g} s of rest: the joints jitter by "
+            f"{in_words(jitter(parts[0][1]).round(4))}; seconds= and within= say what "
+            "is a rest"
+        )
+    if messages is None:
+        return Rests(postures, None)
+    at, values = messages
+    readings = []
+    for number, (first, last) in enumerate(np.concatenate(spans)):
+        there = (at >= first) & (at <= last)
+        if not there.any():
+            raise ValueError(f"{path}: rest {number} has no reading of the sensor")
+        readings.append(values[there].mean(axis=0))
+    return Rests(postures, np.array(readings))
+
+
+def _vector(part: Any) -> list[float]:
+    return [part.x, part.y, part.z]
+
+
+def _pose(message: Any) -> list[float]:
+    """Position, then the columns of its rotation, whose mean is nearly one."""
+    from scipy.spatial.transform import Rotation
+
+    at, turn = message.pose.position, message.pose.orientation
+    matrix = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+    return [*_vector(at), *matrix.T.ravel().tolist()]
+
+
+# Of a sensor's kind the messages that hold its readings, the first that a bag has.
+_MESSAGES: dict[str, dict[str, Callable[[Any], list[float]]]] = {
+    "position": {
+        "geometry_msgs/msg/PointStamped": lambda each: _vector(each.point),
+        "geometry_msgs/msg/PoseStamped": lambda each: _vector(each.pose.position),
+    },
+    "pose": {"geometry_msgs/msg/PoseStamped": _pose},
+    "gravity": {"sensor_msgs/msg/Imu": lambda each: _vector(each.linear_acceleration)},
+    "wrench": {
+        "geometry_msgs/msg/WrenchStamped": lambda each: [
+            *_vector(each.wrench.force),
+            *_vector(each.wrench.torque),
+        ]
+    },
+}
+
+
+def _bag(
+    path: pathlib.Path, names: Sequence[str], kind: str, topic: str
+) -> tuple[Array, Array, tuple[Array, Array] | None]:
+    """Times (T,) and joints (T, J) in radians, metres; times and values of messages."""
+    times, rows = [], []
+    at, values = [], []
+    seen: set[str] = set()
+    with _opened(path) as bag:
+        types = _MESSAGES.get(kind, {})
+        given = [c for c in bag.connections if topic in ("", c.topic)]
+        there = [c for each in types for c in given if c.msgtype == each]
+        there = [c for c in there if c.msgtype == there[0].msgtype]
+        topics = sorted({c.topic for c in there})
+        if types and len(topics) != 1:
+            listed = ", ".join(topics) or f"none of topic {topic or '(any)'}"
+            raise ValueError(
+                f"{path} must hold one topic of {' or '.join(types)}, got {listed}"
+                + ("; topic= names one" if topics else "")
+            )
+        states = [c for c in bag.connections if c.msgtype == _STATES]
+        for connection, time, raw in bag.messages(connections=[*states, *there]):
+            message = bag.deserialize(raw, connection.msgtype)
+            if connection.msgtype != _STATES:
+                at.append(1e-9 * time)
+                values.append(types[connection.msgtype](message))
+                continue
+            joints = dict(zip(message.name, message.position, strict=False))
+            seen |= joints.keys()
+            if joints.keys() >= set(names):
+                times.append(1e-9 * time)
+                rows.append([joints[name] for name in names])
+    if not rows:
+        raise ValueError(
+            f"{path} must hold joint states of {', '.join(names)}, got "
+            f"{', '.join(sorted(seen)) or 'none'}"
+        )
+    messages = (np.array(at), np.array(values)) if types else None
+    return np.array(times), np.array(rows), messages
+
+
+@contextlib.contextmanager
+def _opened(path: pathlib.Path) -> Iterator[Any]:
     with needs("ros", "reading a rosbag"):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     store = get_typestore(Stores.ROS2_HUMBLE)
-    times, rows = [], []
-    seen: set[str] = set()
-    with AnyReader([pathlib.Path(path)], default_typestore=store) as bag:
-        states = [each for each in bag.connections if each.msgtype == _STATES]
-        for connection, time, raw in bag.messages(connections=states):
-            message = bag.deserialize(raw, connection.msgtype)
-            at = dict(zip(message.name, message.position, strict=False))
-            seen |= at.keys()
-            if at.keys() >= set(names):
-                times.append(1e-9 * time)
-                rows.append([at[name] for name in names])
-    if not rows:
+    with AnyReader([path], default_typestore=store) as bag:
+        yield bag
+
+
+def _dataset(
+    path: pathlib.Path, names: Sequence[str], servos: Any
+) -> list[tuple[Array, Array]]:
+    """Times (T,) and joints (T, J) in degrees of each episode of a LeRobot dataset.
+
+    Of versions 2 and 3: ``observation.state`` of ``data/**/*.parquet``, its columns
+    named by ``meta/info.json``, motors as "shoulder_pan.pos".
+    """
+    with needs("lerobot", "reading a LeRobot dataset"):
+        from pyarrow import parquet
+    info = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8"))
+    feature = info.get("features", {}).get("observation.state", {})
+    columns = feature.get("names") or []
+    if isinstance(columns, dict):
+        columns = [name for part in columns.values() for name in part]
+    columns = [name.removesuffix(".pos").removeprefix("main_") for name in columns]
+    missing = [name for name in names if name not in columns]
+    if missing:
         raise ValueError(
-            f"{os.fspath(path)} must hold joint states of {', '.join(names)}, got "
-            f"{', '.join(sorted(seen)) or 'none'}"
+            f"{path} must hold observation.state of {', '.join(names)}, got "
+            f"{', '.join(columns) or 'none'}"
         )
-    return np.array(times), np.array(rows)
+    files = sorted((path / "data").rglob("*.parquet"))
+    episodes, times, states = [], [], []
+    for file in files:
+        held = parquet.read_table(
+            file, columns=["episode_index", "timestamp", "observation.state"]
+        ).to_pydict()
+        episodes += held["episode_index"]
+        times += held["timestamp"]
+        states += held["observation.state"]
+    if not states:
+        raise ValueError(f"{path} must hold data/**/*.parquet, got none")
+    values = np.array(states, dtype=np.float64)[:, [columns.index(n) for n in names]]
+    if servos is not None:
+        values = Servos.load(servos).degrees(names, values)
+    elif np.abs(values).max() > 360.0:
+        raise ValueError(
+            f"{path}: joints must be in degrees, got {np.abs(values).max():g}"
+        )
+    which, at = np.array(episodes), np.array(times, dtype=np.float64)
+    return [(at[which == i], values[which == i]) for i in np.unique(which)]
 
 
 def jitter(joints: Array) -> Array:
@@ -64,10 +222,11 @@ def jitter(joints: Array) -> Array:
     return np.asarray(np.median(np.abs(second), axis=0) / (0.6745 * np.sqrt(6.0)))
 
 
-def at_rest(
+def rests(
     times: Array, joints: Array, seconds: float, within: float | None
-) -> NDArray[np.float64]:
-    """(N, J) means of the stretches of ``seconds`` or more that stay ``within``.
+) -> tuple[Array, Array]:
+    """(N, J) means of the stretches of ``seconds`` or more that stay ``within``, and
+    (N, 2) from when to when.
 
     When not given that is 0.05, or eight times what the joint jitters by if that is
     more; the first and the last third of a stretch then agree to 0.05 and the noise of
@@ -79,6 +238,7 @@ def at_rest(
     if within is None:
         most = np.maximum(most, _JITTER * noise)
     resting: list[Array] = []
+    spans: list[tuple[float, float]] = []
     first = 0
     low, high = joints[0], joints[0]
     for i in range(1, len(joints) + 1):
@@ -100,6 +260,9 @@ def at_rest(
                 resting and (np.abs(mean - resting[-1]) <= 2.0 * most).all()
             ):
                 resting.append(mean)
+                spans.append((times[first], times[i - 1]))
         if i < len(joints):
             first, low, high = i, joints[i], joints[i]
-    return np.array(resting).reshape(-1, joints.shape[1])
+    return np.array(resting).reshape(-1, joints.shape[1]), np.array(spans).reshape(
+        -1, 2
+    )
