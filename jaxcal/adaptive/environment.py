@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcal.adaptive.policy.features import NUM_FEATURES, Seen
-from jaxcal.adaptive.policy.network import Network
+from jaxcal.adaptive.policy.features import NUM_FEATURES, Shortlist
+from jaxcal.adaptive.policy.network import Correction
 from jaxcal.adaptive.policy.sessions import Exercise, Sessions, State
 from jaxcal.adaptive.rules import Scored
 from jaxcal.learning.environments.functional import FunctionalEnv
@@ -20,7 +20,7 @@ __all__ = ["TaskEnv"]
 
 @struct.dataclass
 class _Episode(State):
-    seen: Seen
+    seen: Shortlist
     key: jax.Array  # of what comes next
 
 
@@ -81,8 +81,8 @@ class _FromObservation(nn.Module):
         c, end = self.options, self.options * NUM_FEATURES
         shape = (*observation.shape[:-1], c, NUM_FEATURES)
         index = jnp.arange(c)
-        return Network(self.width)(
-            Seen(
+        return Correction(self.width)(
+            Shortlist(
                 index=index,
                 designs=index,
                 features=observation[..., :end].reshape(shape),

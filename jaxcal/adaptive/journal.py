@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxcal.jsonlines import JsonLines, Record
 
-__all__ = ["Journal", "fingerprint"]
+__all__ = ["SessionJournal", "fingerprint"]
 
 _KIND = "jaxcal adaptive session"
 
@@ -29,7 +29,7 @@ def fingerprint(tree: Any) -> str:
     return found.hexdigest()
 
 
-class Journal:
+class SessionJournal:
     """A header, which says what is measured and how, and a record a measurement.
 
     Args:
@@ -66,7 +66,7 @@ class Journal:
         """Let another process go on with the session."""
         self._lines.close()
 
-    def __enter__(self) -> Journal:
+    def __enter__(self) -> SessionJournal:
         return self
 
     def __exit__(self, *_: object) -> None:

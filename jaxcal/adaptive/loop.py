@@ -23,7 +23,7 @@ from jaxcal.adaptive.history import (
     replay,
     step_keys,
 )
-from jaxcal.adaptive.journal import Journal, fingerprint
+from jaxcal.adaptive.journal import SessionJournal, fingerprint
 from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.rules import Gain
 from jaxcal.adaptive.session import Decider, Session, Task
@@ -153,7 +153,7 @@ class Loop:
         }
         self._outside = outside(task) if decider is None else ()
         self._decider = _default(task, session) if decider is None else decider
-        self._journal = None if journal is None else Journal(journal, header)
+        self._journal = None if journal is None else SessionJournal(journal, header)
         try:
             lines = [] if self._journal is None else self._journal.entries
             made = [

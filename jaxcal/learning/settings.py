@@ -22,6 +22,9 @@ __all__ = [
 ]
 
 
+_OWN = "jaxcal.own "  # before the path of a file, in the name of its module
+
+
 class Setting(NamedTuple):
     """One field of a configuration, as a command shows it."""
 
@@ -56,8 +59,8 @@ def require(config: Any, rule: str, holds: Callable[[Any], bool], *names: str) -
 
 
 def path_of(thing: type) -> str:
-    """``module:Name`` of a class, by which ``named`` finds it again."""
-    return f"{thing.__module__}:{thing.__qualname__}"
+    """``module:Name`` or ``file.py:Name`` of a class, by which ``named`` finds it."""
+    return f"{thing.__module__.removeprefix(_OWN)}:{thing.__qualname__}"
 
 
 def named(path: str) -> Any:
@@ -69,7 +72,7 @@ def named(path: str) -> Any:
     place, _, name = path.rpartition(":")
     try:
         if place.endswith(".py"):
-            spec = importlib.util.spec_from_file_location(f"jaxcal.own {place}", place)
+            spec = importlib.util.spec_from_file_location(f"{_OWN}{place}", place)
             assert spec is not None and spec.loader is not None  # it is a Python file
             module = sys.modules.get(spec.name)
             if module is None:

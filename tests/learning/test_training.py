@@ -21,6 +21,7 @@ import pytest
 
 from jaxcal.commands import train as command
 from jaxcal.commands import train_arguments
+from jaxcal.learning import settings
 from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import GivenCandidates, Task
@@ -37,7 +38,7 @@ from jaxcal.learning.training.run import updates
 ROOT = pathlib.Path(__file__).parents[2]
 
 CONFIG = TrainConfig(
-    network=NetworkConfig(width=8, encoder_rounds=1),
+    network=NetworkConfig(width=8, encoder_rounds=0),
     ppo=EpisodesConfig(
         num_episodes=64 * 6,
         episodes_per_update=64,
@@ -344,6 +345,49 @@ def test_a_task_and_a_network_of_ones_own_are_in_the_checkpoint(tmp_path):
         build(NetworkConfig(kind="json:JSONDecoder"))
 
 
+def test_a_network_and_a_task_may_be_in_a_file(tmp_path):
+    """Named by ``file.py:Name``, on the command line and in a checkpoint."""
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "import dataclasses\n"
+        "from jaxcal.learning import Task\n"
+        "from jaxcal.learning.policies.compact import CompactNetwork\n"
+        "class Net(CompactNetwork):\n    extra: int = 5\n"
+        "@dataclasses.dataclass(frozen=True)\nclass Own(Task):\n"
+        "    price: float = 2.0\n"
+    )
+    options = train_arguments.read("train.py", ["--kind", f"{file}:Net"])
+    config = presets.with_values(CONFIG, options.values)
+    assert build(config.network).extra == 5
+    own = settings.named(f"{file}:Own")(SelectionConfig(8, 3, 2, 2), price=3.0)
+    assert Task.from_meta(json.loads(json.dumps(own.as_meta()))) == own
+    with pytest.raises(ValueError, match=r"mine.py:Nat must be .*FILE.py:NAME that is"):
+        build(NetworkConfig(kind=f"{file}:Nat"))
+
+
+def test_a_sweep_is_read_and_its_table_written(tmp_path, capsys):
+    given = ["--sweep", "learning-rate=1e-3,3e-3", "entropy_start=0,.02"]
+    options = train_arguments.read("train.py", [*given, "--seeds", "2"])
+    assert options.sweep == [
+        ("learning_rate", (1e-3, 3e-3)),
+        ("entropy_start", (0.0, 0.02)),
+    ]
+    sweep = tuple(options.sweep)
+    config = dataclasses.replace(CONFIG, sweep=sweep, num_seeds=2)
+    assert config.num_runs == 8 and TrainConfig.from_meta(config.as_meta()) == config
+    reached = [
+        {"ratio_to_exact": 0.9 + 0.01 * i, "hit_rate": 0.1 * i} for i in range(8)
+    ]
+    meta = config.as_meta() | {"progress": {"seeds": reached, "best": 7}}
+    checkpoint.save(tmp_path, 1, {"a": np.zeros(2)}, meta)
+    command._compare_runs(tmp_path, config, training.MEASURED, checkpoint.SCHEMA)
+    head, *rows = (line.split() for line in capsys.readouterr().out.splitlines())
+    assert head == [*("seed", "learning_rate", "entropy_start"), *training.MEASURED]
+    assert len(rows) == 8 and [len(row) for row in rows] == [5] * 7 + [6]
+    assert rows[0] == ["3", "0.001", "0", "0.9000", "0.0000"]
+    assert rows[7] == ["4", "0.003", "0.02", "0.9700", "0.7000", "best"]
+
+
 def test_the_paper_preset_is_table_2():
     paper = presets.load("paper")
     assert paper.ppo.episodes_per_update == 16
@@ -411,7 +455,7 @@ def test_learning_finds_the_papers_network_without_importing_the_paper():
 # The update that these flags compile is CONFIG's.
 SHORT = (
     "--episodes=384 --episodes-per-update=64 --episodes-per-set=4 --num-minibatches=2 "
-    "--warmup-updates=1 --width=8 --encoder-rounds=1 --num-candidates=8 --seed=3"
+    "--warmup-updates=1 --width=8 --encoder-rounds=0 --num-candidates=8 --seed=3"
 ).split()
 SMALL = [*SHORT, "--num-inputs=2", "--num-outputs=2", "--num-selected=3"]
 
@@ -469,6 +513,8 @@ BRAX = ["--trainer", "brax"]
         (["--export", "folder"], "--export must be a file NAME.npz, got folder"),
         (["--num-selected=2", "--num-inputs=1"], "num_selected must be at least 3"),
         (["--seeds", "2", "--no-validation"], "--seeds and --sweep need the valid"),
+        (["--sweep", "learning_rate=x"], "--sweep: must be NAME=X,Y with numbers, got"),
+        (["--sweep", "num_epochs=1,2"], "sweep must be of learning_rate"),
         (["--updates", "2"], "preset compact does not read --updates"),
         (["--task", "knee", "--episodes", "9"], "knee does not read --episodes"),
         (["--task", "nee"], "task must be one of"),

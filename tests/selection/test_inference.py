@@ -22,7 +22,7 @@ from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.training import checkpoint
 from jaxcal.selection.policy import select_batch
-from jaxcal.selection.policy.compact import CompactNetwork
+from jaxcal.selection.policy.compact import CompactScorer
 from jaxcal.selection.policy.policy_kernel import look_ahead
 from jaxcal.selection.problem import make_problems
 
@@ -132,7 +132,7 @@ def test_the_scores_are_those_of_jax_in_double_precision(rng, config, n, k, made
         theirs = scorer.NetworkScorer(network, double)
         memory = theirs.encode(regressors, available)
         logits = theirs.scores(memory, chosen, free, made)
-    ours = CompactNetwork(dataclasses.asdict(config), weights.flat(params))
+    ours = CompactScorer(dataclasses.asdict(config), weights.flat(params))
     own = ours.encode(np.stack([p.rows for p in problems]), available)
     np.testing.assert_allclose(own.encoded, memory[1], rtol=1e-4, atol=1e-4)
     scores = ours.scores(own, chosen, free, made)

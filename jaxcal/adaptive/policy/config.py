@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from jaxcal.adaptive import rules
-from jaxcal.adaptive.policy.network import Network
+from jaxcal.adaptive.policy.network import Correction
 from jaxcal.adaptive.policy.sessions import Sessions
 from jaxcal.adaptive.rules import Scored
 from jaxcal.learning.config import RunConfig, StreamsConfig
@@ -56,7 +56,7 @@ class PolicyConfig(RunConfig):
     @property
     def learners(self) -> tuple[Streams, ...]:
         """One learner: other options are other arrays of the same program."""
-        return (Streams(self.ppo, Sessions(self.per_group), Network(self.width)),)
+        return (Streams(self.ppo, Sessions(self.per_group), Correction(self.width)),)
 
     def as_meta(self) -> dict[str, Any]:
         """Plain JSON values; ``from_meta`` reads them back."""

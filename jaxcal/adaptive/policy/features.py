@@ -11,14 +11,14 @@ from flax import struct
 from jaxcal.adaptive.rules import Scored, groups_of, log_score, shortlist
 from jaxcal.adaptive.session import Options, Session
 
-__all__ = ["NUM_FEATURES", "Seen", "see"]
+__all__ = ["NUM_FEATURES", "Shortlist", "shortlist_of"]
 
 NUM_FEATURES = 31
 _SCALE = 20.0  # seconds
 
 
 @struct.dataclass
-class Seen:
+class Shortlist:
     """A shortlist of C options."""
 
     index: jax.Array  # (C,) int32 into the options
@@ -28,7 +28,7 @@ class Seen:
     valid: jax.Array  # (C,) bool
 
 
-def see(
+def shortlist_of(
     task: Any,
     belief: Any,
     session: Session,
@@ -36,7 +36,7 @@ def see(
     key: jax.Array,
     base: Scored,
     per_group: int,
-) -> Seen:
+) -> Shortlist:
     """The best ``per_group`` options of each group by the base rule, and features."""
     gains = belief.gains(task, options, key)
     seconds, uses = task.expected(belief, session, options)
@@ -97,7 +97,7 @@ def see(
     }
     wide = {name: jnp.full_like(g, value) for name, value in of_session.items()}
     features = jnp.stack([*of_option.values(), *wide.values()], axis=-1)
-    return Seen(
+    return Shortlist(
         index=index,
         designs=jax.tree.map(lambda leaf: leaf[index], options.designs),
         features=jnp.where(valid[:, None], features, 0.0),

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcal.adaptive.policy.features import NUM_FEATURES, Seen, see
+from jaxcal.adaptive.policy.features import NUM_FEATURES, Shortlist, shortlist_of
 from jaxcal.adaptive.rules import Scored
 from jaxcal.adaptive.session import Options, Session
 
-__all__ = ["Network", "Policy"]
+__all__ = ["Correction", "Policy"]
 
 # Initial factor of the rule's log score: an option whose score is a fifth below the
 # best one's is sampled a third as often (0.8^5).
@@ -21,7 +21,7 @@ _SHARPNESS = 5.0
 _STEP = 3.0  # logits per unit of the network's output, so that it learns faster
 
 
-class Network(nn.Module):
+class Correction(nn.Module):
     """Logits (..., C) and a value (...) of shortlists.
 
     Each option is embedded, the embeddings are pooled by their maximum, and each is
@@ -31,7 +31,7 @@ class Network(nn.Module):
     width: int = 64
 
     @nn.compact
-    def __call__(self, seen: Seen) -> tuple[jax.Array, jax.Array]:
+    def __call__(self, seen: Shortlist) -> tuple[jax.Array, jax.Array]:
         hidden = nn.tanh(nn.Dense(self.width)(seen.features))
         valid = seen.valid[..., None]
         pool = jnp.where(valid, hidden, -1.0).max(axis=-2)
@@ -62,8 +62,10 @@ class Policy:
     def __call__(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
     ) -> jax.Array:
-        seen = see(task, belief, session, options, key, self.base, self.per_group)
-        logits, _ = Network(self.width).apply(self.params, seen)
+        seen = shortlist_of(
+            task, belief, session, options, key, self.base, self.per_group
+        )
+        logits, _ = Correction(self.width).apply(self.params, seen)
         if self.sample:
             return seen.index[jax.random.categorical(key, logits)]
         return seen.index[jnp.argmax(logits)]
@@ -72,11 +74,11 @@ class Policy:
 def initial(key: jax.Array, per_group: int, num_groups: int, width: int = 64) -> Any:
     """Parameters before training."""
     c = per_group * num_groups
-    blank = Seen(
+    blank = Shortlist(
         index=jnp.zeros(c, jnp.int32),
         designs=jnp.zeros(c),
         features=jnp.zeros((c, NUM_FEATURES)),
         log_score=jnp.zeros(c),
         valid=jnp.ones(c, bool),
     )
-    return Network(width).init(key, blank)
+    return Correction(width).init(key, blank)

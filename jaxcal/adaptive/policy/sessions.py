@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.policy.features import Seen, see
+from jaxcal.adaptive.policy.features import Shortlist, shortlist_of
 from jaxcal.adaptive.rules import Scored
 from jaxcal.adaptive.session import Session
 from jaxcal.learning.core.streams import Step
@@ -46,12 +46,12 @@ class Sessions:
         key_truth, key_begin = jax.random.split(key)
         return State(task.task.draw(key_truth), *task.task.begin(key_begin))
 
-    def observe(self, task: Exercise, state: State, key: jax.Array) -> Seen:
+    def observe(self, task: Exercise, state: State, key: jax.Array) -> Shortlist:
         """The shortlist."""
         key_options, key_seen = jax.random.split(key)
         belief, session = state.belief, state.session
         options = task.task.options(belief, session, key_options)
-        return see(
+        return shortlist_of(
             *(task.task, belief, session, options, key_seen), task.base, self.per_group
         )
 
@@ -59,7 +59,7 @@ class Sessions:
         self,
         task: Exercise,
         state: State,
-        seen: Seen,
+        seen: Shortlist,
         action: jax.Array,
         key: jax.Array,
     ) -> Step:

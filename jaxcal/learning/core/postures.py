@@ -59,7 +59,7 @@ class Episode(Protocol):
 
 
 @struct.dataclass
-class Seen:
+class RowInputs:
     """Inputs of the network for one set: T learned decisions of G episodes."""
 
     features: Any  # leaves (...): candidate features of the set
@@ -141,7 +141,7 @@ class Postures:
         score = jax.vmap(functools.partial(self._score, params))
         return surrogate(self.config, *score(experience.seen), experience, done)
 
-    def _score(self, params: Any, seen: Seen) -> tuple[jax.Array, jax.Array]:
+    def _score(self, params: Any, seen: RowInputs) -> tuple[jax.Array, jax.Array]:
         """(T, G, M) logits and (T, G) values in reward units of a row's decisions.
 
         The set is encoded once, and so is the first decision.
@@ -215,7 +215,7 @@ class Postures:
         played = jax.tree.map(lambda *x: jnp.concatenate(x), *records)  # leaves (K, G)
         advantage, target = self._advantages_and_targets(played)
         batch = Batch(
-            seen=Seen(features, first, later),
+            seen=RowInputs(features, first, later),
             action=played["action"][:learned],
             log_prob=played["log_prob"][:learned],
             advantage=advantage[:learned],

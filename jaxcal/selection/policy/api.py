@@ -30,10 +30,10 @@ Indices = NDArray[np.int64]
 
 # From problems of one M, n, k and number of required, decoding, num and seed to (B, k)
 # indices, the required first, then in the order of choice.
-Network = Callable[[Sequence[Problem], str, int, int], Indices]
+Chooser = Callable[[Sequence[Problem], str, int, int], Indices]
 
 
-def load_policy(checkpoint: str | pathlib.Path | None = None) -> Network:
+def load_policy(checkpoint: str | pathlib.Path | None = None) -> Chooser:
     """The newest policy of a checkpoint; read again only where its files have changed.
 
     Args:
@@ -50,7 +50,7 @@ def load_policy(checkpoint: str | pathlib.Path | None = None) -> Network:
 
 
 @functools.lru_cache(maxsize=8)
-def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Network:
+def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Chooser:
     """Args: a weights file or a run's step, and what changes when it is replaced."""
     if path.is_file():
         found = weights.read(path)
@@ -59,14 +59,14 @@ def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Network:
             from jaxcal.learning.training import checkpoint
         found = checkpoint.load(path.parent).weights
     if found.network["kind"] == "compact":
-        from jaxcal.selection.policy.compact import CompactNetwork
+        from jaxcal.selection.policy.compact import CompactScorer
 
-        return CompactNetwork(found.network, found.arrays)
+        return CompactScorer(found.network, found.arrays)
     with needs("policy", f"checkpoint {path}, whose network is not compact,"):
         return _through_jax(path if path.is_file() else path.parent)
 
 
-def _through_jax(path: pathlib.Path) -> Network:
+def _through_jax(path: pathlib.Path) -> Chooser:
     """A network that reads the candidates' own coordinates, compiled for each shape."""
     from jaxcal.learning.policies import scorer
     from jaxcal.learning.training import checkpoint

@@ -16,7 +16,7 @@ from jaxcal.learning.policies.decoding import choose, in_pieces
 from jaxcal.selection.policy.policy_kernel import CLOSE, describe
 from jaxcal.selection.problem import Problem
 
-__all__ = ["CompactNetwork", "Memory"]
+__all__ = ["CompactScorer", "Memory"]
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -57,7 +57,7 @@ def _product(a: Array32, b: Array32) -> Array32:
     return np.concatenate([a[..., i : i + size, :] @ b for i in begins], axis=-2)
 
 
-class CompactNetwork:
+class CompactScorer:
     """Chooses for problems of one shape, in pieces, on every core.
 
     It is the ``Scorer`` that ``learning.policies.decoding`` asks.
@@ -80,7 +80,7 @@ class CompactNetwork:
     def __call__(
         self, problems: Sequence[Problem], decoding: str, num: int, seed: int
     ) -> Indices:
-        """See ``jaxcal.selection.policy.api.Network``."""
+        """See ``jaxcal.selection.policy.api.Chooser``."""
         tries = 1 if decoding == "greedy" else num
         size = max(1, _ROWS // (len(problems[0].rows) * tries))
 
