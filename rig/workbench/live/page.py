@@ -35,6 +35,9 @@ NOTES = {  # of the cards, in their order: below the title
 }
 
 
+OF_NUMBERS = {"Device": "", "Angles": "Solid: sensor. Dashed: drives."}
+
+
 class LivePage:
     """One browser's view of a run."""
 
@@ -53,6 +56,8 @@ class LivePage:
                     axes = watcher.state.names[0]
                     if title == "Commands" and len(axes) > 2:
                         note += f" The larger the mark, the larger the {axes[2]}."
+                    if watcher.state.start.get("config", {}).get("readings"):
+                        note = OF_NUMBERS.get(title, note)
                     ui.html(f"<h2>{title}</h2><p class='note'>{note}</p>")
                     self._fill(title)
         self.update()

@@ -48,7 +48,7 @@ class DeviceScene:
     """The device as the phone says, and a ghost of its plate as commanded."""
 
     def __init__(self, config: dict[str, Any]) -> None:
-        axes = config.get("axes", [])
+        axes = [] if config.get("readings") else config.get("axes", [])
         letters = [axis["rotates"] for axis in axes]
         # Outermost joint first.
         order = config.get("mechanism", {}).get("order", "ZXY")
@@ -59,6 +59,9 @@ class DeviceScene:
         ends = [1.95, *RADII[: len(turns) - 1], 0.3]  # of the axle of each joint
         groups = []
         self._shown: list[Degrees | None] = [None, None]
+        self._chains: tuple[list[Any], list[Any]] = ([], [])
+        if not axes:  # numbers are no joints that could be drawn
+            return
         camera = ui.scene.perspective_camera(fov=32)
         camera.x, camera.y, camera.z = 4.7, -5.3, 2.7
         scene = ui.scene(grid=False, camera=camera, background_color=BACK)

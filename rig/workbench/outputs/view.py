@@ -128,8 +128,10 @@ def stream(sample: Record, now: float) -> str:
     if now - sample["time"] > STALE_S:
         return f"no telemetry for {now - sample['time']:.0f} s"
     if "age" not in sample:
-        return "no reading from the phone"
-    late = f"phone {sample['rate']:.0f} Hz, newest reading {1e3 * sample['age']:.0f} ms"
+        return "no reading"
+    late = (
+        f"readings {sample['rate']:.0f} Hz, newest reading {1e3 * sample['age']:.0f} ms"
+    )
     return late + ("" if "deg" in sample else "; angles follow once the zero is taken")
 
 
