@@ -12,6 +12,7 @@ import pytest
 from fault_matrix import _free_port
 from harness import Simulator, commissioned, fast_config, fast_text, simulator
 
+from rig.config import AXIS_NAMES
 from rig.journal import read_journal
 from rig.simulator import Truth
 from rig.workbench.commission import characterise, steps
@@ -36,7 +37,7 @@ def measured(tmp_path, monkeypatch):
                 served, record, Operator(yes=True, say=told.append),
                 full_speed=True, listeners=(sim.answer,),
             )  # fmt: skip
-            code = steps.characterise(place, axis)
+            code = steps.characterise(place, AXIS_NAMES[axis])
         runs = tmp_path.glob("characterise-*/journal.jsonl")
         records = read_journal(max(runs, key=lambda path: path.stat().st_mtime_ns))
         return code, records, "\n".join(told)
