@@ -8,6 +8,8 @@ predicts; ``calibration`` adds ``check``, the ``inverse``, the summary and the `
 
 from jaxcal.calibration.budget import Budget, Source
 from jaxcal.calibration.calibration import Calibration
+from jaxcal.calibration.check import Check
 from jaxcal.calibration.identify import identify
+from jaxcal.models.verdict import Verdict
 
-__all__ = ["Budget", "Calibration", "Source", "identify"]
+__all__ = ["Budget", "Calibration", "Check", "Source", "Verdict", "identify"]

@@ -350,7 +350,8 @@ def check(
             report, check=told, readings=(commands, measured), files=files
         )
     if json:
-        write_json("", dataclasses.asdict(told))
+        more = {"good": told.good, "next_step": told.next_step}
+        write_json("", dataclasses.asdict(told) | more)
     else:
         print(told)
         if report:

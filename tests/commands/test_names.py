@@ -169,7 +169,8 @@ def test_check_and_report_take_both_by_name(ask, tmp_path):
     before = np.linalg.norm(off, axis=0).mean()
     assert numbers["nominal_mean"] == pytest.approx(before)
     shuffled = dict([*columns.items()][i] for i in (5, 1, 4, 0, 3, 2))
-    assert ask("check noisy.json t.csv", shuffled)[0] == 0
+    code, out, _ = ask("check noisy.json t.csv --json", shuffled)
+    assert code == 0 and json.loads(out)["good"]
     alone = {axis: COMMANDED[axis] for axis in AXES}
     code, _, said = ask("check noisy.json t.csv", alone)
     assert code == 2 and "both would be pitch, roll, yaw; begin their names" in said
