@@ -185,13 +185,12 @@ def _white(
         columns = largest.max(axis=0, initial=0.0)
         outputs = (largest / np.where(columns > 0.0, columns, 1.0)).max(axis=1)
         return np.asarray(jacobian / np.where(outputs > 0.0, outputs, 1.0)[:, None])
-    shape = len(commands), model.num_outputs
     readings = dataclasses.replace(noise, command_std=None)
-    white = readings.whitening(*shape) @ jacobian
+    white = readings.weigh(jacobian)
     if noise.command_std is None:
         return white
     slopes = np.asarray(model.command_jacobian(commands, mean))
-    rest = noise.whitening(*shape, slopes) @ jacobian
+    rest = noise.weigh(jacobian, slopes)
     # What unknown commands take away whole leaves rounding.
     lost = flat(np.linalg.norm(rest, axis=(0, 1)), np.linalg.norm(white, axis=(0, 1)))
     return np.where(lost, 0.0, rest)

@@ -199,6 +199,29 @@ class Noise:
         eaten[:, : size.shape[-1]] = significant(size)
         return np.where(eaten[..., None], 0.0, np.matrix_transpose(left) @ white)
 
+    def require_shape(self, count: int, num_outputs: int) -> None:
+        """Refuse what is not of N measurements of q readings."""
+        if self.covariance is None:
+            self._std(count, num_outputs)
+        else:
+            self._of_readings(count, num_outputs)
+
+    def weigh(self, rows: Array, command_jacobian: ArrayLike | None = None) -> Array:
+        """(N, q, p) rows of readings ``W @ rows``, of thousands of readings too.
+
+        Args:
+            rows: (N, q, p).
+            command_jacobian: as of ``whitening``.
+        """
+        count, q = rows.shape[:2]
+        if self.covariance is None and self.command_std is None:
+            return np.asarray(rows * (1.0 / self._std(count, q)))
+        white = self.whitening(count, q, command_jacobian)
+        scale = np.diagonal(white[0]) if count else np.ones(q)
+        if white.strides[0] == 0 and (white[0] == np.diag(scale)).all():
+            return rows * scale[:, None]
+        return white @ rows
+
     def _of_readings(self, count: int, q: int) -> Array:
         """(q, q) or (N, q, q) covariance."""
         if self.covariance is None:

@@ -175,3 +175,15 @@ def test_noise_of_each_candidate_goes_with_the_available_ones():
                 commands, 3, model=model, noise=noise, measured=commands[:2],
                 available=available,
             )  # fmt: skip
+
+
+@pytest.mark.parametrize("noise", [
+    jaxcal.Noise(0.3), jaxcal.Noise([0.1, 0.2]), jaxcal.Noise(np.full((4, 2), 0.5)),
+    jaxcal.Noise(covariance=[[1.0, 0.2], [0.2, 2.0]]),
+    jaxcal.Noise(0.1, command_std=[0.2, np.inf]),
+])  # fmt: skip
+def test_rows_are_weighed_by_the_whitening_matrices(noise):
+    rng = np.random.default_rng(0)
+    rows, slopes = rng.normal(size=(4, 2, 3)), rng.normal(size=(4, 2, 2))
+    found = noise.weigh(rows, slopes)
+    np.testing.assert_allclose(found, noise.whitening(4, 2, slopes) @ rows, rtol=1e-14)

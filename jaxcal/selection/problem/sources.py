@@ -120,7 +120,7 @@ class BlockSource(Source):
     def _white(self, blocks: Array) -> Array:
         if self._noise is None:
             return blocks
-        return self._noise.whitening(len(blocks), self._q) @ blocks
+        return self._noise.weigh(blocks)
 
 
 class ModelSource(Source):
@@ -165,11 +165,12 @@ class ModelSource(Source):
         if self._noise.command_std is not None:
             slopes = np.zeros((count, q, self._candidates.shape[1]))
             slopes[mask] = self._model.command_jacobian(self.used, self._mean)
-        white = self._read.whitening(count, q, slopes)
         if mask.all():
-            return _weighted(white, jacobian)
+            return self._read.weigh(jacobian, slopes)
+        self._read.require_shape(count, q)
+        read = self._read.of(mask)
         blocks = np.zeros((count, q, len(self.names)))
-        blocks[mask] = white[mask] @ jacobian
+        blocks[mask] = read.weigh(jacobian, None if slopes is None else slopes[mask])
         return blocks
 
     def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
@@ -188,8 +189,7 @@ class ModelSource(Source):
         else:
             noise = dataclasses.replace(noise, command_std=None)
         jacobian = self._jacobian(points)
-        white = noise.whitening(len(points), jacobian.shape[1], slopes)
-        return _weighted(white, jacobian)
+        return noise.weigh(jacobian, slopes)
 
     def predicted(self) -> Array | None:
         same = self._read is self._noise and self._noise.command_std is None
@@ -226,11 +226,3 @@ class ModelSource(Source):
         """(N, q, p) derivative by the free parameters, checked."""
         jacobian = derivative(self._model, commands, self._mean)
         return jacobian if self._free.all() else jacobian[..., self._free]
-
-
-def _weighted(white: Array, jacobian: Array) -> Array:
-    """``white @ jacobian`` (N, q, p), by columns where white is one diagonal matrix."""
-    scale = np.diagonal(white[0]) if len(white) else np.ones(white.shape[1])
-    if white.strides[0] == 0 and (white[0] == np.diag(scale)).all():
-        return jacobian * scale[:, None]
-    return white @ jacobian
