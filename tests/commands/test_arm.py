@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -138,6 +139,9 @@ def test_postures_are_planned_and_the_rest_chosen_again(files, capsys):
              "--radians", "--count", "20"]  # fmt: skip
     near = ["--near=.4,.1,.3", "--near=.4,.15,.3"]
     assert main([*given, *near, "-k", "8", "--out", str(out)]) == 0
+    told = r"these 8: expected error (0\.\d+) of that of 8 random ones, and that of "
+    worth = re.search(told + r"about (\d+);", capsys.readouterr().err)
+    assert worth and float(worth[1]) < 1.0 and int(worth[2]) > 8
     lines = out.read_text().splitlines()
     arm = SerialChain.from_urdf(urdf, tip="ball_link")
     assert lines[0] == ",".join([*arm.joint_names, "socket"])
