@@ -21,10 +21,12 @@ import threading
 import time
 from collections.abc import Callable
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from commission import turns
 from harness import (
+    AS_OF_A_DEVICE,
     ENTERED,
     HASTY,
     HOST_FAULTS,
@@ -41,6 +43,7 @@ from harness import (
 )
 
 from rig.config import RigConfig, parse_config
+from rig.core import motion
 from rig.drives.modbus import Bus, ModbusDrive
 from rig.journal import (
     HOMED,
@@ -407,7 +410,14 @@ def _changed_cell(fault: str, folder: pathlib.Path) -> Outcome:
         fault, more = "regeared,axis=roll,factor=5", {"truth": Truth(
             matrix=tuple(map(tuple, np.eye(3))), bias=(0.0,) * 3, noise_deg=0.005
         )}  # fmt: skip
-    with simulator(fast_config(), noise_deg=0.005, **more) as sim:
+    config, too_fast = fast_config(), motion.TOO_FAST
+    if fault.startswith("fast_drive"):  # at speeds of a device, and by its limit
+        slow = {"speed_deg_s = 400": "speed_deg_s = 20", "_s2 = 8000": "_s2 = 400"}
+        config, too_fast, more = fast_config(slow), AS_OF_A_DEVICE[2], {"speedup": 1.0}
+    with (
+        mock.patch.object(motion, "TOO_FAST", too_fast),
+        simulator(config, **{"noise_deg": 0.005, **more}) as sim,
+    ):
         if near:
             sim.drives[2].position = sim.config.axes[2].to_pulses(NEAR_DEG)
         served = sim.start()

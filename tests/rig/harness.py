@@ -31,7 +31,11 @@ from rig.workbench.outputs.console import listen
 from rig.workbench.procedures.calibrate import calibrate
 from rig.workbench.run import Run, run_safely
 
-REAL = stop.VERIFY_S, stop.stand_s, motion.TOO_FAST  # as sessions of a device have them
+AS_OF_A_DEVICE = (
+    stop.VERIFY_S,
+    stop.stand_s,
+    motion.TOO_FAST,
+)  # as sessions of a device have them
 # A simulated drive stands within 0.1 s; for a dead one the whole time is waited.
 stop.VERIFY_S = 0.6
 stop.stand_s = lambda drives: 0.05

@@ -172,7 +172,7 @@ def test_a_place_where_an_axis_ends_twice_is_out_of_reach(at, capsys):
 
 def real_limits(monkeypatch):
     """Speeds and looks as sessions of a device have them, not as the harness does."""
-    verify_s, stand_s, too_fast = harness.REAL
+    verify_s, stand_s, too_fast = harness.AS_OF_A_DEVICE
     monkeypatch.setattr(stop, "VERIFY_S", verify_s)
     monkeypatch.setattr(stop, "stand_s", stand_s)
     monkeypatch.setattr(motion, "TOO_FAST", too_fast)

@@ -20,9 +20,8 @@ from rig.workbench.commission import setup, steps
 from rig.workbench.commission.operator import Operator
 
 
-@pytest.mark.parametrize(
-    "transport", ["tcp", pytest.param("rtu", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("transport", ["tcp", "rtu"])
 def test_setup_finds_exchanged_reversed_and_wrongly_geared_axes(at, transport, capsys):
     truth = Truth(
         noise_deg=0.005, swapped=(1, 0, 2), reversed=(True, False, True),

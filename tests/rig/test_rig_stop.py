@@ -264,7 +264,9 @@ def test_stop_ends_the_session_that_moves_and_then_stops_every_unit(
 LOADS = "import rig.core.stop, rig.drives.drive, rig.config.config"
 
 
-@pytest.mark.parametrize("transport", ["tcp", "rtu"])
+@pytest.mark.parametrize(
+    "transport", ["tcp", pytest.param("rtu", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("alone", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_suspended_session_is_ended_and_its_drives_are_stopped(
     alone, transport, tmp_path
@@ -305,7 +307,9 @@ def test_a_suspended_session_is_ended_and_its_drives_are_stopped(
         assert took - loading < 2.0
 
 
-@pytest.mark.parametrize("suspended", [False, True])
+@pytest.mark.parametrize(
+    "suspended", [False, pytest.param(True, marks=pytest.mark.slow)]
+)
 def test_the_page_says_stopped_from_the_word_of_the_drives(suspended, rig, tmp_path):
     """C: it said "STOP sent", and the drives of a suspended session went on."""
     pytest.importorskip("nicegui", reason="the page needs the extra live")
@@ -333,7 +337,11 @@ def load_all():
     import pymodbus.client  # noqa: F401
 
 
-@pytest.mark.parametrize("number", [signal.SIGQUIT, signal.SIGTSTP, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGTSTP, *(pytest.param(number, marks=pytest.mark.slow)
+                       for number in (signal.SIGQUIT, signal.SIGHUP))],
+)  # fmt: skip
 def test_a_signal_that_would_end_or_suspend_a_session_stops_its_drives_first(
     number, rig, tmp_path
 ):

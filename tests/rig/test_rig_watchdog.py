@@ -105,6 +105,7 @@ def test_drives_that_watch_their_line_do_by_default_and_are_as_before_at_the_end
     assert timeouts_left(records) == {}
 
 
+@pytest.mark.slow
 def test_no_success_ends_in_an_alarm(tmp_path):
     """Drives whose watch acts while they stand, too, and a line that falls silent."""
     config = fast_config(WATCHED)
