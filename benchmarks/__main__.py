@@ -27,6 +27,7 @@ ROWS = (
     "startup",
     "memory",
     "scaling",
+    "accelerator",
 )
 
 

@@ -147,3 +147,19 @@ def test_figarohs_relaxation_reaches_the_known_optimum_and_its_weights():
     assert gap < 1e-6
     assert figaroh.chosen(weight).tolist() == [0, 10, 20]
     np.testing.assert_allclose(weight[[0, 10, 20]], 1 / 3, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_the_row_of_the_accelerator_runs_on_what_is_there():
+    """On a CPU in about a minute; every figure is positive and says its unit."""
+    from benchmarks.harness import Budget
+    from benchmarks.rows import accelerator
+
+    row = accelerator.run(Budget(quick=True))
+    cases = [line.case for line in row.lines]
+    assert cases.count("roofline") == 3 and cases.count("update of 64 episodes") == 2
+    assert all(line.value > 0.0 and line.unit for line in row.lines)
+    # No call is quicker than the roofline of what it does.
+    for line in row.lines:
+        if line.case.startswith("update"):
+            assert float(line.note.split()[2]) < line.value

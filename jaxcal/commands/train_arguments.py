@@ -43,7 +43,7 @@ tasks, of sequential measurement:
 
 what to try first:
   {program}                        the compact policy, a few minutes on a laptop
-  {program} --episodes 20000 --out runs/brief   half a minute, 0.993 of the optimum
+  {program} --episodes 20000 --out runs/brief   half a minute, 0.990 of the optimum
   {program} --num-selected 6 --out runs/six     another number of postures
   {program} --candidates mine.csv --out runs/mine   your own machine's postures
   then --imitation 0.5 --initial-trust 4 --initial-actor 0.05 --close-up, which adds

@@ -187,3 +187,15 @@ def test_only_the_sum_of_rotor_and_upper_arm_moves_the_simulated_arm():
     angles = example.trajectory(signal, np.zeros(7))
     assert np.ptp(angles) > 0.3
     np.testing.assert_allclose(example.trajectory(signal, theta), angles, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_policy_of_an_end_stop_is_no_worse_than_the_rule_it_begins_as(tmp_path):
+    """After 12 updates; the largest gain alone, which pays no price, is far behind."""
+    found, rows = quick("end_stop", tmp_path)
+    played = found.found
+    assert [row["method"] for row in rows] == list(played.names)
+    over_rule, error = played.paired("policy", "state")
+    assert over_rule > -3.0 * error
+    over_gain, error = played.paired("policy", "gain")
+    assert over_gain > 10.0 * error

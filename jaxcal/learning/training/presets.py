@@ -19,7 +19,7 @@ _GROUP = "jaxcal.presets"  # entry points: the presets of installed packages
 
 _COMPACT = TrainConfig(
     preset="compact",
-    about="one task (4 of 50), PPO alone from nothing; 0.993 of the optimum in half a "
+    about="one task (4 of 50), PPO alone from nothing; 0.990 of the optimum in half a "
     "minute, 0.999 in a few; what to try first",
     network=NetworkConfig(),
     ppo=EpisodesConfig(num_episodes=200_000),
