@@ -13,7 +13,7 @@ LEANING = re.compile(r'"""((?:The same|As|Of|Likewise)\b.*)')
 PRONOUN = re.compile(r"(?m)^ *[\w, (]*\b(each|found|known)\b(, \w+)*( [+|]?=|:| in) ")
 LONG = 10  # lines, beyond which a pronoun must be held in the head
 # Rooms whose variables are not there yet.
-LATER = ("adaptive", "evaluation", "information", "learning", "selection")
+LATER = ("adaptive", "learning")
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 

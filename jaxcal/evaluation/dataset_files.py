@@ -76,8 +76,8 @@ def _read_npz(data: bytes) -> dict[str, Any]:
     with archive:
         held = {k: _member(archive, k) for k in archive.files if k in (*_KEYS, *_ENDS)}
         if "candidates" not in held:
-            found = ", ".join(sorted(archive.files)) or "nothing"
-            raise ValueError(f'key "candidates" is missing, found {found}')
+            keys = ", ".join(sorted(archive.files)) or "nothing"
+            raise ValueError(f'key "candidates" is missing, found {keys}')
     ends = [held.pop(key) for key in _ENDS if key in held]
     if len(ends) == 1:
         raise ValueError('keys "low" and "high" must come together')

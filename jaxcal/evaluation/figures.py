@@ -73,8 +73,8 @@ def first_selection(evaluation: Evaluation) -> Figure:
     planes = list(itertools.combinations(range(min(points.shape[1], 3)), 2))
     title = _title(evaluation, "First episode")
     figure, panels = _panels((3.6 * len(planes), 3.9), title, (1, len(planes)))
-    found = [r for r in evaluation.results if r.method != "random"]
-    shown = (found or list(evaluation.results))[:: max(len(found) - 1, 1)][:2]
+    chosen = [r for r in evaluation.results if r.method != "random"]
+    shown = (chosen or list(evaluation.results))[:: max(len(chosen) - 1, 1)][:2]
     for axes, plane in zip(np.ravel(panels), planes, strict=True):
         names = [f"command {i + 1}" for i in plane]
         for i, result in enumerate(shown):

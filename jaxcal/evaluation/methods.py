@@ -77,8 +77,8 @@ def check_methods(methods: Sequence[str]) -> tuple[str, ...]:
     chosen: list[str] = []
     for name in methods:
         if name not in METHODS and name not in several:
-            known = ", ".join((*METHODS, "policy:all"))
-            raise ValueError(f"method must be one of {known}, got {name!r}")
+            names = ", ".join((*METHODS, "policy:all"))
+            raise ValueError(f"method must be one of {names}, got {name!r}")
         chosen += several.get(name, (name,))
     if not chosen:
         raise ValueError("methods must name at least one method, got none")
@@ -139,15 +139,15 @@ def evaluate(
     policies = {row: run.policy(*row) for row in rows if row[0] in POLICIES}
     random = run.random(random_draws)
     exact, reference, proven = run.exact(time_limit)
-    found = policies | {("random", None): random, ("exact", None): exact}
+    results = policies | {("random", None): random, ("exact", None): exact}
     for row in rows:
-        if row not in found:
-            found[row] = run.solver(row[0])
+        if row not in results:
+            results[row] = run.solver(row[0])
     return Evaluation(
         dataset=dataset,
         k=k,
         seed=seed,
-        results=tuple(found[row] for row in rows),
+        results=tuple(results[row] for row in rows),
         reference=reference,
         proven=proven,
         random_log_det=random.log_det,
@@ -205,13 +205,13 @@ class _Run:
         """What ``choose`` returns for every piece, and the seconds that took."""
         total = self.dataset.num_episodes
         self.progress(label, 0, total)
-        found, seconds = [], 0.0
+        choices, seconds = [], 0.0
         for cut in self.pieces(size):
             start = time.perf_counter()
-            found.append(choose(cut))
+            choices.append(choose(cut))
             seconds += time.perf_counter() - start
             self.progress(label, cut.stop, total)
-        return found, seconds
+        return choices, seconds
 
     def policy(self, method: str, checkpoint: str | None) -> MethodResult:
         """One decoding of one checkpoint."""
@@ -231,8 +231,8 @@ class _Run:
             )
 
         choose(self.pieces()[0])  # not timed: it may compile
-        found, seconds = self.timed(label, choose)
-        indices = np.concatenate(found)
+        choices, seconds = self.timed(label, choose)
+        indices = np.concatenate(choices)
         self.require_valid(label, indices)
         return self.result(method, indices[:, None], seconds, checkpoint)
 
@@ -274,8 +274,8 @@ class _Run:
             return np.array(chosen)
 
         choose(slice(0, 1))  # not timed: it may compile
-        found, seconds = self.timed(method, choose)
-        return self.result(method, np.concatenate(found)[:, None], seconds)
+        choices, seconds = self.timed(method, choose)
+        return self.result(method, np.concatenate(choices)[:, None], seconds)
 
     def exact(
         self, time_limit: float | None
@@ -294,9 +294,9 @@ class _Run:
         begun = time.perf_counter()
         choose(slice(0, 1))  # not timed: it may compile
         begun = time.perf_counter()
-        found, seconds = self.timed("exact", choose, _CHUNK_EXACT)
+        batches, seconds = self.timed("exact", choose, _CHUNK_EXACT)
         indices, proven, bound = (
-            np.concatenate([getattr(batch, name) for batch in found])
+            np.concatenate([getattr(batch, name) for batch in batches])
             for name in ("indices", "proven", "bound")
         )
         result = self.result("exact", indices[:, None], seconds)

@@ -170,10 +170,10 @@ def file_prefixes(names: Sequence[str]) -> list[str]:
         stem = pathlib.PurePath(name).stem or name
         return "".join(c if c.isalnum() or c in "-." else "-" for c in stem)
 
-    found = [plain(name) for name in names]
+    prefixes = [plain(name) for name in names]
     return [
-        name if found.count(name) == 1 else f"{name}-{number}"
-        for number, name in enumerate(found, start=1)
+        name if prefixes.count(name) == 1 else f"{name}-{number}"
+        for number, name in enumerate(prefixes, start=1)
     ]
 
 

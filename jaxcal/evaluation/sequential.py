@@ -98,7 +98,7 @@ def evaluate(
     trained = policies.load(checkpoint) if "policy" in methods else None
     needed = [m for m in ("priced", "state") if m in methods]
     rules = _rules(entry, task, needed, retune, seed, progress)
-    found, seconds = [], []
+    played_by, seconds = [], []
     for method in methods:
         if method == "policy":
             assert trained is not None  # loaded above
@@ -117,12 +117,12 @@ def evaluate(
             batch=_BATCH,
             progress=lambda done, method=method: progress(method, done, episodes),  # type: ignore[misc]  # default binds the loop's value
         )
-        found.append(played)
+        played_by.append(played)
         seconds.append(seconds_a_choice(task, decider, seed))
     whole = Comparison(
         tuple(methods),
         *(
-            np.concatenate([getattr(one, field) for one in found])
+            np.concatenate([getattr(one, field) for one in played_by])
             for field in ("gain", "entropy_drop", "log_ratio", "choices")
         ),
     )
@@ -153,7 +153,7 @@ def _rules(
     progress: Progress,
 ) -> dict[str, Scored]:
     """Priced rules: as they ship with the task, or tuned on it now."""
-    found = {}
+    rules = {}
     for name in needed:
         rule = entry.rules.get(name)
         if rule is None or retune:
@@ -169,8 +169,8 @@ def _rules(
                 seed=seed + 1,
                 report=lambda number, *_, tell=tell: tell(number, _GENERATIONS),
             )
-        found[name] = rule
-    return found
+        rules[name] = rule
+    return rules
 
 
 def _decider(method: str, rules: Mapping[str, Scored]) -> Any:

@@ -62,20 +62,20 @@ def _heading(result: Result) -> str:
 
 def json_document(result: Result, *, command: Sequence[str]) -> str:
     """The numbers; the envelope is that of an evaluation of postures."""
-    found = result.found
+    comparison = result.found
     methods = {}
-    for row, name in enumerate(found.names):
-        drop, ratio = found.entropy_drop[row], found.log_ratio[row]
+    for row, name in enumerate(comparison.names):
+        drop, ratio = comparison.entropy_drop[row], comparison.log_ratio[row]
         methods[name] = {
             "label": METHODS[name],
-            "nats": _moments(found.gain[row]),
+            "nats": _moments(comparison.gain[row]),
             "entropy_drop": _moments(drop),
             "log_ratio_at_truth": _moments(ratio),
-            "choices": float(found.choices[row].mean()),
+            "choices": float(comparison.choices[row].mean()),
             "seconds_per_choice": float(result.seconds[row]),
             "paired": {
-                other: _moments(found.gain[row] - found.gain[number])
-                for number, other in enumerate(found.names)
+                other: _moments(comparison.gain[row] - comparison.gain[number])
+                for number, other in enumerate(comparison.names)
                 if other != name
             },
         }
@@ -88,7 +88,7 @@ def json_document(result: Result, *, command: Sequence[str]) -> str:
     entry = {
         "task": result.task,
         "options": dict(result.options),
-        "episodes": found.gain.shape[1],
+        "episodes": comparison.gain.shape[1],
         "seed": result.seed,
         "checkpoint": result.checkpoint,
         "methods": methods,
@@ -110,12 +110,15 @@ def figure(result: Result) -> Any:
     """Nats with 95 % intervals; the paired difference from the reference."""
     from jaxcal.plots.style import COLOURS, panels
 
-    found = result.found
-    names = found.names
+    comparison = result.found
+    names = comparison.names
     y = np.arange(len(names))[::-1]
     drawn, (left, right) = panels((9.0, 0.6 + 0.35 * len(names)), shape=(1, 2))
-    pairs = [found.paired(name, result.reference) for name in names]
-    for axes, values in ((left, [found.mean(name) for name in names]), (right, pairs)):
+    pairs = [comparison.paired(name, result.reference) for name in names]
+    for axes, values in (
+        (left, [comparison.mean(name) for name in names]),
+        (right, pairs),
+    ):
         mean, error = np.array(values).T
         axes.errorbar(mean, y, xerr=1.96 * error, fmt="o", color=COLOURS[0], capsize=3)
         axes.set_yticks(y, names)

@@ -69,9 +69,9 @@ def evaluate_stream(
     for number, path in enumerate(todo):
         progress("parts", number, len(todo))
         if not path.exists():  # no other process was sooner
-            found = solve(*files[path])
-            rows = [(row.method, row.checkpoint, row.numbers) for row in found.rows]
-            write_text(path, json.dumps({"proven": found.num_proven, "rows": rows}))
+            summary = solve(*files[path])
+            rows = [(row.method, row.checkpoint, row.numbers) for row in summary.rows]
+            write_text(path, json.dumps({"proven": summary.num_proven, "rows": rows}))
     progress("parts", len(todo), len(todo))
 
     parts = [_read(path) for path in files]

@@ -59,10 +59,10 @@ def training_curves(runs: Mapping[str, pathlib.Path]) -> Figure:
             for column in (reward, np.ones(len(x)))
         )
         right.plot(x, sums / weights, color=colour, label=name)
-        known = np.isfinite(ratio := metrics.get("ratio_to_exact", np.nan * x))
-        if known.any():
+        finite = np.isfinite(ratio := metrics.get("ratio_to_exact", np.nan * x))
+        if finite.any():
             twin = right.twinx() if twin is None else twin
-            twin.plot(x[known], ratio[known], color=colour, linestyle="--")
+            twin.plot(x[finite], ratio[finite], color=colour, linestyle="--")
             twin.set(ylabel="dashed: mean det S / det S*", ylim=(0.0, 1.02))
     left.set_title("(a) reward", fontsize=10)
     middle.set_title(f"(b) {what}", fontsize=10)

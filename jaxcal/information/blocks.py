@@ -128,9 +128,9 @@ def _centred(
         blocks = np.where(usable[..., None, None], blocks, 0.0)  # type: ignore[index]
     rows = blocks.reshape(sets, count * q, p)
     if len(root):
-        known = root if shift is None else root - root @ shift
-        known = np.broadcast_to(known, (sets, *known.shape[-2:]))
-        rows = np.concatenate([rows, known], axis=1)
+        prior = root if shift is None else root - root @ shift
+        prior = np.broadcast_to(prior, (sets, *prior.shape[-2:]))
+        rows = np.concatenate([rows, prior], axis=1)
     far = None if where_far is None else np.asarray(where_far.any(axis=(1, 2)))
     return _Centred(rows, largest, scale, shift, far)
 

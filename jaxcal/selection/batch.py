@@ -101,8 +101,8 @@ def _solved(
 ) -> BatchSelection:
     start = time.perf_counter()
     problems = make_problems(candidates, k, **rules)
-    found = list(solve(problems))
-    indices = np.stack([one.indices for one in found])
+    solutions = list(solve(problems))
+    indices = np.stack([one.indices for one in solutions])
     values = log_dets(problems, indices)
     singular = np.flatnonzero(np.isneginf(values))
     if singular.size:
@@ -113,9 +113,11 @@ def _solved(
     return BatchSelection(
         indices=indices,
         log_det=values,
-        proven=np.array([one.proven for one in found]),
-        bound=np.array([np.inf if one.bound is None else one.bound for one in found]),
-        nodes=np.array([one.nodes or 0 for one in found]),
+        proven=np.array([one.proven for one in solutions]),
+        bound=np.array(
+            [np.inf if one.bound is None else one.bound for one in solutions]
+        ),
+        nodes=np.array([one.nodes or 0 for one in solutions]),
         method=method,
         seconds=time.perf_counter() - start,
     )

@@ -259,25 +259,25 @@ def _drawn(box: Array, count: int, allowed: Allowed | None, seed: int) -> Array:
     corners = np.zeros((0, n))
     if 1 << n <= count // 2:
         corners = np.array(np.meshgrid(*[[0.0, 1.0]] * n)).reshape(n, -1).T
-    found, size = np.zeros((0, n)), count
+    drawn, size = np.zeros((0, n)), count
     unit = np.concatenate([corners, even(0, size)])
     for batch in range(_DRAWS):
         points = box[:, 0] + unit * np.ptp(box, axis=1)
-        found = np.concatenate([found, _moved(allowed, points)])
-        if len(found) >= count:
-            return found[:count]
-        if len(found) and batch % 2:
-            near = found[rng.integers(len(found), size=size)] - box[:, 0]
+        drawn = np.concatenate([drawn, _moved(allowed, points)])
+        if len(drawn) >= count:
+            return drawn[:count]
+        if len(drawn) and batch % 2:
+            near = drawn[rng.integers(len(drawn), size=size)] - box[:, 0]
             near = near / np.ptp(box, axis=1) + rng.normal(0.0, 0.05, (size, n))
             unit = near.clip(0.0, 1.0)
         else:
             unit = even((batch + 1) * size, size)
-    if not len(found):
+    if not len(drawn):
         raise ValueError(
             f"allowed must hold somewhere within the limits, but is False at all "
             f"{_DRAWS * size} points tried"
         )
-    return found
+    return drawn
 
 
 def _descended(
@@ -402,7 +402,7 @@ class _Search:
         return np.outer(along, along) / values[-1] ** 2
 
     def soft(self, information: Array, sharp: float) -> tuple[float, Array]:
-        """Of E a smooth value below phi, and its gradient W (p, p).
+        """A smooth value below phi of E, and its gradient W (p, p).
 
         phi is the least ``trace(W M)`` over W of trace 1 in the criterion's own
         coordinates, so with any such W that is above it.
@@ -556,8 +556,8 @@ class _Search:
         if self.surface:
             return self._tried(best, best_phi)
         start = ((commands - self.low) / self.span).clip(0.0, 1.0).ravel()
-        found = _descended(down, start, 0.0, 1.0, 300)
-        there = self.low + found.reshape(shape) * self.span
+        ends = _descended(down, start, 0.0, 1.0, 300)
+        there = self.low + ends.reshape(shape) * self.span
         there = there.clip(self.box[:, 0], self.box[:, 1])
         phi = float(self.phi(self.information(self.blocks(there))))
         if phi > best_phi and _permitted(self.allowed, there).all():
@@ -694,8 +694,8 @@ class _Search:
             return -value, -self.slopes(at, metric).ravel() / size
 
         start = ((points - self.low) / self.span).clip(0.0, 1.0).ravel()
-        found = _descended(down, start, 0.0, 1.0, 150)
-        there = self.low + found.reshape(shape) * self.span
+        ends = _descended(down, start, 0.0, 1.0, 150)
+        there = self.low + ends.reshape(shape) * self.span
         there = there.clip(self.box[:, 0], self.box[:, 1])
         higher = self.leverage(self.blocks(there), metric)
         kept = (higher > d) & _permitted(self.allowed, there)
@@ -809,11 +809,11 @@ class _Search:
             return -score, -w * (slope - w @ slope)
 
         start = np.log(np.maximum(weights, 1e-9))
-        found = _descended(down, start, -np.inf, np.inf, 300)
+        logits = _descended(down, start, -np.inf, np.inf, 300)
         for sharper in _SHARP[1:] if least else ():
             sharp = sharper
-            found = _descended(down, found, -np.inf, np.inf, 300)
-        e = np.exp(found - found.max())
+            logits = _descended(down, logits, -np.inf, np.inf, 300)
+        e = np.exp(logits - logits.max())
         return np.asarray(e / e.sum())
 
     # -- the answer --------------------------------------------------------------------

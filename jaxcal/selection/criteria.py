@@ -489,14 +489,14 @@ def positions(
     if not isinstance(parameters, Iterable):
         raise ValueError(f"parameters must be names or indices, got {parameters!r}")
     parameters = [parameters] if isinstance(parameters, str) else list(parameters)
-    found: list[Any] = [names.index(x) if x in names else x for x in parameters]
-    for at, asked in zip(found, parameters, strict=True):
+    places: list[Any] = [names.index(x) if x in names else x for x in parameters]
+    for at, asked in zip(places, parameters, strict=True):
         whole = isinstance(at, int | np.integer) and not isinstance(at, bool)
         if not whole or not 0 <= int(at) < len(names):
             raise ValueError(
                 "parameters must be indices or names of free parameters "
                 f"({', '.join(names)}), got {asked!r}"
             )
-    if len(set(found)) < len(found) or not found:
+    if len(set(places)) < len(places) or not places:
         raise ValueError(f"parameters must name some once each, got {parameters!r}")
-    return [int(at) for at in found]
+    return [int(at) for at in places]

@@ -114,8 +114,8 @@ class Design(CandidateSet):
         given = checked_options(method, options)
         start = time.perf_counter()
         problem = with_optima(self.problem(k, criterion, region))
-        found = SOLVERS[method](problem, **given)
-        return self._judged(problem, found, method, start)
+        solution = SOLVERS[method](problem, **given)
+        return self._judged(problem, solution, method, start)
 
     def score(
         self,
@@ -165,17 +165,17 @@ class Design(CandidateSet):
                 "indices must repeat a candidate at most max_replicates = "
                 f"{problem.max_replicates} times, got {repeats}"
             )
-        found = Solution(subset.astype(np.int64))
+        solution = Solution(subset.astype(np.int64))
         if reference == "bound":
-            return self._judged(problem, found, "score", start)
+            return self._judged(problem, solution, "score", start)
         optimum = solve_exact(problem, deadline=Deadline(limit))
-        value = float(values(problem, found.indices[None])[0][0])
+        value = float(values(problem, solution.indices[None])[0][0])
         assert optimum.bound is not None
         near = abs(value - optimum.bound) <= _PROVEN * max(1.0, abs(optimum.bound))
-        found = Solution(
-            found.indices, bound=optimum.bound, proven=optimum.proven and near
+        solution = Solution(
+            solution.indices, bound=optimum.bound, proven=optimum.proven and near
         )
-        return self._judged(problem, found, "score", start)
+        return self._judged(problem, solution, "score", start)
 
     plan = plan
     fastest = fastest
@@ -223,14 +223,14 @@ class Design(CandidateSet):
         )
 
     def _judged(
-        self, problem: Problem, found: Solution, method: str, start: float
+        self, problem: Problem, solution: Solution, method: str, start: float
     ) -> Selection:
         """What a solver found, judged by the caller's numbers.
 
         Raises:
             RuntimeError: it is no selection of this problem: the solver is wrong.
         """
-        indices, value = np.asarray(found.indices), found.value
+        indices, value = np.asarray(solution.indices), solution.value
         counts = np.bincount(indices, minlength=len(problem.blocks))
         right = len(indices) == problem.k and len(counts) == len(problem.blocks)
         if not right or ((counts < problem.lower) | (counts > problem.upper)).any():
@@ -238,7 +238,7 @@ class Design(CandidateSet):
                 f"method {method!r} must return {problem.k} candidates within lower "
                 f"and upper of its problem, got {indices.tolist()}"
             )
-        log_det = found.log_det
+        log_det = solution.log_det
         if value is None or log_det is None:
             value, log_det = (float(each[0]) for each in values(problem, indices[None]))
         if np.isneginf(log_det):
@@ -255,24 +255,24 @@ class Design(CandidateSet):
                 f"precision, got {value} in these units; give the commands in others"
             )
         subsets = [Subset(indices, value, log_det)]
-        if len(found.alternatives) > 1:
-            others = np.stack([each for each, _ in found.alternatives])
+        if len(solution.alternatives) > 1:
+            others = np.stack([each for each, _ in solution.alternatives])
             pairs = np.stack(values(problem, others), axis=1).tolist()
             subsets = [Subset(i, *pair) for i, pair in zip(others, pairs, strict=True)]
         return Selection(
             indices=indices,
             value=value,
             log_det=log_det,
-            method=found.method or method,
-            proven=found.proven,
+            method=solution.method or method,
+            proven=solution.proven,
             seconds=time.perf_counter() - start,
             problem=problem,
-            reason=found.reason,
-            seed=found.seed,
-            restarts=found.restarts,
-            nodes=found.nodes,
+            reason=solution.reason,
+            seed=solution.seed,
+            restarts=solution.restarts,
+            nodes=solution.nodes,
             alternatives=tuple(subsets),
-            known_bound=found.bound,
+            known_bound=solution.bound,
             names=self.names,
             axes=self.axes,
         )

@@ -52,11 +52,11 @@ class InScenarios:
     def summary(self) -> list[str]:
         """Two lines: this design, and the nominal's own."""
         count = len(self.weights)
-        known = (
+        bounded = (
             "" if self.proven.all() else f", {int(self.proven.sum())} of them proven"
         )
         lines = [
-            f"scenarios     {count}, efficiency against the optimum of each{known}",
+            f"scenarios     {count}, efficiency against the optimum of each{bounded}",
             f"  this one    least {self.least:.4f}, mean {self.mean:.4f}",
         ]
         if self.nominal_efficiencies is not None:

@@ -209,10 +209,10 @@ def _searched(
     if size:
         bound = max(bounds[:size].max(), best_values[0])
         bound = min(bound, trivial)
-    found = np.isfinite(best_values)
+    reached = np.isfinite(best_values)
     return BranchResult(
-        best_counts[order[found]].astype(np.int64),
-        scale * best_values[found] + shift,
+        best_counts[order[reached]].astype(np.int64),
+        scale * best_values[reached] + shift,
         float(scale * (bound if size else best_values[0]) + shift),
         done,
         size == 0,

@@ -62,8 +62,8 @@ def solve(
     """The solver "exact"; 10 s where no time limit is given."""
     deadline = Deadline(time_limit or TIME_LIMIT)
     restarts = restarts or STARTING_RESTARTS
-    found = solve_exact(problem, best, deadline, restarts, seed)
-    return dataclasses.replace(found, seed=seed, restarts=restarts)
+    solution = solve_exact(problem, best, deadline, restarts, seed)
+    return dataclasses.replace(solution, seed=seed, restarts=restarts)
 
 
 def solve_auto(
@@ -87,28 +87,28 @@ def solve_auto(
     limit = time_limit or (TIME_LIMIT if problem.rank_one else _BLOCKS_LIMIT)
     deadline = Deadline(limit)
     restarts = restarts or STARTING_RESTARTS
-    found = solve_exact(problem, 1, deadline, restarts, seed, least_efficiency)
-    assert found.value is not None and found.bound is not None
+    solution = solve_exact(problem, 1, deadline, restarts, seed, least_efficiency)
+    assert solution.value is not None and solution.bound is not None
     started: dict[str, Any] = {"seed": seed, "restarts": restarts}
-    if found.reason:  # rounding
-        return dataclasses.replace(found, method="exact", **started)
+    if solution.reason:  # rounding
+        return dataclasses.replace(solution, method="exact", **started)
     name = f"a {problem.criterion.name}-efficiency"
     if isinstance(problem.criterion, Joined):
         name = "an efficiency"
-    proven_share = problem.criterion.efficiency(found.value, found.bound)
+    proven_share = problem.criterion.efficiency(solution.value, solution.bound)
     method, reason = "exact", "the exact search proved this optimum"
-    if not found.proven and proven_share >= least_efficiency:
+    if not solution.proven and proven_share >= least_efficiency:
         method = "exchange"
         reason = (
             f"the bound proves {name} of at least {proven_share:.6f}, and "
             f"{least_efficiency:g} was asked for"
         )
-    elif not found.proven:
+    elif not solution.proven:
         reason = (
             f"the exact search ran out of time after {limit:g} s with {name} "
             f"of at least {proven_share:.6f} proven; {least_efficiency:g} was asked for"
         )
-    return dataclasses.replace(found, method=method, reason=reason, **started)
+    return dataclasses.replace(solution, method=method, reason=reason, **started)
 
 
 def solve_exact(
@@ -142,10 +142,13 @@ def solve_exact(
                     exchange_indices(problem, restarts, seed, deadline.part(0.5))
                 )
                 root_bound = relaxed(problem, start, deadline)
-                found = _found(problem, [start], best, root_bound, 1)
-                assert found.value is not None and found.bound is not None
-                if problem.criterion.efficiency(found.value, found.bound) >= enough:
-                    return found
+                by_bound = _found(problem, [start], best, root_bound, 1)
+                assert by_bound.value is not None and by_bound.bound is not None
+                if (
+                    problem.criterion.efficiency(by_bound.value, by_bound.bound)
+                    >= enough
+                ):
+                    return by_bound
             return _enumerate(problem, pool, best, deadline)
     # Half of the time: a bound takes time as well.
     start = exchange_indices(problem, restarts, seed, deadline.part(0.5))
@@ -203,9 +206,9 @@ def upper_bound(problem: Problem) -> float:
         pool = _pool(problem, hull=True)
         free = problem.k - len(problem.required)
         if math.comb(len(pool), free) <= _CHEAP:
-            found = _enumerate(problem, pool, 1, NEVER)
-            assert found.bound is not None
-            return found.bound
+            solution = _enumerate(problem, pool, 1, NEVER)
+            assert solution.bound is not None
+            return solution.bound
     if isinstance(problem, LossProblem):
         start = greedy_indices(problem)
         some = problem.among(problem.losses_of(start))
@@ -273,18 +276,18 @@ def _enumerate(
         # The rows outside the span of the required ones keep all the volume there is.
         basis = np.linalg.qr(required.T, mode="complete")[0][:, len(required) :]
         vectors = vectors @ basis
-    found = largest_volumes(vectors, best, deadline)
+    volumes = largest_volumes(vectors, best, deadline)
     subsets = [
-        np.sort(np.concatenate([problem.required, pool[s]])) for s in found.subsets
+        np.sort(np.concatenate([problem.required, pool[s]])) for s in volumes.subsets
     ]
-    if found.complete:
-        return _found(problem, subsets, best, None, found.examined)
+    if volumes.complete:
+        return _found(problem, subsets, best, None, volumes.examined)
     # Out of time: whatever greedy has, if that is better, and the sharper bound.
     greedy = np.sort(greedy_indices(problem))
     # log det(X_s.T X_s) is twice the log of the volume, beside that of ``required``.
     fixed = np.linalg.slogdet(required @ required.T)[1] if len(required) else 0.0
-    bound = min(relaxed(problem, greedy), fixed + 2.0 * float(np.log(found.bound)))
-    return _found(problem, [*subsets, greedy], best, bound, found.examined)
+    bound = min(relaxed(problem, greedy), fixed + 2.0 * float(np.log(volumes.bound)))
+    return _found(problem, [*subsets, greedy], best, bound, volumes.examined)
 
 
 def _found(

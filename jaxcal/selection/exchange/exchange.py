@@ -173,9 +173,9 @@ class Climbs:
         best, phi = self._required, -np.inf
         shares = (self.share, *_FURTHER)[:restarts]
         for share in shares:
-            chosen, found = self.climbed(self._required, share)
-            if not phi > -np.inf or found > phi + 1e-10 * max(1.0, abs(phi)):
-                best, phi = chosen, found
+            chosen, value = self.climbed(self._required, share)
+            if not phi > -np.inf or value > phi + 1e-10 * max(1.0, abs(phi)):
+                best, phi = chosen, value
             if self._deadline.passed and phi > -np.inf:
                 break
         more = max(restarts - len(shares), 0 if phi > -np.inf else _MENDING)
@@ -203,8 +203,8 @@ class Climbs:
         starts = np.array(list(kept.values()))
         order = np.argsort(-values(problem, starts)[0])[:most]
         more = [self.random_start() for _ in range(min(most, restarts - many))]
-        found = [self.climbed(start, swaps=2) for start in (*starts[order], *more)]
-        return max(found, key=lambda each: each[1])
+        climbed = [self.climbed(start, swaps=2) for start in (*starts[order], *more)]
+        return max(climbed, key=lambda one: one[1])
 
 
 def _lengths(criterion: Criterion) -> Array:

@@ -102,13 +102,13 @@ def fastest(
     """
     least = share("least_efficiency", least_efficiency)
     search = _Search(design, k, motion, start, method, time_limit, seed)
-    found = search.answer(least, None)
-    if found is None:
+    answer = search.answer(least, None)
+    if answer is None:
         raise ValueError(
             f"least_efficiency must be reachable, got {least:g}; the optimum is "
             "only bounded within the time limit: give more time, or ask for less"
         )
-    return found
+    return answer
 
 
 def pareto(

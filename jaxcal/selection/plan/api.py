@@ -173,8 +173,8 @@ def plan(
     cases = [Case(one.problem, one.points) for one in requests]
     unit, problem = request.unit, request.problem
     if design.scenarios is not None:
-        each, weights = [case.problem for case in cases], design.scenarios.weights
-        problem = joined_problem(each, weights, Mean("D"), None)
+        problems, weights = [case.problem for case in cases], design.scenarios.weights
+        problem = joined_problem(problems, weights, Mean("D"), None)
     total, (identify, least_k) = problem.k, _fewest(problem)
     if max_k is None:
         max_k = min(total, max(_LARGEST_K, least_k))
@@ -220,12 +220,12 @@ def plan(
         if last is None:
             variance = best(max_k, None)[1]
         one = int((unit * np.sqrt(variance) / request.target).argmax())
-        found, least = unit[one] * np.sqrt([variance.max(), bound_of(max_k)])
+        reached, least = unit[one] * np.sqrt([variance.max(), bound_of(max_k)])
         every = " (all that are allowed)" if max_k == total else ""
         raise ValueError(
             f"accuracy must be reachable with max_k = {max_k} measurements{every}: "
             f"the best design found has a {_SUMMARIES[criterion]} standard error "
-            f"of {found:.6g}, no design has less than {least:.6g}, got "
+            f"of {reached:.6g}, no design has less than {least:.6g}, got "
             f"{request.target[one]:g}"
         )
     return Plan(

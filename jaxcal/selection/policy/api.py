@@ -53,15 +53,15 @@ def load_policy(checkpoint: str | pathlib.Path | None = None) -> Chooser:
 def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Chooser:
     """Args: a weights file or a run's step, and what changes when it is replaced."""
     if path.is_file():
-        found = weights.read(path)
+        stored = weights.read(path)
     else:
         with needs("policy", f"checkpoint {path}, the folder of a training run,"):
             from jaxcal.learning.training import checkpoint
-        found = checkpoint.load(path.parent).weights
-    if found.network["kind"] == "compact":
+        stored = checkpoint.load(path.parent).weights
+    if stored.network["kind"] == "compact":
         from jaxcal.selection.policy.compact import CompactScorer
 
-        return CompactScorer(found.network, found.arrays)
+        return CompactScorer(stored.network, stored.arrays)
     with needs("policy", f"checkpoint {path}, whose network is not compact,"):
         return _through_jax(path if path.is_file() else path.parent)
 
@@ -169,9 +169,9 @@ def choose(
     num, seed = whole_number("num", num, 1), whole_number("seed", seed, 0)
     climbs = decoding == "exchange"
     policy = load_policy(checkpoint)
-    found = policy(problems, "greedy" if climbs else decoding, num, seed)
+    chosen = policy(problems, "greedy" if climbs else decoding, num, seed)
     if climbs:
         from jaxcal.selection.exchange.exchange import exchange_from
 
-        found = np.stack(list(map(exchange_from, problems, found)))
-    return found
+        chosen = np.stack(list(map(exchange_from, problems, chosen)))
+    return chosen

@@ -151,8 +151,8 @@ class CompactScorer:
         seen = self._described(x, chosen[:, :count].copy(), free, k, left, only)
         if exact:
             return np.where(free, _SHARP * seen.ahead, -np.inf)
-        each = np.arange(len(h))[:, None]
-        mean = h[each, chosen[:, :count]].sum(axis=1) / np.float32(max(count, 1))
+        episode = np.arange(len(h))[:, None]
+        mean = h[episode, chosen[:, :count]].sum(axis=1) / np.float32(max(count, 1))
         progress = [left == 1, left == 2, left == 3, 1 / left, count / p]
         progress += [min(left / p, 3.0), k > p]
         scalars = np.tile(np.array(progress, np.float32), (len(h), 1))

@@ -117,15 +117,15 @@ def with_losses(problem: Problem, lost: int) -> Problem:
         raise ValueError(
             f"lost must come with max_replicates = 1, got {problem.max_replicates}"
         )
-    each = problem.criterion
+    criterion = problem.criterion
     if isinstance(problem, ScenarioProblem):
         if not problem.joined.least or problem.joined.of_efficiency:
             raise ValueError(
                 "lost must come with jaxcal.Worst(...) over scenarios, got "
                 f"{problem.joined.name}"
             )
-        each = problem.joined.each
-    fields = fields_of(problem) | {"criterion": Lost(lost).within(each)}
+        criterion = problem.joined.each
+    fields = fields_of(problem) | {"criterion": Lost(lost).within(criterion)}
     return LossProblem(**fields, whole=problem, lost=lost)
 
 
@@ -154,8 +154,8 @@ def with_arrivals(problem: Problem, reliability: Array, criterion: Joined) -> Pr
     whole = getattr(problem, "members", (problem,))
     weights = getattr(problem, "weights", np.ones(1))
     members = [_without(one, lost) for one in whole for lost in missing]
-    each = getattr(problem.criterion, "each", problem.criterion)
-    fields = fields_of(problem) | {"criterion": criterion.within(each)}
+    of_one = getattr(problem.criterion, "each", problem.criterion)
+    fields = fields_of(problem) | {"criterion": criterion.within(of_one)}
     return ScenarioProblem(
         **fields,
         members=tuple(members),

@@ -209,8 +209,8 @@ def make_problem(
         white, k, available, forced, cap, criterion.within(at), times, raw, readings,
         root, candidates, model,
     )  # fmt: skip
-    for each in (raw, readings, root, available, forced):
-        each.flags.writeable = False
+    for array in (raw, readings, root, available, forced):
+        array.flags.writeable = False
     if len(forced):
         _check_required_rank(problem)
     return problem
@@ -279,20 +279,21 @@ def _check_k(
     if k is None:
         k = p if regressors else _cover(usable)
     k = whole_number("k", k, 1)
-    known = 0
+    prior_rank = 0
     if len(root):
-        known = rank_of_blocks(root[None, None], root[:0])[0][0]
-    if k * most + known >= p:
+        prior_rank = rank_of_blocks(root[None, None], root[:0])[0][0]
+    if k * most + prior_rank >= p:
         return k
-    if regressors and not known:
+    if regressors and not prior_rank:
         raise ValueError(
             f"k must be at least {p}, the number of regressors of {p - 1} inputs and a "
             f"bias, got {k}"
         )
+    least = -(-(p - prior_rank) // max(most, 1))
     raise ValueError(
-        f"k must be at least {-(-(p - known) // max(most, 1))} for {p} parameters, at "
+        f"k must be at least {least} for {p} parameters, at "
         f"most {most} of them from a candidate"
-        + (f" and {known} known beforehand" if known else "")
+        + (f" and {prior_rank} known beforehand" if prior_rank else "")
         + f", got {k}"
     )
 

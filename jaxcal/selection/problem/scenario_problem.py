@@ -73,22 +73,22 @@ class ScenarioProblem(Problem):
 
     def values(self, indices: Indices) -> tuple[Array, Array]:
         """(R,) joined value, as reported, and mean log det S of subsets (R, k)."""
-        each, log_dets = self.scenario_values(indices)
+        of_members, log_dets = self.scenario_values(indices)
         regular = np.isfinite(log_dets).all(axis=0)
         joined = self.joined
         if joined.of_efficiency:
             assert self.optima is not None
             one, best = joined.each, self.optima
-            each = np.array(
+            of_members = np.array(
                 [
                     [one.efficiency(x, best[s]) if np.isfinite(x) else 0.0 for x in row]
-                    for s, row in enumerate(each)
+                    for s, row in enumerate(of_members)
                 ]
             )
         if joined.least:
-            value = each.min(0) if joined.larger_is_better else each.max(0)
+            value = of_members.min(0) if joined.larger_is_better else of_members.max(0)
         else:
-            value = self.weights @ np.where(regular, each, 0.0)
+            value = self.weights @ np.where(regular, of_members, 0.0)
         worst = -np.inf if joined.larger_is_better else np.inf
         log_det = self.weights @ np.where(regular, log_dets, 0.0)
         return np.where(regular, value, worst), np.where(regular, log_det, -np.inf)

@@ -59,8 +59,8 @@ def _parameters(given: ArrayLike, model: Model) -> Array:
 
 def _drawn(count: int, model: Model, prior: Prior | None) -> Array:
     """(S, p) draws from the prior; what it says nothing of stays at its mean."""
-    known = (model.default_prior() if prior is None else prior).resolve(model)
-    precision = np.where(known.free, np.diagonal(known.precision), 0.0)
+    resolved = (model.default_prior() if prior is None else prior).resolve(model)
+    precision = np.where(resolved.free, np.diagonal(resolved.precision), 0.0)
     drawn = precision > 0.0
     if not drawn.any():
         raise ValueError(
@@ -70,7 +70,7 @@ def _drawn(count: int, model: Model, prior: Prior | None) -> Array:
         )
     std = np.where(drawn, 1.0 / np.sqrt(np.where(drawn, precision, 1.0)), 0.0)
     normal = np.random.default_rng(0).standard_normal((count, len(std)))
-    return np.asarray(known.mean + std * normal)
+    return np.asarray(resolved.mean + std * normal)
 
 
 def checked_weights(weights: ArrayLike | None, count: int) -> Array:

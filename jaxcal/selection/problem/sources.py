@@ -69,8 +69,8 @@ def shares_regressor(model: Model, prior: Prior | None, noise: Noise | None) -> 
             return False
     if prior is None:
         return True
-    known = prior.resolve(model)
-    return bool(known.free.all() and not known.precision.any())
+    resolved = prior.resolve(model)
+    return bool(resolved.free.all() and not resolved.precision.any())
 
 
 class SharedSource(Source):
@@ -142,14 +142,14 @@ class ModelSource(Source):
         # Readings are off by what no parameter explains; a prediction is no reading.
         self._read = self._noise.beside(misfit) if misfit else self._noise
         self._prior = model.default_prior() if prior is None else prior
-        known = self._prior.resolve(model)
-        self._mean, self._free = known.mean, known.free
+        resolved = self._prior.resolve(model)
+        self._mean, self._free = resolved.mean, resolved.free
         if parameters is not None:  # of a scenario; what came last is not told
-            self._mean = np.append(parameters, known.mean[len(parameters) :])
-        pairs = zip(model.names, known.free, strict=True)
+            self._mean = np.append(parameters, resolved.mean[len(parameters) :])
+        pairs = zip(model.names, resolved.free, strict=True)
         self.names = tuple(name for name, free in pairs if free)
-        self._precision = known.precision[np.ix_(known.free, known.free)]
-        besides = model.facts(known.mean)[1][:, known.free]
+        self._precision = resolved.precision[np.ix_(resolved.free, resolved.free)]
+        besides = model.facts(resolved.mean)[1][:, resolved.free]
         self.root = prior_root(self._precision + besides.T @ besides)
 
     @property
