@@ -181,7 +181,7 @@ class Calibration(Fit):
         return steps
 
     def _again(self, model: Any, prior: Prior) -> Calibration:
-        """The same readings, fitted by another model of the machine."""
+        """These readings, fitted by another model of the machine."""
         fields = fit_model(
             self.commands,
             self.residuals + self.predict(self.commands),

@@ -103,8 +103,8 @@ def identify(
         ValueError: naming the argument, the rule and the value; for commands that leave
             a direction unexcited, naming that direction.
     """
-    given, measured, known = recorded(model, commands, measured)
-    if known:
+    given, measured, is_recording = recorded(model, commands, measured)
+    if is_recording:
         input_names = input_names or getattr(model, "inputs", ()) or None
     given = by_name(model, given)
     input_names = input_names or names_of(given) or None

@@ -183,7 +183,7 @@ def _counted(text: str) -> list[int]:
 
 @dataclasses.dataclass
 class RecordingOptions:
-    """Of a bag or a LeRobot dataset in the place of a table."""
+    """Options of a bag or a LeRobot dataset in the place of a table."""
 
     which: Annotated[
         list[int] | None,

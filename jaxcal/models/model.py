@@ -410,10 +410,10 @@ def recorded(model: Any, commands: Any, measured: Any) -> tuple[Any, Any, bool]:
     Raises:
         ValueError: there are no readings, or no such recording.
     """
-    known = isinstance(commands, Recording)
+    is_recording = isinstance(commands, Recording)
     if isinstance(commands, str | os.PathLike):
-        commands, known = Recording(commands), True
-    if known:
+        commands, is_recording = Recording(commands), True
+    if is_recording:
         if model is None:
             raise ValueError("model must be an arm where commands are a recording")
         commands, read = as_model(model).recorded(commands)
@@ -422,7 +422,7 @@ def recorded(model: Any, commands: Any, measured: Any) -> tuple[Any, Any, bool]:
         measured = np.zeros((len(commands), model.num_outputs))
     if measured is None:
         raise ValueError("measured must be given: what was read at each of commands")
-    return commands, measured, known
+    return commands, measured, is_recording
 
 
 def predict(

@@ -467,8 +467,8 @@ class SerialChain(Arm, Model):
                 f"commands of a {sensor.kind} hold {', '.join(sensor.inputs)}, which "
                 "no recording has: take the postures by at_rest"
             )
-        found = self._rests(recording, sensor.kind)
-        commands, read = found.joints, found.readings
+        of_recording = self._rests(recording, sensor.kind)
+        commands, read = of_recording.joints, of_recording.readings
         if sensor.inputs:
             which = () if recording.which is None else recording.which
             if len(which) != len(commands):

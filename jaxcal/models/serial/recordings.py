@@ -62,12 +62,12 @@ def rests_of(
             raise ValueError(f"servos are of a LeRobot dataset, {path} is none")
         times, joints, messages = _bag(path, [*given.values()], kind, recording.topic)
         parts = [(times, np.where(turning, np.degrees(joints), joints))]
-    found, spans = [], []
+    tables, spans = [], []
     for times, joints in parts:
         postures, between = rests(times, joints, recording.seconds, recording.within)
-        found.append(postures)
+        tables.append(postures)
         spans.append(between)
-    postures = np.concatenate(found)
+    postures = np.concatenate(tables)
     if not len(postures):
         raise ValueError(
             f"{path} must hold {recording.seconds:g} s of rest: the joints jitter by "
