@@ -1,4 +1,4 @@
-"""Is each sensor's calibration of an arm as uncertain as it says? Seven tables more.
+"""Is each sensor's calibration of an arm as uncertain as it says? Eight tables more.
 
     python -m benchmarks.arm_sensors [draws] [NAMES OF TABLES]
 
@@ -10,14 +10,15 @@ and over that of ``identify`` as it comes, with harmonics.
 ``misfit``: positions of arms that no table explains (cables, eccentric gears): the
 error elsewhere with and without harmonics of the joints. ``trial``: the simulated ones
 fitted as a real one was. ``chance``: of a linear WAM whose misfit and sizes the choice
-knows exactly, how many random choices are better on one arm. ``checks``: what a few
-chosen postures and random ones can tell of a drift. ``contacts``: of real arms, trained
-on one place and judged at the others: 12 and 16 contacts that are random or chosen, and
-all; likewise with stiff joints, stated tolerances and noise (of the choice and the
-fit); and what is expected of those chosen, and at best (chosen for the very postures
-they are judged at), of a model without any error, with the noise and sizes that all
-contacts of the place show; then trained on two places and on three. ``distances``: how
-far apart sockets of other places are found, which were printed 50 mm (0.1) apart.
+knows exactly, how many random choices are better on one arm. ``servos``: what contacts
+of a servo arm determine, by where the sockets stand. ``checks``: what a few chosen
+postures and random ones can tell of a drift. ``contacts``: of real arms, trained on one
+place and judged at the others: 12 and 16 contacts that are random or chosen, and all;
+likewise with stiff joints, stated tolerances and noise (of the choice and the fit); and
+what is expected of those chosen, and at best (chosen for the very postures they are
+judged at), of a model without any error, with the noise and sizes that all contacts of
+the place show; then trained on two places and on three. ``distances``: how far apart
+sockets of other places are found, which were printed 50 mm (0.1) apart.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.spatial.transform import Rotation
 
 import jaxcal
 from jaxcal.models import (
@@ -312,6 +314,77 @@ def _errors(
     return result
 
 
+SERVO_ARM = [  # five axes, of the size of an SO-101, metres
+    (0.03, 90, 0.12, 0),
+    (0.116, 0, 0, 0),
+    (0.135, 0, 0, 0),
+    (0, 90, 0, 90),
+    (0, 0, 0.06, 0),
+]
+SOCKETS = {  # where they stand, metres
+    "two, 50 mm apart": [[0.22, 0.025, 0.05], [0.22, -0.025, 0.05]],
+    "two, 300 mm apart": [[0.2, 0.15, 0.05], [0.2, -0.15, 0.05]],
+    "two, one 200 mm higher": [[0.2, 0.1, 0.05], [0.2, -0.1, 0.25]],
+    "four, far and near, high and low": [
+        [0.28, 0.1, 0.05], [0.28, -0.1, 0.2], [0.15, 0.1, 0.2], [0.15, -0.1, 0.05],
+    ],
+}  # fmt: skip
+
+
+def servos(draws: int) -> None:
+    """What contacts determine of a servo arm with play, by where the sockets stand."""
+    print("| sockets | error anywhere, mm: uncalibrated, calibrated | stated |")
+    print("| --- | --- | --- |")
+    for name, places in SOCKETS.items():
+        rows = [_of_servos(np.array(places), draw) for draw in range(draws)]
+        before, after, stated = np.mean(rows, axis=0)
+        print(f"| {name} | {before:.1f}, {after:.1f} | {stated:.1f} |", flush=True)
+
+
+def _of_servos(places: Array, draw: int) -> tuple[float, float, float]:
+    """Errors of the tip anywhere, moved as a whole to fit, and the stated deviation."""
+    count = len(places)
+    apart = [
+        (0, i, float(np.linalg.norm(places[i] - places[0])), 2e-4)
+        for i in range(1, count)
+    ]
+    model = SerialChain.from_dh(
+        SERVO_ARM,
+        tool=(0.02, 0.0, 0.1),
+        sensor=Socket(count, places, distances=apart),
+        limits=[(-110.0, 110.0)] * 4 + [(-160.0, 160.0)],
+        compliance=(),
+    )
+    rng = np.random.default_rng(draw)
+    truth = model.nominal.copy()
+    names = np.array(model.names)
+    zeros = np.char.startswith(names, "theta")
+    truth[zeros] += 2.0 * rng.normal(size=zeros.sum())  # degrees
+    std = np.asarray(model.default_prior().std)[: model.table.size]
+    lengths = np.array(model.units)[: model.table.size] == "length"
+    truth[: len(std)] += 3.0 * lengths * std * rng.normal(size=len(std))
+    offered = model.postures(100, seed=draw)
+    plan = offered[jaxcal.select(offered, 24, "exchange", model=model).indices]
+    play = np.zeros(plan.shape)
+    play[:, :5] = rng.uniform(-0.3, 0.3, (24, 5))
+    off = model.predict(plan + play, truth)
+    low, high = model.limits.T
+    anywhere = rng.uniform(low, high, (200, 5))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        found = jaxcal.identify(plan, off, model=model)
+    wanted = model.calibrated(truth).predict(anywhere)
+    errors = []
+    for theta in (model.nominal, found.parameters):
+        points = model.calibrated(theta).predict(anywhere)
+        turn, _ = Rotation.align_vectors(
+            wanted - wanted.mean(0), points - points.mean(0)
+        )
+        left = turn.apply(points - points.mean(0)) + wanted.mean(0) - wanted
+        errors.append(1e3 * float(np.linalg.norm(left, axis=1).mean()))
+    return errors[0], errors[1], 1e3 * float(found.verdict.anywhere)
+
+
 def chance(draws: int) -> None:
     """What the best choice gains on a WAM that is as the choice believes, linear.
 
@@ -572,10 +645,8 @@ def distances(_: int) -> None:
                 print(f"| {name}, {trained} | {other} | {1e3 * far:.2f} | {half:.2f} |")
 
 
-TABLES = {
-    each.__name__: each
-    for each in (intervals, sizes, misfit, trial, chance, checks, contacts, distances)
-}
+_ALL = (intervals, sizes, misfit, trial, chance, servos, checks, contacts, distances)
+TABLES = {each.__name__: each for each in _ALL}
 
 if __name__ == "__main__":
     given = sys.argv[1:]
