@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
+import pathlib
 from collections.abc import Callable
+from importlib.machinery import EXTENSION_SUFFIXES
 
 import numpy as np
 
@@ -78,8 +81,12 @@ def arms() -> None:
 
 def trees() -> None:
     """Look-ahead on tables of every size, with outcomes that cannot be."""
-    from jaxcal.adaptive.search_kernel import Tree
-
+    # From its file: the package around it loads JAX, which takes valgrind minutes.
+    folder = pathlib.Path(jaxcal.__file__).parent / "adaptive"
+    (path,) = folder.glob("search_kernel*" + EXTENSION_SUFFIXES[0])
+    spec = importlib.util.spec_from_file_location("jaxcal.adaptive.search_kernel", path)
+    kernel = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(kernel)
     rng = np.random.default_rng(3)
     for designs, outcomes, states in ((1, 1, 1), (3, 2, 5), (17, 4, 40), (8, 3, 2)):
         likelihood = rng.random((designs, outcomes, states)).astype(np.float32)
@@ -89,7 +96,7 @@ def trees() -> None:
         for price in (1e-30, 1.0, 1e30):
             for effort in (0.0, 1e6):
                 tables = np.full((outcomes, designs), price, np.float32)
-                tree = Tree(
+                tree = kernel.Tree(
                     likelihood, np.full((designs, designs), price, np.float32), tables,
                     np.ones((outcomes, designs), np.float32),
                     np.zeros((designs, outcomes), np.int32), tables[0], tables[0],

@@ -208,6 +208,16 @@ def test_bad_scenarios_are_named(scenarios, says) -> None:
         Design(x, MichaelisMenten(), Prior(np.inf), scenarios=scenarios).select(2)
 
 
+def test_the_fewest_by_default_identify_in_every_scenario() -> None:
+    """Two readings tell the same in one scenario, and two things in the other."""
+    blocks = np.random.default_rng(0).standard_normal((2, 9, 2, 4))
+    blocks[1, :, 1] = blocks[1, :, 0]
+    answer = Design.from_blocks(blocks).select()
+    assert len(answer.indices) == 4 and np.isfinite(answer.log_det)
+    exact = Design.from_blocks(blocks).score(answer.indices, reference="exact")
+    assert exact.efficiency >= answer.efficiency - 1e-9
+
+
 def test_units_beyond_double_precision_are_refused_by_name() -> None:
     blocks = np.random.default_rng(0).standard_normal((2, 6, 1, 3)) * 1e200
     with pytest.raises(ValueError, match=r"criterion Mean.A. must be a number in dou"):

@@ -111,14 +111,15 @@ def default_restarts(problem: Problem) -> int:
     if problem.criterion.kind == "least":
         most = 100
     count, q, p = problem.blocks.shape
-    name = problem.criterion.name
+    name, least = problem.criterion.name, 1.0
     if isinstance(problem, ScenarioProblem):
         name = problem.joined.each.name
         count *= len(problem.members)
+        least = 3.0  # a start from each share of the greedy ones
+        if name == "E":  # a swap takes eigenvalues in every scenario
+            least, most = 1.0, 2
     work = _WORK.get(name, _WORK["other"])
-    if name == "E" and isinstance(problem, ScenarioProblem):
-        most = 2  # a swap takes eigenvalues in every scenario
-    return int(min(max(work / ((problem.k + 8) * count * q * q * p), 1.0), most))
+    return int(min(max(work / ((problem.k + 8) * count * q * q * p), least), most))
 
 
 class Climbs:

@@ -110,7 +110,7 @@ def joined_problem(
     criterion: Joined,
     nominal: Problem | None,
 ) -> Problem:
-    """The problem of scenarios; equal ones are one, and one alone is its own problem.
+    """The problem of scenarios; where all are equal it is that of one.
 
     Args:
         members: (S,) problems that differ in blocks and prior only.
@@ -118,23 +118,19 @@ def joined_problem(
         criterion: as asked for.
         nominal: the problem at the model's nominal, where there is a model.
     """
-    merged: dict[bytes, int] = {}
-    kept: list[Problem] = []
-    shares: list[float] = []
-    for member, weight in zip(members, weights.tolist(), strict=True):
-        key = member.raw.tobytes() + member.root.tobytes()
-        if key in merged:
-            shares[merged[key]] += weight
-        else:
-            merged[key] = len(kept)
-            kept.append(member)
-            shares.append(weight)
-    if len(kept) == 1:
-        return kept[0]
-    first = kept[0]
-    fields = fields_of(first) | {"criterion": criterion.within(first.criterion)}
-    problem = ScenarioProblem(
-        **fields, members=tuple(kept), weights=np.array(shares), nominal=nominal
+    first, k = members[0], max(member.k for member in members)
+    if all(
+        (member.raw == first.raw).all() and np.array_equal(member.root, first.root)
+        for member in members[1:]
+    ):
+        return first
+    # The fewest that identify in every scenario, where k was not given.
+    members = [one if one.k == k else one.of_size(k) for one in members]
+    fields = fields_of(members[0]) | {"criterion": criterion.within(first.criterion)}
+    weights = np.array(weights)
+    weights.flags.writeable = False
+    if nominal is not None and nominal.k != k:
+        nominal = nominal.of_size(k)
+    return ScenarioProblem(
+        **fields, members=tuple(members), weights=weights, nominal=nominal
     )
-    problem.weights.flags.writeable = False
-    return problem
