@@ -22,7 +22,7 @@ from jaxcal import plots
 from jaxcal.plots.style import panels
 from jaxcal.selection import Design, select
 from jaxcal.selection.fastest import Motion, fastest_tour, travel_times
-from jaxcal.selection.fastest.run import ParetoFront
+from jaxcal.selection.fastest.search import ParetoFront
 
 MOTION = Motion(speed=(20.0,), acceleration=(100.0,), settle=1.0)
 HOME = np.zeros(3)

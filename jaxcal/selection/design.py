@@ -19,7 +19,7 @@ from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.continuous import Refinement, refine
 from jaxcal.selection.exact.exact import TIME_LIMIT, solve_exact
-from jaxcal.selection.fastest.run import fastest, pareto
+from jaxcal.selection.fastest.search import fastest, pareto
 from jaxcal.selection.in_scenarios import with_optima
 from jaxcal.selection.plan import plan
 from jaxcal.selection.problem import CandidateSet, Problem, Solution, values

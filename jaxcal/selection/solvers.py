@@ -79,8 +79,12 @@ def random_indices(
 @functools.cache
 def _options(solve: Callable[..., Solution]) -> tuple[str, ...]:
     """Names of the options that a solver reads."""
-    found = inspect.signature(solve).parameters.values()
-    return tuple(each.name for each in found if each.kind == each.KEYWORD_ONLY)
+    arguments = inspect.signature(solve).parameters.values()
+    return tuple(
+        argument.name
+        for argument in arguments
+        if argument.kind == argument.KEYWORD_ONLY
+    )
 
 
 def _policy(

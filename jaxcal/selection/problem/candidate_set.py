@@ -19,16 +19,16 @@ from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, answered, as_model, by_name
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.criteria import Criterion, Joined, Mean, criterion_of
-from jaxcal.selection.problem.losses import (
-    checked_reliability,
-    with_arrivals,
-    with_losses,
-)
-from jaxcal.selection.problem.making import (
+from jaxcal.selection.problem.assembly import (
     check_available,
     filled,
     make_problem,
     usable_numbers,
+)
+from jaxcal.selection.problem.losses import (
+    checked_reliability,
+    with_arrivals,
+    with_losses,
 )
 from jaxcal.selection.problem.problem import Problem
 from jaxcal.selection.problem.scenario_problem import joined_problem

@@ -156,8 +156,8 @@ class Problem:
     def log_det(self, indices: Indices) -> float:
         """log det S of a subset, natural, in the caller's units; -inf if singular."""
         blocks = self.raw[np.asarray(indices)[None]]
-        found = rank_of_blocks(blocks, self.root, self.white.size)[1][0]
-        return self.multiplicity * float(found)
+        log_det = rank_of_blocks(blocks, self.root, self.white.size)[1][0]
+        return self.multiplicity * float(log_det)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
