@@ -74,12 +74,12 @@ cdef class Climber:
     cdef void _carry(self, Py_ssize_t came, Py_ssize_t went) noexcept nogil
     cdef void _update(self, Py_ssize_t c, int r) noexcept nogil
     cdef void _cross(self, Py_ssize_t c, int m, int r) noexcept nogil
-    cdef void _swaps(self, Py_ssize_t c) noexcept nogil
+    cdef inline void _swaps(self, Py_ssize_t c) noexcept nogil
     cdef int _grow(self, Py_ssize_t size, double share) except -1 nogil
     cdef void _fill(self, Py_ssize_t size) noexcept nogil
     cdef double _finish(self, bint climbs) except? -2.0 nogil
     cdef double _climb(self, bint least) except? -2.0 nogil
-    cdef void _take_out(self, Py_ssize_t out) noexcept nogil
+    cdef inline void _take_out(self, Py_ssize_t out) noexcept nogil
     cdef Py_ssize_t _replacement(self, Py_ssize_t out, double rise) noexcept nogil
     cdef double _least(self) noexcept nogil
     cdef bint _bound_without(self, Py_ssize_t at) noexcept nogil
