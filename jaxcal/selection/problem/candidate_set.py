@@ -109,8 +109,6 @@ class CandidateSet:
         if self.scenarios is not None and self.scenarios.parameters is not None:
             cases += list(self.scenarios.parameters)
         for parameters in cases:
-            if not self.model.unanswered(self.candidates[self.available], parameters):
-                continue
             rows = np.flatnonzero(self.available)
             asked = self.candidates[rows]
             kept = answered(self.model, asked, parameters, rows, self.names)
