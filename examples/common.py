@@ -25,7 +25,7 @@ HERE = pathlib.Path(__file__).parent
 NAMES = (
     *("ankle", "ur5", "contacts", "hand_eye", "drift", "force_sensor", "triad"),
     *("camera", "tcp", "own_function", "backlash", "magnetometry", "own_policy"),
-    *("cartpole", "end_stop", "fr3", "positioner", "wrench"),
+    *("cartpole", "end_stop", "fr3", "positioner", "trajectories", "wrench"),
 )
 Rows = list[dict[str, str]]
 
