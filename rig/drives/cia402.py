@@ -11,8 +11,10 @@ import contextlib
 import time
 from typing import Any
 
+from jaxcal.extras import install
 from rig.drives.drive import Drive, Look
 from rig.drives.line import BusError, Line, Refusal
+from rig.faults import Refused
 
 CONTROL, STATUS, ERROR, MODE = 0x6040, 0x6041, 0x603F, 0x6060
 POSITION, TARGET, SPEED, ACCEL, DECEL = 0x6064, 0x607A, 0x6081, 0x6083, 0x6084
@@ -36,9 +38,14 @@ class CanLine(Line):
 
     def connect(self) -> None:
         if self._network is None:
-            import can
-            import canopen
-
+            try:
+                import can
+                import canopen
+            except ModuleNotFoundError as error:
+                raise Refused(
+                    f"drives on CANopen need {error.name}, which is not installed: "
+                    f"{install('canopen')}"
+                ) from None
             s, network = self.settings, canopen.Network()
             try:
                 network.connect(

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import sys
 import time
 import types
 
@@ -163,6 +164,14 @@ def test_drives_of_two_lines_and_of_another_bus_are_refused():
         make_drives(config.bus, [config.axes[0], other.axes[1]])
     with pytest.raises(Refused, match=r"bus\.transport: must be serial"):
         make_drives(other.bus, config.axes)
+
+
+def test_a_missing_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "canopen", None)
+    config = parse_config(stage_text(CAN.format("x"), "cia402", 1))
+    line, _ = make_drives(config.bus, config.axes)
+    with pytest.raises(Refused, match=r"need canopen, which is not installed: .*pip"):
+        line.open()
 
 
 # A device of each kind, commissioned once and then spoilt
