@@ -32,8 +32,8 @@ class NetworkScorer:
         return _encoded(self._network, self._params, rows[..., :-1], usable)
 
     def part(self, memory: Any, sets: NDArray[np.int64]) -> Any:
-        """The memory of episodes on ``sets``."""
-        return jax.tree.map(lambda leaf: leaf[sets], memory)
+        """The memory as it is: ``scores`` shares a set's among its tries."""
+        return memory
 
     def scores(
         self,
@@ -43,12 +43,17 @@ class NetworkScorer:
         count: int,
         best_only: bool = False,
     ) -> NDArray[Any]:
-        """(E, M) logits."""
+        """(E, M) logits of episodes that are as many in a row on each set."""
         learned = chosen.shape[1] - count > self._network.num_unlearned
-        made = chosen.astype(np.int32)
-        return np.asarray(
-            scores_of(self._network, self._params, memory, made, free, count, learned)
+        tries = len(chosen) // len(jax.tree.leaves(memory)[0])  # in a row on each set
+        made, left = (
+            array.reshape(-1, tries, array.shape[-1])
+            for array in (chosen.astype(np.int32), free)
         )
+        scores = scores_of(
+            self._network, self._params, memory, made, left, count, learned
+        )
+        return np.asarray(scores).reshape(free.shape)
 
 
 @functools.partial(jax.jit, static_argnames="network")
@@ -69,17 +74,21 @@ def scores_of(
     count: jax.typing.ArrayLike,
     learned: bool,
 ) -> jax.Array:
-    """(E, M) logits of the decision after ``count`` choices.
+    """(B, T, M) logits of the decision after ``count`` choices, T tries on each set.
 
     ``learned`` is False for the last ``network.num_unlearned`` choices, which the
     look-ahead makes.
     """
     features, encoded = memory
-    decision = network.decision_features(features, chosen, free, count)
-    if not learned:
-        return network.lookahead_logits(decision)[0]
-    logits: jax.Array = networks.decode(network, params, encoded, decision)[0]
-    return logits
+
+    def of_try(chosen: jax.Array, free: jax.Array) -> jax.Array:
+        decision = network.decision_features(features, chosen, free, count)
+        if not learned:
+            return network.lookahead_logits(decision)[0]
+        logits: jax.Array = networks.decode(network, params, encoded, decision)[0]
+        return logits
+
+    return jax.vmap(of_try, in_axes=1, out_axes=1)(chosen, free)
 
 
 def choose(
