@@ -11,8 +11,9 @@ READY := $(VENV)/.ready
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile --no-deps
 KERNELS := hatch_build.py $(shell find jaxcal -name '*kernel.py' -o -name '*.pxd')
 
-# Newer versions end at the second flag, and with the first their loss is NaN.
-QUICK_XLA = $(shell $(BIN)/python -c 'import importlib.metadata as m; print(\
+# XLA's flags for quick compiling, asked of what is installed when a recipe runs. Newer
+# versions end at the second flag, and with the first their loss is NaN.
+QUICK_XLA = $$($(BIN)/python -c 'import importlib.metadata as m; print(\
 	"--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false" \
 	" --xla_cpu_parallel_codegen_split_count=1" \
 	* m.version("jaxlib").startswith("0.10."))')
@@ -46,7 +47,6 @@ reproduce: $(READY) ## the paper's figures, tables and claims from our own runs,
 
 # Most of a first run is XLA compiling: without its optimiser that takes a third of the
 # time. `make test-all` compiles as users do.
-test: export XLA_FLAGS ?= $(QUICK_XLA)
 # Hundreds of programs are started: what one has compiled the others load.
 test: export PYTHONDONTWRITEBYTECODE =
 # Half of the rig's tests wait for a device, so four share two cores, file by file in order:
@@ -55,7 +55,8 @@ test: export PYTHONDONTWRITEBYTECODE =
 # while mypy runs.
 test: $(READY) ## set everything up, lint, and run the quick tests (the ones CI runs)
 	$(BIN)/python -m pytest --collect-only -qq >/dev/null & $(MAKE) --no-print-directory lint && wait
-	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder -m 'not slow' $(ARGS)
+	XLA_FLAGS="$${XLA_FLAGS-$(QUICK_XLA)}" $(BIN)/python -m pytest -n 4 --dist loadfile \
+	--no-loadscope-reorder -m 'not slow' $(ARGS)
 
 # A part is a folder of tests/, or `files`, the tests beside them. Each is a run of its own:
 # what one process has compiled it keeps, and the whole suite is too much for one.

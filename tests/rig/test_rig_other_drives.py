@@ -167,10 +167,11 @@ def test_drives_of_two_lines_and_of_another_bus_are_refused():
 
 
 def test_a_missing_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "canopen", None)
+    for module in ("can", "canopen"):
+        monkeypatch.setitem(sys.modules, module, None)
     config = parse_config(stage_text(CAN.format("x"), "cia402", 1))
     line, _ = make_drives(config.bus, config.axes)
-    with pytest.raises(Refused, match=r"need canopen, which is not installed: .*pip"):
+    with pytest.raises(Refused, match=r"need can, which is not installed: .*canopen"):
         line.open()
 
 
