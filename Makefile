@@ -55,7 +55,7 @@ test: export PYTHONDONTWRITEBYTECODE =
 # while mypy runs.
 test: $(READY) ## set everything up, lint, and run the quick tests (the ones CI runs)
 	$(BIN)/python -m pytest --collect-only -qq >/dev/null & $(MAKE) --no-print-directory lint && wait
-	XLA_FLAGS="$${XLA_FLAGS-$(QUICK_XLA)}" $(BIN)/python -m pytest -n 4 --dist loadfile \
+	XLA_FLAGS="$${XLA_FLAGS-$(QUICK_XLA)}" $(BIN)/python -m pytest -n 6 --dist loadfile \
 	--no-loadscope-reorder -m 'not slow' $(ARGS)
 
 # A part is a folder of tests/, or `files`, the tests beside them. Each is a run of its own:

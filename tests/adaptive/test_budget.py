@@ -125,6 +125,7 @@ def test_costs_that_sum_to_the_budget_can_all_be_paid():
         assert np.asarray(played.alive).sum(axis=1).tolist() == [count] * 2
 
 
+@pytest.mark.slow
 def test_a_stream_for_training_ends_where_nothing_can_be_paid():
     of = Exercise(task(), RULE)
     sessions = Sessions(4)

@@ -110,6 +110,7 @@ def test_a_proposal_states_what_it_tells(task):
     assert has_exact_mean(gains)
 
 
+@pytest.mark.slow
 def test_brax_is_rewarded_with_what_an_option_tells(task):
     pytest.importorskip("brax")
     from jaxcal.adaptive.brax_env import SequentialEnv

@@ -24,6 +24,7 @@ def normal_posterior(rows, readings, prior_std, covariance):
     return np.linalg.solve(precision, right), np.linalg.inv(precision)
 
 
+@pytest.mark.slow
 def test_a_linear_model_is_known_as_by_bayes_in_closed_form():
     task = ParticleTask.of(
         Polynomial(2, 1), Prior(1.0, mean=0.0), Noise(std=0.3), AT, measurements=4,

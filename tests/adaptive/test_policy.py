@@ -85,6 +85,7 @@ def test_the_run_trains_what_the_pure_function_does_and_tasks_are_arguments(tmp_
     assert train._cache_size() == 1
 
 
+@pytest.mark.slow
 def test_a_checkpoint_gives_back_the_policy_and_its_configuration(finished, tmp_path):
     folder, state = finished
     trained = run.load(folder)
@@ -99,6 +100,7 @@ def test_a_checkpoint_gives_back_the_policy_and_its_configuration(finished, tmp_
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_checkpoints_of_another_kind_are_refused(finished):
     folder, _ = finished
     with pytest.raises(CheckpointError, match="must be jaxcal-sequential-policy"):

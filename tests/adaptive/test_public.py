@@ -98,6 +98,7 @@ def mean_signal(sources, at):
     return np.log(0.1 + (1.0 / (1e-4 + squared)).sum(axis=-1))
 
 
+@pytest.mark.slow
 def test_location_finding_is_that_of_a_second_implementation():
     """Likelihood and gain; the outcome's entropy by quadrature, float64."""
     task = location_finding(particles=600, candidates=4, contrasts=600)

@@ -132,6 +132,7 @@ def test_joints_are_locked_and_have_other_limits(files, capsys):
     assert "--locked must be JOINT=VALUE" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_postures_are_planned_and_the_rest_chosen_again(files, capsys):
     urdf, _, folder = files
     out, reached, picture = (folder / name for name in ("a.csv", "b.csv", "plan.png"))

@@ -398,6 +398,7 @@ def test_the_json_has_an_entry_for_each_checkpoint(shown: Evaluation) -> None:
         assert np.shape(entry["methods"]["exact"]["indices"]) == (12, 4)
 
 
+@pytest.mark.slow
 def test_figures_have_axes_units_and_legends(shown: Evaluation) -> None:
     drawn = evaluation_figures(shown)
     assert set(drawn) == {

@@ -83,6 +83,7 @@ PLAYED = streams(dataclasses.replace(SHORT, gae_lambda=0.0, decisions_per_update
 play = jax.jit(PLAYED.gather)  # op by op it would be hundreds of programs
 
 
+@pytest.mark.slow
 def test_two_updates_of_a_length_play_what_one_of_twice_the_length_does():
     short = PLAYED
     long = short.having(

@@ -194,6 +194,7 @@ def _shown(studies: pathlib.Path) -> dict[str, object]:
     return {exhibit.key: exhibit for exhibit in found}
 
 
+@pytest.mark.slow
 def test_no_label_of_figure_2_is_cut_off() -> None:
     figures = [f for e in exhibits(Material(Settings())) for f in e.figures.items()]
     assert [name for name, _ in figures] == ["figure_2_seeds", "figure_2_paper"]

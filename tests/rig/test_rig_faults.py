@@ -30,6 +30,7 @@ def test_a_spoilt_run_ends_as_it_should_and_resumes_to_the_same(
     assert outcome.worst < 1e-6  # of A and b, from the uninterrupted run
 
 
+@pytest.mark.slow
 def test_a_coupling_that_slips_a_little_before_it_is_seen(truth, tmp_path):
     """The posture measured in between was kept: A was wrong by .109, without a word."""
     begun: list[str] = []

@@ -120,6 +120,7 @@ class Talking:
         return self.port.write(data)
 
 
+@pytest.mark.slow
 def test_nothing_is_sent_while_a_serial_line_is_not_quiet():
     """A frame sent into a late reply would meet it on the wire."""
     pytest.importorskip("serial", reason="serial ports need pyserial")

@@ -92,6 +92,7 @@ def test_a_stuck_axis_is_noticed_although_its_position_flickers():
 OVERSHOOT = {"[motion]": "[motion]\napproach_overshoot_deg = 2"}
 
 
+@pytest.mark.slow
 def test_the_zero_taken_here_is_approached_from_the_side_of_the_references(tmp_path):
     """With play, a zero taken as the device was put there is off by half of it."""
     config = parse_config(fast_text(OVERSHOOT))

@@ -129,7 +129,9 @@ def test_setup_asks_with_defaults_and_moves_nothing_without_a_yes(at):
     assert all(re.search(r"(\[.+\]|go on): $", question) for question in asked)
 
 
-@pytest.mark.parametrize("simulated", [False, True])
+@pytest.mark.parametrize(
+    "simulated", [pytest.param(False, marks=pytest.mark.slow), True]
+)
 def test_the_next_command_of_a_simulated_device_simulates_it(
     commissioned, at, simulated
 ):
