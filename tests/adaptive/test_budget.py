@@ -42,7 +42,7 @@ DECIDERS = {
         initial(jax.random.key(0), 4, 1, 8), RULE, 4, 8, sample=True
     ),
 }
-QUICK = ("random", "state", "ahead")
+QUICK = ("random", "state")
 
 
 def spent(of, episodes, number):
@@ -83,6 +83,7 @@ def test_no_decider_spends_more_than_there_is_and_each_goes_on_while_it_can(name
         assert uses == 0 or made == 12 or seconds < cheapest + 1e-3
 
 
+@pytest.mark.slow
 def test_with_overrun_the_last_measurement_may_cost_more():
     of = task(overrun=True, seconds=1.0, cost=100.0)
     episodes = play(of, Gain(), jax.random.split(jax.random.key(0), 8))

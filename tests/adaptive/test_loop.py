@@ -66,6 +66,7 @@ def test_a_proposal_is_the_largest_gain_of_the_exact_posterior(task):
     assert int(proposal.session.uses) == 1  # two of the tests tripped
 
 
+@pytest.mark.slow
 def test_coordinates_are_as_good_as_indices(task):
     at = np.asarray(task.designs)
     by_index = next_measurement(task, [(3, 1), (np.int64(7), 0)], seconds=30, uses=3)

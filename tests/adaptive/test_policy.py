@@ -152,6 +152,7 @@ def own(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_a_users_task_is_one_file(own):
     entry = registry.load(str(own))
     assert entry.about == "a heavy side"

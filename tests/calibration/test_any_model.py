@@ -272,6 +272,7 @@ def test_uncertain_commands_are_estimated_beside_the_parameters(
 # -- uncertainty -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [

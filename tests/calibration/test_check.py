@@ -28,6 +28,7 @@ def _new(theta, count, seed):
     return joints, ARM.predict(joints, theta) + NOISE * rng.normal(size=(count, 3))
 
 
+@pytest.mark.slow
 def test_false_alarms_are_five_in_a_hundred():
     alarms = [FOUND.check(*_new(TRUTH, 4, seed)).says == "does not hold"
               for seed in range(400)]  # fmt: skip
@@ -35,6 +36,7 @@ def test_false_alarms_are_five_in_a_hundred():
     assert low <= sum(alarms) <= high
 
 
+@pytest.mark.slow
 def test_a_drift_of_the_size_it_states_is_seen_four_times_in_five():
     joints, _ = _new(TRUTH, 4, 0)
     rng = np.random.default_rng(1)

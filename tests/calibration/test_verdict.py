@@ -197,6 +197,7 @@ def test_sockets_as_one_are_told():
     assert not found.verdict.good
 
 
+@pytest.mark.slow
 def test_another_zero_and_noise_in_another_unit_are_named():
     arm, joints = ur5(), np.random.default_rng(0).uniform(-120.0, 120.0, (40, 6))
     turned = joints + 20.0 * np.eye(6)[1]

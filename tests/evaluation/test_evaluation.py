@@ -172,6 +172,7 @@ def test_unit_changes_nothing_but_det_s() -> None:
         assert gain == pytest.approx(6 * np.log(40 * 10 * 3))
 
 
+@pytest.mark.slow
 def test_det_s_too_large_for_a_float_is_no_error() -> None:
     dataset = small(3, 6, 4)
     huge = Dataset("huge", dataset.candidates * 1e12)

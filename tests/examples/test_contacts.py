@@ -3,8 +3,10 @@
 import common
 import contacts
 import numpy as np
+import pytest
 
 
+@pytest.mark.slow
 def test_twelve_chosen_contacts_calibrate_an_arm(tmp_path):
     found = common.main(contacts, ["--out", str(tmp_path)])
     error = {rule: np.mean(values) for (_, rule, _), values in found.items()}

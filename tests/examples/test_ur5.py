@@ -7,6 +7,7 @@ import pytest
 import ur5
 
 
+@pytest.mark.slow
 def test_eight_chosen_poses_do_what_the_thesis_needed_a_thousand_for(monkeypatch):
     monkeypatch.setattr(ur5, "RULES", ("random", "I"))
     monkeypatch.setattr(ur5, "COUNTS", (8,))

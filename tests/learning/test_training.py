@@ -141,6 +141,7 @@ def test_a_checkpoint_names_its_configuration_seed_and_versions(finished):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_validation_of_the_optimum_itself_is_one():
     rng = np.random.default_rng(0)
     sets = rng.uniform(size=(6, 8, 2))
