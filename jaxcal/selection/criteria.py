@@ -309,6 +309,10 @@ class Joined:
             )
         self.criterion = criterion
 
+    def __repr__(self) -> str:
+        given = "" if self.criterion is None else repr(self.criterion)
+        return f"{type(self).__name__}({given})"
+
     def within(self, each: Criterion) -> Self:
         """The criterion of a problem whose first scenario has ``each``."""
         joined = copy.copy(self)

@@ -127,6 +127,7 @@ def test_one_scenario_changes_nothing(name) -> None:
     plain = Design.from_blocks(blocks)
     for one in (blocks[None], np.stack([blocks, blocks])):
         for criterion in (Mean(name), Worst(name)):
+            assert repr(criterion).endswith(f"({name!r})")
             answer = Design.from_blocks(one).select(4, criterion)
             same = plain.select(4, name)
             assert answer.indices.tolist() == same.indices.tolist()
