@@ -255,4 +255,4 @@ def test_devices_exchange_gradients_and_no_experience() -> None:
     )
     assert out["params"] < out["numbers on 8"] < 2.0 * out["params"]
     assert out["numbers on 2"] < 2.0 * out["params"]
-    assert out["experience"] > 20.0 * out["params"]
+    assert out["experience"] > 10.0 * out["params"]

@@ -27,7 +27,7 @@ TINY = (
 ).split()
 # At the preset's learning rate so small a run is chaotic: a difference in the last
 # place grows some fivefold an update, and in the end another posture is drawn.
-CALM = "--learning-rate=5e-5 --final-learning-rate=5e-5".split()
+CALM = "--learning-rate=2e-5 --final-learning-rate=2e-5".split()
 
 
 def free_port() -> int:
