@@ -66,6 +66,7 @@ def random_task(seed, designs, outcomes, horizon, overrun):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("designs", "outcomes", "horizon"), [(6, 2, 2), (4, 3, 2), (6, 2, 1), (2, 2, 4)]
 )

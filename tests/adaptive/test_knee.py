@@ -70,6 +70,7 @@ def replay(task, episodes, number, cells, sigma):
     return belief, total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", [Random(), STATE_RULE])
 def test_sessions_are_those_of_the_second_implementation(rule):
     task = knee(**SMALL)

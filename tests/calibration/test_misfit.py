@@ -126,6 +126,7 @@ def test_a_urdf_file_is_fitted_without_harmonics_and_says_what_that_costs(tmp_pa
     assert off < float(said[1]) < 2.0 * off
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "place"), [("panda_1", "right"), ("kuka_14", "front")]
 )

@@ -93,6 +93,7 @@ def test_compact_is_blind_to_affine_maps(rng, k, chosen):
     np.testing.assert_allclose(other - value, moved, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "config", [CLOSE, pytest.param(NetworkConfig(kind="paper", width=32), marks=slow)]
 )

@@ -152,6 +152,7 @@ def test_a_gradient_step_is_that_of_optax(rng, size):
         np.testing.assert_allclose(ours.params[name], theirs[name], rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "n", "k"),
     [
@@ -270,6 +271,7 @@ def test_value_and_policy_are_learned_in_a_probe_environment():
     assert abs(float(state.average["value"]) - np.mean(rewards[-5:])) < 0.1
 
 
+@pytest.mark.slow
 def test_training_maps_over_seeds():
     """Each of several in one program is what it is alone, and no two are the same."""
     keys = jax.random.split(jax.random.key(5), 3)

@@ -144,6 +144,7 @@ def recipe(config, *tasks):
     return Recipe(config, tuple((task,) for task in tasks), "probe", (), (), None)
 
 
+@pytest.mark.slow
 def test_a_run_resumes_bit_for_bit_in_the_middle_of_sessions(tmp_path):
     """Of two tasks in turn, with streams of their own."""
     tasks = jnp.float32(1.0), jnp.float32(2.0)

@@ -157,6 +157,7 @@ def test_a_function_cannot_come_back_from_a_file(arm):
         from_dict(data)
 
 
+@pytest.mark.slow
 def test_an_arm_of_ones_own_shows_what_the_chain_shows():
     """The first joints of a UR5 in JAX, radians and all: the same is seen of them."""
     chain = SerialChain.from_dh(UR5_TABLE[:3], tool=(0, 0, 31))

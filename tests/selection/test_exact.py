@@ -342,6 +342,7 @@ def test_score_against_the_exact_optimum():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [4, 8, pytest.param(12, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("cap", [1, 12])
 def test_exact_and_exchange_agree_on_hundreds_of_sets(k, cap):
