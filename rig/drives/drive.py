@@ -23,6 +23,9 @@ STILL_COUNTS = 2  # between two readings of a position that flickers by one coun
 LOOKS = 4  # for two readings that agree
 HOME = 2**30  # a count that no drive shows when it is switched on
 
+_OWN = "every kind of drive defines this itself; Drive only declares it"
+_WATCH = "a drive that watches its line defines this itself"
+
 
 class Look(NamedTuple):
     """What a drive says when it is looked at."""
@@ -68,15 +71,15 @@ class Drive:
 
     def ids(self) -> dict[str, int | str]:
         """What tells this drive from another, and does not change."""
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)  # abstract
 
     def arm(self) -> None:
         """Switch its power stage on, where it is off."""
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)  # abstract
 
     def position(self) -> int:
         """Its own count, by its encoder or of the steps it has made."""
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)  # abstract
 
     def move(self, count: int, speed: float, accel: float) -> None:
         """Start an absolute move, and return.
@@ -87,19 +90,19 @@ class Drive:
             count: where to.
             speed, accel: counts a second, and a second squared; no faster.
         """
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)  # abstract
 
     def standing(self) -> bool:
         """Whether its last move has ended, at its target or not."""
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)  # abstract
 
     def stop(self) -> None:
         """Stop as fast as it may, with its torque on; to be sent at any time."""
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)  # abstract
 
     def alarm(self) -> str:
         """The fault that it is in, in words; empty where there is none."""
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)  # abstract
 
     # What it may know besides
 
@@ -145,15 +148,15 @@ class Drive:
 
     def watch(self) -> int:
         """Its timeout of the line, as its register holds it, where it has one."""
-        raise NotImplementedError
+        raise NotImplementedError(_WATCH)  # abstract
 
     def set_watch(self, counts: int) -> None:
         """Set that register."""
-        raise NotImplementedError
+        raise NotImplementedError(_WATCH)  # abstract
 
     def watch_counts(self, seconds: float) -> int:
         """What that register holds of so many seconds, or of a little more."""
-        raise NotImplementedError
+        raise NotImplementedError(_WATCH)  # abstract
 
     def lasting(self, ids: dict[str, int | str]) -> dict[str, int | str]:
         """Its ids that do not change."""

@@ -17,6 +17,8 @@ from rig.faults import Fault
 
 QUICK_S = 0.05  # for a reply to a stop in its first round, besides the frames' time
 
+_OWN = "every kind of line defines this itself; Line only declares it"
+
 
 class BusError(Fault):
     """No valid reply: silence, noise, a closed port, or a reply to something else."""
@@ -70,11 +72,11 @@ class Line:
 
     def connect(self) -> None:
         """Open the port, unless it is open; OSError or BusError where it cannot be."""
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)  # abstract
 
     def close(self) -> None:
         """Close the port; opening it again is possible."""
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)  # abstract
 
     def stops_at_once(self, drives: Sequence[Any]) -> bool:
         """Whether one frame stops all of these."""

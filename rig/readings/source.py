@@ -16,6 +16,9 @@ from rig.readings.attitude import Array, Reading
 
 RING = 8192  # readings kept: over half a minute at 200 Hz
 
+_OWN = "every source of readings defines this itself; Source only declares it"
+_TURN = "a source of attitudes defines this itself; numbers have no world to turn"
+
 
 class ReadingError(Fault):
     """Readings are stale, their line is closed, or they are not to be trusted."""
@@ -54,16 +57,16 @@ class Source:
 
     def open(self) -> Any:
         """Begin to receive; ReadingError where the port cannot be opened."""
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)  # abstract
 
     def close(self) -> None:
-        """End it."""
-        raise NotImplementedError
+        """Stop receiving and close the port."""
+        raise NotImplementedError(_OWN)  # abstract
 
     @property
     def where(self) -> str:
         """Where it is heard, in words."""
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)  # abstract
 
     @property
     def port(self) -> int:
@@ -77,7 +80,7 @@ class Source:
 
     def turn(self, world: Array) -> None:
         """Turn all readings, those that were received too; of attitudes alone."""
-        raise NotImplementedError
+        raise NotImplementedError(_TURN)  # abstract
 
     def store(self, readings: list[Reading]) -> bool:
         """Keep what was accepted, under the lock; whether anything was."""

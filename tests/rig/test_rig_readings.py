@@ -89,6 +89,7 @@ def test_registers_of_a_modbus_device_are_readings():
         )  # fmt: skip
         with make_source(given) as source:
             read(source, [-70.001, 123.45])
+            assert source.counts["accepted"] >= 1
     finally:
         server.close()
 

@@ -16,7 +16,7 @@ from jaxcal.learning.training.run import Recipe, updates
 
 __all__ = ["memory", "require_room"]
 
-_SMALL = 2**20  # candidates of an update's episodes below which nobody runs out
+_SMALL = 2**20  # candidates of an update's episodes; fewer fit into any memory
 
 
 def memory() -> float:
@@ -29,7 +29,7 @@ def memory() -> float:
         for line in pathlib.Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
                 return 1024.0 * float(line.split()[1])
-    return math.inf  # another system than Linux: nobody says
+    return math.inf  # unknown on other systems than Linux
 
 
 def require_room(recipe: Recipe, mesh: Mesh | None) -> None:

@@ -92,7 +92,8 @@ def solve_auto(
     started: dict[str, Any] = {"seed": seed, "restarts": restarts}
     if solution.reason:  # rounding
         return dataclasses.replace(solution, method="exact", **started)
-    name = f"a {problem.criterion.name}-efficiency"
+    letter = problem.criterion.name
+    name = f"{'an' if letter[0] in 'AEI' else 'a'} {letter}-efficiency"
     if isinstance(problem.criterion, Joined):
         name = "an efficiency"
     proven_share = problem.criterion.efficiency(solution.value, solution.bound)
