@@ -12,7 +12,7 @@ from flax import struct
 from jaxcal.adaptive.policy.features import NUM_FEATURES, Shortlist
 from jaxcal.adaptive.policy.network import Correction
 from jaxcal.adaptive.policy.sessions import Exercise, Sessions, State
-from jaxcal.adaptive.rules import Scored
+from jaxcal.adaptive.rules import CostRule
 from jaxcal.learning.environments.functional import FunctionalEnv
 
 __all__ = ["TaskEnv"]
@@ -35,7 +35,7 @@ class TaskEnv(FunctionalEnv):
 
     metric = "gain"
 
-    def __init__(self, task: Any, base: Scored, per_group: int = 8) -> None:
+    def __init__(self, task: Any, base: CostRule, per_group: int = 8) -> None:
         self._given, self._sessions = Exercise(task, base), Sessions(per_group)
 
     def begin(self, key: jax.Array) -> _Episode:
@@ -59,7 +59,7 @@ class TaskEnv(FunctionalEnv):
 
     def network(self, width: int = 64) -> nn.Module:
         """That of a policy: it begins as the base rule."""
-        return _FromObservation(self.num_actions, width)
+        return _TaskNetwork(self.num_actions, width)
 
     def _seen(self, state: State, key: jax.Array) -> _Episode:
         key_seen, key = jax.random.split(key)
@@ -70,7 +70,7 @@ class TaskEnv(FunctionalEnv):
         return episode.seen.valid
 
 
-class _FromObservation(nn.Module):
+class _TaskNetwork(nn.Module):
     """The network of a policy, whose input is what ``SequentialEnv`` observes."""
 
     options: int

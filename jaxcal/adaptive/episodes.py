@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxcal.adaptive.session import Decider, Task
+from jaxcal.adaptive.session import Decider, SequentialTask
 
 __all__ = ["Comparison", "Episodes", "compare", "play"]
 
@@ -35,7 +35,7 @@ class Episodes:
         return (self.gains * self.alive).sum(axis=-1)
 
 
-def play(task: Task, decider: Decider, keys: jax.Array) -> Episodes:
+def play(task: SequentialTask, decider: Decider, keys: jax.Array) -> Episodes:
     """Play one session per key (B,), at most ``task.batch`` at once if it is defined.
 
     The truth, the budget and the noise of every measurement depend on the key alone, so
@@ -57,7 +57,7 @@ def play(task: Task, decider: Decider, keys: jax.Array) -> Episodes:
 
 
 @jax.jit
-def _played(task: Task, decider: Decider, keys: jax.Array) -> Episodes:
+def _played(task: SequentialTask, decider: Decider, keys: jax.Array) -> Episodes:
     """Sessions played at once."""
     key_truth, key_begin, key_steps = jax.vmap(
         lambda key: jax.random.split(key, 3), out_axes=1
@@ -142,7 +142,7 @@ class Comparison:
 
 
 def compare(
-    task: Task,
+    task: SequentialTask,
     deciders: Mapping[str, Decider],
     episodes: int = 4096,
     seed: int = 0,
@@ -159,17 +159,17 @@ def compare(
         progress: called with the sessions of a decider played so far, from 0.
     """
     keys = jax.random.split(jax.random.key(seed), episodes)
-    found = []
+    measured = []
     for decider in deciders.values():
         parts = []
         for at in range(0, episodes, batch):
             progress(at)
             played = play(task, decider, keys[at : at + batch])
-            made = played.alive.sum(axis=1)
-            part = played.gain, played.entropy_drop, played.log_ratio, made
+            choices = played.alive.sum(axis=1)
+            part = played.gain, played.entropy_drop, played.log_ratio, choices
             parts.append([np.asarray(values, np.float64) for values in part])
-        found.append([np.concatenate(values) for values in zip(*parts, strict=True)])
-    whole = (np.stack(values) for values in zip(*found, strict=True))
+        measured.append([np.concatenate(values) for values in zip(*parts, strict=True)])
+    whole = (np.stack(values) for values in zip(*measured, strict=True))
     return Comparison(tuple(deciders), *whole)
 
 

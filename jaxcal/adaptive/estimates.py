@@ -80,11 +80,11 @@ def _of_particles(
     unknowns = np.asarray(jax.vmap(belief.model.unknowns)(belief.z), np.float64)
     weights = np.exp(np.asarray(belief.log_weight, np.float64))
     weights /= weights.sum()
-    found = {}
+    estimate_of = {}
     for name, values in zip(names, unknowns.T, strict=True):
         order = np.argsort(values)
         # Half of a particle's weight lies below it.
         below = np.cumsum(weights[order]) - weights[order] / 2.0
         low, high = np.interp(tails, below, values[order])
-        found[name] = Estimate(float(weights @ values), float(low), float(high))
-    return found
+        estimate_of[name] = Estimate(float(weights @ values), float(low), float(high))
+    return estimate_of

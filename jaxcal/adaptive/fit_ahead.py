@@ -28,7 +28,7 @@ from jaxcal.adaptive.rules import SHARES, Shares
 from jaxcal.adaptive.search_kernel import NODE, SUM
 from jaxcal.adaptive.tuning import search
 
-__all__ = ["Fitted", "fit", "outside"]
+__all__ = ["Fit", "fit", "outside"]
 
 Array = NDArray[np.float32]
 
@@ -47,7 +47,7 @@ _MEASURED = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Fitted:
+class Fit:
     """A decider for one task, and its information gain there."""
 
     decider: Ahead | Shares
@@ -78,7 +78,7 @@ def fit(
     seconds: float | None = None,
     uses: int | None = None,
     seed: int = 0,
-) -> Fitted:
+) -> Fit:
     """``ahead`` with the constants that gain most on a task's own sessions.
 
     Args:
@@ -127,19 +127,21 @@ class _Task:
 
 
 @functools.lru_cache(maxsize=16)
-def _fit(of: _Task, seed: int) -> Fitted:
+def _fit(of: _Task, seed: int) -> Fit:
     seeds = np.random.SeedSequence(seed).generate_state(4)
     chosen = of.play(_plain(SHARES), _LEAST, seeds[0])[1]
     length = max(float((chosen >= 0).sum()) / _LEAST, 1.0)
     designs, outcomes, states = of.task.likelihood.shape
-    each = designs * outcomes * (states + SUM) + NODE  # of a choice of ``shares``
+    choice_work = (
+        designs * outcomes * (states + SUM) + NODE
+    )  # of a choice of ``shares``
 
     def sessions(work: float, choice: float) -> int:
         return int(min(work / (length * choice), _MOST))
 
     bases = [SHARES]
     limited = bool(np.isfinite(of.seconds[1]))
-    if (count := sessions(_TUNE, each)) >= _LEAST:
+    if (count := sessions(_TUNE, choice_work)) >= _LEAST:
         start = SHARES if limited else SHARES.replace(haste=_HASTE)  # type: ignore[attr-defined]  # flax
         bases.append(
             search(
@@ -150,7 +152,7 @@ def _fit(of: _Task, seed: int) -> Fitted:
             )
         )  # fmt: skip
     tried = [Ahead(base) for base in bases]
-    if (count := sessions(_PLAY, max(_DEEP, each))) >= _LEAST // 2:
+    if (count := sessions(_PLAY, max(_DEEP, choice_work))) >= _LEAST // 2:
         tried += [
             Ahead(base, hints=_hints(of.play(deep, count, seeds[2])[1], designs))
             for base in bases
@@ -160,15 +162,15 @@ def _fit(of: _Task, seed: int) -> Fitted:
         one.replace(doubt=doubt)  # type: ignore[attr-defined]  # flax
         for one, doubt in itertools.product(tried, (AHEAD.doubt, 1.0))
     ]
-    count = max(sessions(_TRY, max(AHEAD.effort, each)), _LEAST)
+    count = max(sessions(_TRY, max(AHEAD.effort, choice_work)), _LEAST)
     nats = np.array([of.play(one, count, seeds[3])[0].sum(axis=1) for one in tried])
     mean, error = _paired(nats - nats[0])
     best = int((mean - error).argmax())
     rule = of.play(_plain(SHARES), count, seeds[3])[0].sum(axis=1)
     more, error = _paired(nats[best] - rule)
     if more < -2.0 * error:
-        return Fitted(SHARES, float(rule.mean()), 0.0, 0.0)
-    return Fitted(tried[best], float(nats[best].mean()), float(more), float(error))
+        return Fit(SHARES, float(rule.mean()), 0.0, 0.0)
+    return Fit(tried[best], float(nats[best].mean()), float(more), float(error))
 
 
 def _plain(rule: Shares) -> Ahead:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.particles import ParticleBelief, outcome_shape
-from jaxcal.adaptive.session import Session, Task
+from jaxcal.adaptive.session import SequentialTask, Session
 from jaxcal.checks import in_words, numbers, whole_number
 from jaxcal.checks import seconds as checked_seconds
 
@@ -34,7 +34,7 @@ _NEAR = 1e-5  # of a coordinate's range: tolerance for coordinates of a design
 
 
 def begin(
-    task: Task, seconds: float | None, uses: int | None, seed: int
+    task: SequentialTask, seconds: float | None, uses: int | None, seed: int
 ) -> tuple[Any, Session]:
     """The belief and the session at the start, with this budget.
 
@@ -62,11 +62,11 @@ def begin(
                 f"{in_words(ends.astype(float))}"
             )
     if seconds is not None:
-        left = jnp.float32(checked_seconds("seconds", seconds))
-        session = session.replace(seconds=left)  # type: ignore[attr-defined]  # flax
+        budget = jnp.float32(checked_seconds("seconds", seconds))
+        session = session.replace(seconds=budget)  # type: ignore[attr-defined]  # flax
     if uses is not None:
-        left = jnp.int32(whole_number("uses", uses, 1))
-        session = session.replace(uses=left)  # type: ignore[attr-defined]  # flax
+        budget = jnp.int32(whole_number("uses", uses, 1))
+        session = session.replace(uses=budget)  # type: ignore[attr-defined]  # flax
     return belief, session
 
 
@@ -89,7 +89,7 @@ def step_keys(seed: int, number: int) -> StepKeys:
 
 
 def replay(
-    task: Task, history: History, belief: Any, session: Session, seed: int
+    task: SequentialTask, history: History, belief: Any, session: Session, seed: int
 ) -> tuple[Any, Session, list[tuple[Any, Any]]]:
     """Belief and session after a history, and its entries as the task has them.
 
@@ -122,7 +122,12 @@ def replay(
 
 
 def checked_entry(
-    task: Task, belief: Any, session: Session, design: Any, outcome: Any, where: str
+    task: SequentialTask,
+    belief: Any,
+    session: Session,
+    design: Any,
+    outcome: Any,
+    where: str,
 ) -> tuple[Any, Any]:
     """Design and outcome as the task has them, of a measurement that can be paid.
 
@@ -134,7 +139,9 @@ def checked_entry(
     return entry
 
 
-def _require_paid(task: Task, session: Session, design: Any, where: str) -> None:
+def _require_paid(
+    task: SequentialTask, session: Session, design: Any, where: str
+) -> None:
     """Refuse a measurement that the budget could not pay."""
     if isinstance(task, GridTask) and not task.payable(session)[design]:
         cost = task.travel[session.place, design] + task.most_extra[design]
@@ -147,7 +154,12 @@ def _require_paid(task: Task, session: Session, design: Any, where: str) -> None
 
 @jax.jit
 def after(
-    task: Task, belief: Any, session: Session, design: Any, outcome: Any, key: jax.Array
+    task: SequentialTask,
+    belief: Any,
+    session: Session,
+    design: Any,
+    outcome: Any,
+    key: jax.Array,
 ) -> tuple[Any, Session]:
     """Belief and session after one measurement."""
     return (
@@ -157,7 +169,12 @@ def after(
 
 
 def _checked(
-    task: Task, belief: Any, session: Session, design: Any, outcome: Any, where: str
+    task: SequentialTask,
+    belief: Any,
+    session: Session,
+    design: Any,
+    outcome: Any,
+    where: str,
 ) -> tuple[Any, Any]:
     """Design and outcome as the task has them.
 
@@ -175,20 +192,20 @@ def _checked(
         design = _as_designs(task, belief, session, design, f"{where}: design")
     if isinstance(task, GridTask):
         count = task.likelihood.shape[1]
-        found = _whole(outcome)
-        if found is None or not 0 <= found < count:
+        index = _whole(outcome)
+        if index is None or not 0 <= index < count:
             raise ValueError(
                 f"{where}: outcome must be a whole number in [0, {count}), "
                 f"got {outcome!r}"
             )
-        likelihood = np.asarray(task.likelihood[design, found], np.float64)
+        likelihood = np.asarray(task.likelihood[design, index], np.float64)
         if not (likelihood * np.asarray(belief.weights, np.float64)).sum() > 0.0:
             raise ValueError(
-                f"{where}: outcome {found} of design "
+                f"{where}: outcome {index} of design "
                 f"{in_words(np.asarray(task.designs[design], np.float64))} cannot "
                 "follow what was measured before: the model gives it probability 0"
             )
-        return design, jnp.int32(found)
+        return design, jnp.int32(index)
     values = numbers(f"{where}: outcome", outcome)
     shape = outcome_shape(belief.model)
     if values.shape != shape:
@@ -214,7 +231,7 @@ _can_answer = jax.jit(ParticleBelief.can_answer)
 
 
 def _as_designs(
-    task: Task, belief: Any, session: Session, design: Any, where: str
+    task: SequentialTask, belief: Any, session: Session, design: Any, where: str
 ) -> Any:
     """A design in the structure, the shapes and the types of the task's options."""
     leaves, structure = jax.tree.flatten(_like(task, belief, session))
@@ -224,22 +241,24 @@ def _as_designs(
         raise ValueError(
             f"{where} must have the structure {structure}, got {design!r}"
         ) from None
-    found = [numbers(where, values) for values in given]
-    for each, leaf in zip(found, leaves, strict=True):
-        if each.shape != leaf.shape[1:]:
+    arrays = [numbers(where, values) for values in given]
+    for array, leaf in zip(arrays, leaves, strict=True):
+        if array.shape != leaf.shape[1:]:
             raise ValueError(
-                f"{where} must have shape {leaf.shape[1:]}, got {each.shape}"
+                f"{where} must have shape {leaf.shape[1:]}, got {array.shape}"
             )
-    typed = [jnp.asarray(x, leaf.dtype) for x, leaf in zip(found, leaves, strict=True)]
+    typed = [jnp.asarray(x, leaf.dtype) for x, leaf in zip(arrays, leaves, strict=True)]
     return jax.tree.unflatten(structure, typed)
 
 
-def from_leaves(task: Task, belief: Any, session: Session, leaves: list[Any]) -> Any:
+def from_leaves(
+    task: SequentialTask, belief: Any, session: Session, leaves: list[Any]
+) -> Any:
     """A design from the list of its leaves, as a journal has it."""
     return jax.tree.unflatten(jax.tree.structure(_like(task, belief, session)), leaves)
 
 
-def _like(task: Task, belief: Any, session: Session) -> Any:
+def _like(task: SequentialTask, belief: Any, session: Session) -> Any:
     """Shapes and types of the task's options, leaves (A, ...)."""
     return jax.eval_shape(task.options, belief, session, jax.random.key(0)).designs
 

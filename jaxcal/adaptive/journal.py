@@ -21,12 +21,12 @@ _KIND = "jaxcal adaptive session"
 def fingerprint(tree: Any) -> str:
     """A hash of a task or a decider: its tables, its numbers and its kind."""
     leaves, structure = jax.tree.flatten(tree)
-    found = hashlib.sha256(re.sub(r" at 0x[0-9a-f]+", "", str(structure)).encode())
+    digest = hashlib.sha256(re.sub(r" at 0x[0-9a-f]+", "", str(structure)).encode())
     for leaf in leaves:
         array = np.ascontiguousarray(leaf)
-        found.update(f"{array.dtype}{array.shape}".encode())
-        found.update(array.tobytes())
-    return found.hexdigest()
+        digest.update(f"{array.dtype}{array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
 
 
 class SessionJournal:
@@ -78,13 +78,13 @@ def _whole(number: int, record: Record) -> bool:
 
 
 def _require_same(
-    path: pathlib.Path, found: dict[str, Any], header: dict[str, Any]
+    path: pathlib.Path, written: dict[str, Any], header: dict[str, Any]
 ) -> None:
-    if found.get("kind") != _KIND:
+    if written.get("kind") != _KIND:
         raise ValueError(f"{path} is not a journal of a session")
     for name, value in header.items():
-        if found.get(name) != value:
+        if written.get(name) != value:
             raise ValueError(
-                f"{path} is of a session with another {name}: {found.get(name)!r}, "
+                f"{path} is of a session with another {name}: {written.get(name)!r}, "
                 f"not {value!r}. Give another path, or the same {name}"
             )

@@ -77,13 +77,13 @@ _DIMENSIONS = (3, 2, 2, 2, 2, 1, 1, 1, 1, 2, 1, 0, 0, 0, 0)
 def _chosen(horizon: int, effort: float, *arrays: Any) -> Any:
     """(...) int32 choices; arrays have leading batch axes that broadcast."""
     given = [np.asarray(array) for array in arrays]
-    each = list(zip(given, _DIMENSIONS, strict=True))
-    batches = [array.shape[: array.ndim - dims] for array, dims in each]
+    sized = list(zip(given, _DIMENSIONS, strict=True))
+    batches = [array.shape[: array.ndim - dims] for array, dims in sized]
     batch = np.broadcast_shapes(*batches)
     tasks = np.broadcast_shapes(*batches[:_TABLES])
     states = [
         np.broadcast_to(array, batch + array.shape[array.ndim - dims :])
-        for array, dims in each[_TABLES:]
+        for array, dims in sized[_TABLES:]
     ]
     chosen = np.empty(batch, np.int32)
     for index in np.ndindex(tasks):  # one iteration per task
@@ -97,13 +97,13 @@ def _chosen(horizon: int, effort: float, *arrays: Any) -> Any:
         at = tuple(
             slice(None) if n == 1 else i for i, n in zip(index, tasks, strict=True)
         )
-        belief, place, seconds, left, made = (state[at] for state in states)
-        found = np.empty(place.size, np.int32)
+        belief, place, seconds, uses, made = (state[at] for state in states)
+        designs = np.empty(place.size, np.int32)
         searched.choose(
-            _single(belief).reshape(found.size, -1), _whole(place),
-            _single(seconds).ravel(), _whole(left), _whole(made), found,
+            _single(belief).reshape(designs.size, -1), _whole(place),
+            _single(seconds).ravel(), _whole(uses), _whole(made), designs,
         )  # fmt: skip
-        chosen[at] = found.reshape(place.shape)
+        chosen[at] = designs.reshape(place.shape)
     return chosen
 
 

@@ -26,9 +26,9 @@ from jaxcal.adaptive.history import (
 from jaxcal.adaptive.journal import SessionJournal, fingerprint
 from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.rules import Gain
-from jaxcal.adaptive.session import Decider, Session, Task
+from jaxcal.adaptive.session import Decider, SequentialTask, Session
 
-__all__ = ["Finished", "Loop", "Proposal", "next_measurement", "run"]
+__all__ = ["Loop", "Proposal", "SessionResult", "next_measurement", "run"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Proposal:
 
 
 @dataclasses.dataclass(frozen=True)
-class Finished:
+class SessionResult:
     """A session that has ended."""
 
     history: list[tuple[Any, Any]]  # (design, outcome)
@@ -56,7 +56,7 @@ class Finished:
 
 
 def next_measurement(
-    task: Task,
+    task: SequentialTask,
     history: History = (),
     decider: Decider | None = None,
     *,
@@ -88,7 +88,7 @@ def next_measurement(
 
 
 def run(
-    task: Task,
+    task: SequentialTask,
     decider: Decider | None,
     measure: Callable[[Proposal], Any],
     *,
@@ -97,7 +97,7 @@ def run(
     uses: int | None = None,
     seed: int = 0,
     enough: Callable[[Proposal], bool] = lambda proposal: False,
-) -> Finished:
+) -> SessionResult:
     """Propose, measure, update, until the budget is spent.
 
     Args:
@@ -118,7 +118,7 @@ def run(
         while True:
             proposal = loop.suggest()
             if proposal.design is None or enough(proposal):
-                return Finished(loop.history, loop.belief, loop.session)
+                return SessionResult(loop.history, loop.belief, loop.session)
             loop.observed(measure(proposal))
 
 
@@ -134,7 +134,7 @@ class Loop:
 
     def __init__(
         self,
-        task: Task,
+        task: SequentialTask,
         decider: Decider | None = None,
         *,
         journal: str | os.PathLike[str] | None = None,
@@ -216,7 +216,7 @@ class Loop:
         self.close()
 
 
-def _default(task: Task, session: Session) -> Decider:
+def _default(task: SequentialTask, session: Session) -> Decider:
     counted = isinstance(task, GridTask) and bool((task.uses > 0).any())
     if not (math.isfinite(session.seconds) or counted):
         return Gain()
@@ -226,7 +226,7 @@ def _default(task: Task, session: Session) -> Decider:
 
 
 def _proposal(
-    task: Task,
+    task: SequentialTask,
     decider: Decider,
     belief: Any,
     session: Session,
@@ -253,7 +253,7 @@ def _proposal(
 
 @jax.jit
 def _choose(
-    task: Task,
+    task: SequentialTask,
     decider: Decider,
     belief: Any,
     session: Session,

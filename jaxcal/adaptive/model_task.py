@@ -38,7 +38,7 @@ Draw = Callable[[jax.Array], jax.Array]  # p standard normal numbers -> paramete
 
 @struct.dataclass
 class Candidates:
-    """Candidates of a model as ``particles.Model``; made by ``candidates_of``."""
+    """A model's candidates as a ``ParticleModel``; made by ``candidates_of``."""
 
     commands: jax.Array  # (M, n)
     mean: jax.Array  # (p,) of the prior
@@ -169,9 +169,9 @@ def _drawn(
                 f"prior must return ({p},) finite parameters, got {drawn.tolist()}"
             )
         return drawn, np.zeros(p), prior
-    known = (model.default_prior() if prior is None else prior).resolve(model)
-    precision = np.diag(known.precision)
-    unknown = known.free & (precision == 0.0)
+    resolved = (model.default_prior() if prior is None else prior).resolve(model)
+    precision = np.diag(resolved.precision)
+    unknown = resolved.free & (precision == 0.0)
     if unknown.any():
         named = ", ".join(np.array(model.names)[unknown])
         raise ValueError(
@@ -179,7 +179,7 @@ def _drawn(
             f"nothing can be drawn of {named}"
         )
     with np.errstate(divide="ignore"):
-        return known.mean, np.where(known.free, precision**-0.5, 0.0), None
+        return resolved.mean, np.where(resolved.free, precision**-0.5, 0.0), None
 
 
 def _whitening(
@@ -207,11 +207,11 @@ def _whitening(
 
 def _outputs(model: Model, commands: Array, mean: Array) -> Callable[..., jax.Array]:
     if isinstance(model, FromJax):
-        return _Traced(model.f)
-    return _Asked(model, commands)
+        return _JaxReadings(model.f)
+    return _HostReadings(model, commands)
 
 
-class _Traced:
+class _JaxReadings:
     """Readings of a function in JAX."""
 
     def __init__(self, f: Callable[[Any, Any], Any]) -> None:
@@ -223,7 +223,7 @@ class _Traced:
         return jnp.atleast_1d(self._f(command, unknowns))
 
 
-class _Asked:
+class _HostReadings:
     """Readings of a model in numpy, asked on the host."""
 
     def __init__(self, model: Model, commands: Array) -> None:

@@ -1,6 +1,6 @@
 """Tasks of continuous unknowns, and their belief: particles.
 
-The unknowns of a ``Model`` are functions of d independent standard normal
+The unknowns of a ``ParticleModel`` are functions of d independent standard normal
 coordinates z, so every prior is N(0, I) and information, which no change of coordinates
 alters, is that of the unknowns themselves.
 """
@@ -22,8 +22,8 @@ from jaxcal.checks import in_words, numbers, whole_number
 from jaxcal.models import Noise, Prior
 
 __all__ = [
-    "Model",
     "ParticleBelief",
+    "ParticleModel",
     "ParticleTask",
     "log_mean",
     "outcome_shape",
@@ -39,7 +39,7 @@ _AT_ONCE = 2**25  # log probabilities that sessions played at once may hold
 _DESIGNS = 512  # whose gains are computed at once
 
 
-class Model(Protocol):
+class ParticleModel(Protocol):
     """What is measured: a pytree with these methods, for one z and one design each.
 
     An outcome is a number. Where it is an array, the model says so by an attribute
@@ -90,7 +90,7 @@ class ParticleBelief:
     answers: jax.Array  # (T, ...) their outcomes
     made: jax.Array  # () int32 measurements made
     log_evidence: jax.Array  # () estimated log density of the measurements made
-    model: Model
+    model: ParticleModel
 
     def entropy(self) -> jax.Array:
         """() nats, of z: log evidence less the particles' mean log joint density."""
@@ -293,7 +293,7 @@ class ParticleBelief:
 class ParticleTask:
     """A model, the length of a session, and the effort of its belief; see ``make``."""
 
-    model: Model
+    model: ParticleModel
     seconds: jax.Array  # () budget of a session; inf where nothing costs
     horizon: int = struct.field(pytree_node=False)
     num_particles: int = struct.field(pytree_node=False)
@@ -303,7 +303,7 @@ class ParticleTask:
 
     @staticmethod
     def make(
-        model: Model,
+        model: ParticleModel,
         horizon: int,
         *,
         seconds: float = float("inf"),
@@ -481,19 +481,20 @@ def _check(task: ParticleTask) -> None:
     """Try the model on some designs and draws of the prior."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(task)):
         return
-    cost, outcomes, own, total = jax.device_get(_tried(task))
+    cost, outcomes, log_prob, total = jax.device_get(_tried(task))
     if not (cost >= 0.0).all():
         raise ValueError(f"model.cost must be at least 0, got {in_words(cost)}")
     shape = outcome_shape(task.model)
-    if outcomes.shape[1:] != shape or own.ndim != 1:
+    if outcomes.shape[1:] != shape or log_prob.ndim != 1:
         raise ValueError(
             f"model.sample must give shape {shape} and model.log_prob a number, got "
-            f"shapes {outcomes.shape[1:]} and {own.shape[1:]}"
+            f"shapes {outcomes.shape[1:]} and {log_prob.shape[1:]}"
         )
-    if not (own > _FLOOR).all():
+    if not (log_prob > _FLOOR).all():
         raise ValueError(
             "model.log_prob must be finite for what model.sample draws, got "
-            f"{own.min():g} for the outcome {in_words(outcomes[own.argmin()])}"
+            f"{log_prob.min():g} for the outcome "
+            f"{in_words(outcomes[log_prob.argmin()])}"
         )
     if (np.abs(total - 1.0) > 1e-3).any():
         worst = total[np.abs(total - 1.0).argmax()]
@@ -514,14 +515,21 @@ def _tried(task: ParticleTask) -> tuple[jax.Array, ...]:
     outcomes = jax.vmap(model.sample)(
         predictions, jax.random.split(keys[3], task.num_candidates)
     )
-    own = jax.vmap(model.log_prob)(predictions, outcomes)
+    log_prob = jax.vmap(model.log_prob)(predictions, outcomes)
     if model.support is None:
-        return options.seconds, outcomes, own, jnp.ones(1)
-    each = jax.vmap(lambda p: jax.vmap(lambda y: model.log_prob(p, y))(model.support))
-    return options.seconds, outcomes, own, jnp.exp(each(predictions)).sum(axis=-1)
+        return options.seconds, outcomes, log_prob, jnp.ones(1)
+    support_log_prob = jax.vmap(
+        lambda p: jax.vmap(lambda y: model.log_prob(p, y))(model.support)
+    )
+    return (
+        options.seconds,
+        outcomes,
+        log_prob,
+        jnp.exp(support_log_prob(predictions)).sum(axis=-1),
+    )
 
 
-def outcome_shape(model: Model) -> tuple[int, ...]:
+def outcome_shape(model: ParticleModel) -> tuple[int, ...]:
     """Shape of an outcome; () of a number."""
     return tuple(getattr(model, "outcome_shape", ()))
 
@@ -539,30 +547,32 @@ def log_mean(values: jax.Array) -> jax.Array:
     return jax.nn.logsumexp(values, axis=-1) - jnp.log(float(values.shape[-1]))
 
 
-def _gain(model: Model, unknowns: Any, design: Any, keys: jax.Array) -> jax.Array:
+def _gain(
+    model: ParticleModel, unknowns: Any, design: Any, keys: jax.Array
+) -> jax.Array:
     predictions = jax.vmap(lambda u: model.predict(u, design))(unknowns)
     if model.support is None:
         outcomes = jax.vmap(model.sample)(predictions, keys)
-        own = jax.vmap(model.log_prob)(predictions, outcomes)
+        log_prob = jax.vmap(model.log_prob)(predictions, outcomes)
         all_of = jax.vmap(
             lambda y: jax.vmap(lambda p: model.log_prob(p, y))(predictions)
         )(outcomes)
         # Outcomes are likely under their own particle: clipping prevents overflow.
-        ratio = jnp.exp(jnp.minimum(all_of - own[:, None], 80.0))
-        found = -jnp.log(ratio.mean(axis=-1)).mean()
+        ratio = jnp.exp(jnp.minimum(all_of - log_prob[:, None], 80.0))
+        gain = -jnp.log(ratio.mean(axis=-1)).mean()
     else:
         log_p = jax.vmap(
             lambda p: jax.vmap(lambda y: model.log_prob(p, y))(model.support)
         )(predictions)  # (n, Y)
         p = jnp.exp(log_p)
-        each = (p * jnp.maximum(log_p, _FLOOR)).sum(axis=-1).mean()
+        within = (p * jnp.maximum(log_p, _FLOOR)).sum(axis=-1).mean()
         mixed = p.mean(axis=0)
-        found = each - (mixed * jnp.log(mixed + 1e-30)).sum()
-    return jnp.maximum(found, 0.0)
+        gain = within - (mixed * jnp.log(mixed + 1e-30)).sum()
+    return jnp.maximum(gain, 0.0)
 
 
 def _log_likelihood(
-    model: Model, unknowns: Any, design: Any, outcome: jax.Array
+    model: ParticleModel, unknowns: Any, design: Any, outcome: jax.Array
 ) -> jax.Array:
     return jnp.maximum(model.log_prob(model.predict(unknowns, design), outcome), _FLOOR)
 

@@ -94,16 +94,16 @@ def _answer(loop: Loop, line: str) -> dict[str, Any]:
         raise ValueError(
             f"a request must be a JSON object in a line: {error}"
         ) from None
-    task = request.get("do") if isinstance(request, dict) else None
-    if task not in _FIELDS:
-        known = ", ".join(_FIELDS)
-        raise ValueError(f"do must be one of {known}, got {line.strip()[:80]}")
-    if more := set(request) - {"do"} - _FIELDS[task]:
-        raise ValueError(f"{task} has no {min(more)!r}")
+    asked = request.get("do") if isinstance(request, dict) else None
+    if asked not in _FIELDS:
+        requests = ", ".join(_FIELDS)
+        raise ValueError(f"do must be one of {requests}, got {line.strip()[:80]}")
+    if more := set(request) - {"do"} - _FIELDS[asked]:
+        raise ValueError(f"{asked} has no {min(more)!r}")
     number = int(loop.session.made)
-    if task == "suggest":
+    if asked == "suggest":
         return _suggested(loop)
-    if task == "state":
+    if asked == "state":
         return _state(loop)
     if "outcome" not in request:
         raise ValueError("observed needs the outcome")

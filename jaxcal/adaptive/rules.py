@@ -159,10 +159,10 @@ class Shares(Rule):
         always = jnp.where(options.allowed, u, jnp.inf).min()
         n = jnp.maximum(task.horizon - session.made, 1).astype(gains.dtype)
         n = jnp.minimum(n, jnp.maximum(e / jnp.maximum(always, 1e-6), 1.0))
-        each = jnp.maximum(s[best(log_score(gains, s), options)], 1e-9)
+        typical = jnp.maximum(s[best(log_score(gains, s), options)], 1e-9)
         limited = jnp.isfinite(session.seconds)
-        t = jnp.where(limited, jnp.maximum(session.seconds, 1e-9), n * each)
-        number = jnp.minimum(n, jnp.maximum(t / each, 0.1))
+        t = jnp.where(limited, jnp.maximum(session.seconds, 1e-9), n * typical)
+        number = jnp.minimum(n, jnp.maximum(t / typical, 0.1))
         price = (
             1.0 / n
             + jnp.where(limited, self.time, self.haste) * jnp.minimum(s / t, 1.0)
@@ -177,7 +177,7 @@ SHARES = Shares(1.4, 1.8, 0.2, -0.7)
 --tune`` makes."""
 
 
-class Scored(Rule):
+class CostRule(Rule):
     """A price by seconds and uses alone."""
 
     def judged(
@@ -193,7 +193,7 @@ class Scored(Rule):
 
 
 @struct.dataclass
-class Priced(Scored):
+class Priced(CostRule):
     """``c0 + c1 seconds + c2 uses``, the same throughout a session."""
 
     c0: Any = 1.0
@@ -209,7 +209,7 @@ class Priced(Scored):
 
 
 @struct.dataclass
-class StateRule(Scored):
+class StateRule(CostRule):
     """A price that follows what is left: e uses and t seconds.
 
     ``c0 exp(d0 (e - 1)) + c1 seconds + c2 exp(d1 (e - 1) + d2 t / scale) uses``

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import jax
 from flax import struct
 
-__all__ = ["Belief", "Decider", "Options", "Session", "Task", "pays"]
+__all__ = ["Belief", "Decider", "Options", "SequentialTask", "Session", "pays"]
 
 _ROUNDING = 1e-4  # of a cost: sums of float32 may miss the budget by less
 
@@ -77,7 +77,7 @@ class Belief(Protocol):
         """() nats; NaN where it is not defined."""
 
 
-class Task(Protocol):
+class SequentialTask(Protocol):
     """What is measured. ``GridTask`` and ``ParticleTask`` are the two kinds."""
 
     @property

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxcal.adaptive.episodes import play
 from jaxcal.adaptive.rules import Rule
-from jaxcal.adaptive.session import Task
+from jaxcal.adaptive.session import SequentialTask
 from jaxcal.checks import whole_number
 
 __all__ = ["search", "tune"]
@@ -23,7 +23,7 @@ _SMOOTH = 0.7  # weight of the elite in the next mean and spread
 
 
 def tune(
-    task: Task,
+    task: SequentialTask,
     rule: R,
     *,
     episodes: int = 2048,
@@ -94,6 +94,6 @@ def search(
     return rule.moved(centre)
 
 
-def _nats(task: Task, rule: Rule, keys: jax.Array) -> float:
+def _nats(task: SequentialTask, rule: Rule, keys: jax.Array) -> float:
     rule = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), rule)
     return float(play(task, rule, keys).gain.mean())

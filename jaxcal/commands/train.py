@@ -271,7 +271,7 @@ def _task_configuration(arguments: TrainOptions, out: pathlib.Path) -> PolicyCon
     options = entry.train_on
     if arguments.with_:
         options = (registry.options_from(entry, arguments.with_),)
-    ppo, own = (
+    ppo, policy = (
         {
             f.name: given[f.name]
             for f in settings_of(TASK_PARTS[part])
@@ -281,7 +281,7 @@ def _task_configuration(arguments: TrainOptions, out: pathlib.Path) -> PolicyCon
     )
     require_writable_folder(out)
     base = entry.rules.get("state") or _tuned(entry, options[0])
-    config = PolicyConfig(task=arguments.task, base=base, options=options, **own)
+    config = PolicyConfig(task=arguments.task, base=base, options=options, **policy)
     changed = dataclasses.replace(config.ppo, **ppo)
     return dataclasses.replace(config, ppo=changed, sweep=tuple(arguments.sweep))
 

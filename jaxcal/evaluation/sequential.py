@@ -20,11 +20,11 @@ from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.policy import run as policies
 from jaxcal.adaptive.rules import (
     SHARES,
+    CostRule,
     Gain,
     GainRate,
     Priced,
     Random,
-    Scored,
     StateRule,
 )
 from jaxcal.adaptive.tasks.registry import Entry
@@ -59,7 +59,7 @@ class Result:
     reference: str  # whom the others are compared with in pairs
     found: Comparison
     seconds: NDArray[np.float64]  # (D,) of one core, a choice
-    rules: Mapping[str, Scored]
+    rules: Mapping[str, CostRule]
     checkpoint: Mapping[str, Any] | None  # meta of the policy
     outside: tuple[str, ...]  # sizes beyond those that ``ahead`` was measured on
 
@@ -151,7 +151,7 @@ def _rules(
     retune: bool,
     seed: int,
     progress: Progress,
-) -> dict[str, Scored]:
+) -> dict[str, CostRule]:
     """Priced rules: as they ship with the task, or tuned on it now."""
     rules = {}
     for name in needed:
@@ -173,7 +173,7 @@ def _rules(
     return rules
 
 
-def _decider(method: str, rules: Mapping[str, Scored]) -> Any:
+def _decider(method: str, rules: Mapping[str, CostRule]) -> Any:
     simple = {
         "random": Random(), "gain": Gain(), "rate": GainRate(), "shares": SHARES,
         "ahead": AHEAD,

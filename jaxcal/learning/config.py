@@ -91,8 +91,8 @@ class PPOConfig(abc.ABC):
         """Refuse a sweep of what cannot be swept, or of values that break a rule."""
         for name, values in sweep:
             if name not in TRACED:
-                known = ", ".join(TRACED)
-                raise ValueError(f"sweep must be of {known}, got {name}")
+                names = ", ".join(TRACED)
+                raise ValueError(f"sweep must be of {names}, got {name}")
             for value in values:
                 changed: dict[str, Any] = {name: value}
                 dataclasses.replace(self, **changed)

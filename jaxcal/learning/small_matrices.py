@@ -78,8 +78,8 @@ def solve_lower(lower: jax.Array, rows: jax.Array) -> jax.Array:
     out: list[jax.Array] = []
     for j in range(lower.shape[-1]):
         value = rows[..., j]
-        for i, known in enumerate(out):
-            value = value - lower[..., j, i][..., None] * known
+        for i, solved in enumerate(out):
+            value = value - lower[..., j, i][..., None] * solved
         out.append(value / lower[..., j, j][..., None])
     return jnp.stack(out, axis=-1)
 

@@ -17,7 +17,7 @@ __all__ = ["HEADS", "PaperNetwork"]
 HEADS = ("actor", "critic_1", "critic_2")  # everything else is shared
 
 
-class Candidates(NamedTuple):
+class PaperFeatures(NamedTuple):
     """A set, as it is."""
 
     poses: jax.Array  # (..., M, n), in [0, 1]
@@ -80,19 +80,19 @@ class PaperNetwork(Network):
 
     def candidate_features(
         self, candidates: jax.Array, usable: jax.Array
-    ) -> Candidates:
-        return Candidates(candidates)
+    ) -> PaperFeatures:
+        return PaperFeatures(candidates)
 
     def decision_features(
         self,
-        features: Candidates,
+        features: PaperFeatures,
         chosen: jax.Array,
         available: jax.Array,
         count: jax.typing.ArrayLike,
     ) -> Decision:
         return Decision(context_features(features.poses, chosen), available)
 
-    def encode(self, features: Candidates) -> jax.Array:
+    def encode(self, features: PaperFeatures) -> jax.Array:
         """The candidates (..., M, width), encoded one by one."""
         poses = nn.relu(self.pose_1(2.0 * features.poses - 1.0))
         return self.pose_norm(nn.relu(self.pose_2(poses)))
@@ -120,4 +120,4 @@ class PaperNetwork(Network):
         poses = observation[..., : n * m].reshape(*observation.shape[:-1], m, n)
         available = observation[..., n * m : (n + 1) * m] > 0.5
         decision = Decision(observation[..., (n + 1) * m :], available)
-        return self.decode(self.encode(Candidates(poses)), decision)
+        return self.decode(self.encode(PaperFeatures(poses)), decision)

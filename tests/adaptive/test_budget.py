@@ -9,7 +9,7 @@ from jaxcal.adaptive import next_measurement, play, run
 from jaxcal.adaptive.fit_ahead import fit
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import AHEAD
-from jaxcal.adaptive.policy.network import Policy, initial
+from jaxcal.adaptive.policy.network import PolicyDecider, initial
 from jaxcal.adaptive.policy.sessions import Exercise, Sessions
 from jaxcal.adaptive.rules import SHARES, Gain, Random, StateRule
 
@@ -38,7 +38,7 @@ DECIDERS = {
     "state": lambda of: RULE,
     "ahead": lambda of: AHEAD,
     "fitted": lambda of: fit(of).decider,
-    "policy": lambda of: Policy(
+    "policy": lambda of: PolicyDecider(
         initial(jax.random.key(0), 4, 1, 8), RULE, 4, 8, sample=True
     ),
 }

@@ -8,7 +8,7 @@ from scipy import stats
 from benchmarks.sequential.deciders import Rollouts, TwoStep
 from benchmarks.sequential.sequence import Static
 from jaxcal.adaptive.grid import GridBelief, GridTask
-from jaxcal.adaptive.policy.network import Policy, initial
+from jaxcal.adaptive.policy.network import PolicyDecider, initial
 from jaxcal.adaptive.rules import Gain, GainRate, Priced, Random, StateRule
 
 RULE = StateRule(0.1, 1.0, 1.0)
@@ -101,7 +101,7 @@ def chosen(task, deciders):
 
 def policy(task):
     begun = jax.jit(initial, static_argnums=(1, 2, 3))
-    return Policy(begun(jax.random.key(0), 4, task.num_groups, 8), RULE, 4, 8)
+    return PolicyDecider(begun(jax.random.key(0), 4, task.num_groups, 8), RULE, 4, 8)
 
 
 def test_a_policy_begins_as_its_rule():

@@ -11,7 +11,7 @@ import pytest
 from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.policy import run
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
-from jaxcal.adaptive.policy.network import Policy, initial
+from jaxcal.adaptive.policy.network import PolicyDecider, initial
 from jaxcal.adaptive.rules import Gain, Priced, StateRule
 from jaxcal.adaptive.tasks import registry
 from jaxcal.adaptive.tasks.knee import STATE_RULE, knee
@@ -49,7 +49,7 @@ def leaves(state):
 def test_a_policy_begins_as_its_rule():
     task = knee(**SMALL)
     keys = jax.random.split(jax.random.key(3), 32)
-    policy = Policy(initial(jax.random.key(0), 2, 2, 8), STATE_RULE, 2, 8)
+    policy = PolicyDecider(initial(jax.random.key(0), 2, 2, 8), STATE_RULE, 2, 8)
     mine, rules = (play(task, decider, keys) for decider in (policy, STATE_RULE))
     np.testing.assert_array_equal(
         mine.designs * mine.alive, rules.designs * rules.alive

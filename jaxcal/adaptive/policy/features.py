@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcal.adaptive.rules import Scored, groups_of, log_score, shortlist
+from jaxcal.adaptive.rules import CostRule, groups_of, log_score, shortlist
 from jaxcal.adaptive.session import Options, Session
 
 __all__ = ["NUM_FEATURES", "Shortlist", "shortlist_of"]
@@ -34,7 +34,7 @@ def shortlist_of(
     session: Session,
     options: Options,
     key: jax.Array,
-    base: Scored,
+    base: CostRule,
     per_group: int,
 ) -> Shortlist:
     """The best ``per_group`` options of each group by the base rule, and features."""
@@ -46,13 +46,13 @@ def shortlist_of(
     mine = groups[index]
     below = score[index] - jnp.where(options.allowed, score, -jnp.inf).max()
 
-    left = jnp.where(jnp.isfinite(session.seconds), session.seconds, 2 * _SCALE)
+    time_left = jnp.where(jnp.isfinite(session.seconds), session.seconds, 2 * _SCALE)
     g, s, u = gains[index], seconds[index], uses[index]
     members = groups[None] == jnp.arange(number)[:, None]
     within = jnp.where(members & options.allowed[None], gains[None], 0.0)  # (G, A)
     # Summed over a group's options, the gains measure how much of it is unknown.
     tops, sums = within.max(axis=1), within.sum(axis=1)
-    own, whole = tops[mine], sums[mine]
+    top, total = tops[mine], sums[mine]
     others = jnp.where(jnp.arange(number)[None] == mine[:, None], 0.0, tops[None]).max(
         axis=1
     )
@@ -65,7 +65,7 @@ def shortlist_of(
         "gain": g,
         "uses": u,
         "seconds": s / 5.0,
-        "share_of_time": jnp.minimum(s / jnp.maximum(left, 1e-3), 3.0),
+        "share_of_time": jnp.minimum(s / jnp.maximum(time_left, 1e-3), 3.0),
         "rate": g / jnp.maximum(s, 1e-6),
         "log_score": jnp.maximum(below, -10.0),
         "in_nearest_group": (nearest[mine] <= nearest.min() + 1e-6).astype(g.dtype),
@@ -73,20 +73,20 @@ def shortlist_of(
         "uses_at_last": u * first,
         "uses_at_last_two": u * second,
         "uses_squared": u * u,
-        "time_after": (left - s) / _SCALE,
-        "best_of_group": own,
+        "time_after": (time_left - s) / _SCALE,
+        "best_of_group": top,
         "best_of_others": others,
-        "uses_by_time": u * left / _SCALE,
+        "uses_by_time": u * time_left / _SCALE,
         "gain_per_use": g / (u + 0.05),
         "root_gain": jnp.sqrt(g),
         "entropy_if_used": spent[index] / 3.0,
         "entropy_if_not": free[index] / 3.0,
-        "sum_of_group": jnp.log1p(whole),
-        "sum_of_others": jnp.log1p(jnp.maximum(sums.sum() - whole, 0.0)),
+        "sum_of_group": jnp.log1p(total),
+        "sum_of_others": jnp.log1p(jnp.maximum(sums.sum() - total, 0.0)),
     }
     of_session = {
-        "time": left / _SCALE,
-        "last_seconds": jnp.minimum(left / 5.0, 1.0),
+        "time": time_left / _SCALE,
+        "last_seconds": jnp.minimum(time_left / 5.0, 1.0),
         "last_use": first,
         "last_two_uses": second,
         "uses_left": jnp.minimum(session.uses, 4) / 4.0,

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxcal.adaptive.policy.features import NUM_FEATURES, Shortlist, shortlist_of
-from jaxcal.adaptive.rules import Scored
+from jaxcal.adaptive.rules import CostRule
 from jaxcal.adaptive.session import Options, Session
 
-__all__ = ["Correction", "Policy"]
+__all__ = ["Correction", "PolicyDecider"]
 
 # Initial factor of the rule's log score: an option whose score is a fifth below the
 # best one's is sampled a third as often (0.8^5).
@@ -50,11 +50,11 @@ class Correction(nn.Module):
 
 
 @struct.dataclass
-class Policy:
+class PolicyDecider:
     """A trained network as a decider."""
 
     params: Any
-    base: Scored
+    base: CostRule
     per_group: int = struct.field(pytree_node=False, default=6)
     width: int = struct.field(pytree_node=False, default=64)
     sample: bool = struct.field(pytree_node=False, default=False)

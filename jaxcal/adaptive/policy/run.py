@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from jaxcal.adaptive.episodes import play
 from jaxcal.adaptive.policy.config import PolicyConfig
-from jaxcal.adaptive.policy.network import Policy, initial
+from jaxcal.adaptive.policy.network import PolicyDecider, initial
 from jaxcal.adaptive.policy.sessions import Exercise
 from jaxcal.adaptive.tasks import registry
 from jaxcal.learning.core.ppo import TrainState
@@ -21,7 +21,7 @@ from jaxcal.learning.training import checkpoint
 from jaxcal.learning.training.checkpoint import CheckpointError
 from jaxcal.learning.training.run import Recipe, run
 
-__all__ = ["MEASURED", "Trained", "exercises", "load", "train"]
+__all__ = ["MEASURED", "TaskPolicy", "exercises", "load", "train"]
 
 SCHEMA = "jaxcal-sequential-policy"
 MEASURED = ("nats", "nats_over_base")
@@ -30,7 +30,7 @@ _FRESH = 2**31 - 1  # their seed
 
 
 @dataclasses.dataclass(frozen=True)
-class Trained:
+class TaskPolicy:
     """A policy from a checkpoint."""
 
     params: Any
@@ -38,9 +38,9 @@ class Trained:
     meta: dict[str, Any]
 
     @property
-    def decider(self) -> Policy:
+    def decider(self) -> PolicyDecider:
         """The policy, ready to choose."""
-        return Policy(
+        return PolicyDecider(
             self.params, self.config.base, self.config.per_group, self.config.width
         )
 
@@ -98,7 +98,7 @@ def train(
     rules: list[float] = []  # nats of the base rule, once it is played
 
     def validate(average: Any) -> dict[str, float]:
-        policy = Policy(average, base, config.per_group, config.width)
+        policy = PolicyDecider(average, base, config.per_group, config.width)
         if not rules:
             rules.append(float(play(task, base, keys).gain.mean()))
         nats = float(play(task, policy, keys).gain.mean())
@@ -115,7 +115,7 @@ def train(
     return run(recipe, folder, mesh=mesh, **rest)
 
 
-def load(path: str | pathlib.Path | None = None) -> Trained:
+def load(path: str | pathlib.Path | None = None) -> TaskPolicy:
     """A policy; with several seeds the best by validation.
 
     Args:
@@ -126,7 +126,7 @@ def load(path: str | pathlib.Path | None = None) -> Trained:
         CheckpointError: there is none, it is damaged, or it is of another kind.
     """
     path = weights.shipped("knee") if path is None else path
-    found, meta = checkpoint.read_meta(path, SCHEMA)
+    source, meta = checkpoint.read_meta(path, SCHEMA)
     try:
         config = PolicyConfig.from_meta(meta)
         like = jax.eval_shape(
@@ -134,6 +134,6 @@ def load(path: str | pathlib.Path | None = None) -> Trained:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(
-            f"checkpoint {found} names no policy this jaxcal knows: {error}"
+            f"checkpoint {source} names no policy this jaxcal knows: {error}"
         ) from error
-    return Trained(checkpoint.read(found, meta, like), config, meta)
+    return TaskPolicy(checkpoint.read(source, meta, like), config, meta)

@@ -11,7 +11,7 @@ from flax import struct
 
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.policy.features import Shortlist, shortlist_of
-from jaxcal.adaptive.rules import Scored
+from jaxcal.adaptive.rules import CostRule
 from jaxcal.adaptive.session import Session
 from jaxcal.learning.core.streams import Step
 
@@ -23,7 +23,7 @@ class Exercise:
     """Arrays that a stream takes: a task, and the rule that the policy corrects."""
 
     task: Any
-    base: Scored
+    base: CostRule
 
 
 @struct.dataclass
@@ -80,8 +80,8 @@ class Sessions:
 
         def after(outcome: jax.Array) -> tuple[State, jax.Array]:
             then = belief.update(made, design, outcome, key_update)
-            left = made.spend(state.session, design, outcome)
-            return State(state.truth, then, left), made.over(left)
+            session = made.spend(state.session, design, outcome)
+            return State(state.truth, then, session), made.over(session)
 
         states, ended = jax.vmap(after)(outcomes)
         return Step(

@@ -98,7 +98,7 @@ def options_from(entry: Entry, given: Sequence[str]) -> dict[str, Any]:
     Raises:
         ValueError: not NAME=VALUE, or a name that the task does not have.
     """
-    known = [
+    option_names = [
         name
         for name, parameter in inspect.signature(entry.make).parameters.items()
         if parameter.kind is not parameter.VAR_KEYWORD
@@ -106,9 +106,9 @@ def options_from(entry: Entry, given: Sequence[str]) -> dict[str, Any]:
     options = {}
     for text in given:
         name, equals, value = text.partition("=")
-        if not equals or name not in known:
+        if not equals or name not in option_names:
             raise ValueError(
-                f"--with must be NAME=VALUE with NAME of {', '.join(known)}, "
+                f"--with must be NAME=VALUE with NAME of {', '.join(option_names)}, "
                 f"got {text!r}"
             )
         try:

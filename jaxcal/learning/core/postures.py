@@ -190,8 +190,8 @@ class Postures:
 
         def decide(learns: bool, state: Any, now: Any) -> tuple[Any, tuple[Any, ...]]:
             count, keys = now
-            each = functools.partial(score, count=count, learns=learns)
-            decision, logits, value = _mapped(each, at_once, state)
+            score_at = functools.partial(score, count=count, learns=learns)
+            decision, logits, value = _mapped(score_at, at_once, state)
             state, record = jax.vmap(act)(state, logits, value, keys)
             return state, (decision if learns else None, record)
 

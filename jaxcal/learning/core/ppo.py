@@ -228,9 +228,9 @@ def _having(config: PPOConfig, values: Metrics) -> PPOConfig:
 
 def schedule(config: PPOConfig) -> optax.Schedule:
     """Learning rate by gradient step: linear warm-up, then cosine decay."""
-    each = config.steps_per_update
-    warm = max(config.warmup_updates, 1) * each
-    steps = max(config.num_updates, config.warmup_updates + 1) * each - warm
+    per_update = config.steps_per_update
+    warm = max(config.warmup_updates, 1) * per_update
+    steps = max(config.num_updates, config.warmup_updates + 1) * per_update - warm
     peak, last = config.learning_rate, config.final_learning_rate
 
     def rate(step: jax.typing.ArrayLike) -> jax.Array:
@@ -301,8 +301,8 @@ def make_update(
     blocks = 1 if mesh is None else mesh.size
 
     def update(before: TrainState, *given: Any) -> tuple[TrainState, Metrics]:
-        own = _having(config, before.values)
-        trained = learner.having(own)
+        ppo = _having(config, before.values)
+        trained = learner.having(ppo)
         key = jax.random.wrap_key_data(before.key)
         key, key_epochs = jax.random.split(key)
         playing = placed(before.playing, mesh, "sets")
@@ -327,7 +327,7 @@ def make_update(
 
             # A slice's arrays stay in a core's cache: faster than all rows at once.
             number = index.shape[1]
-            size = number if whole else math.gcd(number, own.slice_rows)
+            size = number if whole else math.gcd(number, ppo.slice_rows)
             parts = index.reshape(blocks, -1, size).swapaxes(0, 1)
             return jax.tree.map(lambda x: x.mean(0), jax.lax.map(of_part, parts))
 
@@ -337,25 +337,25 @@ def make_update(
                 return of_loss(state.params, some, state.num_updates)
 
             grads, metrics = mean(gradient, index)
-            state, norm = descend(own, state, grads)
+            state, norm = descend(ppo, state, grads)
             return state, metrics | {"grad_norm": norm}
 
         def epoch(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
             keys = jax.random.split(key, blocks)
             order = jax.vmap(jax.random.permutation, (0, None))(keys, per_block)
-            parts = order.reshape(blocks, own.num_minibatches, -1).swapaxes(0, 1)
+            parts = order.reshape(blocks, ppo.num_minibatches, -1).swapaxes(0, 1)
             return jax.lax.scan(step, state, parts)
 
-        keys = jax.random.split(key_epochs, own.num_epochs)
+        keys = jax.random.split(key_epochs, ppo.num_epochs)
         state, losses = jax.lax.scan(epoch, before, keys)
         losses = jax.tree.map(jnp.mean, losses)
         if "kl" in losses:  # of a minibatch, by the weights that the update ends with
-            some = jnp.arange(per_block // own.num_minibatches)
+            some = jnp.arange(per_block // ppo.num_minibatches)
             losses["kl_after"] = mean(
                 lambda rows: trained.loss(state.params, rows, state.num_updates)[1],
                 jnp.broadcast_to(some, (blocks, len(some))),
             )["kl"]
-        rate = schedule(own)((before.num_updates + 1) * own.steps_per_update)
+        rate = schedule(ppo)((before.num_updates + 1) * ppo.steps_per_update)
         fine = jnp.isfinite(jnp.stack(jax.tree.leaves(losses))).all()
         after = dataclasses.replace(
             state,
@@ -393,14 +393,14 @@ def make_train(config: Any) -> Callable[..., tuple[Any, Metrics]]:
             f"imitation must be 0, got a share with {imitated} updates: its teacher "
             "works on the host; training.postures.train has it, or set imitation=0"
         )
-    learners, own = config.learners, config.ppo
-    each = [make_update(own, learner) for learner in learners]
+    learners, ppo = config.learners, config.ppo
+    updates = [make_update(ppo, learner) for learner in learners]
 
     def train(key: jax.Array, *given: Any, **values: Any) -> tuple[TrainState, Metrics]:
         def update(state: TrainState, number: jax.Array) -> tuple[TrainState, Metrics]:
-            return jax.lax.switch(number % len(each), each, state, *given)
+            return jax.lax.switch(number % len(updates), updates, state, *given)
 
-        state = begin(own, learners[0], key, *given, **values)
-        return jax.lax.scan(update, state, jnp.arange(own.num_updates))
+        state = begin(ppo, learners[0], key, *given, **values)
+        return jax.lax.scan(update, state, jnp.arange(ppo.num_updates))
 
     return train

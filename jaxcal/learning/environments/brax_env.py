@@ -15,7 +15,7 @@ from brax.envs.base import Env, State, Wrapper
 from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 
 from jaxcal.learning.environments.functional import FunctionalEnv, PosturesEnv
-from jaxcal.learning.environments.selection import Candidates, SelectionConfig
+from jaxcal.learning.environments.selection import CandidateSource, SelectionConfig
 from jaxcal.learning.policies.networks import NetworkConfig
 
 __all__ = ["EpisodeEnv", "SelectionEnv", "wrap_fresh"]
@@ -68,7 +68,7 @@ class SelectionEnv(EpisodeEnv):
     def __init__(
         self,
         config: SelectionConfig | None = None,
-        draw: Candidates | None = None,
+        draw: CandidateSource | None = None,
         net: NetworkConfig | None = None,
     ) -> None:
         super().__init__(PosturesEnv(config, draw, net))

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcal.learning.environments import selection
-from jaxcal.learning.environments.selection import Candidates, SelectionConfig
+from jaxcal.learning.environments.selection import CandidateSource, SelectionConfig
 from jaxcal.learning.policies.compact import build
 from jaxcal.learning.policies.networks import NetworkConfig
 
@@ -110,7 +110,7 @@ class PosturesEnv(FunctionalEnv):
     def __init__(
         self,
         config: SelectionConfig | None = None,
-        draw: Candidates | None = None,
+        draw: CandidateSource | None = None,
         net: NetworkConfig | None = None,
     ) -> None:
         self.config = SelectionConfig() if config is None else config
@@ -132,10 +132,10 @@ class PosturesEnv(FunctionalEnv):
         return after, reward, done, reward / self.config.reward_scale
 
     def network(self) -> nn.Module:
-        return _FromObservation(self.config, self._net)
+        return _PosturesNetwork(self.config, self._net)
 
 
-class _FromObservation(nn.Module):
+class _PosturesNetwork(nn.Module):
     """A network of postures whose input is the paper's observation."""
 
     env: SelectionConfig

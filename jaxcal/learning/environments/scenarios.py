@@ -1,8 +1,8 @@
 """Where training candidates come from: shapes and masks, a pool, given sets.
 
-Each function returns a ``Candidates``: key -> (M, n) candidates and (M,) available. The
-compact network is invariant to affine maps, so ``mixture`` varies no ranges, shear or
-correlation, only the shape of the cloud and what is masked.
+Each function returns a ``CandidateSource``: key -> (M, n) candidates and (M,)
+available. The compact network is invariant to affine maps, so ``mixture`` varies no
+ranges, shear or correlation, only the shape of the cloud and what is masked.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.learning.environments.selection import Candidates, SelectionConfig
+from jaxcal.learning.environments.selection import CandidateSource, SelectionConfig
 
 __all__ = ["SHAPES", "given", "mixture"]
 
@@ -24,7 +24,7 @@ SHAPES = ("uniform", "gaussian", "sphere", "clustered", "grid", "cluster_uniform
 
 def given(
     config: SelectionConfig, sets: ArrayLike, available: ArrayLike | None = None
-) -> Candidates:
+) -> CandidateSource:
     """A given set, drawn for every episode; of a single set (a pool), M of its rows.
 
     Args:
@@ -90,7 +90,7 @@ def _shape(name: str, key: jax.Array, m: int, n: int) -> jax.Array:
 
 def mixture(
     config: SelectionConfig, shapes: Sequence[str] = ("uniform",), masked: float = 0.0
-) -> Candidates:
+) -> CandidateSource:
     """Candidates of a shape drawn at random for every episode.
 
     Args:

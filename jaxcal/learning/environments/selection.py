@@ -28,7 +28,7 @@ from jaxcal.learning.settings import require, setting
 from jaxcal.learning.small_matrices import log_det_gram, picked
 
 __all__ = [
-    "Candidates",
+    "CandidateSource",
     "SelectionConfig",
     "SelectionState",
     "observe",
@@ -38,7 +38,7 @@ __all__ = [
     "step",
 ]
 
-Candidates = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
+CandidateSource = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
 """key -> (M, n) candidates and (M,) bool available."""
 
 
@@ -103,7 +103,7 @@ def start(
 
 
 def reset(
-    key: jax.Array, config: SelectionConfig, draw: Candidates | None = None
+    key: jax.Array, config: SelectionConfig, draw: CandidateSource | None = None
 ) -> SelectionState:
     """A new episode with fresh candidates.
 
@@ -122,7 +122,7 @@ def reset(
 
 
 def reset_from(
-    state: SelectionState, config: SelectionConfig, draw: Candidates | None = None
+    state: SelectionState, config: SelectionConfig, draw: CandidateSource | None = None
 ) -> SelectionState:
     """The episode after this one: the state's own key draws its candidates."""
     return reset(state.key, config, draw)

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxcal.learning.environments import scenarios, selection
 from jaxcal.learning.environments.selection import (
-    Candidates,
+    CandidateSource,
     SelectionConfig,
     SelectionState,
 )
@@ -52,7 +52,7 @@ class GivenCandidates:
                 "candidates must be given by values or sha256, got neither"
             )
 
-    def source(self, config: SelectionConfig) -> Candidates:
+    def source(self, config: SelectionConfig) -> CandidateSource:
         """key -> the candidates of an episode, from the file's values."""
         if self.values is None:
             raise ValueError(
@@ -76,7 +76,7 @@ class Task:
     given: GivenCandidates | None = None  # instead of shapes and masked
 
     @property
-    def draw(self) -> Candidates:
+    def draw(self) -> CandidateSource:
         """key -> (M, n) candidates and (M,) available."""
         if self.given is not None:
             return self.given.source(self.environment)
@@ -115,8 +115,8 @@ class Task:
         """Plain JSON values; ``from_meta`` reads them back."""
         given = self.given and {"name": self.given.name, "sha256": self.given.sha256}
         meta = dataclasses.asdict(dataclasses.replace(self, given=None))
-        own = {} if type(self) is Task else {"class": path_of(type(self))}
-        return meta | {"shapes": list(self.shapes), "given": given} | own
+        class_path = {} if type(self) is Task else {"class": path_of(type(self))}
+        return meta | {"shapes": list(self.shapes), "given": given} | class_path
 
     @staticmethod
     def from_meta(meta: dict[str, Any]) -> Task:
@@ -129,9 +129,9 @@ class Task:
         path = meta.pop("class", None)
         made: type[Task] = Task if path is None else named(path)
         given = meta.get("given")
-        own = {
+        values = {
             "environment": SelectionConfig(**meta["environment"]),
             "shapes": tuple(meta["shapes"]),
             "given": given and GivenCandidates(**given),
         }
-        return made(**meta | own)
+        return made(**meta | values)

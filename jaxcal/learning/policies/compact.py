@@ -74,8 +74,8 @@ class _Round(nn.Module):
         number = jnp.maximum(active.sum(-2, keepdims=True), 1.0)
         mean = (u * active).sum(-2, keepdims=True) / number
         # The layer is linear: it is applied to p (p + 1) / 2 totals, not M messages.
-        own, sent = _Dense(2 * width, name="mix")(u, total)
-        inner = own + jnp.einsum("...mf,...fw->...mw", vectors.moments, sent)
+        direct, sent = _Dense(2 * width, name="mix")(u, total)
+        inner = direct + jnp.einsum("...mf,...fw->...mw", vectors.moments, sent)
         pooled = nn.Dense(2 * width, use_bias=False, name="pool")(mean)
         out = nn.Dense(width, name="out")(nn.relu(inner + pooled))
         return h + out * active
@@ -198,12 +198,12 @@ def build(config: NetworkConfig) -> Network:
     if config.kind == "compact":
         return CompactNetwork(config)
     if ":" in config.kind:
-        made = named(config.kind)
-        if not (isinstance(made, type) and issubclass(made, Network)):
+        kind = named(config.kind)
+        if not (isinstance(kind, type) and issubclass(kind, Network)):
             raise ValueError(f"kind must be a Network, got {config.kind}")
-        fields = [field.name for field in dataclasses.fields(made)]
+        fields = [field.name for field in dataclasses.fields(kind)]
         arguments: dict[str, Any] = {"config": config} if "config" in fields else {}
-        own: Network = made(**arguments)
-        return own
+        instance: Network = kind(**arguments)
+        return instance
     network: Network = installed(GROUP)[config.kind].load()(config)
     return network

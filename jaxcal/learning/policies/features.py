@@ -99,7 +99,7 @@ def decision_features(
     x = features.whitened
     p, total = x.shape[-1], chosen.shape[-1]
     count = jnp.asarray(count)
-    left = total - count
+    remaining = total - count
     which = jax.nn.one_hot(chosen, x.shape[-2], dtype=x.dtype)
     picked = jnp.einsum(
         "...km,...mp->...kp", which, x, precision=jax.lax.Precision.HIGHEST
@@ -113,10 +113,10 @@ def decision_features(
         # beside what a posture contributes.
         ridge = jnp.where(count < p, _RIDGE, 0.0)
         y, so_far = geometry.normalised_by(x, picked, ridge)
-    depth = jnp.minimum(lookahead, left)
+    depth = jnp.minimum(lookahead, remaining)
     vectors = vector_features(y, total != p, available, depth, close_up)
-    ends = (left == 1, left == 2, left == 3, 1.0 / left)
-    shares = (count / p, jnp.minimum(left / p, 3.0), total > p)
+    ends = (remaining == 1, remaining == 2, remaining == 3, 1.0 / remaining)
+    shares = (count / p, jnp.minimum(remaining / p, 3.0), total > p)
     numbers = jnp.stack([jnp.asarray(x, y.dtype) for x in (*ends, *shares)])
     return DecisionFeatures(
         vectors,

@@ -42,11 +42,11 @@ class NetworkConfig:
         kind: Any = self.kind
         if isinstance(kind, type):
             object.__setattr__(self, "kind", path_of(kind))
-        own = self.kind == "compact" or ":" in self.kind
-        if not own and self.kind not in installed(GROUP):
-            known = ", ".join(["compact", *installed(GROUP)])
+        installs = self.kind != "compact" and ":" not in self.kind
+        if installs and self.kind not in installed(GROUP):
+            kinds = ", ".join(["compact", *installed(GROUP)])
             raise ValueError(
-                f"kind must be one of {known}, got "
+                f"kind must be one of {kinds}, got "
                 f"{self.kind!r}; your own is MODULE:NAME or FILE.py:NAME, or an entry "
                 f"point in the group {GROUP}"
             )

@@ -46,12 +46,12 @@ class NetworkScorer:
         """(E, M) logits of episodes that are as many in a row on each set."""
         learned = chosen.shape[1] - count > self._network.num_unlearned
         tries = len(chosen) // len(jax.tree.leaves(memory)[0])  # in a row on each set
-        made, left = (
+        choices, available = (
             array.reshape(-1, tries, array.shape[-1])
             for array in (chosen.astype(np.int32), free)
         )
         scores = scores_of(
-            self._network, self._params, memory, made, left, count, learned
+            self._network, self._params, memory, choices, available, count, learned
         )
         return np.asarray(scores).reshape(free.shape)
 

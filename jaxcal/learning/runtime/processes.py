@@ -55,19 +55,19 @@ def expected(job: Job, environ: Mapping[str, str] = os.environ) -> bool:
     Raises:
         ValueError: naming the flag, the rule and the value.
     """
-    address, number, own = job.coordinator, job.num_processes, job.process_id
+    address, number, process_id = job.coordinator, job.num_processes, job.process_id
     if number == 1:
         return False
-    if address is number is own is None:
+    if address is number is process_id is None:
         return _cluster(environ)
-    if address is None or number is None or own is None:
+    if address is None or number is None or process_id is None:
         raise ValueError(
             "--coordinator, --num-processes and --process-id must come together"
         )
     if number < 1:
         raise ValueError(f"--num-processes must be at least 1, got {number}")
-    if not 0 <= own < number:
-        raise ValueError(f"--process-id must be in [0, {number}), got {own}")
+    if not 0 <= process_id < number:
+        raise ValueError(f"--process-id must be in [0, {number}), got {process_id}")
     if not re.fullmatch(r".+:\d+", address):
         raise ValueError(f"--coordinator must be HOST:PORT, got {address!r}")
     return True
@@ -101,9 +101,11 @@ def local_device_ids(environ: Mapping[str, str] = os.environ) -> list[int] | Non
         return None
     number = len(visible.split(","))
     tasks = environ.get("SLURM_STEP_TASKS_PER_NODE", "")
-    own = number == 1 or re.fullmatch(r"1(\(x\d+\))?", tasks)
+    shown_alone = number == 1 or re.fullmatch(r"1(\(x\d+\))?", tasks)
     return (
-        list(range(number)) if own and "JAX_LOCAL_DEVICE_IDS" not in environ else None
+        list(range(number))
+        if shown_alone and "JAX_LOCAL_DEVICE_IDS" not in environ
+        else None
     )
 
 

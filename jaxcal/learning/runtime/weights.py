@@ -142,15 +142,15 @@ def read(path: str | pathlib.Path) -> Weights:
         with np.load(io.BytesIO(data)) as file:
             arrays = {name: file[name] for name in file.files}
         header = json.loads(arrays.pop("header").tobytes())
-        found = header["format"], header["version"]
+        version = header["format"], header["version"]
         weights = Weights(header["network"], arrays, header["meta"])
         stated = header["sha256"]
     except Exception as error:  # zipfile and numpy raise many kinds
         raise CheckpointError(_damaged(path, type(error).__name__)) from error
-    if found != (_FORMAT, _VERSION):
+    if version != (_FORMAT, _VERSION):
         raise CheckpointError(
             f"weights file {path} must be of format {_FORMAT} {_VERSION}, got "
-            f"{found[0]} {found[1]}"
+            f"{version[0]} {version[1]}"
         )
     if weights.fingerprint != stated:
         raise CheckpointError(_damaged(path, "SHA-256 differs"))

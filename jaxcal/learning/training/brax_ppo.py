@@ -50,9 +50,9 @@ def adapted(config: TrainConfig) -> TrainConfig:
 
 def require_read(given: Collection[str]) -> None:
     """Refuse values of fields, by name, that brax's trainer would not read."""
-    known = {*_READ, "num_episodes", "seed", "width"}
-    known |= {field.name for field in settings_of(SelectionConfig)}
-    if unread := sorted(set(given) - known):
+    read = {*_READ, "num_episodes", "seed", "width"}
+    read |= {field.name for field in settings_of(SelectionConfig)}
+    if unread := sorted(set(given) - read):
         flags = ", ".join("--" + name.replace("_", "-") for name in unread)
         raise ValueError(f"--trainer brax does not read {flags}: leave it out")
 

@@ -95,8 +95,8 @@ def save(
     root = pathlib.Path(folder)
     root.mkdir(parents=True, exist_ok=True)
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    own: dict[str, Any] = {"schema": SCHEMA, "version": VERSION}
-    meta = own | {"created": now, "versions": versions()} | meta
+    header: dict[str, Any] = {"schema": SCHEMA, "version": VERSION}
+    meta = header | {"created": now, "versions": versions()} | meta
     trees = {"policy": policy} | ({} if state is None else {"state": _rest(state)})
     # Arrays of the host, so that no device is recorded.
     items = {
@@ -163,15 +163,15 @@ def _read(path: pathlib.Path, like: Any, what: str) -> Any:
     asyncio.set_event_loop_policy(_TolerantPolicy())
     try:
         with ocp.StandardCheckpointer(multiprocessing_options=_alone()) as reader:
-            found = reader.restore(path.absolute(), like)
-        for leaf, wanted in zip(*map(jax.tree.leaves, (found, like)), strict=True):
+            tree = reader.restore(path.absolute(), like)
+        for leaf, wanted in zip(*map(jax.tree.leaves, (tree, like)), strict=True):
             if leaf.shape != wanted.shape:
                 raise ValueError(f"shape {leaf.shape}, not {wanted.shape}")
     except Exception as error:  # orbax and tensorstore raise many kinds
         raise _unreadable(path.parent, what, error) from error
     finally:
         asyncio.set_event_loop_policy(before)
-    return jax.tree.map(jax.numpy.asarray, found)
+    return jax.tree.map(jax.numpy.asarray, tree)
 
 
 def _unreadable(path: pathlib.Path, what: str, error: Exception) -> CheckpointError:

@@ -115,8 +115,8 @@ def train(
 
     def validate(average: Any) -> dict[str, float]:
         assert validation is not None  # else it is not called
-        found = validation.measure(network, average, k)
-        return dict(zip(MEASURED, found, strict=True))
+        measured = validation.measure(network, average, k)
+        return dict(zip(MEASURED, measured, strict=True))
 
     recipe = Recipe(
         config=config,

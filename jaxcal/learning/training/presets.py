@@ -109,7 +109,7 @@ def with_values(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
     """
     for name in sorted(set(values) - field_names()):
         raise ValueError(f"no configuration has the field {name}")
-    network, ppo, own, changed = (
+    network, ppo, run, changed = (
         {f.name: values[f.name] for f in settings_of(PARTS[part]) if f.name in values}
         for part in ("network", "ppo", "run", "environment")
     )
@@ -126,7 +126,7 @@ def with_values(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
         network=dataclasses.replace(config.network, **network),
         ppo=dataclasses.replace(config.ppo, **ppo),
         tasks=tuple(_changed(task, changed) for task in config.tasks),
-        **own,
+        **run,
     )
 
 

@@ -80,8 +80,11 @@ class Recipe:
 
         def begin(key: jax.Array, values: dict[str, jax.Array]) -> TrainState:
             ppo, learner = self.config.ppo, self.learners[0]
-            each = [_begun(ppo, learner, key, *given, **values) for given in self.given]
-            return dataclasses.replace(each[0], playing=tuple(s.playing for s in each))
+            states = [
+                _begun(ppo, learner, key, *given, **values) for given in self.given
+            ]
+            playing = tuple(state.playing for state in states)
+            return dataclasses.replace(states[0], playing=playing)
 
         keys = jnp.stack([jax.random.key(run["seed"]) for run in self.runs])
         swept = [name for name, _ in self.config.sweep]
@@ -143,31 +146,31 @@ def updates(
         def update(state: TrainState) -> tuple[TrainState, ppo.Metrics]:
             return one(state, *given)
 
-        each: Any = update
+        all_seeds: Any = update
         if seeds:
             # On a CPU one after another: several at once do not fit a core's cache.
             at_once = None if jax.default_backend() == "cpu" else seeds
-            each = functools.partial(jax.lax.map, update, batch_size=at_once)
+            all_seeds = functools.partial(jax.lax.map, update, batch_size=at_once)
 
         def step(number: jax.Array, carry: Any) -> Any:
             state, kept = carry
-            state, found = each(state)
-            kept = jax.tree.map(lambda k, f: k.at[number].set(f), kept, found)
+            state, metrics = all_seeds(state)
+            kept = jax.tree.map(lambda k, m: k.at[number].set(m), kept, metrics)
             return state, kept
 
-        shapes = jax.eval_shape(each, state)[1]
+        shapes = jax.eval_shape(all_seeds, state)[1]
         kept = jax.tree.map(lambda m: jnp.zeros((at_most, *m.shape), m.dtype), shapes)
         return jax.lax.fori_loop(0, count, step, (state, kept))
 
     def call(state: TrainState, count: jax.Array, *given: Any) -> Any:
         if not spread:
             return ppo.placed(several(state, count, given), mesh)
-        own, all_of = PartitionSpec("seeds"), PartitionSpec()
+        by_seed, copied = PartitionSpec("seeds"), PartitionSpec()
         on_each = jax.shard_map(
             several,
             mesh=mesh,
-            in_specs=(own, all_of, all_of),
-            out_specs=(own, PartitionSpec(None, "seeds")),
+            in_specs=(by_seed, copied, copied),
+            out_specs=(by_seed, PartitionSpec(None, "seeds")),
             check_vma=False,
         )
         return ppo.placed(on_each(state, count, given), mesh)
@@ -234,9 +237,9 @@ def run(
             update = updates(recipe.config.ppo, learner, mesh, at_most, seeds)
             state = dataclasses.replace(state, playing=held[which])
             with collective():
-                state, found = update(state, np.int32(count), *given)
+                state, metrics = update(state, np.int32(count), *given)
                 # One transfer for all that these updates measured.
-                rows, made = jax.device_get(devices.local((found, state.num_updates)))
+                rows, made = jax.device_get(devices.local((metrics, state.num_updates)))
             held[which] = state.playing
             first, done = done, done + count
             if made.max() < done:  # every run has kept its last finite state
@@ -245,9 +248,9 @@ def run(
                 count = done - first + 1  # rows, that of the broken update included
             if recorder is not None:
                 recorder.note(whole(state), first, count, rows, save=not broken)
-            each = (time.perf_counter() - begun) / count
+            seconds = (time.perf_counter() - begun) / count
             # The first call also compiled, so the second is of one update too.
-            fit = int(_CALL_SECONDS / each) if timed else 1
+            fit = int(_CALL_SECONDS / seconds) if timed else 1
             count, timed = devices.on_first(functools.partial(max, fit, 1)), True
     if recorder is not None:
         recorder.save(whole(state), done)
@@ -293,27 +296,29 @@ class _Recorder:
             self._seeds = _table(path, self.reported, self._seed_columns)
         self._begun = self._validated = time.perf_counter()
         self._noted, self._saved = self._begun, -np.inf  # soon after the beginning too
-        self._each: list[dict[str, float]] = []  # of every seed, at the last validation
+        self._of_seeds: list[
+            dict[str, float]
+        ] = []  # of every seed, at the last validation
 
     def note(
         self,
         state: TrainState,
         first: int,
         count: int,
-        found: Mapping[str, Any],
+        metrics: Mapping[str, Any],
         save: bool = True,
     ) -> None:
         """Record the metrics of ``count`` updates; validate and save when due."""
         recipe, config, now = self.recipe, self.recipe.config, time.perf_counter()
         for number in range(count):
-            rewards = found["rewards"][number] if "rewards" in found else ()
+            rewards = metrics["rewards"][number] if "rewards" in metrics else ()
             if (first + number) % len(recipe.learners) == 0:
                 self.recent = np.concatenate([self.recent, np.ravel(rewards)])[-_LAST:]
             # Only the end of a call is timed: interpolate.
             at = self._noted + (now - self._noted) * (number + 1) / count
             done = first + number + 1
             row: dict[str, float] = {
-                name: _mean(values[number]) for name, values in found.items()
+                name: _mean(values[number]) for name, values in metrics.items()
             }
             row |= {
                 "update": done,
@@ -338,15 +343,15 @@ class _Recorder:
         spread: dict[str, float] = {}
         if recipe.validate is not None:
             averages = _of_each(devices.local(state.average), len(recipe.runs))
-            self._each = [recipe.validate(average) for average in averages]
-            for name in self._each[0]:
-                values = [each[name] for each in self._each]
+            self._of_seeds = [recipe.validate(average) for average in averages]
+            for name in self._of_seeds[0]:
+                values = [seed[name] for seed in self._of_seeds]
                 row[name] = float(np.mean(values))
                 spread[name] = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
             if self._seeds is not None:
-                for run, each in zip(recipe.runs, self._each, strict=True):
-                    own = {"update": done} | run | each
-                    _add(self._seeds, self._seed_columns, own)
+                for run, measured in zip(recipe.runs, self._of_seeds, strict=True):
+                    validation = {"update": done} | run | measured
+                    _add(self._seeds, self._seed_columns, validation)
         rate = (done - self.reported) / max(now - self._validated, 1e-9)
         self._validated, self.reported = time.perf_counter(), done
         self.report(
@@ -376,9 +381,9 @@ class _Recorder:
             "device": jax.devices()[0].device_kind,
         }
         if len(recipe.runs) > 1:
-            scores = [each[recipe.measured[0]] for each in self._each]
+            scores = [seed[recipe.measured[0]] for seed in self._of_seeds]
             progress["best"] = int(np.argmax(scores)) if scores else 0
-            progress["seeds"] = self._each
+            progress["seeds"] = self._of_seeds
         meta = config.as_meta() | {"schema": recipe.schema, "progress": progress}
         state = devices.local(state)
         checkpoint.save(self.root / "checkpoint", done, state.average, meta, state)
