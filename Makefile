@@ -49,14 +49,17 @@ reproduce: $(READY) ## the paper's figures, tables and claims from our own runs,
 # time. `make test-all` compiles as users do.
 # Hundreds of programs are started: what one has compiled the others load.
 test: export PYTHONDONTWRITEBYTECODE =
-# Half of the rig's tests wait for a device, so four share two cores, file by file in order:
-# xdist would put the files of few long tests last.
-# Each of them would compile everything that the tests import: one process does it before,
-# while mypy runs.
+# The rig's tests mostly wait for a device and import no JAX: three processes of them run
+# beside two of the others, which compile. Files stay in order: xdist would put the files of
+# few long tests last. Each process would compile everything that the tests import: one does
+# it before, while mypy runs.
+QUICK_TESTS = $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -m 'not slow' $(ARGS)
 test: $(READY) ## set everything up, lint, and run the quick tests (the ones CI runs)
 	$(BIN)/python -m pytest --collect-only -qq >/dev/null & $(MAKE) --no-print-directory lint && wait
-	XLA_FLAGS="$${XLA_FLAGS-$(QUICK_XLA)}" $(BIN)/python -m pytest -n 6 --dist loadfile \
-	--no-loadscope-reorder -m 'not slow' $(ARGS)
+	@export XLA_FLAGS="$${XLA_FLAGS-$(QUICK_XLA)}"; \
+	$(QUICK_TESTS) -n 3 tests/rig >$(VENV)/rig-tests.log 2>&1 & rig=$$!; \
+	$(QUICK_TESTS) -n 2 tests --ignore tests/rig; others=$$?; \
+	wait $$rig; rig=$$?; cat $(VENV)/rig-tests.log; exit $$((rig | others))
 
 # A part is a folder of tests/, or `files`, the tests beside them. Each is a run of its own:
 # what one process has compiled it keeps, and the whole suite is too much for one.
