@@ -72,7 +72,7 @@ class DesignOptions:
             lost=self.lost,
             names=next(iter(table.labels.values()), None),
         )
-        design.axes = names
+        design.candidate_set.axes = names
         return design
 
 

@@ -41,7 +41,14 @@ from jaxcal.models.model import Model, as_model
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.criteria import CRITERIA
 from jaxcal.selection.exchange.exchange import exchange_indices
-from jaxcal.selection.problem import CandidateSet, Problem, values
+from jaxcal.selection.problem import (
+    CandidateSet,
+    HasCandidates,
+    Problem,
+    blocks_of,
+    problem_of,
+    values,
+)
 from jaxcal.selection.result import Selection
 
 __all__ = ["Refinement", "optimise", "refine"]
@@ -153,14 +160,16 @@ def optimise(
     box = _limits(limits)
     model = as_model(model) if model is not None else Affine(len(box), len(box))
     pool = _drawn(box, _POOL, allowed, seed)
-    design = CandidateSet(pool, model, prior, noise, measured, max_replicates=_POOL)
-    search = _Search(design, box, allowed, k, criterion, region, seed, time_limit)
+    offer = CandidateSet.of_commands(
+        pool, model, prior, noise, measured, max_replicates=_POOL
+    )
+    search = _Search(offer, box, allowed, k, criterion, region, seed, time_limit)
     return search.run(None, whole_number("starts", starts, 1))
 
 
 def refine(
-    design: CandidateSet,
-    selection: Any,
+    design: HasCandidates,
+    selection: Selection | ArrayLike,
     limits: ArrayLike | None = None,
     *,
     criterion: Any = None,
@@ -170,16 +179,34 @@ def refine(
     seed: int = 0,
     time_limit: float | None = None,
 ) -> Refinement:
-    """See ``jaxcal.Design.refine``."""
-    if design.model is None or design.candidates is None:
+    """The chosen commands moved between the candidates to a better design.
+
+    Args:
+        design: what may be measured; ``design.refine(selection, ...)`` asks the same.
+        selection: what to begin with, or its (k,) indices; the answer is never worse.
+        limits: (n, 2) least and greatest command of each input; the range of the
+            available candidates when not given.
+        criterion: that of the selection when not given.
+        region: of I; the available candidates when not given.
+        allowed: f(u (n,)) -> whether a command may be given.
+        starts: of the search, the selection among them.
+        seed: of points that are drawn.
+        time_limit: seconds, 60 when not given; the best so far is returned.
+
+    Raises:
+        ValueError: naming the argument, the rule and the value.
+    """
+    offer = design.candidate_set
+    candidates, available = offer.candidates, offer.available
+    if offer.model is None or candidates is None:
         raise ValueError("refine needs candidates and a model, not blocks")
     rows = selection.indices if isinstance(selection, Selection) else selection
     rows = array_of("selection", rows, "k").astype(np.int64)
-    outside = (rows < 0) | (rows >= len(design.candidates))
-    require_none(outside, rows, f"selection must lie in [0, {len(design.candidates)})")
+    outside = (rows < 0) | (rows >= len(candidates))
+    require_none(outside, rows, f"selection must lie in [0, {len(candidates)})")
     if criterion is None and isinstance(selection, Selection):
         criterion = _asked(selection)
-    usable = design.candidates[design.available]
+    usable = candidates[available]
     given = limits
     if given is None:
         given = np.stack([usable.min(axis=0), usable.max(axis=0)], axis=1)
@@ -188,7 +215,7 @@ def refine(
         still = given[:, 0] == given[:, 1]  # a column that holds one value
         given[still, 1] += 1e-9 * np.maximum(np.abs(given[still, 1]), 1.0)
     box = _limits(given)
-    begun = design.candidates[rows]
+    begun = candidates[rows]
     beyond = (begun < box[:, 0]) | (begun > box[:, 1])
     require_none(beyond, begun, "selection must be within the limits")
     if allowed is not None:
@@ -199,7 +226,7 @@ def refine(
                 f"{in_words(begun[bad][0])}"
             )
     search = _Search(
-        design, box, allowed, len(begun), criterion, region, seed, time_limit
+        offer, box, allowed, len(begun), criterion, region, seed, time_limit
     )
     return search.run(begun, whole_number("starts", starts, 1))
 
@@ -332,7 +359,7 @@ class _Search:
 
     def __init__(
         self,
-        design: CandidateSet,
+        offer: CandidateSet,
         box: Array,
         allowed: Allowed | None,
         k: int | None,
@@ -344,13 +371,14 @@ class _Search:
         self.started = time.perf_counter()
         limit = _MINUTE if time_limit is None else seconds("time_limit", time_limit)
         self.end = self.started + limit
-        self.design, self.box, self.allowed, self.seed = design, box, allowed, seed
+        self.offer, self.box = offer, box
+        self.allowed, self.seed = allowed, seed
         self.low, self.span = box[:, 0], np.ptp(box, axis=1)
-        assert design.candidates is not None and design.model is not None
-        n = design.candidates.shape[1]
+        assert offer.candidates is not None and offer.model is not None
+        n = offer.candidates.shape[1]
         if len(box) != n:
             raise ValueError(f"limits must be ({n}, 2) for this model, got {box.shape}")
-        noise = design.noise or Noise()
+        noise = offer.noise or Noise()
         for given, axes in ((noise.std, 1), (noise.covariance, 2)):
             if given is not None and np.ndim(given) > axes:
                 raise ValueError(
@@ -358,7 +386,7 @@ class _Search:
                     "the candidates"
                 )
         self.asked, self.region = criterion, region
-        problem = design.problem(k, criterion, region)
+        problem = problem_of(offer, k, criterion, region)
         if type(problem) is not Problem:
             raise ValueError(
                 "refine is of one set of parameters and of measurements that all "
@@ -368,17 +396,17 @@ class _Search:
         self.k, self.objective = problem.k, problem.criterion
         of_one = self.objective.name
         by_name = CRITERIA[of_one].by_name
-        self.source = design.source(by_name, CRITERIA[of_one].of_region)
+        self.block_maker = blocks_of(offer, by_name, CRITERIA[of_one].of_region)
         # Commands lie on a surface in the limits, as of an arm that touches something.
         self.surface = hasattr(allowed, "onto")
-        self.rough = _ROUGH if design.model.resolution else _STEP
+        self.rough = _ROUGH if offer.model.resolution else _STEP
 
     # -- the criterion -----------------------------------------------------------------
 
     def blocks(self, commands: Array) -> Array:
         """(N, q, p) whitened."""
         return self.problem.white.of(
-            self.source.at("commands", _filled(commands), True)
+            self.block_maker.at("commands", _filled(commands), True)
         )[: len(commands)]
 
     def information(self, blocks: Array) -> Array:
@@ -455,7 +483,7 @@ class _Search:
         """(N, n) by the model's own derivative, where it has one."""
         basis = self.problem.white.basis
         metric = basis @ metric @ basis.T
-        found = self.source.leverage_slopes(_filled(commands), metric)
+        found = self.block_maker.leverage_slopes(_filled(commands), metric)
         return None if found is None else found[: len(commands)]
 
     # -- the search --------------------------------------------------------------------
@@ -494,7 +522,7 @@ class _Search:
             problem=problem,
             seed=self.seed,
             known_bound=float(self.objective.reported(bound)),
-            axes=self.design.axes or getattr(self.design.model, "inputs", None) or None,
+            axes=self.offer.axes or getattr(self.offer.model, "inputs", None) or None,
             began=began,
             search_error=error,
             certain=certain,
@@ -508,9 +536,9 @@ class _Search:
         if begun is not None:
             yield begun
             count -= 1
-        candidates = self.design.candidates
+        candidates = self.offer.candidates
         assert candidates is not None
-        usable = np.flatnonzero(self.design.available)
+        usable = np.flatnonzero(self.offer.available)
         if self.allowed is not None and begun is not None:
             usable = usable[_permitted(self.allowed, candidates[usable])]
         for i in range(count):
@@ -651,8 +679,8 @@ class _Search:
     @functools.cached_property
     def _spread(self) -> Array:
         """(R, n) points over the limits, where d is looked at."""
-        assert self.design.model is not None
-        cheap = not (self.design.model.resolution or self.surface)
+        assert self.offer.model is not None
+        cheap = not (self.offer.model.resolution or self.surface)
         count = _SEARCH if cheap else _POOL
         return _drawn(self.box, count, self.allowed, self.seed + 1)
 
@@ -723,8 +751,8 @@ class _Search:
 
         The best weighted design of the commands and the peaks found so far gives M0.
         """
-        assert self.design.model is not None
-        convex = self.design.model.affine(self.design.model.nominal) is not None
+        assert self.offer.model is not None
+        convex = self.offer.model.affine(self.offer.model.nominal) is not None
         certain = convex and len(self.box) <= _CORNERS
         support, blocks = commands, self.blocks(commands)
         weights = np.ones(len(commands)) / len(commands)
@@ -820,16 +848,16 @@ class _Search:
 
     def _judged(self, commands: Array) -> tuple[Problem, float, float]:
         """The problem of commands and all candidates; value and log det of them."""
-        design = self.design
-        assert design.candidates is not None
-        pool = design.candidates[design.available]
+        offer = self.offer
+        assert offer.candidates is not None
+        pool = offer.candidates[offer.available]
         region = self.region
         if region is None and CRITERIA[self.objective.name].of_region:
             region = pool
-        own = CandidateSet(
-            np.concatenate([commands, pool]), design.model, design.prior, design.noise,
-            design._measured,
+        own = CandidateSet.of_commands(
+            np.concatenate([commands, pool]), offer.model, offer.prior, offer.noise,
+            offer.measured,
         )  # fmt: skip
-        problem = own.problem(self.k, self.asked, region)
+        problem = problem_of(own, self.k, self.asked, region)
         value, log_det = values(problem, np.arange(self.k)[None])
         return problem, float(value[0]), float(log_det[0])

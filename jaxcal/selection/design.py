@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
-import copy
+import dataclasses
 import time
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import (
-    one_of,
-    require_none,
-    seconds,
-)
+from jaxcal.checks import one_of, require_none, seconds
 from jaxcal.deadline import Deadline
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
-from jaxcal.selection.continuous import Refinement, refine
+from jaxcal.selection.continuous import refine
 from jaxcal.selection.exact.exact import TIME_LIMIT, solve_exact
 from jaxcal.selection.fastest.search import fastest, pareto
 from jaxcal.selection.in_scenarios import with_optima
 from jaxcal.selection.plan import plan
-from jaxcal.selection.problem import CandidateSet, Problem, Solution, values
+from jaxcal.selection.problem import (
+    CandidateSet,
+    Problem,
+    Scenarios,
+    Solution,
+    problem_of,
+    values,
+)
 from jaxcal.selection.result import Selection, Subset
 from jaxcal.selection.solvers import SOLVERS, checked_options
 
@@ -34,7 +38,7 @@ _REFERENCES = ("bound", "exact")
 _PROVEN = 1e-9  # a value this near a proven optimum, relative above 1, is that optimum
 
 
-class Design(CandidateSet):
+class Design:
     """Which few of these candidates to measure: the problem, and its questions.
 
     Args:
@@ -66,6 +70,130 @@ class Design(CandidateSet):
         ValueError: naming the argument, the rule and the value; here or when a question
             is asked.
     """
+
+    candidate_set: CandidateSet  # what is asked about
+
+    def __init__(
+        self,
+        candidates: ArrayLike,
+        model: Model | None = None,
+        prior: Prior | None = None,
+        noise: Noise | None = None,
+        measured: ArrayLike | None = None,
+        available: ArrayLike | None = None,
+        required: ArrayLike | None = None,
+        max_replicates: int = 1,
+        *,
+        scenarios: Any = None,
+        lost: int = 0,
+        reliability: ArrayLike | None = None,
+        names: Sequence[str] | None = None,
+    ) -> None:
+        self.candidate_set = CandidateSet.of_commands(
+            candidates, model, prior, noise, measured, available, scenarios=scenarios,
+            names=names, required=required, max_replicates=max_replicates, lost=lost,
+            reliability=reliability,
+        )  # fmt: skip
+
+    @classmethod
+    def from_blocks(
+        cls,
+        blocks: ArrayLike,
+        prior: ArrayLike | None = None,
+        noise: Noise | None = None,
+        measured: ArrayLike | None = None,
+        available: ArrayLike | None = None,
+        required: ArrayLike | None = None,
+        max_replicates: int = 1,
+        *,
+        commands: ArrayLike | None = None,
+        names: Sequence[str] | None = None,
+        weights: ArrayLike | None = None,
+        lost: int = 0,
+        reliability: ArrayLike | None = None,
+    ) -> Self:
+        """The problem of information blocks, of any model.
+
+        Args:
+            blocks: (M, q, p); candidate i gives q readings, ``y = B_i theta + noise``
+                with noise of unit variance, and adds ``B_i.T @ B_i`` to the
+                information. Or (S, M, q, p), those of S scenarios.
+            prior: (p, p) precision of what is known beforehand; nothing by default.
+            noise: of the readings, where it is not of unit variance.
+            measured: (N, q, p) blocks that were measured already, of scenarios
+                (S, N, q, p).
+            available, required, max_replicates, names, lost, reliability: as for
+                candidates.
+            commands: (M, n) of the candidates, for travel between them and for tables.
+            weights: (S,) of the scenarios, of sum 1; equal when not given.
+        """
+        design = object.__new__(cls)
+        design.candidate_set = CandidateSet.of_blocks(
+            blocks, prior, noise, measured, available, commands=commands, names=names,
+            weights=weights, required=required, max_replicates=max_replicates,
+            lost=lost, reliability=reliability,
+        )  # fmt: skip
+        return design
+
+    @property
+    def candidates(self) -> Array | None:
+        """(M, n) in the caller's unit; None where blocks came without commands."""
+        return self.candidate_set.candidates
+
+    @property
+    def model(self) -> Model | None:
+        """What makes blocks of the candidates; None where they were given."""
+        return self.candidate_set.model
+
+    @property
+    def prior(self) -> Prior | ArrayLike | None:
+        """What was given: of blocks a (p, p) precision."""
+        return self.candidate_set.prior
+
+    @property
+    def noise(self) -> Noise | None:
+        """The noise given, else the model's own."""
+        return self.candidate_set.noise
+
+    @property
+    def available(self) -> NDArray[np.bool_]:
+        """(M,) True where a candidate may be chosen."""
+        return self.candidate_set.available
+
+    @property
+    def scenarios(self) -> Scenarios | None:
+        """Parameters (S, p) and weights (S,); None: the nominal alone."""
+        return self.candidate_set.scenarios
+
+    @property
+    def names(self) -> tuple[str, ...] | None:
+        """(M,) of the candidates, the caller's own."""
+        return self.candidate_set.names
+
+    @property
+    def axes(self) -> tuple[str, ...] | None:
+        """(n,) of the inputs, the caller's own."""
+        return self.candidate_set.axes
+
+    def __repr__(self) -> str:
+        what = "blocks" if self.model is None else type(self.model).__name__
+        count, usable = len(self.available), int(self.available.sum())
+        return (
+            f"{type(self).__name__} of {count} candidates, {usable} available, {what}"
+        )
+
+    def problem(
+        self, k: int | None = None, criterion: Any = None, region: Any = None
+    ) -> Problem:
+        """The problem of choosing k by a criterion, checked and whitened.
+
+        Args:
+            k: candidates to choose; the fewest that identify when not given.
+            criterion: letters of ``CRITERIA`` or an object of it; D for the affine
+                model and blocks, else I.
+            region: of I, where it is given by its letter.
+        """
+        return problem_of(self.candidate_set, k, criterion, region)
 
     def select(
         self,
@@ -180,47 +308,7 @@ class Design(CandidateSet):
     plan = plan
     fastest = fastest
     pareto = pareto
-
-    def refine(
-        self,
-        selection: Selection | ArrayLike,
-        limits: ArrayLike | None = None,
-        *,
-        criterion: Any = None,
-        region: ArrayLike | None = None,
-        allowed: Any = None,
-        starts: int = 4,
-        seed: int = 0,
-        time_limit: float | None = None,
-    ) -> Refinement:
-        """The chosen commands moved between the candidates to a better design.
-
-        Args:
-            selection: what to begin with, or its (k,) indices; the answer is never
-                worse.
-            limits: (n, 2) least and greatest command of each input; the range of the
-                available candidates when not given.
-            criterion: that of the selection when not given.
-            region: of I; the available candidates when not given.
-            allowed: f(u (n,)) -> whether a command may be given.
-            starts: of the search, the selection among them.
-            seed: of points that are drawn.
-            time_limit: seconds, 60 when not given; the best so far is returned.
-
-        Raises:
-            ValueError: naming the argument, the rule and the value.
-        """
-        return refine(
-            self,
-            selection,
-            limits,
-            criterion=criterion,
-            region=region,
-            allowed=allowed,
-            starts=starts,
-            seed=seed,
-            time_limit=time_limit,
-        )
+    refine = refine
 
     def _judged(
         self, problem: Problem, solution: Solution, method: str, start: float
@@ -279,11 +367,14 @@ class Design(CandidateSet):
 
     def _why_singular(self, indices: NDArray[np.int64]) -> str:
         """What choosing among these candidates alone would be refused for."""
-        alone = copy.copy(self)
-        alone.available = np.isin(np.arange(len(self.available)), indices)
-        alone._required, alone.max_replicates = None, len(indices)
+        alone = dataclasses.replace(
+            self.candidate_set,
+            available=np.isin(np.arange(len(self.available)), indices),
+            required=None,
+            max_replicates=len(indices),
+        )
         try:
-            alone.problem(len(indices))
+            problem_of(alone, len(indices))
         except ValueError as error:
             return f": {error}"
         return ""

@@ -26,7 +26,7 @@ from jaxcal.deadline import Deadline
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.fastest.motion import Motion, travel_times
-from jaxcal.selection.problem import CandidateSet
+from jaxcal.selection.problem import CandidateSet, HasCandidates, problem_of
 from jaxcal.selection.solvers import checked_seed
 
 __all__ = ["FastSelection", "ParetoFront", "fastest", "pareto"]
@@ -74,7 +74,7 @@ class ParetoFront:
 
 
 def fastest(
-    design: CandidateSet,
+    design: HasCandidates,
     k: int | None,
     motion: Motion,
     *,
@@ -101,7 +101,7 @@ def fastest(
         The selection; among runs of equal time the one with the largest determinant.
     """
     least = share("least_efficiency", least_efficiency)
-    search = _Search(design, k, motion, start, method, time_limit, seed)
+    search = _Search(design.candidate_set, k, motion, start, method, time_limit, seed)
     answer = search.answer(least, None)
     if answer is None:
         raise ValueError(
@@ -112,7 +112,7 @@ def fastest(
 
 
 def pareto(
-    design: CandidateSet,
+    design: HasCandidates,
     k: int | None,
     motion: Motion,
     *,
@@ -131,7 +131,7 @@ def pareto(
     """
     least = share("least_efficiency", least_efficiency)
     defaults = {"start": None, "method": None, "time_limit": 60.0, "seed": 0}
-    search = _Search(design, k, motion, **(defaults | options))
+    search = _Search(design.candidate_set, k, motion, **(defaults | options))
     points: list[FastSelection] = []
     point = search.answer(least, None)
     while point is not None and len(points) < _MOST_POINTS:
@@ -153,7 +153,7 @@ class _Search:
 
     def __init__(
         self,
-        design: CandidateSet,
+        offer: CandidateSet,
         k: int | None,
         motion: Motion,
         start: ArrayLike | None,
@@ -161,12 +161,12 @@ class _Search:
         time_limit: float,
         seed: int | np.random.Generator,
     ) -> None:
-        if design.scenarios is not None or design.uncertain:
+        if offer.scenarios is not None or offer.uncertain:
             raise ValueError(
                 "scenarios, lost and reliability must be left out with fastest and "
                 "pareto"
             )
-        problem, points = design.problem(k, "D"), design.candidates
+        problem, points = problem_of(offer, k, "D"), offer.candidates
         if points is None:
             raise ValueError(
                 "commands must be given with blocks, Design.from_blocks(..., "

@@ -37,9 +37,15 @@ from jaxcal.selection.plan.designs import (
     region_root,
     variances_of,
 )
-from jaxcal.selection.problem import CandidateSet, Problem
+from jaxcal.selection.problem import (
+    CandidateSet,
+    HasCandidates,
+    Problem,
+    blocks_of,
+    problem_of,
+    shares_regressor,
+)
 from jaxcal.selection.problem.scenario_problem import joined_problem
-from jaxcal.selection.problem.sources import shares_regressor
 from jaxcal.selection.solvers import checked_seed
 
 __all__ = ["Plan", "PlanRow", "plan"]
@@ -127,7 +133,7 @@ class Plan:
 
 
 def plan(
-    design: CandidateSet,
+    design: HasCandidates,
     accuracy: ArrayLike,
     noise_std: ArrayLike | None = None,
     criterion: str = "G",
@@ -161,19 +167,20 @@ def plan(
         ValueError: naming the argument, the rule and the value; where no K up to
             ``max_k`` suffices, with the accuracy that can be reached.
     """
-    begun = time.perf_counter()
-    if design.uncertain:
+    begun, offer = time.perf_counter(), design.candidate_set
+    if offer.uncertain:
         raise ValueError("lost and reliability must be left out with plan")
     one_of("criterion", criterion, tuple(_SUMMARIES))
     more, start = whole_number("more", more, 0), checked_seed(seed)
     how = "I" if criterion == "I" else "G"
     given = criterion, accuracy, noise_std, parameters, region
-    requests = [_request(one, *given) for one in design.each()]
+    requests = [_request(one, *given) for one in offer.by_scenario()]
     request = requests[0]
     cases = [Case(one.problem, one.points) for one in requests]
     unit, problem = request.unit, request.problem
-    if design.scenarios is not None:
-        problems, weights = [case.problem for case in cases], design.scenarios.weights
+    if offer.scenarios is not None:
+        problems = [case.problem for case in cases]
+        weights = offer.scenarios.weights
         problem = joined_problem(problems, weights, Mean("D"), None)
     total, (identify, least_k) = problem.k, _fewest(problem)
     if max_k is None:
@@ -254,7 +261,7 @@ class _Request(NamedTuple):
 
 
 def _request(
-    design: CandidateSet,
+    offer: CandidateSet,
     criterion: str,
     accuracy: ArrayLike,
     noise_std: ArrayLike | None,
@@ -265,9 +272,9 @@ def _request(
     of_parameters = criterion == "parameters"
     if parameters is not None and not of_parameters:
         raise ValueError("parameters must come with criterion parameters only")
-    cap = whole_number("max_replicates", design.max_replicates, 1)
-    total = max(1, int(design.available.sum()) * cap)
-    model, noise = design.model, design.noise
+    cap = whole_number("max_replicates", offer.max_replicates, 1)
+    total = max(1, int(offer.available.sum()) * cap)
+    model, prior, noise = offer.model, offer.prior, offer.noise
     shared = False  # one regressor for all outputs?
     if model is None:
         if not (noise_std is noise is None):
@@ -284,16 +291,18 @@ def _request(
                 noise_std = std if np.ndim(std) < 2 else None
         if noise_std is not None:
             noise_std = levels("noise_std", noise_std, model.num_outputs)
-            shared = not of_parameters and shares_regressor(model, design.prior, None)
+            shared = not of_parameters and shares_regressor(model, prior, None)
             # Where outputs share a regressor the noise is in the targets.
-            design = design.with_noise(None if shared else Noise(noise_std))
-    problem = design.problem(total, "D")
-    source = design.with_noise(None).source(not shared)
-    names = source.names
+            offer = dataclasses.replace(
+                offer, noise=None if shared else Noise(noise_std)
+            )
+    problem = problem_of(offer, total, "D")
+    blocks = blocks_of(dataclasses.replace(offer, noise=None), not shared)
+    names = blocks.names
     if model is not None:
         assert problem.candidates is not None
         where = problem.candidates[problem.available] if region is None else region
-        rows = source.at("region", where, False)
+        rows = blocks.at("region", where, readings=False)
     elif region is None:
         rows = problem.readings[problem.available]
     else:

@@ -1,19 +1,27 @@
 """What is chosen from, under which rules, and by which criterion."""
 
-from jaxcal.selection.problem.assembly import make_problems
-from jaxcal.selection.problem.candidate_set import CandidateSet
+from jaxcal.selection.problem.assembly import make_problems, problem_of
+from jaxcal.selection.problem.blocks import Blocks, blocks_of, shares_regressor
+from jaxcal.selection.problem.candidate_set import CandidateSet, HasCandidates
 from jaxcal.selection.problem.losses import Loss, LossProblem
 from jaxcal.selection.problem.problem import Problem, Solution, log_dets, values
 from jaxcal.selection.problem.scenario_problem import ScenarioProblem
+from jaxcal.selection.problem.scenarios import Scenarios
 
 __all__ = [
+    "Blocks",
     "CandidateSet",
+    "HasCandidates",
     "Loss",
     "LossProblem",
     "Problem",
     "ScenarioProblem",
+    "Scenarios",
     "Solution",
+    "blocks_of",
     "log_dets",
     "make_problems",
+    "problem_of",
+    "shares_regressor",
     "values",
 ]

@@ -1,19 +1,18 @@
-"""Problems from information blocks: which candidates may be chosen, and how many."""
+"""The problem of a question to a candidate set, checked and whitened.
+
+``problem_of`` makes it out of the set's information blocks; scenarios are problems of
+their own, joined, and losses a problem about these. ``make_problems`` makes a batch of
+the affine model's.
+"""
 
 from __future__ import annotations
 
-import functools
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import (
-    array_of,
-    axis_names,
-    require_finite,
-    require_none,
-    whole_number,
-)
+from jaxcal.checks import axis_names, require_none, whole_number
 from jaxcal.information.blocks import (
     Whitened,
     coarseness,
@@ -29,70 +28,117 @@ from jaxcal.information.singular import (
 )
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model
-from jaxcal.selection.criteria import CRITERIA, Coordinates, Criterion
+from jaxcal.selection.criteria import (
+    CRITERIA,
+    Coordinates,
+    Criterion,
+    Joined,
+    Mean,
+    criterion_of,
+)
+from jaxcal.selection.problem.arrays import (
+    check_available,
+    filled,
+    one_array,
+    usable_numbers,
+)
+from jaxcal.selection.problem.blocks import blocks_of
+from jaxcal.selection.problem.candidate_set import CandidateSet
+from jaxcal.selection.problem.losses import with_arrivals, with_losses
 from jaxcal.selection.problem.problem import Problem
+from jaxcal.selection.problem.scenario_problem import joined_problem
 
-__all__ = [
-    "check_available",
-    "filled",
-    "make_problem",
-    "make_problems",
-    "usable_numbers",
-]
+__all__ = ["make_problems", "problem_of"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-_FILLED = ", none of them 0"
 
+def problem_of(
+    offer: CandidateSet,
+    k: int | None = None,
+    criterion: Any = None,
+    region: ArrayLike | None = None,
+) -> Problem:
+    """The problem of choosing k of the candidates by a criterion.
 
-def filled(name: str, values: ArrayLike, *letters: str) -> Array:
-    """``values`` as float64 with an axis for each letter, none of them empty."""
-    array = array_of(name, values, *letters, rule=_FILLED, finite=False)
-    if 0 in array.shape:
-        raise ValueError(
-            f"{name} must have shape ({', '.join(letters)}){_FILLED}, got {array.shape}"
-        )
-    return array
-
-
-@functools.cache
-def _keep_freed_memory() -> None:
-    """The C library keeps freed memory once an array as large as this was freed.
-
-    Else the arrays of every large problem go back to the system and are asked for
-    again, which takes longer than what is computed in them. No page of it is touched.
+    Args:
+        offer: what may be measured.
+        k: candidates to choose; the fewest that identify when not given.
+        criterion: letters of ``CRITERIA`` or an object of it; D for the affine model
+            and blocks, else I.
+        region: of I, where it is given by its letter.
     """
-    np.empty(2**21)
+    joined = criterion if isinstance(criterion, Joined) else Mean(criterion)
+    default = "I" if offer.model and not offer.model.multiplicity else "D"
+    of_one = criterion_of(joined.criterion, region, default)
+    if offer.lost:
+        return _problem_with_losses(offer, k, of_one, joined)
+    problem = _problem_of_scenarios(offer, k, of_one, joined)
+    if offer.reliability is None:
+        return problem
+    return with_arrivals(problem, offer.reliability, joined)
 
 
-def usable_numbers(name: str, array: Array, mask: Mask) -> Array:
-    """A copy, finite where available; what is not finite elsewhere becomes zero."""
-    _keep_freed_memory()
-    own = np.array(array, order="C")
-    bad = ~np.isfinite(own)
-    if bad.any():
-        hidden = bad & ~mask.reshape(*mask.shape, *[1] * (own.ndim - mask.ndim))
-        own[hidden] = 0.0
-        require_finite(name, own)
-    return own
+def _problem_with_losses(
+    offer: CandidateSet, k: int | None, criterion: Criterion, joined: Joined
+) -> Problem:
+    """The problem where the worst ``offer.lost`` of the chosen fail."""
+    if offer.reliability is not None:
+        raise ValueError("lost and reliability must not be given together")
+    if k is None:
+        k = _problem_of_scenarios(offer, None, criterion, joined).k + offer.lost
+    try:
+        kept = whole_number("k", k, 1) - offer.lost
+        _problem_of_scenarios(offer, kept, criterion, joined)
+    except ValueError as error:
+        raise ValueError(f"of k = {k} with {offer.lost} lost: {error}") from None
+    return with_losses(_problem_of_scenarios(offer, k, criterion, joined), offer.lost)
 
 
-def check_available(available: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
-    """(M,) or, of many sets, (B, M), as ``shape`` says."""
-    if available is None:
-        return np.ones(shape, dtype=np.bool_)
-    mask = _one_array("available", available)
-    if mask.shape != shape:
-        raise ValueError(f"available must have shape {shape}, got {mask.shape}")
-    if mask.dtype.kind not in "biuf" or not np.isin(mask, (0, 1)).all():
-        wrong = mask[~np.isin(mask, (0, 1))] if mask.dtype.kind in "iuf" else mask
-        raise ValueError(
-            "available must hold True or 1 where a candidate may be chosen, else False "
-            f"or 0, got {wrong.flat[0]}"
-        )
-    return mask.astype(np.bool_)
+def _problem_of_scenarios(
+    offer: CandidateSet, k: int | None, criterion: Criterion, joined: Joined
+) -> Problem:
+    """The problem in all scenarios."""
+    if offer.scenarios is None:
+        return _problem_of_one(offer, k, criterion)
+    members = []
+    for s, alone in enumerate(offer.by_scenario()):
+        try:
+            members.append(_problem_of_one(alone, k, criterion))
+        except ValueError as error:
+            raise ValueError(f"in scenario {s}: {error}") from None
+    nominal = None if offer.model is None else _problem_of_one(offer, k, criterion)
+    return joined_problem(members, offer.scenarios.weights, joined, nominal)
+
+
+def _problem_of_one(
+    offer: CandidateSet, k: int | None, criterion: Criterion
+) -> Problem:
+    """The problem of one scenario, or at the nominal."""
+    blocks = blocks_of(offer, criterion.by_name, criterion.of_region)
+    raw, root = blocks.of_candidates(), blocks.root
+    if offer.measured is not None:
+        measured = blocks.at("measured", offer.measured, readings=True)
+        root = _with_measured(root, measured)
+    blocks.require_identified(offer.measured)
+    where = criterion.region
+    if where is None and criterion.of_region:
+        where = blocks.predicted()
+    region = None if where is None else blocks.at("region", where, readings=False)
+    return _checked_problem(
+        raw, root, criterion, k, offer.available, offer.required,
+        offer.max_replicates, coarse=offer.coarse, names=blocks.names,
+        times=blocks.times, region=region, candidates=offer.candidates,
+        model=offer.model,
+    )  # fmt: skip
+
+
+def _with_measured(root: Array, blocks: Array) -> Array:
+    """Root of a precision with the information of blocks (N, q, p) added."""
+    rows = np.concatenate([root, blocks.reshape(-1, root.shape[1])])
+    return np.linalg.qr(rows)[1] if len(rows) > root.shape[1] else rows
 
 
 def make_problems(
@@ -123,7 +169,7 @@ def make_problems(
     array.flags.writeable = False  # and so of every set
     m = array.shape[2] if num_outputs is None else num_outputs
     model = Affine(array.shape[2], whole_number("num_outputs", m, 1))
-    forced = None if required is None else _one_array("required", required)
+    forced = None if required is None else one_array("required", required)
     if forced is not None and (forced.ndim != 2 or len(forced) != len(array)):
         raise ValueError(f"required must have shape (B, r), got {forced.shape}")
     raw, coarse = model.blocks(array), coarseness(candidates)
@@ -134,7 +180,7 @@ def make_problems(
     problems = []
     for b in range(len(array)):
         try:
-            problems.append(make_problem(
+            problems.append(_checked_problem(
                 raw[b], root, criterion, k, mask[b],
                 None if forced is None else forced[b], max_replicates,
                 white=white[b], coarse=coarse, times=m, candidates=array[b],
@@ -145,7 +191,7 @@ def make_problems(
     return problems
 
 
-def make_problem(
+def _checked_problem(
     raw: Array,
     root: Array,
     criterion: Criterion,
@@ -216,16 +262,6 @@ def make_problem(
     return problem
 
 
-def _one_array(name: str, values: ArrayLike) -> NDArray[np.generic]:
-    """A copy of ``values`` as an array of any kind."""
-    try:
-        return np.array(values)
-    except ValueError as error:
-        raise ValueError(
-            f"{name} must be one array, got {type(values).__name__} of mixed lengths"
-        ) from error
-
-
 def _check_counts(
     mask: Mask, k: int, required: ArrayLike | None, cap: int
 ) -> NDArray[np.int64]:
@@ -241,7 +277,7 @@ def _check_counts(
         )
     if required is None:
         return np.zeros(0, dtype=np.int64)
-    given = _one_array("required", required)
+    given = one_array("required", required)
     if not given.size:
         return np.zeros(0, dtype=np.int64)
     if given.ndim != 1:
