@@ -88,6 +88,10 @@ class Refinement(Selection):
         assert self.problem.candidates is not None
         return self.problem.candidates[self.indices]
 
+    @property
+    def _noun(self) -> str:
+        return "command"
+
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, text and lists, as a JSON file takes them."""
         content = super().to_dict()

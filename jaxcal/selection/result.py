@@ -157,6 +157,11 @@ class Selection:
             }
         }
 
+    @property
+    def _noun(self) -> str:
+        """What a measurement is called in the table."""
+        return "candidate"
+
     def _axes(self) -> tuple[str, ...]:
         assert self.problem.candidates is not None
         count = self.problem.candidates.shape[1]
@@ -167,11 +172,14 @@ class Selection:
         needed = np.flatnonzero(self.left_without == 0.0)
         if len(needed) == len(self.indices):
             return "singular, whichever is lost"
-        if len(needed):
-            return "singular without " + ", ".join(self.labels[i] for i in needed)
+        names = [self.labels[i] for i in needed]
+        if len(names) > 1:
+            return f"singular without any one of {self._noun}s {', '.join(names)}"
+        if names:
+            return f"singular without {self._noun} {names[0]}"
         worst = int(self.left_without.argmin())
-        left = self.left_without[worst]
-        return f"{left:.3g} of det S is left, without {self.labels[worst]}"
+        share, name = self.left_without[worst], f"{self._noun} {self.labels[worst]}"
+        return f"{name} matters most, {share:.3g} of det S is left without it"
 
     def __str__(self) -> str:
         head = ["candidate"] + (["name"] if self.names is not None else [])

@@ -187,12 +187,15 @@ def test_what_is_left_without_each_measurement_is_told(rng):
     rest = [np.delete(rows, i, axis=0) for i in range(4)]
     expected = [max(np.linalg.det(some.T @ some), 0.0) / whole for some in rest]
     np.testing.assert_allclose(selection.left_without, expected, atol=1e-12)
-    assert "without one   singular without 0, 3" in str(selection)
+    ends = "without one   singular without any one of candidates 0, 3\n"
+    assert ends in str(selection)
     fewest = jaxcal.select(rng.random((9, 3)))
     np.testing.assert_array_equal(fewest.left_without, 0.0)
     assert "singular, whichever is lost" in str(fewest)
     more = jaxcal.select(rng.random((9, 3)), 6)
-    assert f"{more.left_without.min():.3g} of det S is left, without" in str(more)
+    worst = more.left_without.argmin()
+    share = f"{more.left_without[worst]:.3g} of det S is left without it\n"
+    assert f"candidate {more.indices[worst]} matters most, {share}" in str(more)
 
 
 def test_a_time_limit_is_kept_by_many_best_and_by_many_replicates(rng):
