@@ -11,6 +11,7 @@ import numpy as np
 from flax import struct
 
 from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.host import on_host
 from jaxcal.adaptive.rules import SHARES, Shares
 from jaxcal.adaptive.search_kernel import Tree
 from jaxcal.adaptive.session import Options, Session
@@ -39,16 +40,14 @@ class Ahead:
         if not isinstance(task, GridTask):
             return self.base(task, belief, session, options, key)
         constants, hints = self.constants()
-        chosen: jax.Array = jax.pure_callback(
+        return on_host(
             functools.partial(_chosen, task.horizon, self.effort),
             jax.ShapeDtypeStruct((), jnp.int32),
             *(task.likelihood, task.travel, task.extra, task.uses, task.place_after),
             *(*task.limits, _possible(task, session, options)),
             *(jnp.stack(constants), hints, belief.weights),
             *(session.place, session.seconds, session.uses, session.made),
-            vmap_method="expand_dims",
         )
-        return chosen
 
     def constants(self) -> tuple[list[Any], Any]:
         """Constants of ``shares`` and ``doubt``; (N, A) hints, (1, 1) without any."""

@@ -18,6 +18,7 @@ import numpy as np
 from flax import struct
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.adaptive.host import on_host
 from jaxcal.adaptive.session import Session
 from jaxcal.checks import numbers, table
 from jaxcal.models import FromFunction, FromJax, Noise, Prior
@@ -234,10 +235,7 @@ class _HostReadings:
         self, unknowns: jax.Array, design: jax.Array, command: jax.Array
     ) -> jax.Array:
         shape = jax.ShapeDtypeStruct((self._model.num_outputs,), jnp.float32)
-        read: jax.Array = jax.pure_callback(
-            self._at, shape, unknowns, design, vmap_method="expand_dims"
-        )
-        return read
+        return on_host(self._at, shape, unknowns, design)
 
     def _at(self, unknowns: Any, designs: Any) -> Any:
         """(..., q) of parameters (..., p) and designs (...) that broadcast."""

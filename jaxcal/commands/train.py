@@ -184,12 +184,16 @@ def _configuration(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
         preset_of,
         trained_on,
     )
+    from jaxcal.learning.runtime.weights import criterion_of
     from jaxcal.learning.training import checkpoint, presets
     from jaxcal.learning.training.config import TrainConfig
 
     given = given_to(arguments, task=False)
     path = arguments.candidates
-    candidates = candidates_of(path) if path else None
+    criterion = given.get("criterion", "D")
+    if arguments.resume and path:
+        criterion = criterion_of(out)
+    candidates = candidates_of(path, criterion) if path else None
     config = presets.load(preset_of(arguments))
     if arguments.trainer == "brax":
         config = _for_brax(config, arguments, given)
@@ -325,6 +329,8 @@ def _introduction(config: TrainConfig, out: pathlib.Path, devices: str) -> str:
     """What will be trained, in one line."""
     import jax
 
+    from jaxcal.learning.config import AFFINE
+
     shapes = jax.eval_shape(config.learners[0].init, jax.random.key(0))
     size = sum(leaf.size for leaf in jax.tree.leaves(shapes))
     task, seed = config.tasks[0], f"seed {config.seed}"
@@ -334,6 +340,16 @@ def _introduction(config: TrainConfig, out: pathlib.Path, devices: str) -> str:
         seed += f", {name} " + " ".join(f"{value:g}" for value in values)
     env = task.environment
     given = f" from {task.given.name}" if task.given else ""
+    if env.criterion != "D":
+        unit = (
+            "does not change with their unit: whitened"
+            if env.criterion in AFFINE
+            else "changes with their unit: as they are"
+        )
+        given += (
+            f" by criterion {env.criterion}, which {unit}, with a look-ahead by "
+            f"{env.criterion}"
+        )
     return (
         f"preset {config.preset}: {config.network.kind} network, {size:,} parameters; "
         f"choose {env.num_selected} of {env.num_candidates}{given}; "

@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal import selection
+from jaxcal.deadline import NEVER, Deadline
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.parameters import estimate_parameters
 from jaxcal.evaluation.results import Evaluation, MethodResult
-from jaxcal.information.regression import log_det_gram
+from jaxcal.information.regression import log_det_gram, log_worth
 from jaxcal.models import Affine
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "check_methods",
     "evaluate",
     "label_of",
+    "methods_by",
     "rows_of",
 ]
 
@@ -96,6 +98,21 @@ def rows_of(
     ]
 
 
+def methods_by(criterion: str, methods: Sequence[str] | None) -> tuple[str, ...]:
+    """``check_methods`` of those asked for, else all that serve a criterion.
+
+    Raises:
+        ValueError: as ``check_methods``, or one that serves D alone.
+    """
+    chosen = check_methods(DEFAULT_METHODS if methods is None else methods)
+    if criterion == "D":
+        return chosen
+    climbs = "policy:exchange"  # by det S
+    if methods is not None and climbs in methods:
+        raise ValueError(f"{climbs} is of criterion D, the policy of {criterion}")
+    return tuple(name for name in chosen if name != climbs)
+
+
 def evaluate(
     dataset: Dataset,
     k: int = 4,
@@ -106,6 +123,7 @@ def evaluate(
     random_draws: int = DEFAULT_RANDOM_DRAWS,
     seed: int = 0,
     time_limit: float | None = None,
+    criterion: str = "D",
     progress: Progress | None = None,
 ) -> Evaluation:
     """Run methods on a dataset and judge them against the proven optimum.
@@ -120,13 +138,14 @@ def evaluate(
         seed: of everything drawn at random.
         time_limit: seconds for the exact solver over the whole dataset; episodes not
             proven by then are judged against an upper bound.
+        criterion: by which methods are judged, and solvers choose: D, A, I or E.
         progress: called as selections are made.
 
     Raises:
         ValueError: naming the dataset and what is wrong with it, k or a method.
         OSError: a checkpoint cannot be read.
     """
-    methods = check_methods(methods)
+    methods = methods_by(criterion, methods)
     for name, value in (("num", num), ("random_draws", random_draws)):
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
@@ -134,7 +153,7 @@ def evaluate(
         selection.make_problems(dataset.candidates, k, available=dataset.available)
     except ValueError as error:
         raise ValueError(f"{dataset.name}: {error}") from None
-    run = _Run(dataset, k, num, seed, progress or (lambda *_: None))
+    run = _Run(dataset, k, num, seed, progress or (lambda *_: None), criterion)
     rows = rows_of(methods, checkpoints)
     policies = {row: run.policy(*row) for row in rows if row[0] in POLICIES}
     random = run.random(random_draws)
@@ -151,6 +170,7 @@ def evaluate(
         reference=reference,
         proven=proven,
         random_log_det=random.log_det,
+        criterion=criterion,
     )
 
 
@@ -163,6 +183,7 @@ class _Run:
     num: int
     seed: int
     progress: Progress
+    criterion: str = "D"
 
     def result(
         self,
@@ -174,9 +195,7 @@ class _Run:
     ) -> MethodResult:
         """Judge (E, R, k) indices, unless their (E, R) log det of Z.T Z is known."""
         if gram is None:
-            candidates = self.dataset.candidates
-            parts = [log_det_gram_of(candidates[c], indices[c]) for c in self.pieces()]
-            gram = np.concatenate(parts)
+            gram = np.concatenate([self.worth(c, indices[c]) for c in self.pieces()])
         return MethodResult(
             method=method,
             label=label_of(method, self.num),
@@ -186,6 +205,39 @@ class _Run:
             seconds=seconds / self.dataset.num_episodes,
             parameters=estimate_parameters(self.dataset, indices),
         )
+
+    def worth(self, cut: slice, indices: Indices) -> Array:
+        """(E, R) of (E, R, k) indices: log det of Z.T Z, or what stands for it."""
+        candidates, mask = self.dataset.candidates[cut], self.dataset.available
+        if self.criterion == "D":
+            return log_det_gram_of(candidates, indices)
+        free = None if mask is None else mask[cut]
+        return log_worth(self.criterion, candidates, indices, free)
+
+    def selected(
+        self, method: str, cut: slice, deadline: Deadline = NEVER
+    ) -> list[selection.Selection]:
+        """``select`` of each of some episodes."""
+        part = self.part(cut)
+        masks, chosen = part["available"], []
+        for i, candidates in enumerate(part["candidates"]):
+            more: dict[str, Any] = {}
+            if method in ("exchange", "auto"):
+                more["seed"] = self.seed
+            if deadline is not NEVER:
+                more["time_limit"] = max(deadline.remaining_s, 1e-3)
+            chosen.append(
+                selection.select(
+                    candidates,
+                    self.k,
+                    method,
+                    criterion=self.criterion,
+                    model=Affine(candidates.shape[1], self.dataset.num_outputs),
+                    available=None if masks is None else masks[i],
+                    **more,
+                )
+            )
+        return chosen
 
     def pieces(self, size: int = _CHUNK) -> list[slice]:
         """All episodes in slices of at most ``size``."""
@@ -256,22 +308,11 @@ class _Run:
 
         def choose(cut: slice) -> Indices:
             part = self.part(cut)
+            if self.criterion != "D" or method == "auto":
+                return np.array([one.indices for one in self.selected(method, cut)])
             if method == "greedy":
                 return selection.greedy_batch(**part).indices
-            if method == "exchange":
-                return selection.exchange_batch(**part, seed=self.seed).indices
-            masks = part["available"]
-            chosen = [
-                selection.select(
-                    candidates,
-                    self.k,
-                    model=Affine(candidates.shape[1], self.dataset.num_outputs),
-                    available=None if masks is None else masks[i],
-                    seed=self.seed,
-                ).indices
-                for i, candidates in enumerate(part["candidates"])
-            ]
-            return np.array(chosen)
+            return selection.exchange_batch(**part, seed=self.seed).indices
 
         choose(slice(0, 1))  # not timed: it may compile
         choices, seconds = self.timed(method, choose)
@@ -281,24 +322,29 @@ class _Run:
         self, time_limit: float | None
     ) -> tuple[MethodResult, Array, NDArray[np.bool_]]:
         """The optimum, its (E,) log det S or an upper bound, and (E,) where proven."""
+        m = self.dataset.num_outputs
+        p = m * (self.dataset.num_inputs + 1)
 
-        def choose(cut: slice) -> selection.BatchSelection:
-            left = None
-            if time_limit is not None:
-                left = max(begun + time_limit - time.perf_counter(), 1e-3)
-            m = self.dataset.num_outputs
-            return selection.exact_batch(
-                **self.part(cut), num_outputs=m, time_limit=left
-            )
+        def choose(cut: slice) -> tuple[Array, ...]:
+            """(E, k) indices, (E,) proven, (E,) upper bounds; efficiencies but by D."""
+            if self.criterion == "D":
+                left = None if deadline is NEVER else max(deadline.remaining_s, 1e-3)
+                batch = selection.exact_batch(
+                    **self.part(cut), num_outputs=m, time_limit=left
+                )
+                return batch.indices, batch.proven, batch.bound
+            chosen = self.selected("exact", cut, deadline)
+            lists = ([getattr(one, name) for one in chosen]
+                     for name in ("indices", "proven", "efficiency"))  # fmt: skip
+            indices, proven, efficiency = map(np.array, lists)
+            reached = m * self.worth(cut, indices[:, None])[:, 0]
+            return indices, proven, reached - p * np.log(efficiency)
 
-        begun = time.perf_counter()
+        deadline = NEVER if time_limit is None else Deadline(time_limit)
         choose(slice(0, 1))  # not timed: it may compile
-        begun = time.perf_counter()
+        deadline = NEVER if time_limit is None else Deadline(time_limit)
         batches, seconds = self.timed("exact", choose, _CHUNK_EXACT)
-        indices, proven, bound = (
-            np.concatenate([getattr(batch, name) for batch in batches])
-            for name in ("indices", "proven", "bound")
-        )
+        indices, proven, bound = map(np.concatenate, zip(*batches, strict=True))
         result = self.result("exact", indices[:, None], seconds)
         reached = result.log_det[:, 0]
         return result, np.where(proven, reached, np.maximum(bound, reached)), proven
@@ -311,7 +357,8 @@ class _Run:
             "random", lambda cut: draw_random(rng, **self.part(cut), num=draws)
         )
         picks, gram = map(np.concatenate, zip(*found, strict=True))
-        return self.result("random", picks, batch.seconds, gram=gram)
+        judged = gram if self.criterion == "D" else None
+        return self.result("random", picks, batch.seconds, gram=judged)
 
 
 def draw_random(

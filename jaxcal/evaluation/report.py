@@ -27,6 +27,7 @@ _COLUMNS = (
     *("method", "mean det S", "median det S", "det S/det S*", "hit rate"),
     *("D-eff.", "x random", "time each"),
 )
+_BY_OTHERS = ("method", "efficiency", "least", "hit rate", "time each")
 _ABOUT = (
     "det S is quoted in the unit of the dataset's commands; S is the information "
     "matrix AᵀA of the chosen postures and S* that of the best choice there is. Hit "
@@ -38,7 +39,8 @@ _ABOUT = (
 
 def text_table(shown: Summary, *, many: bool = False) -> str:
     """One dataset as a table; where there are ``many``, a policy's checkpoint too."""
-    lines = aligned([_COLUMNS, *_rows(shown, many)], "<>", ruled=True)
+    columns = _COLUMNS if shown.criterion == "D" else _BY_OTHERS
+    lines = aligned([columns, *_rows(shown, many)], "<>", ruled=True)
     return "\n  ".join([_heading(shown), *lines, *notes(shown)])
 
 
@@ -49,9 +51,9 @@ def notes(shown: Summary) -> list[str]:
     unproven = episodes - shown.num_proven
     if unproven:
         texts.append(
-            f"{unproven} of {episodes} optima are not proven: there det S* is an upper "
-            "bound, so the ratios are at least what is shown and no selection counts "
-            "as a hit"
+            f"{unproven} of {episodes} optima are not proven: there an upper bound "
+            "stands for det S*, so ratios and efficiencies are at least what is shown "
+            "and no selection counts as a hit"
         )
     if shown.k == shown.dataset["num_inputs"] + 1:
         texts.append(
@@ -184,24 +186,31 @@ def _heading(shown: Summary) -> str:
         f"{data['name']}{seed}: {data['episodes']:,} episodes, "
         f"{shown.k} of {data['num_candidates']} postures, "
         f"{data['num_inputs']} inputs, {data['num_outputs']} outputs"
+        + ("" if shown.criterion == "D" else f", criterion {shown.criterion}")
     )
 
 
 def _rows(shown: Summary, many: bool) -> list[tuple[str, ...]]:
-    """The rows of the table, a cell for each of ``_COLUMNS``."""
+    """The rows of the table, a cell for each column of the criterion."""
     rows = []
     for row in shown.rows:
         numbers = row.numbers
-        name, times = numbers["label"], numbers["ratio_to_random"]
+        name = numbers["label"]
         if many and row.is_policy:
             name += f" ({row.checkpoint or 'default'})"
+        if shown.criterion != "D":
+            shares = [numbers["efficiency"]["mean"], numbers["least_efficiency"]]
+            shares = [_share(share) for share in (*shares, numbers["hit_rate"])]
+            rows.append((name, *shares, _time(numbers["seconds_per_selection"])))
+            continue
+        times = numbers["ratio_to_random"]
         middle = (numbers["det_s"][moment] for moment in ("mean", "median"))
-        shares = ("ratio_to_exact", "hit_rate", "d_efficiency")
+        ratios = ("ratio_to_exact", "hit_rate", "d_efficiency")
         rows.append(
             (
                 name,
                 *("-" if value is None else f"{value:.4g}" for value in middle),
-                *(_share(numbers[share]) for share in shares),
+                *(_share(numbers[ratio]) for ratio in ratios),
                 "-" if times is None else f"{times:,.0f}",
                 _time(numbers["seconds_per_selection"]),
             )
@@ -219,6 +228,7 @@ def _entries(shown: Summary) -> list[dict[str, Any]]:
             "dataset": shown.dataset,
             "k": shown.k,
             "seed": shown.seed,
+            "criterion": shown.criterion,
             "checkpoint": (checkpoint or "default") if policies else None,
             "proven": shown.num_proven / shown.dataset["episodes"],
             "notes": notes(shown),

@@ -58,6 +58,7 @@ class Summary:
     num_proven: int
     rows: tuple[Row, ...]
     parameter_names: tuple[str, ...] | None = None  # where outputs were measured
+    criterion: str = "D"
 
     @property
     def num_parameters(self) -> int:
@@ -71,14 +72,17 @@ class MethodResult(_Named):
 
     label: str  # in words
     indices: Indices  # (E, R, k)
-    log_det: Array  # (E, R) natural log det S
+    log_det: Array  # (E, R) log det S; by another criterion what stands for it
     seconds: float  # a selection, averaged over the batch, compilation left out
     parameters: Array | None  # (E, R, m (n + 1)) identified from the chosen postures
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Evaluation:
-    """All methods on one dataset, selection by selection."""
+    """All methods on one dataset, selection by selection.
+
+    By another criterion than D ``log_worth`` times the outputs stands for log det S.
+    """
 
     dataset: Dataset
     k: int  # postures chosen
@@ -87,6 +91,7 @@ class Evaluation:
     reference: Array  # (E,) log det S* where proven, else an upper bound on it
     proven: NDArray[np.bool_]  # (E,)
     random_log_det: Array  # (E, R) the baseline behind ratio_to_random
+    criterion: str = "D"
 
     def summarise(self, *, indices: bool = False) -> Summary:
         """The numbers of every method.
@@ -103,7 +108,9 @@ class Evaluation:
         if data.measured is not None:
             names = Affine(data.num_inputs, data.num_outputs).names
         proven = int(self.proven.sum())
-        return Summary(data.facts(), self.k, self.seed, proven, tuple(rows), names)
+        return Summary(
+            data.facts(), self.k, self.seed, proven, tuple(rows), names, self.criterion
+        )
 
     def summary(self, result: MethodResult) -> dict[str, Any]:
         """The numbers of one method, as documented in docs/evaluation.md."""
@@ -112,17 +119,26 @@ class Evaluation:
         behind = log_det - self.reference[:, None]
         hits = self.proven[:, None] & (behind >= -HIT_TOLERANCE * m)
         behind = np.minimum(behind, 0.0)
+        num_parameters = m * (self.dataset.num_inputs + 1)
+        efficiency = np.exp(behind / num_parameters)
+        row: dict[str, Any] = {"label": result.label}
+        if self.criterion != "D":
+            return row | {
+                "efficiency": _moments(efficiency),
+                "least_efficiency": float(efficiency.min()),
+                "hit_rate": float(hits.mean()),
+                "seconds_per_selection": result.seconds,
+                "draws_per_episode": log_det.shape[1],
+            }
         with np.errstate(over="ignore"):
             det = np.exp(log_det)
             times = np.exp(log_mean(log_det) - log_mean(self.random_log_det))
-        num_parameters = m * (self.dataset.num_inputs + 1)
-        row: dict[str, Any] = {
-            "label": result.label,
+        row |= {
             "det_s": _moments(det),
             "log_det_s": _moments(log_det),
             "ratio_to_exact": float(np.exp(behind).mean()),
             "hit_rate": float(hits.mean()),
-            "d_efficiency": float(np.exp(behind / num_parameters).mean()),
+            "d_efficiency": float(efficiency.mean()),
             "ratio_to_random": finite(times),
             "seconds_per_selection": result.seconds,
             "draws_per_episode": log_det.shape[1],

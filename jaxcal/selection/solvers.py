@@ -90,17 +90,25 @@ def _options(solve: Callable[..., Solution]) -> tuple[str, ...]:
 def _policy(
     problem: Problem, *, seed: int, checkpoint: Any, decoding: str, num: int
 ) -> Solution:
-    from jaxcal.selection.policy import choose
+    from jaxcal.selection.policy import choose, load_policy
 
     if problem.candidates is None or problem.model is None:
         raise ValueError(
             'blocks cannot be used with method "policy", which is trained on '
             "candidates of the affine model; use auto, exact or exchange"
         )
-    if not problem.rank_one or len(problem.root) or problem.raw[0, 0, -1] != 1.0:
+    affine = problem.blocks.shape[1] == 1 and problem.raw[0, 0, -1] == 1.0
+    if not affine or len(problem.root):
         raise ValueError(
             'method must be auto, exact or exchange here: "policy" is trained on the '
-            "affine model, criterion D and nothing known beforehand"
+            "affine model and nothing known beforehand"
+        )
+    asked, trained = problem.criterion, load_policy(checkpoint).criterion
+    of_region = asked.name == "I" and np.ptp(np.diagonal(asked.root)) > 1e-9
+    if asked.name != trained or of_region:
+        raise ValueError(
+            'method must be auto, exact or exchange here: the policy of "checkpoint" '
+            f"was trained for criterion {trained}, over the candidates"
         )
     if problem.max_replicates > 1:
         raise ValueError(

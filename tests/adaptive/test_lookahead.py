@@ -1,5 +1,8 @@
 """Two steps, rollouts, static sequences and tuning, on tasks small enough to judge."""
 
+import subprocess
+import sys
+
 import jax
 import numpy as np
 import pytest
@@ -161,3 +164,25 @@ def test_bad_sizes_of_a_search_are_refused():
 
 
 pytestmark = pytest.mark.slow  # minutes together
+
+
+@pytest.mark.slow
+def test_ahead_plays_on_a_single_core():
+    """A callback whose arguments are copied on the pool's one thread waits for ever."""
+    code = """
+import os
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import subprocess
+import sys
+
+import jax
+from jaxcal.adaptive.episodes import compare
+from jaxcal.adaptive.lookahead import AHEAD
+from jaxcal.adaptive.tasks.knee import knee
+nats = [compare(knee(24), {"ahead": AHEAD}, 1024).mean("ahead")[0] for _ in range(4)]
+print(min(nats) == max(nats))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120
+    )
+    assert done.stdout.strip() == "True", done.stderr

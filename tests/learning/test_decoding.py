@@ -29,6 +29,12 @@ class Table:
             np.put_along_axis(near, (chosen[:, [made]] + 1) % memory.shape[1], 3.0, 1)
         return memory - near
 
+    def worth(self, rows, usable, tries):
+        picked = np.array(
+            [[sets[few] for few in of] for sets, of in zip(rows, tries, strict=True)]
+        )
+        return np.linalg.slogdet(np.swapaxes(picked, -1, -2) @ picked)[1]
+
 
 def greedy(scores, free, begun, k):
     """One set, chosen by the definition."""

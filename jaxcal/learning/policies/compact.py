@@ -196,7 +196,10 @@ class CompactNetwork(Network):
 def build(config: NetworkConfig) -> Network:
     """The network that a configuration names: ``compact``, one's own, a package's."""
     if config.kind == "compact":
-        return CompactNetwork(config)
+        from jaxcal.learning.policies.criterion import CriterionNetwork
+
+        kinds = CompactNetwork, CriterionNetwork
+        return kinds[config.criterion != "D"](config)
     if ":" in config.kind:
         kind = named(config.kind)
         if not (isinstance(kind, type) and issubclass(kind, Network)):

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Scorer", "choose", "in_pieces"]
+__all__ = ["Scorer", "choose", "in_pieces", "log_dets"]
 
 Array = NDArray[Any]
 Indices = NDArray[np.int64]
@@ -51,6 +51,9 @@ class Scorer(Protocol):
             count: choices made.
             best_only: all but the largest may be too low where nothing is learned.
         """
+
+    def worth(self, rows: Array, usable: Mask, tries: Indices) -> Array:
+        """(B, T) by which the best of the tries (B, T, K) on each set is taken."""
 
 
 def choose(
@@ -112,10 +115,15 @@ def choose(
     if scorer.piece_rows is not None and not generators:
         size = max(1, scorer.piece_rows // rows.shape[1])
     tries = in_pieces(piece, len(sets), size).reshape(batch, num, k)
+    best = scorer.worth(rows, usable, tries).argmax(axis=1)
+    return tries[np.arange(batch), best]
+
+
+def log_dets(rows: Array, tries: Indices) -> Array:
+    """(B, T) log det of the information of tries (B, T, K); -inf where singular."""
     picked = np.take_along_axis(rows[:, None], tries[..., None], axis=2)
     sign, value = np.linalg.slogdet(np.matrix_transpose(picked) @ picked)
-    best = np.where(sign > 0, value, -np.inf).argmax(axis=1)
-    return tries[np.arange(batch), best]
+    return np.asarray(np.where(sign > 0, value, -np.inf))
 
 
 def _completed(

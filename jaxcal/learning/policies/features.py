@@ -21,6 +21,9 @@ __all__ = [
     "VectorFeatures",
     "close_up_of",
     "decision_features",
+    "described",
+    "picked_of",
+    "progress_of",
     "vector_features",
 ]
 
@@ -99,11 +102,7 @@ def decision_features(
     x = features.whitened
     p, total = x.shape[-1], chosen.shape[-1]
     count = jnp.asarray(count)
-    remaining = total - count
-    which = jax.nn.one_hot(chosen, x.shape[-2], dtype=x.dtype)
-    picked = jnp.einsum(
-        "...km,...mp->...kp", which, x, precision=jax.lax.Precision.HIGHEST
-    )
+    which, picked = picked_of(x, chosen)
     # A choice multiplies the determinant by |y|^2, or by 1 + |y|^2.
     if total == p:
         # Every choice is a new direction: exact projections.
@@ -113,17 +112,36 @@ def decision_features(
         # beside what a posture contributes.
         ridge = jnp.where(count < p, _RIDGE, 0.0)
         y, so_far = geometry.normalised_by(x, picked, ridge)
-    depth = jnp.minimum(lookahead, remaining)
+    depth = jnp.minimum(lookahead, total - count)
     vectors = vector_features(y, total != p, available, depth, close_up)
-    ends = (remaining == 1, remaining == 2, remaining == 3, 1.0 / remaining)
-    shares = (count / p, jnp.minimum(remaining / p, 3.0), total > p)
-    numbers = jnp.stack([jnp.asarray(x, y.dtype) for x in (*ends, *shares)])
     return DecisionFeatures(
         vectors,
         chosen=which.sum(-2) / jnp.maximum(count, 1).astype(x.dtype),
         reached=features.offset + so_far + vectors.best[..., -1],
-        progress=jnp.broadcast_to(numbers, (*so_far.shape, len(numbers))),
+        progress=progress_of(count, total, x, so_far.shape),
     )
+
+
+def picked_of(x: jax.Array, chosen: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """(..., K, M) one-hot of the chosen and their rows (..., K, p) of x (..., M, p);
+    zeros where nothing is chosen yet."""
+    which = jax.nn.one_hot(chosen, x.shape[-2], dtype=x.dtype)
+    return which, jnp.einsum(
+        "...km,...mp->...kp", which, x, precision=jax.lax.Precision.HIGHEST
+    )
+
+
+def progress_of(
+    count: jax.typing.ArrayLike, total: int, x: jax.Array, shape: tuple[int, ...]
+) -> jax.Array:
+    """(*shape, 7) ``DecisionFeatures.progress`` after ``count`` of ``total`` choices
+    among regressors x (..., M, p)."""
+    p, count = x.shape[-1], jnp.asarray(count)
+    remaining = total - count
+    ends = (remaining == 1, remaining == 2, remaining == 3, 1.0 / remaining)
+    shares = (count / p, jnp.minimum(remaining / p, 3.0), total > p)
+    numbers = jnp.stack([jnp.asarray(number, x.dtype) for number in (*ends, *shares)])
+    return jnp.broadcast_to(numbers, (*shape, len(numbers)))
 
 
 def close_up_of(ahead: jax.Array) -> jax.Array:
@@ -143,12 +161,21 @@ def vector_features(
     ``close_up`` adds the columns that tell near-equal look-aheads apart.
     """
     y = y * active[..., None].astype(y.dtype)
+    ahead = geometry.lookahead(y, spanned, active, depth)
+    return described(y, ahead, active, close_up)
+
+
+def described(
+    y: jax.Array, lookaheads: list[jax.Array], active: jax.Array, close_up: bool
+) -> VectorFeatures:
+    """Features of vectors y (..., M, p) and their four look-aheads (..., M)."""
+    y = y * active[..., None].astype(y.dtype)
     number = jnp.maximum(active.sum(-1).astype(y.dtype), 1.0)
     square = (y * y).sum(-1)
     mean_square = jnp.maximum(square.sum(-1) / number, 1e-8)
     unit = y * jax.lax.rsqrt(mean_square)[..., None, None]
     moments = _second_moments(unit) * jax.lax.rsqrt(number)[..., None, None]
-    ahead = jnp.stack(geometry.lookahead(y, spanned, active, depth), axis=-1)
+    ahead = jnp.stack(lookaheads, axis=-1)
     best = ahead.max(-2)
     ahead = jnp.maximum(ahead - best[..., None, :], -30.0)
     level = jnp.log(jnp.maximum(square, 1e-6) / mean_square[..., None])

@@ -11,12 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.information.regression import log_worth
 from jaxcal.learning.core import network as networks
 from jaxcal.learning.core.network import Network
 from jaxcal.learning.policies import decoding as decoders
 from jaxcal.learning.small_matrices import log_det_gram
 
-__all__ = ["NetworkScorer", "choose", "log_det_of", "scores_of"]
+__all__ = ["NetworkScorer", "choose", "criterion_of", "log_det_of", "scores_of"]
+
+
+def criterion_of(network: Network) -> str:
+    """The criterion that a network's configuration names; D where it names none."""
+    return str(getattr(getattr(network, "config", None), "criterion", "D"))
 
 
 class NetworkScorer:
@@ -54,6 +60,14 @@ class NetworkScorer:
             self._network, self._params, memory, choices, available, count, learned
         )
         return np.asarray(scores).reshape(free.shape)
+
+    def worth(
+        self, rows: NDArray[Any], usable: NDArray[np.bool_], tries: NDArray[np.int64]
+    ) -> NDArray[Any]:
+        """(B, T) of tries (B, T, K), by the network's criterion."""
+        if (criterion := criterion_of(self._network)) == "D":
+            return decoders.log_dets(rows, tries)
+        return log_worth(criterion, rows[..., :-1], tries, usable)
 
 
 @functools.partial(jax.jit, static_argnames="network")

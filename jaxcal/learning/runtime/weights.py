@@ -23,6 +23,7 @@ from jaxcal.files import atomic_write
 __all__ = [
     "CheckpointError",
     "Weights",
+    "criterion_of",
     "flat",
     "locate",
     "nested",
@@ -155,6 +156,27 @@ def read(path: str | pathlib.Path) -> Weights:
     if weights.fingerprint != stated:
         raise CheckpointError(_damaged(path, "SHA-256 differs"))
     return weights
+
+
+def criterion_of(checkpoint: str | pathlib.Path) -> str:
+    """The criterion that a policy of postures was trained for: D, A, I or E.
+
+    Raises:
+        CheckpointError: there is no such checkpoint, or it is damaged.
+    """
+    path = locate(checkpoint)
+    try:
+        if path.is_file():
+            meta = read(path).meta
+        else:
+            meta = json.loads((path / "meta" / "metadata").read_text())
+        return str(meta["tasks"][0]["environment"].get("criterion", "D"))
+    except (OSError, KeyError, IndexError, TypeError, ValueError) as error:
+        if isinstance(error, CheckpointError):
+            raise
+        raise CheckpointError(
+            f"checkpoint {path} is not a jaxcal policy of postures, or damaged"
+        ) from error
 
 
 def _damaged(path: str | pathlib.Path, what: str) -> str:

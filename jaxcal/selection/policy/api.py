@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import functools
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,9 +29,19 @@ _LARGEST_CALL = 512  # sets
 
 Indices = NDArray[np.int64]
 
-# From problems of one M, n, k and number of required, decoding, num and seed to (B, k)
-# indices, the required first, then in the order of choice.
-Chooser = Callable[[Sequence[Problem], str, int, int], Indices]
+
+class Chooser(Protocol):
+    """A policy, ready to choose."""
+
+    @property
+    def criterion(self) -> str:
+        """What it was trained for: D, A, I or E."""
+
+    def __call__(
+        self, problems: Sequence[Problem], decoding: str, num: int, seed: int
+    ) -> Indices:
+        """(B, k) for problems of one M, n, k and number of required, which come first,
+        then in the order of choice."""
 
 
 def load_policy(checkpoint: str | pathlib.Path | None = None) -> Chooser:
@@ -58,24 +69,32 @@ def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Chooser:
         with needs("policy", f"checkpoint {path}, the folder of a training run,"):
             from jaxcal.learning.training import checkpoint
         stored = checkpoint.load(path.parent).weights
-    if stored.network["kind"] == "compact":
+    network = stored.network
+    if network["kind"] == "compact" and network.get("criterion", "D") == "D":
         from jaxcal.selection.policy.compact import CompactScorer
 
         return CompactScorer(stored.network, stored.arrays)
     with needs("policy", f"checkpoint {path}, whose network is not compact,"):
-        return _through_jax(path if path.is_file() else path.parent)
+        return _ThroughJax(path if path.is_file() else path.parent)
 
 
-def _through_jax(path: pathlib.Path) -> Chooser:
+class _ThroughJax:
     """A network that reads the candidates' own coordinates, compiled for each shape."""
-    from jaxcal.learning.policies import scorer
-    from jaxcal.learning.training import checkpoint
 
-    policy = checkpoint.load(path)
+    def __init__(self, path: pathlib.Path) -> None:
+        from jaxcal.learning.policies.scorer import criterion_of
+        from jaxcal.learning.training import checkpoint
 
-    def choose(
-        problems: Sequence[Problem], decoding: str, num: int, seed: int
+        self._policy = checkpoint.load(path)
+        self.criterion = criterion_of(self._policy.network)
+
+    def __call__(
+        self, problems: Sequence[Problem], decoding: str, num: int, seed: int
     ) -> Indices:
+        from jaxcal.learning.policies import scorer
+
+        # A and E change with the unit: their networks see it.
+        read = _in_unit_range if self.criterion == "D" else _as_given
         m, tries = len(problems[0].available), 1 if decoding == "greedy" else num
         # A power of two, filled up by repeating the last set: few shapes to compile.
         most = max(1, min(_LARGEST_CALL, _CELLS // (m * m * tries)))
@@ -85,9 +104,9 @@ def _through_jax(path: pathlib.Path) -> Chooser:
             part = list(problems[begin : begin + size])
             filled = part + part[-1:] * (size - len(part))
             indices = scorer.choose(
-                policy.network,
-                policy.params,
-                np.stack([_in_unit_range(problem) for problem in filled]),
+                self._policy.network,
+                self._policy.params,
+                np.stack([read(problem) for problem in filled]),
                 np.stack([problem.available for problem in filled]),
                 np.stack([problem.required for problem in filled]),
                 k=problems[0].k,
@@ -98,7 +117,12 @@ def _through_jax(path: pathlib.Path) -> Chooser:
             chosen.append(indices[: len(part)])
         return np.concatenate(chosen)
 
-    return choose
+
+def _as_given(problem: Problem) -> NDArray[np.float32]:
+    """(M, n) candidates, 0 where masked."""
+    assert problem.candidates is not None  # blocks are refused before
+    free = problem.available[:, None]
+    return np.where(free, problem.candidates, 0.0).astype(np.float32)
 
 
 def _in_unit_range(problem: Problem) -> NDArray[np.float32]:

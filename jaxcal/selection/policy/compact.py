@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.learning.policies.decoding import choose, in_pieces
+from jaxcal.learning.policies.decoding import choose, in_pieces, log_dets
 from jaxcal.selection.policy.policy_kernel import CLOSE, describe
 from jaxcal.selection.problem import Problem
 
@@ -67,7 +67,7 @@ class CompactScorer:
         arrays: weights by flat name.
     """
 
-    piece_rows = _ROWS
+    piece_rows, criterion = _ROWS, "D"
 
     def __init__(self, config: Mapping[str, Any], arrays: Mapping[str, Array32]):
         self._lookahead: int = config["lookahead"]
@@ -169,6 +169,10 @@ class CompactScorer:
                 rule += np.exp(scale * seen.ahead)
         scores = learned[..., 0] + float(self._weights["trust"]) * rule
         return np.where(free, scores, -np.inf)
+
+    def worth(self, rows: Array, usable: Mask, tries: Indices) -> Array:
+        """(B, T) log det of the information of tries (B, T, K)."""
+        return log_dets(rows, tries)
 
     def _described(
         self,
