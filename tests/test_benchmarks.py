@@ -10,7 +10,7 @@ import pytest
 from jaxcal.learning.core import network as networks
 from jaxcal.learning.environments import selection as environment
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.policies.compact import build
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 
 CONFIG = SelectionConfig()

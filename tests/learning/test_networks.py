@@ -15,7 +15,7 @@ import pytest
 
 from jaxcal.learning.core import network as networks
 from jaxcal.learning.policies import scorer
-from jaxcal.learning.policies.compact import build
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training import checkpoint
 from jaxcal.paper.network import HEADS

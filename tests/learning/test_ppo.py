@@ -19,7 +19,7 @@ from jaxcal.learning.core import ppo
 from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.policies.compact import build
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training.config import TrainConfig
 from jaxcal.learning.training.run import Recipe, run, updates

@@ -25,7 +25,8 @@ from jaxcal.learning import settings
 from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import GivenCandidates, Task
-from jaxcal.learning.policies.compact import CompactNetwork, build
+from jaxcal.learning.policies.build import build
+from jaxcal.learning.policies.compact import CompactNetwork
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.training import checkpoint, presets, room
@@ -444,7 +445,7 @@ def test_an_unknown_network_or_preset_is_named():
 def test_learning_finds_the_papers_network_without_importing_the_paper():
     code = (
         "import sys\n"
-        "from jaxcal.learning.policies.compact import build\n"
+        "from jaxcal.learning.policies.build import build\n"
         "from jaxcal.learning.training import presets\n"
         "assert not any(name.startswith('jaxcal.paper') for name in sys.modules)\n"
         "print(type(build(presets.load('paper').network)).__module__)"

@@ -17,7 +17,7 @@ import pytest
 from jaxcal.extras import MissingExtraError
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import scorer
-from jaxcal.learning.policies.compact import build
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.training import checkpoint

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 from jaxcal.learning.environments import selection
 from jaxcal.learning.environments.selection import CandidateSource, SelectionConfig
-from jaxcal.learning.policies.compact import build
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 
 __all__ = ["FunctionalEnv", "PosturesEnv"]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
-from typing import Any
 
 import flax.linen as nn
 import jax
@@ -20,10 +18,9 @@ from jaxcal.learning.policies.features import (
     decision_features,
     vector_features,
 )
-from jaxcal.learning.policies.networks import GROUP, NetworkConfig
-from jaxcal.learning.settings import installed, named
+from jaxcal.learning.policies.networks import NetworkConfig
 
-__all__ = ["CompactNetwork", "build"]
+__all__ = ["CompactNetwork"]
 
 _SHARP = 60.0  # inverse temperature of the choices that need no learning
 
@@ -191,22 +188,3 @@ class CompactNetwork(Network):
         vectors = decision.vectors
         logits = mask_logits(_SHARP * vectors.to_the_end, vectors.active)
         return logits, decision.reached
-
-
-def build(config: NetworkConfig) -> Network:
-    """The network that a configuration names: ``compact``, one's own, a package's."""
-    if config.kind == "compact":
-        from jaxcal.learning.policies.criterion import CriterionNetwork
-
-        kinds = CompactNetwork, CriterionNetwork
-        return kinds[config.criterion != "D"](config)
-    if ":" in config.kind:
-        kind = named(config.kind)
-        if not (isinstance(kind, type) and issubclass(kind, Network)):
-            raise ValueError(f"kind must be a Network, got {config.kind}")
-        fields = [field.name for field in dataclasses.fields(kind)]
-        arguments: dict[str, Any] = {"config": config} if "config" in fields else {}
-        instance: Network = kind(**arguments)
-        return instance
-    network: Network = installed(GROUP)[config.kind].load()(config)
-    return network

@@ -28,7 +28,7 @@ from jaxcal.extras import versions
 from jaxcal.learning.config import runs_of
 from jaxcal.learning.core.network import Network, initial
 from jaxcal.learning.core.ppo import TrainState
-from jaxcal.learning.policies.compact import build
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.weights import CheckpointError, Weights, locate

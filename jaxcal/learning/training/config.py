@@ -9,7 +9,7 @@ from typing import Any
 from jaxcal.learning.config import EpisodesConfig, RunConfig
 from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.policies.compact import build
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.settings import require, setting
 
