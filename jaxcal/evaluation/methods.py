@@ -325,7 +325,7 @@ class _Run:
         m = self.dataset.num_outputs
         p = m * (self.dataset.num_inputs + 1)
 
-        def choose(cut: slice) -> tuple[Array, ...]:
+        def choose(cut: slice) -> tuple[NDArray[Any], ...]:
             """(E, k) indices, (E,) proven, (E,) upper bounds; efficiencies but by D."""
             if self.criterion == "D":
                 left = None if deadline is NEVER else max(deadline.remaining_s, 1e-3)
