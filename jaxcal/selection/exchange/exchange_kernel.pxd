@@ -4,26 +4,49 @@ from jaxcal.watch cimport Watch
 cdef enum:
     WIDE = 64  # candidates in a group
 
+cdef class Choice:
+    cdef int k, fixed, groups  # to choose, of them required; groups of candidates
+    cdef const unsigned char[::1] usable  # (M,) which may be chosen
+    cdef Py_ssize_t cap, available  # how often each of them may be, and their number
+    cdef Py_ssize_t[::1] counts  # (M,)
+    cdef Py_ssize_t[::1] tried  # (M,) swaps made when a candidate was last tried
+    cdef Py_ssize_t[::1] chosen  # (k,), the required first
+    cdef double* closed  # (groups WIDE,), inf where it may not be chosen once more
+    cdef unsigned long long state  # of the random numbers
+    cdef Watch watch
+    cdef int sweep, looked  # groups in a look at all candidates; since the clock was read
+    cdef void _clear(self) noexcept nogil
+    cdef void _count(self, Py_ssize_t i, int more) noexcept nogil
+    cdef Py_ssize_t _draw(self, Py_ssize_t below) noexcept nogil
+    cdef void _random_start(self) noexcept nogil
+    cdef int _late(self) except -1 nogil
+    cdef int _grow(self, Py_ssize_t size, double share) except -1 nogil
+    cdef void _fill(self, Py_ssize_t size) noexcept nogil
+    cdef double _finish(self, bint climbs) except? -2.0 nogil
+    cdef double _climb(self, bint least) except? -2.0 nogil
+    cdef void _set_known(self, double share, double ridge) noexcept nogil
+    cdef double _evaluate(self, Py_ssize_t size, bint trial) noexcept nogil
+    cdef void _refresh(self) noexcept nogil
+    cdef void _carry(self, Py_ssize_t came, Py_ssize_t went) noexcept nogil
+    cdef Py_ssize_t _addition(self) noexcept nogil
+    cdef Py_ssize_t _replacement(self, Py_ssize_t out, double value, double rise) noexcept nogil
+    cdef double _least_of_chosen(self) noexcept nogil
+    cdef Py_ssize_t _strongest(self, Py_ssize_t at, double* found) noexcept nogil
+
 @cython.final
-cdef class Climber:
+cdef class Climber(Choice):
     cdef int kind  # of ``kinds.pxd``
     cdef int parts  # 1 where V is enough, 2 with X
     cdef int dets  # of which the determinant counts
     cdef bint rows  # one reading each, and DET
-    cdef int k, q, p, s, fixed, groups
+    cdef int q, p, s
     cdef Py_ssize_t size  # q q WIDE
     cdef double[::1] room  # which holds all that is a pointer below
     cdef const double[:, :, ::1] blocks  # (M, q, p)
     cdef double* columns  # (groups, q, p, WIDE), zeros after the M
     cdef const double[:, ::1] prior  # (p, p)
     cdef const double[:, ::1] root  # C (s, p)
-    cdef const unsigned char[::1] usable  # (M,) which may be chosen
-    cdef Py_ssize_t cap, available  # how often each of them may be, and their number
-    cdef Py_ssize_t[::1] counts  # (M,)
     cdef Py_ssize_t[::1] times  # (M,) in a sum of many replicates
-    cdef Py_ssize_t[::1] tried  # (M,) swaps made when a candidate was last tried
-    cdef double* closed  # (groups WIDE,), inf where it may not be chosen once more
-    cdef Py_ssize_t[::1] chosen  # (k,), the required first
     cdef double* known  # (p, p) what counts beside the chosen
     cdef double* gram
     cdef double* lower
@@ -56,43 +79,23 @@ cdef class Climber:
     cdef double* values  # (p,) eigenvalues of C V C.T, the smallest first
     cdef double* lapack
     cdef int[::1] whole
-    cdef unsigned long long state  # of the random numbers
-    cdef Watch watch
-    cdef int looked  # groups since the clock was read
     cdef Py_ssize_t _lay_out(self, double* room) noexcept
-    cdef void _clear(self) noexcept nogil
-    cdef void _count(self, Py_ssize_t i, int more) noexcept nogil
-    cdef Py_ssize_t _draw(self, Py_ssize_t below) noexcept nogil
-    cdef void _random_start(self) noexcept nogil
-    cdef int _late(self) except -1 nogil
-    cdef void _set_known(self, double share, double ridge) noexcept nogil
     cdef void _sum(self, Py_ssize_t size, Py_ssize_t skipped) noexcept nogil
     cdef void _add(self, Py_ssize_t i) noexcept nogil
-    cdef double _evaluate(self, Py_ssize_t size, double* into) noexcept nogil
-    cdef void _refresh(self) noexcept nogil
     cdef void _keep(self, Py_ssize_t c) noexcept nogil
-    cdef void _carry(self, Py_ssize_t came, Py_ssize_t went) noexcept nogil
     cdef void _update(self, Py_ssize_t c, int r) noexcept nogil
     cdef void _cross(self, Py_ssize_t c, int m, int r) noexcept nogil
     cdef inline void _swaps(self, Py_ssize_t c) noexcept nogil
-    cdef int _grow(self, Py_ssize_t size, double share) except -1 nogil
-    cdef void _fill(self, Py_ssize_t size) noexcept nogil
-    cdef double _finish(self, bint climbs) except? -2.0 nogil
-    cdef double _climb(self, bint least) except? -2.0 nogil
     cdef inline void _take_out(self, Py_ssize_t out) noexcept nogil
-    cdef Py_ssize_t _replacement(self, Py_ssize_t out, double rise) noexcept nogil
     cdef double _least(self) noexcept nogil
     cdef bint _bound_without(self, Py_ssize_t at) noexcept nogil
     cdef Py_ssize_t _next(self, double least) noexcept nogil
-    cdef Py_ssize_t _strongest(self, Py_ssize_t at, double* found) noexcept nogil
 
 @cython.final
-cdef class JointClimber:
+cdef class JointClimber(Choice):
     cdef list climbers
-    cdef Climber lead  # the first of them: what is chosen, and the clock
     cdef Py_ssize_t[::1] addresses  # (S,) of the climbers: a call takes no reference
     cdef void** members  # the same
-    cdef void* first
     cdef bint least  # the least counts, else the mean
     cdef double[::1] weights  # (S,), as are the next four
     cdef double[::1] scale
@@ -101,19 +104,10 @@ cdef class JointClimber:
     cdef double[::1] after  # of those after a swap
     cdef double[::1] total  # (WIDE,)
     cdef double[::1] ahead  # (groups WIDE,) bounds on E in the first scenario
-    cdef void _set_known(self, double share, double ridge) noexcept nogil
     cdef double _join(self, const double* phi) noexcept nogil
-    cdef double _evaluate(self, Py_ssize_t size, bint trial) noexcept nogil
-    cdef void _refresh(self) noexcept nogil
-    cdef void _carry(self, Py_ssize_t came, Py_ssize_t went) noexcept nogil
     cdef void _totals(self, Py_ssize_t c, bint swaps) noexcept nogil
-    cdef int _grow(self, Py_ssize_t size, double share) except -1 nogil
     cdef Py_ssize_t _best(self, bint swaps, double most) noexcept nogil
-    cdef double _finish(self, bint climbs) except? -2.0 nogil
-    cdef double _least_eigenvalue(self) noexcept nogil
-    cdef double _climb(self, bint eigenvalue) except? -2.0 nogil
     cdef bint _betters(self, Py_ssize_t e, double* found) noexcept nogil
-    cdef Py_ssize_t _strongest(self, Py_ssize_t at, double* found) noexcept nogil
 
 cdef void _weigh(double* into, double* weights, double* rows, Py_ssize_t count) noexcept nogil
 cdef void _dots(double* into, double* left, double* right, Py_ssize_t count) noexcept nogil

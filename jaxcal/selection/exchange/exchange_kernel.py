@@ -186,8 +186,234 @@ def _best_of(gain, closed, most):
     return -1
 
 
-class Climber:
-    """The candidates of a problem, and work space; ``exchange_kernel.pxd`` has it.
+class Choice:
+    """What is chosen of the candidates, grown and climbed by the phi of a subclass."""
+
+    def climb(self, start, share, swaps, seconds):
+        """Complete ``start`` (size,), required first, and swap while that helps.
+
+        Args:
+            share: of the information of k mean candidates, what stands in for those
+                not chosen yet while the selection grows.
+            swaps: 0 none, 1 those that raise phi, 2 those that raise E.
+            seconds: after which no more swaps are made.
+
+        Returns:
+            (k,) chosen, and phi, or E; -inf where that is singular.
+        """
+        self.watch = begin(seconds)
+        size: cython.Py_ssize_t = len(start)
+        kept: cython.double = share
+        how: cython.int = swaps
+        value: cython.double = 0.0
+        for r in range(size):
+            self.chosen[r] = start[r]
+        with cython.nogil:
+            self._clear()
+            for c in range(size):
+                self._count(self.chosen[c], 1)
+            if how == 2:
+                self._set_known(0.0, 0.0)
+                value = self._climb(True)
+            else:
+                self._grow(size, kept)
+                value = self._finish(how)
+        return np.array(self.chosen), value
+
+    def random_climbs(self, count, chosen, phi, seconds):
+        """The best of ``chosen`` (k,) with its phi, and ``count`` random starts."""
+        self.watch = begin(seconds)
+        best: cython.Py_ssize_t[::1] = np.array(chosen)
+        value: cython.double = phi
+        starts: cython.Py_ssize_t = count
+        with cython.nogil:
+            for _ in range(starts):
+                if self._late() and value > -INFINITY:
+                    break
+                self._random_start()
+                reached = self._finish(True)
+                least = value + 1e-10 * max(1.0, fabs(value))
+                if reached > least or not value > -INFINITY:
+                    value = reached
+                    best[:] = self.chosen
+        return np.asarray(best), value
+
+    def random_start(self):
+        """(k,) the required, then others at random."""
+        self._random_start()
+        return np.array(self.chosen)
+
+    # --- what is chosen -------------------------------------------------------------
+
+    def _clear(self):
+        """Nothing is chosen."""
+        for i in range(self.counts.shape[0]):
+            self.counts[i] = 0
+            self.closed[i] = 0.0 if self.usable[i] else INFINITY
+
+    def _count(self, i, more):
+        """Candidate i is chosen once more, or once less."""
+        self.counts[i] += more
+        is_open: cython.bint = self.usable[i] and self.counts[i] < self.cap
+        self.closed[i] = 0.0 if is_open else INFINITY
+
+    def _draw(self, below):
+        """A whole number in [0, below) from a xorshift generator."""
+        self.state ^= self.state << 13
+        self.state ^= self.state >> 7
+        self.state ^= self.state << 17
+        return ((self.state >> 32) * below) >> 32
+
+    def _random_start(self):
+        """Fill ``chosen`` at random, distinct where there are enough candidates."""
+        distinct: cython.bint = self.k <= self.available
+        self._clear()
+        for c in range(self.k):
+            i = self.chosen[c] if c < self.fixed else self._draw(self.counts.shape[0])
+            while c >= self.fixed and (
+                self.closed[i] > 0.0 or (distinct and self.counts[i] > 0)
+            ):
+                i = self._draw(self.counts.shape[0])
+            self.chosen[c] = i
+            self._count(i, 1)
+
+    def _late(self):
+        """``late`` of the watch, asked after some work."""
+        self.looked += self.sweep
+        if self.looked < _PATIENCE:
+            return 0
+        self.looked = 0
+        return late(cython.address(self.watch))
+
+    # --- greedy and exchange --------------------------------------------------------
+
+    def _grow(self, size, share):
+        """Complete the first ``size`` chosen, the largest gain first."""
+        if size == self.k:
+            return 0
+        self._set_known(share, 0.0)
+        self._evaluate(size, False)
+        self._refresh()
+        while True:
+            best = -1 if self._late() else self._addition()
+            if best < 0:
+                self._fill(size)
+                return 0
+            self.chosen[size] = best
+            self._count(best, 1)
+            size += 1
+            if size == self.k:
+                return 0
+            self._evaluate(size, True)
+            self._carry(best, -1)
+
+    def _fill(self, size):
+        """Complete the first ``size`` chosen, each candidate in turn: time is over."""
+        i: cython.Py_ssize_t = 0
+        while size < self.k:
+            if self.closed[i] == 0.0:
+                self.chosen[size] = i
+                self._count(i, 1)
+                size += 1
+            i = i + 1 if i + 1 < self.counts.shape[0] else 0
+
+    def _finish(self, climbs):
+        """phi of the chosen, climbed; swaps may mend a singular start.
+
+        The more surely the smaller the ridge that makes it regular.
+        """
+        value: cython.double = 0.0
+        for attempt in range(5):
+            ridge: cython.double = 0.0
+            if attempt % 2:
+                ridge = _RIDGE if attempt == 1 else 1e-4 * _RIDGE
+            self._set_known(0.0, ridge)
+            if not climbs:
+                return self._evaluate(self.k, False)
+            value = self._climb(False)
+            if ridge == 0.0 and value > -INFINITY:
+                break
+        return value
+
+    def _climb(self, least):
+        """Swap each chosen for its best replacement until none helps; phi, or E."""
+        k = self.k
+        value: cython.double = 0.0
+        if least:
+            value = self._least_of_chosen()
+        else:
+            value = self._evaluate(k, False)
+        if k == self.fixed or not value > -INFINITY:
+            return value
+        if not least:
+            self._refresh()
+        position, since, swaps = self.fixed, 0, 0
+        for i in range(self.tried.shape[0]):
+            self.tried[i] = -1
+        while since < k - self.fixed and swaps < _MOST_SWAPS * k:
+            if late(cython.address(self.watch)) if least else self._late():
+                break
+            at, out, after = position, self.chosen[position], value
+            since += 1
+            position = position + 1 if position + 1 < k else self.fixed
+            if self.tried[out] == swaps:  # another measurement of the same
+                continue
+            self.tried[out] = swaps
+            rise = _IMPROVES * max(1.0, fabs(value))
+            if least:
+                best = self._strongest(at, cython.address(after))
+            else:
+                best = self._replacement(out, value, rise)
+            if best < 0:
+                continue
+            self.chosen[at] = best
+            if not least:
+                after = self._evaluate(k, True)
+                if not after > value + rise:  # the formulas promised more
+                    self.chosen[at] = out
+                    continue
+            value, since = after, 0
+            swaps += 1
+            self._count(out, -1)
+            self._count(best, 1)
+            if not least:
+                self._carry(best, out)
+        return value
+
+    # --- what a subclass answers ----------------------------------------------------
+
+    def _set_known(self, share, ridge):
+        """Count ``share`` of k mean candidates' information, and a ridge, beside."""
+
+    def _evaluate(self, size, trial):
+        """phi of the first ``size`` chosen; of a ``trial`` beside what is kept."""
+        return -INFINITY
+
+    def _refresh(self):
+        """The gain of every candidate alone, after ``_evaluate``."""
+
+    def _carry(self, came, went):
+        """What is kept, after a trial that swapped; -1: none went."""
+
+    def _addition(self):
+        """The candidate whose addition gives the largest phi; -1: none."""
+        return -1
+
+    def _replacement(self, out, value, rise):
+        """The best in the place of ``out``, by over ``rise`` of ``value``; -1: none."""
+        return -1
+
+    def _least_of_chosen(self):
+        """E of the chosen; -inf where it is singular."""
+        return -INFINITY
+
+    def _strongest(self, at, found):
+        """The best in place ``at`` by E, which ``found`` becomes; -1: none lifts it."""
+        return -1
+
+
+class Climber(Choice):
+    """One scenario, with its work space; ``exchange_kernel.pxd`` says what is where.
 
     Args:
         form: "det", "subset" or "trace", of the criterion.
@@ -217,6 +443,7 @@ class Climber:
         self.blocks, self.prior, self.root = blocks, prior, root
         self.usable, self.available = usable, np.count_nonzero(usable)
         self.cap, self.counts = cap, np.zeros(count, dtype=np.intp)
+        self.sweep = self.groups
         self.chosen = np.zeros(k, dtype=np.intp)
         self.times, self.tried = np.zeros((2, count), dtype=np.intp)
         for r in range(len(required)):
@@ -263,106 +490,9 @@ class Climber:
         self.lapack = take(at, 1 + 6 * p + 2 * p * p)
         return room - first
 
-    def climb(self, start, share, swaps, seconds):
-        """Complete ``start`` (size,), required first, and swap while that helps.
-
-        Args:
-            share: of the information of k mean candidates, what stands in for those
-                not chosen yet while the selection grows.
-            swaps: 0 none, 1 those that raise phi, 2 those that raise E.
-            seconds: after which no more swaps are made.
-
-        Returns:
-            (k,) chosen, and phi, or E; -inf where that is singular.
-        """
-        self.watch = begin(seconds)
-        size: cython.Py_ssize_t = len(start)
-        kept: cython.double = share
-        how: cython.int = swaps
-        value: cython.double = 0.0
-        for r in range(size):
-            self.chosen[r] = start[r]
-        with cython.nogil:
-            self._clear()
-            for c in range(size):
-                self._count(self.chosen[c], 1)
-            if how == 2:
-                self._set_known(0.0, 0.0)
-                value = self._climb(True)
-            else:
-                self._grow(size, kept)
-                value = self._finish(how)
-        return np.array(self.chosen), value
-
-    def random_climbs(self, count, chosen, phi, seconds):
-        """The best of ``chosen`` (k,) with its phi, and ``count`` random starts."""
-        self.watch = begin(seconds)
-        best: cython.Py_ssize_t[::1] = np.array(chosen)
-        value: cython.double = phi
-        starts: cython.Py_ssize_t = count
-        with cython.nogil:
-            for _ in range(starts):
-                if self._late() and value > -INFINITY:
-                    break
-                self._random_start()
-                found = self._finish(1)
-                if found > value + 1e-10 * max(1.0, fabs(value)) or not (
-                    value > -INFINITY
-                ):
-                    value = found
-                    best[:] = self.chosen
-        return np.asarray(best), value
-
     def wide(self):
         """Candidates, in whole groups."""
         return self.groups * WIDE
-
-    def random_start(self):
-        """(k,) the required, then others at random."""
-        self._random_start()
-        return np.array(self.chosen)
-
-    # --- what is chosen -------------------------------------------------------------
-
-    def _clear(self):
-        """Nothing is chosen."""
-        for i in range(self.counts.shape[0]):
-            self.counts[i] = 0
-            self.closed[i] = 0.0 if self.usable[i] else INFINITY
-
-    def _count(self, i, more):
-        """Candidate i is chosen once more, or once less."""
-        self.counts[i] += more
-        is_open: cython.bint = self.usable[i] and self.counts[i] < self.cap
-        self.closed[i] = 0.0 if is_open else INFINITY
-
-    def _draw(self, below):
-        """A whole number in [0, below) from a xorshift generator."""
-        self.state ^= self.state << 13
-        self.state ^= self.state >> 7
-        self.state ^= self.state << 17
-        return ((self.state >> 32) * below) >> 32
-
-    def _random_start(self):
-        """Fill ``chosen`` at random, distinct where there are enough candidates."""
-        distinct: cython.bint = self.k <= self.available
-        self._clear()
-        for c in range(self.k):
-            i = self.chosen[c] if c < self.fixed else self._draw(self.blocks.shape[0])
-            while c >= self.fixed and (
-                self.closed[i] > 0.0 or (distinct and self.counts[i] > 0)
-            ):
-                i = self._draw(self.blocks.shape[0])
-            self.chosen[c] = i
-            self._count(i, 1)
-
-    def _late(self):
-        """``late`` of the watch, asked after some work."""
-        self.looked += self.groups
-        if self.looked < _PATIENCE:
-            return 0
-        self.looked = 0
-        return late(cython.address(self.watch))
 
     # --- phi ------------------------------------------------------------------------
 
@@ -398,9 +528,9 @@ class Climber:
         """Add candidate i to ``gram``."""
         add(self.gram, 1.0, cython.address(self.blocks[i, 0, 0]), self.q, self.p)
 
-    def _evaluate(self, size, into):
+    def _evaluate(self, size, trial):
         """phi of the first ``size`` chosen, summed from their blocks; fills V and X."""
-        p = self.p
+        p, into = self.p, self.trial if trial else self.now
         self._sum(size, -1)
         value: cython.double = factor(self.gram, into, self.lower, p)
         if self.kind == DET or not value > -INFINITY:
@@ -577,113 +707,6 @@ class Climber:
         for j in range(WIDE):  # none where it is singular without i
             gain[j] = alone[j] - gain[j] if det[j] > 1e-14 else -INFINITY
 
-    # --- greedy and exchange --------------------------------------------------------
-
-    def _grow(self, size, share):
-        """Complete the first ``size`` chosen, the largest gain first."""
-        if size == self.k:
-            return 0
-        self._set_known(share, 0.0)
-        self._evaluate(size, self.now)
-        self._refresh()
-        while True:
-            if self._late():
-                self._fill(size)
-                return 0
-            best: cython.Py_ssize_t = -1
-            most: cython.double = -INFINITY
-            for c in range(self.groups):
-                alone = self.alone + c * WIDE
-                j = _best_of(alone, self.closed + c * WIDE, most)
-                if j >= 0:
-                    best, most = c * WIDE + j, alone[j]
-            if best < 0:  # no gain is a number: whichever may be chosen
-                best = 0
-                while self.closed[best] > 0.0:
-                    best += 1
-            self.chosen[size] = best
-            self._count(best, 1)
-            size += 1
-            if size == self.k:
-                return 0
-            self._evaluate(size, self.trial)
-            self._carry(best, -1)
-
-    def _fill(self, size):
-        """Complete the first ``size`` chosen, each candidate in turn: time is over."""
-        i: cython.Py_ssize_t = 0
-        while size < self.k:
-            if self.closed[i] == 0.0:
-                self.chosen[size] = i
-                self._count(i, 1)
-                size += 1
-            i = i + 1 if i + 1 < self.counts.shape[0] else 0
-
-    def _finish(self, climbs):
-        """phi of the chosen, climbed; swaps may mend a singular start.
-
-        The more surely the smaller the ridge that makes it regular.
-        """
-        value: cython.double = 0.0
-        for attempt in range(5):
-            ridge: cython.double = 0.0
-            if attempt % 2:
-                ridge = _RIDGE if attempt == 1 else 1e-4 * _RIDGE
-            self._set_known(0.0, ridge)
-            if not climbs:
-                return self._evaluate(self.k, self.now)
-            value = self._climb(False)
-            if ridge == 0.0 and value > -INFINITY:
-                break
-        return value
-
-    def _climb(self, least):
-        """Swap each chosen for its best replacement until none helps; phi, or E."""
-        k = self.k
-        value: cython.double = 0.0
-        if least:
-            self._sum(k, -1)
-            value = self._least()
-        else:
-            value = self._evaluate(k, self.now)
-        if k == self.fixed or not value > -INFINITY:
-            return value
-        if not least:
-            self._refresh()
-        position, since, swaps = self.fixed, 0, 0
-        for i in range(self.tried.shape[0]):
-            self.tried[i] = -1
-        while since < k - self.fixed and swaps < _MOST_SWAPS * k:
-            if late(cython.address(self.watch)) if least else self._late():
-                break
-            at, out, after = position, self.chosen[position], value
-            since += 1
-            position = position + 1 if position + 1 < k else self.fixed
-            if self.tried[out] == swaps:  # another measurement of the same
-                continue
-            self.tried[out] = swaps
-            rise = _IMPROVES * max(1.0, fabs(value))
-            if least:
-                after *= 1.0 + _LIFTS
-                best = self._strongest(at, cython.address(after))
-            else:
-                best = self._replacement(out, rise)
-            if best < 0:
-                continue
-            self.chosen[at] = best
-            if not least:
-                after = self._evaluate(k, self.trial)
-                if not after > value + rise:  # the formulas promised more
-                    self.chosen[at] = out
-                    continue
-            value, since = after, 0
-            swaps += 1
-            self._count(out, -1)
-            self._count(best, 1)
-            if not least:
-                self._carry(best, out)
-        return value
-
     def _take_out(self, out):
         """B_i V, B_i X, D_ii and H_ii of the candidate that goes out."""
         q, p = self.q, self.p
@@ -696,8 +719,23 @@ class Climber:
                     (2 * g + m) * self.size + a * WIDE + e
                 ]
 
-    def _replacement(self, out, rise):
-        """Who raises phi most in the place of ``out``, by over ``rise``; -1: none."""
+    def _addition(self):
+        """The candidate of the largest gain alone, any where no gain is a number."""
+        best: cython.Py_ssize_t = -1
+        most: cython.double = -INFINITY
+        for c in range(self.groups):
+            alone = self.alone + c * WIDE
+            j = _best_of(alone, self.closed + c * WIDE, most)
+            if j >= 0:
+                best, most = c * WIDE + j, alone[j]
+        if best < 0:
+            best = 0
+            while self.closed[best] > 0.0:
+                best += 1
+        return best
+
+    def _replacement(self, out, value, rise):
+        """The candidate that raises phi most in the place of ``out``; -1: none."""
         q = self.q
         taken: cython.double = 0.0
         self._take_out(out)
@@ -721,6 +759,11 @@ class Climber:
 
     # --- E --------------------------------------------------------------------------
 
+    def _least_of_chosen(self):
+        """E of the chosen; -inf where it is singular."""
+        self._sum(self.k, -1)
+        return self._least()
+
     def _least(self):
         """E of ``gram``; C V and the eigenvectors of C V C.T are there."""
         p, inverse = self.p, self.now
@@ -733,8 +776,9 @@ class Climber:
         return 1.0 / self.values[p - 1]
 
     def _strongest(self, at, found):
-        """Who in place ``at`` gives the largest E, over ``found``; -1: none."""
+        """The candidate of the largest E in place ``at``, over ``found``; -1: none."""
         p = self.p
+        found[0] *= 1.0 + _LIFTS
         gram, rest = self.gram, self.rest
         if not self._bound_without(at):
             return -1
@@ -802,11 +846,11 @@ class Climber:
         return True
 
 
-class JointClimber:
+class JointClimber(Choice):
     """One choice in several scenarios, the mean or the least of whose phi counts.
 
     phi of a scenario counts as ``scale phi + shift``. What is chosen, and which may be
-    chosen once more, is the first climber's; the others hold V, X and what follows.
+    chosen once more, is held in common with the first climber.
 
     Args:
         climbers: a ``Climber`` each, of one shape, with the same rules.
@@ -823,77 +867,34 @@ class JointClimber:
         self.scale, self.shift = np.ones(count), np.zeros(count)
         self.phi, self.after = np.zeros((2, count))
         self.total = np.zeros(WIDE)
-        self.ahead = np.zeros(climbers[0].wide())
-        self.lead = climbers[0]
+        lead: Climber = self.climbers[0]
+        self.k, self.fixed, self.groups = lead.k, lead.fixed, lead.groups
+        self.usable, self.available, self.cap = lead.usable, lead.available, lead.cap
+        self.counts, self.tried, self.chosen = lead.counts, lead.tried, lead.chosen
+        self.closed, self.state = lead.closed, lead.state
+        self.ahead = np.zeros(self.groups * WIDE)
+        self.sweep = lead.groups * cython.cast(cython.int, count)
         for s in range(count):
             member: Climber = self.climbers[s]
-            member.chosen = self.lead.chosen
+            member.chosen = self.chosen
             self.addresses[s] = cython.cast(
                 cython.Py_ssize_t, cython.cast(cython.p_void, member)
             )
         self.members = cython.cast(
             cython.pointer(cython.p_void), cython.address(self.addresses[0])
         )
-        self.first = self.members[0]
 
     def weigh(self, scale, shift):
         """Let phi of the scenarios count as ``scale phi + shift``, (S,) both."""
         self.scale = np.array(scale, dtype=np.float64)
         self.shift = np.array(shift, dtype=np.float64)
 
-    def climb(self, start, share, swaps, seconds):
-        """See ``Climber.climb``."""
-        lead: Climber = self.lead
-        lead.watch = begin(seconds)
-        size: cython.Py_ssize_t = len(start)
-        kept: cython.double = share
-        how: cython.int = swaps
-        value: cython.double = 0.0
-        for r in range(size):
-            lead.chosen[r] = start[r]
-        with cython.nogil:
-            lead._clear()
-            for c in range(size):
-                lead._count(lead.chosen[c], 1)
-            if how == 2:
-                self._set_known(0.0, 0.0)
-                value = self._climb(True)
-            else:
-                self._grow(size, kept)
-                value = self._finish(how)
-        return np.array(lead.chosen), value
-
-    def random_climbs(self, count, chosen, phi, seconds):
-        """See ``Climber.random_climbs``."""
-        lead: Climber = self.lead
-        lead.watch = begin(seconds)
-        best: cython.Py_ssize_t[::1] = np.array(chosen)
-        value: cython.double = phi
-        starts: cython.Py_ssize_t = count
-        with cython.nogil:
-            for _ in range(starts):
-                if late(cython.address(lead.watch)) and value > -INFINITY:
-                    break
-                lead._random_start()
-                found = self._finish(1)
-                if found > value + 1e-10 * max(1.0, fabs(value)) or not (
-                    value > -INFINITY
-                ):
-                    value = found
-                    best[:] = lead.chosen
-        return np.asarray(best), value
-
-    def random_start(self):
-        """(k,) the required, then others at random."""
-        return self.lead.random_start()
-
     def value(self, chosen):
         """The joined phi of a selection (k,), and (S,) that of each scenario."""
-        lead: Climber = self.lead
         for r in range(len(chosen)):
-            lead.chosen[r] = chosen[r]
+            self.chosen[r] = chosen[r]
         self._set_known(0.0, 0.0)
-        value = self._evaluate(lead.k, False)
+        value = self._evaluate(self.k, False)
         return value, np.array(self.phi)
 
     # --- the joined phi -------------------------------------------------------------
@@ -915,10 +916,7 @@ class JointClimber:
     def _evaluate(self, size, trial):
         """The joined phi of the first ``size`` chosen; fills V and X of each."""
         for s in range(self.addresses.shape[0]):
-            into = cython.cast(Climber, self.members[s]).now
-            if trial:
-                into = cython.cast(Climber, self.members[s]).trial
-            value = cython.cast(Climber, self.members[s])._evaluate(size, into)
+            value = cython.cast(Climber, self.members[s])._evaluate(size, trial)
             if not value > -INFINITY:
                 return -INFINITY
             value = self.scale[s] * value + self.shift[s]
@@ -961,129 +959,46 @@ class JointClimber:
                 else:
                     total[j] += weight * rise
 
-    # --- greedy and exchange, as of a Climber ---------------------------------------
+    def _addition(self):
+        """The candidate whose addition gives the largest joined phi; -1: none."""
+        return self._best(False, -INFINITY)
 
-    def _grow(self, size, share):
-        """Complete the first ``size`` chosen, the largest joined phi first."""
-        k = cython.cast(Climber, self.first).k
-        if size == k:
-            return 0
-        self._set_known(share, 0.0)
-        self._evaluate(size, False)
-        self._refresh()
-        while True:
-            if late(cython.address(cython.cast(Climber, self.first).watch)):
-                cython.cast(Climber, self.first)._fill(size)
-                return 0
-            best = self._best(False, -INFINITY)
-            if best < 0:
-                cython.cast(Climber, self.first)._fill(size)
-                return 0
-            cython.cast(Climber, self.first).chosen[size] = best
-            cython.cast(Climber, self.first)._count(best, 1)
-            size += 1
-            if size == k:
-                return 0
-            self._evaluate(size, True)
-            self._carry(best, -1)
+    def _replacement(self, out, value, rise):
+        """The candidate that raises the joined phi most in place of ``out``."""
+        for s in range(self.addresses.shape[0]):
+            cython.cast(Climber, self.members[s])._take_out(out)
+        best = self._best(True, value + rise)
+        return -1 if best == out else best
 
     def _best(self, swaps, most):
         """Which candidate gives the largest joined phi above ``most``; -1: none."""
         best: cython.Py_ssize_t = -1
         total = cython.address(self.total[0])
-        for c in range(cython.cast(Climber, self.first).groups):
+        for c in range(self.groups):
             self._totals(c, swaps)
-            j = _best_of(
-                total, cython.cast(Climber, self.first).closed + c * WIDE, most
-            )
+            j = _best_of(total, self.closed + c * WIDE, most)
             if j >= 0:
                 best, most = c * WIDE + j, total[j]
         return best
 
-    def _finish(self, climbs):
-        """The joined phi of the chosen, climbed; swaps may mend a singular start."""
-        value: cython.double = 0.0
-        for attempt in range(5):
-            ridge: cython.double = 0.0
-            if attempt % 2:
-                ridge = _RIDGE if attempt == 1 else 1e-4 * _RIDGE
-            self._set_known(0.0, ridge)
-            if not climbs:
-                return self._evaluate(cython.cast(Climber, self.first).k, False)
-            value = self._climb(False)
-            if ridge == 0.0 and value > -INFINITY:
-                break
-        return value
+    # --- E --------------------------------------------------------------------------
 
-    def _least_eigenvalue(self):
-        """The joined E of the grams of all, -inf where one is singular."""
+    def _least_of_chosen(self):
+        """The joined E of the chosen; -inf where a scenario is singular."""
         for s in range(self.addresses.shape[0]):
-            value = cython.cast(Climber, self.members[s])._least()
+            value = cython.cast(Climber, self.members[s])._least_of_chosen()
             if not value > -INFINITY:
                 return -INFINITY
             self.after[s] = self.scale[s] * value + self.shift[s]
         return self._join(cython.address(self.after[0]))
 
-    def _climb(self, eigenvalue):
-        """Swap each chosen for its best replacement until none helps; the value."""
-        k = cython.cast(Climber, self.first).k
-        fixed = cython.cast(Climber, self.first).fixed
-        value: cython.double = 0.0
-        if eigenvalue:
-            for s in range(self.addresses.shape[0]):
-                cython.cast(Climber, self.members[s])._sum(k, -1)
-            value = self._least_eigenvalue()
-        else:
-            value = self._evaluate(k, False)
-        if k == fixed or not value > -INFINITY:
-            return value
-        if not eigenvalue:
-            self._refresh()
-        position, since, swaps = fixed, 0, 0
-        tried = cython.address(cython.cast(Climber, self.first).tried[0])
-        chosen = cython.address(cython.cast(Climber, self.first).chosen[0])
-        for i in range(cython.cast(Climber, self.first).tried.shape[0]):
-            tried[i] = -1
-        while since < k - fixed and swaps < _MOST_SWAPS * k:
-            if late(cython.address(cython.cast(Climber, self.first).watch)):
-                break
-            at, out, after = position, chosen[position], value
-            since += 1
-            position = position + 1 if position + 1 < k else fixed
-            if tried[out] == swaps:  # another measurement of the same
-                continue
-            tried[out] = swaps
-            rise = _IMPROVES * max(1.0, fabs(value))
-            if eigenvalue:
-                after += max(_LIFTS * fabs(value), rise)
-                best = self._strongest(at, cython.address(after))
-            else:
-                for s in range(self.addresses.shape[0]):
-                    cython.cast(Climber, self.members[s])._take_out(out)
-                best = self._best(True, value + rise)
-                if best == out:
-                    best = -1
-            if best < 0:
-                continue
-            chosen[at] = best
-            if not eigenvalue:
-                after = self._evaluate(k, True)
-                if not after > value + rise:  # the formulas promised more
-                    chosen[at] = out
-                    continue
-            value, since = after, 0
-            swaps += 1
-            cython.cast(Climber, self.first)._count(out, -1)
-            cython.cast(Climber, self.first)._count(best, 1)
-            if not eigenvalue:
-                self._carry(best, out)
-        return value
-
     def _strongest(self, at, found):
-        """Who in place ``at`` gives the largest joined E, over ``found``; -1: none."""
-        groups = cython.cast(Climber, self.first).groups
-        bounds = cython.cast(Climber, self.first).bounds
-        tops = cython.cast(Climber, self.first).tops
+        """The candidate of the largest joined E in place ``at``; -1: none over it."""
+        lift = max(_LIFTS * fabs(found[0]), _IMPROVES * max(1.0, fabs(found[0])))
+        found[0] += lift
+        groups = self.groups
+        bounds = cython.cast(Climber, self.members[0]).bounds
+        tops = cython.cast(Climber, self.members[0]).tops
         for s in range(self.addresses.shape[0]):
             if not cython.cast(Climber, self.members[s])._bound_without(at):
                 return -1
@@ -1105,7 +1020,7 @@ class JointClimber:
             tops[2 * c] = _largest(bounds + c * WIDE)
         best: cython.Py_ssize_t = -1
         while True:
-            e = cython.cast(Climber, self.first)._next(found[0])
+            e = cython.cast(Climber, self.members[0])._next(found[0])
             if e < 0:
                 return best
             if self._betters(e, found):
