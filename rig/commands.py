@@ -23,6 +23,10 @@ def _axes(text: str) -> list[str]:
     return text.split(",")
 
 
+def _numbers(text: str) -> list[float]:
+    return [float(number) for number in text.split(",")]
+
+
 Path = pathlib.Path
 FILE = Path("rig.toml")  # without --config
 AxisName = Annotated[str, "of rig.toml"]
@@ -102,12 +106,7 @@ class Target(Simulation):
         options = options or self.simulation
         return Simulator(
             config,
-            truth_of(
-                options,
-                config.session.seed,
-                config.axis_names,
-                len(config.output_names),
-            ),
+            truth_of(options, config),
             [parse_fault(text, config.axis_names) for text in self.fault or ()],
             transport=options["transport"],
             rate_hz=options["rate"],
@@ -417,9 +416,11 @@ def stop(*, config: ConfigPath | None = None) -> int:
 def check(file: ConfigPath | None = None, *, config: ConfigPath | None = None) -> int:
     """check a configuration and list every fault"""
     from rig.config import load_config
+    from rig.model import model_of
 
     path = config or file or FILE
     found = load_config(path)
+    model_of(found)
     print(f"{path}: valid")
     for axis in found.axes:
         print(
@@ -446,6 +447,7 @@ def refit(
     imu_order: Annotated[Order, "imu.order: of the phone's angles"] | None = None,
     signs: Annotated[tuple[int, int, int], "imu.signs", (-1, 1)] | None = None,
     mounting: Annotated[Angles, "imu.mounting_deg: Z, Y, X", CIRCLE] | None = None,
+    factors: Annotated[list[float], "readings.factors", _numbers] | None = None,
 ) -> int:
     """identify a recorded calibration anew"""
     from rig.workbench.identification.refit import refit as identify_anew
@@ -459,6 +461,7 @@ def refit(
         "imu.order": imu_order,
         "imu.signs": signs,
         "imu.mounting_deg": mounting,
+        "readings.factors": factors,
     }
     return identify_anew(run, records_of(run), then, wanted, print)
 

@@ -106,7 +106,7 @@ class Axis(Scale):
     ``range_mm`` for the keys in degrees.
     """
 
-    name: str = key("of the joint", pattern="^[a-z][a-z0-9_]{0,23}$")
+    name: str = key("of the joint", pattern="^[a-z][a-z0-9_]{0,39}$")
     rotates: Literal["X", "Y", "Z"] | None = key(
         "of a rotation: axis of the joint in the device's frame, as a phone sees it",
         "X, Z, Y of pitch, yaw, roll",

@@ -23,6 +23,7 @@ from rig.config.settings import (
     BusSettings,
     ImuSettings,
     MechanismSettings,
+    ModelSettings,
     MotionSettings,
     ReadingsSettings,
     SessionSettings,
@@ -39,6 +40,7 @@ PHONE = (
     "format", "columns", "quaternion_columns", "unit", "order", "signs", "mounting_deg"
 )  # fmt: skip
 SENSOR = ("names", "unit", "registers", "columns", "factors")
+UP = ("up_x", "up_y", "up_z")  # what a phone on an arm measures
 # Where bus and phone are reached, and when a session gives up or says that it is good,
 # may change between a run and its resumption.
 UNMEASURED = (
@@ -56,7 +58,8 @@ def names_of(described: dict[str, Any]) -> tuple[list[str], list[str]]:
     """Names of the axes, and of what is measured, of a configuration as a journal
     keeps it."""
     axes = [str(axis["name"]) for axis in described.get("axes", ())]
-    readings = described.get("readings") or {"names": axes}
+    by_phone = UP if (described.get("model") or {}).get("urdf") else axes
+    readings = described.get("readings") or {"names": by_phone}
     return axes, [str(name) for name in readings["names"]]
 
 
@@ -115,6 +118,7 @@ class RigConfig(Section):
     axes: tuple[Axis, ...]
     imu: ImuSettings | None = None  # the phone, or
     readings: ReadingsSettings | None = None  # numbers
+    model: ModelSettings | None = None  # else it is affine
     mechanism: MechanismSettings = MechanismSettings()
     settle: SettleSettings = SettleSettings()
     motion: MotionSettings = MotionSettings()
@@ -144,7 +148,21 @@ class RigConfig(Section):
     @property
     def output_names(self) -> tuple[str, ...]:
         """Names of what is measured, in the order of every measurement."""
-        return self.readings.names if self.readings else self.axis_names
+        if self.readings:
+            return self.readings.names
+        return UP if self.is_arm else self.axis_names
+
+    @property
+    def is_arm(self) -> bool:
+        """Its axes are the joints of a URDF."""
+        return self.model is not None and bool(self.model.urdf)
+
+    @property
+    def model_path(self) -> pathlib.Path | None:
+        """The file of its model, where it has one."""
+        return (
+            self._folder / self.model.file if self.model and self.model.file else None
+        )
 
     @property
     def output_unit(self) -> str:
@@ -183,6 +201,15 @@ class RigConfig(Section):
     def joint_order(self) -> str:
         """Axis letters of the joints that there are, from the base outwards."""
         return "".join(at for at in self.mechanism.order if at in self.letters)
+
+    @property
+    def chain(self) -> list[int]:
+        """The axes that turn a phone, from the base outwards; none of numbers."""
+        if self.imu is None:
+            return []
+        if self.is_arm:
+            return list(range(len(self.axes)))
+        return [self.letters.index(letter) for letter in self.joint_order]
 
     @property
     def ranges(self) -> tuple[tuple[float, float], ...]:
@@ -243,6 +270,10 @@ class RigConfig(Section):
     def described(self) -> dict[str, Any]:
         """Every key as JSON, as the journal keeps it; of a map its name and digest."""
         data = self.model_dump(exclude={"output", "device"})
+        if self.model is None:
+            del data["model"]
+        else:
+            data["model"]["digest"] = self._model_digest
         # Those left out too.
         session = {"ranges": self.ranges, "k": self.k, "method": self.method}
         data["session"] |= session
@@ -280,6 +311,9 @@ class RigConfig(Section):
             family = f"{axis.map.name} ({_digest(axis.map.text, PLACES)})"
             values = {"map": family, **scale}
             found |= {f"axes.{axis.name}.{name}": values[name] for name in values}
+        if self.model is not None:
+            data = self.model.model_dump() | {"digest": self._model_digest}
+            found |= {f"model.{name}": data[name] for name in data}
         if self.imu is None:
             assert self.readings is not None
             data = self.readings.model_dump(mode="json", include=set(SENSOR))
@@ -287,6 +321,11 @@ class RigConfig(Section):
         found["mechanism.order"] = self.mechanism.order
         imu = self.imu.model_dump(mode="json", include=set(PHONE))
         return found | {f"imu.{name}": imu[name] for name in PHONE}
+
+    @property
+    def _model_digest(self) -> str:
+        path = self.model_path
+        return "" if path is None else hashlib.sha256(path.read_bytes()).hexdigest()[:8]
 
     def stop_fingerprint(self) -> dict[str, str]:
         """Key to digest of what says how each drive is stopped, and stands."""
@@ -307,14 +346,17 @@ class RigConfig(Section):
         if (self.imu is None) == (self.readings is None):
             yield "imu: either [imu] or [readings] is required, and not both"
             return
-        for axis in self.axes if self.imu else ():
+        if self.model is not None:
+            yield from self._rules_of_model(self.model)
+        by_letters = self.axes if self.imu and not self.is_arm else ()
+        for axis in by_letters:
             if axis.kind != "rotation" or axis.rotates is None:
                 yield (
                     f"axes.{axis.name}.rotates: missing; a phone measures rotations "
                     "about X, Y, Z"
                 )
                 return
-        for middle in self.axes if self.imu else ():
+        for middle in by_letters:
             within = -90.0 < middle.min_deg and middle.max_deg < 90.0
             if within or middle.rotates != self.mechanism.order[1]:
                 continue
@@ -350,6 +392,23 @@ class RigConfig(Section):
                     f"the axis's limits {limits}"
                 )
 
+    def _rules_of_model(self, model: ModelSettings) -> Iterator[str]:
+        if self.session.k is None:
+            yield (
+                "session.k: missing; with a [model] it says how many postures are "
+                "measured"
+            )
+        if not model.urdf:
+            return
+        for axis in self.axes:
+            if axis.kind != "rotation":
+                yield f"axes.{axis.name}.kind: must be rotation, of a [model] by urdf"
+        if self.imu and model.sensor != "gravity":
+            yield "model.sensor: must be gravity: a phone at rest measures where up is"
+        if self.readings and len(self.readings.names) != 3:
+            count = len(self.readings.names)
+            yield f"readings.names: must be 3, of model.sensor, got {count}"
+
 
 # Files
 
@@ -368,6 +427,10 @@ def parse_config(
         axes = sorted(config.axes, key=lambda axis: AXIS_NAMES.index(axis.name))
         config = config.model_copy(update={"axes": tuple(axes)})
     config._folder = folder or pathlib.Path()
+    if (path := config.model_path) and not path.is_file():
+        assert config.model is not None
+        name = "urdf" if config.model.urdf else "factory"
+        raise ConfigError(source, [f"model.{name}: there is no file {path}"])
     return config
 
 
@@ -378,7 +441,10 @@ def _repeated(data: dict[str, Any]) -> Iterator[str]:
     axes = [{"rotates": DEFAULT_ROTATES.get(str(a.get("name"))), **a} for a in axes]
     if isinstance(given, list) and not 1 <= len(given) <= MOST_AXES:
         yield f"axes: must be 1 to {MOST_AXES} tables, got {len(given)}"
-    for name in ("name", "unit", *(["rotates"] if "readings" not in data else [])):
+    by_letters = "readings" not in data and not (
+        isinstance(data.get("model"), dict) and data["model"].get("urdf")
+    )
+    for name in ("name", "unit", *(["rotates"] if by_letters else [])):
         values = [str(a[name]) for a in axes if a.get(name) is not None]
         if len(set(values)) < len(values):
             yield f"axes: {name} must differ between them, got {', '.join(values)}"

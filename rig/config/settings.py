@@ -202,6 +202,39 @@ class ReadingsSettings(Section):
             yield f"separator: must be a character that no number has, got {got}"
 
 
+class ModelSettings(Section):
+    """What the device does with a command, where that is not ``y = A u + b``."""
+
+    urdf: str = key("an arm: its URDF file, whose joints are the axes", "")
+    base: str = advanced("of urdf: link that is still; absent: the root", "")
+    tip: str = key("of urdf: link that carries phone or sensor; absent: the last", "")
+    sensor: Literal["gravity", "position"] = key(
+        "of urdf: what is measured there: where up is, of a phone or an accelerometer "
+        "at rest, or the place, in the file's metres",
+        "gravity",
+    )
+    magnitude: float = advanced(
+        "of gravity, in the unit of [readings]", 9.81, 1e-6, 1e6
+    )
+    factory: str = key(
+        "FILE.py:NAME or MODULE:NAME of a model of jaxcal.models, or of a function "
+        "that returns one",
+        "",
+    )
+
+    @property
+    def file(self) -> str:
+        """The file that says it, where there is one."""
+        path = self.factory.rpartition(":")[0]
+        return self.urdf or (path if path.endswith(".py") else "")
+
+    def broken_rules(self) -> Iterator[str]:
+        if bool(self.urdf) == bool(self.factory):
+            yield "urdf: either urdf or factory is required, and not both"
+        elif self.factory and not all(self.factory.rpartition(":")[::2]):
+            yield f"factory: must be FILE.py:NAME or MODULE:NAME, got {self.factory!r}"
+
+
 class MechanismSettings(Section):
     """The chain of joints."""
 

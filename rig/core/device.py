@@ -18,7 +18,7 @@ import numpy as np
 
 from rig.config.axis import Pulses
 from rig.config.config import RigConfig
-from rig.core.proof import Proof, Turns
+from rig.core.proof import Proof, Turns, slopes
 from rig.core.stop import Stopper
 from rig.drives import Drive, make_drives
 from rig.drives.drive import Status
@@ -31,6 +31,7 @@ from rig.readings.geometry import Frame, geometry_of
 
 LOOK_S = 0.002  # between two looks for a reading
 OVERDUE_S = 0.3  # of a stop that was asked for and that no loop has answered
+TELLS = 0.03  # least of the singular values, of the largest: by so little an axis tells
 TICK_S = 0.05  # of the heartbeat
 
 
@@ -214,8 +215,10 @@ class Device:
         requests: Requests | None = None,
         *,
         simulated: bool = False,
+        predict: Callable[[Array], Array] | None = None,
     ) -> None:
-        """``simulated``: it need not be slow where nothing is proved."""
+        """``simulated``: it need not be slow where nothing is proved. ``predict``:
+        what is measured at (n,) commands by its model as designed, where it has one."""
         self.config = config
         self.run = run
         self.record = record
@@ -228,6 +231,7 @@ class Device:
         self.stopper = Stopper(self.drives, run.emit)
         self.requests = requests or Requests()
         self.simulated = simulated
+        self.predict = predict
         turns, checked = Turns.of(record), not record.missing(config, SIGN_CHECKED)
         gains = turns.gains if turns and checked else None
         self.proof = Proof(config.axes, self.geometry, checked, simulated, gains)
@@ -350,18 +354,25 @@ class Device:
             time.sleep(LOOK_S)
         return reading.value
 
-    def moved(self, change: Array) -> Array | None:
+    def moved(self, change: Array, middle: Array) -> Array | None:
         """(n,) by which the axes moved, of an (m,) change of what is measured.
 
         Of a phone these are its joint angles; of numbers, what `axes` saw explains
-        them by. None where that is not known, or does not tell.
+        them by, or a model does at the ``middle`` (n,) of the way. None where that is
+        not known, or does not tell.
         """
-        if self.config.imu:
+        if self.geometry.of_joints:
             return change
         turns = Turns.of(self.record)
-        if turns is None or np.linalg.matrix_rank(turns.deg) < len(self.config.axes):
+        rates = None if turns is None else turns.deg
+        if self.predict is not None:
+            rates = slopes(self.predict, middle)
+        if rates is None:
             return None
-        moved: Array = np.linalg.pinv(turns.deg).astype(np.float64) @ change
+        size = np.linalg.svd(rates, compute_uv=False)
+        if len(rates) < len(self.config.axes) or size[-1] < TELLS * size[0]:
+            return None
+        moved: Array = np.linalg.pinv(rates).astype(np.float64) @ change
         return moved
 
     def positions(self) -> Pulses:

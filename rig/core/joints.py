@@ -12,7 +12,7 @@ import numpy as np
 from rig.core.device import Device, Posture
 from rig.core.measure import measure
 from rig.core.motion import move
-from rig.core.proof import Turns
+from rig.core.proof import Turns, slopes
 from rig.faults import MotionFault
 from rig.journal import SIGN_CHECKED
 from rig.readings.attitude import Array
@@ -34,6 +34,10 @@ def show(device: Device) -> None:
         return
     device.emit("phase", phase="showing")
     expected = turns.at(config, start)
+    if device.predict and not config.chain:  # numbers may change otherwise elsewhere
+        at_start, then = (config.to_deg(place) for place in (start, turns.pulses))
+        change = slopes(device.predict, at_start) - slopes(device.predict, then)
+        expected = expected + change
     for j, axis in enumerate(config.axes):
         here = axis.to_deg(start[j])
         middle = (axis.min_deg + axis.max_deg) / 2.0  # a limit may be why it is here

@@ -18,6 +18,9 @@ from rig.readings.geometry import Frame
 DISAGREEMENT_DEG = 45.0  # between IMU and command at a posture, at most
 FOLLOW_MIN_DEG = 3.0  # a commanded change this large must be seen by the IMU
 FOLLOW_SHARE = 0.1  # at least this share of it
+FOLLOW_MODEL = (
+    0.6  # of what the axis that changes most changes: by so much a model errs
+)
 FOLLOW_LEADING = 0.3  # of axes that move at least this share of the largest move
 
 
@@ -177,8 +180,8 @@ def _check_position(device: Device, target: Pulses, feedback: list[int]) -> None
 def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
     """The joints are where the drives say, roughly, and moved when they moved."""
     names, seen = device.config.axis_names, device.seen
-    # Numbers are no angles of joints, and are compared by how they change alone.
-    apart = measured - commanded if device.config.imu else np.zeros(1)
+    # What are no angles of joints is compared by how it changes alone.
+    apart = measured - commanded if device.geometry.of_joints else np.zeros(1)
     if (np.abs(apart) > DISAGREEMENT_DEG).any():
         worst = int(np.argmax(np.abs(apart)))
         raise MotionFault(
@@ -188,7 +191,9 @@ def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
         )
     way = commanded - seen.commanded
     asked = np.abs(way)
-    moved = device.moved(measured - seen.measured)
+    moved = device.moved(measured - seen.measured, seen.commanded + way / 2.0)
+    if moved is None:
+        _check_predicted(device, commanded, measured)
     followed = np.sign(way) * (way if moved is None else moved)
     leading = max(FOLLOW_MIN_DEG, FOLLOW_LEADING * float(asked.max()))
     for index, name in enumerate(names):
@@ -201,3 +206,22 @@ def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
                 f"saw {followed[index]:.2f}. Look for {hint}"
             )
     seen.commanded, seen.measured = commanded, measured
+
+
+def _check_predicted(device: Device, commanded: Array, measured: Array) -> None:
+    """What is measured changed about as the device's model says, where it does not say
+    of each axis how far that moved."""
+    if device.predict is None:
+        return
+    before, place = device.predict(device.seen.commanded), device.seen.commanded
+    alone = place + np.diag(commanded - place)  # each axis by itself
+    largest = max(np.linalg.norm(device.predict(at) - before) for at in alone)
+    expected = device.predict(commanded) - before
+    off = float(np.linalg.norm(measured - device.seen.measured - expected))
+    if off > FOLLOW_MODEL * largest + FOLLOW_MIN_DEG * device.geometry.scale:
+        raise NotFollowing(
+            f"what is measured changed by {off:.3g} {device.config.output_unit} "
+            "otherwise than the model says; most that one axis changes it is "
+            f"{largest:.3g}. Look for a slipped coupling, a frozen stream, axes mixed "
+            "up, or a [model] of another device"
+        )

@@ -219,8 +219,8 @@ def _check_attitude(device: Device, connection: int) -> None:
     reading = device.imu.latest()
     if device.imu.connections == connection:  # its heading is another since
         device.proof.watch(reading.value)
-    if device.frame is None or not device.oriented or device.config.imu is None:
-        return  # numbers are no angles of joints
+    if device.frame is None or not device.oriented or not device.geometry.of_joints:
+        return
     margin = device.config.motion.envelope_margin_deg
     angles = device.frame.angles(reading.value)
     for axis, angle in zip(device.config.axes, angles, strict=True):

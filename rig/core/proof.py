@@ -17,7 +17,7 @@ joint, and grows while the phone turns no further than `axes` saw it turn.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -52,6 +52,7 @@ NO_UNIT = (
     "No angle of the phone is over 6.3, so imu.unit, radians or degrees, is not "
     "proved: turn the base, or the phone's heading, by some degrees"
 )
+STEP_DEG = 0.5  # of a derivative of a model
 RADIANS = 180.0 / math.pi
 LARGEST_RAD = 2.0 * math.pi + 0.1  # no larger number is an angle in radians
 
@@ -79,15 +80,20 @@ class Turns(NamedTuple):
         In the phone's frame a joint's axis turns with the joints that it carries.
         Numbers are taken to change alike everywhere.
         """
-        if config.imu is None:
-            return self.deg
         turns, away = self.deg.copy(), config.to_deg(np.subtract(pulses, self.pulses))
-        chain = [config.letters.index(letter) for letter in config.joint_order]
+        chain = config.chain
         for place, joint in enumerate(chain):
             for inner in chain[place + 1 :]:
                 turn = Rotation.from_rotvec(self.deg[:, inner] * away[inner], True)
                 turns[:, joint] = turn.inv().apply(turns[:, joint])
         return turns
+
+
+def slopes(predict: Callable[[Array], Array], at_deg: Array) -> Array:
+    """(m, n) change of what a model predicts for a degree of each axis."""
+    steps = STEP_DEG * np.eye(len(at_deg))
+    columns = [predict(at_deg + step) - predict(at_deg - step) for step in steps]
+    return np.column_stack(columns) / (2.0 * STEP_DEG)
 
 
 def unit_proved(imu: ImuSettings | ReadingsSettings, attitude: Array) -> bool:

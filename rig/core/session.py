@@ -45,6 +45,7 @@ ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
 SAME_PLACE_DEG = 0.5  # two places where an axis ended short of one target
 Check = Callable[[RigConfig, Sequence[Drive], DeviceRecord], None]
 Beside = Callable[[Device], contextlib.AbstractContextManager[Any]]
+Predict = Callable[[Array], Array]
 
 
 @contextlib.contextmanager
@@ -58,6 +59,7 @@ def open_device(
     beside: Sequence[Beside] = (),
     simulated: bool = False,
     reset_alarms: bool = False,
+    predict: Predict | None = None,
 ) -> Iterator[Device]:
     """The device, armed; however this ends its drives are stopped and looked at.
 
@@ -68,11 +70,12 @@ def open_device(
         beside: what runs while the ports are open, such as telemetry.
         simulated: it need not be slow where nothing is proved.
         reset_alarms: of drives that are in alarm.
+        predict: (m,) that is measured at (n,) commands, by its model as designed.
 
     Raises:
         MotionFault, BusError, ReadingError, Refused: not fit to move.
     """
-    device = Device(config, run, record, requests, simulated=simulated)
+    device = Device(config, run, record, requests, simulated=simulated, predict=predict)
     requests, lock = device.requests, BusLock(config.bus)
     # A request that came while something was computed may have been raised in a
     # callback that drops exceptions, as those of a garbage collection are.

@@ -20,11 +20,13 @@ from rig.readings.attitude import (
     Array,
     Reading,
     angle_between_deg,
+    euler_to_matrix,
     frame_at,
     mean_rotation,
     raw_fields,
 )
 
+RADIAN = 180.0 / np.pi  # a direction's length, so that a turn of it is in degrees
 UNSEEN_DEG = 15.0  # an axis this near to the vertical hardly changes the tilt
 
 
@@ -44,6 +46,7 @@ class Geometry(Protocol):
 
     scale: float
     told: str  # how far it moved, in words before the figure
+    of_joints: bool  # what is measured are angles of the joints, by the axes' names
 
     def apart(self, first: ArrayLike, second: ArrayLike) -> float:
         """How far one reading is from another."""
@@ -67,6 +70,9 @@ class Geometry(Protocol):
     def unseen(self, zero: Array) -> list[str]:
         """Names of the axes of which a move at the zero posture cannot be seen."""
 
+    def outputs(self, reading: Array, measured: Array) -> Array:
+        """(m,) what a model predicts, of a reading and what it is against the zero."""
+
     def raw(self, readings: Sequence[Reading]) -> dict[str, Any]:
         """Every single reading, for the journal."""
 
@@ -82,6 +88,7 @@ class Attitudes:
 
     scale = 1.0
     told = "the phone turned"
+    of_joints = True
 
     def __init__(self, config: RigConfig) -> None:
         self._config = config
@@ -123,6 +130,9 @@ class Attitudes:
         pairs = zip(config.axis_names, config.letters, strict=True)
         return [name for name, letter in pairs if upright["XYZ".index(letter)] > least]
 
+    def outputs(self, reading: Array, measured: Array) -> Array:
+        return measured
+
     def drift(self, readings: Array, minutes: Array) -> Array:
         """Drift of the phone's world: a heading that drifts turns that."""
         turned = Rotation.from_matrix(readings @ readings[0].T)
@@ -131,6 +141,38 @@ class Attitudes:
     def without(self, reading: Array, rate: ArrayLike, minutes: float) -> Array:
         back = Rotation.from_rotvec(-minutes * np.asarray(rate), degrees=True)
         return back.as_matrix() @ reading
+
+
+class Up:
+    """Where up is in the frame of an arm's tip, less that at the zero posture."""
+
+    def __init__(self, zero: Array, mounting: Array) -> None:
+        self.zero, self._mounting = zero, mounting
+
+    def of(self, readings: ArrayLike) -> Array:
+        """(..., 3) of attitudes (..., 3, 3), RADIAN long."""
+        rows = np.asarray(readings, dtype=np.float64)[..., 2, :]
+        return RADIAN * rows @ self._mounting.T
+
+    def angles(self, readings: ArrayLike) -> Array:
+        return self.of(readings) - self.of(self.zero)
+
+
+class Upright(Attitudes):
+    """Attitudes of a phone on an arm: it tells how far the arm turned it, and its
+    accelerometer, which no heading enters, where up is."""
+
+    of_joints = False
+
+    def frame(self, zero: Array) -> Up:
+        mounting = euler_to_matrix(self._config.phone.mounting_deg, "ZYX")
+        return Up(zero, mounting)
+
+    def unseen(self, zero: Array) -> list[str]:
+        return [] if self._config.phone.heading == "absolute" else ["any turn"]
+
+    def outputs(self, reading: Array, measured: Array) -> Array:
+        return self.frame(reading).of(reading)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,6 +189,7 @@ class Numbers:
     """(m,) vectors; ways are their differences."""
 
     told = "the readings changed by"
+    of_joints = False
 
     def __init__(self, scale: float) -> None:
         self.scale = scale
@@ -175,6 +218,9 @@ class Numbers:
     def unseen(self, zero: Array) -> list[str]:
         return []
 
+    def outputs(self, reading: Array, measured: Array) -> Array:
+        return reading
+
     def raw(self, readings: Sequence[Reading]) -> dict[str, Any]:
         return {"readings": [reading.value.tolist() for reading in readings]}
 
@@ -193,5 +239,5 @@ def _slope(values: Array, minutes: Array) -> Array:
 def geometry_of(config: RigConfig) -> Geometry:
     """The geometry of a device's readings."""
     if config.readings is None:
-        return Attitudes(config)
+        return Upright(config) if config.is_arm else Attitudes(config)
     return Numbers(config.readings.scale)

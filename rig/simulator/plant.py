@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rig.config.config import RigConfig
+from rig.model import model_of
 from rig.readings.attitude import Array, euler_to_matrix
 from rig.simulator.drive import SimDrive
 from rig.simulator.faults import FaultInjector
@@ -41,6 +42,12 @@ class Plant:
         self._joint = self._drive_deg.copy()  # behind the friction too
         self._sliding = np.zeros(len(drives), dtype=bool)
         self._centre = self._drive_deg + truth.dead_centre_deg
+        self._model = model_of(config)
+        if self._model is not None:
+            known = self._model.model.nominal
+            self._parameters = np.array(truth.parameters or known)
+            if config.is_arm:
+                self._attitude_of = self._model.attitude_with(self._parameters)
         mounting = config.imu.mounting_deg if config.imu else (0.0, 0.0, 0.0)
         self._mounting = euler_to_matrix(mounting, "ZYX")
 
@@ -64,7 +71,7 @@ class Plant:
         self._mounting = self._mounting @ turn
 
     def joints(self) -> Array:
-        """(n,) joint angles in degrees now, or (m,) of what is measured.
+        """(n,) joint angles in degrees now, or (m,) of an affine device's numbers.
 
         ``A u + b`` behind the play, the friction (a joint at rest stays until its drive
         is ``breakaway_deg`` away, then follows it until that stands) and the dead zone.
@@ -97,23 +104,25 @@ class Plant:
 
     def numbers(self) -> Array:
         """(m,) of what a sensor measures now."""
-        noise = self._rng.normal(0.0, self.truth.noise_deg, len(self._bias))
-        return self.joints() + noise
+        values = self.joints()
+        if self._model is not None:
+            values = self._model.model.predict(values[None], self._parameters)[0]
+        return values + self._rng.normal(0.0, self.truth.noise_deg, len(values))
 
     def attitude(self) -> Array:
         """(3, 3) attitude of the phone in its world, as its sensors see it."""
         joints = self.joints()
         config = self._config
-        order = config.mechanism.order
-        of_letter = dict(zip(config.letters, joints, strict=True))
-        sequence = [of_letter.get(letter, 0.0) for letter in order]
+        if config.is_arm:
+            turned = self._attitude_of(joints)
+        else:
+            of_letter = dict(zip(config.letters, joints, strict=True))
+            order = config.mechanism.order
+            sequence = [of_letter.get(letter, 0.0) for letter in order]
+            turned = euler_to_matrix(sequence, order)
         minutes = (time.monotonic() - self._start) / 60.0
         heading = self.truth.heading_deg + self.truth.drift_deg_per_min * minutes
-        attitude = (
-            euler_to_matrix([heading, 0.0, 0.0], "ZYX")
-            @ euler_to_matrix(sequence, order)
-            @ self._mounting
-        )
+        attitude = euler_to_matrix([heading, 0.0, 0.0], "ZYX") @ turned @ self._mounting
         if self.truth.noise_deg:
             noise = self._rng.normal(0.0, self.truth.noise_deg, 3)
             attitude = attitude @ Rotation.from_rotvec(noise, degrees=True).as_matrix()

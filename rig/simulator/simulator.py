@@ -29,9 +29,7 @@ class Simulator:
         speedup: float = 1.0,
     ) -> None:
         self.config = config
-        self.truth = truth or Truth.of_axes(
-            len(config.axes), len(config.output_names), seed=config.session.seed
-        )
+        self.truth = truth or Truth.of(config, seed=config.session.seed)
         self.faults = FaultInjector(faults)
         self.transport = transport
         self.drives: list[SimDrive] = []

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from rig.config import RigConfig
+from rig.model import model_of
 from rig.readings.attitude import Array
 
 
@@ -32,6 +33,7 @@ class Truth:
     dead_centre_deg: float = 0.0  # of the zone, away from there
     drift_deg_per_min: float = 0.0  # of the phone's heading
     heading_deg: float = 170.0  # of the base in the phone's world
+    parameters: tuple[float, ...] = ()  # of the device's model; none: as designed
     seed: int = 0
     # What is wired, set or lost otherwise than the configuration says:
     reversed: tuple[bool, ...] = (False, False, False)  # turns the other way
@@ -63,6 +65,17 @@ class Truth:
         }
         return cls(**given | more)
 
+    @classmethod
+    def of(cls, config: RigConfig, **more: Any) -> Truth:
+        """A truth of a configured device."""
+        count, model = len(config.axes), model_of(config)
+        if model is not None:
+            drawn = tuple(model.drawn(int(more.get("seed", 0))).tolist())
+            matrix = tuple(map(tuple, np.eye(count).tolist()))
+            given = {"matrix": matrix, "bias": (0.0,) * count, "parameters": drawn}
+            more = given | more
+        return cls.of_axes(count, len(config.output_names), **more)
+
     @property
     def jig_deg(self) -> Array:
         """(n,) turns of the motors, by axis, at which every joint stands at zero."""
@@ -87,14 +100,13 @@ REALISTIC: dict[str, Any] = {
 }
 
 
-def truth_of(
-    options: dict[str, Any], seed: int, names: Sequence[str], outputs: int
-) -> Truth:
+def truth_of(options: dict[str, Any], config: RigConfig) -> Truth:
     """The simulated device that the options of a command line describe.
 
     Raises:
         ValueError: ``swapped`` or ``reversed`` names no axes of the device.
     """
+    names = config.axis_names
     order = list(range(len(names)))
     for key in ("swapped", "reversed"):
         if unknown := set(options[key] or ()) - set(names):
@@ -107,11 +119,10 @@ def truth_of(
         order[a], order[b] = b, a
     degrees = ("noise", "backlash", "breakaway", "dead_zone")
     pulses, turned = options["gearing"], options["reversed"] or ()
-    return Truth.of_axes(
-        len(names),
-        outputs,
+    return Truth.of(
+        config,
         drift_deg_per_min=options["drift"],
-        seed=seed,
+        seed=config.session.seed,
         reversed=tuple(name in turned for name in names),
         swapped=tuple(order),
         drive_pulses_per_rev=pulses and (pulses,) * len(names),

@@ -13,6 +13,7 @@ from rig.core.record_check import KeptZero, check_drives
 from rig.core.session import Beside, Check, open_device, take_zero
 from rig.faults import EXIT_FAULT, PlanOnly, Refused, ending
 from rig.journal import DeviceRecord, JournalError, Record, RunFolder
+from rig.model import model_of
 from rig.signals import Signals
 
 
@@ -46,6 +47,7 @@ class Run(RunFolder):
         self.kept_zero = kept_zero
         self.dry_run = dry_run
         self.reset_alarms = reset_alarms
+        self.model = model_of(config)  # None: affine
         self.signals = signals or Signals()
         super().__init__(config, folder, mode, start or {})
 
@@ -76,6 +78,7 @@ class Run(RunFolder):
             self.config, self, self.record, self.signals,
             check=self.check, beside=self.beside, simulated=self.simulated,
             reset_alarms=self.reset_alarms,
+            predict=None if self.model is None else self.model.predict,
         ) as device:  # fmt: skip
             yield device
 

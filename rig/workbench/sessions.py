@@ -126,6 +126,11 @@ def _procedure(
         return calibrate.calibrate, None, []
     if mode == "collect":
         return lambda run: collect(run, inputs["count"]), None, []
+    if mode == "goto" and config.is_arm:
+        raise Refused(
+            "goto: an arm is moved by its own controller. Give it calibrated.urdf of "
+            "the calibration's folder in place of the URDF"
+        )
     found, kept = verify.load_calibration(
         pathlib.Path(inputs["calibration"]), config, start["simulated"] is not None
     )

@@ -131,6 +131,18 @@ def measured_text(axes: dict[str, str], transport: str = "tcp") -> str:
     return head + tables + readings + tail
 
 
+ARM = pathlib.Path(__file__).parent / "arm5.urdf"
+
+
+def arm_text(more: str = "", session: str = "k = 12\nverify_postures = 4") -> str:
+    """Of an arm of five joints, by its URDF, with a phone at its tip."""
+    text = axes_text(dict.fromkeys(("turn", "shoulder", "elbow", "bend", "twist"), "X"))
+    text = text[: text.index("[session]")].replace('rotates = "X"\n', "")
+    text = text.replace("min_deg = -20", "min_deg = -40")
+    text = text.replace("max_deg = 20", "max_deg = 40")
+    return f'{text}[model]\nurdf = "{ARM}"\n{more}\n[session]\n{session}\n'
+
+
 def changed(settings, **changes):
     """The same settings but for some."""
     return settings.model_copy(update=changes)

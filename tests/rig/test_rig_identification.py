@@ -14,7 +14,7 @@ from rig.config import AXIS_NAMES
 from rig.readings.attitude import ORDERS, Frame, Reading, euler_to_matrix, raw_fields
 from rig.readings.geometry import Attitudes
 from rig.simulator import Truth
-from rig.workbench.identification.conclusion import estimate_drift, without_drift
+from rig.workbench.identification.drift import estimate_drift, without_drift
 from rig.workbench.identification.fit import uncertainty
 from rig.workbench.identification.refit import attitudes
 from rig.workbench.outputs.words import drift_text, recalibrate

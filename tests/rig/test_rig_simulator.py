@@ -8,7 +8,7 @@ import pytest
 from harness import Simulator, fast_config, fast_text
 
 from rig.commands import make_parser
-from rig.config import AXIS_NAMES, parse_config
+from rig.config import parse_config
 from rig.drives.modbus import Bus, ModbusDrive
 from rig.simulator import Truth, truth_of
 from rig.simulator.drive import COMM_ALARM, SimDrive
@@ -146,18 +146,18 @@ def test_replies_take_their_time():
 def test_options_of_the_command_line_describe_a_device():
     args = make_parser().parse_args(["simulate", "--noise", "0"])
     plain = vars(args)
-    assert truth_of(plain, 3, AXIS_NAMES, 3) == Truth(noise_deg=0.0, seed=3)
+    assert truth_of(plain, fast_config()) == Truth(noise_deg=0.0)
     odd = {
         "reversed": ["roll"], "swapped": ["pitch", "yaw"], "gearing": 4000,
         "lost_origin": 1.4, "realistic": True,
     }  # fmt: skip
-    truth = truth_of(plain | odd, 0, AXIS_NAMES, 3)
+    truth = truth_of(plain | odd, fast_config())
     assert truth.reversed == (False, False, True) and truth.swapped == (1, 0, 2)
     assert truth.drive_pulses_per_rev == (4000,) * 3
     assert truth.lost_origin_deg == (1.4,) * 3
     assert truth.jitter_counts == 1 and truth.idle_watchdog and truth.enable_delay_s
     with pytest.raises(ValueError, match="swapped must name two axes"):
-        truth_of(plain | {"swapped": ["yaw"]}, 0, AXIS_NAMES, 3)
+        truth_of(plain | {"swapped": ["yaw"]}, fast_config())
 
 
 def test_a_drive_ends_on_its_target_and_never_passes_it(monkeypatch):

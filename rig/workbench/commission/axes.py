@@ -6,7 +6,7 @@ import numpy as np
 
 from rig.core.device import Device, Posture
 from rig.core.motion import move
-from rig.core.proof import FIRST_MOTOR_DEG, unit_proved
+from rig.core.proof import FIRST_MOTOR_DEG, slopes, unit_proved
 from rig.faults import MotionFault, Refused
 from rig.journal import SIGN_CHECKED
 from rig.workbench.commission.axis_check import (
@@ -46,10 +46,15 @@ def check_axes(run: Run, device: Device) -> list[Change]:
     stop it has been tried, STOP_PROVED.
     """
     stands = measure_axes(run, device)
+    start, model, expected = stands["start"].pulses, run.model, None
     if run.config.imu is None:
-        changes, ratios = check_numbers(run.config, stands)
+        if model is not None:
+            expected = slopes(model.predict, run.config.to_deg(start))
+        changes, ratios = check_numbers(run.config, stands, expected)
         return _conclude(run, device, stands, changes, ratios, {})
-    found = find(run.config, stands)
+    if model is not None and model.rotations is not None:
+        expected = model.axes_at(run.config.to_deg(start))
+    found = find(run.config, stands, expected)
     told = [drive.pulses_per_rev() for drive in device.drives]
     ratios = ratios_of(run.config, found)
     if run.config.phone.unit == "rad":
@@ -123,8 +128,8 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
         return stands[name]
 
     names, geometry = config.axis_names, device.geometry
-    # Of numbers it does not matter which axis carries which.
-    corners = corners_of(len(config.axes)) if config.imu else []
+    # Of numbers it does not matter which axis carries which; of an arm it is known.
+    corners = corners_of(len(config.axes)) if config.imu and not config.is_arm else []
     run.say(
         f"axes: about {1 + 7 * len(names) + len(corners)} places; each axis first by "
         f"{FIRST_MOTOR_DEG:g} deg of its motor, then as far as the phone's turn "

@@ -22,6 +22,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rig.config import RigConfig
+from rig.config.axis import Axis
 from rig.core.device import Device, Posture
 from rig.core.measure import measure
 from rig.core.motion import move
@@ -33,6 +34,7 @@ from rig.workbench.run import Run
 
 CLEAR = 4.0  # standard deviations that make a difference a finding
 NEAREST = 0.7  # cosine: an axis within 45 degrees of where it is expected
+EXCHANGED = 0.3  # of the sum of cosines: exchanged drives must explain more by it
 LETTERS = ("X", "Y", "Z")
 # A smaller turn of the phone cannot be told from cross-coupling of the axes, and the
 # linear calibration takes it up as such.
@@ -145,12 +147,13 @@ def _inner(
 
 
 def check_numbers(
-    config: RigConfig, stands: Mapping[str, Stand]
+    config: RigConfig, stands: Mapping[str, Stand], expected: Array | None = None
 ) -> tuple[list[Change], list[float]]:
     """What the places say of axes that are measured by numbers.
 
     A number of the name of an axis rises with that axis; where it has its unit too, it
-    changes about as far.
+    changes about as far. Or they change as a model says, ``expected`` (m, n) for a unit
+    of each axis.
 
     Returns:
         Corrections of directions, and what a commanded unit of each axis changes.
@@ -163,6 +166,9 @@ def check_numbers(
     for j, axis in enumerate(config.axes):
         per_unit = rates[:, j] * axis.pulses_per_deg
         ratios.append(float(np.linalg.norm(per_unit)))
+        if expected is not None:
+            changes += _against(config, axis, per_unit, expected[:, j])
+            continue
         if axis.name not in config.output_names:
             continue
         own = per_unit[config.output_names.index(axis.name)]
@@ -179,6 +185,31 @@ def check_numbers(
     return changes, ratios
 
 
+def _against(
+    config: RigConfig, axis: Axis, seen: Array, expected: Array
+) -> list[Change]:
+    """An axis changed the readings as the model says, the other way, or neither."""
+    size, way = float(np.linalg.norm(seen)), float(np.linalg.norm(expected))
+    cosine = float(seen @ expected) / max(size * way, 1e-12)
+    low, high = SOUND_RATIO
+    told = (
+        f"{axis.name} changed what is measured by {size:.3g} for each {axis.unit_name} "
+        f"commanded, the model says {way:.3g}"
+    )
+    if not low * way <= size <= high * way:
+        raise MotionFault(f"{told}; sound is {low:g} to {high:g} of it. {BY_PLATE}")
+    if abs(cosine) < NEAREST:
+        raise MotionFault(
+            f"{told}, and in another direction: units, cables or readings are "
+            "exchanged, or [model] is of another device. Nothing was corrected"
+        )
+    if cosine > 0:
+        return []
+    key = f"axes.{axis.name}.direction"
+    reason = "what is measured changes the other way than the model says"
+    return [Change(key, axis.direction, -axis.direction, reason)]
+
+
 @dataclasses.dataclass(frozen=True)
 class Findings:
     """Findings by drive, in the order of the configuration's axes if not said."""
@@ -193,6 +224,7 @@ class Findings:
 def find(
     config: RigConfig,
     stands: Mapping[str, Stand],
+    expected: Array | None = None,
 ) -> Findings:
     """Read the findings from the places that ``axes.measure`` went to.
 
@@ -200,6 +232,8 @@ def find(
         config: as the moves were made.
         stands: ``start``; of each axis NAME ``NAME:look``, ``:plus``, ``:back``,
             ``:minus``; of each of ``corners_of`` its ``corner_name``.
+        expected: (3, n) axes of an arm's joints in its tip's frame at the start, of
+            which the order of the joints is known.
 
     Raises:
         MotionFault: the axes fit no joints, or the readings are no rotations.
@@ -207,7 +241,12 @@ def find(
     rates = rates_of(config, stands)
     size = np.linalg.norm(rates, axis=0)
     axes = rates / size
-    joints, signs, mounting = _placed(config, axes)
+    told = euler_to_matrix(config.phone.mounting_deg, "ZYX")
+    if expected is not None:
+        joints, signs, mounting = _placed(config, axes, expected)
+        turned = float(np.linalg.norm(turn(told, mounting)))
+        return Findings(joints, signs * size, mounting, turned, None)
+    joints, signs, mounting = _placed(config, axes, _expected(config))
     order, inner = None, _inner(config, stands, rates)
     if inner is not None:
         if not inner:
@@ -227,7 +266,6 @@ def find(
             "direction is wrong or imu.signs. Raise settle.samples, then run "
             "`jaxcal-rig axes` again"
         )
-    told = euler_to_matrix(config.phone.mounting_deg, "ZYX")
     turned = float(np.linalg.norm(turn(told, mounting)))
     return Findings(joints, signs * size, mounting, turned, order)
 
@@ -242,14 +280,22 @@ def _directions(config: RigConfig) -> Array:
     return np.array([float(axis.direction) for axis in config.axes])
 
 
-def _placed(config: RigConfig, axes: Array) -> tuple[tuple[int, ...], Array, Array]:
-    """Joint and sign of each drive, and the mounting that fits them best."""
-    expected = _expected(config)
+def _placed(
+    config: RigConfig, axes: Array, expected: Array
+) -> tuple[tuple[int, ...], Array, Array]:
+    """Joint and sign of each drive, and the mounting that fits them best.
+
+    Joints whose axes are parallel cannot be told apart: where as much is explained
+    otherwise, drives turn the joints that they are named after.
+    """
     told = euler_to_matrix(config.phone.mounting_deg, "ZYX")
     cosines = expected.T @ told @ axes  # rows: joints
     joints: tuple[int, ...] = max(
-        itertools.permutations(range(len(cosines))),
-        key=lambda order: np.abs(cosines[order, range(len(order))]).sum(),
+        itertools.permutations(range(len(cosines))),  # the first is as named
+        key=lambda order: (
+            np.abs(cosines[order, range(len(order))]).sum()
+            - EXCHANGED * (order != tuple(range(len(order))))
+        ),
     )
     own = cosines[joints, range(len(joints))]
     signs = np.sign(own)
@@ -407,7 +453,7 @@ def proposals(
         before, reason = list(config.phone.mounting_deg), "the axes put the phone"
         reason += f" {found.turned_deg:.1f} deg from there"
         changes.append(Change("imu.mounting_deg", before, angles.tolist(), reason))
-    if found.order not in (None, config.joint_order):
+    if found.order is not None and found.order != config.joint_order:
         reason = "combined moves show which joint carries which"
         order, seen = config.mechanism.order, iter(str(found.order))
         # What no joint turns about keeps its place.
@@ -435,6 +481,9 @@ def lines(config: RigConfig, found: Findings) -> list[str]:
         f"  phone: turned by [{' '.join(f'{angle:.1f}' for angle in angles)}] deg "
         f"about Z, Y, X, {found.turned_deg:.1f} from imu.mounting_deg"
     )
-    order = found.order or "not clear from these moves"
-    text.append(f"  joints from the base outwards: {order}")
+    if config.is_arm:
+        text.append("  parallel joints look alike: watch that each is the one named")
+    else:
+        order = found.order or "not clear from these moves"
+        text.append(f"  joints from the base outwards: {order}")
     return text

@@ -1,10 +1,10 @@
 """Every way that the software has to stop the drives, tried in a slow move.
 
-The axes move together, 3 degrees (or mm) either side of where they stood, or one after
-another where their line moves them in turn, and are stopped on the way: by the frame to
-each unit, by the broadcast where the map has one, and by the drives' own watch of the
-line where they have one. Each must stand short of its target, by its drive and by the
-phone, and must stay there.
+The axes move together, 3 degrees (or mm) either side of where they stood, less of more
+than three, which may add up, or one after another where their line moves them in turn,
+and are stopped on the way: by the frame to each unit, by the broadcast where the map
+has one, and by the drives' own watch of the line where they have one. Each must stand
+short of its target, by its drive and by the phone, and must stay there.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from rig.journal import STOP_PROVED
 from rig.workbench.run import Run
 
 REACH_DEG = 3.0  # either side
+ADD_UP = 3.0  # axes: more move less far
 SPEED_DEG_S = 5.0
 BEGIN, LATE = 0.3, 0.6  # share of the way at which a stop is sent, and the latest
 SHORT = 0.1  # share of the way that must be left
@@ -46,7 +47,8 @@ def prove_stops(run: Run, device: Device) -> None:
     """
     start = device.positions()
     evidence: dict[str, dict[str, float]] = {}
-    offsets = [axis.to_pulses(REACH_DEG) for axis in run.config.axes]
+    reach = REACH_DEG * min(1.0, ADD_UP / len(run.config.axes))
+    offsets = [axis.to_pulses(reach) for axis in run.config.axes]
     low = tuple(int(p) for p in np.subtract(start, offsets))
     high = tuple(int(p) for p in np.add(start, offsets))
     timeout_s = max(run.config.comm_timeouts_s.values(), default=0.0)
@@ -59,7 +61,7 @@ def prove_stops(run: Run, device: Device) -> None:
             SPEED_DEG_S,
         )
     if timeout_s:
-        left_deg = (1.0 - LATE - SHORT) * 2 * REACH_DEG
+        left_deg = (1.0 - LATE - SHORT) * 2 * reach
         slow = min(SPEED_DEG_S, left_deg / (timeout_s + SILENCE_S))
         silent = timeout_s + SILENCE_S
         ways["their watch of the line"] = (lambda: _be_silent(device, silent), slow)

@@ -10,8 +10,11 @@ from numpy.typing import ArrayLike
 from rig.config import RigConfig
 from rig.faults import MotionFault
 from rig.journal import Record, measured_postures
+from rig.model import model_of
 from rig.readings.attitude import ORDERS, frame_at
-from rig.readings.geometry import Attitudes, Geometry, geometry_of
+from rig.readings.geometry import Attitudes, geometry_of
+from rig.workbench.identification import of_model
+from rig.workbench.identification.drift import estimate_drift, without_drift
 from rig.workbench.identification.fit import (
     held_out_errors,
     identify,
@@ -21,9 +24,6 @@ from rig.workbench.identification.fit import (
 from rig.workbench.outputs.words import recalibrate
 
 USUAL = (1 / 3, 3.0)  # degrees of a joint for one commanded; outside it is told
-SIGNIFICANT = 3.0  # standard deviations, of a drift
-LEAST = 0.1  # of session.drift_limit_deg: a smaller drift is left alone
-STRAIGHT = 0.25  # of a drift: what a line leaves of it, and it is still linear
 
 
 def conclude(
@@ -42,7 +42,7 @@ def conclude(
     """
     last = {record["event"]: record for record in records}
     zero, held = last["zero"], last.get("held_out", {"pairs": []})["pairs"]
-    geometry = geometry_of(config)
+    geometry, model = geometry_of(config), model_of(config)
     postures = measured_postures(records)
     references = [r for r in postures.values() if r["role"] == "reference"]
     visits = sorted([zero, *references], key=lambda record: record["seq"])
@@ -53,101 +53,50 @@ def conclude(
             n: without_drift(r, turn, zero, geometry) for n, r in postures.items()
         }
     chosen = [r for r in postures.values() if r["role"] == "select"]
-    held_out, errors = held_out_errors(config, held, postures, identify(config, chosen))
-    zero_share = chosen[0]["samples"] / zero["samples"]
-    limits = uncertainty(chosen, held_out, zero_share)
     shared = {
         "zero_pulses": zero["pulses"],
         "zero_attitude": zero["attitude"],
         "device": config.device_fingerprint(),
         "postures": [record["name"] for record in chosen],
     }
-    if not compensated:
-        errors.pop("after", None)
-    judged = {**errors, "drift": drift}
-    reasons = recalibrate(judged, config.session.verify_limit_deg)
-    notes |= shared | {
-        "mechanism_order": config.mechanism.order,
-        "approach_overshoot_deg": config.motion.approach_overshoot_deg,
-        "noise_from": limits["basis"],
-        "drift_corrected": bool(drift and drift["corrected"]),
-        "verdict": {"good": not reasons, "reasons": reasons},
-    }
-    noise = np.maximum(1e-9, limits["noise_std_deg"])
-    calibration = identify(config, chosen, noise, notes, zero_share)
-    return calibration, {
+    told = {
         "schema": 1,
         "measured_at": zero["time"],
         "axes": list(config.axis_names),
         "outputs": list(config.output_names),
         "unit": config.output_unit,
+        "drift": drift,
+        **shared,
+    }
+    notes |= {
+        "approach_overshoot_deg": config.motion.approach_overshoot_deg,
+        "drift_corrected": bool(drift and drift["corrected"]),
+        **shared,
+    }
+    if model is not None:
+        return of_model.conclude(config, model, postures, notes, told)
+    held_out, errors = held_out_errors(config, held, postures, identify(config, chosen))
+    zero_share = chosen[0]["samples"] / zero["samples"]
+    limits = uncertainty(chosen, held_out, zero_share)
+    if not compensated:
+        errors.pop("after", None)
+    judged = {**errors, "drift": drift}
+    reasons = recalibrate(judged, config.session.verify_limit_deg)
+    notes |= {
+        "mechanism_order": config.mechanism.order,
+        "noise_from": limits["basis"],
+        "verdict": {"good": not reasons, "reasons": reasons},
+    }
+    noise = np.maximum(1e-9, limits["noise_std_deg"])
+    calibration = identify(config, chosen, noise, notes, zero_share)
+    return calibration, {
+        **told,
         "A": np.asarray(calibration.matrix).tolist(),
         "b": np.asarray(calibration.bias).tolist(),
         **limits,
-        **shared,
         "orders": order_residuals(config, zero, chosen + held_out),
         **errors,
-        "drift": drift,
     }
-
-
-def estimate_drift(
-    visits: list[Record], geometry: Geometry, limit_deg: float
-) -> dict[str, Any] | None:
-    """How far the phone's zero drifted; None where it was visited once.
-
-    The zero posture is visited first, in the middle and last. A heading that drifts
-    turns the phone's world, so a linear drift is taken out of the attitudes, never of
-    angles: ``R' = exp(-w t) R`` with w (3,) in that world. Three visits tell a linear
-    drift from any other, which cannot be taken out.
-
-    Args:
-        visits: the zero, then postures measured there, in order of time.
-        geometry: of the readings.
-        limit_deg: ``session.drift_limit_deg``.
-
-    Returns:
-        minutes (V,) and angles_deg (V, m) of the visits; size_deg, the largest angle;
-        turn_deg_per_min (3,), w; corrected: it is linear and to be taken out; left_deg,
-        what is in the measurements then; limit_deg, and whether left is over it.
-    """
-    zero = visits[0]
-    if len(visits) < 2:
-        return None
-    minutes = np.array([visit["time"] - zero["time"] for visit in visits]) / 60.0
-    later = [visit["measured_deg"] for visit in visits[1:]]
-    seen = np.array([np.zeros(len(later[0])), *later])
-    attitudes = np.array([visit["attitude"] for visit in visits])
-    turn = geometry.drift(attitudes, minutes)
-    rest = [without_drift(visit, turn, zero, geometry) for visit in visits[1:]]
-    bend = np.abs([visit["measured_deg"] for visit in rest]).max(axis=0)
-    noise = sum(np.square(v["std_deg"]) / v["samples"] for v in (zero, visits[-1]))
-    least = np.maximum(SIGNIFICANT * np.sqrt(noise), LEAST * limit_deg)
-    size, end = float(np.abs(seen).max()), np.abs(seen[-1])
-    straight = bool((bend <= np.maximum(least, STRAIGHT * end.max())).all())
-    corrected = len(visits) == 3 and straight and bool((end > least).any())
-    left = float(bend.max()) if corrected else size
-    return {
-        "minutes": minutes.round(4).tolist(),
-        "angles_deg": seen.tolist(),
-        "size_deg": size,
-        "turn_deg_per_min": turn.tolist(),
-        "corrected": corrected,
-        "left_deg": left,
-        "limit_deg": limit_deg,
-        "over": left > limit_deg,
-    }
-
-
-def without_drift(
-    record: Record, turn: ArrayLike, zero: Record, geometry: Geometry
-) -> Record:
-    """A record without a drift: (3,) degrees a minute of the phone's world, or (m,)."""
-    minutes = (record["time"] - zero["time"]) / 60.0
-    attitude = geometry.without(np.array(record["attitude"]), turn, minutes)
-    frame = geometry.frame(np.array(zero["attitude"]))
-    measured = frame.angles(attitude).tolist()
-    return {**record, "attitude": attitude.tolist(), "measured_deg": measured}
 
 
 def order_residuals(

@@ -1,8 +1,8 @@
-"""A recorded calibration identified anew: same readings, other orders or mounting.
+"""A recorded calibration identified anew: same readings, read in another way.
 
 The phone's angles are what was recorded, whatever was made of them: the attitude of a
 reading is taken apart under the order and signs of then and put together under those of
-now.
+now. Numbers are counts times factors.
 """
 
 from __future__ import annotations
@@ -23,10 +23,9 @@ from rig.readings.attitude import (
     DIGITS,
     Array,
     euler_to_matrix,
-    frame_at,
     matrix_to_euler,
-    mean_rotation,
 )
+from rig.readings.geometry import geometry_of
 from rig.workbench.identification.conclusion import check_matrix, conclude
 from rig.workbench.outputs.report import save_result
 from rig.workbench.toml import set_values
@@ -43,7 +42,7 @@ def reread(records: list[Record], then: RigConfig, now: RigConfig) -> list[Recor
     Args:
         records: of the journal of a calibration.
         then: its configuration.
-        now: the same but for orders, signs and mounting.
+        now: the same but for orders, signs, mounting or factors.
 
     Raises:
         Refused: not enough was measured to identify from.
@@ -56,33 +55,85 @@ def reread(records: list[Record], then: RigConfig, now: RigConfig) -> list[Recor
             f"the run holds {len(chosen)} of the {then.k} chosen postures that "
             "a calibration takes. Finish it first with `jaxcal-rig resume`"
         )
-    if then.imu is None or now.imu is None:
-        raise Refused("the run was measured by numbers, which are read in one way only")
-    phone, new = then.phone, now.phone
-    same = (phone.order, phone.signs) == (new.order, new.signs)
-    signs = np.array(phone.signs) * np.array(new.signs)
-    frame = None
+    geometry, frame = geometry_of(now), None
+    values_of = _numbers(then, now) if then.imu is None else _attitudes(then, now)
 
     def read(record: Record) -> Record:
         nonlocal frame
-        turned = attitudes(record)
-        if not same:
-            sent = matrix_to_euler(turned, str(phone.order))
-            turned = euler_to_matrix(sent * signs, str(new.order))
-        attitude = mean_rotation(turned)
-        frame = frame or frame_at(now, attitude)  # of the zero, which comes first
-        spread = frame.angles(turned)
+        values, raw = values_of(record)
+        attitude = geometry.mean(values)
+        frame = frame or geometry.frame(attitude)  # of the zero, which comes first
+        spread = frame.angles(values)
         std = spread.std(axis=0, ddof=1) if len(spread) > 1 else 0.0 * spread[0]
-        quaternions = Rotation.from_matrix(turned).as_quat(canonical=True)
         return record | {
             "measured_deg": frame.angles(attitude).round(9).tolist(),
             "std_deg": std.round(6).tolist(),
             "attitude": attitude.round(12).tolist(),
-            "quaternions": quaternions.round(DIGITS).tolist(),
+            **raw,
         }
 
     held = [r for r in records if r["event"] == "held_out"][-1:]
     return [read(zeros[-1]), *held, *map(read, postures.values())]
+
+
+def _attitudes(then: RigConfig, now: RigConfig) -> Callable[[Record], Any]:
+    """What reads the phone's attitudes of a record, and the fields that hold them."""
+    phone, new = then.phone, now.phone
+    same = (phone.order, phone.signs) == (new.order, new.signs)
+    signs = np.array(phone.signs) * np.array(new.signs)
+
+    def read(record: Record) -> tuple[Array, Record]:
+        turned = attitudes(record)
+        if not same:
+            sent = matrix_to_euler(turned, str(phone.order))
+            turned = euler_to_matrix(sent * signs, str(new.order))
+        quaternions = Rotation.from_matrix(turned).as_quat(canonical=True)
+        return turned, {"quaternions": quaternions.round(DIGITS).tolist()}
+
+    return read
+
+
+def _numbers(then: RigConfig, now: RigConfig) -> Callable[[Record], Any]:
+    """Likewise the numbers of a sensor."""
+    assert then.readings is not None and now.readings is not None
+    factors = np.divide(now.readings.factors or 1.0, then.readings.factors or 1.0)
+
+    def read(record: Record) -> tuple[Array, Record]:
+        values = np.array(record["readings"]) * factors
+        return values, {"readings": values.tolist()}
+
+    return read
+
+
+def _changed(then: RigConfig, wanted: dict[str, Any]) -> dict[str, list[Any]]:
+    """Keys that are to be read otherwise, as they were and as they will be.
+
+    Raises:
+        Refused: a key is not of what the run was measured with.
+    """
+    imu, described = then.imu, json.loads(json.dumps(then.described()))
+    changed = {}
+    for name, value in wanted.items():
+        if value is None:
+            continue
+        table, _, key = name.partition(".")
+        if table == "imu" and imu is None:
+            raise Refused(f"{name} is of a phone; the run was measured by numbers")
+        if table == "readings" and imu is not None:
+            raise Refused(f"{name} is of numbers; the run was measured by a phone")
+        if table == "mechanism" and (imu is None or then.is_arm):
+            raise Refused(f"{name} is of a phone on three joints, not of this device")
+        old, new = described[table][key], json.loads(json.dumps(value))
+        if old != new:
+            changed[name] = [old, value]
+    quaternions = imu and (imu.format == "sensorlogger" or imu.quaternion_columns)
+    for name in changed.keys() & {"imu.order", "imu.signs"} if quaternions else ():
+        raise Refused(
+            f"{name} cannot be changed to {changed[name][1]}: this phone sent "
+            "quaternions, which have neither order nor signs. Look at mechanism.order "
+            "and imu.mounting_deg"
+        )
+    return changed
 
 
 def refit(
@@ -107,28 +158,18 @@ def refit(
     Raises:
         Refused: the run does not allow it; nothing was written.
     """
-    start, imu, described = held[0], then.imu, held[0]["config"]
-    if imu is None:
-        raise Refused("the run was measured by numbers, which are read in one way only")
-    old = {k: described[k.partition(".")[0]][k.partition(".")[2]] for k in wanted}
-    new = {k: v for k, v in wanted.items() if v is not None and v != old[k]}
-    quaternions = imu.format == "sensorlogger" or imu.quaternion_columns is not None
-    for name in new.keys() & {"imu.order", "imu.signs"} if quaternions else ():
-        raise Refused(
-            f"{name} cannot be changed to {new[name]}: this phone sent quaternions, "
-            "which have neither order nor signs. Look at mechanism.order and "
-            "imu.mounting_deg"
-        )
-    text = set_values(then.text, new)
+    start, changed = held[0], _changed(then, wanted)
+    text = set_values(then.text, {key: value for key, (_, value) in changed.items()})
     now = parse_config(text, pathlib.Path(start["maps_from"]), str(folder))
-    changed = {key: [old[key], value] for key, value in new.items()}
     records = reread(held, then, now)
     notes = {"refit_of": folder.name, "simulated": start["simulated"] is not None}
     calibration, summary = conclude(now, records, notes, compensated=not changed)
-    try:
-        warnings = check_matrix(now, calibration.matrix)
-    except MotionFault as fault:
-        raise Refused(f"nothing was written: read like this, {fault}") from None
+    warnings = []
+    if now.model is None:
+        try:
+            warnings = check_matrix(now, calibration.matrix)
+        except MotionFault as fault:
+            raise Refused(f"nothing was written: read like this, {fault}") from None
     summary |= {
         "mode": "refit",
         "refit_of": folder.name,

@@ -64,9 +64,9 @@ def plan_lines(
     speeds = np.array([axis.speed_deg_s for axis in config.axes])
     seconds = (ways / speeds).max(axis=1).sum() / config.k
     seconds += settle.window_s + 0.02 * settle.samples + 0.1
-    total = seconds * (config.k + 2 * session.verify_postures + 2)
+    visits, both = (2, ", before and after") if config.model is None else (1, "")
+    total = seconds * (config.k + visits * session.verify_postures + 2)
     lines.append(
-        f"  with {session.verify_postures} held-out postures, before and after, about "
-        f"{total:.0f} s"
+        f"  with {session.verify_postures} held-out postures{both}, about {total:.0f} s"
     )
     return lines

@@ -45,6 +45,12 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
     """
     import jaxcal
 
+    if model := records[0]["config"].get("model"):
+        use = "calibrated.urdf in its folder" if model["urdf"] else "calibration.json"
+        raise Refused(
+            f"{folder}: the inverse map is that of an affine device, this one has a "
+            f"[model]. Use {use}"
+        )
     path = folder / "calibration.json"
     try:
         calibration: Any = jaxcal.Calibration.load(path)

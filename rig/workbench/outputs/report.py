@@ -10,6 +10,7 @@ import datetime
 import functools
 import json
 import pathlib
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -35,13 +36,22 @@ def save_result(
 ) -> int:
     """Write what a calibration comes to, say what it holds; returns the exit code."""
     calibration.save(run.folder / "calibration.json")
+    saved = ["calibration.json", "pairs.csv", "summary.json", "report.html"]
+    if run.config.is_arm:
+        summary["urdf"] = "calibrated.urdf"
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            calibration.to_urdf(run.folder / summary["urdf"], force=True)
+        for warning in caught:
+            say(f"  note: {warning.message}")
+        saved.insert(1, summary["urdf"])
     run.save_pairs()
     run.save_summary(summary)
     write_report(run.folder, run.journal.records)
     limit = run.config.session.verify_limit_deg
     for line in summary_lines(summary, limit):
         say(line)
-    say(f"saved: {run.folder}/calibration.json, pairs.csv, summary.json, report.html")
+    say(f"saved: {run.folder}/{', '.join(saved)}")
     return EXIT_RECALIBRATE if recalibrate(summary, limit) else EXIT_OK
 
 
@@ -84,8 +94,10 @@ def _result(state: RunState, summary: Record) -> list[Section]:
     ]
     if "before" in summary:
         shown = {"raw": "before", "compensated": "after"}
+        if state.start["config"].get("model"):
+            shown = {"as designed": "before", "calibrated": "prediction"}
         each = {t: summary[key]["each"] for t, key in shown.items() if key in summary}
-        alt = "held-out errors in degrees, raw and compensated"
+        alt = f"held-out errors in {state.unit}, {' and '.join(each)}"
         names = summary.get("outputs", state.names[1])
         draw = functools.partial(draw_errors, names=names, unit=state.unit)
         parts.append(drawn(draw, each, (9, 3.4), alt))

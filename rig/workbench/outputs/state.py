@@ -7,6 +7,7 @@ a page that is opened late shows the same as one that was there from the beginni
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 from rig.config.axis import Scale
@@ -23,10 +24,16 @@ TITLES = {  # of a posture, by its role
     "select": "posture {}",
     "before": "target {}, raw",
     "after": "target {}, compensated",
+    "held": "target {}",
     "reference": "zero posture, {}",
     "collect": "posture {}",
     "goto": "desired posture",
 }
+
+
+def roles_of(held: Sequence[Any]) -> tuple[str, ...]:
+    """Roles of the visits of a held-out target: raw and compensated, or one."""
+    return ("before", "after") if len(held) == 2 else ("held",)
 
 
 @dataclasses.dataclass
@@ -101,7 +108,7 @@ class RunState:
                     self._posture(f"select:{index}").commanded = self.candidates[index]
             case "held_out":
                 for number, pair in enumerate(record["pairs"]):
-                    for role, pulses in zip(("before", "after"), pair, strict=True):
+                    for role, pulses in zip(roles_of(pair), pair, strict=True):
                         self._posture(f"{role}:{number}", pulses)
             case "collection":
                 for number, pulses in enumerate(record["pulses"]):
@@ -228,10 +235,11 @@ class RunState:
         roles = [p.role for p in self.postures.values() if p.state not in LOST]
         if self.mode != "calibrate" or self.ended is not None:
             return len(roles)
-        pairs = (
-            0 if "before" in roles else self.setting("session", "verify_postures", 0)
-        )
-        return len(roles) + 2 * pairs + 2 - roles.count("reference")
+        targets = self.setting("session", "verify_postures", 0)
+        visits = targets * (1 if self.start.get("config", {}).get("model") else 2)
+        if "before" in roles or "held" in roles:
+            visits = 0
+        return len(roles) + visits + 2 - roles.count("reference")
 
     def left_s(self) -> float:
         """Seconds to the end, from the pace so far; 0 where it is not known."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import json
+import math
 import pathlib
 
 import numpy as np
@@ -69,7 +70,7 @@ def _device(runs: list[Record]) -> Device:
     device = Device(runs[0]["device"], [], [], [])
     for run in sorted(runs, key=lambda run: run["time"]):
         moved, error = "", "not measured"
-        if "A" in run:
+        if "A" in run or "parameters" in run:
             before = device.calibrations[-1:]
             moved = (
                 (", ".join(_moved(before[0], run)) or "nothing") if before else "first"
@@ -87,6 +88,8 @@ def _device(runs: list[Record]) -> Device:
 
 def _moved(before: Record, now: Record) -> list[str]:
     """Parameters that differ by more than their intervals allow, A before b."""
+    if "parameters" in now:
+        return _moved_parameters(before["parameters"], now["parameters"])
     then, new = (np.column_stack([run["A"], run["b"]]) for run in (before, now))
     change, allowed = new - then, np.hypot(now["ci95"], before["ci95"])
     axes, last = now["axes"], len(now["axes"])
@@ -97,6 +100,19 @@ def _moved(before: Record, now: Record) -> list[str]:
         for i, j in sorted(np.ndindex(change.shape), key=lambda at: at[1] == last)
         if abs(change[i, j]) > allowed[i, j]
     ]
+
+
+def _moved_parameters(before: Record, now: Record) -> list[str]:
+    """The same of a model's."""
+    moved = []
+    for name, found in now.items():
+        if name not in before or found["half_width"] is None:
+            continue
+        change = found["value"] - before[name]["value"]
+        allowed = math.hypot(found["half_width"], before[name]["half_width"] or 0.0)
+        if abs(change) > allowed:
+            moved.append(f"{name} {change:+.4g} (interval {allowed:.4g})")
+    return moved
 
 
 def trend_lines(device: Device) -> list[str]:
@@ -123,7 +139,7 @@ def write_trend(folder: pathlib.Path, devices: list[Device]) -> pathlib.Path:
             Text(device.verdict, "warning" if bad else ""),
             Table(HEAD, device.rows, numeric=False),
         ]
-        if device.calibrations:
+        if device.calibrations and "A" in device.calibrations[-1]:
             alt = "A and b over time, with their 95 % intervals"
             blocks.append(drawn(draw_parameters, device.calibrations, (11, 7), alt))
         rows = [[key, json.dumps(v)] for key, v in device.fingerprint.items()]

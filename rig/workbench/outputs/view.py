@@ -9,7 +9,12 @@ from typing import Any
 from rig.core.stop import UnitStop
 from rig.faults import EXIT_RECALIBRATE
 from rig.workbench.outputs.state import ACTIVE, SESSIONS, Posture, Record, RunState
-from rig.workbench.outputs.words import error_text, event_lines, summary_lines
+from rig.workbench.outputs.words import (
+    error_text,
+    event_lines,
+    prediction_text,
+    summary_lines,
+)
 
 SHOWN = 40  # rows of a long queue
 STALE_S = 1.0
@@ -149,8 +154,10 @@ def queue(state: RunState) -> list[Posture]:
 def verdict(state: RunState, summary: dict[str, Any]) -> list[str]:
     """The result of a run, as on the console; empty before there is one."""
     limit = state.setting("session", "verify_limit_deg", math.nan)
-    if "A" in summary:
+    if "A" in summary or "parameters" in summary:
         return summary_lines(summary, limit)
+    if "before" in summary and "after" not in summary:
+        return [f"{prediction_text(summary, state.unit)}, limit {limit:g}"]
     if "before" in summary:
         return [f"{error_text(summary, state.unit)}, limit {limit:g}"]
     if state.ended is None or state.ended["event"] != "end":

@@ -89,8 +89,8 @@ SENTENCES: dict[str, str | Callable[[Record], str]] = {
     "zero": "zero taken at pulses {pulses}",
     "void": lambda r: f"  withdrawn, to be measured again: {', '.join(r['names'])}",
     "replan": lambda r: (
-        "  the postures that are left were selected again: log det "
-        f"{r['choice']['log_det']:.4f}; visits of candidates "
+        "  the postures that are left were selected again: "
+        f"{choice_text(r['choice'])}; visits of candidates "
         f"{', '.join(map(str, r['choice']['indices']))}"
     ),
     "pausing": "pausing after this posture; another Ctrl-C stops at once",
@@ -123,6 +123,8 @@ def numbers(values: Any, width: int = 9, digits: int = 4) -> str:
 
 def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
     """A and b with their intervals, the errors and any warning."""
+    if "parameters" in summary:
+        return _model_lines(summary, limit_deg)
     outputs = summary.get("outputs", summary["axes"])
     count = np.size(summary["ci95"])
     number = NUMBERS.get(count, count)
@@ -152,18 +154,51 @@ def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
         lines.append(f"drift: {drift_text(summary['drift'], outputs, unit)}")
     if summary["orders"]["warning"]:
         lines.append(f"WARNING: {summary['orders']['warning']}")
+    return [*lines, _verdict_line(summary, limit_deg, "`jaxcal-rig export` writes it")]
+
+
+def _verdict_line(summary: dict[str, Any], limit_deg: float, use: str) -> str:
     if reasons := recalibrate(summary, limit_deg):
-        lines.append(
+        return (
             f"RECALIBRATE: {' and '.join(reasons)}. Do not use this calibration; next: "
             "find the cause (report.html shows each posture), then `jaxcal-rig "
             "calibrate`"
         )
-    else:
+    return (
+        f"good; next: {use} for a controller, `jaxcal-rig verify` checks it again later"
+    )
+
+
+def _model_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
+    """Parameters of a model with their intervals, the errors and the verdict."""
+    unit, count = summary["unit"], len(summary["postures"])
+    lines = [f"model {summary['model']}, fitted to {count} postures, +- 95 % each:"]
+    for name, found in summary["parameters"].items():
+        wide = found["half_width"]
+        sure = "" if wide is None else f" +- {wide:.4g}"
         lines.append(
-            "good; next: `jaxcal-rig export` writes it for a controller, `jaxcal-rig "
-            "verify` checks it again later"
+            f"  {name:<14} {found['value']:11.5g}{sure}  (designed "
+            f"{found['designed']:.5g})"
         )
-    return lines
+    if "prediction" in summary:
+        lines.append(f"held-out {prediction_text(summary, unit)}")
+    lines += [f"  note: {reason}" for reason in summary["fit"]["reasons"]]
+    if summary.get("drift"):
+        told = drift_text(summary["drift"], summary["outputs"], unit)
+        lines.append(f"drift: {told}")
+    use = "calibration.json (jaxcal command, jaxcal predict)"
+    if summary.get("urdf"):
+        use = f"{summary['urdf']} in the run's folder"
+    return [*lines, _verdict_line(summary, limit_deg, use)]
+
+
+def prediction_text(errors: dict[str, Any], unit: str) -> str:
+    """Errors of predictions at held-out postures, as designed and calibrated."""
+    before, after = errors["before"], errors["prediction"]
+    return (
+        f"error of the prediction: as designed {before['rms']:.4f} {unit} rms (max "
+        f"{before['max']:.4f}), calibrated {after['rms']:.4f} (max {after['max']:.4f})"
+    )
 
 
 def held_out(summary: dict[str, Any]) -> tuple[str, float]:
@@ -184,6 +219,8 @@ def recalibrate(summary: dict[str, Any], limit_deg: float) -> list[str]:
         most = summary["drift"]["limit_deg"]
         limit = f"session.drift_limit_deg ({most:g} {unit})"
         reasons.append(f"the drift of the zero that is left exceeds {limit}")
+    if "prediction" not in summary and not summary.get("fit", {}).get("good", True):
+        reasons += summary["fit"]["reasons"]  # of a model, by its readings alone
     return reasons
 
 
@@ -211,6 +248,11 @@ def drift_text(drift: dict[str, Any], outputs: Sequence[str], unit: str = "deg")
 
 def choice_text(choice: dict[str, Any]) -> str:
     """How the postures were chosen, and how good they are."""
+    if choice.get("criterion", "D") != "D":
+        return (
+            f"{choice['method']}: {choice['criterion']}-efficiency "
+            f"{choice['efficiency']:.4f} or more"
+        )
     rank = "proven optimum" if choice["proven"] else "best known"
     gap = choice["best_log_det"] - choice["log_det"]
     return (

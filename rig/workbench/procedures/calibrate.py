@@ -16,6 +16,7 @@ from rig.readings.attitude import Array
 from rig.workbench.identification.conclusion import check_matrix, conclude
 from rig.workbench.identification.fit import identify
 from rig.workbench.outputs.console import plan_lines
+from rig.workbench.outputs.state import roles_of
 from rig.workbench.procedures.plan import (
     Choice,
     choose,
@@ -38,8 +39,10 @@ def calibrate(run: Run) -> int:
             _visit_chosen(run, device, candidates, choice)
             run.emit("phase", phase="saving")
             chosen = [r for r in run.postures().values() if r["role"] == "select"]
-            first = identify(config, chosen)
-            _check_gains(run, first.matrix)
+            first = None
+            if run.model is None:
+                first = identify(config, chosen)
+                _check_gains(run, first.matrix)
             held = _held_out(run, first)
             if held:
                 visit(device, Posture(MIDDLE, run.zero_pulses), role="reference")
@@ -135,7 +138,7 @@ def _held_out(run: Run, calibration: Any) -> list[Any]:
     ]
     if known and not (voids and voids[-1] > known[-1]["seq"]):
         return known[-1]["pairs"]
-    stale = [n for n in run.postures() if n.startswith(("before:", "after:"))]
+    stale = [n for n in run.postures() if n.startswith(("before:", "after:", "held:"))]
     if stale:
         run.emit("void", sync=True, names=stale)
     wanted = run.config.session.verify_postures
@@ -150,13 +153,15 @@ def _held_out(run: Run, calibration: Any) -> list[Any]:
 
 def pair_names(held: list[Any]) -> list[str]:
     """Names of the visits of held-out targets, all raw and then all compensated."""
-    return [f"{role}:{i}" for role in ("before", "after") for i in range(len(held))]
+    roles = roles_of(held[0]) if held else ()
+    return [f"{role}:{i}" for role in roles for i in range(len(held))]
 
 
 def visit_pairs(run: Run, device: Device, held: list[Any]) -> None:
     """Visit held-out targets raw and compensated, in the order of least travel."""
     names = pair_names(held)
-    targets = [pair[number] for number in (0, 1) for pair in held]
+    visits = range(len(held[0])) if held else ()
+    targets = [pair[number] for number in visits for pair in held]
     points = run.config.to_deg(targets or np.empty((0, len(run.config.axes))))
     start = run.config.to_deg(run.zero_pulses)
     queue = travel_order(run.config, points, start)

@@ -11,7 +11,9 @@ from rig.config import RigConfig
 from rig.core.device import Posture
 from rig.core.session import visit
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
+from rig.readings.attitude import Array
 from rig.readings.geometry import Frame, geometry_of
+from rig.workbench.identification import of_model
 from rig.workbench.run import Run
 
 
@@ -21,7 +23,7 @@ def goto(run: Run, calibration: Any, to: Sequence[float]) -> int:
     if len(desired) != len(config.output_names):
         outputs = ", ".join(config.output_names)
         raise Refused(f"--to must be {outputs}, got {len(desired)} numbers")
-    command = np.asarray(calibration.command_for(desired), dtype=np.float64)
+    command = _command(config, calibration, desired)
     for axis, value in zip(config.axes, command, strict=True):
         if not axis.min_deg <= value <= axis.max_deg:
             raise LimitError(
@@ -49,11 +51,26 @@ def goto(run: Run, calibration: Any, to: Sequence[float]) -> int:
     if record is None:
         return EXIT_RECALIBRATE
     reached = np.array(record["measured_deg"])
+    if run.model is not None:
+        reached = of_model.outputs(config, [record])[1][0]
     run.say(
         f"reached {reached.round(4).tolist()} {config.output_unit}, off by "
         f"{(reached - desired).round(4).tolist()}"
     )
     return EXIT_OK
+
+
+def _command(config: RigConfig, calibration: Any, desired: Array) -> Array:
+    """(n,) what gives (m,) desired measurements."""
+    more: dict[str, Any] = {}
+    if config.model is not None:
+        more["limits"] = [(axis.min_deg, axis.max_deg) for axis in config.axes]
+    try:
+        return np.asarray(calibration.command_for(desired, **more), dtype=np.float64)
+    except ValueError as error:
+        if config.model is None:
+            raise
+        raise Refused(f"goto: no command gives {desired.tolist()}: {error}") from None
 
 
 def unchecked(

@@ -12,6 +12,7 @@ from jaxcal.models import Affine
 from jaxcal.selection.fastest import Motion, fastest_tour, travel_times
 from rig.config import RigConfig
 from rig.config.axis import Pulses
+from rig.model import DeviceModel, model_of
 from rig.readings.attitude import Array
 
 EXACT_LIMIT_S = 20.0  # for the proof that the choice is (or is not) the optimum
@@ -30,6 +31,7 @@ class Choice:
     proven: bool  # that best is the proven optimum
     method: str
     note: str = ""
+    criterion: str = "D"
 
 
 def draw(config: RigConfig, count: int, *seed: int) -> Array:
@@ -63,6 +65,12 @@ def choose(
     import jaxcal
 
     session, replanning = config.session, available is not None
+    if (made := model_of(config)) is not None:
+        limit = REPLAN_LIMIT_S if replanning else EXACT_LIMIT_S
+        return _choose_by_model(
+            config, made, candidates_deg, limit, available=available,
+            required=list(required) or None,
+        )  # fmt: skip
     n, m = len(config.axes), len(config.output_names)
     model, parameters = None if m == n else Affine(n, m), m * (n + 1)
     limit = REPLAN_LIMIT_S if replanning else EXACT_LIMIT_S
@@ -108,6 +116,35 @@ def choose(
     )
 
 
+def _choose_by_model(
+    config: RigConfig, made: DeviceModel, candidates: Array, limit_s: float, **more: Any
+) -> Choice:
+    """Those whose measurements predict best what any candidate measures (I)."""
+    import jaxcal
+
+    session = config.session
+    design = jaxcal.Design(candidates, model=made.model, prior=made.prior, **more)
+    options: dict[str, Any] = {"seed": session.seed}
+    method = session.method or "auto"
+    if method == "auto":
+        options |= {"least_efficiency": session.min_efficiency, "time_limit": limit_s}
+    elif method == "exact":
+        options["time_limit"] = limit_s
+    elif method == "greedy":
+        options = {}
+    chosen = design.select(config.k, method=method, **options)
+    return Choice(
+        indices=tuple(int(i) for i in chosen.indices),
+        log_det=float(chosen.log_det),
+        best_log_det=float(chosen.log_det),
+        efficiency=float(chosen.efficiency),
+        proven=bool(chosen.proven),
+        method=str(chosen.method),
+        note=str(chosen.reason),
+        criterion=chosen.criterion,
+    )
+
+
 def travel_order(config: RigConfig, points_deg: Array, start_deg: Array) -> list[int]:
     """Order of visits of (N, n) points of least travel time from (n,), ending anywhere.
 
@@ -133,13 +170,16 @@ def travel_order(config: RigConfig, points_deg: Array, start_deg: Array) -> list
 
 def draw_held_out(
     config: RigConfig, calibration: Any, count: int
-) -> list[tuple[Pulses, Pulses]]:
+) -> list[tuple[Pulses, ...]]:
     """Held-out targets in pulses, each as it is and as its compensated command.
 
-    Fewer than ``count`` where little of the range can be reached compensated.
+    Fewer than ``count`` where little of the range can be reached compensated. By a
+    ``[model]`` they are predicted, and visited once.
     """
+    if config.model is not None:
+        return [(tuple(pulses.tolist()),) for pulses in draw(config, count, 1)]
     low, high = np.array(config.ranges).T
-    pairs: list[tuple[Pulses, Pulses]] = []
+    pairs: list[tuple[Pulses, ...]] = []
     for pulses in draw(config, 200 * count, 1):
         if len(pairs) == count:
             break

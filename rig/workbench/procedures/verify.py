@@ -12,8 +12,10 @@ from rig.config.axis import Pulses
 from rig.config.config import differences
 from rig.core.record_check import KeptZero
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
+from rig.model import model_of
+from rig.workbench.identification import of_model
 from rig.workbench.identification.fit import held_out_errors, pairs
-from rig.workbench.outputs.words import error_text, numbers
+from rig.workbench.outputs.words import error_text, numbers, prediction_text
 from rig.workbench.procedures.calibrate import pair_names, visit_pairs
 from rig.workbench.procedures.plan import draw_held_out
 from rig.workbench.run import Run
@@ -39,7 +41,9 @@ def load_calibration(
 
     path = path / "calibration.json" if path.is_dir() else path
     try:
-        calibration = jaxcal.Calibration.load(path)
+        made = None if config.is_arm else model_of(config)  # a file holds an arm
+        own = None if made is None else made.model
+        calibration = jaxcal.Calibration.load(path, model=own)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise Refused(f"{path}: not a calibration: {error}") from None
     notes = calibration.provenance.get("notes", {})
@@ -84,25 +88,35 @@ def verify(run: Run, calibration: Any, count: int) -> int:
             "Widen the ranges, or calibrate again"
         )
     if run.dry_run:
-        for raw, command in held:
-            run.say(f"  target {numbers(config.to_deg(raw))}  command {list(command)}")
+        for target in held:
+            run.say(
+                f"  target {numbers(config.to_deg(target[0]))}  command "
+                f"{list(target[-1])}"
+            )
     if run.lacks(pair_names(held)):
         with run.device() as device:
             visit_pairs(run, device, held)
             run.emit("phase", phase="saving")
-    records, found = held_out_errors(config, held, run.postures(), calibration)
+    if run.model is not None:
+        records = [r for r in run.postures().values() if r["role"] == "held"]
+        found = of_model.held_out_errors(config, run.model, calibration, records)
+    else:
+        records, found = held_out_errors(config, held, run.postures(), calibration)
     if not found:
         raise Refused(
             "no held-out posture could be reached. Narrow session.*_range_deg to what "
             "the device reaches"
         )
     limit = config.session.verify_limit_deg
-    again = found["after"]["max"] > limit
+    worst = "after" if run.model is None else "prediction"
+    words = error_text if run.model is None else prediction_text
+    again = found[worst]["max"] > limit
     run.save_pairs()
     run.save_summary({**found, "limit_deg": limit, "recalibrate": again})
-    run.say(f"{error_text(found, config.output_unit)}, limit {limit:g}")
+    run.say(f"{words(found, config.output_unit)}, limit {limit:g}")
     if calibration.noise_std is not None:
-        told = calibration.check(*pairs(records), tolerance=limit)
+        rows = of_model.outputs(config, records) if run.model else pairs(records)
+        told = calibration.check(*rows, tolerance=limit)
         run.say(f"a drift that moves it by {limit:g} is seen with {told.power:.0%}")
     over = "RECALIBRATE: over session.verify_limit_deg. Run `jaxcal-rig calibrate`"
     run.say(over if again else "the calibration still holds")
@@ -111,10 +125,10 @@ def verify(run: Run, calibration: Any, count: int) -> int:
 
 def telling(
     config: RigConfig, calibration: Any, count: int
-) -> list[tuple[Pulses, Pulses]]:
+) -> list[tuple[Pulses, ...]]:
     """Held-out targets, of many, that show best that the calibration is wrong."""
     offered = draw_held_out(config, calibration, _OFFERED * count)
     if calibration.noise_std is None or len(offered) <= count:
         return offered[:count]
-    at = np.array([config.to_deg(command) for _, command in offered])
+    at = np.array([config.to_deg(target[-1]) for target in offered])
     return [offered[i] for i in calibration.verification(at, count)]
