@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import operator
 from collections.abc import Sequence
 from typing import Any
@@ -115,11 +116,17 @@ def require_kind(argument: str, value: Any, kind: type) -> None:
         )
 
 
-def table(name: str, values: ArrayLike) -> Array:
+def table(name: str, values: ArrayLike, count: int | None = None) -> Array:
+    """Values (N, n) as float64; ``count``: N, where it is that of the commands."""
     table = numbers(name, values)
     if table.ndim != 2 or table.shape[1] < 1:
         raise ValueError(
             f"{name} must have shape (N, {'m' if name == 'measured' else 'n'}), "
+            f"got {table.shape}"
+        )
+    if count is not None and len(table) != count:
+        raise ValueError(
+            f"{name} must have shape ({count}, m): as many rows as commands, "
             f"got {table.shape}"
         )
     return table
@@ -148,12 +155,17 @@ def axis_names(
     argument: str, names: Sequence[str] | None, letter: str, count: int
 ) -> tuple[str, ...]:
     if names is None:
-        return tuple(f"{letter}_{axis_letter(i, count)}" for i in range(count))
+        return _axis_names(letter, count)
     given = () if isinstance(names, str) else tuple(names)
     texts = all(isinstance(name, str) and name for name in given)
     if len(given) != count or not texts or len(set(given)) < count:
         raise ValueError(f"{argument} must hold {count} different names, got {names!r}")
     return given
+
+
+@functools.lru_cache
+def _axis_names(letter: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{letter}_{axis_letter(i, count)}" for i in range(count))
 
 
 def one_of(argument: str, value: Any, choices: Sequence[str]) -> str:

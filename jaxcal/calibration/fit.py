@@ -196,8 +196,8 @@ class Fit:
         from scipy import special
 
         chance = special.chdtrc(self.num_readings, self.distance)
-        at = np.flatnonzero(chance < 0.01 / self.num_measurements)
-        return {int(i): float(self.loss_weights[i]) for i in at}
+        (rows,) = (chance < 0.01 / self.num_measurements).nonzero()
+        return {int(i): float(self.loss_weights[i]) for i in rows}
 
     def lack_of_fit(self) -> float | None:
         """p-value of residuals at least this large under the noise that was given.
@@ -332,6 +332,8 @@ class Fit:
 
 def _copied(content: Any) -> Any:
     """A copy of what JSON can hold."""
+    if isinstance(content, str):
+        return content
     if isinstance(content, Mapping):
         return {key: _copied(value) for key, value in content.items()}
     return [*map(_copied, content)] if isinstance(content, list) else content

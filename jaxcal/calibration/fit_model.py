@@ -23,10 +23,15 @@ from jaxcal.calibration.prior_scales import (
     misfit_scale,
 )
 from jaxcal.checks import one_of, require_kind
-from jaxcal.information.singular import exact_zeros, null_directions, significant
+from jaxcal.information.singular import (
+    exact_zeros,
+    null_directions,
+    require_excited,
+    significant,
+)
 from jaxcal.models.identifiability import unknown
 from jaxcal.models.model import Model, as_model, derivative
-from jaxcal.models.uncertainty import Noise, Prior, ResolvedPrior
+from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["fit_model", "require_fitting"]
 
@@ -35,7 +40,6 @@ Array = NDArray[np.float64]
 # Of -2 log likelihood, what misfit must gain where readings of one place do not tell
 # how it goes on elsewhere.
 _TOLD = 20.0
-_MANY = 64  # readings of a measurement from which no matrix of their noise is made
 
 
 def require_fitting(model: Any, commands: Array, measured: Array) -> Model:
@@ -68,42 +72,50 @@ def fit_model(
     noise: Noise | None,
     loss: str,
     common_noise: bool | None,
+    excited: tuple[str, ...] = (),
 ) -> dict[str, Any]:
-    """The fields of a ``Calibration`` but names, units and provenance."""
+    """The fields of a ``Calibration`` but names, units and provenance.
+
+    ``excited`` are names of commands that must vary in every direction.
+    """
     one_of("loss", loss, ("student", "gaussian"))
     require_kind("prior", prior, Prior)
     weights = _of_distinct(model, commands, measured, weights)
     noise = noise or Noise()
     spread = _of_commands(noise, commands, measured.shape[1])
-    if spread.any() and model.relative:
+    exact = not spread.any()
+    if not exact and model.relative:
         raise ValueError(
             "command_std must not be given with a Pose: the orientations are "
             "compared with those of the commands given; raise the std of the noise"
         )
     used = weights > 0.0
-    model = model.prepared(commands[used], measured[used])
+    used_commands, used_measured = commands[used], measured[used]
+    model = model.prepared(used_commands, used_measured)
     white, reading_std, levels = _of_readings(model, noise, weights, measured.shape[1])
-    if common_noise or spread.any():
+    if common_noise or not exact:
         levels = 0 * levels
     elif common_noise is False:
         levels = np.arange(len(levels))
     fitted, with_misfit = model, model
-    if prior is None and not spread.any():
+    if prior is None and exact:
         with_misfit = model.with_misfit()
         if model.fits_misfit:
             fitted = with_misfit
-    scaled = prior is not None or not spread.any()  # as far as the prior wants it
+    scaled = prior is not None or exact  # as far as the prior wants it
     prior = prior or fitted.default_prior()
     resolved = prior.resolve(fitted)
-    centre, to_centred = _centre(fitted, commands, weights, resolved, spread)
+    centre, to_centred = None, None
+    if exact and resolved.free.all() and not resolved.precisions.any():
+        centre, to_centred = _centre(fitted, used_commands, weights[used], excited)
     problem = FitProblem(
         model=fitted,
-        commands=commands[used] - (0.0 if centre is None else centre),
-        measured=measured[used],
+        commands=used_commands if centre is None else used_commands - centre,
+        measured=used_measured,
         white=white[used],
         reading_std=reading_std[used],
-        mean=to_centred @ resolved.mean,
-        precision=np.diagonal(resolved.precision),
+        mean=resolved.mean if to_centred is None else to_centred @ resolved.mean,
+        precision=resolved.precisions,
         free=resolved.free,
         command_std=spread,
         noise_known=noise.std is not None or noise.covariance is not None,
@@ -113,7 +125,7 @@ def fit_model(
     scales: PriorScales | None = None
     misfit_factor = 1.0
     if prior.by_data and scaled:
-        if fitted.error_groups() is None or spread.any():
+        if fitted.error_groups() is None or not exact:
             raise ValueError("Prior.sized() is of arms, without command_std")
         fit, misfit_factor = _solve_with_misfit(problem, with_misfit)
         solution, scales, problem = fit
@@ -138,11 +150,13 @@ def _of_distinct(
     model: Model, commands: Array, measured: Array, weights: Array
 ) -> Array:
     """(N,) the weights of the measurements that count, 0 elsewhere."""
-    rows = np.flatnonzero(weights > 0.0)
+    rows = np.flatnonzero(weights)
     if not rows.size:
         raise ValueError("weights must be positive for one measurement at least")
-    rows = rows[model.distinct(commands[rows], measured[rows])]
-    distinct = np.zeros_like(weights)
+    once = model.distinct(commands[rows], measured[rows])
+    if len(once) == len(weights):
+        return weights
+    rows, distinct = rows[once], np.zeros_like(weights)
     distinct[rows] = weights[rows]
     return distinct
 
@@ -170,7 +184,7 @@ def _solve_with_misfit(
         problem,
         model=with_misfit,
         mean=resolved.mean,
-        precision=np.diagonal(resolved.precision),
+        precision=resolved.precisions,
         free=resolved.free,
     )
     return _solve_with_scales(problem), factor
@@ -203,25 +217,25 @@ def _solve_with_scales(problem: FitProblem) -> _ScaledFit:
 
 
 def _centre(
-    model: Model, commands: Array, weights: Array, prior: ResolvedPrior, spread: Array
-) -> tuple[Array | None, Array]:
+    model: Model, commands: Array, weights: Array, excited: tuple[str, ...]
+) -> tuple[Array | None, Array | None]:
     """(n,) what commands are counted from where that changes the parameters alone.
 
-    Far from zero a bias and slopes can hardly be told apart. None where the prior knows
-    something of the parameters as they are, or the commands say little. With it (p, p)
+    Far from zero a bias and slopes can hardly be told apart. None where the commands
+    say little, which is refused with the names that are ``excited``. With it (p, p)
     what makes of parameters those from there.
     """
-    same = np.eye(len(prior.mean))
-    if prior.precision.any() or not prior.free.all() or spread.any():
-        return None, same
-    used = weights > 0.0
-    centre = weights[used] @ commands[used] / weights[used].sum()
+    centre = weights @ commands / weights.sum()
     to_centred = model.centred(centre)
     if to_centred is None:
-        return None, same
-    rows, largest = commands[used], np.abs(commands[used]).max(axis=0)
-    flat = len(rows) <= len(centre) or null_directions(rows - centre, largest)
-    return (None, same) if flat else (centre, to_centred)
+        return None, None
+    if len(commands) <= len(centre) or null_directions(
+        commands - centre, np.abs(commands).max(axis=0)
+    ):
+        if excited:
+            require_excited(commands, excited)
+        return None, None
+    return centre, to_centred
 
 
 def _of_readings(
@@ -230,23 +244,21 @@ def _of_readings(
     """The noise of the readings.
 
     Returns:
-        Whitening (N, q, q) at these weights, or its diagonal (N, q) of many independent
+        Whitening (N, q, q) at these weights, or its diagonal (N, q) of independent
         readings; standard deviations (N, q) at weight 1; and (q,) which outputs share a
         level, from 0.
     """
-    if noise.command_std is not None:
-        noise = Noise(std=noise.std, covariance=noise.covariance)
-    white, levels = noise.whitening(len(weights), q), np.arange(q)
+    count, levels = len(weights), np.arange(q)
     if noise.covariance is None:
-        diagonal = white.diagonal(axis1=1, axis2=2)
-        std = 1.0 / diagonal
-        white = diagonal if q > _MANY else white
+        std = noise.reading_std(count, q)
+        white = 1.0 / std
     else:
+        white = Noise(covariance=noise.covariance).whitening(count, q)
         std = np.sqrt((np.linalg.inv(white) ** 2).sum(axis=2))
     usual = model.default_noise()
     if usual is not None and noise.std is None and noise.covariance is None:
         usual_std = np.broadcast_to(np.asarray(usual.std), (q,))
-        white = white / (usual_std if white.ndim == 2 else usual_std[:, None])
+        white = white / usual_std
         std = std * usual_std
         levels = np.unique(usual_std, return_inverse=True)[1]  # positions and turns
     root = np.sqrt(weights)[:, None]
@@ -312,8 +324,7 @@ def _misfit(
     none = np.zeros(count)
     theta = np.concatenate([solution.parameters, none])
     waves = derivative(with_misfit, problem.commands, theta)[..., -count:]
-    level = solution.level if problem.white.ndim == 2 else solution.level[:, None]
-    white = whiten(problem.white / level, waves * std)
+    white = whiten(problem.white, waves * std) / solution.level[:, None]
     gram = np.einsum("n,nrf,nrw->fw", _informs(problem, solution), solution.rows, white)
     turned = within[:, problem.free] @ gram
     joint = np.zeros((len(theta), len(theta)))
@@ -352,7 +363,7 @@ def _fields(
     covariance, null = _covariance(problem, solution)
     freedom = float(solution.freedom.sum())
     noise_std: Array | None = solution.level * np.sqrt(
-        (problem.reading_std**2).mean(axis=0)
+        (problem.reading_std**2).sum(axis=0) / len(problem.reading_std)
     )
     noise_dof = 0.0
     if not problem.noise_known:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import functools
 import hashlib
 import json
 import os
@@ -26,7 +27,6 @@ from jaxcal.checks import (
     table,
 )
 from jaxcal.csvtable import names_of
-from jaxcal.information.singular import require_excited
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, by_name, recorded
 from jaxcal.models.recording import Recording
@@ -110,9 +110,7 @@ def identify(
     input_names = input_names or names_of(given) or None
     output_names = output_names or names_of(measured) or None
     commands = table("commands", given)
-    rule = ": as many rows as commands"
-    measured = table("measured", measured)
-    measured = array_of("measured", measured, len(commands), "m", rule=rule)
+    measured = table("measured", measured, len(commands))
     n, m = commands.shape[1], measured.shape[1]
     inputs = axis_names("input_names", input_names, "u", n)
     outputs = axis_names("output_names", output_names, "y", m)
@@ -138,13 +136,12 @@ def identify(
         if not array_of("accuracy", accuracy) > 0.0:
             raise ValueError(f"accuracy must be positive, got {accuracy}")
         about["provenance"]["accuracy"] = float(accuracy)
-    model = Affine(n, m) if model is None else model
+    model = _affine(n, m) if model is None else model
     model = require_fitting(model, commands, measured)
     plain = prior is None and plain_noise and loss in (None, "gaussian")
-    if plain and model.affine(model.nominal) is not None:
+    affine = isinstance(model, Affine)
+    if plain and (affine or model.affine(model.nominal) is not None):
         loss = "gaussian"
-        if isinstance(model, Affine):
-            require_excited(commands[weight > 0.0], inputs)
     fields = fit_model(
         commands,
         measured,
@@ -154,11 +151,16 @@ def identify(
         noise=noise,
         loss=loss or "student",
         common_noise=common_noise,
+        excited=inputs if plain and affine else (),
     )
     calibration = Calibration(**fields, **about)
     if not calibration.verdict.good and not _exact(calibration):
         warnings.warn(str(calibration.verdict), stacklevel=2)
     return calibration
+
+
+# The model of most calibrations, whose names are then made once.
+_affine = functools.lru_cache(Affine)
 
 
 def _exact(calibration: Calibration) -> bool:

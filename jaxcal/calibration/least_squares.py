@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -180,6 +182,7 @@ class FitSolution:
     parameters: Array  # (P,)
     commands: Array  # (N, n) as estimated; as given where they are exact
     residuals: Array  # (N, q) measured less predicted at these commands
+    white: Array  # (N, q) residuals, whitened at level 1
     level: Array  # (q,) of the noise
     weights: Array  # (N,) of the loss, 1 for least squares
     distance: Array  # (N,) squared, of each measurement from the fit, in noise
@@ -187,7 +190,6 @@ class FitSolution:
     num_readings: int  # of a measurement, less its unknown commands
     freedom: Array  # (q,) residual degrees of freedom of each output
     root: Array | None = None  # (F, F) of the covariance, where it is at hand
-    rows: Array  # (N, R, F) whitened derivatives, commands eliminated, no weights
 
     def __init__(
         self, problem: FitProblem, start: FitSolution | None, rough: bool
@@ -201,22 +203,21 @@ class FitSolution:
         count, q = problem.measured.shape
         self.uncertain = problem.command_std > 0.0
         self.command_root = 1.0 / problem.command_std[self.uncertain]  # 0: unknown
-        self.num_readings = q - int(np.isinf(problem.command_std).sum())
+        self.num_readings = q - int((self.command_root == 0.0).sum())
         # From where another search ended, the derivatives are right far enough.
         self.damping, self.grow = 1e-3 if start is None else 1e-10, 2.0
         self.basis: Array | None = None  # (F, r) directions of a linear model
         self.freedom = np.zeros(q)
-        self.shared = problem.levels
+        self._share(problem.levels)
         self.parameters = problem.mean if start is None else start.parameters
-        linear = problem.model.linear and not self.uncertain.any()
-        from_zero = (
-            linear and start is None and not problem.precision[problem.free].any()
-        )
+        linear = problem.model.linear and not len(self.command_root)
+        self.informed = problem.precision[problem.free].any()
+        from_zero = linear and start is None and not self.informed
         self.commands = problem.commands if start is None else start.commands
         if from_zero:  # the answer is then as exact as its step
             self.parameters = np.where(problem.free, 0.0, problem.mean)
         if from_zero and problem.free.all():
-            self.residuals = problem.measured
+            self._take(problem.measured)
         else:
             self._predict()
         # The last step of the logarithms of the levels, and how much of one is taken.
@@ -225,6 +226,7 @@ class FitSolution:
             self.weights, self.level = np.ones(count), self._first_level()
         else:
             self.weights, self.level = start.weights, start.level
+        self.facts, self.fact_rows = problem.model.facts(self.parameters)
         self._linearise()
         if linear:
             self.basis, self.damping = self._directions(), _LEAST_DAMPING
@@ -241,21 +243,28 @@ class FitSolution:
         """(q,) least level; of contacts, whose readings are zero, in usual noise."""
         readings = _times(self.problem.white, self.problem.measured)
         largest = np.abs(readings).max(axis=0)
-        largest = np.where(largest > 0.0, largest, largest.max())
-        return np.where(largest > 0.0, 1e-13 * largest, 1e-6)
+        if not largest.all():
+            largest[largest == 0.0] = largest.max() or 1e7
+        return 1e-13 * largest
+
+    def _share(self, levels: NDArray[np.intp]) -> None:
+        """Outputs of the same number have one level."""
+        self.shared, self.same = levels, 1.0 * (levels[:, None] == levels)
 
     def _first_level(self) -> Array:
         """(q,) root mean square of the residuals, of the outputs that share a level."""
         if self.problem.noise_known:
             return np.ones(len(self.shared))
-        square = _times(self.problem.white, self.residuals) ** 2
-        same = self.shared[:, None] == self.shared
+        square, same = self.white**2, self.same
         mean = same @ square.sum(axis=0) / (len(square) * same.sum(axis=1))
         return np.maximum(np.sqrt(mean), (same * self.floor).max(axis=1))
 
+    def _take(self, residuals: Array) -> None:
+        self.residuals, self.white = residuals, _times(self.problem.white, residuals)
+
     def _predict(self) -> None:
         """Residuals at the present parameters and commands."""
-        self.residuals = self._off(self.commands, self.parameters)
+        self._take(self._off(self.commands, self.parameters))
 
     def _off(self, commands: Array, theta: Array, finite: bool = True) -> Array:
         """(N, q) measured less predicted."""
@@ -266,7 +275,6 @@ class FitSolution:
     def _linearise(self) -> None:
         """Derivatives at the present parameters, whitened at level 1."""
         problem = self.problem
-        self.facts, self.fact_rows = problem.model.facts(self.parameters)
         if self.basis is not None:  # derivatives stay what they are
             return
         rows = derivative(problem.model, self.commands, self.parameters)
@@ -275,7 +283,7 @@ class FitSolution:
         if not problem.free.all():
             rows = rows[..., problem.free]
         self.by_theta = whiten(problem.white, rows)
-        if self.uncertain.any():
+        if len(self.command_root):
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
             rows = derivative(problem.model, self.commands, self.parameters, inputs)
             self.by_command = whiten(problem.white, rows[..., self.uncertain])
@@ -285,7 +293,7 @@ class FitSolution:
 
         Orthogonal in what they change, the readings in noise and the prior.
         """
-        rows, _, scale = self._system(0.0)
+        rows, _, scale = self.system = self._system(0.0)
         inverse, across = _cholesky(rows, 0.0)
         # The least singular value is above one over the length of the inverse.
         if inverse is not None and np.vdot(inverse, inverse) * len(scale) < _CLEAR**2:
@@ -310,38 +318,37 @@ class FitSolution:
         if there are several, each have parameters of their own.
         """
         problem = self.problem
-        informed = len(self.facts) or problem.precision[problem.free].any()
+        informed = len(self.facts) or self.informed
         if self.basis is None or problem.student or informed:
             return False
-        if not problem.noise_known and self.shared.any():
-            moved = (self.by_theta != 0.0).any(axis=0)  # (q, F) by which parameter
-            levels = np.where(moved, self.shared[:, None], -1)
-            if (moved & (levels != levels.max(axis=0))).any():
+        output = None  # (F,) one that each parameter moves
+        if not problem.noise_known:
+            moved = (self.by_theta != 0.0).any(axis=0)  # (q, F)
+            output = moved.argmax(axis=0)
+            if (moved > self.same[:, output]).any():
                 return False
         level, shared, basis = self.level, self.shared, self.basis
-        right = _times(problem.white, self.residuals) / level
-        right = (np.sqrt(self.weights)[:, None] * right).ravel()
+        rows, right, scale = self.system
         if self.solved is None:
-            rows, _, scale = self._system(0.0)
+            rows, right, scale = self._system(0.0)
             inverse, _ = _factor(rows, right, self.damping)
             self.solved, basis = rows @ inverse, basis / scale @ inverse
         cost, target = float(right @ right), self.solved.T @ right
         self.parameters = self.parameters.copy()
         self.parameters[problem.free] += basis @ target
         self._predict()
-        distance = self._distance(self.residuals, self.commands)
+        distance = self._distance(self.white, self.commands)
         gain = float(target @ target)
         as_said = abs(cost - gain - distance.sum()) <= 1e-9 * cost
         if not problem.noise_known:
-            self._estimate_level(distance)
+            self.level = self._level()
         # Where noise is as small as rounding of what was measured, another step helps.
         exact = 1e-28 * cost * (level / self.level).max() ** 2 <= self.least
         if not (as_said and exact and self.shared is shared):
             return False
         if basis.shape[1] == len(basis):
             self.root = basis
-            if not problem.noise_known:
-                output = (self.by_theta != 0.0).any(axis=0).argmax(axis=0)
+            if output is not None:
                 self.root = (self.level / level)[output, None] * basis
         return True
 
@@ -355,10 +362,9 @@ class FitSolution:
         self.parameters[problem.free] = mean - basis @ shown
         self._predict()
 
-    def _distance(self, residuals: Array, commands: Array) -> Array:
+    def _distance(self, white: Array, commands: Array) -> Array:
         """(N,) squared distance of each measurement from the fit, in noise."""
-        readings = _times(self.problem.white, residuals) / self.level
-        square = np.asarray((readings**2).sum(axis=1))
+        square = np.asarray(((white / self.level) ** 2).sum(axis=1))
         if len(self.command_root):
             moved = (commands - self.problem.commands)[:, self.uncertain]
             square += ((moved * self.command_root) ** 2).sum(axis=1)
@@ -367,23 +373,21 @@ class FitSolution:
     @property
     def cost(self) -> float:
         """Sum of squares of readings, commands and prior, weighted."""
-        return self._cost(self.residuals, self.parameters, self.commands, self.facts)
+        return self._cost(self.white, self.parameters, self.commands, self.facts)
 
     @property
     def evidence(self) -> float:
         """-2 log likelihood: the cost, and what a higher level of noise costs."""
         return self.cost + 2.0 * float(self.freedom @ np.log(self.level))
 
-    def _cost(
-        self, residuals: Array, theta: Array, commands: Array, facts: Array
-    ) -> float:
+    def _cost(self, white: Array, theta: Array, commands: Array, facts: Array) -> float:
         off = (theta - self.problem.mean) ** 2 @ self.problem.precision + facts @ facts
-        return float(self.weights @ self._distance(residuals, commands) + off)
+        return float(self.weights @ self._distance(white, commands) + off)
 
     def _reduce(self, damping: float) -> tuple[Array, Array]:
         """Rows (N, R, F) and residuals (N, R), the commands eliminated."""
         rows = self.by_theta / self.level[:, None]
-        right = _times(self.problem.white, self.residuals) / self.level
+        right = self.white / self.level
         k = len(self.command_root)
         if not k:
             return rows, right
@@ -451,15 +455,14 @@ class FitSolution:
             theta[problem.free] += step
             commands = self._moved(step)
             residuals = self._off(commands, theta, finite=False)
-            facts, _ = problem.model.facts(theta)
-            after = self._cost(residuals, theta, commands, facts)
+            white = _times(problem.white, residuals)
+            facts, fact_rows = problem.model.facts(theta)
+            after = self._cost(white, theta, commands, facts)
             ratio = (cost - after) / gain if np.isfinite(after) else -1.0
             if ratio > 1e-4:
-                self.parameters, self.commands, self.residuals = (
-                    theta,
-                    commands,
-                    residuals,
-                )
+                self.parameters, self.commands = theta, commands
+                self.residuals, self.white = residuals, white
+                self.facts, self.fact_rows = facts, fact_rows
                 shrunk = self.damping * max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3)
                 self.damping, self.grow = max(shrunk, _LEAST_DAMPING), 2.0
                 self._linearise()
@@ -488,37 +491,39 @@ class FitSolution:
         """
         problem = self.problem
         before = self.weights, np.log(self.level)
-        distance = self._distance(self.residuals, self.commands)
+        distance = self._distance(self.white, self.commands)
         if problem.student:
             self.weights = student_weight(distance, self.num_readings)
         if not problem.noise_known:
-            self._estimate_level(distance)
+            self._climb(distance)
         after = self.weights, np.log(self.level)
         return all(
             np.abs(new - old).max() < slack * limit
             for new, old, limit in zip(after, before, self.change, strict=True)
         )
 
-    def _estimate_level(self, distance: Array) -> None:
-        """Sums of squares over the degrees of freedom that they have."""
-        problem = self.problem
+    def _level(self) -> Array:
+        """(q,) sums of squares over the degrees of freedom that they have."""
         self.freedom = freedom = self._freedom(self._leverage(self.solved))
         if freedom.sum() < 1.0:
-            return
-        square = self.weights @ _times(problem.white, self.residuals) ** 2
-        same = self.shared[:, None] == self.shared
-        if (same @ freedom < 0.5).any():
+            return self.level
+        square = self.weights @ self.white**2
+        if (self.same @ freedom < 0.5).any():
             # What is met exactly has no level of its own, from then on.
-            self.shared, same = 0 * self.shared, np.ones_like(same)
+            self._share(0 * self.shared)
+        same = self.same
         square, freedom = same @ square, same @ freedom
-        faster = 1.0
-        if problem.student:
+        if self.problem.student:
             square = square / student_constants(self.num_readings)[0]
+        return np.maximum(np.sqrt(square / freedom), (same * self.floor).max(axis=1))
+
+    def _climb(self, distance: Array) -> None:
+        """Move the levels towards those of the residuals."""
+        change, faster = np.log(self._level() / self.level), 1.0
+        if self.problem.student:
             # The weights follow the level: Newton's step takes both at once.
             pulled = self.weights * distance
             faster = pulled.sum() / max(pulled @ self.weights, 1e-300)
-        floor = (same * self.floor).max(axis=1)
-        change = np.log(np.maximum(np.sqrt(square / freedom), floor) / self.level)
         near = np.abs(change).max() < 0.3
         step = change * (faster if near else 1.0)
         # Levels that go back and forth may never settle: then half a step is taken.
@@ -550,16 +555,26 @@ class FitSolution:
         whole = np.rint(freedom)
         return np.where(np.abs(freedom - whole) < 1e-9, whole, freedom)
 
+    @functools.cached_property
+    def rows(self) -> Array:
+        """(N, R, F) whitened derivatives where the search ended, no weights.
+
+        The commands are eliminated.
+        """
+        return self._reduce(0.0)[0]
+
     def finish(self, solved: Array | None = None) -> FitSolution:
         """Itself, with what is said of the measurements where it ended.
 
         ``solved`` are the roots of the hat matrix there, if they are known.
         """
         readings = self._leverage(solved)
-        self.rows, right = self._reduce(0.0)
+        right = self._reduce(0.0)[1]
         if solved is None or self.problem.noise_known:
             self.freedom = self._freedom(readings)
-        self.distance = self._distance(self.residuals, self.commands)
+        self.distance = (right**2).sum(axis=1)
+        if len(self.command_root):
+            self.distance = self._distance(self.white, self.commands)
         deleted = _deleted(readings, right)
         self.deleted = np.maximum((right * deleted).sum(axis=1), 0.0)
         return self
@@ -573,7 +588,7 @@ def _deleted(readings: Array, right: Array) -> Array:
         right: (N, R) residuals.
     """
     count, columns = readings.shape[1:]
-    back = np.matrix_transpose(readings)
+    back = readings.transpose(0, 2, 1)
     if count <= max(_MANY, columns):
         gap = (1.0 + 1e-9) * np.eye(count) - readings @ back
         return np.asarray(np.linalg.solve(gap, right[..., None])[..., 0])
@@ -593,14 +608,21 @@ def _factor(rows: Array, right: Array, damping: float) -> tuple[Array, Array]:
     return np.linalg.inv(triangle), whole[: len(rows)].T @ right
 
 
+@functools.cache
+def _lapack() -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Of a symmetric matrix the root, and the inverse of a triangle."""
+    from scipy.linalg.lapack import dpotrf, dtrtri
+
+    return dpotrf, dtrtri
+
+
 def _cholesky(rows: Array, damping: float) -> tuple[Array | None, Array]:
     """The inverse of R, and Q of the damped rows (R, F); None where it is not exact.
 
     Cholesky twice (Yamamoto et al., 2015) is as exact as Householder's reflections
     where it succeeds, and does not wait for BLAS's threads in every column.
     """
-    from scipy.linalg.lapack import dpotrf, dtrtri
-
+    dpotrf, dtrtri = _lapack()
     turned, inverse = rows, None
     for _ in range(2):
         gram = turned.T @ turned
@@ -609,7 +631,7 @@ def _cholesky(rows: Array, damping: float) -> tuple[Array | None, Array]:
                 np.eye(len(gram)) if inverse is None else inverse.T @ inverse
             )
         root, failed = dpotrf(gram)
-        size = np.diagonal(root)
+        size = root.diagonal()
         if failed or size.min(initial=np.inf) < _CHOLESKY * size.max(initial=0.0):
             return None, rows
         step = dtrtri(root)[0]

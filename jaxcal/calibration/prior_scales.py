@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.least_squares import FitProblem, FitSolution
+from jaxcal.calibration.least_squares import FitProblem, FitSolution, whiten
 from jaxcal.information.blocks import triangle, without
 from jaxcal.information.singular import significant
 from jaxcal.models.model import ErrorGroups, Model, derivative
@@ -95,6 +95,8 @@ def _evidence(
     problem: FitProblem, solution: FitSolution, groups: ErrorGroups
 ) -> Callable[[Array], tuple[float, Array, Array]]:
     """-2 log marginal likelihood of the logarithms (G + 1,), with slope and curve."""
+    from scipy.linalg.lapack import dpotrf, dtrtri
+
     middle, wide = _thought(groups)
     rows, right = _reduced(problem, solution)
     sized = groups.members[problem.free & (problem.precision > 0.0)]
@@ -113,11 +115,18 @@ def _evidence(
         """
         scaled = rows * np.exp(logs[:-1] @ member)
         level = np.exp(2.0 * logs[-1])
-        inverse = np.linalg.inv(scaled @ scaled.T + level * np.eye(top))
+        gram = scaled @ scaled.T + level * np.eye(top)
+        root, failed = dpotrf(gram)
+        if failed:  # beyond rounding
+            inverse, log_det = np.linalg.inv(gram), np.linalg.slogdet(gram)[1]
+        else:
+            half = dtrtri(root)[0]
+            inverse = half @ half.T
+            log_det = 2.0 * np.log(root.diagonal()).sum()
         white, seen = inverse @ right, inverse @ scaled
         spread = member @ (seen * scaled).sum(axis=0)
         alone = (count - top) * 2.0 * logs[-1] + rest / level
-        value = right @ white + alone - np.linalg.slogdet(inverse)[1]
+        value = right @ white + alone + log_det
         slope = np.append(
             spread - member @ (white @ scaled) ** 2,
             level * (np.trace(inverse) - white @ white) + count - top - rest / level,
@@ -238,15 +247,11 @@ def _reduced(problem: FitProblem, solution: FitSolution) -> tuple[Array, Array]:
     theta, free, precision = solution.parameters, problem.free, problem.precision
     # One level for all: what the fit found of how they compare is kept.
     level = solution.level / np.exp(np.log(solution.level).mean())
-    white = problem.white
-    if white.ndim == 2:  # of many readings
-        white = white[..., None] * np.eye(white.shape[1])
-    white = white / level[:, None]
-    white = white * np.sqrt(np.minimum(solution.weights, 1.0))[:, None, None]
+    size = np.sqrt(np.minimum(solution.weights, 1.0))[:, None, None] / level[:, None]
     slopes = derivative(problem.model, problem.commands, theta)
     off = solution.residuals[..., None] + slopes @ (theta - problem.mean)[:, None]
-    right = (white @ off).ravel()
-    rows = (white @ slopes).reshape(len(right), -1)
+    right = (size * whiten(problem.white, off)).ravel()
+    rows = (size * whiten(problem.white, slopes)).reshape(len(right), -1)
     informed = rows[:, free & (precision > 0.0)]
     informed = informed / np.sqrt(precision[free & (precision > 0.0)])
     flat = rows[:, free & (precision == 0.0)]

@@ -66,10 +66,10 @@ class Affine(Model):
         """(N, m, m (n + 1)) derivative of the outputs; ``parameters`` do not matter."""
         commands = as_commands(self, commands)
         (count, n), m = commands.shape, self.num_outputs
-        slopes, output = np.zeros((count, m, m * (n + 1))), np.arange(m)
-        by_slopes = slopes[:, :, : m * n].reshape(count, m, m, n)  # a view
-        by_slopes[:, output, output] = commands[:, None]
-        slopes[:, output, m * n + output] = 1.0
+        slopes = np.zeros((count, m, m * (n + 1)))
+        for i in range(m):
+            slopes[:, i, i * n : (i + 1) * n] = commands
+            slopes[:, i, m * n + i] = 1.0
         return slopes
 
     def command_jacobian(
@@ -92,9 +92,9 @@ class Affine(Model):
     def centred(self, centre: Array) -> Array:
         """(p, p): the outputs at the centre stand for b."""
         m, n = self.num_outputs, self.num_inputs
-        to_centred, output = np.eye(m * (n + 1)), np.arange(m)
-        slopes = to_centred[:, : m * n].reshape(-1, m, n)
-        slopes[m * n + output, output] = centre
+        to_centred = np.eye(m * (n + 1))
+        for i in range(m):
+            to_centred[m * n + i, i * n : (i + 1) * n] = centre
         return to_centred
 
     def affine(self, parameters: Array) -> tuple[Array, Array]:

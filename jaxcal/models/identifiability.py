@@ -123,7 +123,7 @@ def identifiability(
         asked &= np.isin(model.names, list(parameters))
     at = np.flatnonzero(asked)
     names = tuple(model.names[i] for i in at)
-    std = np.sqrt(np.diagonal(model.default_prior().resolve(model).precision))[at]
+    std = np.sqrt(model.default_prior().resolve(model).precisions)[at]
     scale = 1.0 / np.where(std > 0.0, std, 1.0)
     null, size = _null_space(rows[:, at] * scale, model.resolution)
     directions = []

@@ -160,7 +160,7 @@ class Model(abc.ABC):
         if self.linear:
             return np.full(len(self.names), np.nan)
         nominal = np.abs(self.nominal)
-        precision = np.diagonal(self.default_prior().resolve(self).precision)
+        precision = self.default_prior().resolve(self).precisions
         with np.errstate(divide="ignore"):
             sizes = np.where(precision > 0.0, 1.0 / np.sqrt(precision), nominal)
         return np.where(sizes > 0.0, sizes, np.nan)

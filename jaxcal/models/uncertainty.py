@@ -31,8 +31,13 @@ class ResolvedPrior:
     """A prior in the order of one model's parameters."""
 
     mean: Array  # (p,)
-    precision: Array  # (p, p) diagonal, 0 where nothing is known
+    precisions: Array  # (p,) inverse variances, 0 where nothing is known
     free: NDArray[np.bool_]  # (p,) False: held at the mean
+
+    @property
+    def precision(self) -> Array:
+        """(p, p) diagonal."""
+        return np.diag(self.precisions)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +92,7 @@ class Prior:
             free[names.index(one_of("parameter in fixed", name, names))] = False
         if not free.any():
             raise ValueError("prior must leave a parameter free, but it fixes them all")
-        return ResolvedPrior(mean, np.diag(std**-2.0), free)
+        return ResolvedPrior(mean, std**-2.0, free)
 
 
 def _by_name(
@@ -198,6 +203,10 @@ class Noise:
         eaten = np.zeros((count, num_outputs), dtype=np.bool_)
         eaten[:, : size.shape[-1]] = significant(size)
         return np.where(eaten[..., None], 0.0, np.matrix_transpose(left) @ white)
+
+    def reading_std(self, count: int, num_outputs: int) -> Array:
+        """(N, q) ``std`` of the readings, 1 where it is not given."""
+        return np.ones((count, num_outputs)) * self._std(count, num_outputs)[..., 0]
 
     def require_shape(self, count: int, num_outputs: int) -> None:
         """Refuse what is not of N measurements of q readings."""

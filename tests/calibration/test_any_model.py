@@ -249,7 +249,7 @@ def test_uncertain_commands_are_estimated_beside_the_parameters(
         loss="gaussian",
     )
     root = 1.0 / np.where(np.array(command_std) > 0, command_std, 1e-9)
-    weak = np.sqrt(np.diagonal(prior.resolve(WAVE).precision))[:5]
+    weak = np.sqrt(prior.resolve(WAVE).precisions)[:5]
 
     def rows(x: np.ndarray) -> np.ndarray:
         theta, moved = np.append(x[:5], 3.0), x[5:].reshape(told.shape) / (1 + root)

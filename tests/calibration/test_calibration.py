@@ -569,7 +569,7 @@ good = np.vstack([np.zeros(3), np.eye(3), np.ones(3)])
         ({"weights": [1, 1, 1, 1]}, r"weights must have shape \(5,\), got \(4,\)"),
         ({"weights": [1, 1, 1, 1, -2]}, "not be negative, got -2.0"),
         ({"weights": [0, 0, 1, 1, 1]}, "at least 4 postures of positive weight"),
-        ({"weights": np.zeros(5)}, "at least 4 postures of positive weight"),
+        ({"weights": np.zeros(5)}, "positive for one measurement at least"),
         ({"noise_std": 0.0}, "noise_std must be positive, got 0"),
         ({"noise_std": [1, 1]}, r"noise_std must be one number or \(3,\), got \(2,\)"),
         ({"noise_std": np.nan}, "noise_std must be finite"),

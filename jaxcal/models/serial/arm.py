@@ -234,7 +234,7 @@ class Arm:
         moves = gears[:, None] * self._moves(commands).T
         if compliance.any():
             at = [i - 1 for i in self.compliance]
-            moves[at] += compliance[:, None] * self._torque(commands)[0]
+            moves[at] += compliance[:, None] * self._torque(commands)
         if waves.any():
             at = [i - 1 for i in self.harmonics]
             moves[at] += np.einsum(
@@ -270,45 +270,63 @@ class Arm:
         motion[~turns, :3] = axes[at[~turns]]
         tip, inputs = self._tip_at(commands, frame), commands[:, self.num_joints :]
         reading = self.sensor.read(tip, inputs, self._split(parameters)[2])
-        return reading.by_tip @ motion.transpose(2, 1, 0), reading.by_own
+        by_steps = np.ascontiguousarray(motion.transpose(2, 1, 0))
+        return reading.by_tip @ by_steps, reading.by_own
 
-    def _torque(self, commands: Array) -> tuple[Array, ...]:
-        """Torques of the loads on the compliant joints of the nominal arm, and slopes.
+    @functools.cached_property
+    def _revolute(self) -> NDArray[np.bool_]:
+        """(n,)."""
+        return np.array([kind == "R" for kind in self.joints])
 
-        A joint's torque is the work of the loads per radian, so its derivative by
-        another joint is a second derivative of their positions: ``w_i x J_j``, i before
-        j.
+    def _pulled(self, commands: Array) -> tuple[Array, list[tuple[Array, Array]]]:
+        """The nominal arm's axes (n, 3, N), and of each load what a joint does to it.
 
-        Returns:
-            (C, N) and (C, n, N), the latter per degree or unit of length.
+        The latter is the force (3,), and how its point moves by each joint (n, 3, N).
         """
         first = self.table.size + len(self.gears)
         stiff = self.nominal
         stiff[first : first + len(self.compliance)] = 0.0
+        _, axes, origins = self._after(commands, stiff)
+        axes, origins = axes[self._steps_of_joints], origins[self._steps_of_joints]
+        pulls = []
+        for link, weight, centre in self.loads:
+            reached = self._after(commands, stiff, link)[0]
+            point = reached[3] + np.einsum("k,kcn->cn", centre, reached[:3])
+            motion = _cross(axes, point - origins)
+            motion[~self._revolute] = axes[~self._revolute]
+            motion[link:] = 0.0
+            pulls.append((weight * np.array(self.gravity), motion))
+        return axes, pulls
 
-        def find() -> tuple[Array, ...]:
-            _, axes, origins = self._after(commands, stiff)
-            axes, origins = axes[self._steps_of_joints], origins[self._steps_of_joints]
-            n, at = len(axes), np.array(self.compliance) - 1
-            revolute = np.array([kind == "R" for kind in self.joints])
-            turns = revolute[:, None, None]
-            first = np.minimum(at[:, None], np.arange(n))
-            second = np.maximum(at[:, None], np.arange(n))
-            result = np.zeros((len(at), len(commands)))
-            rate = np.zeros((len(at), n, len(commands)))
-            for link, weight, centre in self.loads:
-                reached = self._after(commands, stiff, link)[0]
-                point = reached[3] + np.einsum("k,kcn->cn", centre, reached[:3])
-                motion = np.where(turns, _cross(axes, point - origins), axes)
-                motion[link:] = 0.0
-                force = weight * np.array(self.gravity)
-                result += np.einsum("c,jcn->jn", force, motion[at])
-                bent = _cross((axes * turns)[first], motion[second])
-                rate += np.einsum("c,ijcn->ijn", force, bent)
-            rate[:, revolute] = np.radians(rate[:, revolute])
-            return result, rate
+    def _torque(self, commands: Array) -> Array:
+        """(C, N) torques of the loads on the compliant joints of the nominal arm."""
 
-        return self._kept("_last_torque", (commands,), find)
+        def find() -> tuple[Array]:
+            at = np.array(self.compliance) - 1
+            torque = np.zeros((len(at), len(commands)))
+            for force, motion in self._pulled(commands)[1]:
+                torque += np.einsum("c,jcn->jn", force, motion[at])
+            return (torque,)
+
+        return self._kept("_last_torque", (commands,), find)[0]
+
+    def _torque_slopes(self, commands: Array) -> Array:
+        """(C, n, N) of the torques by the joints, per degree or unit of length.
+
+        A joint's torque is the work of the loads per radian, so its derivative by
+        another joint is a second derivative of their positions: ``w_i x J_j``, i before
+        j.
+        """
+        axes, pulls = self._pulled(commands)
+        at, joints = np.array(self.compliance)[:, None] - 1, np.arange(len(axes))
+        first, second = np.minimum(at, joints), np.maximum(at, joints)
+        axes[~self._revolute] = 0.0
+        rate = np.zeros((len(at), len(joints), len(commands)))
+        for force, motion in pulls:
+            bent = _cross(axes[first], motion[second])
+            rate += np.einsum("c,ijcn->ijn", force, bent)
+        rate[:, self._revolute] = np.radians(rate[:, self._revolute])
+        return rate
 
 
 def _cross(left: Array, right: Array) -> Array:

@@ -828,7 +828,7 @@ class SerialChain(Arm, Model):
             moves = moves * goes[at].T
         columns[..., first:last] *= moves[:, None]
         if self.compliance:
-            torque = self._torque(commands)[0].T
+            torque = self._torque(commands).T
             columns[..., last : last + len(self.compliance)] *= torque[:, None]
         if not self.harmonics:
             return np.concatenate([columns, by_sensor], axis=-1)
@@ -853,7 +853,7 @@ class SerialChain(Arm, Model):
             result *= self._swing(commands, parameters)[1].T[:, None]
         if self.compliance:
             at = [i - 1 for i in self.compliance]
-            rate = compliance[:, None, None] * self._torque(commands)[1]
+            rate = compliance[:, None, None] * self._torque_slopes(commands)
             result += np.einsum("nqc,cjn->nqj", columns[..., at], rate)
         by_inputs = np.zeros((*result.shape[:2], len(self.sensor.inputs)))
         return np.concatenate([result @ self.drive, by_inputs], axis=-1)
@@ -912,7 +912,7 @@ class SerialChain(Arm, Model):
         Where things stand is no size: a board may lie at a height of rounding.
         """
         sizes = super().parameter_sizes()
-        unknown = np.diagonal(self.default_prior().resolve(self).precision) == 0.0
+        unknown = self.default_prior().resolve(self).precisions == 0.0
         units = np.array(self.units)
         sizes[unknown & (units == "length")] = self.length or np.nan
         sizes[unknown & (units == "deg")] = np.degrees(1.0)
