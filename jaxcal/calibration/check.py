@@ -18,10 +18,12 @@ __all__ = ["Check", "check", "verification"]
 
 Array = NDArray[np.float64]
 
+_ALARMS = 0.05  # share of false alarms
 _POWER = 0.8
 _KNOWN = 1e9  # degrees of freedom of noise that was given
 _DRIFT = 10.0  # standard deviations of the prior: no parameter drifts by more
 _RATIOS = 16  # quantiles of how far noise that was estimated is off
+_HALVINGS = 26  # of a search for the smallest change
 _SWEEPS = 20  # of swaps, at most
 _UNITS = {  # factors between units that are mistaken for each other
     1000.0: "metres for millimetres",
@@ -89,8 +91,8 @@ def check(
 ) -> Check:
     """Does the calibration still hold, by a few new measurements.
 
-    A chi-square test (F where the noise was estimated) of the readings against the
-    predictions, with the uncertainty of both, at 5 % false alarms.
+    A chi-square test (F where the noise was estimated, one for each level of it) of the
+    readings against the predictions, with the uncertainty of both, at 5 % false alarms.
 
     Args:
         calibration: what is checked.
@@ -108,8 +110,6 @@ def check(
         "holds", "does not hold", or "cannot be told": a drift of one parameter by more
         than the tolerance would be seen with less than 80 % probability.
     """
-    from scipy import special
-
     given, measured, _ = recorded(calibration.model, commands, measured)
     commands, measured = _distinct(calibration, given, measured)
     noise = calibration.require_noise("check")
@@ -120,30 +120,29 @@ def check(
     p, names = slopes.shape[-1], calibration.names
     root, least = _whitening(calibration, commands, noise)
     white, by = root @ off.ravel(), root @ slopes.reshape(-1, p)
-    placed = np.zeros(p, dtype=np.bool_)
+    placed, levels = np.zeros(p, dtype=np.bool_), _levels(calibration)
+    level = np.tile(levels, len(commands))  # of each reading
     if placed_anew:
         if not calibration.model.placed:
             raise ValueError("placed_anew is of an arm whose sensor stands somewhere")
         placed = np.isin(names, calibration.model.placed)  # which says nothing now
         white, by = without(by[:, placed], white, by)
-    freedom = len(white)
-    if not freedom:
+        level = np.zeros(len(white), dtype=np.intp)
+    if not len(white):
         raise ValueError("measured must hold a reading beside what was placed anew")
-    square = float(white @ white)
-    dof = calibration.noise_dof or _KNOWN
-    p_value = float(special.fdtrc(freedom, dof, square / freedom))
-    needed = _needed(freedom, dof, least)
+    of_level = level == np.unique(level)[:, None]
+    test = _Test(of_level.sum(axis=1), calibration.noise_dof or _KNOWN, least)
+    p_value = test.p_value(of_level @ white**2)
     free = (calibration.free[:p] > 0.0) & ~placed
-    seen = np.sqrt((by**2).sum(axis=0))
-    with np.errstate(divide="ignore"):
-        size = np.sqrt(needed) / seen  # infinite where nothing shows it
+    seen = (of_level @ by**2).T
+    size = test.smallest(seen)
     if tolerance is None:
         tolerance = _tolerance(calibration, commands)
     change = _changes(calibration, calibration.commands, tolerance)
     judged = free & np.isfinite(change)
     hidden = judged & (size > change)
-    power = _mean_power(freedom, dof, (change[judged] * seen[judged]) ** 2, least)
-    if p_value < 0.05:
+    power = test.power(change[judged, None] ** 2 * seen[judged]).mean()
+    if p_value < _ALARMS:
         says = "does not hold"
     else:
         says = "cannot be told" if hidden.any() else "holds"
@@ -269,38 +268,83 @@ def _changes(calibration: Fit, where: Array, tolerance: float) -> Array:
     return np.where(change > most, np.inf, change)
 
 
-def _mean_power(freedom: int, dof: float, shifts: Array, least: float = 1.0) -> Array:
-    """(...,) of changes with noncentralities (..., p), at 5 % false alarms.
+def _levels(calibration: Fit) -> NDArray[np.intp]:
+    """(m,) from 0: outputs of the same number share an estimate of their noise."""
+    noise = calibration.require_noise("check")
+    if (
+        calibration.noise_dof >= (1.0 - 1e-9) * calibration.dof
+        or calibration.noise_known
+    ):
+        return np.zeros(len(noise), dtype=np.intp)
+    return np.unique(noise, return_inverse=True)[1]
 
-    ``least`` is the mean square of a reading without a change, 1 as the test has it.
+
+@dataclasses.dataclass(frozen=True)
+class _Test:
+    """Tests of whitened readings, one for each of G levels of noise, and their power.
+
+    Each level was estimated by itself, so each has an F test (chi-square where the
+    noise is known). The least of their p-values counts, by Sidak.
     """
-    from scipy import special
 
-    limit = special.fdtri(freedom, dof, 0.95) / least
-    # Noise that was estimated is as uncertain here as in the test: the ratio of the
-    # squared estimate to the true variance is a chi-square over its dof.
-    ratio = np.ones(1)
-    if dof < _KNOWN:
-        chance = (np.arange(_RATIOS) + 0.5) / _RATIOS
-        ratio = special.gammaincinv(dof / 2.0, chance) * 2.0 / dof
-    shifts = np.asarray(shifts)[..., None] / least
-    missed = special.chndtr(limit * freedom * ratio, freedom, shifts * ratio)
-    seen = (1.0 - np.nan_to_num(missed, nan=0.0)).mean(axis=-1)  # NaN where too large
-    return np.asarray(seen.mean(axis=-1))
+    counts: NDArray[np.intp]  # (G,) readings of each level
+    dof: float  # of the noise of a level
+    least: float = 1.0  # mean square of a reading without a change; 1 in the test
 
+    def p_value(self, squares: Array) -> float:
+        """Of sums (G,) of squared readings."""
+        from scipy import special
 
-def _needed(freedom: int, dof: float, least: float) -> float:
-    """Noncentrality of a change that is seen with the power asked for."""
-    low, high = 0.0, 1.0
-    while _mean_power(freedom, dof, np.array([high]), least) < _POWER and high < 1e12:
-        low, high = high, 4.0 * high
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        if _mean_power(freedom, dof, np.array([middle]), least) < _POWER:
-            low = middle
-        else:
-            high = middle
-    return high
+        of_levels = special.fdtrc(self.counts, self.dof, squares / self.counts)
+        return float(-np.expm1(len(self.counts) * special.log1p(-of_levels.min())))
+
+    def power(self, shifts: Array) -> Array:
+        """(...,) of changes with noncentralities (..., G).
+
+        Noise that was estimated is as uncertain here as in the test: the ratio of the
+        squared estimate to the true variance is a chi-square over its dof.
+        """
+        from scipy import special
+
+        alarms = -np.expm1(np.log1p(-_ALARMS) / len(self.counts))  # of each level
+        limit = special.fdtri(self.counts, self.dof, 1.0 - alarms) / self.least
+        ratio = np.ones(1)
+        if self.dof < _KNOWN:
+            chance = (np.arange(_RATIOS) + 0.5) / _RATIOS
+            ratio = special.gammaincinv(self.dof / 2.0, chance) * 2.0 / self.dof
+        shifts = np.asarray(shifts) / self.least
+        counts, limit = (np.broadcast_to(v, shifts.shape) for v in (self.counts, limit))
+        missed = np.full(shifts.shape, 1.0 - alarms)
+        moved = (shifts > 0.0) | (self.least != 1.0)
+        of_ratios = special.chndtr(
+            (limit * counts)[moved, None] * ratio,
+            counts[moved, None],
+            shifts[moved, None] * ratio,
+        )
+        missed[moved] = np.nan_to_num(of_ratios, nan=0.0).mean(axis=-1)  # too large
+        return np.asarray(1.0 - missed.prod(axis=-1))
+
+    def smallest(self, seen: Array) -> Array:
+        """(p,) changes that are seen with the power asked for, infinite where none is.
+
+        ``seen`` are noncentralities (p, G) of a change by one.
+        """
+        total = seen.sum(axis=1, keepdims=True)
+        shares = np.divide(seen, total, out=np.ones_like(seen), where=total > 0.0)
+        shares, of_share = np.unique(shares.round(12), axis=0, return_inverse=True)
+        low, high = np.zeros((2, len(shares), 1))
+        high += 1.0
+        while True:
+            short = (self.power(high * shares) < _POWER)[:, None] & (high < 1e12)
+            if not short.any():
+                break
+            low, high = np.where(short, high, low), np.where(short, 4.0 * high, high)
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            short = (self.power(middle * shares) < _POWER)[:, None]
+            low, high = np.where(short, middle, low), np.where(short, high, middle)
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.sqrt(high[of_share.ravel()] / total)[:, 0])
 
 
 def verification(
@@ -336,19 +380,22 @@ def verification(
         prediction_slopes
     ) + np.diag(noise**2)
     white = np.linalg.inv(np.linalg.cholesky(spread)) @ slopes
-    seen = (white**2).sum(axis=1)  # (M, p) by a drift of one
+    levels = _levels(calibration)
+    of_level = (levels == np.unique(levels)[:, None]).astype(np.float64)
+    seen = (of_level @ white**2).transpose(0, 2, 1)  # (M, p, G) by a drift of one
     where = calibration.commands if region is None else table("region", region)
     if tolerance is None:
         tolerance = _tolerance(calibration, where)
     change = _changes(calibration, where, tolerance)
     judged = (calibration.free[: len(change)] > 0.0) & np.isfinite(change)
-    shifts = seen[:, judged] * change[judged] ** 2  # noncentralities of one posture
-    q, dof = slopes.shape[1], calibration.noise_dof or _KNOWN
+    shifts = seen[:, judged] * change[judged, None] ** 2  # of one posture
+    counts, dof = of_level.sum(axis=1), calibration.noise_dof or _KNOWN
 
     def value(rows: list[int]) -> Array:
         """(M,) of the rows and each candidate."""
         shift = shifts[rows].sum(axis=0) + shifts
-        return _mean_power(q * (len(rows) + 1), dof, shift)
+        test = _Test(counts * (len(rows) + 1), dof)
+        return np.asarray(test.power(shift).mean(axis=-1))
 
     chosen: list[int] = []
     for _ in range(k):

@@ -188,21 +188,47 @@ def test_readings_in_another_unit_are_named(factor):
     assert found.check(u[:5], 900.0 * y[:5]).says == "does not hold"
 
 
-def test_power_with_few_degrees_of_freedom_is_what_is_found():
-    """Noise from two residuals is off by half, to which the power owes as much."""
-    rng, said, found = np.random.default_rng(0), [], []
-    model = jaxcal.models.Affine(2, 1)
-    for _ in range(250):
-        commands, again = rng.uniform(-1.0, 1.0, (5, 2)), rng.uniform(-1.0, 1.0, (3, 2))
-        truth = model.nominal
-        measured = model.predict(commands, truth) + 0.1 * rng.normal(size=(5, 1))
-        calibration = jaxcal.identify(commands, measured)
-        slopes = model.jacobian(commands, truth)[:, 0]
-        change = np.zeros(3)
-        which = rng.integers(3)
-        change[which] = 0.5 / np.sqrt((slopes[:, which] ** 2).mean())
-        measured = model.predict(again, truth + change) + 0.1 * rng.normal(size=(3, 1))
-        result = calibration.check(again, measured, tolerance=0.5)
-        said.append(result.power)
-        found.append(result.p_value < 0.05)
-    assert abs(np.mean(said) - np.mean(found)) < 0.08  # .15 with the noise taken as is
+@pytest.mark.parametrize(("outputs", "count"), [(1, 5), (3, 5), (3, 6), (3, 12)])
+def test_p_value_and_power_with_few_degrees_of_freedom(outputs, count):
+    """The noise of each output came from a few residuals, and the truth is drawn so."""
+    rng, draws = np.random.default_rng(10 * outputs + count), 20_000
+    commands, again = rng.uniform(-1.0, 1.0, (count, 2)), rng.uniform(-1.0, 1.0, (3, 2))
+    noise = 0.1 * np.arange(1, outputs + 1) * rng.normal(size=(count, outputs))
+    measured = commands @ rng.normal(size=(2, outputs)) + noise
+    calibration = jaxcal.identify(commands, measured)
+
+    design, new = (np.column_stack([u, np.ones(len(u))]) for u in (commands, again))
+    inverse, dof = np.linalg.inv(design.T @ design), count - 3
+    estimate = inverse @ design.T @ measured
+    std = np.sqrt(((measured - design @ estimate) ** 2).sum(axis=0) / dof)
+    root = np.linalg.cholesky(new @ inverse @ new.T + np.eye(3))
+
+    def p_values(off):
+        """Of differences (..., 3, outputs): each output by itself, then by Sidak."""
+        square = (np.linalg.solve(root, off) ** 2).mean(axis=-2) / std**2
+        return 1.0 - (1.0 - stats.f.sf(square, 3, dof).min(axis=-1)) ** outputs
+
+    off = std * rng.normal(size=(3, outputs))
+    result = calibration.check(again, new @ estimate + off)
+    assert result.p_value == pytest.approx(p_values(off), rel=1e-9)
+    true = std * np.sqrt(dof / rng.chisquare(dof, (draws, outputs)))
+    off = (root @ rng.normal(size=(draws, 3, outputs))) * true[:, None]
+    column, output = rng.integers(3, size=draws), rng.integers(outputs, size=draws)
+    change = result.tolerance / np.sqrt((design**2).mean(axis=0))
+    off[np.arange(draws), :, output] += (new * change).T[column]
+    assert result.power == pytest.approx((p_values(off) < 0.05).mean(), abs=0.012)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [5, 16])
+def test_false_alarms_are_five_in_a_hundred_whatever_the_degrees_of_freedom(count):
+    """Of three outputs with a noise each; one F test of all has .10 and .03."""
+    rng, alarms = np.random.default_rng(count), 0
+    for _ in range(1000):
+        commands, again = (rng.uniform(0.0, 1.0, (n, 3)) for n in (count, 3))
+        found = jaxcal.identify(commands, commands + 0.1 * rng.normal(size=(count, 3)))
+        alarms += (
+            found.check(again, again + 0.1 * rng.normal(size=(3, 3))).p_value < 0.05
+        )
+    low, high = stats.binom.interval(0.999, 1000, 0.05)
+    assert low <= alarms <= high
