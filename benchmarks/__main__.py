@@ -23,6 +23,7 @@ ROWS = (
     "optimum",
     "exchange",
     "blocks",
+    "scenarios",
     "decision",
     "startup",
     "memory",

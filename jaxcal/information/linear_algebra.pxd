@@ -164,15 +164,17 @@ cdef inline void add(
                 gram[a * p + b] += scaled * rows[r * p + b]
 
 cdef inline void eigen(
-    double* matrix, double* values, double* room, int[::1] whole, int p
+    double* matrix, double* values, double* room, int[::1] whole, int p,
+    bint vectors=True,
 ) noexcept nogil:
     """Eigenvalues of a symmetric matrix, smallest first, and eigenvectors in its rows.
 
-    ``room`` holds 1 + 6 p + 2 p^2 numbers, ``whole`` 3 + 5 p.
+    ``room`` holds 1 + 6 p + 2 p^2 numbers, ``whole`` 3 + 5 p. Without ``vectors`` the
+    matrix is spoiled.
     """
     cdef int info = 0, size = 1 + 6 * p + 2 * p * p, wholes = whole.shape[0]
     dsyevd(
-        b"V", b"L", &p, matrix, &p, values, room, &size, &whole[0], &wholes, &info
+        b"V" if vectors else b"N", b"L", &p, matrix, &p, values, room, &size, &whole[0], &wholes, &info
     )
 
 cdef inline double covariance(

@@ -131,10 +131,12 @@ def joint_branch_and_bound(
         scale, shift, trivial = scale / unit, shift / unit, trivial / unit
     useful = min(trivial, _USEFUL.get(criterion.kind, np.inf))
     incumbents, k = _incumbents(best, len(start)), start.sum()
+    packs = _packs(len(scenarios), scenarios[0].blocks)
     members = [
         kernel.Search(
             scenario.criterion.form, scenario.blocks, scenario.prior, one[0], k,
             largest_rank(scenario.blocks), useful, *_incumbents(1, len(start)), True,
+            packs,
         )
         for scenario, one in zip(scenarios, near, strict=True)
     ]  # fmt: skip
@@ -153,6 +155,12 @@ def joint_branch_and_bound(
         search, incumbents, counts, (unit, 0.0, trivial), work, deadline, good,
         root_only,
     )  # fmt: skip
+
+
+def _packs(num_scenarios: int, blocks: Array) -> bool:
+    """Whether there is room to keep what every candidate adds to the information."""
+    count, _, p = blocks.shape
+    return num_scenarios * count * p * (p + 1) * 4 <= _MEMORY
 
 
 def _incumbents(best: int, num_blocks: int) -> tuple[Array, Array, Indices]:

@@ -72,8 +72,13 @@ cdef class Search:
     cdef double* most
     cdef double* right  # (2, m)
     cdef double* node  # (3, M)
+    cdef bint packs  # B.T B of every candidate is kept
+    cdef int triangle  # p (p + 1) / 2
+    cdef double* packed  # (triangle,) work space
+    cdef double* squares  # (M, triangle) where it packs
     cdef Watch watch
     cdef Py_ssize_t _lay_out(self, double* room) noexcept
+    cdef void _pack(self, const double* matrix, double* into, double times) noexcept nogil
     cdef void _sum(self, const double* low, const double* counts, const double* start, double* gram) noexcept nogil
     cdef double _evaluate(self, int kind) noexcept nogil
     cdef double _rounded(self, double share) noexcept nogil
@@ -107,6 +112,8 @@ cdef class JointSearch(Search):
     cdef list keep  # a Search of each scenario
     cdef Py_ssize_t[::1] addresses  # (S,) of them: a call takes no reference
     cdef void** members  # the same
+    cdef unsigned char[::1] sample  # (S,) whether curvature is of it
+    cdef Py_ssize_t turn  # where the sample begins
     cdef bint least_counts  # the least, else the mean
     cdef double[::1] weights_of  # (S,), as are the rest
     cdef double[::1] scale

@@ -76,6 +76,8 @@ _JOINT = cython.declare(cython.int, 6)
 _SMOOTHED = cython.declare(cython.int, 7)
 
 _EPS = cython.declare(cython.double, 2.0**-52)
+_SAMPLED = cython.declare(cython.Py_ssize_t, 8)  # scenarios that curvature is of
+_FAINT = cython.declare(cython.double, 1e-3)  # of an equal share: it does not count
 _UNSEEN = cython.declare(cython.double, 1e-12)  # a share of the mixture left out
 
 _SOLVED = cython.declare(cython.double, 1e-11)  # a bound this near the value is solved
@@ -113,6 +115,7 @@ class Search:
         best_values,
         order,
         lent=False,
+        packs=False,
     ):
         # Arrays are C-contiguous float64; the best (best, M) and (best,) are written.
         # (A docstring here would be a global symbol of C, of which a module that holds
@@ -123,7 +126,7 @@ class Search:
         self.best_counts, self.best_values = best_counts, best_values
         self.useful, self.order = useful, order
         self.most_moved = min(self.count, _FRACTIONAL + 2 * self.p + 4)
-        self.lent = lent
+        self.lent, self.packs = lent, packs
         self.whole = np.empty(3 + 5 * self.p, dtype=np.intc)
         self.which, self.free = np.empty((2, self.most_moved), dtype=np.intp)
         self.open = np.empty(self.count, dtype=np.intp)
@@ -134,6 +137,13 @@ class Search:
             [blocks.ravel(), prior.ravel(), root.ravel()]
         )
         copy(self.blocks, cython.address(given[0]), given.shape[0])
+        i: cython.Py_ssize_t
+        for i in range(self.count if self.packs else 0):
+            block = self.blocks + i * self.q * self.p
+            for a in range(self.p * self.p):
+                self.gram[a] = 0.0
+            add(self.gram, 1.0, block, self.q, self.p)
+            self._pack(self.gram, self.squares + i * self.triangle, 1.0)
 
     def _lay_out(self, room):
         """Share the room out, and how many numbers that takes; of NULL only that."""
@@ -167,19 +177,45 @@ class Search:
         self.least, self.most = take(at, m), take(at, m)
         self.right = take(at, 2 * m)
         self.node = take(at, 3 * self.count)
+        self.triangle = p * (p + 1) // 2
+        self.packed = take(at, self.triangle)
+        self.squares = take(at, self.count * self.triangle if self.packs else 0)
         return room - first
+
+    def _pack(self, matrix, into, times):
+        """The lower triangle in a row, what is off the diagonal ``times`` as large."""
+        at: cython.Py_ssize_t = 0
+        for a in range(self.p):
+            for b in range(a):
+                into[at] = times * matrix[a * self.p + b]
+                at += 1
+            into[at] = matrix[a * self.p + a]
+            at += 1
 
     # --- the criterion at fractional counts -----------------------------------------
 
     def _sum(self, low, counts, start, gram):
         """``gram = start + sum of (counts_i - low_i) B_i.T B_i``, of zeros if NULL."""
         p, size = self.p, self.q * self.p
+        packed, at = self.packed, 0
+        for a in range(self.triangle):
+            packed[a] = 0.0
         for a in range(p * p):
             gram[a] = 0.0
         for i in range(self.count):
             count = counts[i] if low is cython.NULL else counts[i] - low[i]
-            if count != 0.0:
+            if count == 0.0:
+                continue
+            if self.packs:
+                square = self.squares + i * self.triangle
+                for a in range(self.triangle):
+                    packed[a] += count * square[a]
+            else:
                 add(gram, count, self.blocks + i * size, self.q, p)
+        for a in range(p if self.packs else 0):
+            for b in range(a + 1):
+                gram[a * p + b] = packed[at]
+                at += 1
         for a in range(p):
             for b in range(a + 1):
                 if start is not cython.NULL:
@@ -476,6 +512,13 @@ class Search:
         """``trace(B_i G B_i.T)`` where the count is not fixed."""
         size: cython.int = self.q * self.p
         done: cython.Py_ssize_t = 0
+        if self.packs:
+            self._pack(self.gradient, self.packed, 2.0)
+            for o in range(self.opened):
+                i = self.open[o]
+                square = self.squares + i * self.triangle
+                self.leverage[i] = dot(square, self.packed, self.triangle)
+            return
         while done < self.opened:
             m = min(self.opened - done, self.most_moved)
             for f in range(m):
@@ -1046,6 +1089,7 @@ class JointSearch(Search):
         self.weights_of = np.array(weights, dtype=np.float64)
         self.scale, self.shift = np.array([scale, shift], dtype=np.float64)
         self.mixture, self.worth, self.bases = np.zeros((3, count))
+        self.sample, self.turn = np.zeros(count, dtype=np.uint8), 0
         for s in range(count):
             member: Search = self.keep[s]
             member.open, member.which = self.open, self.which
@@ -1153,25 +1197,46 @@ class JointSearch(Search):
                     self.leverage[self.open[o]] += share * one[self.open[o]]
 
     def _hessian(self, kind, m):
-        out, one = self.curvature, self.face
+        """Of some scenarios in place of all: it only says where to step and branch.
+
+        Which these are changes with every call. The part of a smoothed least that the
+        slopes of its scenarios make is of all.
+        """
+        out, one, count = self.curvature, self.face, self.addresses.shape[0]
         for a in range(m * m):
             out[a] = 0.0
-        for s in range(self.addresses.shape[0]):
+        many: cython.Py_ssize_t = 0
+        for s in range(count):
+            many += self.mixture[s] * count > _FAINT
+        stride: cython.Py_ssize_t = max(1, many // _SAMPLED)
+        at: cython.Py_ssize_t = self.turn
+        whole: cython.double = 0.0
+        sampled: cython.double = 0.0
+        for s in range(count):
+            share: cython.double = self.mixture[s] * self.scale[s]
+            self.sample[s] = False
+            if self.mixture[s] * count > _FAINT:
+                at += 1
+                whole += share
+                if at % stride == 0:
+                    self.sample[s] = True
+                    sampled += share
+        self.turn = (self.turn + 1) % stride
+        for s in range(count):
             share = self.mixture[s] * self.scale[s]
-            if not share > 0.0:
-                continue
-            cython.cast(Search, self.members[s])._hessian(
-                cython.cast(Search, self.members[s]).now, m
-            )
-            for a in range(m * m):
-                out[a] += share * one[a]
-            if not self.least_counts:
+            if self.sample[s]:
+                cython.cast(Search, self.members[s])._hessian(
+                    cython.cast(Search, self.members[s]).now, m
+                )
+                for a in range(m * m):
+                    out[a] += share * whole / sampled * one[a]
+            if not self.least_counts or not share > 0.0:
                 continue
             weight = self.smoothing * self.mixture[s]
             own, ends = cython.cast(Search, self.members[s]).leverage, self.ends
             for i in range(m):
-                at = self.which[i]
-                ends[i] = self.scale[s] * own[at] - self.leverage[at]
+                c = self.which[i]
+                ends[i] = self.scale[s] * own[c] - self.leverage[c]
             for i in range(m):
                 for j in range(m):
                     out[i * m + j] += weight * ends[i] * ends[j]

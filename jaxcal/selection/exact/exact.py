@@ -25,7 +25,11 @@ from jaxcal.selection.exact.branch_and_bound import (
     joint_branch_and_bound,
 )
 from jaxcal.selection.exact.volume import largest_volumes
-from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
+from jaxcal.selection.exchange.exchange import (
+    default_restarts,
+    exchange_indices,
+    greedy_indices,
+)
 from jaxcal.selection.exchange.rounds import in_rounds
 from jaxcal.selection.problem import (
     LossProblem,
@@ -61,7 +65,7 @@ def solve(
 ) -> Solution:
     """The solver "exact"; 10 s where no time limit is given."""
     deadline = Deadline(time_limit or TIME_LIMIT)
-    restarts = restarts or STARTING_RESTARTS
+    restarts = restarts or _starts(problem)
     solution = solve_exact(problem, best, deadline, restarts, seed)
     return dataclasses.replace(solution, seed=seed, restarts=restarts)
 
@@ -86,7 +90,7 @@ def solve_auto(
     """
     limit = time_limit or (TIME_LIMIT if problem.rank_one else _BLOCKS_LIMIT)
     deadline = Deadline(limit)
-    restarts = restarts or STARTING_RESTARTS
+    restarts = restarts or _starts(problem)
     solution = solve_exact(problem, 1, deadline, restarts, seed, least_efficiency)
     assert solution.value is not None and solution.bound is not None
     started: dict[str, Any] = {"seed": seed, "restarts": restarts}
@@ -110,6 +114,13 @@ def solve_auto(
             f"of at least {proven_share:.6f} proven; {least_efficiency:g} was asked for"
         )
     return dataclasses.replace(solution, method=method, reason=reason, **started)
+
+
+def _starts(problem: Problem) -> int:
+    """Of the exchange. E of several scenarios takes as long for a few as proofs do."""
+    if isinstance(problem, ScenarioProblem) and problem.joined.kind == "least":
+        return default_restarts(problem)
+    return STARTING_RESTARTS
 
 
 def solve_exact(

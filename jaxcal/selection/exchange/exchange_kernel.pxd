@@ -87,7 +87,7 @@ cdef class Climber(Choice):
     cdef void _cross(self, Py_ssize_t c, int m, int r) noexcept nogil
     cdef inline void _swaps(self, Py_ssize_t c) noexcept nogil
     cdef inline void _take_out(self, Py_ssize_t out) noexcept nogil
-    cdef double _least(self) noexcept nogil
+    cdef double _least(self, bint vectors) noexcept nogil
     cdef bint _bound_without(self, Py_ssize_t at) noexcept nogil
     cdef Py_ssize_t _next(self, double least) noexcept nogil
 

@@ -65,6 +65,7 @@ _CANCELLED = cython.declare(cython.double, 1e-3)
 _LIFTS = cython.declare(cython.double, 1e-9)  # share by which a swap must raise E
 # Added to what is left of E, so that its bounds are true where that is singular.
 _SLIGHT = cython.declare(cython.double, 1e-10)
+_TRIED = cython.declare(cython.int, 3)  # by E in a place, in all of several scenarios
 _PATIENCE = cython.declare(cython.int, 16)  # groups between two looks at the clock
 
 
@@ -762,17 +763,17 @@ class Climber(Choice):
     def _least_of_chosen(self):
         """E of the chosen; -inf where it is singular."""
         self._sum(self.k, -1)
-        return self._least()
+        return self._least(False)
 
-    def _least(self):
-        """E of ``gram``; C V and the eigenvectors of C V C.T are there."""
+    def _least(self, vectors):
+        """E of ``gram``; C V and, where wanted, eigenvectors of C V C.T are there."""
         p, inverse = self.p, self.now
         root = cython.address(self.root[0, 0])
         if not factor(self.gram, inverse, self.lower, p) > -INFINITY:
             return -INFINITY
         multiply(False, False, p, p, p, root, inverse, self.half)
         multiply(False, True, p, p, p, self.half, root, self.small)
-        eigen(self.small, self.values, self.lapack, self.whole, p)
+        eigen(self.small, self.values, self.lapack, self.whole, p, vectors)
         return 1.0 / self.values[p - 1]
 
     def _strongest(self, at, found):
@@ -793,7 +794,7 @@ class Climber(Choice):
             for a in range(p * p):
                 lower[a] = gram[a] - found[0] * self.metric[a]
             if cholesky(lower, lower, p, 0.0) > -INFINITY:
-                value = self._least()
+                value = self._least(False)
                 if value > found[0]:
                     best, found[0] = e, value
 
@@ -821,7 +822,7 @@ class Climber(Choice):
         copy(rest, gram, p * p)
         for a in range(p):
             gram[a * p + a] += _SLIGHT
-        value = self._least()
+        value = self._least(True)
         if not value > -INFINITY:
             return False
         # A block of q readings leaves the variances after the q largest no smaller.
@@ -1019,12 +1020,13 @@ class JointClimber(Choice):
         for c in range(groups):
             tops[2 * c] = _largest(bounds + c * WIDE)
         best: cython.Py_ssize_t = -1
-        while True:
+        for _ in range(_TRIED):
             e = cython.cast(Climber, self.members[0])._next(found[0])
             if e < 0:
                 return best
             if self._betters(e, found):
                 best = e
+        return best
 
     def _betters(self, e, found):
         """Whether the joined E with candidate e is over ``found``, which then is it.
@@ -1047,7 +1049,7 @@ class JointClimber(Choice):
                 * cython.cast(Climber, self.members[s]).p,
             )
             cython.cast(Climber, self.members[s])._add(e)
-            value = cython.cast(Climber, self.members[s])._least()
+            value = cython.cast(Climber, self.members[s])._least(False)
             if not value > -INFINITY:
                 return False
             value = self.scale[s] * value + self.shift[s]
