@@ -373,7 +373,7 @@ def test_verify_says_when_it_is_time_to_recalibrate(finished, tmp_path, capsys):
     code = main(["verify", *given, "--count", "2", "--out", str(tmp_path / "v")])
     assert code == 1
     said = capsys.readouterr().out
-    assert "RECALIBRATE" in said and "then `jaxcal-rig calibrate`" in said
+    assert "RECALIBRATE" in said and "Run `jaxcal-rig calibrate`" in said
     assert "good; next" not in said
 
 
