@@ -108,6 +108,14 @@ class Calibration(Fit):
         """
         return self.model.verdict(self)
 
+    def of(self, tip: str) -> Calibration:
+        """What was found of one of several chains, as if it had been alone.
+
+        Its readings are in its own unit, and its verdict, file and checks are those of
+        an arm; see ``jaxcal.models.Chains``.
+        """
+        return dataclasses.replace(self, **self.model.of_chain(self, tip))
+
     # -- an arm, written back ----------------------------------------------------------
 
     @property

@@ -23,12 +23,13 @@ from jaxcal.models.sensors import (
     Tip,
     Wrench,
 )
-from jaxcal.models.serial import SerialChain, Servos
+from jaxcal.models.serial import Chains, SerialChain, Servos
 from jaxcal.models.uncertainty import Noise, Prior, ResolvedPrior
 
 __all__ = [
     "Affine",
     "Board",
+    "Chains",
     "Differences",
     "Direction",
     "Distance",

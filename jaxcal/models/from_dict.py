@@ -11,13 +11,14 @@ from jaxcal.models.from_jax import FromJax
 from jaxcal.models.function import FromFunction
 from jaxcal.models.linear import Linear, Polynomial
 from jaxcal.models.model import Model
-from jaxcal.models.serial import SerialChain
+from jaxcal.models.serial import Chains, SerialChain
 
 __all__ = ["from_dict"]
 
 # What makes a model of each kind; its arguments are the keys of the file.
 _KINDS: dict[str, Callable[..., Model]] = {
     "affine": Affine,
+    "chains": Chains.from_dict,
     "function": FromFunction,
     "jax": FromJax,
     "linear": Linear,

@@ -306,6 +306,10 @@ class Model(abc.ABC):
         """
         return verdict(fit)
 
+    def of_chain(self, fit: Any, tip: str) -> dict[str, Any]:
+        """The fields of a ``jaxcal.Calibration`` that are of one of several chains."""
+        raise ValueError(f"the model must be Chains, got {type(self).__name__}")
+
     def calibrated(self, parameters: ArrayLike) -> Model:
         """The machine whose nominal is this one's with ``parameters``."""
         raise self._no_arm()

@@ -6,9 +6,10 @@ constants between its joints follow from the table: ``K = C^-1 D C'``, D a row o
 
 from __future__ import annotations
 
+import os
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.checks import one_of
+from jaxcal.files import atomic_write
 from jaxcal.models.serial.urdf import (
     Joint,
     joints_of,
@@ -32,13 +34,14 @@ from jaxcal.models.serial.urdf import (
 if TYPE_CHECKING:
     from jaxcal.models.serial.arm import Arm
 
-__all__ = ["written"]
+__all__ = ["save", "urdf_text", "written"]
 
 Array = NDArray[np.float64]
 
 _UR = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 _TAG = re.compile(rb"""(?:[^>"']+|"[^"]*"|'[^']*')*>""")
 _SAME = 1e-13  # metres and radians: no correction
+_AGREE = 1e-9  # likewise: the same correction
 
 
 class _Part(NamedTuple):
@@ -64,36 +67,62 @@ def written(form: str, nominal: Arm, calibrated: Arm) -> tuple[str, str]:
     """The text of a form of ``SerialChain.write``, and the tip link, if any."""
     one_of("form", form, ("urdf", "dh", "ur"))
     if form == "urdf":
-        return _urdf_text(nominal, calibrated)
+        text, tips = urdf_text([(nominal, calibrated)])
+        return text, tips[0]
     return _dh_text(calibrated) if form == "dh" else _ur_text(nominal, calibrated), ""
 
 
-def _urdf_text(nominal: Arm, calibrated: Arm) -> tuple[str, str]:
-    """The file of ``nominal`` with the origins of ``calibrated``, and its tip link.
+def save(text: str, path: str | os.PathLike[str], force: bool) -> None:
+    """Write a file, over one that is there only by ``force``."""
+    if not force and os.path.exists(path):
+        raise FileExistsError(
+            f"{os.fspath(path)} is there already; force=True writes over it"
+        )
+    with atomic_write(path) as file:
+        file.write(text.encode("utf-8", "surrogateescape"))
 
-    The tip is a new link where the file has no fixed joint that could hold the tool.
+
+def urdf_text(chains: Sequence[tuple[Arm, Arm]]) -> tuple[str, list[str]]:
+    """The file of nominal chains with the origins of calibrated ones, and its tips.
+
+    A tip is a new link where the file has no fixed joint that could hold the tool.
 
     Raises:
-        ValueError: the arm is of no URDF file, or what was found cannot be in one.
+        ValueError: a chain is of no URDF file, or what was found cannot be in one.
     """
-    source = nominal.source
-    if source is None:
+    source = chains[0][0].source
+    if any(nominal.source is None for nominal, _ in chains) or source is None:
         raise ValueError("the arm must come from a URDF file: SerialChain.from_urdf")
-    text, tip = source["text"], source["tip"]
-    origins, extra = _origins(nominal, calibrated)
-    if extra is None:
-        return _with_origins(text, origins), tip
-    name, links, joints = f"{tip}_calibrated", links_of(text), joints_of(text)
-    while name in links or f"{name}_joint" in joints:  # a file calibrated before
-        name += "_again"
-    numbers, quoted = _pose(extra), quoteattr(name)
-    more = (
-        f"  <link name={quoted}/>\n"
-        f'  <joint name={quoteattr(f"{name}_joint")} type="fixed">\n'
-        f"    <parent link={quoteattr(tip)}/>\n    <child link={quoted}/>\n"
-        f'    <origin xyz="{numbers["xyz"]}" rpy="{numbers["rpy"]}"/>\n  </joint>\n'
-    )
-    return _with_origins(text, origins, more), name
+    text = source["text"]
+    links, joints = links_of(text), joints_of(text)
+    origins: dict[str, Array] = {}
+    more, tips = "", []
+    for nominal, calibrated in chains:
+        own = nominal.source or {}
+        if own["text"] != text:
+            raise ValueError("the chains must come from one URDF file")
+        corrected, extra = _origins(nominal, calibrated)
+        for joint, origin in corrected.items():
+            if joint in origins and np.abs(origin - origins[joint]).max() > _AGREE:
+                raise ValueError(f"the chains have joint {joint} in different places")
+        origins |= corrected
+        tip = own["tip"]
+        if extra is None:
+            tips.append(tip)
+            continue
+        name = f"{tip}_calibrated"
+        while name in links or f"{name}_joint" in joints:  # a file calibrated before
+            name += "_again"
+        numbers, quoted = _pose(extra), quoteattr(name)
+        more += (
+            f"  <link name={quoted}/>\n"
+            f'  <joint name={quoteattr(f"{name}_joint")} type="fixed">\n'
+            f"    <parent link={quoteattr(tip)}/>\n    <child link={quoted}/>\n"
+            f'    <origin xyz="{numbers["xyz"]}" rpy="{numbers["rpy"]}"/>\n'
+            "  </joint>\n"
+        )
+        tips.append(name)
+    return _with_origins(text, origins, more), tips
 
 
 def _dh_text(calibrated: Arm) -> str:

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, axis_names, in_words, numbers, one_of
-from jaxcal.files import atomic_write
 from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
 from jaxcal.models.recording import Recording
 from jaxcal.models.sensors import SENSORS, Pose, Position, Sensor, Several
@@ -640,7 +639,7 @@ class SerialChain(Arm, Model):
                 others are not; a gear ratio was found, which none can hold.
             FileExistsError: there is a file and ``force`` is not given.
         """
-        from jaxcal.models.serial.arm_files import written
+        from jaxcal.models.serial.arm_files import save, written
 
         ratios, yields, waves = self._drives(as_parameters(self, parameters))
         for i in np.flatnonzero(ratios != 1.0):
@@ -657,12 +656,7 @@ class SerialChain(Arm, Model):
                 stacklevel=2,
             )
         text, tip = written(form, self, self.calibrated(parameters))
-        if not force and os.path.exists(path):
-            raise FileExistsError(
-                f"{os.fspath(path)} is there already; force=True writes over it"
-            )
-        with atomic_write(path) as file:
-            file.write(text.encode("utf-8", "surrogateescape"))
+        save(text, path, force)
         return tip
 
     def together(

@@ -1,0 +1,572 @@
+"""Several chains in one model: two arms on a torso, a positioner beside an arm."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import array_of, one_of
+from jaxcal.models import verdict as models
+from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
+from jaxcal.models.sensors import Sensor
+from jaxcal.models.sensors.sensor import BASE, label
+from jaxcal.models.serial.chain import SerialChain
+from jaxcal.models.uncertainty import Noise, Prior
+
+__all__ = ["Chains", "ChainsVerdict"]
+
+Array = NDArray[np.float64]
+_SAME = 1e-9  # of lengths and degrees: one and the same link
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Chains(Model):
+    """Chains by the names of their tips; what they share is one parameter.
+
+    Chains that begin with the same joints (a torso's) share these joints' columns, and
+    the parameters of the links between them. A sensor that is given to several chains
+    as one object stands once: both arms touch the same sockets. All else is each
+    chain's own, named ``left: a3``.
+
+    Commands are the columns of all joints, 0 where they are not of the row's chain;
+    ``chain``, which says of each row whose tip was read, from 0; and the sensors'
+    columns. Readings are in units of their sensor's noise; ``together`` makes
+    such tables, and ``Calibration.of(tip)`` is what was found of one chain, as if it
+    had been alone, in its own units.
+
+    Attributes:
+        tips: names of the chains, two or more.
+        chains: in this order.
+        stands: (C,) the first chain that has the same sensor, itself where none.
+    """
+
+    tips: tuple[str, ...]
+    chains: tuple[SerialChain, ...]
+    stands: tuple[int, ...]
+
+    @classmethod
+    def of(cls, chains: Mapping[str, SerialChain]) -> Self:
+        """The model of chains by the names of their tips.
+
+        Raises:
+            ValueError: there are fewer than two; a joint is in two of them and they do
+                not begin alike up to it.
+        """
+        tips, arms = tuple(chains), tuple(chains.values())
+        if len(arms) < 2 or not all(isinstance(arm, SerialChain) for arm in arms):
+            raise ValueError("chains must hold two arms or more (SerialChain), by tip")
+        sensors = [arm.sensor for arm in arms]
+        stands = [next(i for i, s in enumerate(sensors) if s is own) for own in sensors]
+        model = cls(tips, arms, tuple(stands))
+        for k, arm in enumerate(arms):
+            for other, before in zip(arms[:k], tips, strict=False):
+                common = _common(other, arm)
+                twice = set(other.joint_names) & set(arm.joint_names[common:])
+                if twice:
+                    raise ValueError(
+                        f"joint {sorted(twice)[0]} is in the chains {before} and "
+                        f"{tips[k]}, which are not the same up to it: joints of "
+                        "different chains must have names of their own (joint_names)"
+                    )
+        return model
+
+    @classmethod
+    def from_urdf(
+        cls,
+        path: str | os.PathLike[str],
+        sensors: Mapping[str, Sensor],
+        *,
+        base: str | None = None,
+        locked: Mapping[str, float] | None = None,
+        limits: Mapping[str, tuple[float, float]] | None = None,
+    ) -> Self:
+        """The chains of a URDF file from one base to several tips.
+
+        Joints are stiff here: what a torso yields by depends on all that it carries.
+
+        Args:
+            path: the file.
+            sensors: what each tip link is measured with; one object for two tips
+                stands once.
+            base, locked, limits: as of ``SerialChain.from_urdf``; each chain takes
+                the joints that it has.
+        """
+        arms = {}
+        for tip, sensor in sensors.items():
+            arm = SerialChain.from_urdf(
+                path, base=base, tip=tip, sensor=sensor, locked=locked, compliance=()
+            )
+            own = {n: v for n, v in (limits or {}).items() if n in arm.joint_names}
+            if own:
+                arm = SerialChain.from_urdf(
+                    path,
+                    base=base,
+                    tip=tip,
+                    sensor=sensor,
+                    locked=locked,
+                    limits=own,
+                    compliance=(),
+                )
+            arms[tip] = arm
+        return cls.of(arms)
+
+    # -- what the chains share ---------------------------------------------------------
+
+    @functools.cached_property
+    def _shared(self) -> tuple[int, ...]:
+        """(C,) leading joints of each chain that another one has too."""
+        return tuple(
+            max(_common(arm, other) for other in self.chains if other is not arm)
+            for arm in self.chains
+        )
+
+    @functools.cached_property
+    def _named(self) -> list[list[str]]:
+        """Names in this model of the parameters of each chain."""
+        whole = len(set(self.stands)) == 1
+        named = []
+        for tip, arm, shared, owner in zip(
+            self.tips, self.chains, self._shared, self.stands, strict=True
+        ):
+            links = [f"{name}{i}" for i in range(1, shared) for name in _COLUMNS]
+            common = {*links, *(BASE if shared else ())}
+            common |= {
+                name
+                for name in arm.names
+                for i in range(1, shared + 1)
+                if name in (f"gear{i}", f"compliance{i}")
+                or name.startswith(f"theta{i} ")
+            }
+            of_sensor = "" if whole else f"{self.tips[owner]}: "
+            prefix = dict.fromkeys(arm.names, f"{tip}: ") | dict.fromkeys(common, "")
+            prefix |= dict.fromkeys(arm.sensor.names, of_sensor)
+            named.append([prefix[name] + name for name in arm.names])
+        return named
+
+    @functools.cached_property
+    def names(self) -> tuple[str, ...]:
+        """p: of chain after chain, harmonics of all last."""
+        kept, waves = [], []
+        for arm, named in zip(self.chains, self._named, strict=True):
+            end = len(named) - arm.waves.size
+            kept += named[:end]
+            waves += named[end:]
+        return tuple(dict.fromkeys([*kept, *waves]))
+
+    @functools.cached_property
+    def members(self) -> tuple[NDArray[np.intp], ...]:
+        """Where each chain's parameters are among those of this model."""
+        at = {name: i for i, name in enumerate(self.names)}
+        return tuple(np.array([at[n] for n in named]) for named in self._named)
+
+    def _gather(self, values: Sequence[Any]) -> Any:
+        """(p,) from each chain's, the first chain's where they share one."""
+        result = np.empty(len(self.names), dtype=np.asarray(values[0]).dtype)
+        for at, own in zip(self.members[::-1], values[::-1], strict=True):
+            result[at] = own
+        return result
+
+    def _parts(
+        self, commands: Array
+    ) -> Iterator[tuple[int, SerialChain, NDArray[np.intp], Array]]:
+        """Each chain and its number, its rows, and its commands there."""
+        which = label("chain", commands[:, len(self.joint_names)], len(self.chains))
+        for k, arm in enumerate(self.chains):
+            rows = np.flatnonzero(which == k)
+            yield k, arm, rows, commands[rows][:, self._columns[k]]
+
+    @functools.cached_property
+    def _columns(self) -> tuple[list[int], ...]:
+        """Columns of the commands of each chain."""
+        wanted = [(*a.joint_names, *a.sensor.inputs) for a in self.chains]
+        return tuple([self.inputs.index(name) for name in names] for names in wanted)
+
+    def _scale(self, k: int) -> Array:
+        """(q,) units of a chain's readings."""
+        arm = self.chains[k]
+        return arm.sensor.stds(arm.length or 1.0)
+
+    # -- the model ---------------------------------------------------------------------
+
+    @functools.cached_property
+    def joint_names(self) -> tuple[str, ...]:
+        """Columns of the joints, chain after chain."""
+        return tuple(dict.fromkeys(n for arm in self.chains for n in arm.joint_names))
+
+    @functools.cached_property
+    def inputs(self) -> tuple[str, ...]:
+        columns = (name for arm in self.chains for name in arm.sensor.inputs)
+        return (*self.joint_names, "chain", *dict.fromkeys(columns))
+
+    @property
+    def num_inputs(self) -> int:
+        """n."""
+        return len(self.inputs)
+
+    @property
+    def num_outputs(self) -> int:
+        """q, of the sensor that reads most."""
+        return max(arm.num_outputs for arm in self.chains)
+
+    @property
+    def nominal(self) -> Array:
+        """(p,)."""
+        return np.asarray(self._gather([arm.nominal for arm in self.chains]))
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """p units, as of ``SerialChain``."""
+        units = [np.array(arm.units, dtype=object) for arm in self.chains]
+        return tuple(self._gather(units))
+
+    def predict(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """Readings (N, q) in noise, 0 beyond those of a row's sensor."""
+        commands, theta = as_commands(self, commands), as_parameters(self, parameters)
+        values = np.zeros((len(commands), self.num_outputs))
+        for k, arm, rows, own in self._parts(commands):
+            if len(rows):
+                read = arm.predict(own, theta[self.members[k]]) / self._scale(k)
+                values[rows, : arm.num_outputs] = read
+        return values
+
+    def jacobian(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """(N, q, p)."""
+        return self._slopes("jacobian", commands, parameters, self.members)
+
+    def command_jacobian(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """(N, q, n)."""
+        return self._slopes("command_jacobian", commands, parameters, self._columns)
+
+    def _slopes(
+        self, by: str, commands: ArrayLike, parameters: ArrayLike | None, at: Any
+    ) -> Array:
+        commands, theta = as_commands(self, commands), as_parameters(self, parameters)
+        width = len(self.names) if by == "jacobian" else self.num_inputs
+        slopes = np.zeros((len(commands), self.num_outputs, width))
+        for k, arm, rows, own in self._parts(commands):
+            if len(rows):
+                of_chain = getattr(arm, by)(own, theta[self.members[k]])
+                outputs = np.arange(arm.num_outputs)
+                slopes[np.ix_(rows, outputs, at[k])] = (
+                    of_chain / self._scale(k)[:, None]
+                )
+        return slopes
+
+    def wrapped(self, off: Array, commands: Array) -> Array:
+        off = off.copy()
+        for k, arm, rows, own in self._parts(commands):
+            scale, q = self._scale(k), arm.num_outputs
+            its = off[..., rows, :q] * scale
+            off[..., rows, :q] = arm.wrapped(its, own) / scale
+        return off
+
+    def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
+        theta = as_parameters(self, parameters)
+        offs, rows = [np.zeros(0)], [np.zeros((0, len(theta)))]
+        for k, (arm, at) in enumerate(zip(self.chains, self.members, strict=True)):
+            if self.stands[k] != k:  # a distance is known once
+                continue
+            off, slopes = arm.facts(theta[at])
+            offs.append(off)
+            rows.append(np.zeros((len(off), len(theta))))
+            rows[-1][:, at] = slopes
+        return np.concatenate(offs), np.concatenate(rows)
+
+    # -- what is known before measuring ------------------------------------------------
+
+    def default_noise(self) -> Noise:
+        """1: readings are in noise."""
+        return Noise(std=1.0)
+
+    def default_prior(self) -> Prior:
+        """Prior of each chain; held is what no chain that has it sees.
+
+        Where two arms with bases of their own touch the same sockets, the first one's
+        base is held and the other's is found.
+        """
+        priors = [arm.default_prior() for arm in self.chains]
+        seen: set[str] = set()
+        held: dict[str, None] = {}
+        for k, (arm, named, prior) in enumerate(
+            zip(self.chains, self._named, priors, strict=True)
+        ):
+            fixed = set(prior.fixed)
+            if self.stands[k] != k:
+                fixed -= set(BASE)
+            for name, own in zip(named, arm.names, strict=True):
+                if own in fixed:
+                    held[name] = None
+                elif self.stands[k] == k or own not in BASE or not self._shared[k]:
+                    seen.add(name)
+        std = self._gather([np.asarray(prior.std) for prior in priors])
+        unseen = tuple(name for name in held if name not in seen)
+        return Prior(std, fixed=unseen, by_data=True)
+
+    def parameter_sizes(self) -> Array:
+        sizes = [arm.parameter_sizes() for arm in self.chains]
+        return np.asarray(self._gather(sizes))
+
+    def error_groups(self) -> ErrorGroups:
+        """Groups as of ``SerialChain``, one scale for all chains."""
+        groups = [arm.error_groups() for arm in self.chains]
+        members = self._gather([group.members for group in groups])
+        return groups[0]._replace(members=members)
+
+    @property
+    def misfit_std(self) -> float:
+        """Largest of the chains' misfits of a reading, in noise."""
+        return max(
+            arm.misfit_std / float(self._scale(k).min())
+            for k, arm in enumerate(self.chains)
+        )
+
+    @property
+    def fits_misfit(self) -> bool:
+        return all(arm.fits_misfit for arm in self.chains)
+
+    def with_misfit(self) -> Self:
+        """These chains with harmonics of their joints."""
+        return self._bent
+
+    @functools.cached_property
+    def _bent(self) -> Self:  # kept, and what it keeps with it
+        bent = tuple(arm.with_misfit() for arm in self.chains)
+        if all(a is b for a, b in zip(bent, self.chains, strict=True)):
+            return self
+        return dataclasses.replace(self, chains=bent)
+
+    # -- the commands and readings of a fit or a choice --------------------------------
+
+    def together(
+        self, tables: Mapping[str, tuple[ArrayLike, ArrayLike | None]]
+    ) -> tuple[Array, Array]:
+        """Commands and readings of all chains as the tables that a fit takes.
+
+        Args:
+            tables: by tip a pair: commands (N, n) of that chain with its sensor's
+                columns, and what it measured (N, q), or None for zeros (contacts) and
+                for candidates.
+
+        Returns:
+            Commands (N, n) and readings (N, q) in noise.
+        """
+        all_commands, all_measured = [], []
+        for tip, (given, read) in tables.items():
+            k = self.tips.index(one_of("tip", tip, self.tips))
+            arm, columns = self.chains[k], self._columns[k]
+            own = array_of(f"commands of {tip}", given, "N", len(columns))
+            commands = np.zeros((len(own), self.num_inputs))
+            commands[:, len(self.joint_names)] = k
+            commands[:, columns] = own
+            measured = np.zeros((len(own), self.num_outputs))
+            if read is not None:
+                what, width = f"measured of {tip}", arm.num_outputs
+                values = array_of(what, read, len(own), width)
+                measured[:, :width] = values / self._scale(k)
+            all_commands.append(commands)
+            all_measured.append(measured)
+        return np.vstack(all_commands), np.vstack(all_measured)
+
+    def require_commands(self, commands: Array) -> None:
+        for _, arm, rows, own in self._parts(commands):
+            if len(rows):
+                arm.require_commands(own)
+
+    def prepared(self, commands: Array, measured: Array | None = None) -> Self:
+        """These chains with their sensors where commands (and readings) put them."""
+        arms = list(self.chains)
+        for k, arm, rows, own in self._parts(commands):
+            if not len(rows):
+                continue
+            if self.stands[k] != k:
+                arm = arm.measured_with(arms[self.stands[k]].sensor)
+            q, scale = arm.num_outputs, self._scale(k)
+            read = None if measured is None else measured[rows, :q] * scale
+            arms[k] = arm.prepared(own, read)
+        for k, owner in enumerate(self.stands):
+            if owner != k:
+                arms[k] = arms[k].measured_with(arms[owner].sensor)
+        return dataclasses.replace(self, chains=tuple(arms))
+
+    def distinct(self, commands: Array, measured: Array) -> NDArray[np.intp]:
+        kept = []
+        for _, arm, rows, own in self._parts(commands):
+            kept.append(rows[arm.distinct(own, measured[rows])])
+        return np.sort(np.concatenate(kept))
+
+    @property
+    def placed(self) -> tuple[str, ...]:
+        names = (
+            name
+            for arm, named in zip(self.chains, self._named, strict=True)
+            for name, own in zip(named, arm.names, strict=True)
+            if own in arm.sensor.names
+        )
+        return tuple(dict.fromkeys(names))
+
+    # -- a calibrated machine ----------------------------------------------------------
+
+    def of_chain(self, fit: Any, tip: str) -> dict[str, Any]:
+        """The fields of a calibration that are of one chain, in its own units."""
+        k = self.tips.index(one_of("tip", tip, self.tips))
+        arm, at, scale = self.chains[k], fit.whole.members[k], self._scale(k)
+        q, (_, _, rows, own) = arm.num_outputs, list(self._parts(fit.commands))[k]
+        residuals = fit.residuals[rows, :q] * scale
+        noise = None if fit.noise_std is None else fit.noise_std[:q] * scale
+        square = fit.square
+        if noise is not None:
+            weights = fit.loss_weights[rows]
+            square = float((weights[:, None] * (residuals / noise) ** 2).sum())
+        share = len(rows) * q / max(len(fit.commands) * self.num_outputs, 1)
+        null = fit.unidentified
+        if null is not None:
+            null = null[:, at]
+            null = null[np.abs(null).max(axis=1, initial=0.0) > 0.0]
+        joint = fit.joint_covariance
+        names = arm.inputs or (*arm.joint_names, *arm.sensor.inputs)
+        return {
+            "model": arm,
+            "input_names": tuple(names),
+            "output_names": tuple(arm.sensor.outputs),
+            "estimate": fit.estimate[at],
+            "joint_covariance": None if joint is None else joint[np.ix_(at, at)],
+            "unidentified": null if null is not None and len(null) else None,
+            "prior_mean": fit.prior_mean[at],
+            "prior_precision": fit.prior_precision[at],
+            "free": fit.free[at],
+            "commands": own,
+            "estimated_commands": None,
+            "residuals": residuals,
+            "loss_weights": fit.loss_weights[rows],
+            "distance": fit.distance[rows],
+            "dof": max(fit.dof * share, 0.0),
+            "square": square,
+            "num_readings": float(q),
+            "noise_std": noise,
+        }
+
+    def verdict(self, fit: Any) -> ChainsVerdict:
+        """Good where every chain that was read is."""
+        read = {
+            self.tips[k] for k, _, rows, _ in self._parts(fit.commands) if rows.size
+        }
+        of_chains = {tip: fit.of(tip).verdict for tip in self.tips if tip in read}
+        bad = [tip for tip, told in of_chains.items() if not told.good]
+        step = f"{bad[0]}: {of_chains[bad[0]].next_step}" if bad else models.USE
+        reasons = [
+            f"{tip}: {line}" for tip, told in of_chains.items() for line in told.lines()
+        ]
+        reasons += [f"{tip}: no reading" for tip in self.tips if tip not in read]
+        return ChainsVerdict(not bad, tuple(reasons), step, "", of_chains)
+
+    def calibrated(self, parameters: ArrayLike) -> Self:
+        """The chains whose nominal is this one with ``parameters``."""
+        theta = as_parameters(self, parameters)
+        return dataclasses.replace(
+            self,
+            chains=tuple(
+                arm.calibrated(theta[at], arm.sensor)
+                for arm, at in zip(self.chains, self.members, strict=True)
+            ),
+        )
+
+    def writable(self) -> Self:
+        return dataclasses.replace(
+            self, chains=tuple(arm.writable() for arm in self.chains)
+        )
+
+    def write(
+        self,
+        form: str,
+        path: str | os.PathLike[str],
+        parameters: ArrayLike,
+        *,
+        force: bool = False,
+    ) -> str:
+        """Write the URDF file that all chains came from, every chain corrected.
+
+        Returns:
+            The tip links, with a comma between.
+        """
+        from jaxcal.models.serial.arm_files import save, urdf_text
+
+        one_of("form", form, ("urdf",))
+        theta = as_parameters(self, parameters)
+        pairs = [
+            (arm, arm.calibrated(theta[at]))
+            for arm, at in zip(self.chains, self.members, strict=True)
+        ]
+        text, tips = urdf_text(pairs)
+        save(text, path, force)
+        return ", ".join(tips)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What a file holds of the model."""
+        arms = [arm.to_dict() for arm in self.chains]
+        stands = list(self.stands)
+        return {"kind": "chains", "tips": self.tips, "chains": arms, "stands": stands}
+
+    @classmethod
+    def from_dict(
+        cls, tips: Sequence[str], chains: Sequence[Any], stands: Sequence[int]
+    ) -> Self:
+        """The inverse of ``to_dict``."""
+        arms: list[SerialChain] = []
+        for content, owner in zip(chains, stands, strict=True):
+            own = {key: value for key, value in content.items() if key != "kind"}
+            arm = SerialChain.from_dh(**own)
+            if owner < len(arms):
+                arm = arm.measured_with(arms[owner].sensor)
+            arms.append(arm)
+        return cls(tuple(tips), tuple(arms), tuple(stands))
+
+
+@dataclasses.dataclass(frozen=True)
+class ChainsVerdict(models.Verdict):
+    """What the readings say of each chain."""
+
+    of_chains: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def held_out(self) -> float:
+        """Mean held-out error of the chains, each in its unit."""
+        return float(np.mean([told.held_out for told in self.of_chains.values()]))
+
+
+_COLUMNS = ("a", "alpha", "d", "theta", "beta")
+
+
+def _common(one: SerialChain, other: SerialChain) -> int:
+    """Leading joints that two chains have in common."""
+    if not np.allclose(one.base, other.base, atol=_SAME):
+        return 0
+    if one.convention != other.convention:
+        return 0
+    count = 0
+    least = min(len(one.joints), len(other.joints))
+    while count < least and _alike(one, other, count):
+        count += 1
+    return count
+
+
+def _alike(one: SerialChain, other: SerialChain, i: int) -> bool:
+    """Whether joint ``i`` is the same of both, and the link before it."""
+    names = [
+        [a.joint_names[k] for k in np.flatnonzero(a.drive[i])] for a in (one, other)
+    ]
+    link = i == 0 or np.allclose(one.table[i - 1], other.table[i - 1], atol=_SAME)
+    kind = one.joints[i] == other.joints[i]
+    moves = one.drive[i][one.drive[i] != 0.0], other.drive[i][other.drive[i] != 0.0]
+    return bool(link and kind and names[0] == names[1] and np.array_equal(*moves))

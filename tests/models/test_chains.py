@@ -1,0 +1,243 @@
+"""Several chains in one model, against the file's frames multiplied out."""
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import jaxcal
+from jaxcal.models import Chains, Position, SerialChain, Socket, from_dict
+from jaxcal.models.serial.urdf import joints_of
+
+from .arms import differences
+
+TORSO = [("yaw", "base", "waist", (0, 0, 0.3), (0, 0, 0), "0 0 1")]
+TORSO += [("pitch", "waist", "chest", (0, 0, 0.2), (0, 0, 0), "0 1 0")]
+
+
+def side(name, sign):
+    """Joints of an arm on the chest, and the hand fixed to its last link."""
+    links = ["chest", *(f"{name}{i}" for i in range(1, 6))]
+    places = [(0.05, 0.2 * sign, 0.3), (0, 0.1 * sign, 0), (0.05, 0, -0.25)]
+    places += [(0, 0, -0.05), (0.02, 0, -0.2)]
+    axes = ["0 1 0", "1 0 0", "0 0 1", "0 1 0", "1 0 0"]
+    joints = [
+        (f"{name}_joint{i + 1}", links[i], links[i + 1], places[i], (0, 0, 0), axes[i])
+        for i in range(5)
+    ]
+    hand = (f"{name}_fixed", links[-1], f"{name}_hand", (0.01, 0, -0.12), (0, 0, 0), "")
+    return [*joints, hand]
+
+
+JOINTS = [*TORSO, *side("left", 1), *side("right", -1)]
+
+
+def urdf(path, rng=None):
+    """Write the robot, its origins off as real ones are by ``rng``."""
+    text = ['<robot name="torso">']
+    links = dict.fromkeys(["base", *(joint[2] for joint in JOINTS)])
+    text += [f'<link name="{link}"/>' for link in links]
+    for name, parent, child, xyz, rpy, axis in JOINTS:
+        xyz, rpy = np.array(xyz, float), np.array(rpy, float)
+        if rng is not None:
+            xyz, rpy = xyz + rng.normal(0, 1e-3, 3), rpy + rng.normal(0, 5e-3, 3)
+        kind = "revolute" if axis else "fixed"
+        text.append(
+            f'<joint name="{name}" type="{kind}"><parent link="{parent}"/>'
+            f'<child link="{child}"/><origin xyz="{" ".join(map(repr, xyz.tolist()))}"'
+            f' rpy="{" ".join(map(repr, rpy.tolist()))}"/>'
+            + (f'<axis xyz="{axis}"/><limit lower="-1.5" upper="1.5"/>' if axis else "")
+            + "</joint>"
+        )
+    path.write_text("\n".join([*text, "</robot>"]))
+    return path
+
+
+def tip_at(path, tip, joints, commands):
+    """(N, 3) of a link by the file's own frames; ``joints`` name the columns."""
+    above = {joint.child: joint for joint in joints_of(path.read_text()).values()}
+    places = []
+    for row in commands:
+        at = dict(zip(joints, row, strict=True))
+        point, link = np.zeros(3), tip
+        while link in above:
+            joint = above[link]
+            turn = Rotation.from_rotvec(joint.axis * at.get(joint.name, 0), True)
+            point = joint.origin[:3, :3] @ turn.apply(point) + joint.origin[:3, 3]
+            link = joint.parent
+        places.append(point)
+    return np.array(places)
+
+
+def tracked(path):
+    return Chains.from_urdf(
+        path, {"left_hand": Position(), "right_hand": Position()}, base="base"
+    )
+
+
+@pytest.fixture
+def robot(tmp_path):
+    return tracked(urdf(tmp_path / "robot.urdf"))
+
+
+def postures(model, count, seed):
+    """Commands of both chains, half of the rows each."""
+    rng = np.random.default_rng(seed)
+    of_tips = {
+        tip: (rng.uniform(-80, 80, (count // 2, arm.num_joints)), None)
+        for tip, arm in zip(model.tips, model.chains, strict=True)
+    }
+    return model.together(of_tips)[0]
+
+
+def read(path, model, commands, noise=0.0, seed=0):
+    """(N, 3) in noise, of tips by the frames of a file."""
+    rng = np.random.default_rng(seed)
+    values = np.zeros((len(commands), 3))
+    joints = len(model.joint_names)
+    for k, (tip, arm) in enumerate(zip(model.tips, model.chains, strict=True)):
+        rows = commands[:, joints] == k
+        at = tip_at(path, tip, model.joint_names, commands[rows, :joints])
+        at += rng.normal(0, noise, at.shape)
+        values[rows] = at / arm.sensor.stds(arm.length)
+    return values
+
+
+def test_both_tips_are_where_the_file_has_them(robot, tmp_path):
+    commands = postures(robot, 8, 0)
+    wanted = read(tmp_path / "robot.urdf", robot, commands)
+    np.testing.assert_allclose(robot.predict(commands), wanted, atol=1e-9)
+    assert robot.joint_names[:3] == ("yaw", "pitch", "left_joint1")
+    assert len(robot.joint_names) == 12
+    shared = [name for name in robot.names if ":" not in name]
+    assert shared == ["a1", "alpha1", "d1", "theta1", "beta1", *shared[5:]]
+    assert [name.split()[0] for name in shared[5:]] == ["base"] * 6
+
+
+def test_derivatives_are_those_of_the_readings(robot):
+    rng = np.random.default_rng(1)
+    commands = postures(robot, 4, 1)
+    theta = robot.nominal + rng.normal(0, 1e-3, len(robot.names))
+    by_theta = differences(lambda t: robot.predict(commands, t), theta)
+    np.testing.assert_allclose(robot.jacobian(commands, theta), by_theta, atol=2e-4)
+    slopes = robot.command_jacobian(commands, theta)
+    joints = len(robot.joint_names)
+    for row, one in zip(commands, slopes, strict=True):
+        moved = differences(
+            lambda u, row=row: robot.predict([[*u, *row[joints:]]], theta)[0],
+            row[:joints],
+        )
+        np.testing.assert_allclose(one[:, :joints], moved, atol=2e-4)
+
+
+@pytest.mark.slow
+def test_two_arms_on_a_torso_are_found_together_and_written_in_one_file(tmp_path):
+    nominal, truth = tmp_path / "robot.urdf", tmp_path / "truth.urdf"
+    robot = tracked(urdf(nominal))
+    urdf(truth, np.random.default_rng(3))
+    offered, others = postures(robot, 200, 4), postures(robot, 200, 5)
+    chosen = offered[jaxcal.select(offered, 40, "exchange", model=robot).indices]
+    measured = read(truth, robot, chosen, 1e-4)
+    found = jaxcal.identify(chosen, measured, model=robot)
+    assert found.verdict.good, str(found.verdict)
+    off = found.predict(others) - read(truth, robot, others)
+    before = robot.predict(others) - read(truth, robot, others)
+    rms = np.sqrt((off**2).mean())
+    assert rms < 0.1 * np.sqrt((before**2).mean())
+    std = np.sqrt((found.predict_std(others) ** 2).mean())
+    assert 0.5 < rms / std < 1.6
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # harmonics are left out
+        written = tmp_path / "new.urdf"
+        tips = found.to_urdf(written).split(", ")
+    left = [
+        tip_at(path, tip, robot.joint_names, others[rows, :12])
+        for k, tip in enumerate(robot.tips)
+        for rows in [others[:, 12] == k]
+        for path, tip in ((written, tips[k]), (truth, tip))
+    ]
+    for file, real in (left[:2], left[2:]):
+        assert np.linalg.norm(file - real, axis=1).mean() < 5e-4
+
+    again = jaxcal.Calibration.from_dict(json.loads(json.dumps(found.to_dict())))
+    np.testing.assert_array_equal(again.predict(others), found.predict(others))
+    assert "left_hand: held-out error" in str(found.verdict)
+    alone = found.of("left_hand")
+    rows = others[:, 12] == 0
+    own = others[rows][:, [robot.inputs.index(n) for n in alone.input_names]]
+    scale = robot.chains[0].sensor.stds(robot.chains[0].length)
+    np.testing.assert_allclose(
+        alone.predict(own), found.predict(others[rows]) * scale, atol=1e-12
+    )
+    assert found.check(chosen[::4], measured[::4]).says != "does not hold"
+    # What the torso is, both arms say: less is left of it than one arm alone leaves.
+    one = jaxcal.identify(
+        chosen[chosen[:, 12] == 0], measured[chosen[:, 12] == 0], model=robot
+    )
+    at = robot.names.index("theta1")
+    assert found.standard_errors[at] < one.standard_errors[at]
+
+
+@pytest.mark.slow
+def test_arms_that_touch_the_same_sockets_show_where_the_other_stands(tmp_path):
+    rng = np.random.default_rng(0)
+    arm = [(0, 90, 0.3, 0), (-0.4, 0, 0, 0), (-0.3, 0, 0, 0), (0, 90, 0.1, 0)]
+    arm += [(0, -90, 0.1, 0), (0, 0, 0.1, 0)]
+    places = np.array([[0.4, 0.0, 0.3], [0.4, 0.1, 0.45], [0.45, -0.1, 0.2]])
+    sockets = Socket(3, places)
+    base = np.eye(4)
+    base[:3, :3] = Rotation.from_euler("z", 180, True).as_matrix()
+    base[:3, 3] = [0.8, 0.0, 0.0]
+    chains = {
+        tip: SerialChain.from_dh(
+            arm,
+            base=at,
+            tool=(0.02, 0.0, 0.1),
+            sensor=sockets,
+            compliance=(),
+            joint_names=[f"{tip}{i}" for i in range(6)],
+            limits=[(-170, 170)] * 6,
+        )
+        for tip, at in (("one", np.eye(4)), ("two", base))
+    }
+    model = Chains.of(chains)
+    assert "socket0 x" in model.names
+    prior = model.default_prior()
+    assert "one: base x" in prior.fixed and "two: base x" not in prior.fixed
+    truth = model.nominal + 0.5 * np.where(
+        np.isfinite(np.asarray(prior.std)), prior.std, 0.0
+    ) * rng.normal(size=len(model.names))
+    truth[[model.names.index(n) for n in prior.fixed]] = 0.0
+    shift = [model.names.index(f"two: base {axis}") for axis in "xyz"]
+    truth[shift] = base[:3, 3] + [0.004, -0.006, 0.003]
+    tables = {}
+    for tip, chain, at in zip(model.tips, model.chains, model.members, strict=True):
+        real = chain.calibrated(truth[at], chain.sensor)
+        tables[tip] = real.postures(60, seed=1), None
+    commands, measured = model.together(tables)
+    measured = measured + rng.normal(0, 0.5, measured.shape)
+    found = jaxcal.identify(commands, measured, model=model)
+    errors = (found.parameters - truth)[shift]
+    assert np.abs(errors / found.standard_errors[shift]).max() < 3.5
+    assert np.linalg.norm(errors) < 2e-3
+
+
+def test_chains_that_share_no_joint_must_not_name_one_alike():
+    arm = SerialChain.from_dh([(0, 90, 0.3, 0), (0.4, 0, 0, 0)])
+    other = SerialChain.from_dh([(0, 90, 0.3, 0), (0.5, 0, 0, 0)], base=(1, 0, 0))
+    with pytest.raises(ValueError, match="joint 1 is in the chains a and b"):
+        Chains.of({"a": arm, "b": other})
+    with pytest.raises(ValueError, match="two arms or more"):
+        Chains.of({"a": arm})
+    with pytest.raises(ValueError, match="must be Chains"):
+        arm.of_chain(None, "a")
+
+
+def test_a_file_keeps_which_sensor_is_one(robot):
+    again = from_dict(json.loads(json.dumps(robot.to_dict())))
+    assert again.names == robot.names and again.stands == robot.stands
+    commands = postures(robot, 4, 2)
+    np.testing.assert_array_equal(again.predict(commands), robot.predict(commands))
