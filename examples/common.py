@@ -25,7 +25,7 @@ HERE = pathlib.Path(__file__).parent
 NAMES = (
     *("ankle", "ur5", "contacts", "hand_eye", "drift", "force_sensor", "triad"),
     *("camera", "tcp", "own_function", "backlash", "magnetometry", "own_policy"),
-    *("cartpole", "end_stop", "fr3", "positioner", "real_camera", "trajectories"),
+    *("cartpole", "slot", "fr3", "positioner", "real_camera", "trajectories"),
     "wrench",
 )
 Rows = list[dict[str, str]]

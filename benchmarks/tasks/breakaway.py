@@ -33,6 +33,9 @@ def breakaway(
     spread: float = 0.004,
     outliers: float = 1e-3,
     measurements: int = 40,
+    seconds: float | tuple[float, float] = np.inf,
+    test_s: float = 1.0,
+    return_s: float = 2.0,
 ) -> GridTask:
     """The task: theta = (up, down) thresholds, design = (step, direction).
 
@@ -46,6 +49,9 @@ def breakaway(
         spread: standard deviation of the threshold from one test to the next.
         outliers: share of tests that carry no information.
         measurements: that end a session.
+        seconds: budget of a session, or (least, most) to draw it from.
+        test_s: seconds of a test.
+        return_s: seconds more until a joint that moved is back at rest.
     """
     if directions not in (1, 2):
         raise ValueError(f"directions must be 1 or 2, got {directions}")
@@ -64,8 +70,11 @@ def breakaway(
         np.column_stack([u, 1.0 - 2.0 * side]),
         np.stack([1.0 - moved, moved], axis=1),
         groups=side,
+        travel=test_s,
+        extra=[0.0, return_s],
         uses=1,
         num_uses=measurements,
+        seconds=seconds,
         horizon=measurements,
         theta_names=["up", "down"][:directions],
         design_names=["step", "direction"],

@@ -42,7 +42,7 @@ tasks, of sequential measurement:
   FILE.py   your own: a file that defines ENTRY (docs/adaptive.md)
 
 what to try first:
-  {program}                        the compact policy, a few minutes on a laptop
+  {program}                        the compact policy, one to three minutes on a laptop
   {program} --episodes 20000 --out runs/brief   half a minute, 0.990 of the optimum
   {program} --num-selected 6 --out runs/six     another number of postures
   {program} --candidates mine.csv --out runs/mine   your own machine's postures

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 import textwrap
 
 import jax
@@ -160,6 +161,16 @@ def test_a_users_task_is_one_file(own):
     task = entry.make(**options)
     found = compare(task, {"gain": Gain(), "state": StateRule(0.1, 1.0, 1.0)}, 256)
     assert (found.gain > 0.0).all()
+
+
+def test_a_users_file_imports_what_lies_beside_it(own):
+    (own.parent / "beside_own.py").write_text("ABOUT = 'a heavy die'")
+    own.write_text(
+        "from beside_own import ABOUT\n" + FILE.replace('"a heavy side"', "ABOUT")
+    )
+    before = list(sys.path)
+    assert registry.load(str(own)).about == "a heavy die"
+    assert sys.path == before
 
 
 @pytest.mark.parametrize(

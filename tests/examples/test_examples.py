@@ -190,12 +190,21 @@ def test_only_the_sum_of_rotor_and_upper_arm_moves_the_simulated_arm():
 
 
 @pytest.mark.slow
-def test_a_policy_of_an_end_stop_is_no_worse_than_the_rule_it_begins_as(tmp_path):
+def test_a_policy_of_a_slot_is_no_worse_than_the_rule_it_begins_as(tmp_path):
     """After 12 updates; the largest gain alone, which pays no price, is far behind."""
-    found, rows = quick("end_stop", tmp_path)
-    played = found.found
-    assert [row["method"] for row in rows] == list(played.names)
-    over_rule, error = played.paired("policy", "state")
-    assert over_rule > -3.0 * error
-    over_gain, error = played.paired("policy", "gain")
-    assert over_gain > 10.0 * error
+    found, rows = quick("slot", tmp_path)
+    names = ["gain", "state", "shares", "ahead", "policy 0"]
+    assert [row["method"] for row in rows] == names
+    gains = {
+        name: found.results[name].found.gain[
+            found.results[name].found.names.index(name.split()[0])
+        ]
+        for name in names
+    }
+    for row in rows:
+        assert float(row["nats"]) == pytest.approx(
+            gains[row["method"]].mean(), abs=1e-3
+        )
+    for name, errors in (("state", -3.0), ("gain", 10.0)):
+        less = gains["policy 0"] - gains[name]
+        assert less.mean() > errors * less.std() / np.sqrt(len(less))

@@ -71,6 +71,7 @@ def backlash(
     measure_s: float = 1.0,
     speed: float = 5.0,
     measurements: int = 20,
+    seconds: float | tuple[float, float] = np.inf,
 ) -> GridTask:
     """The task: theta = (width, offset), design = (posture, direction).
 
@@ -91,6 +92,7 @@ def backlash(
         speed: of the axis, per second. A measurement runs up from 1.5 of ``max_width``
             on the other side.
         measurements: that end a session.
+        seconds: budget of a session, or (least, most) to draw it from.
     """
     far = 1.5 * max_width
     at = (
@@ -119,6 +121,7 @@ def backlash(
         uses=1,
         num_uses=measurements,
         horizon=measurements,
+        seconds=seconds,
         theta_names=["width", "offset"],
         design_names=["posture", "direction"],
     )

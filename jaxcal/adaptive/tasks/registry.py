@@ -86,7 +86,11 @@ def _of_file(path: pathlib.Path) -> Any:
     assert spec is not None and spec.loader is not None  # it is a Python file
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # its dataclasses look up the module there
-    spec.loader.exec_module(module)
+    sys.path.insert(0, folder := str(path.parent.resolve()))  # as Python runs a file
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        sys.path.remove(folder)
     if not hasattr(module, "ENTRY"):
         raise ValueError(f"task file {path} must define ENTRY = Entry(...)")
     return module.ENTRY

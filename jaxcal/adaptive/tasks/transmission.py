@@ -29,6 +29,7 @@ def transmission_error(
     measure_s: float = 1.0,
     travel_s: float = 2.0,
     measurements: int = 20,
+    seconds: float | tuple[float, float] = np.inf,
 ) -> GridTask:
     """The task: theta = (frequency, amplitude, phase), design = (posture,) in [0, 1].
 
@@ -44,6 +45,7 @@ def transmission_error(
         measure_s: seconds of a reading.
         travel_s: seconds over the full range.
         measurements: that end a session.
+        seconds: budget of a session, or (least, most) to draw it from.
     """
     low, high = frequencies
     if not 0.0 < low < high:
@@ -71,6 +73,7 @@ def transmission_error(
         uses=1,
         num_uses=measurements,
         horizon=measurements,
+        seconds=seconds,
         theta_names=["frequency", "amplitude", "phase"],
         design_names=["posture"],
     )
