@@ -149,6 +149,18 @@ def setup(
     units: Units = 16,
     imu: Annotated[str, "APP[:PORT]: hyperimu, sensorlogger or lines"] = "",
     home: Annotated[Literal["here", "drive"], "how"] = "here",
+    axes: Annotated[
+        str, "NAME:KIND,... with a KIND of X, Y, Z (a phone's), deg or mm"
+    ] = "",
+    drives: Annotated[str, "their map: grbl, marlin, cia402, FILE.toml, ..."] = "",
+    readings: Annotated[
+        str, "numbers, not a phone: tcp:HOST:PORT, listen:PORT, serial:DEVICE, ..."
+    ] = "",
+    urdf: Annotated[str, "of an arm, whose joints are the axes"] = "",
+    example: Annotated[
+        Literal["turntable", "gimbal", "stage", "servos"], "these for a device"
+    ]
+    | None = None,
     set: Annotated[list[str], "KEY=VALUE of the new rig.toml"] | None = None,
 ) -> int:
     """from cables to a device that may be calibrated; writes rig.toml"""
@@ -158,7 +170,15 @@ def setup(
 
     path, operator = given.config or FILE, steps.Operator(given.yes, _say)
     values = dict(map(wizard.setting, set or ()))
-    asked = wizard.Given(bus, imu, units, values, home)
+    asked = wizard.asked(
+        bus=bus, imu=imu, units=units, values=values, home=home, axes=axes,
+        drives=drives, readings=readings, model=urdf, example=example or "",
+    )  # fmt: skip
+    if given.simulate and (axes or drives or readings or urdf or example):
+        raise Refused(
+            "--simulate commissions the simulator's own device: leave out --axes, "
+            "--drives, --readings, --urdf and --example"
+        )
     with contextlib.ExitStack() as stack:
         if given.simulate:
             device = dataclasses.replace(given, config=None)

@@ -9,7 +9,7 @@ import dataclasses
 import importlib
 import importlib.util
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -105,7 +105,7 @@ def _arm(config: RigConfig) -> DeviceModel:
         tip=config.model.tip or None,
         sensor=sensor,
     )
-    names = [re.sub("[^a-z0-9]+", "_", name.lower()) for name in arm.joint_names]
+    names = _in_small_letters(arm.joint_names)
     if tuple(names) != config.axis_names:
         raise ValueError(
             f"its joints are {', '.join(names)} from the base outwards; the axes must "
@@ -118,6 +118,17 @@ def _arm(config: RigConfig) -> DeviceModel:
     return DeviceModel(
         arm, prior, lambda commands: arm.rotations(commands, 0.0 * commands[:, :3])
     )
+
+
+def _in_small_letters(names: Sequence[str]) -> list[str]:
+    return [re.sub("[^a-z0-9]+", "_", name.lower()) for name in names]
+
+
+def joint_names(urdf: str) -> list[str]:
+    """Names of the axes of an arm, from the base outwards; ValueError, OSError."""
+    from jaxcal.models import SerialChain
+
+    return _in_small_letters(SerialChain.from_urdf(urdf).joint_names)
 
 
 def _made(config: RigConfig) -> DeviceModel:

@@ -62,7 +62,8 @@ def _compare(device: Device, j: int, turn: Array, then: Array, noise: float) -> 
     """(3,) turns for a degree of axis j, or (m,) of numbers, now and at `axes`; the
     noise of each part."""
     size, before = float(np.linalg.norm(turn)), float(np.linalg.norm(then))
-    share, axis = size / before, device.config.axes[j]
+    share, axis, geometry = size / before, device.config.axes[j], device.geometry
+    one = "degree" if axis.unit_name == "deg" else axis.unit_name
     along = float(turn @ then)
     across = max(size**2 * before**2 - along**2, 0.0) ** 0.5
     aside = np.degrees(np.arctan2(across, along))
@@ -74,7 +75,8 @@ def _compare(device: Device, j: int, turn: Array, then: Array, noise: float) -> 
     fault = ""
     if not RATIO[0] <= share <= RATIO[1]:
         fault = (
-            f"{axis.name} turned the phone by {size:.3g} deg for a degree commanded, "
+            f"{axis.name} {geometry.changed} {size:.3g} {geometry.unit} for a {one} "
+            f"commanded, "
             f"and by {before:.3g} when `axes` looked: its drive, its setting or its "
             "gearbox was exchanged, or the coupling slips"
         )
@@ -83,6 +85,11 @@ def _compare(device: Device, j: int, turn: Array, then: Array, noise: float) -> 
             f"{axis.name} turned the phone about an axis {aside:.1f} deg from where "
             "`axes` saw it: the phone or its holder was turned since"
         )
+        if device.config.imu is None:
+            fault = (
+                f"{axis.name} changed the readings in a direction {aside:.1f} deg from "
+                "that which `axes` saw: the sensor was moved since"
+            )
     if fault:
         device.record.void(SIGN_CHECKED, fault)
         raise MotionFault(f"{fault}. Correct it, then run `jaxcal-rig axes`")

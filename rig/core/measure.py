@@ -136,7 +136,8 @@ def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
             return (
                 f"{names[worst]} reads {found[worst]:.3f} {unit} (settle.{what} = "
                 f"{limit:g}). Either something still shakes, or the limit is below "
-                "the phone's noise: `jaxcal-rig imu` shows that; raise the key above it"
+                f"{device.imu.whose}'s noise: `jaxcal-rig imu` shows that; raise the "
+                "key above it"
             )
     return ""
 
@@ -198,12 +199,16 @@ def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
     leading = max(FOLLOW_MIN_DEG, FOLLOW_LEADING * float(asked.max()))
     for index, name in enumerate(names):
         if asked[index] >= leading and followed[index] < FOLLOW_SHARE * asked[index]:
+            axis, imu = device.config.axes[index], device.config.imu
+            went = "turned" if axis.kind == "rotation" else "moved"
             hint = "a slipped coupling, a frozen stream, or axes mixed up"
             if followed[index] < -FOLLOW_SHARE * asked[index]:
-                hint = f"axes.{name}.direction, its wiring, and imu.signs"
+                hint = f"axes.{name}.direction, its wiring, and "
+                hint += "imu.signs" if imu else "readings.factors"
             raise NotFollowing(
-                f"the drive of {name} turned {asked[index]:.1f} deg, the IMU "
-                f"saw {followed[index]:.2f}. Look for {hint}"
+                f"the drive of {name} {went} {asked[index]:.1f} {axis.unit_name}, "
+                f"the {'IMU' if imu else 'sensor'} saw {followed[index]:.2f}. Look for "
+                f"{hint}"
             )
     seen.commanded, seen.measured = commanded, measured
 

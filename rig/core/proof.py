@@ -45,7 +45,7 @@ MARGIN_DEG = 1.0
 SAME = 4 / 3, 0.3  # likewise where it is known what `axes` saw, of one axis alone
 SEEN_SHARE = 0.1  # of a checked axis's move must be seen, or the moves do not grow
 BLIND = (
-    "The phone has shown no turn: look for a loose coupling, a stream that does not "
+    "Nothing was seen of it: look for a loose coupling, a stream that does not "
     "change, or a reduction that is far too small"
 )
 NO_UNIT = (
@@ -328,11 +328,12 @@ class Proof:
             and reach.gain
             and turned_deg > (most * expected + margin * self._scale)
         ):
+            geometry = self._geometry
             raise MotionFault(
-                f"{reach.axis.name} turned the phone by {turned_deg:.2f} deg in a move "
-                f"that turned it by {expected:.2f} when `axes` looked: its drive, its "
-                "setting or its gearbox was exchanged. Correct it, then run "
-                "`jaxcal-rig axes`"
+                f"{reach.axis.name} {geometry.changed} {turned_deg:.2f} "
+                f"{geometry.unit} in a move that {geometry.again} {expected:.2f} when "
+                "`axes` looked: its drive, its setting or its gearbox was exchanged. "
+                "Correct it, then run `jaxcal-rig axes`"
             )
 
 

@@ -189,7 +189,7 @@ def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:
         f"the zero posture is not that of {whose}: "
         f"{told} (limit "
         f"session.reference_tolerance_deg = {limit:g}){but}. Drives that were without "
-        "power have lost their origin: home them. Where the phone or the base was "
+        "power have lost their origin: home them. Where phone, sensor or base were "
         "moved, calibrate again"
     )
 

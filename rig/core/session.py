@@ -129,6 +129,8 @@ def _last_move(device: Device) -> Record:
     return {
         "label": label,
         "axes": list(config.axis_names),
+        "units": [axis.unit_name for axis in config.axes],
+        "outputs": list(config.output_names),
         "from_deg": config.to_deg(start).round(3).tolist(),
         "to_deg": config.to_deg(end).round(3).tolist(),
         "drives_deg": [
@@ -225,14 +227,16 @@ def _check_reference(device: Device, zero: Posture) -> None:
     """Before a resumed run goes on: the zero posture must still read zero."""
     angles = measure(move(device, zero))["measured_deg"]
     limit = device.config.session.reference_tolerance_deg
-    device.emit("reference", sync=True, angles=angles, limit=limit)
+    unit = device.config.output_unit
+    device.emit("reference", sync=True, angles=angles, limit=limit, unit=unit)
     if max(map(abs, angles)) > limit:
         config = device.config
         moved = record_check.axes_text(config.output_names, config.output_unit, angles)
         raise MotionFault(
             "the zero posture of this run has moved: "
             f"{moved} (limit {limit:g}): the "
-            "drives lost their origin, or the phone or the device was moved. Start a "
+            f"drives lost their origin, or {device.imu.whose} or the device was moved. "
+            "Start a "
             "new run"
         )
 

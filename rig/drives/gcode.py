@@ -53,12 +53,13 @@ class TextLine(Line):
     def ask(
         self, unit: int, data: bytes, ends: Callable[[str], bool] | None = None
     ) -> list[str]:
-        """Send, and wait for the lines up to the one that ends the answer, ``ok``.
+        """Send, and wait for the lines up to the one that ends the answer: ``ok``,
+        which the answer itself may follow.
 
         Raises:
             Refusal: the controller answered with an error. BusError: none came.
         """
-        ends = ends or (lambda line: line == "ok")
+        ends = ends or (lambda line: line.split()[:1] == ["ok"])
         with self.exchange(unit) as seconds:
             try:
                 self._port.reset_input_buffer()
@@ -165,7 +166,9 @@ class GCodeDrive(Drive):
         """Ramps are those that are set in the controller."""
         place, feed = count / self._scale, 60.0 * speed / self._scale
         self._goal, self._asked = count, time.monotonic()
-        how = "$J=G90 G53 G21" if self._grbl else "G90\nG1"
+        if not self._grbl:
+            self._ask("G90")
+        how = "$J=G90 G53 G21" if self._grbl else "G1"
         text = f"{how} {self._letter}{place:.4f} F{feed:.4f}"
         self.line.tell(self.axis.unit, text=text)
         self._ask(text)

@@ -8,6 +8,7 @@ import fcntl
 import json
 import os
 import pathlib
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -194,11 +195,11 @@ class RunFolder:
 
     def save_pairs(self) -> None:
         """Write pairs.csv: role, commands, measurements, scatter of every posture."""
-        inputs, outputs = self.config.axis_names, self.config.output_names
-        columns = [f"{what}_{name}" for what in ("pulses", "u_deg") for name in inputs]
-        columns += [
-            f"{what}_{name}" for what in ("y_deg", "std_deg") for name in outputs
-        ]
+        axes, outputs = self.config.axes, self.config.output_names
+        unit = re.sub("[^A-Za-z0-9]+", "_", self.config.output_unit)
+        columns = [f"pulses_{axis.name}" for axis in axes]
+        columns += [f"u_{axis.unit_name}_{axis.name}" for axis in axes]
+        columns += [f"{of}_{unit}_{name}" for of in ("y", "std") for name in outputs]
         rows: list[list[Any]] = [["name", "role", *columns, "samples"]]
         for r in self.postures().values():
             values = r["pulses"] + r["commanded_deg"] + r["measured_deg"] + r["std_deg"]

@@ -46,6 +46,9 @@ class Geometry(Protocol):
 
     scale: float
     told: str  # how far it moved, in words before the figure
+    changed: str  # the same of an axis that moved it,
+    again: str  # and once that is said
+    unit: str  # of that figure
     of_joints: bool  # what is measured are angles of the joints, by the axes' names
 
     def apart(self, first: ArrayLike, second: ArrayLike) -> float:
@@ -88,6 +91,7 @@ class Attitudes:
 
     scale = 1.0
     told = "the phone turned"
+    changed, again, unit = "turned the phone by", "turned it by", "deg"
     of_joints = True
 
     def __init__(self, config: RigConfig) -> None:
@@ -189,10 +193,11 @@ class Numbers:
     """(m,) vectors; ways are their differences."""
 
     told = "the readings changed by"
+    changed, again = "changed the readings by", "changed them by"
     of_joints = False
 
-    def __init__(self, scale: float) -> None:
-        self.scale = scale
+    def __init__(self, scale: float, unit: str = "") -> None:
+        self.scale, self.unit = scale, unit
 
     def apart(self, first: ArrayLike, second: ArrayLike) -> float:
         return float(np.linalg.norm(np.subtract(second, first)))
@@ -240,4 +245,4 @@ def geometry_of(config: RigConfig) -> Geometry:
     """The geometry of a device's readings."""
     if config.readings is None:
         return Upright(config) if config.is_arm else Attitudes(config)
-    return Numbers(config.readings.scale)
+    return Numbers(config.readings.scale, config.readings.unit)

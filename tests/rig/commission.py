@@ -56,7 +56,7 @@ def quick_text(bus, port):
     from rig.workbench.toml import new_text
 
     axes = [
-        {"name": name, "letter": letter, "unit": unit, "family": "leadshine_pr",
+        {"name": name, "kind": letter, "unit": unit, "family": "leadshine_pr",
          "pulses": 10000}
         for unit, (name, letter) in enumerate(zip(AXIS_NAMES, "XZY", strict=True), 1)
     ]  # fmt: skip

@@ -109,6 +109,7 @@ class Controller:
         while b"\n" in buffer:
             line, buffer = buffer.split(b"\n", 1)
             if reply := self._line(line.decode().strip()):
+                time.sleep(0.03 * ("late" in self.faults))
                 self._say(reply)
         return buffer
 
@@ -139,7 +140,8 @@ class Controller:
         if line == "M114":
             exact = " ".join(f"{k}:{v:.2f}" for k, v in self.at.items())
             count = " ".join(f"{k}:{round(v * self.steps)}" for k, v in self.at.items())
-            return f"{exact} E:0.00 Count {count}\r\nok"
+            told = f"{exact} E:0.00 Count {count}"
+            return f"ok {told}" if "one_line" in self.faults else f"{told}\r\nok"
         if line == "M410":
             self.stops += 1
             if "deaf" not in self.faults:

@@ -43,6 +43,21 @@ def until(holds, seconds=3.0):
         time.sleep(0.01)
 
 
+def test_each_line_of_gcode_has_an_answer_of_its_own():
+    """As OctoPrint's virtual printer has it: one line for M114, and each ok is late."""
+    made, bus, counts = device("marlin")
+    made.faults |= {"one_line", "late"}
+    with made:
+        config = parse_config(stage_text(bus(made), "marlin", 1, counts))
+        line, (x, _) = make_drives(config.bus, config.axes)
+        with line:
+            x.look(0)
+            x.go(counts // 10)
+            assert x.look(0).moving
+            until(lambda: x.look(0).done)
+            assert x.position() == counts // 10
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_drive_moves_stops_and_says_what_it_is(kind):
     made, bus, counts = device(kind, "quick")
@@ -290,5 +305,5 @@ def test_another_gearing_is_found_before_it_is_far(stage):
 
     code, said, _ = run(stage, "regeared", [listen])
     stage.gain[0] = 1.0
-    assert code == 3 and "x turned the phone by" in said, said
+    assert code == 3 and "x changed the readings by" in said, said
     assert np.max(far) < 21.0

@@ -1,5 +1,6 @@
 """From cables to a calibration, against a simulated device that is miswired."""
 
+import dataclasses
 import json
 import os
 import pathlib
@@ -8,7 +9,7 @@ import re
 import numpy as np
 import pytest
 from commission import QUICK, device, quick_text, set_up
-from harness import fast_text, no_figures
+from harness import ARM, fast_text, no_figures
 
 from rig.__main__ import main
 from rig.config import load_config, parse_config
@@ -18,6 +19,7 @@ from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED, DeviceRecord
 from rig.simulator import Truth
 from rig.workbench.commission import setup, steps
 from rig.workbench.commission.operator import Operator
+from rig.workbench.commission.scan import Found
 
 
 @pytest.mark.slow
@@ -127,6 +129,55 @@ def test_setup_asks_with_defaults_and_moves_nothing_without_a_yes(at):
         assert sim.executions() == [[], [], []]
     assert record.state(HOMED) and not record.state(SIGN_CHECKED)
     assert all(re.search(r"(\[.+\]|go on): $", question) for question in asked)
+
+
+OPTIONS = {"bus": "", "imu": "", "axes": "", "example": "", "readings": ""}
+
+
+@pytest.mark.parametrize(
+    "options, kinds, told",
+    [
+        ({"example": "turntable"}, ["rotation"], "hyperimu"),
+        ({"example": "gimbal", "imu": "lines:2055"}, ["rotation"] * 2, "lines"),
+        ({"example": "servos"}, ["rotation"] * 2, "hyperimu"),
+        ({"example": "stage"}, ["translation"] * 3, "serial"),
+        (
+            {"axes": "x:mm,turn:deg", "readings": "modbus:10.0.0.9"},
+            ["translation", "rotation"], "modbus",
+        ),
+        ({"model": str(ARM)}, ["rotation"] * 5, "hyperimu"),
+    ],
+)  # fmt: skip
+def test_setup_writes_files_of_other_devices(
+    tmp_path, monkeypatch, options, kinds, told
+):
+    """Each passes its own check, and the drives' line is that of their map."""
+    units = [Found(unit, ("leadshine_pr",), {}, 10000) for unit in range(1, 7)]
+    monkeypatch.setattr(setup, "scan", lambda *_: units)
+    given = setup.asked(**OPTIONS | options)
+    if not given.bus:
+        given = dataclasses.replace(given, bus="tcp:10.0.0.7")
+    operator = Operator(yes=True, say=lambda text: None)
+    config = setup.write_config(tmp_path / "rig.toml", given, operator)
+    assert [axis.kind for axis in config.axes] == kinds
+    source = config.imu.format if config.imu else config.readings.transport
+    assert source == told
+    assert main(["check", str(tmp_path / "rig.toml")]) == 0
+
+
+@pytest.mark.parametrize(
+    "options, told",
+    [
+        ({"axes": "x"}, "--axes must be NAME:KIND"),
+        ({"axes": "x:mm"}, "--axes x:mm: a phone measures rotations"),
+        ({"axes": "x:mm,x:mm"}, "the axis x is there twice"),
+        ({"readings": "pipe:1"}, "--readings must be tcp:HOST:PORT"),
+        ({"readings": "udp:1", "imu": "lines"}, "either a phone or a sensor"),
+    ],
+)
+def test_wrong_options_of_setup_are_refused(options, told):
+    with pytest.raises(Refused, match=told):
+        setup.sensor_of(setup.asked(**OPTIONS | options).readings)
 
 
 @pytest.mark.parametrize(

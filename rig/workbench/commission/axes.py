@@ -132,8 +132,8 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
     corners = corners_of(len(config.axes)) if config.imu and not config.is_arm else []
     run.say(
         f"axes: about {1 + 7 * len(names) + len(corners)} places; each axis first by "
-        f"{FIRST_MOTOR_DEG:g} deg of its motor, then as far as the phone's turn "
-        f"allows, {REACH_DEG:g} deg at most either way"
+        f"{FIRST_MOTOR_DEG:g} deg of its motor, then as far as what is seen allows, "
+        f"{REACH_DEG:g} deg or mm at most either way"
     )
     base = visit("start", {}, 4 * config.settle.samples)
     device.proof.stay_near(base.attitude)

@@ -114,8 +114,9 @@ class Probe:
         self._line = each / self._rate
         if self._rate * deg < SEEN_DEG:
             raise MotionFault(
-                f"{self.name} was moved by {deg:g} deg and the phone turned "
-                f"{self._rate * deg:.3f}. Check the axes first: jaxcal-rig axes"
+                f"{self.name} was moved by {deg:g} and {self.geometry.told} "
+                f"{self._rate * deg:.3f} {self.geometry.unit}. Check the axes first: "
+                "jaxcal-rig axes"
             )
         first = self.read(down[0]) - self.read(up[0])
         if first > 0.9 * MOST_DEG:

@@ -160,8 +160,8 @@ def _check_homing(
     ):
         raise MotionFault(
             f"the drive of {axis.name} has turned {abs(axis.to_deg(gone)):.0f} deg on "
-            "its way home, and the phone saw nothing of it. Look for a loose coupling, "
-            "a stream that does not change, or units that are exchanged"
+            f"its way home, and {device.imu.whose} saw nothing of it. Look for a "
+            "loose coupling, a stream that does not change, or units that are exchanged"
         )
 
 

@@ -24,6 +24,7 @@ OF_BUS = {
     "rtu_tcp": ("host", "port"),
     "rtu": ("device", "baudrate", "parity", "bytesize", "stopbits"),
 }
+OF_OTHERS = {"serial": ("device", "baudrate"), "can": ("device", "baudrate")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +46,8 @@ class Found:
 
 
 def parse_bus(text: str) -> BusSettings:
-    """Settings of ``tcp:HOST[:PORT]``, ``rtu_tcp:HOST[:PORT]`` or ``rtu:DEVICE,...``.
+    """Settings of ``tcp:HOST[:PORT]``, ``rtu_tcp:HOST[:PORT]`` or ``rtu:DEVICE,...``;
+    of drives of other kinds ``serial:DEVICE[,BAUD]`` or ``can:CHANNEL[,BAUD]``.
 
     After the device follow baud rate, parity, data bits and stop bits, as far as they
     are given: ``rtu:/dev/ttyUSB0,115200,N,8,1``.
@@ -54,10 +56,11 @@ def parse_bus(text: str) -> BusSettings:
         ConfigError: not such a text, or settings that cannot be.
     """
     transport, _, rest = text.partition(":")
-    names = OF_BUS.get(transport, ())
-    words = re.split("," if transport == "rtu" else ":", rest)
+    names = (OF_BUS | OF_OTHERS).get(transport, ())
+    words = re.split(":" if "host" in names else ",", rest)
     if not names or len(words) > len(names) or not all(words):
-        kinds = "tcp:HOST[:PORT], rtu_tcp:HOST[:PORT] or rtu:DEVICE"
+        kinds = "tcp:HOST[:PORT], rtu_tcp:HOST[:PORT], serial:DEVICE[,BAUD], "
+        kinds += "can:CHANNEL[,BAUD] or rtu:DEVICE"
         must = f"must be {kinds}[,BAUD[,PARITY[,BITS[,STOPBITS]]]]"
         raise ConfigError("--bus", [f"{must}, got {text!r}"])
     given = [f"transport = {json.dumps(transport)}"]

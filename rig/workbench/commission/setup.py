@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+import re
 import socket
 import tomllib
 from typing import TYPE_CHECKING, Any
 
 from jaxcal.files import write_text
-from rig.config import AXIS_NAMES, RigConfig, load_config, parse_config
-from rig.config.axis import DEFAULT_ROTATES
+from rig.config import RigConfig, load_config, parse_config
+from rig.config.axis import DEFAULT_ROTATES as DEFAULT_AXES
 from rig.faults import EXIT_OK, Refused
 from rig.journal import HOMED, IDENTIFIED, STOP_PROVED, ZEROED
+from rig.model import joint_names
 from rig.workbench.commission import steps
 from rig.workbench.commission.home import can_home
 from rig.workbench.commission.operator import Operator
@@ -40,7 +42,100 @@ class Given:
     units: int = UNITS
     values: dict[str, Any] = dataclasses.field(default_factory=dict)  # of rig.toml
     home: str = "here"
-    names: tuple[str, ...] = AXIS_NAMES  # of the axes
+    # Axis to X, Y or Z that it turns about, deg of a rotation, mm of a translation.
+    axes: dict[str, str] = dataclasses.field(default_factory=lambda: dict(DEFAULT_AXES))
+    drives: str = ""  # map of the drives; none: Modbus drives that are found
+    readings: str = ""  # where numbers come from; none: a phone
+    model: str = ""  # URDF file of an arm
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the axes."""
+        return tuple(self.axes)
+
+
+KINDS = ("X", "Y", "Z", "deg", "mm")
+OF_READINGS = {  # keys of [readings]
+    "tcp": ("host", "port"),
+    "listen": ("port",),
+    "udp": ("port",),
+    "serial": ("device", "baudrate"),
+    "modbus": ("host", "port"),
+}
+EXAMPLES: dict[str, dict[str, Any]] = {  # of --example
+    "turntable": {"axes": {"table": "Z"}},
+    "gimbal": {"axes": {"pan": "Z", "tilt": "X"}},
+    "stage": {
+        "axes": {"x": "mm", "y": "mm", "z": "mm"}, "drives": "grbl",
+        "bus": "serial:/dev/ttyUSB0,115200", "readings": "serial:/dev/ttyUSB1,9600",
+    },
+    "servos": {
+        "axes": {"pan": "Z", "tilt": "X"}, "drives": "cia402", "bus": "can:can0,500000",
+    },
+}  # fmt: skip
+
+
+def axis_kinds(text: str) -> dict[str, str]:
+    """``NAME:KIND,...``; ValueError where that is not what it is."""
+    kinds = {}
+    for word in text.split(","):
+        name, _, kind = word.partition(":")
+        if not re.fullmatch("[a-z][a-z0-9_]*", name) or kind not in KINDS:
+            raise ValueError(
+                f"must be NAME:KIND,... with a KIND of {', '.join(KINDS)}, got {word!r}"
+            )
+        if name in kinds:
+            raise ValueError(f"the axis {name} is there twice")
+        kinds[name] = kind
+    return kinds
+
+
+def asked(*, axes: str, example: str, **given: Any) -> Given:
+    """What the command line says, where it says nothing as of the example.
+
+    Raises:
+        Refused: an option is not what it must be.
+    """
+    options = dict(EXAMPLES.get(example, {}))
+    options |= {name: value for name, value in given.items() if value}
+    if axes:
+        try:
+            options["axes"] = axis_kinds(axes)
+        except ValueError as error:
+            raise Refused(f"--axes {error}") from None
+    elif urdf := options.get("model"):
+        options["axes"] = dict.fromkeys(joint_names(urdf), "deg")
+    made = Given(**options)
+    if options.get("readings") and options.get("imu"):
+        raise Refused("--imu and --readings: either a phone or a sensor measures")
+    by_phone = {"X", "Y", "Z"} | ({"deg"} if made.model else set())
+    wrong = [
+        f"{name}:{kind}" for name, kind in made.axes.items() if kind not in by_phone
+    ]
+    if wrong and not made.readings:
+        raise Refused(
+            f"--axes {', '.join(wrong)}: a phone measures rotations about X, Y, Z; "
+            "others take --readings"
+        )
+    return made
+
+
+def sensor_of(text: str) -> dict[str, Any]:
+    """Keys of ``[readings]`` of ``tcp:HOST:PORT``, ``listen:PORT``, ``udp:PORT``,
+    ``serial:DEVICE[,BAUD]`` or ``modbus:HOST[:PORT]``."""
+    transport, _, rest = text.partition(":")
+    names = OF_READINGS.get(transport, ())
+    words = rest.split("," if transport == "serial" else ":")
+    if not names or len(words) > len(names) or not all(words):
+        raise Refused(
+            "--readings must be tcp:HOST:PORT, listen:PORT, udp:PORT, "
+            f"serial:DEVICE[,BAUD] or modbus:HOST[:PORT], got {text!r}"
+        )
+    values = [int(word) if word.isdecimal() else word for word in words]
+    sensor: dict[str, Any] = {"transport": transport}
+    if transport in ("listen", "udp"):
+        sensor["host"] = "0.0.0.0"  # every address of this computer
+    return sensor | dict(zip(names, values, strict=False))
 
 
 def setting(text: str) -> tuple[str, Any]:
@@ -94,23 +189,39 @@ def write_config(path: pathlib.Path, given: Given, operator: Operator) -> RigCon
     default = f"rtu:{lines[0].partition(':')[0]},115200,N,8,1" if lines else ""
     question = "bus, as rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT"
     bus = parse_bus(given.bus or operator.ask(question, default))
-    say(f"2 scan: units 1 to {given.units} on {bus.where}; reads only")
-    found = scan(bus, given.units, lambda text: say(f"  {text}"))
+    found: list[Found] = []
+    if given.drives:
+        say(f"2 scan: none of drives named by --drives {given.drives}")
+    else:
+        say(f"2 scan: units 1 to {given.units} on {bus.where}; reads only")
+        found = scan(bus, given.units, lambda text: say(f"  {text}"))
     say("3 axes: which unit drives which joint. Step 8 checks it by moving them")
     axes = _ask_axes(found, given, operator)
-    say("4 phone")
-    form, _, port = (given.imu or "").partition(":")
-    form = form or operator.choose(
-        f"app of the phone ({', '.join(FORMATS)})", FORMATS, FORMATS[0]
-    )
-    port = port or operator.ask("TCP port that the phone sends to", "2055")
+    source: dict[str, Any]
+    if given.readings:
+        say("4 sensor")
+        kinds = set(given.axes.values())
+        source = {"names": given.names, "sensor": sensor_of(given.readings)}
+        source["unit"] = operator.ask(
+            "unit of the readings", "mm" if "mm" in kinds else "deg"
+        )
+        if given.model:
+            source |= {"names": ("x", "y", "z"), "unit": "m"}
+    else:
+        say("4 phone")
+        form, _, port = (given.imu or "").partition(":")
+        form = form or operator.choose(
+            f"app of the phone ({', '.join(FORMATS)})", FORMATS, FORMATS[0]
+        )
+        port = port or operator.ask("TCP port that the phone sends to", "2055")
+        source = {"form": form, "port": int(port)}
     values = dict(given.values)
     for name in given.names:
         key = f"axes.{name}.reduction"
         if key not in values:
             question = f"{name}: motor turns for one turn of the joint (gearbox)"
             values[key] = operator.number(question, 1.0)
-    text = set_values(new_text(bus, axes, form, int(port)), values)
+    text = set_values(new_text(bus, axes, **source, model=given.model), values)
     config = parse_config(text, path.parent, str(path))
     operator.confirm(f"setup writes {path}", "write")
     write_text(path, text)
@@ -121,6 +232,8 @@ def _ask_axes(
     found: list[Found], given: Given, operator: Operator
 ) -> list[dict[str, Any]]:
     usable = {each.unit: each for each in found if each.families}
+    if given.drives:
+        usable = {unit: Found(unit, (given.drives,), {}) for unit in range(1, 7)}
     if len(usable) < len(given.names):
         unknown = [each.unit for each in found if not each.families]
         raise Refused(
@@ -131,8 +244,7 @@ def _ask_axes(
             "drive has a unit id of its own; another family needs a map (docs/rig.md)"
         )
     left, axes = sorted(usable), []
-    letters = ["X", "Y", "Z"]
-    for name in given.names:
+    for name, kind in given.axes.items():
         choices = [str(unit) for unit in left]
         unit = int(operator.choose(f"unit of {name}", choices, choices[0]))
         left.remove(unit)
@@ -144,13 +256,11 @@ def _ask_axes(
         pulses = each.pulses_per_rev or int(
             operator.number(f"{name}: pulses for one motor turn", 10000)
         )
-        letter = DEFAULT_ROTATES.get(name) or operator.choose(
-            f"{name}: turns about (X, Y, Z, as it is mounted)", letters, letters[0]
-        )
-        letters = [each for each in letters if each != letter]
-        axes.append(
-            dict(name=name, letter=letter, unit=unit, family=family, pulses=pulses)
-        )
+        axis = dict(name=name, kind=kind, unit=unit, family=family, pulses=pulses)
+        if kind == "mm":
+            question = f"{name}: mm for one turn of its screw, pulley or pinion"
+            axis["lead"] = operator.number(question, 1.0)
+        axes.append(axis)
     return axes
 
 

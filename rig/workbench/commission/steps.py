@@ -216,11 +216,11 @@ def jog(place: Place, name: str, way_deg: float) -> int:
         try:
             move(device, Posture("jog", tuple(here)))
         except Enough as turned:
-            device.stopper.stop("the phone has turned far enough", latch=False)
+            device.stopper.stop("far enough by what is measured", latch=False)
             gone = abs(each.to_deg(device.positions()[axis] - start))
             run.say(
-                f"  stopped: the phone has turned by {turned} deg after {gone:.2g} "
-                f"commanded. Check the reduction of {name}"
+                f"  stopped: {device.geometry.told} {turned} {device.geometry.unit} "
+                f"after {gone:.2g} {unit} commanded. Check the reduction of {name}"
             )
         run.say(
             f"  {name} stands at {each.to_deg(device.positions()[axis]):.3f} {unit}"
@@ -236,7 +236,8 @@ def characterise(place: Place, name: str) -> int:
     axis = number_of(place.config, name)
     most = measured.BASE_DEG + measured.FAR_DEG
     place.operator.confirm(
-        f"characterise: {name} will move up to {most:.2f} deg from where it stands, "
+        f"characterise: {name} will move up to {most:.2f} "
+        f"{place.config.axes[axis].unit_name} from where it stands, "
         "many times. Keep out of the device's reach",
         "characterise",
     )
@@ -290,7 +291,7 @@ def take_zero(place: Place) -> int:
     """Measure the zero posture: ZEROED."""
     place.operator.confirm(
         "zero: the device stands in its zero posture (jig, level), or moves to pulse 0 "
-        'with session.zero = "drive"; the phone\'s attitude there is measured',
+        'with session.zero = "drive"; what is measured there is its zero',
         "zero",
     )
     return place.run("zero", lambda run, device: session.take_zero(device))

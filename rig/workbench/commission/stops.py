@@ -136,9 +136,9 @@ def _prove(
         )
     if moved or turned > TURNED_DEG * device.geometry.scale:
         raise MotionFault(
-            f"{', '.join(moved) or 'the phone'} moved again after {name} (the phone "
-            f"turned by {turned:.2f} deg). Set the drive so that it does not go on by "
-            "itself after a stop"
+            f"{', '.join(moved) or 'what is measured'} moved again after {name} "
+            f"({device.geometry.told} {turned:.2f} {device.geometry.unit}). Set the "
+            "drive so that it does not go on by itself after a stop"
         )
     after_deg = {
         axis.name: round(axis.to_deg(b - a), 3)

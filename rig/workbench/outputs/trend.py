@@ -16,7 +16,7 @@ from rig.journal import JournalError, Record, read_journal
 from rig.workbench.outputs.report import draw_parameters, drawn
 from rig.workbench.outputs.words import held_out, recalibrate
 
-HEAD = ["measured", "run", "mode", "held-out error [deg]", "moved since the one before"]
+HEAD = ["measured", "run", "mode", "held-out error", "moved since the one before"]
 HOLDS = "the last calibration still holds"
 
 
@@ -78,7 +78,7 @@ def _device(runs: list[Record]) -> Device:
             device.calibrations.append(run)
         if "prediction" in run:
             _, worst = held_out(run)
-            error = f"{worst:.4f} (limit {run['limit']:g})"
+            error = f"{worst:.4f} {run.get('unit', 'deg')} (limit {run['limit']:g})"
             reasons = recalibrate(run, run["limit"])
             device.reasons = [f"{run['name']}: {reason}" for reason in reasons]
         when = f"{datetime.datetime.fromtimestamp(run['time']):%Y-%m-%d %H:%M}"

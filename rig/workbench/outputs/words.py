@@ -27,7 +27,8 @@ REPLIES = {
 
 def _reference(record: Record) -> str:
     worst = max(map(abs, record["angles"]))
-    good = f"reference posture reads {worst:.3f} deg from zero: going on"
+    unit = record.get("unit", "deg")
+    good = f"reference posture reads {worst:.3f} {unit} from zero: going on"
     return good if worst <= record["limit"] else ""
 
 
@@ -57,14 +58,19 @@ def _last_move(record: Record) -> str:
     ways = []
     # Written before axes had names of their own: those of the first device.
     names = record.get("axes", AXIS_NAMES)
+    units = record.get("units", ["deg"] * len(names))
+    outputs, values = record.get("outputs") or names, record["phone_deg"] or ()
+    measured = dict(zip(outputs, values, strict=False))
     for i, name in enumerate(names):
         begin, end = record["from_deg"][i], record["to_deg"][i]
         if begin != end:
-            drive, phone = record["drives_deg"][i], record["phone_deg"]
+            drive = record["drives_deg"][i]
             seen = "its drive does not answer" if drive is None else f"now {drive:.2f}"
-            seen += "" if phone is None else f", phone {phone[i]:.2f}"
-            ways.append(f"{name} from {begin:.2f} to {end:.2f} deg ({seen})")
-    return f"moved last, to {record['label']}: {'; '.join(ways) or 'no axis'}"
+            seen += f", measured {measured[name]:.2f}" if name in measured else ""
+            ways.append(f"{name} from {begin:.2f} to {end:.2f} {units[i]} ({seen})")
+    others = [f"{name} {at:.3g}" for name, at in measured.items() if name not in names]
+    told = f"; measured {', '.join(others)}" if others else ""
+    return f"moved last, to {record['label']}: {'; '.join(ways) or 'no axis'}{told}"
 
 
 def _stop(record: Record) -> str:

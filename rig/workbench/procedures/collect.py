@@ -56,8 +56,9 @@ def collect(run: Run, count: int) -> int:
     limit = config.session.drift_limit_deg
     if drift > limit:
         run.say(
-            f"RECALIBRATE: the zero posture reads {drift:.3f} deg at the end (limit "
-            f"session.drift_limit_deg = {limit:g}). Fix the phone, and collect again"
+            f"RECALIBRATE: the zero posture reads {drift:.3f} {config.output_unit} at "
+            f"the end (limit session.drift_limit_deg = {limit:g}). Fix "
+            f"{'the sensor' if config.readings else 'the phone'}, and collect again"
         )
         return EXIT_RECALIBRATE
     return EXIT_OK
