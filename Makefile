@@ -87,7 +87,7 @@ $(BENCH)/.ready: pyproject.toml constraints.txt constraints-bench.txt
 	$(BENCH)/bin/python -m pip install --quiet -c constraints.txt -c constraints-bench.txt -e '.[all,dev,bench]'
 	@touch $@
 
-benchmark: $(BENCH)/.ready ## every benchmark with its peers: table, JSON, figures (26 to 40 minutes; ARGS="--only steps", "--quick")
+benchmark: $(BENCH)/.ready ## every benchmark with its peers: table, JSON, figures (36 to 50 minutes; ARGS="--only steps", "--quick")
 	$(BENCH)/bin/python -m benchmarks $(ARGS)
 
 docs: $(READY) ## the documentation site in site/, strictly and without a network

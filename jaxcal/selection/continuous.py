@@ -1,6 +1,7 @@
 """Designs whose commands are any within limits: ``optimise`` and ``Design.refine``.
 
-A criterion phi is a concave function of the information M of all k commands. With G its
+A criterion phi is a concave function of the information M of all k commands; over
+scenarios, their mean or least is one of the S informations together. With G its
 gradient at M, the slope of phi by one command u is that of ``d(u) = trace(B G B.T)``, B
 the block there. So all commands climb together, from
 several starts; then single ones are moved to where d is largest, and those that must
@@ -39,12 +40,13 @@ from jaxcal.checks import (
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, as_model
 from jaxcal.models.uncertainty import Noise, Prior
-from jaxcal.selection.criteria import CRITERIA
+from jaxcal.selection.criteria import CRITERIA, Criterion, Joined
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.problem import (
     CandidateSet,
     HasCandidates,
     Problem,
+    ScenarioProblem,
     blocks_of,
     problem_of,
     values,
@@ -115,11 +117,12 @@ class Refinement(Selection):
         lines = [
             f"{len(rows)} commands, method {self.method}",
             *aligned([self._axes(), *rows]),
-            f"{CRITERIA[name].says:13} {self.value:.6g}"
+            f"{self.problem.criterion.says:13} {self.value:.6g}"
             + ("" if np.isnan(self.began) else f" (began at {self.began:.6g})"),
             f"{side + ' bound':13} {self.bound:.6g} ({proof})",
             f"{name + '-efficiency':13} {self.efficiency:.6f} or more",
             f"{'without one':13} {self._lost()}",
+            *(self.in_scenarios.summary() if self.in_scenarios else ()),
             f"time          {self.seconds:.3g} s, seed {self.seed}",
         ]
         return "\n".join(lines)
@@ -141,6 +144,7 @@ def optimise(
     starts: int = 8,
     seed: int = 0,
     time_limit: float | None = None,
+    scenarios: Any = None,
 ) -> Refinement:
     """The k commands within limits whose measurements say most about the parameters.
 
@@ -148,7 +152,7 @@ def optimise(
         limits: (n, 2) least and greatest command of each input.
         k: commands to choose, which may repeat; the fewest that identify when None.
         model: of ``jaxcal.models``; ``y = A u + b`` when not given.
-        prior, noise, criterion, measured: as of ``Design`` and ``select``.
+        prior, noise, criterion, measured, scenarios: as of ``Design`` and ``select``.
         region: (R, n) commands of criterion I; spread over the limits when not given.
         allowed: f(u (n,)) -> whether the command may be given.
         starts: of the search.
@@ -165,7 +169,7 @@ def optimise(
     model = as_model(model) if model is not None else Affine(len(box), len(box))
     pool = _drawn(box, _POOL, allowed, seed)
     offer = CandidateSet.of_commands(
-        pool, model, prior, noise, measured, max_replicates=_POOL
+        pool, model, prior, noise, measured, max_replicates=_POOL, scenarios=scenarios
     )
     search = _Search(offer, box, allowed, k, criterion, region, seed, time_limit)
     return search.run(None, whole_number("starts", starts, 1))
@@ -237,6 +241,8 @@ def refine(
 
 def _asked(selection: Selection) -> Any:
     """The criterion of a selection, asked for again."""
+    if isinstance(selection.problem.criterion, Joined):
+        return selection.problem.criterion
     name = selection.criterion
     if name in ("Ds", "As"):
         raise ValueError(
@@ -358,6 +364,31 @@ def _filled(commands: Array) -> Array:
     return np.concatenate([commands, np.repeat(commands[-1:], more, axis=0)])
 
 
+def _slope(criterion: Criterion, information: Array) -> Array:
+    """(p, p) gradient of the criterion by the information (p, p)."""
+    half = np.linalg.solve(information, criterion.root.T)  # M^-1 C.T
+    covariance = criterion.root @ half
+    if criterion.kind == "det":
+        return np.asarray(half @ np.linalg.solve(covariance, half.T))
+    if criterion.kind == "trace":
+        return np.asarray(half @ half.T)
+    values, vectors = np.linalg.eigh(covariance)
+    along = half @ vectors[:, -1]
+    return np.asarray(np.outer(along, along) / values[-1] ** 2)
+
+
+def _among(problem: Problem, available: NDArray[np.bool_]) -> Problem:
+    """The problem where these may be chosen, each as often as there are commands."""
+    rules: dict[str, Any] = {
+        "available": available,
+        "required": np.zeros(0, dtype=np.int64),
+        "max_replicates": problem.k,
+    }
+    if isinstance(problem, ScenarioProblem):
+        rules["members"] = tuple(_among(one, available) for one in problem.members)
+    return dataclasses.replace(problem, **rules)
+
+
 class _Search:
     """Blocks of any command, the criterion, and the moves of a search."""
 
@@ -390,72 +421,130 @@ class _Search:
                     "the candidates"
                 )
         self.asked, self.region = criterion, region
-        problem = problem_of(offer, k, criterion, region)
-        if type(problem) is not Problem:
+        if offer.uncertain:
             raise ValueError(
-                "refine is of one set of parameters and of measurements that all "
-                "arrive, got a design with scenarios, lost or reliability"
+                "refine is of measurements that all arrive, got a design with lost or "
+                "reliability"
             )
-        self.problem = problem
-        self.k, self.objective = problem.k, problem.criterion
-        of_one = self.objective.name
-        by_name = CRITERIA[of_one].by_name
-        self.block_maker = blocks_of(offer, by_name, CRITERIA[of_one].of_region)
+        problem = problem_of(offer, k, criterion, region)
+        self.problem, self.objective = problem, problem.criterion
+        self.k = problem.k
+        self.members: tuple[Problem, ...] = (problem,)
+        self.weights, self.scale, self.shift = np.ones(1), np.ones(1), np.zeros(1)
+        self.each, self.worst = problem.criterion, False
+        if isinstance(problem, ScenarioProblem):
+            if problem.joined.of_efficiency:
+                raise ValueError(
+                    "criterion must be of values with refine, got "
+                    f"{problem.criterion.name}: between candidates no scenario's own "
+                    "optimum is proven"
+                )
+            self.members, self.weights = problem.members, problem.weights
+            self.scale, self.shift = problem.terms()
+            self.each, self.worst = problem.joined.each, problem.joined.least
+        # Their least is climbed smoothed.
+        self.smooth = self.worst or self.each.kind == "least"
+        self.prior = np.stack([member.prior for member in self.members])
+        alone = offer.by_scenario() if len(self.members) > 1 else [offer]
+        of_one = CRITERIA[self.each.name]
+        self.block_makers = [
+            blocks_of(one, of_one.by_name, of_one.of_region) for one in alone
+        ]
         # Commands lie on a surface in the limits, as of an arm that touches something.
         self.surface = hasattr(allowed, "onto")
         self.rough = _ROUGH if offer.model.resolution else _STEP
 
-    # -- the criterion -----------------------------------------------------------------
+    # -- the criterion, of S scenarios; S is 1 where there are none --------------------
 
     def blocks(self, commands: Array) -> Array:
-        """(N, q, p) whitened."""
-        return self.problem.white.of(
-            self.block_maker.at("commands", _filled(commands), True)
-        )[: len(commands)]
+        """(N, S, q, p) whitened."""
+        many = _filled(commands)
+        pairs = zip(self.members, self.block_makers, strict=True)
+        found = [one.white.of(made.at("commands", many, True)) for one, made in pairs]
+        return np.stack(found, axis=1)[: len(commands)]
+
+    @staticmethod
+    def squares(blocks: Array) -> Array:
+        """(N, S, p, p) what each of (N, S, q, p) adds to the information."""
+        return np.matrix_transpose(blocks) @ blocks
 
     def information(self, blocks: Array) -> Array:
-        rows = blocks.reshape(-1, blocks.shape[-1])
-        return rows.T @ rows + self.problem.prior
+        """(S, p, p) of all of (N, S, q, p) and what is known."""
+        rows = np.moveaxis(blocks, 1, 0).reshape(len(self.prior), -1, blocks.shape[-1])
+        return np.asarray(np.matrix_transpose(rows) @ rows + self.prior)
 
     def phi(self, information: Array) -> Array:
-        return np.asarray(self.objective.value(information))
+        """(...,) joined value of (..., S, p, p)."""
+        values = np.stack(
+            [
+                scale * member.criterion.value(information[..., s, :, :]) + shift
+                for s, (member, scale, shift) in enumerate(
+                    zip(self.members, self.scale, self.shift, strict=True)
+                )
+            ],
+            axis=-1,
+        )
+        return np.asarray(values.min(axis=-1) if self.worst else values @ self.weights)
+
+    def unit(self, phi: float) -> float:
+        """Of the joined value: by so much a hundredth is a percent."""
+        if self.objective.kind != "det":
+            return max(abs(phi), 1e-300)
+        return float(self.scale[0]) * len(self.each.root)
 
     def gradient(self, information: Array) -> Array:
-        """(p, p) of phi by the information."""
-        root, kind = self.objective.root, self.objective.kind
-        half = np.linalg.solve(information, root.T)  # M^-1 C.T
-        covariance = root @ half
-        if kind == "det":
-            return np.asarray(half @ np.linalg.solve(covariance, half.T))
-        if kind == "trace":
-            return np.asarray(half @ half.T)
-        values, vectors = np.linalg.eigh(covariance)
-        along = half @ vectors[:, -1]
-        return np.outer(along, along) / values[-1] ** 2
+        """(S, p, p) of phi by the information, of a worst scenario smoothed."""
+        if self.worst:
+            phi = float(self.phi(information))
+            return self.soft(information, _SHARP[-1] / self.unit(phi))[1]
+        slopes = [
+            _slope(member.criterion, one)
+            for member, one in zip(self.members, information, strict=True)
+        ]
+        return np.stack(slopes) * (self.weights * self.scale)[:, None, None]
 
-    def soft(self, information: Array, sharp: float) -> tuple[float, Array]:
-        """A smooth value below phi of E, and its gradient W (p, p).
+    def soft(self, information: Array, sharp: float) -> tuple[float, Array, float]:
+        """A smooth value below phi, and a bound on phi of other information N.
 
-        phi is the least ``trace(W M)`` over W of trace 1 in the criterion's own
-        coordinates, so with any such W that is above it.
+        The bound is the third plus ``trace(W (N - information))``, W the second. E is
+        the least ``trace(W M)`` over W of trace 1 in its own coordinates, so any such W
+        bounds it; the worst scenario is bounded by any mixture of bounds of all.
 
         Args:
-            information: (p, p).
-            sharp: how sharply the least eigenvalue stands out, by one over phi.
+            information: (S, p, p).
+            sharp: how sharply the least stands out, by one over phi.
         """
-        half = np.linalg.inv(self.objective.root)
-        values, vectors = np.linalg.eigh(half.T @ information @ half)
-        shares = np.exp(-sharp * (values - values[0]))
-        total = float(shares.sum())
-        along = half @ vectors
-        return float(values[0] - np.log(total) / sharp), (
-            along * (shares / total)
-        ) @ along.T
+        values, metrics, bounds = [], [], []  # of what the least is taken of
+        for s, member in enumerate(self.members):
+            criterion, one, scale = member.criterion, information[s], self.scale[s]
+            if criterion.kind == "least":
+                half = np.linalg.inv(criterion.root)
+                eigenvalues, vectors = np.linalg.eigh(half.T @ one @ half)
+                along = (half @ vectors).T
+                values.append(scale * eigenvalues)
+                metrics.append(scale * along[:, :, None] * along[:, None, :])
+                bounds.append((metrics[-1] * one).sum(axis=(1, 2)))
+            else:
+                value = scale * float(criterion.value(one)) + self.shift[s]
+                values.append(np.array([value]))
+                metrics.append(scale * _slope(criterion, one)[None])
+                bounds.append(values[-1])
+        each = np.array(values)  # (S, p) or (S, 1)
+        lowest = each.min() if self.worst else each.min(axis=1, keepdims=True)
+        shares = np.exp(-sharp * (each - lowest))
+        total = shares.sum() if self.worst else shares.sum(axis=1, keepdims=True)
+        least = lowest - np.log(total) / sharp
+        shares = shares / total
+        if not self.worst:
+            least = float(self.weights @ least[:, 0])
+            shares = shares * self.weights[:, None]
+        metric = np.einsum("sl,slab->sab", shares, np.array(metrics))
+        return float(least), metric, float((shares * np.array(bounds)).sum())
 
     def score(self, phi: float) -> tuple[float, float]:
         """What is climbed, in which a hundredth is a percent, and its slope by phi."""
         if self.objective.kind == "det":
-            size = len(self.objective.root)
+            size = self.unit(phi)
             return phi / size, 1.0 / size
         if self.objective.kind == "trace":
             return -float(np.log(-phi)), -1.0 / phi
@@ -463,8 +552,8 @@ class _Search:
 
     @staticmethod
     def leverage(blocks: Array, metric: Array) -> Array:
-        """(N,) d."""
-        return np.einsum("nqa,ab,nqb->n", blocks, metric, blocks)
+        """(N,) d of (N, S, q, p)."""
+        return np.asarray(((blocks @ metric) * blocks).sum(axis=(1, 2, 3)))
 
     def slopes(self, commands: Array, metric: Array) -> Array:
         """(N, n) of d by the commands, in shares of the limits."""
@@ -485,10 +574,15 @@ class _Search:
 
     def _exact_slopes(self, commands: Array, metric: Array) -> Array | None:
         """(N, n) by the model's own derivative, where it has one."""
-        basis = self.problem.white.basis
-        metric = basis @ metric @ basis.T
-        found = self.block_maker.leverage_slopes(_filled(commands), metric)
-        return None if found is None else found[: len(commands)]
+        total, many = np.zeros_like(commands), _filled(commands)
+        for s, member in enumerate(self.members):
+            basis = member.white.basis
+            own = basis @ metric[s] @ basis.T
+            slopes = self.block_makers[s].leverage_slopes(many, own)
+            if slopes is None:
+                return None
+            total += slopes[: len(commands)]
+        return total
 
     # -- the search --------------------------------------------------------------------
 
@@ -550,12 +644,7 @@ class _Search:
             if i:  # another part of the pool
                 few = max(4 * self.problem.num_regressors, 2 * self.k, 24)
                 share = rng.permutation(usable)[: min(few, len(usable))]
-            one = dataclasses.replace(
-                self.problem,
-                available=np.isin(np.arange(len(candidates)), share),
-                required=np.zeros(0, dtype=np.int64),
-                max_replicates=self.k,
-            )
+            one = _among(self.problem, np.isin(np.arange(len(candidates)), share))
             try:
                 yield candidates[exchange_indices(one, 10, self.seed + i)]
             except ValueError:  # singular: another part
@@ -571,7 +660,7 @@ class _Search:
         if not np.isfinite(best_phi):
             return best, best_phi
 
-        sharp = _SHARP[-1] / best_phi if self.objective.kind == "least" else 0.0
+        unit = self.unit(best_phi)
 
         def down(x: Array) -> tuple[float, Array]:
             at = self.low + x.reshape(shape) * self.span
@@ -579,9 +668,9 @@ class _Search:
             phi = float(self.phi(information))
             if not np.isfinite(phi) or self._late():
                 return 1e10, np.zeros_like(x)
-            if sharp:
-                value, metric = self.soft(information, sharp)
-                return -value / best_phi, -self.slopes(at, metric).ravel() / best_phi
+            if self.smooth:
+                value, metric, _ = self.soft(information, _SHARP[-1] / unit)
+                return -value / unit, -self.slopes(at, metric).ravel() / unit
             score, rate = self.score(phi)
             return -score, -rate * self.slopes(at, self.gradient(information)).ravel()
 
@@ -594,7 +683,7 @@ class _Search:
         phi = float(self.phi(self.information(self.blocks(there))))
         if phi > best_phi and _permitted(self.allowed, there).all():
             best, best_phi = there, phi
-        if self.allowed is not None or self.objective.kind == "least":
+        if self.allowed is not None or self.smooth:
             best, best_phi = self._tried(best, best_phi)
         return best, best_phi
 
@@ -615,8 +704,8 @@ class _Search:
                 if not len(trial):
                     continue
                 new = self.blocks(trial)
-                rest = information - blocks[i].T @ blocks[i]
-                phis = self.phi(rest + np.matrix_transpose(new) @ new)
+                rest = information - self.squares(blocks[i])
+                phis = self.phi(rest + self.squares(new))
                 j = int(np.argmax(phis))
                 if phis[j] > phi:
                     gained = self.score(float(phis[j]))[0] - self.score(phi)[0]
@@ -665,8 +754,8 @@ class _Search:
             information = self.information(blocks)
             peaks, _, _ = self._peaks(self.gradient(information))
             new = self.blocks(peaks)
-            rest = information - np.matrix_transpose(blocks) @ blocks  # (k, p, p)
-            gained = self.phi(rest[:, None] + (np.matrix_transpose(new) @ new)[None])
+            rest = information - self.squares(blocks)  # (k, S, p, p)
+            gained = self.phi(rest[:, None] + self.squares(new)[None])
             i, j = np.unravel_index(np.argmax(gained), gained.shape)
             if not gained[i, j] > phi or self._late():
                 break
@@ -763,18 +852,16 @@ class _Search:
         best, error = np.inf, 0.0
         for _ in range(_ROUNDS):
             weights = self._weights(blocks, weights)
-            rows = (np.sqrt(self.k * weights)[:, None, None] * blocks).reshape(
-                -1, blocks.shape[-1]
-            )
-            information = rows.T @ rows + self.problem.prior
+            roots = np.sqrt(self.k * weights)[:, None, None, None]
+            information = self.information(roots * blocks)
             at = float(self.phi(information))
             if not np.isfinite(at):
                 break
-            metric = self.gradient(information)
-            if self.objective.kind == "least":  # any W is a bound, a soft one is tight
-                metric = self.soft(information, _SHARP[-1] / at)[1]
-                at = float((metric * information).sum())
-            off = float((metric * (self.problem.prior - information)).sum())
+            if self.smooth:
+                _, metric, at = self.soft(information, _SHARP[-1] / self.unit(at))
+            else:
+                metric = self.gradient(information)
+            off = float((metric * (self.prior - information)).sum())
             if certain:
                 corners = np.array(np.meshgrid(*self.box)).reshape(len(self.box), -1).T
                 peaks, differ = corners, 0.0
@@ -816,33 +903,29 @@ class _Search:
 
     def _weights(self, blocks: Array, weights: Array) -> Array:
         """(S,) of sum 1, near the best for k commands at these blocks (S, q, p)."""
-        grams = self.k * np.matrix_transpose(blocks) @ blocks
-
-        least = self.objective.kind == "least"
-        unit = 1.0
-        if least:
-            information = np.tensordot(weights, grams, 1) + self.problem.prior
-            unit = max(float(self.phi(information)), 1e-300)
+        grams = self.k * self.squares(blocks)
+        information = np.tensordot(weights, grams, 1) + self.prior
+        unit = self.unit(float(self.phi(information)))
         sharp = _SHARP[0]
 
         def down(z: Array) -> tuple[float, Array]:
             e = np.exp(z - z.max())
             w = e / e.sum()
-            information = np.tensordot(w, grams, 1) + self.problem.prior
-            if least:
-                value, metric = self.soft(information, sharp / unit)
-                slope = (grams * metric).sum(axis=(1, 2)) / unit
-                return -value / unit, -w * (slope - w @ slope)
+            information = np.tensordot(w, grams, 1) + self.prior
             phi = float(self.phi(information))
-            if not np.isfinite(phi):
+            if not np.isfinite(phi) and self.each.kind != "least":
                 return 1e10, np.zeros_like(z)
+            if self.smooth:
+                value, metric, _ = self.soft(information, sharp / unit)
+                slope = (grams * metric).sum(axis=(1, 2, 3)) / unit
+                return -value / unit, -w * (slope - w @ slope)
             score, rate = self.score(phi)
-            slope = rate * (grams * self.gradient(information)).sum(axis=(1, 2))
+            slope = rate * (grams * self.gradient(information)).sum(axis=(1, 2, 3))
             return -score, -w * (slope - w @ slope)
 
         start = np.log(np.maximum(weights, 1e-9))
         logits = _descended(down, start, -np.inf, np.inf, 300)
-        for sharper in _SHARP[1:] if least else ():
+        for sharper in _SHARP[1:] if self.smooth else ():
             sharp = sharper
             logits = _descended(down, logits, -np.inf, np.inf, 300)
         e = np.exp(logits - logits.max())
@@ -856,11 +939,16 @@ class _Search:
         assert offer.candidates is not None
         pool = offer.candidates[offer.available]
         region = self.region
-        if region is None and CRITERIA[self.objective.name].of_region:
+        given = getattr(getattr(self.asked, "criterion", self.asked), "region", None)
+        if region is None and given is None and CRITERIA[self.each.name].of_region:
             region = pool
+        scenarios = None
+        if len(self.members) > 1:
+            assert offer.scenarios is not None
+            scenarios = offer.scenarios.parameters, offer.scenarios.weights
         own = CandidateSet.of_commands(
             np.concatenate([commands, pool]), offer.model, offer.prior, offer.noise,
-            offer.measured,
+            offer.measured, scenarios=scenarios,
         )  # fmt: skip
         problem = problem_of(own, self.k, self.asked, region)
         value, log_det = values(problem, np.arange(self.k)[None])

@@ -175,6 +175,56 @@ def test_a_function_that_can_only_be_run_is_refined():
     np.testing.assert_allclose(np.sort(best.commands[:, 0]), [0.0, 2.0], atol=1e-3)
 
 
+SCENARIOS = np.array([[1.0, 0.1], [1.0, 0.3], [1.0, 3.0]])
+
+
+def enzyme():
+    def reading(u, theta):
+        return theta[0] * u / (theta[1] + u)
+
+    return FromFunction(reading, [1.0, 0.3], batch=True, quiet=True)
+
+
+@pytest.mark.parametrize(
+    ("joined", "name"),
+    [
+        ("Worst", "D"),
+        *(
+            pytest.param(joined, name, marks=pytest.mark.slow)
+            for joined, name in itertools.product(["Mean", "Worst"], "DAE")
+        ),
+    ],
+)
+def test_two_commands_for_several_scenarios_are_those_of_a_fine_grid(joined, name):
+    """Every pair of 250 commands, in numpy; the bound is above them all."""
+    x = np.linspace(0.02, 5.0, 250)
+    k = SCENARIOS[:, 1:]
+    slopes = np.stack([x / (k + x), -x / (k + x) ** 2], axis=-1)  # (S, N, 2)
+    i, j = np.triu_indices(len(x), 1)
+    pairs = slopes[:, np.stack([i, j], axis=1)]  # (S, pairs, 2, 2)
+    sizes = np.linalg.svd(pairs, compute_uv=False)
+    each = {
+        "D": lambda: 2.0 * np.log(sizes).sum(axis=-1),
+        "A": lambda: -(sizes**-2.0).sum(axis=-1),
+        "E": lambda: sizes[..., -1] ** 2,
+    }[name]()
+    worth = (each.mean(axis=0) if joined == "Mean" else each.min(axis=0)).max()
+    design = jaxcal.Design(
+        np.linspace(0.5, 5.0, 10)[:, None], enzyme(), jaxcal.Prior(np.inf),
+        scenarios=SCENARIOS,
+    )  # fmt: skip
+    first = design.select(2, getattr(jaxcal, joined)(name), "exact")
+    better = design.refine(first, [[0.02, 5.0]], starts=2)
+    sign = -1.0 if name == "A" else 1.0
+    assert sign * better.value > sign * first.value
+    assert better.began == pytest.approx(first.value, rel=1e-9)
+    near = 1e-3 if name == "D" else 1e-3 * abs(worth)
+    assert sign * better.value > worth - 0.02 * near
+    assert sign * better.value < worth + near  # the grid is this fine
+    assert sign * better.bound > worth
+    assert "scenarios     3" in str(better)
+
+
 def test_bad_input_is_named():
     design = jaxcal.Design(np.random.default_rng(0).random((9, 2)), Affine(2, 1))
     with pytest.raises(ValueError, match=r"limits must be \(n, 2\), least below"):
@@ -192,8 +242,12 @@ def test_bad_input_is_named():
     with pytest.raises(ValueError, match="refine needs candidates and a model"):
         jaxcal.Design.from_blocks(np.ones((3, 1, 1))).refine([0])
     careful = jaxcal.Design(np.random.default_rng(0).random((9, 2)), lost=1)
-    with pytest.raises(ValueError, match="got a design with scenarios, lost"):
+    with pytest.raises(ValueError, match="got a design with lost or reliability"):
         careful.refine([0, 1, 2, 3])
+    best = jaxcal.Worst("D", efficiency=True)
+    cases = ([[0.0, 1.0]], 2, enzyme())
+    with pytest.raises(ValueError, match="criterion must be of values with refine"):
+        jaxcal.optimise(*cases, criterion=best, scenarios=SCENARIOS)
 
 
 # -- arms ------------------------------------------------------------------------------
