@@ -11,7 +11,8 @@ ROOT = pathlib.Path(__file__).parents[1]
 LEANING = re.compile(r'"""((?:The same|As|Of|Likewise)\b.*)')
 WORDS = {"each", "found", "known"}
 # What is left of a budget, and what is a thing's own, have names in these rooms.
-MORE = {room: {"left", "own"} for room in ("adaptive", "commands", "learning")}
+ROOMS = ("adaptive", "calibration", "commands", "evaluation", "learning")
+MORE = {room: {"left", "own"} for room in ROOMS}
 # Where a file may bind one, which parsing tells.
 PRONOUN = re.compile(
     r"(?m)^ *[\w, (]*\b(each|found|known|left|own)\b(, \w+)*( [+|]?=|:| in) "

@@ -171,9 +171,10 @@ class Calibration(Fit):
         """
         plain: Any = self.model.writable()
         zeros = [name for name in plain.names if name.startswith("theta")]
-        own = (*zeros, *plain.sensor.names, *(n for n in plain.names if "tool" in n))
+        tool = [name for name in plain.names if "tool" in name]
+        fitted = (*zeros, *plain.sensor.names, *tool)
         prior = plain.default_prior()
-        held = tuple(name for name in plain.names if name not in own)
+        held = tuple(name for name in plain.names if name not in fitted)
         fixed = tuple(dict.fromkeys((*prior.fixed, *held)))
         again = self._again(plain, dataclasses.replace(prior, fixed=fixed))
         steps: dict[str, int] = plain.write_servos(

@@ -292,14 +292,14 @@ class _Test:
     least: float = 1.0  # mean square of a reading without a change; 1 in the test
 
     def p_value(self, squares: Array) -> float:
-        """Of sums (G,) of squared readings."""
+        """Chance of sums (G,) of squared readings at least this large, unchanged."""
         from scipy import special
 
         of_levels = special.fdtrc(self.counts, self.dof, squares / self.counts)
         return float(-np.expm1(len(self.counts) * special.log1p(-of_levels.min())))
 
     def power(self, shifts: Array) -> Array:
-        """(...,) of changes with noncentralities (..., G).
+        """(...,) chance that changes with noncentralities (..., G) are seen.
 
         Noise that was estimated is as uncertain here as in the test: the ratio of the
         squared estimate to the true variance is a chi-square over its dof.

@@ -80,38 +80,32 @@ def fit_model(
     """
     one_of("loss", loss, ("student", "gaussian"))
     require_kind("prior", prior, Prior)
-    weights = _of_distinct(model, commands, measured, weights)
-    noise = noise or Noise()
+    weights, noise = _of_distinct(model, commands, measured, weights), noise or Noise()
     spread = _of_commands(noise, commands, measured.shape[1])
-    exact = not spread.any()
+    exact, used = not spread.any(), weights > 0.0
     if not exact and model.relative:
         raise ValueError(
             "command_std must not be given with a Pose: the orientations are "
             "compared with those of the commands given; raise the std of the noise"
         )
-    used = weights > 0.0
-    used_commands, used_measured = commands[used], measured[used]
-    model = model.prepared(used_commands, used_measured)
-    white, reading_std, levels = _of_readings(model, noise, weights, measured.shape[1])
-    if common_noise or not exact:
-        levels = 0 * levels
-    elif common_noise is False:
-        levels = np.arange(len(levels))
-    fitted, with_misfit = model, model
-    if prior is None and exact:
-        with_misfit = model.with_misfit()
-        if model.fits_misfit:
-            fitted = with_misfit
+    model = model.prepared(commands[used], measured[used])
+    with_misfit = model.with_misfit() if prior is None and exact else model
+    fitted = with_misfit if model.fits_misfit else model
     scaled = prior is not None or exact  # as far as the prior wants it
     prior = prior or fitted.default_prior()
     resolved = prior.resolve(fitted)
     centre, to_centred = None, None
     if exact and resolved.free.all() and not resolved.precisions.any():
-        centre, to_centred = _centre(fitted, used_commands, weights[used], excited)
+        centre, to_centred = _centre(fitted, commands[used], weights[used], excited)
+    white, reading_std, levels = _of_readings(model, noise, weights, measured.shape[1])
+    if common_noise or not exact:
+        levels = 0 * levels
+    elif common_noise is False:
+        levels = np.arange(len(levels))
     problem = FitProblem(
         model=fitted,
-        commands=used_commands if centre is None else used_commands - centre,
-        measured=used_measured,
+        commands=commands[used] - (0.0 if centre is None else centre),
+        measured=measured[used],
         white=white[used],
         reading_std=reading_std[used],
         mean=resolved.mean if to_centred is None else to_centred @ resolved.mean,
@@ -122,8 +116,7 @@ def fit_model(
         levels=levels,
         student=loss == "student",
     )
-    scales: PriorScales | None = None
-    misfit_factor = 1.0
+    scales, misfit_factor = None, 1.0
     if prior.by_data and scaled:
         if fitted.error_groups() is None or not exact:
             raise ValueError("Prior.sized() is of arms, without command_std")
@@ -135,15 +128,28 @@ def fit_model(
         problem, solution = _with_levels_apart(problem, solution)
     fields = _fields(problem, solution, commands, measured, weights, centre)
     if fields["joint_covariance"] is not None:
-        by_noise = fields["joint_covariance"].copy()
-        if scales is not None:
-            added = covariance_of_scales(problem, solution, scales)
-            fields["joint_covariance"] += added
-        if with_misfit is not problem.model:
-            fields |= _misfit(
-                with_misfit, problem, solution, fields, by_noise, misfit_factor
-            )
+        fields |= _widened(
+            problem, solution, fields, scales, with_misfit, misfit_factor
+        )
     return fields | {"model": model, "loss": loss}
+
+
+def _widened(
+    problem: FitProblem,
+    solution: FitSolution,
+    fields: dict[str, Any],
+    scales: PriorScales | None,
+    with_misfit: Model,
+    misfit_factor: float,
+) -> dict[str, Any]:
+    """Fields whose covariance counts what was estimated besides: scales and misfit."""
+    by_noise = fields["joint_covariance"]
+    if scales is not None:
+        added = covariance_of_scales(problem, solution, scales)
+        fields = fields | {"joint_covariance": by_noise + added}
+    if with_misfit is problem.model:
+        return fields
+    return _misfit(with_misfit, problem, solution, fields, by_noise, misfit_factor)
 
 
 def _of_distinct(

@@ -144,10 +144,10 @@ class _Search:
     def solved(self) -> Array:
         """(P, n) the commands of a square affine map, which must not be singular."""
         centre = self.fit.commands.mean(axis=0)[None]
-        left, singular, right, rows = self.require_regular(centre)
+        turn, singular, right, rows = self.require_regular(centre)
         if self.fit.joint_covariance is not None:
-            # Standard deviation of left . B right, whose value is the smallest one.
-            back, ahead = left[:, -1] / rows, right[-1] * self.spread
+            # Standard deviation of turn . B right, whose value is the smallest one.
+            back, ahead = turn[:, -1] / rows, right[-1] * self.spread
             entries = [self.model.affine(one) for one in np.eye(len(self.fit.names))]
             along = np.array([back @ entry[0] @ ahead for entry in entries if entry])
             variance = along @ self.fit.joint_covariance @ along
@@ -160,7 +160,7 @@ class _Search:
                 )
         with np.errstate(over="ignore", invalid="ignore"):
             off = ((self.wanted - self.outputs(centre)) / rows).T
-            step = right.T @ ((left.T @ off) / singular[:, None])
+            step = right.T @ ((turn.T @ off) / singular[:, None])
             command = np.asarray(centre + self.spread * step.T)
         if not np.isfinite(command).all():
             raise ValueError(
@@ -182,13 +182,13 @@ class _Search:
                 f"the model is singular at the command {in_words(commands[i])}: "
                 f"{self.fit.output_names[j]} does not respond to any input"
             )
-        left, size, right = np.linalg.svd(effect / rows[..., None])
+        turn, size, right = np.linalg.svd(effect / rows[..., None])
         for i in np.flatnonzero(~significant(size)[:, -1])[:1]:
             raise ValueError(
                 f"the model is singular at the command {in_words(commands[i])}: "
                 + self._insensitive(right[i, size.shape[1] - 1])
             )
-        return left[-1], size[-1], right[-1], rows[-1]
+        return turn[-1], size[-1], right[-1], rows[-1]
 
     def require_determined(self, commands: Array) -> None:
         """Refuse commands whose outputs depend on what nothing determines."""

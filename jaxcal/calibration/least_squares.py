@@ -610,7 +610,7 @@ def _factor(rows: Array, right: Array, damping: float) -> tuple[Array, Array]:
 
 @functools.cache
 def _lapack() -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Of a symmetric matrix the root, and the inverse of a triangle."""
+    """Cholesky's root of a symmetric matrix, and the inverse of a triangle."""
     from scipy.linalg.lapack import dpotrf, dtrtri
 
     return dpotrf, dtrtri

@@ -503,12 +503,12 @@ def _scatter(
         low = 0.0
     room = 0.06 * ((high - low) or 1.0)
     low, high = low - (0.0 if zero else room), high + room
-    left, right = float(np.min(x)), float(np.max(x))
-    pad = 0.03 * ((right - left) or 1.0)
-    left, right = left - pad, right + pad
+    first, last = float(np.min(x)), float(np.max(x))
+    pad = 0.03 * ((last - first) or 1.0)
+    first, last = first - pad, last + pad
 
     def at_x(value: float) -> float:
-        share = (value - left) / (right - left)
+        share = (value - first) / (last - first)
         return _LEFT + share * (_WIDTH - _LEFT - _RIGHT)
 
     def at_y(value: float) -> float:
@@ -525,7 +525,7 @@ def _scatter(
         y = at_y(value)
         parts.append(f'<text x="{_LEFT - 6:g}" y="{y + 4:.1f}" text-anchor="end">'
                      f"{value:.3g}</text>")  # fmt: skip
-    for value in _ticks(left, right):
+    for value in _ticks(first, last):
         parts.append(f'<text x="{at_x(value):.1f}" y="{_HEIGHT - _BOTTOM + 16:g}" '
                      f'text-anchor="middle">{value:.3g}</text>')  # fmt: skip
     middle = at_y(0.0)

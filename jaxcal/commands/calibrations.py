@@ -7,7 +7,7 @@ import logging
 import os
 import pathlib
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -251,8 +251,7 @@ def identify(
     dataset does in the place of the table, with the postures at which the arm rested.
     """
     as_urdf = out.lower().endswith(".urdf")
-    table = recording.table(file, lambda which: of_arm.of_recording(model, which))
-    table = read_table(file) if table is None else table
+    of_urdf = (model or "").lower().endswith(".urdf")
     if servos_out and as_urdf:
         raise ValueError(
             "one of --servos-out and --out FILE.urdf must be left out: either corrects "
@@ -260,53 +259,43 @@ def identify(
         )
     if servos_out and not recording.servos:
         raise ValueError("--servos-out needs --servos, the file that it corrects")
+    if as_urdf and not of_urdf:
+        raise ValueError("--out FILE.urdf needs --model FILE.urdf")
+    table = recording.table(file, lambda which: of_arm.of_recording(model, which))
+    table = read_table(file) if table is None else table
     machine: Any = of_arm.machine(model, table)
-    if (model or "").lower().endswith(".urdf"):
-        names = of_arm.columns(machine, table, inputs, "--inputs")
-        commands = of_arm.commands(machine, table, names)
-        readings = machine.sensor.outputs
+    if of_urdf:
+        readings = _arm_readings(of_arm, machine, table, inputs, outputs)
         if machine.sensor.kind in _LENGTHS:  # files of this format are in metres
             measured_unit = measured_unit or "m"
-        if machine.sensor.zeros:  # a contact needs no columns of readings
-            measured = np.zeros((len(commands), len(readings)))
-        else:
-            readings = table.named(
-                readings, MEASURED, chosen=outputs, option="--outputs"
-            )
-            measured = table.columns(readings)
         if as_urdf and os.path.exists(out) and not overwrite:
             raise ValueError(f"{out} is there already; --overwrite writes over it")
     else:
-        if as_urdf:
-            raise ValueError("--out FILE.urdf needs --model FILE.urdf")
-        readings = table.outputs(outputs)
-        other = (*readings, weights or "")
-        names = of_arm.columns(machine, table, inputs, "--inputs", other)
-        if both := sorted({*names} & {*readings}):
-            raise ValueError(f"--inputs and --outputs must differ, both hold {both[0]}")
-        commands, measured = table.columns(names), table.columns(readings)
+        readings = _readings(of_arm, machine, table, inputs, outputs, weights)
     calibration = identified(
-        commands,
-        measured,
+        readings.commands,
+        readings.measured,
         model=machine,
         noise_std=noise[0] if noise and len(noise) == 1 else noise,
         weights=table.columns([weights])[:, 0] if weights else None,
-        input_names=names,
-        output_names=readings,
+        input_names=readings.inputs,
+        output_names=readings.outputs,
         command_unit=command_unit,
         measured_unit=measured_unit,
         accuracy=accuracy,
     )
-    told, saved = calibration.verdict, [f"saved {out}"] if out else []
-    if (as_urdf or servos_out) and not told.good and not unproven:
+    corrected = out if as_urdf else servos_out
+    if corrected and not calibration.verdict.good and not unproven:
         raise ValueError(
-            f"{out if as_urdf else servos_out} is not written, --unproven writes it "
-            f"all the same:\n{told}"
+            f"{corrected} is not written, --unproven writes it all the same:\n"
+            f"{calibration.verdict}"
         )
+    saved = []
     if as_urdf:
         saved = [f"saved {out}, tip link {calibration.to_urdf(out, force=overwrite)}"]
     elif out:
         calibration.save(out)
+        saved = [f"saved {out}"]
     if servos_out:
         steps = calibration.to_lerobot(
             servos_out, str(recording.servos), force=overwrite
@@ -333,6 +322,47 @@ def identify(
     if report:
         print(f"report {os.path.join(report, 'index.html')}")
     return int(not good)
+
+
+class _Readings(NamedTuple):
+    """Commands (N, n) and readings (N, m), and the names of their columns."""
+
+    commands: Array
+    measured: Array
+    inputs: Sequence[str]
+    outputs: Sequence[str]
+
+
+def _arm_readings(
+    of_arm: ArmOptions, arm: Any, table: Table, inputs: str | None, outputs: str | None
+) -> _Readings:
+    """The columns named as the arm's joints and its sensor's; a contact has none."""
+    names = of_arm.columns(arm, table, inputs, "--inputs")
+    commands, columns = of_arm.commands(arm, table, names), arm.sensor.outputs
+    if arm.sensor.zeros:
+        return _Readings(
+            commands, np.zeros((len(commands), len(columns))), names, columns
+        )
+    columns = table.named(columns, MEASURED, chosen=outputs, option="--outputs")
+    return _Readings(commands, table.columns(columns), names, columns)
+
+
+def _readings(
+    of_arm: ArmOptions,
+    machine: Any,
+    table: Table,
+    inputs: str | None,
+    outputs: str | None,
+    weights: str | None,
+) -> _Readings:
+    """The columns that begin with u_ and y_, or those that were named."""
+    columns = table.outputs(outputs)
+    names = of_arm.columns(
+        machine, table, inputs, "--inputs", (*columns, weights or "")
+    )
+    if both := sorted({*names} & {*columns}):
+        raise ValueError(f"--inputs and --outputs must differ, both hold {both[0]}")
+    return _Readings(table.columns(names), table.columns(columns), names, columns)
 
 
 CalibrationPath = Annotated[str, "made by identify", "calibration.json"]

@@ -230,9 +230,9 @@ def variances(
         if ends is not None:
             # A percentile interval need not hold the estimate.
             error = np.maximum([variance - ends[0], ends[1] - variance], 0.0)
-        own = {"label": label, "color": style["color"], "marker": style["marker"]}
+        marks = {"label": label, "color": style["color"], "marker": style["marker"]}
         axes.errorbar(
-            np.arange(len(names)) + offset, variance, yerr=error, **own, **look
+            np.arange(len(names)) + offset, variance, yerr=error, **marks, **look
         )
     for edge in np.arange(len(names) - 1) + 0.5:
         axes.axvline(edge, color="#DDDDDD", linewidth=0.6, zorder=0)

@@ -328,9 +328,11 @@ class _Run:
         def choose(cut: slice) -> tuple[NDArray[Any], ...]:
             """(E, k) indices, (E,) proven, (E,) upper bounds; efficiencies but by D."""
             if self.criterion == "D":
-                left = None if deadline is NEVER else max(deadline.remaining_s, 1e-3)
+                remaining_s = max(deadline.remaining_s, 1e-3)
                 batch = selection.exact_batch(
-                    **self.part(cut), num_outputs=m, time_limit=left
+                    **self.part(cut),
+                    num_outputs=m,
+                    time_limit=None if deadline is NEVER else remaining_s,
                 )
                 return batch.indices, batch.proven, batch.bound
             chosen = self.selected("exact", cut, deadline)

@@ -57,7 +57,7 @@ class Result:
     options: Mapping[str, Any]
     seed: int
     reference: str  # whom the others are compared with in pairs
-    found: Comparison
+    comparison: Comparison
     seconds: NDArray[np.float64]  # (D,) of one core, a choice
     rules: Mapping[str, CostRule]
     checkpoint: Mapping[str, Any] | None  # meta of the policy
@@ -136,7 +136,7 @@ def evaluate(
         options=options,
         seed=seed,
         reference=[*rivals, methods[0]][0],
-        found=whole,
+        comparison=whole,
         seconds=np.array(seconds),
         rules=rules,
         checkpoint=None if trained is None else trained.meta,

@@ -35,15 +35,15 @@ def _rows(result: Result) -> list[tuple[str, ...]]:
     rival = result.reference
     head = ("method", "nats", "less " + rival + ", paired", "choices", "time each")
     rows: list[tuple[str, ...]] = [head]
-    for row, name in enumerate(result.found.names):
-        mean, error = result.found.mean(name)
-        over, spread = result.found.paired(name, rival)
+    for row, name in enumerate(result.comparison.names):
+        mean, error = result.comparison.mean(name)
+        over, spread = result.comparison.paired(name, rival)
         rows.append(
             (
                 name,
                 f"{mean:.3f} ± {error:.3f}",
                 "" if name == rival else f"{over:+.3f} ± {spread:.3f}",
-                f"{result.found.choices[row].mean():.1f}",
+                f"{result.comparison.choices[row].mean():.1f}",
                 f"{1e3 * result.seconds[row]:.3g} ms",
             )
         )
@@ -55,14 +55,14 @@ def _heading(result: Result) -> str:
     beyond = "; ".join(result.outside)
     return (
         f"{result.task}{f' ({shown})' if shown else ''}, seed {result.seed}: "
-        f"{result.found.gain.shape[1]:,} sessions, information gained in nats"
+        f"{result.comparison.gain.shape[1]:,} sessions, information gained in nats"
         f"{f'; ahead is used beyond its tests: {beyond}' if beyond else ''}"
     )
 
 
 def json_document(result: Result, *, command: Sequence[str]) -> str:
     """The numbers; the envelope is that of an evaluation of postures."""
-    comparison = result.found
+    comparison = result.comparison
     methods = {}
     for row, name in enumerate(comparison.names):
         drop, ratio = comparison.entropy_drop[row], comparison.log_ratio[row]
@@ -110,22 +110,22 @@ def figure(result: Result) -> Any:
     """Nats with 95 % intervals; the paired difference from the reference."""
     from jaxcal.plots.style import COLOURS, panels
 
-    comparison = result.found
+    comparison = result.comparison
     names = comparison.names
     y = np.arange(len(names))[::-1]
-    drawn, (left, right) = panels((9.0, 0.6 + 0.35 * len(names)), shape=(1, 2))
+    drawn, (gains, differences) = panels((9.0, 0.6 + 0.35 * len(names)), shape=(1, 2))
     pairs = [comparison.paired(name, result.reference) for name in names]
     for axes, values in (
-        (left, [comparison.mean(name) for name in names]),
-        (right, pairs),
+        (gains, [comparison.mean(name) for name in names]),
+        (differences, pairs),
     ):
         mean, error = np.array(values).T
         axes.errorbar(mean, y, xerr=1.96 * error, fmt="o", color=COLOURS[0], capsize=3)
         axes.set_yticks(y, names)
         axes.set_ylim(-0.5, len(names) - 0.5)
-    left.set_xlabel("information gained in a session (nats)")
-    right.set_xlabel(f"less that of {result.reference}, in pairs (nats)")
-    right.axvline(0.0, color=COLOURS[1], linestyle="--")
+    gains.set_xlabel("information gained in a session (nats)")
+    differences.set_xlabel(f"less that of {result.reference}, in pairs (nats)")
+    differences.axvline(0.0, color=COLOURS[1], linestyle="--")
     return drawn
 
 

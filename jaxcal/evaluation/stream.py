@@ -105,16 +105,16 @@ def total(counts: list[int], parts: list[dict[str, Any]]) -> dict[str, Any]:
         return float(np.average(np.array(values, float), weights=counts))  # None: NaN
 
     # Medians and variances of parts do not add up.
-    own = {k: v for k, v in parts[0].items() if k != "parameter_variance"}
+    row = {k: v for k, v in parts[0].items() if k != "parameter_variance"}
     for name in _MEANS:
-        own[name] = finite(mean([part[name] for part in parts]))
+        row[name] = finite(mean([part[name] for part in parts]))
     for name in ("det_s", "log_det_s"):
         held = [[part[name]["mean"], part[name]["std"]] for part in parts]
         middles, stds = np.array(held, float).T
         middle = mean(middles)
         std = math.sqrt(mean(stds**2 + (middles - middle) ** 2))
-        own[name] = {"mean": finite(middle), "std": finite(std), "median": None}
-    return own
+        row[name] = {"mean": finite(middle), "std": finite(std), "median": None}
+    return row
 
 
 def _open(folder: pathlib.Path, plan: Mapping[str, Any]) -> None:

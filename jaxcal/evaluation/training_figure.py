@@ -31,26 +31,26 @@ def training_curves(runs: Mapping[str, pathlib.Path]) -> Figure:
         OSError: there is no metrics.csv in a folder.
         ValueError: it cannot be understood, naming the line or column.
     """
-    figure, (left, middle, right) = panels((12.0, 3.8), shape=(1, 3))
+    figure, (curve, spread, smooth) = panels((12.0, 3.8), shape=(1, 3))
     twin, label, what = None, {"label": "moving average"}, ""
     for number, (name, folder) in enumerate(runs.items()):
         metrics, colour = read_metrics(folder / "metrics.csv"), COLOURS[number % 6]
         x, reward = metrics["episodes"] / 1000.0, metrics["reward_mean"]
-        left.plot(x, reward, color=colour, linewidth=0.8, alpha=0.5)
+        curve.plot(x, reward, color=colour, linewidth=0.8, alpha=0.5)
         if "reward_std" in metrics and len(runs) == 1:
             ends = reward - metrics["reward_std"], reward + metrics["reward_std"]
             look: dict[str, Any] = {"color": COLOURS[5], "alpha": 0.2, "linewidth": 0}
-            left.fill_between(x, *ends, label="± 1 s.d. of episodes", **look)
+            curve.fill_between(x, *ends, label="± 1 s.d. of episodes", **look)
         # The mean of the last ``window`` values, of fewer at the beginning.
         window = max(1, min(len(reward) // 10, 50))
         count = np.minimum(np.arange(1, len(reward) + 1), window)
         mean = np.convolve(reward, np.ones(window))[: len(reward)] / count
-        left.plot(x, mean, color=colour, **label)
+        curve.plot(x, mean, color=colour, **label)
         label = {}
         last, what = last_rewards(folder, metrics)
         text = f"{name}: {np.mean(last):.3g} ± {np.std(last):.2g}"
         bins = min(50, max(5, len(last) // 10))
-        middle.hist(
+        spread.hist(
             last, bins=bins, color=colour, histtype="step", density=True, label=text
         )
         # An exponential moving average, unbiased at the beginning.
@@ -58,24 +58,24 @@ def training_curves(runs: Mapping[str, pathlib.Path]) -> Figure:
             lfilter([0.05], [1.0, -0.95], column)
             for column in (reward, np.ones(len(x)))
         )
-        right.plot(x, sums / weights, color=colour, label=name)
+        smooth.plot(x, sums / weights, color=colour, label=name)
         finite = np.isfinite(ratio := metrics.get("ratio_to_exact", np.nan * x))
         if finite.any():
-            twin = right.twinx() if twin is None else twin
+            twin = smooth.twinx() if twin is None else twin
             twin.plot(x[finite], ratio[finite], color=colour, linestyle="--")
             twin.set(ylabel="dashed: mean det S / det S*", ylim=(0.0, 1.02))
-    left.set_title("(a) reward", fontsize=10)
-    middle.set_title(f"(b) {what}", fontsize=10)
-    right.set_title("(c) smoothed curve", fontsize=10)
+    curve.set_title("(a) reward", fontsize=10)
+    spread.set_title(f"(b) {what}", fontsize=10)
+    smooth.set_title("(c) smoothed curve", fontsize=10)
     unit = "reward (log det S, scaled)"
-    left.set(xlabel="training episodes (thousands)", ylabel=unit)
-    middle.set(xlabel=unit, ylabel="density")
-    right.set(xlabel="training episodes (thousands)", ylabel=unit)
-    left.legend(fontsize=8, frameon=False)
-    middle.margins(y=0.1 + 0.08 * len(runs))  # room for the legend
-    middle.legend(fontsize=7, framealpha=1.0, edgecolor="none")  # over the lines
+    curve.set(xlabel="training episodes (thousands)", ylabel=unit)
+    spread.set(xlabel=unit, ylabel="density")
+    smooth.set(xlabel="training episodes (thousands)", ylabel=unit)
+    curve.legend(fontsize=8, frameon=False)
+    spread.margins(y=0.1 + 0.08 * len(runs))  # room for the legend
+    spread.legend(fontsize=7, framealpha=1.0, edgecolor="none")  # over the lines
     place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.2)}
-    right.legend(fontsize=8, frameon=False, ncols=3, **place)
+    smooth.legend(fontsize=8, frameon=False, ncols=3, **place)
     return figure
 
 

@@ -94,7 +94,7 @@ def _attitudes(then: RigConfig, now: RigConfig) -> Callable[[Record], Any]:
 
 
 def _numbers(then: RigConfig, now: RigConfig) -> Callable[[Record], Any]:
-    """Likewise the numbers of a sensor."""
+    """What reads the numbers of a record, and the fields that hold them."""
     assert then.readings is not None and now.readings is not None
     factors = np.divide(now.readings.factors or 1.0, then.readings.factors or 1.0)
 

@@ -103,7 +103,7 @@ def _moved(before: Record, now: Record) -> list[str]:
 
 
 def _moved_parameters(before: Record, now: Record) -> list[str]:
-    """The same of a model's."""
+    """Parameters of a model that differ by more than their intervals allow."""
     moved = []
     for name, found in now.items():
         if name not in before or found["half_width"] is None:
