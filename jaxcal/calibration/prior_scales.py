@@ -244,17 +244,20 @@ def _reduced(problem: FitProblem, solution: FitSolution) -> tuple[Array, Array]:
 
     Free of the parameters of which nothing is known.
     """
-    theta, free, precision = solution.parameters, problem.free, problem.precision
+    free, precision = problem.free, problem.precision[problem.free]
+    slopes = solution.by_theta
+    if problem.model is not solution.problem.model:
+        theta = solution.parameters
+        slopes = derivative(problem.model, problem.commands, theta)[..., free]
+        slopes = whiten(problem.white, slopes)
     # One level for all: what the fit found of how they compare is kept.
     level = solution.level / np.exp(np.log(solution.level).mean())
-    size = np.sqrt(np.minimum(solution.weights, 1.0))[:, None, None] / level[:, None]
-    slopes = derivative(problem.model, problem.commands, theta)
-    off = solution.residuals[..., None] + slopes @ (theta - problem.mean)[:, None]
-    right = (size * whiten(problem.white, off)).ravel()
-    rows = (size * whiten(problem.white, slopes)).reshape(len(right), -1)
-    informed = rows[:, free & (precision > 0.0)]
-    informed = informed / np.sqrt(precision[free & (precision > 0.0)])
-    flat = rows[:, free & (precision == 0.0)]
+    size = np.sqrt(np.minimum(solution.weights, 1.0))[:, None] / level
+    off = solution.white + slopes @ (solution.parameters - problem.mean)[free]
+    right = (size * off).ravel()
+    rows = (size[..., None] * slopes).reshape(len(right), -1)
+    informed = rows[:, precision > 0.0] / np.sqrt(precision[precision > 0.0])
+    flat = rows[:, precision == 0.0]
     if flat.shape[1]:
         flat = flat / (np.linalg.norm(flat, axis=0) + 1e-300)
         informed, right = without(flat, informed, right)

@@ -264,7 +264,7 @@ class Arm:
         frame, axes, origins = self._chain(commands, parameters)
         motion = np.zeros((len(at), 6, len(commands)))  # shift and turn of the tip
         turns = self._steps[0][at] > 2
-        about = np.radians(axes[at[turns]])
+        about = np.radians(1.0) * axes[at[turns]]
         motion[turns, :3] = _cross(about, frame[3] - origins[at[turns]])
         motion[turns, 3:] = about
         motion[~turns, :3] = axes[at[~turns]]
