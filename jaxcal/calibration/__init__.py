@@ -2,8 +2,9 @@
 
 ``identify`` checks the arguments, ``fit_model`` makes a problem of them and of its
 solution the fields of a calibration; ``least_squares`` is the search, for every model,
-and ``prior_scales`` how large a machine's errors are. ``fit`` holds what was found and
-predicts; ``calibration`` adds ``check``, the ``inverse``, the summary and the ``file``.
+``losses`` what an outlier counts, ``prior_scales`` how large a machine's errors are.
+``fit`` holds the fields and predicts; ``calibration`` adds ``check``, the ``inverse``,
+the summary and the ``file``.
 """
 
 from jaxcal.calibration.budget import Budget, Source

@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from jaxcal.calibration.fit import Fit
+from jaxcal.calibration.losses import LOSSES
 from jaxcal.files import write_text
 from jaxcal.models.from_dict import from_dict
 from jaxcal.models.model import Model, as_model
@@ -132,7 +133,7 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
         values[key] = tuple(values[key])
     for key, (kind, what) in _KINDS.items():
         require(isinstance(values[key], kind), key, f"be {what}")
-    require(values["loss"] in ("student", "gaussian"), "loss", "be student or gaussian")
+    require(values["loss"] in LOSSES, "loss", f"be {' or '.join(LOSSES)}")
     for key in ("model", "derived"):
         require(isinstance(content.get(key), dict), key, "be an object")
     names = content["derived"].get("parameter_names")

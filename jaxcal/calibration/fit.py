@@ -37,7 +37,7 @@ class Fit:
     measured_unit: str
     provenance: Mapping[str, Any]  # created, packages, data_sha256, notes
     model: Model
-    loss: str  # "student" or "gaussian"
+    loss: str  # of jaxcal.calibration.losses
     estimate: Annotated[Array, "P"]
     joint_covariance: Annotated[Array | None, "PP"]  # None where the noise is unknown
     # Commands are counted from it in joint_covariance; None: from zero.

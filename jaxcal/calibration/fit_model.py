@@ -13,9 +13,9 @@ from jaxcal.calibration.least_squares import (
     FitSolution,
     singular,
     solve,
-    student_constants,
     whiten,
 )
+from jaxcal.calibration.losses import LOSSES, constants
 from jaxcal.calibration.prior_scales import (
     PriorScales,
     covariance_of_scales,
@@ -78,7 +78,7 @@ def fit_model(
 
     ``excited`` are names of commands that must vary in every direction.
     """
-    one_of("loss", loss, ("student", "gaussian"))
+    one_of("loss", loss, tuple(LOSSES))
     require_kind("prior", prior, Prior)
     weights, noise = _of_distinct(model, commands, measured, weights), noise or Noise()
     spread = _of_commands(noise, commands, measured.shape[1])
@@ -114,7 +114,7 @@ def fit_model(
         command_std=spread,
         noise_known=noise.std is not None or noise.covariance is not None,
         levels=levels,
-        student=loss == "student",
+        loss=LOSSES[loss],
     )
     scales, misfit_factor = None, 1.0
     if prior.by_data and scaled:
@@ -351,9 +351,9 @@ def _misfit(
 
 def _informs(problem: FitProblem, solution: FitSolution) -> Array:
     """(N,) how much each measurement says, one in full."""
-    if not problem.student:
+    if problem.loss is None:
         return solution.weights
-    _, mean, efficiency = student_constants(solution.num_readings)
+    _, mean, efficiency = constants(problem.loss, solution.num_readings)
     return np.asarray(efficiency * np.minimum(1.0, solution.weights / mean))
 
 

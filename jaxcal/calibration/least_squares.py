@@ -4,12 +4,12 @@ Rows of residuals, whitened: the readings, the prior (one row for each parameter
 where commands are uncertain, the commands. Those are unknowns of their own measurement
 and are eliminated there by an orthogonal projection. A model that is linear in its
 parameters is searched along orthogonal directions, so one step is enough whatever its
-units. Student's loss is iteratively
+units. A loss is iteratively
 reweighted least squares. A level of noise that was not given is estimated beside the
 parameters, from the residuals and the degrees of freedom that they really have.
 
 Sources: Marquardt, 1963, with the damping of Nielsen, 1999; Lange, Little and Taylor,
-1989 (Student); Foerstner, 1979, and MacKay, 1992 (levels of noise and prior).
+1989 (losses); Foerstner, 1979, and MacKay, 1992 (levels of noise and prior).
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.calibration.losses import Loss, constants
 from jaxcal.checks import in_words
 from jaxcal.information.blocks import triangle
 from jaxcal.information.singular import significant
@@ -32,13 +33,11 @@ __all__ = [
     "FitSolution",
     "singular",
     "solve",
-    "student_constants",
     "whiten",
 ]
 
 Array = NDArray[np.float64]
 
-NU = 4.0  # degrees of freedom of Student's loss
 _LIMIT = 300  # iterations
 _PATIENCE = 20  # iterations whose gain together decides whether the search creeps
 _MANY = 64  # readings of a measurement from which matrices of them are not made
@@ -62,34 +61,7 @@ class FitProblem:
     command_std: Array  # (n,) 0 exact, inf unknown in every measurement
     noise_known: bool  # the level is 1; else it is estimated
     levels: NDArray[np.intp]  # (q,) from 0: outputs of the same number share one
-    student: bool
-
-
-@functools.lru_cache
-def student_constants(q: int) -> tuple[float, float, float]:
-    """Student's loss where the noise of q readings is normal.
-
-    Returns:
-        Mean weighted squared residual of a reading of unit noise; mean weight;
-        efficiency relative to least squares.
-    """
-    from scipy import special
-
-    node, share = special.roots_genlaguerre(60, q / 2.0 - 1.0)
-    share, square = share / share.sum(), 2.0 * node
-    weight = student_weight(square, q)
-    slope = share @ (weight - 2.0 * square * weight**2 / (NU + q) / q)
-    efficiency = slope**2 / (share @ (weight**2 * square) / q)
-    return float(share @ (weight * square) / q), float(share @ weight), efficiency
-
-
-def student_weight(square: Array, q: int) -> Array:
-    """Weights of measurements at squared distances ``square`` from the fit.
-
-    Of Student's distribution, scaled so that a residual of zero has weight one: where
-    no residual is large the fit is that of least squares.
-    """
-    return np.asarray((NU + q) / (NU + q + square))
+    loss: Loss | None  # None: least squares
 
 
 def solve(
@@ -104,9 +76,9 @@ def solve(
         ValueError: the model fails at the start, a derivative is not finite, or the
             search does not converge.
     """
-    if problem.student and start is None:
-        start = solve(dataclasses.replace(problem, student=False), rough=True)
-        start.weights = student_weight(start.deleted, start.num_readings)
+    if problem.loss is not None and start is None:
+        start = solve(dataclasses.replace(problem, loss=None), rough=True)
+        start.weights = problem.loss.weight(start.deleted, start.num_readings)
     search = FitSolution(problem, start, rough)
     if search.direct():
         return search.finish(search.solved)
@@ -196,7 +168,7 @@ class FitSolution:
     ) -> None:
         self.problem = problem
         # 1e-6 standard deviations; 1e-5 where convergence is linear.
-        self.least = 1e-2 if rough else 1e-10 if problem.student else 1e-12
+        self.least = 1e-2 if rough else 1e-10 if problem.loss else 1e-12
         self.change = (3e-2, 3e-2) if rough else (1e-5, 1e-4)  # of weights and levels
         # (R, r) roots of the hat matrix, hardly damped, where a step had them.
         self.solved: Array | None = None
@@ -319,7 +291,7 @@ class FitSolution:
         """
         problem = self.problem
         informed = len(self.facts) or self.informed
-        if self.basis is None or problem.student or informed:
+        if self.basis is None or problem.loss or informed:
             return False
         output = None  # (F,) one that each parameter moves
         if not problem.noise_known:
@@ -492,8 +464,8 @@ class FitSolution:
         problem = self.problem
         before = self.weights, np.log(self.level)
         distance = self._distance(self.white, self.commands)
-        if problem.student:
-            self.weights = student_weight(distance, self.num_readings)
+        if problem.loss is not None:
+            self.weights = problem.loss.weight(distance, self.num_readings)
         if not problem.noise_known:
             self._climb(distance)
         after = self.weights, np.log(self.level)
@@ -513,17 +485,18 @@ class FitSolution:
             self._share(0 * self.shared)
         same = self.same
         square, freedom = same @ square, same @ freedom
-        if self.problem.student:
-            square = square / student_constants(self.num_readings)[0]
+        if self.problem.loss is not None:
+            square = square / constants(self.problem.loss, self.num_readings)[0]
         return np.maximum(np.sqrt(square / freedom), (same * self.floor).max(axis=1))
 
     def _climb(self, distance: Array) -> None:
         """Move the levels towards those of the residuals."""
         change, faster = np.log(self._level() / self.level), 1.0
-        if self.problem.student:
+        if (loss := self.problem.loss) is not None:
             # The weights follow the level: Newton's step takes both at once.
-            pulled = self.weights * distance
-            faster = pulled.sum() / max(pulled @ self.weights, 1e-300)
+            slope = loss.slope(distance, self.num_readings)
+            pulled = distance @ (self.weights + distance * slope)
+            faster = (self.weights @ distance) / max(pulled, 1e-300)
         near = np.abs(change).max() < 0.3
         step = change * (faster if near else 1.0)
         # Levels that go back and forth may never settle: then half a step is taken.

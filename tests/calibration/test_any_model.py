@@ -12,6 +12,7 @@ from scipy import optimize
 
 import jaxcal
 from jaxcal.calibration import Calibration, identify
+from jaxcal.calibration.losses import LOSSES, Loss
 from jaxcal.models import (
     Affine,
     FromJax,
@@ -128,6 +129,28 @@ def test_students_loss_is_at_its_minimum() -> None:
         np.linalg.norm((each.parameters - TRUTH)[:5]) for each in (found, plain)
     )
     assert error < 0.1 < plain_error
+
+
+class Cauchy(Loss):
+    def weight(self, square: np.ndarray, q: int) -> np.ndarray:
+        return 1.0 / (1.0 + square)
+
+    def slope(self, square: np.ndarray, q: int) -> np.ndarray:
+        return -1.0 / (1.0 + square) ** 2
+
+
+def test_a_loss_of_ones_own_is_a_class_and_a_row(monkeypatch) -> None:
+    monkeypatch.setitem(LOSSES, "cauchy", Cauchy())
+    commands, measured = waves(3)
+    options = {"model": WAVE, "noise_std": 0.05, "loss": "cauchy"}
+    found = identify(commands, measured, **options)
+
+    def loss(theta: np.ndarray) -> float:
+        off = (WAVE.predict(commands, [*theta, 3.0]) - measured) / 0.05
+        return float(np.log1p((off**2).sum(axis=1)).sum())
+
+    expected = optimize.minimize(loss, TRUTH[:5], method="BFGS", tol=1e-10).x
+    np.testing.assert_allclose(found.parameters[:5], expected, atol=5e-6)
 
 
 def test_a_linear_model_with_a_prior_has_a_closed_form() -> None:

@@ -117,7 +117,7 @@ def solve_auto(
 
 
 def _starts(problem: Problem) -> int:
-    """Of the exchange. E of several scenarios takes as long for a few as proofs do."""
+    """Restarts of the exchange; E of several scenarios is as slow as its proof."""
     if isinstance(problem, ScenarioProblem) and problem.joined.kind == "least":
         return default_restarts(problem)
     return STARTING_RESTARTS

@@ -1,0 +1,71 @@
+"""How much a measurement counts that lies far from the fit: the losses of ``identify``.
+
+Iteratively reweighted least squares needs of a loss its weight of a measurement and
+the slope of that. A loss of one's own is a class here and a row in ``LOSSES``.
+
+Source: Lange, Little and Taylor, 1989 (Student).
+"""
+
+from __future__ import annotations
+
+import abc
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["LOSSES", "Loss", "Student", "constants"]
+
+Array = NDArray[np.float64]
+
+
+class Loss(abc.ABC):
+    """Weights of measurements by their squared distances from the fit, in noise.
+
+    At the fit the weight is one, so that where no residual is large the fit is that of
+    least squares.
+    """
+
+    @abc.abstractmethod
+    def weight(self, square: Array, q: int) -> Array:
+        """(N,) of measurements of q readings at squared distances (N,)."""
+
+    @abc.abstractmethod
+    def slope(self, square: Array, q: int) -> Array:
+        """(N,) derivative of the weight by the squared distance."""
+
+
+@functools.lru_cache
+def constants(loss: Loss, q: int) -> tuple[float, float, float]:
+    """What a loss does where the noise of q readings is normal.
+
+    Returns:
+        Mean weighted squared residual of a reading of unit noise; mean weight;
+        efficiency relative to least squares.
+    """
+    from scipy import special
+
+    node, share = special.roots_genlaguerre(60, q / 2.0 - 1.0)
+    share, square = share / share.sum(), 2.0 * node
+    weight = loss.weight(square, q)
+    slope = share @ (weight + 2.0 * square * loss.slope(square, q) / q)
+    efficiency = slope**2 / (share @ (weight**2 * square) / q)
+    return float(share @ (weight * square) / q), float(share @ weight), efficiency
+
+
+class Student(Loss):
+    """Student's distribution: outliers count little, all others nearly in full."""
+
+    degrees_of_freedom = 4.0
+
+    def weight(self, square: Array, q: int) -> Array:
+        size = self.degrees_of_freedom + q
+        return np.asarray(size / (size + square))
+
+    def slope(self, square: Array, q: int) -> Array:
+        size = self.degrees_of_freedom + q
+        return np.asarray(-size / (size + square) ** 2)
+
+
+LOSSES: dict[str, Loss | None] = {"student": Student(), "gaussian": None}
+"""The losses by name; None is least squares."""
