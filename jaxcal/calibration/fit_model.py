@@ -82,7 +82,7 @@ def fit_model(
     require_kind("prior", prior, Prior)
     weights, noise = _of_distinct(model, commands, measured, weights), noise or Noise()
     spread = _of_commands(noise, commands, measured.shape[1])
-    exact, used = not spread.any(), weights > 0.0
+    exact, used = not spread.any(), _used(weights)
     if not exact and model.relative:
         raise ValueError(
             "command_std must not be given with a Pose: the orientations are "
@@ -150,6 +150,11 @@ def _widened(
     if with_misfit is problem.model:
         return fields
     return _misfit(with_misfit, problem, solution, fields, by_noise, misfit_factor)
+
+
+def _used(weights: Array) -> slice | NDArray[np.bool_]:
+    """The rows of positive weight; all of them at once where none is left out."""
+    return slice(None) if weights.all() else weights > 0.0
 
 
 def _of_distinct(
@@ -365,7 +370,7 @@ def _fields(
     weights: Array,
     centre: Array | None,
 ) -> dict[str, Any]:
-    used = weights > 0.0
+    used = _used(weights)
     covariance, null = _covariance(problem, solution)
     freedom = float(solution.freedom.sum())
     noise_std: Array | None = solution.level * np.sqrt(
@@ -379,10 +384,11 @@ def _fields(
             noise_std, noise_dof = None, 0.0
     residuals = np.empty_like(measured)
     residuals[used] = solution.residuals
-    if not used.all():
-        left_out = commands[~used] - (0.0 if centre is None else centre)
-        outputs = problem.model.predict(left_out, solution.parameters)
-        residuals[~used] = problem.model.wrapped(measured[~used] - outputs, left_out)
+    unused = weights == 0.0
+    if unused.any():
+        elsewhere = commands[unused] - (0.0 if centre is None else centre)
+        off = measured[unused] - problem.model.predict(elsewhere, solution.parameters)
+        residuals[unused] = problem.model.wrapped(off, elsewhere)
     estimate, mean = solution.parameters, problem.mean
     if centre is not None:
         back = np.asarray(problem.model.centred(-centre))

@@ -200,6 +200,15 @@ def _noise(
     return noise, plain
 
 
+@functools.cache
+def _packages() -> dict[str, str]:
+    return {
+        "jaxcal": sys.modules["jaxcal"].__version__,  # an import would be a circle
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+    }
+
+
 def _provenance(
     commands: Array, measured: Array, weight: Array, notes: Mapping[str, Any] | None
 ) -> dict[str, Any]:
@@ -213,11 +222,7 @@ def _provenance(
         digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
     return {
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "packages": {
-            "jaxcal": sys.modules["jaxcal"].__version__,  # an import would be a circle
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
+        "packages": _packages(),
         "data_sha256": digest.hexdigest(),
         "notes": noted,
     }

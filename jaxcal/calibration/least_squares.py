@@ -495,8 +495,8 @@ class FitSolution:
         if (loss := self.problem.loss) is not None:
             # The weights follow the level: Newton's step takes both at once.
             slope = loss.slope(distance, self.num_readings)
-            pulled = distance @ (self.weights + distance * slope)
-            faster = (self.weights @ distance) / max(pulled, 1e-300)
+            pulled = float(distance @ (self.weights + distance * slope))
+            faster = float(self.weights @ distance) / max(pulled, 1e-300)
         near = np.abs(change).max() < 0.3
         step = change * (faster if near else 1.0)
         # Levels that go back and forth may never settle: then half a step is taken.
