@@ -64,7 +64,7 @@ def numbers(name: str, values: ArrayLike, *, finite: bool = True) -> Array:
         given = np.asarray(values)
         if given.dtype.kind not in "biufO":
             raise TypeError
-        array = given.astype(np.float64)
+        array = given.astype(np.float64, order="C")
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"{name} must be an array of numbers, got "
