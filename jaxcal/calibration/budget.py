@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -213,37 +213,8 @@ def budget(
         raise ValueError(
             f"sources must hold jaxcal.calibration.Source, got {wrong[0]!r}"
         )
-    p, covariance = len(calibration.names), np.asarray(calibration.joint_covariance)
-    prior = calibration.prior_precision * (calibration.free > 0.0)
-    if commands is None:
-        slopes = np.eye(p, len(covariance))  # of the results by all parameters
-        slopes[:, :p] = calibration.to_parameters
-        names, values, unit = calibration.names, calibration.parameters, ""
-    else:
-        points = calibration.points("commands", commands, calibration.num_inputs)
-        points = points.reshape(-1, calibration.num_inputs)
-        slopes = calibration.linear(points)[0]
-        width = slopes.shape[-1]
-        slopes = slopes.reshape(-1, width)
-        covariance, prior = covariance[:width, :width], prior[:width]
-        outputs = calibration.output_names
-        names = tuple(f"{y} at row {i}" for i in range(len(points)) for y in outputs)
-        values, unit = calibration.predict(points).ravel(), calibration.measured_unit
-    by = slopes @ covariance
-    total = np.maximum((by * slopes).sum(axis=1), 0.0)
-    before, misfit = (by[:, :p] ** 2) @ prior[:p], (by[:, p:] ** 2) @ prior[p:]
-    # Sizes of the errors that are estimates widen what was known before.
-    share = total / np.maximum(before + misfit, np.maximum(total, 1e-300))
-    before, misfit = share * before, share * misfit
-    noise = np.maximum(total - before - misfit, 0.0)
-    if calibration.unidentified is not None:
-        lost = calibration.unseen[:, : slopes.shape[-1]]
-        noise = np.where(depends(slopes, lost), np.inf, noise)
-    parts = {"noise": (noise, calibration.noise_dof or np.inf)}
-    if before.any():
-        parts["known before"] = before, np.inf
-    if misfit.any():
-        parts["misfit"] = misfit, np.inf
+    results = _results(calibration, commands)
+    slopes, parts = results.slopes, _parts(calibration, results.slopes)
     gain = _gain(calibration, slopes.shape[-1]) if sources else None
     for source in sources:
         if source.name in parts:
@@ -253,14 +224,65 @@ def budget(
     finite = np.where(np.isfinite(contributions), contributions, 0.0)
     least = 1e-9 * finite.max(axis=1, keepdims=True)  # below is rounding
     return Budget(
-        names=names,
-        values=np.asarray(values),
+        names=results.names,
+        values=np.asarray(results.values),
         sources=tuple(parts),
         source_dof=np.array([float(dof) for _, dof in parts.values()]),
         contributions=np.where(contributions > least, contributions, 0.0),
         confidence=float(confidence),
-        unit=unit,
+        unit=results.unit,
     )
+
+
+class _Results(NamedTuple):
+    """What a budget is of: the parameters, or the outputs at commands."""
+
+    names: tuple[str, ...]  # R
+    values: Array  # (R,)
+    unit: str
+    slopes: Array  # (R, P) by all parameters, as joint_covariance has them
+
+
+def _results(calibration: Fit, commands: ArrayLike | None) -> _Results:
+    if commands is None:
+        p = len(calibration.names)
+        slopes = np.eye(p, len(np.asarray(calibration.joint_covariance)))
+        slopes[:, :p] = calibration.to_parameters
+        return _Results(calibration.names, calibration.parameters, "", slopes)
+    points = calibration.points("commands", commands, calibration.num_inputs)
+    points = points.reshape(-1, calibration.num_inputs)
+    slopes = calibration.linear(points)[0]
+    outputs = calibration.output_names
+    return _Results(
+        tuple(f"{output} at row {i}" for i in range(len(points)) for output in outputs),
+        calibration.predict(points).ravel(),
+        calibration.measured_unit,
+        slopes.reshape(-1, slopes.shape[-1]),
+    )
+
+
+def _parts(calibration: Fit, slopes: Array) -> dict[str, tuple[Array, float]]:
+    """Variances (R,) of the results, and their degrees of freedom, by what the fit has:
+    noise, what was known before, misfit."""
+    p, width = len(calibration.names), slopes.shape[-1]
+    covariance = np.asarray(calibration.joint_covariance)[:width, :width]
+    prior = (calibration.prior_precision * (calibration.free > 0.0))[:width]
+    by = slopes @ covariance
+    total = np.maximum((by * slopes).sum(axis=1), 0.0)
+    before, misfit = (by[:, :p] ** 2) @ prior[:p], (by[:, p:] ** 2) @ prior[p:]
+    # Sizes of the errors that are estimates widen what was known before.
+    share = total / np.maximum(before + misfit, np.maximum(total, 1e-300))
+    before, misfit = share * before, share * misfit
+    noise = np.maximum(total - before - misfit, 0.0)
+    if calibration.unidentified is not None:
+        undetermined = depends(slopes, calibration.unseen[:, :width])
+        noise = np.where(undetermined, np.inf, noise)
+    parts = {"noise": (noise, calibration.noise_dof or np.inf)}
+    if before.any():
+        parts["known before"] = before, np.inf
+    if misfit.any():
+        parts["misfit"] = misfit, np.inf
+    return parts
 
 
 def _gain(calibration: Fit, width: int) -> Array:

@@ -277,71 +277,82 @@ def _page(
     readings: tuple[ArrayLike, ArrayLike] | None,
     at: ArrayLike | None,
 ) -> pages.Page:
-    good, check = document["good"], document["of"] == "check"
-    word = "good" if good else "not good"
-    if check:
-        word = str(document["numbers"]["check_says"])
-    badge = pages.Badge(word, "good" if good else "bad")
-    numbers = document["numbers"]
-    of_readings = f" {calibration.measured_unit}" if calibration.measured_unit else ""
-    rows = [
-        [
-            name.replace("_", " "),
-            _text(value) + (of_readings if name in _IN_UNIT else ""),
-        ]
-        for name, value in numbers.items()
-        if value is not None
-    ]
-    first: list[pages.Block] = [pages.Text(line) for line in document["reasons"]]
-    first.append(pages.Text(f"Next: {document['next_step']}."))
-    first.append(pages.Table(("", "value"), rows))
-    sections = [pages.Section("Verdict", first, "verdict", badge)]
+    sections = [_verdict_section(calibration, document)]
     if readings is not None:
         sections.append(_new_section(calibration, *readings))
     if "moved" in document:
         sections.append(_moved_section(calibration, document["moved"]))
-    blocks: list[pages.Block]
+    sections.append(_parameter_section(calibration, budgets))
     if budgets:
-        of_parameters, of_predictions = (one.rows() for one in budgets)
-        if units := _units(calibration):
-            pairs = zip(of_parameters, ("unit", *units), strict=True)
-            of_parameters = [[*row, unit] for row, unit in pairs]
-        note = (
-            "Standard uncertainties by source (GUM), effective degrees of freedom by "
-            "Welch and Satterthwaite, coverage factor k, expanded uncertainty U."
-        )
-        blocks = [pages.Table(of_parameters[0], of_parameters[1:]), note]
-    else:
-        cells = zip(calibration.names, calibration.parameters, strict=True)
-        parameters = [[name, f"{value:.6g}"] for name, value in cells]
-        blocks = [
-            pages.Table(("", "value"), parameters),
-            pages.Text(calibration.no_noise("intervals"), "warning"),
-        ]
-    sections.append(pages.Section("Parameters", blocks, "parameters"))
-    if budgets:
-        unit = f", {calibration.measured_unit}" if calibration.measured_unit else ""
-        text = (
-            f"Of the true outputs{unit}, without the noise of a reading there; rows "
-            "are counted from 0."
-        )
-        if at is None:
-            text += (
-                " Of the rows measured the first is nearest to their middle, the "
-                "second is known least."
-            )
-        table = pages.Table(of_predictions[0], of_predictions[1:])
-        sections.append(pages.Section("Predictions", [text, table], "predictions"))
+        sections.append(_prediction_section(calibration, budgets[1], at))
     sections += _residual_sections(calibration)
     sections.append(_files_section(calibration, document["files"]))
     made = calibration.provenance.get("created", "")
     return pages.Page(
-        "Check of a calibration" if check else "Calibration",
+        "Check of a calibration" if document["of"] == "check" else "Calibration",
         sections,
         intro=[calibration.summary().splitlines()[0], pages.Text(str(made), "note")],
         contents=True,
         footer=[pages.Text("verdict.json has the same numbers", "note")],
     )
+
+
+def _verdict_section(calibration: Fit, document: Mapping[str, Any]) -> pages.Section:
+    good, numbers = document["good"], document["numbers"]
+    word = "good" if good else "not good"
+    if document["of"] == "check":
+        word = str(numbers["check_says"])
+    unit = f" {calibration.measured_unit}" if calibration.measured_unit else ""
+    rows = [
+        [name.replace("_", " "), _text(value) + (unit if name in _IN_UNIT else "")]
+        for name, value in numbers.items()
+        if value is not None
+    ]
+    blocks: list[pages.Block] = [pages.Text(line) for line in document["reasons"]]
+    blocks.append(pages.Text(f"Next: {document['next_step']}."))
+    blocks.append(pages.Table(("", "value"), rows))
+    badge = pages.Badge(word, "good" if good else "bad")
+    return pages.Section("Verdict", blocks, "verdict", badge)
+
+
+def _parameter_section(calibration: Fit, budgets: Sequence[Budget]) -> pages.Section:
+    """The parameters with their budget, or without one where no noise is known."""
+    blocks: list[pages.Block]
+    if budgets:
+        rows = budgets[0].rows()
+        if units := _units(calibration):
+            pairs = zip(rows, ("unit", *units), strict=True)
+            rows = [[*row, unit] for row, unit in pairs]
+        note = (
+            "Standard uncertainties by source (GUM), effective degrees of freedom by "
+            "Welch and Satterthwaite, coverage factor k, expanded uncertainty U."
+        )
+        blocks = [pages.Table(rows[0], rows[1:]), note]
+    else:
+        cells = zip(calibration.names, calibration.parameters, strict=True)
+        blocks = [
+            pages.Table(("", "value"), [[name, f"{x:.6g}"] for name, x in cells]),
+            pages.Text(calibration.no_noise("intervals"), "warning"),
+        ]
+    return pages.Section("Parameters", blocks, "parameters")
+
+
+def _prediction_section(
+    calibration: Fit, budget: Budget, at: ArrayLike | None
+) -> pages.Section:
+    unit = f", {calibration.measured_unit}" if calibration.measured_unit else ""
+    text = (
+        f"Of the true outputs{unit}, without the noise of a reading there; rows "
+        "are counted from 0."
+    )
+    if at is None:
+        text += (
+            " Of the rows measured the first is nearest to their middle, the "
+            "second is known least."
+        )
+    rows = budget.rows()
+    table = pages.Table(rows[0], rows[1:])
+    return pages.Section("Predictions", [text, table], "predictions")
 
 
 def _text(value: Any) -> str:

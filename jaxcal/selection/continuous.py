@@ -487,7 +487,7 @@ class _Search:
         return np.asarray(values.min(axis=-1) if self.worst else values @ self.weights)
 
     def unit(self, phi: float) -> float:
-        """Of the joined value: by so much a hundredth is a percent."""
+        """The change of the joined value of which a hundredth is a percent."""
         if self.objective.kind != "det":
             return max(abs(phi), 1e-300)
         return float(self.scale[0]) * len(self.each.root)
@@ -529,9 +529,9 @@ class _Search:
                 values.append(np.array([value]))
                 metrics.append(scale * _slope(criterion, one)[None])
                 bounds.append(values[-1])
-        each = np.array(values)  # (S, p) or (S, 1)
-        lowest = each.min() if self.worst else each.min(axis=1, keepdims=True)
-        shares = np.exp(-sharp * (each - lowest))
+        terms = np.array(values)  # (S, p) or (S, 1)
+        lowest = terms.min() if self.worst else terms.min(axis=1, keepdims=True)
+        shares = np.exp(-sharp * (terms - lowest))
         total = shares.sum() if self.worst else shares.sum(axis=1, keepdims=True)
         least = lowest - np.log(total) / sharp
         shares = shares / total
