@@ -7,7 +7,7 @@ with predicted covariance S and noise R the residual r becomes ``R (R - S)^-1 r`
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,17 +113,8 @@ def verdict(calibration: Fit) -> Verdict:
     used = np.flatnonzero(calibration.loss_weights > 0.0)
     commands, residuals = calibration.commands[used], calibration.residuals[used]
     usual = np.asarray(model.default_noise().std)
-    size = usual / usual[0]  # readings of two units are compared in noise
-    errors = np.linalg.norm(_left_out(calibration, used) / size, axis=1)
     measured = residuals + calibration.predict(commands)
-    at = model.located(commands, measured)
-    before = measured - at.predict(commands)
-    for rows in _groups(at, commands):  # a socket's place is no merit of either
-        before[rows] -= before[rows].mean(axis=0) if len(rows) else 0.0
-    nominal = float(np.linalg.norm(before / size, axis=1).mean())
-    mean = float(errors.mean())
-    half = 1.96 * errors.std() / np.sqrt(max(len(errors) - 1, 1))
-    interval = (max(mean - half, 0.0), mean + half)
+    errors = _errors(calibration, used, measured, usual)
     explains, reasons = _scattered(calibration, usual)
     swapped = _swapped(calibration, model, used, explains)
     for row, other in swapped.items():
@@ -145,7 +136,7 @@ def verdict(calibration: Fit) -> Verdict:
     if contradict:
         reasons.insert(0, "some readings contradict the others")
     mistaken = ""
-    if not explains and nominal > _PLAIN * model.length:
+    if not explains and errors.nominal > _PLAIN * model.length:
         mistaken = mistaken_columns(model, commands, measured)
     tip, doubtful = _other_tip(calibration, model)
     other_arm = [] if mistaken else _other_links(calibration, model)
@@ -156,56 +147,92 @@ def verdict(calibration: Fit) -> Verdict:
         told = [mistaken]
     doubtful |= bool(contradict or other_arm or unused or mistaken)
     clean = not (doubtful or (moved and not explains))
-    helps = True if mean < nominal else None if mean - half < nominal else False
     accuracy = calibration.provenance.get("accuracy")
     if accuracy is not None:
-        good = clean and interval[1] <= accuracy
+        good = clean and errors.interval[1] <= accuracy
     else:
-        enough = explains or interval[1] < _LITTLE * nominal
-        good = bool(clean and helps and enough)
-    if mistaken:
-        step = "correct the columns, then identify again"
-    elif contradict:
-        listed = ", ".join(map(str, sorted({*swapped, *calibration.outliers})))
-        step = (
-            "look at the sockets' columns"
-            if exchanged
-            else (
-                f"look at measurement {listed} (counted from 0): correct it, measure "
-                "it again or leave it out"
-            )
-        )
-    elif moved and not explains:
-        kind = model.sensor.kind
-        step = (
+        enough = explains or errors.interval[1] < _LITTLE * errors.nominal
+        good = bool(clean and errors.helps and enough)
+    rows = ", ".join(map(str, sorted({*swapped, *calibration.outliers})))
+    kind = model.sensor.kind
+    steps = (
+        (mistaken, "correct the columns, then identify again"),
+        (exchanged, "look at the sockets' columns"),
+        (
+            contradict,
+            f"look at measurement {rows} (counted from 0): correct it, measure "
+            "it again or leave it out",
+        ),
+        (
+            moved and not explains,
             f"measure again with the {kind} fixed, or number it as two: one {kind} "
-            "before it moved and another after"
-        )
-    elif doubtful:
-        step = "clear up what ends in a question or an advice, then identify again"
-    elif good:
-        step = models.USE
-    elif accuracy is not None or helps is None:
-        step = "measure more postures: jaxcal postures --measured chooses them"
-    else:
-        step = (
+            "before it moved and another after",
+        ),
+        (
+            doubtful,
+            "clear up what ends in a question or an advice, then identify again",
+        ),
+        (good, models.USE),
+        (
+            accuracy is not None or errors.helps is None,
+            "measure more postures: jaxcal postures --measured chooses them",
+        ),
+        (
+            True,
             "look at the residuals (report, --report); keep the nominal machine until "
-            "they are explained"
-        )
+            "they are explained",
+        ),
+    )
     return Verdict(
         good=good,
         reasons=tuple(told),
-        next_step=step,
+        next_step=next(step for holds, step in steps if holds),
         unit=unit,
         explains=explains,
-        helps=helps,
+        helps=errors.helps,
         clean=clean,
-        held_out=mean,
-        interval=interval,
-        nominal=nominal,
+        held_out=errors.held_out,
+        interval=errors.interval,
+        nominal=errors.nominal,
         anywhere=_anywhere(calibration, model, commands),
         accuracy=accuracy,
     )
+
+
+class _Errors(NamedTuple):
+    """Mean errors of a measurement, readings of two units compared in noise."""
+
+    held_out: float
+    half_width: float  # of the 95 % interval of ``held_out``
+    nominal: float
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % of ``held_out``."""
+        least = max(self.held_out - self.half_width, 0.0)
+        return least, self.held_out + self.half_width
+
+    @property
+    def helps(self) -> bool | None:
+        """Whether held-out errors are below the nominal arm's; None where not sure."""
+        if self.held_out < self.nominal:
+            return True
+        return None if self.held_out - self.half_width < self.nominal else False
+
+
+def _errors(
+    calibration: Fit, used: NDArray[np.intp], measured: Array, usual: Array
+) -> _Errors:
+    """The errors held out and of the nominal arm, of the rows that are used."""
+    size, commands = usual / usual[0], calibration.commands[used]
+    held_out = np.linalg.norm(_left_out(calibration, used) / size, axis=1)
+    arm = calibration.model.located(commands, measured)
+    off = measured - arm.predict(commands)
+    for rows in _groups(arm, commands):  # a socket's place is no merit of either
+        off[rows] -= off[rows].mean(axis=0) if len(rows) else 0.0
+    half_width = 1.96 * held_out.std() / np.sqrt(max(len(held_out) - 1, 1))
+    nominal = np.linalg.norm(off / size, axis=1).mean()
+    return _Errors(float(held_out.mean()), float(half_width), float(nominal))
 
 
 def _in(calibration: Fit) -> str:
