@@ -181,10 +181,10 @@ class Calibration(Fit):
             path, again.parameters, servos, names or {}, force=force
         )
         if again.noise_std is not None:
-            told: Any = again.verdict
+            verdict: Any = again.verdict
             warnings.warn(
                 "the file holds zeros of the joints alone: held-out error "
-                f"{told.held_out:.3g}, nominal {told.nominal:.3g}",
+                f"{verdict.held_out:.3g}, nominal {verdict.nominal:.3g}",
                 stacklevel=2,
             )
         return steps
@@ -235,20 +235,20 @@ class Calibration(Fit):
         again = self._again(plain, plain.default_prior())
         moved = self.predict(self.commands) - again.predict(self.commands)
         unit = f" {self.measured_unit}" if self.measured_unit else ""
-        told = (
+        effect = (
             "its predictions at the measured postures are "
             f"{np.linalg.norm(moved, axis=1).mean():.3g}{unit} from the calibration's "
             "on average"
         )
         if again.noise_std is not None and self.noise_std is not None:
             of_arms: tuple[Any, Any] = again.verdict, self.verdict
-            told += (
+            effect += (
                 f"; held-out error {of_arms[0].held_out:.3g}{unit}, of the "
                 f"calibration {of_arms[1].held_out:.3g}"
             )
         warnings.warn(
             "the file has stiff joints and round gears and was fitted without "
-            f"harmonics: {told}",
+            f"harmonics: {effect}",
             stacklevel=4,
         )
         return again.parameters

@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 
 # Of -2 log likelihood, what misfit must gain where readings of one place do not tell
 # how it goes on elsewhere.
-_TOLD = 20.0
+_DECISIVE = 20.0
 
 
 def require_fitting(model: Any, commands: Array, measured: Array) -> Model:
@@ -80,8 +80,11 @@ def fit_model(
     """
     one_of("loss", loss, tuple(LOSSES))
     require_kind("prior", prior, Prior)
-    weights, noise = _of_distinct(model, commands, measured, weights), noise or Noise()
-    spread = _of_commands(noise, commands, measured.shape[1])
+    weights, noise = (
+        _distinct_weights(model, commands, measured, weights),
+        noise or Noise(),
+    )
+    spread = _command_noise(noise, commands, measured.shape[1])
     exact, used = not spread.any(), _used(weights)
     if not exact and model.relative:
         raise ValueError(
@@ -97,7 +100,9 @@ def fit_model(
     centre, to_centred = None, None
     if exact and resolved.free.all() and not resolved.precisions.any():
         centre, to_centred = _centre(fitted, commands[used], weights[used], excited)
-    white, reading_std, levels = _of_readings(model, noise, weights, measured.shape[1])
+    white, reading_std, levels = _reading_noise(
+        model, noise, weights, measured.shape[1]
+    )
     if common_noise or not exact:
         levels = 0 * levels
     elif common_noise is False:
@@ -157,7 +162,7 @@ def _used(weights: Array) -> slice | NDArray[np.bool_]:
     return slice(None) if weights.all() else weights > 0.0
 
 
-def _of_distinct(
+def _distinct_weights(
     model: Model, commands: Array, measured: Array, weights: Array
 ) -> Array:
     """(N,) the weights of the measurements that count, 0 elsewhere."""
@@ -188,7 +193,7 @@ def _solve_with_misfit(
     if with_misfit is problem.model:
         return fit, 1.0
     gain, factor = misfit_scale(with_misfit, problem, fit.solution, fit.scales)
-    if gain <= _TOLD:
+    if gain <= _DECISIVE:
         return fit, factor
     resolved = with_misfit.default_prior().resolve(with_misfit)
     problem = dataclasses.replace(
@@ -249,7 +254,7 @@ def _centre(
     return centre, to_centred
 
 
-def _of_readings(
+def _reading_noise(
     model: Model, noise: Noise, weights: Array, q: int
 ) -> tuple[Array, Array, NDArray[np.intp]]:
     """The noise of the readings.
@@ -276,7 +281,7 @@ def _of_readings(
     return white * (root if white.ndim == 2 else root[..., None]), std, levels
 
 
-def _of_commands(noise: Noise, commands: Array, q: int) -> Array:
+def _command_noise(noise: Noise, commands: Array, q: int) -> Array:
     """(n,) command_std, zero where it is not given."""
     if noise.command_std is None:
         return np.zeros(commands.shape[1])
@@ -336,7 +341,9 @@ def _misfit(
     theta = np.concatenate([solution.parameters, none])
     waves = derivative(with_misfit, problem.commands, theta)[..., -count:]
     white = whiten(problem.white, waves * std) / solution.level[:, None]
-    gram = np.einsum("n,nrf,nrw->fw", _informs(problem, solution), solution.rows, white)
+    gram = np.einsum(
+        "n,nrf,nrw->fw", _information_shares(problem, solution), solution.rows, white
+    )
     turned = within[:, problem.free] @ gram
     joint = np.zeros((len(theta), len(theta)))
     joint[:-count, :-count] = fields["joint_covariance"] + turned @ turned.T
@@ -354,7 +361,7 @@ def _misfit(
     }
 
 
-def _informs(problem: FitProblem, solution: FitSolution) -> Array:
+def _information_shares(problem: FitProblem, solution: FitSolution) -> Array:
     """(N,) how much each measurement says, one in full."""
     if problem.loss is None:
         return solution.weights
@@ -432,8 +439,10 @@ def _covariance(
     size, free = len(problem.mean), np.flatnonzero(problem.free)
     if solution.root is not None:
         covariance = solution.root @ solution.root.T
-        return _among(size, free, covariance), None
-    rows = np.sqrt(_informs(problem, solution))[:, None, None] * solution.rows
+        return _with_held(size, free, covariance), None
+    rows = (
+        np.sqrt(_information_shares(problem, solution))[:, None, None] * solution.rows
+    )
     rows = rows.reshape(-1, rows.shape[-1])
     rows = np.concatenate([rows, problem.model.facts(solution.parameters)[1][:, free]])
     precision = problem.precision[free]
@@ -470,11 +479,11 @@ def _covariance(
         )
     directions = np.zeros((len(unseen), size))
     directions[:, free] = unseen
-    covariance = _among(size, free, factor.T @ factor)
+    covariance = _with_held(size, free, factor.T @ factor)
     return covariance, directions if len(directions) else None
 
 
-def _among(size: int, free: NDArray[np.intp], covariance: Array) -> Array:
+def _with_held(size: int, free: NDArray[np.intp], covariance: Array) -> Array:
     """(P, P) covariance of all ``size`` parameters, from that of the free ones."""
     if len(free) == size:
         return covariance

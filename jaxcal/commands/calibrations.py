@@ -401,22 +401,22 @@ def check(
             f"{', '.join(both)}; begin their names with {COMMANDS} and {MEASURED}"
         )
     measured = table.columns(outputs)
-    told = calibrated.check(
+    result = calibrated.check(
         commands, measured, tolerance=tolerance, placed_anew=placed_anew
     )
     if report:
         files = [path for path in (calibration, file) if os.path.isfile(path)]
         calibrated.report(
-            report, check=told, readings=(commands, measured), files=files
+            report, check=result, readings=(commands, measured), files=files
         )
     if json:
-        more = {"good": told.good, "next_step": told.next_step}
-        write_json("", dataclasses.asdict(told) | more)
+        more = {"good": result.good, "next_step": result.next_step}
+        write_json("", dataclasses.asdict(result) | more)
     else:
-        print(told)
+        print(result)
         if report:
             print(f"report {os.path.join(report, 'index.html')}")
-    return int(not told.good)
+    return int(not result.good)
 
 
 def predict(

@@ -51,9 +51,9 @@ def outlying(fit: Fit, row: int) -> str:
 
 def verdict(fit: Fit) -> Verdict:
     """Good with a known noise, every parameter determined, no outlier, no misfit."""
-    told: list[tuple[str, str]] = []  # a reason and what to do about it
+    findings: list[tuple[str, str]] = []  # a reason and what to do about it
     if fit.noise_std is None:
-        told.append(
+        findings.append(
             (
                 fit.no_noise("intervals"),
                 "measure more rows, or state noise_std, --noise",
@@ -61,7 +61,7 @@ def verdict(fit: Fit) -> Verdict:
         )
     if fit.undetermined.any():
         names = ", ".join(fit.names[i] for i in np.flatnonzero(fit.undetermined))
-        told.append(
+        findings.append(
             (
                 f"not determined, held near the prior's mean: {names}; see "
                 "identifiability()",
@@ -72,13 +72,13 @@ def verdict(fit: Fit) -> Verdict:
     if fit.outliers:
         rows = ", ".join(map(str, fit.outliers))
         again = f"measure again, or leave out, measurement {rows} (counted from 0)"
-        told += [
+        findings += [
             (f"{outlying(fit, row)}, weight {weight:.2g}", again)
             for row, weight in fit.outliers.items()
         ]
     lack = fit.lack_of_fit()
     if lack is not None and lack < UNLIKELY:
-        told.append(
+        findings.append(
             (
                 f"lack of fit under the noise that was given: p = {lack:.2g}",
                 "look at the residuals (report, --report): a pattern asks for a model "
@@ -86,8 +86,8 @@ def verdict(fit: Fit) -> Verdict:
             )
         )
     return Verdict(
-        good=not told,
-        reasons=tuple(reason for reason, _ in told),
-        next_step=told[0][1] if told else USE,
+        good=not findings,
+        reasons=tuple(reason for reason, _ in findings),
+        next_step=findings[0][1] if findings else USE,
         unit=fit.measured_unit,
     )
