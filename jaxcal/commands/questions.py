@@ -88,8 +88,10 @@ class CriterionOptions:
     ] = None
     worst: Annotated[bool, "with --scenarios: the worst counts, not the mean"] = False
 
-    def by(self) -> Any:
-        """The criterion."""
+    def by(self, scenarios: int | None) -> Any:
+        """The criterion, over so many scenarios."""
+        if self.worst and scenarios is None:
+            raise ValueError("--worst must come with --scenarios N")
         name, parameters = self.criterion, self.parameters
         if (name in ("Ds", "As")) != (parameters is not None):
             raise ValueError(
@@ -153,7 +155,10 @@ def select(
     """
     table = read_table(file)
     given = {name: x for name, x in vars(of_method).items() if x is not None}
-    design, criterion = of_design.design(table, of_arm), of_criterion.by()
+    design, criterion = (
+        of_design.design(table, of_arm),
+        of_criterion.by(of_design.scenarios),
+    )
     selection = design.select(k, criterion, method, **given)
     if not between:
         _show(selection, table, output)
@@ -199,7 +204,10 @@ def score(
             )
         rows = _rows_of(read_table(subset), table)
     selection = of_design.design(table, of_arm).score(
-        rows, of_criterion.by(), reference=reference, time_limit=time_limit
+        rows,
+        of_criterion.by(of_design.scenarios),
+        reference=reference,
+        time_limit=time_limit,
     )
     _show(selection, table, output)
 

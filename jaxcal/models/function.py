@@ -34,7 +34,7 @@ from jaxcal.models.model import (
 )
 from jaxcal.models.periods import checked_periods
 from jaxcal.models.runs import CommandLine, Runs
-from jaxcal.models.uncertainty import Noise
+from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["FromFunction"]
 
@@ -64,6 +64,7 @@ class FromFunction(Model):
             given. A program needs them.
         batch: f takes commands (N, n) and returns (N, q).
         noise: the usual noise of a reading, where none is given to what asks.
+        prior: what is known of the parameters, where none is given to what asks.
         periods: (q,) of readings that wrap, 360 of an angle in degrees, inf of others;
             one number for all.
         processes: that run f at a time; f must then be importable.
@@ -86,6 +87,7 @@ class FromFunction(Model):
         inputs: Sequence[str] | int | None = None,
         batch: bool = False,
         noise: Noise | None = None,
+        prior: Prior | None = None,
         periods: ArrayLike | None = None,
         processes: int = 1,
         cache: str | os.PathLike[str] | None = None,
@@ -117,7 +119,8 @@ class FromFunction(Model):
         elif timeout is not None:
             raise ValueError("timeout is of a program, and f is a function")
         require_kind("noise", noise, Noise)
-        self._noise, self._given_periods = noise, periods
+        require_kind("prior", prior, Prior)
+        self._noise, self._prior, self._given_periods = noise, prior, periods
         self._runs = Runs(
             f, bool(batch), whole_number("processes", processes, 1), cache, quiet
         )
@@ -212,6 +215,10 @@ class FromFunction(Model):
     def parameter_sizes(self) -> Array:
         """(p,) the scale."""
         return self.scale
+
+    def default_prior(self) -> Prior:
+        """The prior as given, else infinite standard deviations."""
+        return super().default_prior() if self._prior is None else self._prior
 
     def default_noise(self) -> Noise | None:
         """The noise as given."""

@@ -102,6 +102,8 @@ def test_contacts_are_chosen_from_a_table(files, capsys):
     assert main([*given[:-1], *sensor, *several]) == 0
     told = capsys.readouterr().out
     assert "log det S, worst" in told and "scenarios     2" in told
+    assert main([*given, *sensor, "--worst"]) == 2
+    assert "--worst must come with --scenarios N" in capsys.readouterr().err
     assert main([*given, *sensor[:-1]]) == 2
     assert "which look like radians" in capsys.readouterr().err
     assert main([*given, *sensor, "--lost", "3"]) == 2

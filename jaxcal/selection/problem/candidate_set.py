@@ -125,6 +125,11 @@ class CandidateSet:
             cases += list(self.scenarios.parameters)
         for parameters in cases:
             rows = np.flatnonzero(self.available)
+            if not len(rows):
+                raise ValueError(
+                    "model must give finite readings for some candidate in every "
+                    "scenario, but fails for all"
+                )
             asked = self.candidates[rows]
             kept = answered(model, asked, parameters, rows, self.names)
             self.available[rows[~kept]] = False
