@@ -12,13 +12,15 @@ error elsewhere with and without harmonics of the joints. ``trial``: the simulat
 fitted as a real one was. ``chance``: of a linear WAM whose misfit and sizes the choice
 knows exactly, how many random choices are better on one arm. ``servos``: what contacts
 of a servo arm determine, by where the sockets stand. ``checks``: what a few chosen
-postures and random ones can tell of a drift. ``contacts``: of real arms, trained on one
+postures and random ones can tell of a drift. ``slips``: how many slips of a joint six
+readings show, and could show at best. ``contacts``: of real arms, trained on one
 place and judged at the others: 12 and 16 contacts that are random or chosen, and all;
 likewise with stiff joints, stated tolerances and noise (of the choice and the fit); and
 what is expected of those chosen, and at best (chosen for the very postures they are
 judged at), of a model without any error, with the noise and sizes that all contacts of
 the place show; then trained on two places and on three. ``distances``: how far apart
-sockets of other places are found, which were printed 50 mm (0.1) apart.
+sockets of other places are found, which were printed 50 mm (0.1) apart. ``files``:
+what files without compliance have there, as they are written and made otherwise.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import optimize, stats
 from scipy.spatial.transform import Rotation
 
 import jaxcal
@@ -333,15 +335,16 @@ SOCKETS = {  # where they stand, metres
 
 def servos(draws: int) -> None:
     """What contacts determine of a servo arm with play, by where the sockets stand."""
-    print("| sockets | error anywhere, mm: uncalibrated, calibrated | stated |")
-    print("| --- | --- | --- |")
+    print("| sockets | error anywhere, mm: uncalibrated, calibrated | stated | good |")
+    print("| --- | --- | --- | --- |")
     for name, places in SOCKETS.items():
         rows = [_of_servos(np.array(places), draw) for draw in range(draws)]
-        before, after, stated = np.mean(rows, axis=0)
-        print(f"| {name} | {before:.1f}, {after:.1f} | {stated:.1f} |", flush=True)
+        before, after, stated, good = np.mean(rows, axis=0)
+        cells = f"{before:.1f}, {after:.1f} | {stated:.1f} | {good:.0%}"
+        print(f"| {name} | {cells} |", flush=True)
 
 
-def _of_servos(places: Array, draw: int) -> tuple[float, float, float]:
+def _of_servos(places: Array, draw: int) -> tuple[float, float, float, float]:
     """Errors of the tip anywhere, moved as a whole to fit, and the stated deviation."""
     count = len(places)
     apart = [
@@ -367,12 +370,13 @@ def _of_servos(places: Array, draw: int) -> tuple[float, float, float]:
     plan = offered[jaxcal.select(offered, 24, "exchange", model=model).indices]
     play = np.zeros(plan.shape)
     play[:, :5] = rng.uniform(-0.3, 0.3, (24, 5))
+    noise = model.noise_with_play(0.6)
     off = model.predict(plan + play, truth)
     low, high = model.limits.T
     anywhere = rng.uniform(low, high, (200, 5))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        found = jaxcal.identify(plan, off, model=model)
+        found = jaxcal.identify(plan, off, model=model, noise=noise)
     wanted = model.calibrated(truth).predict(anywhere)
     errors = []
     for theta in (model.nominal, found.parameters):
@@ -382,7 +386,8 @@ def _of_servos(places: Array, draw: int) -> tuple[float, float, float]:
         )
         left = turn.apply(points - points.mean(0)) + wanted.mean(0) - wanted
         errors.append(1e3 * float(np.linalg.norm(left, axis=1).mean()))
-    return errors[0], errors[1], 1e3 * float(found.verdict.anywhere)
+    told = found.verdict
+    return errors[0], errors[1], 1e3 * float(told.anywhere), float(told.good)
 
 
 def chance(draws: int) -> None:
@@ -477,6 +482,117 @@ def checks(draws: int) -> None:
         power = np.mean([one.power for one in told])
         hidden = np.mean([len(one.unseen) for one in told])
         print(f"| {count} {rule} | {power:.0%} | {hidden:.1f} |", flush=True)
+
+
+def files(draws: int) -> None:
+    """What a file without compliance can say of real arms: mm at the other places.
+
+    As it is written, fitted again without compliance, and by least squares nearest to
+    the calibrated arm's tip over all postures, or over those that were measured.
+    """
+    sys.path.insert(0, str(EXAMPLES))
+    import contacts as example
+
+    lines = []
+    for name in ("panda_1", "kuka_14"):
+        places = example.load(name)
+        for trained, (joints, sockets) in places.items():
+            rows = np.arange(len(sockets))
+            found = example.identify(name, (joints, sockets), rows)
+            plain: Any = found.model.writable()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                written = found._for_file()[np.isin(found.names, plain.names)]
+                again = found._again(plain, plain.default_prior())
+            low, high = np.clip(plain.limits, -180.0, 180.0).T
+            anywhere = np.random.default_rng(0).uniform(low, high, (500, len(low)))
+            arms = [found.arm, plain.calibrated(written), again.arm]
+            arms += [_nearest(plain, found, at) for at in (anywhere, joints)]
+            others = [place for other, place in places.items() if other != trained]
+            errors = [[example.consistency(one, at) for at in others] for one in arms]
+            lines.append(np.mean(errors, axis=1))
+            print(name, trained, lines[-1].round(3), flush=True)
+    print("| calibration | file | stiff fit | nearest over all | over the measured |")
+    print("| --- | --- | --- | --- | --- |")
+    print("| " + " | ".join(f"{mean:.2f}" for mean in np.mean(lines, axis=0)) + " |")
+
+
+def _nearest(plain: Any, found: Any, postures: Array) -> SerialChain:
+    """The stiff arm whose tip is nearest to that of the calibrated one there."""
+    tracked = plain.measured_with(Position())
+    start = np.array([found.parameters[found.names.index(n)] for n in tracked.names])
+    std = np.asarray(plain.default_prior().std)
+    size = np.array([std[plain.names.index(name)] for name in tracked.names])
+    wanted, unit = found.arm.predict(postures), 1e-4 * np.sqrt(len(postures))
+
+    def off(steps: Array) -> Array:
+        here = tracked.predict(postures, start + size * steps)
+        return np.concatenate([(here - wanted).ravel() / unit, 1e-3 * steps])
+
+    def slopes(steps: Array) -> Array:
+        by = tracked.jacobian(postures, start + size * steps).reshape(-1, len(start))
+        return np.vstack([by * size / unit, 1e-3 * np.eye(len(start))])
+
+    steps = optimize.least_squares(off, np.zeros(len(start)), slopes).x
+    return tracked.calibrated(start + size * steps)
+
+
+def slips(draws: int) -> None:
+    """How many slips of a joint by 0.05 degrees six chosen readings show.
+
+    Beside it the power of the best test that knows which joint may have slipped, of
+    this calibration and of one without any error; and how many checks of an arm that
+    did not slip say that it holds.
+    """
+    print("| sensor | seen | at best | of an exact arm | unchanged: holds |")
+    print("| --- | --- | --- | --- | --- |")
+    for name in ("position", "pose", "socket", "camera"):
+        rows = [_slipped(ALONE[name], seed) for seed in range(draws)]
+        seen, best, exact, holds = np.mean(rows, axis=0)
+        print(f"| {name} | {seen:.2f} | {best:.2f} | {exact:.2f} | {holds:.2f} |")
+
+
+def _slipped(sensor: Sensor, seed: int) -> tuple[float, float, float, float]:
+    """Shares of the joints' slips: seen, to be seen at best, of an exact arm; holds."""
+    rng = np.random.default_rng(seed)
+    model = arm(6, sensor)
+    bent = model.with_misfit()
+    prior = model.default_prior()
+    std, free = np.asarray(prior.std), ~np.isin(model.names, prior.fixed)
+    truth = bent.nominal.copy()
+    free &= np.isfinite(std)
+    truth[: len(std)][free] += 0.5 * std[free] * rng.normal(size=free.sum())
+    truth[len(std) :] = 0.015 * rng.normal(size=bent.waves.size)  # degrees
+    near = NEAR.get(sensor.kind)
+    made = bent.calibrated(truth, sensor)  # which touches what the arm touches
+    offered = rng.permutation(made.postures(60, seed=seed, near=near))
+    noise = np.asarray(model.default_noise().std) * np.ones(model.num_outputs)
+
+    def read(rows: Array, theta: Array) -> Array:
+        return bent.predict(rows, theta) + noise * rng.normal(size=(len(rows), q))
+
+    q, used = model.num_outputs, offered[:24]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        found = jaxcal.identify(used, read(used, truth), model=model)
+    at = offered[24:][found.verification(offered[24:], 6)]
+    holds = found.check(at, read(at, truth)).says == "holds"
+    slopes, covariance = found.linear(at)
+    rows = slopes.reshape(6 * q, -1)
+    of_noise = np.diag(np.tile(np.asarray(found.noise_std) ** 2, 6))
+    seen, best, exact = [], [], []
+    for i in range(model.num_joints):
+        joint = model.names.index(f"theta{i + 1}")
+        if model.names[joint] in prior.fixed:
+            continue
+        slipped = truth.copy()
+        slipped[joint] += 0.05
+        seen.append(found.check(at, read(at, slipped)).says == "does not hold")
+        shift = 0.05 * rows[:, joint]
+        for powers, spread in ((best, rows @ covariance @ rows.T), (exact, 0.0)):
+            far = np.sqrt(shift @ np.linalg.solve(of_noise + spread, shift))
+            powers.append(stats.norm.sf(1.96 - far) + stats.norm.cdf(-1.96 - far))
+    return float(np.mean(seen)), np.mean(best), np.mean(exact), float(holds)
 
 
 def intervals(draws: int) -> None:
@@ -645,7 +761,10 @@ def distances(_: int) -> None:
                 print(f"| {name}, {trained} | {other} | {1e3 * far:.2f} | {half:.2f} |")
 
 
-_ALL = (intervals, sizes, misfit, trial, chance, servos, checks, contacts, distances)
+_ALL = (
+    *(intervals, sizes, misfit, trial, chance, servos),
+    *(checks, slips, contacts, distances, files),
+)
 TABLES = {each.__name__: each for each in _ALL}
 
 if __name__ == "__main__":

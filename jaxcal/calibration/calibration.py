@@ -221,11 +221,24 @@ class Calibration(Fit):
         joints = self.commands[:, : file.num_inputs]
         off = file.predict(joints) - self.arm.predict(joints)
         unit = f" {self.measured_unit}" if self.measured_unit else ""
+        apart = float(np.linalg.norm(off, axis=1).mean())
+        touched = self.commands[:, file.num_inputs :]  # of which all may be elsewhere
+        for place in np.unique(touched, axis=0) if touched.shape[1] else ():
+            rows = (touched == place).all(axis=1)
+            off[rows] -= off[rows].mean(axis=0)
+        scatter = float(np.linalg.norm(off, axis=1).mean())
+        told = getattr(self.verdict, "held_out", np.nan)
+        of_tip = self.num_outputs == 3 and "tool x" in self.names
+        errors = (
+            f"; held-out error about {np.hypot(told, scatter):.3g}{unit}, of the "
+            f"calibration {told:.3g}"
+            if of_tip and np.isfinite(told)
+            else ""
+        )
         warnings.warn(
             "the file has stiff joints and round gears: the arm without compliance "
             "and harmonics, moved as a whole, whose tip at the measured postures "
-            f"is {np.linalg.norm(off, axis=1).mean():.3g}{unit} from the "
-            "calibration's on average",
+            f"is {apart:.3g}{unit} from the calibration's on average{errors}",
             stacklevel=4,
         )
         return parameters

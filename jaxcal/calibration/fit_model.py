@@ -92,6 +92,9 @@ def fit_model(
             "compared with those of the commands given; raise the std of the noise"
         )
     model = model.prepared(commands[used], measured[used])
+    if not exact and model.error_groups() is not None:
+        noise, exact = _with_play(model, noise, commands, spread), True
+        spread = np.zeros_like(spread)
     with_misfit = model.with_misfit() if prior is None and exact else model
     fitted = with_misfit if model.fits_misfit else model
     scaled = prior is not None or exact  # as far as the prior wants it
@@ -292,6 +295,21 @@ def _command_noise(noise: Noise, commands: Array, q: int) -> Array:
             f"measurement, got {int(np.isinf(spread).sum())}"
         )
     return spread
+
+
+def _with_play(model: Model, noise: Noise, commands: Array, spread: Array) -> Noise:
+    """The noise of an arm's readings, that of its joints in it, to first order.
+
+    Joints are off by little, and by their own unknowns the arm's errors could not be
+    sized from the readings.
+    """
+    if not np.isfinite(spread).all():
+        raise ValueError("command_std of an arm must be finite")
+    slopes = model.command_jacobian(commands) * spread
+    plain = Noise(std=noise.std, covariance=noise.covariance)
+    root = np.linalg.inv(plain.whitening(len(commands), model.num_outputs))
+    covariance = root @ np.matrix_transpose(root)
+    return Noise(covariance=covariance + slopes @ np.matrix_transpose(slopes))
 
 
 def _levels_differ(problem: FitProblem, solution: FitSolution) -> bool:

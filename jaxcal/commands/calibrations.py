@@ -97,6 +97,11 @@ def postures(
         several(float, "numbers"),
     ] = None,
     count: Annotated[int, "postures to choose from"] = 300,
+    one_side: Annotated[
+        float | None,
+        "columns `from JOINT`: where to come from, so many degrees below, so that play "
+        "is on one side",
+    ] = None,
     seed: Annotated[int, "of the random draws of these postures"] = 0,
     picture: Annotated[
         pathlib.Path | None, "draw the arm at each posture chosen: .png, .pdf, .svg"
@@ -153,8 +158,13 @@ def postures(
 
         figure = Figure(figsize=(8, 2.2 * -(-more // 4)), layout="constrained")
         plots.postures(figure, arm, plan).savefig(picture)
+    turning = [i for i, unit in enumerate(arm.command_units) if unit == "deg"]
+    if one_side is not None:
+        at, width = arm.from_one_side(plan, one_side), plan.shape[1]
+        header = (*header, *(f"from {name}" for name in arm.joint_names))
+        turning += [width + i for i in turning]
+        plan = np.hstack([plan, at])
     if of_arm.radians:
-        turning = [i for i, unit in enumerate(arm.command_units) if unit == "deg"]
         plan[:, turning] = np.radians(plan[:, turning])
     rows = plan.tolist()
     if not output.written(header, rows):
@@ -214,6 +224,9 @@ def identify(
     of_arm: ArmOptions,
     recording: RecordingOptions,
     noise: Annotated[Numbers, "std of a measurement, where it is known", "S"] = None,
+    play: Annotated[
+        float | None, "of an arm's joints, degrees from stop to stop: servos 0.3"
+    ] = None,
     weights: Annotated[str | None, "column of relative weights", "W"] = None,
     command_unit: Annotated[str, "of the commands, stored and printed", "UNIT"] = "",
     measured_unit: Annotated[str, "of the readings, stored and printed", "UNIT"] = "",
@@ -272,11 +285,21 @@ def identify(
             raise ValueError(f"{out} is there already; --overwrite writes over it")
     else:
         readings = _readings(of_arm, machine, table, inputs, outputs, weights)
+    given = noise[0] if noise and len(noise) == 1 else noise
+    with_play = None
+    if play is not None:
+        if not isinstance(machine, SerialChain):
+            raise ValueError("--play is of an arm, --model FILE.urdf")
+        with_play = machine.noise_with_play(play)
+        if given is not None:
+            with_play = dataclasses.replace(with_play, std=given)
+            given = None
     calibration = identified(
         readings.commands,
         readings.measured,
         model=machine,
-        noise_std=noise[0] if noise and len(noise) == 1 else noise,
+        noise=with_play,
+        noise_std=given,
         weights=table.columns([weights])[:, 0] if weights else None,
         input_names=readings.inputs,
         output_names=readings.outputs,

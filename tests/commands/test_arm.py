@@ -56,6 +56,7 @@ def test_contacts_become_a_calibrated_file(files, capsys):
     [
         (["--out", "a.urdf"], "which look like radians"),
         (["--radians", "--tip", "thumb"], "tip link must be one of"),
+        (["--radians", "--play", "-1"], "play must not be negative"),
         (["--radians", "--distance", "0,1,0.05"], "distances must be rows"),
         (["--radians", "--sensor", "plane", "--distance", "0,1,2,3"], "is of --sensor"),
         (["--radians", "--base", "panda_rightfinger"], "there is no column"),
@@ -130,6 +131,12 @@ def test_joints_are_locked_and_have_other_limits(files, capsys):
     header, *rows = capsys.readouterr().out.splitlines()
     assert header == ",".join(f"panda_joint{i}" for i in range(1, 7))
     assert all(20.0 <= float(row.split(",")[0]) <= 30.0 for row in rows)
+    assert main([*given, "--locked", "panda_joint7=45", "--one-side", "5"]) == 0
+    both, *rows = capsys.readouterr().out.splitlines()
+    assert both.split(",")[6:] == [f"from panda_joint{i}" for i in range(1, 7)]
+    joints = np.array([row.split(",") for row in rows], dtype=np.float64)
+    first = np.maximum(joints[:, 0] - 5.0, 20.0)
+    np.testing.assert_allclose(joints[:, 6], first, atol=1e-9)
     assert main([*given, "--locked", "panda_joint7=1,2"]) == 2
     assert "--locked must be JOINT=VALUE" in capsys.readouterr().err
 

@@ -876,6 +876,40 @@ class SerialChain(Arm, Model):
         """What ``select`` takes where no noise is given: the sensor's."""
         return Noise(std=self.sensor.stds(self.length or 1.0))
 
+    def noise_with_play(self, play: ArrayLike) -> Noise:
+        """The sensor's noise and play of the joints, of which each rests anywhere in.
+
+        Args:
+            play: degrees (or units of length) from stop to stop: one number or (J,),
+                0.3 or so of hobby servos.
+
+        Returns:
+            Noise for ``identify`` and ``select``: a joint is off by its play over the
+            square root of twelve.
+        """
+        width = np.broadcast_to(numbers("play", play), (self.num_joints,))
+        if not (width >= 0.0).all():
+            raise ValueError(f"play must not be negative, got {width.min():g}")
+        by_inputs = np.zeros(len(self.sensor.inputs))
+        spread = np.concatenate([width / np.sqrt(12.0), by_inputs])
+        return dataclasses.replace(self.default_noise(), command_std=spread)
+
+    def from_one_side(self, commands: ArrayLike, by: float) -> Array:
+        """Joints (N, J) to go to before each posture, so that all arrive from below.
+
+        Every joint then ends with its play on the same side, which is an error of its
+        zero and not of each reading.
+
+        Args:
+            commands: (N, n) postures.
+            by: degrees (or units of length) below, more than the play; less where a
+                joint's limit is nearer.
+        """
+        if not numbers("by", by) > 0.0:
+            raise ValueError(f"by must be positive, got {by:g}")
+        joints = as_commands(self, commands)[:, : self.num_joints]
+        return np.maximum(joints - by, np.minimum(self.limits[:, 0], joints))
+
     def default_prior(self) -> Prior:
         """Loose knowledge of any arm, by the length of its links; see the constants.
 
