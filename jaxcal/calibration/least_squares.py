@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from jaxcal.calibration.losses import Loss, constants
 from jaxcal.checks import in_words
-from jaxcal.information.blocks import triangle
+from jaxcal.information.blocks import gram, triangle
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model, derivative, predict, without_effect
 
@@ -598,12 +598,12 @@ def _cholesky(rows: Array, damping: float) -> tuple[Array | None, Array]:
     dpotrf, dtrtri = _lapack()
     turned, inverse = rows, None
     for _ in range(2):
-        gram = turned.T @ turned
+        square = gram(turned)
         if damping:
-            gram += damping * (
-                np.eye(len(gram)) if inverse is None else inverse.T @ inverse
+            square += damping * (
+                np.eye(len(square)) if inverse is None else inverse.T @ inverse
             )
-        root, failed = dpotrf(gram)
+        root, failed = dpotrf(square)
         size = root.diagonal()
         if failed or size.min(initial=np.inf) < _CHOLESKY * size.max(initial=0.0):
             return None, rows

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration.least_squares import FitProblem, FitSolution, whiten
-from jaxcal.information.blocks import triangle, without
+from jaxcal.information.blocks import gram, triangle, without
 from jaxcal.information.singular import significant
 from jaxcal.models.model import ErrorGroups, Model, derivative
 
@@ -115,13 +115,12 @@ def _evidence(
         """
         scaled = rows * np.exp(logs[:-1] @ member)
         level = np.exp(2.0 * logs[-1])
-        gram = scaled @ scaled.T + level * np.eye(top)
-        root, failed = dpotrf(gram)
+        square = gram(scaled.T) + level * np.eye(top)
+        root, failed = dpotrf(square)
         if failed:  # beyond rounding
-            inverse, log_det = np.linalg.inv(gram), np.linalg.slogdet(gram)[1]
+            inverse, log_det = np.linalg.inv(square), np.linalg.slogdet(square)[1]
         else:
-            half = dtrtri(root)[0]
-            inverse = half @ half.T
+            inverse = gram(dtrtri(root)[0].T)
             log_det = 2.0 * np.log(root.diagonal()).sum()
         white, seen = inverse @ right, inverse @ scaled
         spread = member @ (seen * scaled).sum(axis=0)
@@ -200,20 +199,20 @@ def covariance_of_scales(
     weights = np.sqrt(np.minimum(solution.weights, 1.0))[:, None, None]
     rows = (weights * solution.rows).reshape(-1, solution.rows.shape[-1])
     fact_rows = problem.model.facts(solution.parameters)[1][:, free]
-    gram = rows.T @ rows + fact_rows.T @ fact_rows
+    square = gram(rows) + fact_rows.T @ fact_rows
     precision = problem.precision[free]
-    scale = 1.0 / np.sqrt(np.diagonal(gram) + precision + 1e-300)
+    scale = 1.0 / np.sqrt(np.diagonal(square) + precision + 1e-300)
     off = (solution.parameters - problem.mean)[free]
-    right = scale * (gram @ off + precision * off)  # as the fit balances them
+    right = scale * (square @ off + precision * off)  # as the fit balances them
 
-    gram = scale[:, None] * gram * scale
-    value, vectors = np.linalg.eigh(gram + np.diag(scale**2 * precision))
+    square = scale[:, None] * square * scale
+    value, vectors = np.linalg.eigh(square + np.diag(scale**2 * precision))
     none = vectors[:, ~significant(value, squares=True)]  # nothing determines these
-    gram, none = gram + none @ none.T, none @ none.T
+    square, none = square + none @ none.T, none @ none.T
 
     def at(logs: Array) -> tuple[Array, Array]:
         factor = np.where(groups >= 0, np.exp(-2.0 * logs[groups]), 1.0)
-        inverse = np.linalg.inv(gram + np.diag(scale**2 * precision * factor)) - none
+        inverse = np.linalg.inv(square + np.diag(scale**2 * precision * factor)) - none
         return inverse @ right, inverse
 
     # The logarithm of a size has a long upper tail where few errors show it: its mean
@@ -227,7 +226,7 @@ def covariance_of_scales(
     values, axes = np.linalg.eigh(wider[:, None] * scales.covariance * wider)
     nodes = np.sqrt(3.0 * np.maximum(values, 0.0)) * axes  # of Gauss and Hermite
     first, least = at(np.zeros(len(values)))
-    spread = np.zeros_like(gram)
+    spread = np.zeros_like(square)
     shares = [1.0 - len(values) / 3.0, *[1.0 / 6.0] * 2 * len(values)]
     for share, node in zip(shares, [0.0 * skew, *nodes.T, *-nodes.T], strict=True):
         mean, covariance = at(skew + node)
