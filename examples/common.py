@@ -26,7 +26,7 @@ NAMES = (
     *("ankle", "ur5", "contacts", "hand_eye", "drift", "force_sensor", "triad"),
     *("camera", "tcp", "own_function", "backlash", "magnetometry", "own_policy"),
     *("cartpole", "slot", "fr3", "positioner", "real_camera", "trajectories"),
-    "wrench",
+    *("wrench", "scenarios"),
 )
 Rows = list[dict[str, str]]
 

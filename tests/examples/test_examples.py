@@ -163,6 +163,14 @@ def test_the_closed_loop_finds_a_peak_with_fewer_readings(tmp_path):
 
 
 @pytest.mark.slow
+def test_doses_for_scenarios_hold_where_the_nominal_is_wrong(tmp_path):
+    found, _ = quick("scenarios", tmp_path)
+    off = {rule: rms(error.T) for rule, error in found.items()}
+    for rule in ("30 scenarios", "worst of 30"):  # wrong by a factor of four
+        assert off[rule].max() < 0.9 * off["nominal"].max()
+
+
+@pytest.mark.slow
 def test_four_chosen_postures_weigh_a_tool_better_than_four_far_apart(tmp_path):
     found, _ = quick("wrench", tmp_path)
     for rule in ("wrist alone", "random", "far apart"):
