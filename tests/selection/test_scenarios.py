@@ -95,6 +95,19 @@ def test_exact_is_brute_force(name) -> None:
                 assert bound >= sign * answer.value - 1e-9 * abs(answer.value)
 
 
+@pytest.mark.parametrize("name", "DA")
+def test_many_scenarios_are_brute_force_too(name) -> None:
+    """Twenty, of which the search looks at the curvature of some at a time."""
+    blocks = np.random.default_rng(ord(name)).standard_normal((20, 12, 1, 3))
+    subsets = list(itertools.combinations(range(12), 4))
+    each = np.array([phi(blocks, c, name, blocks) for c in subsets])
+    for criterion in (Mean(name), Worst(name)):
+        worth = joined(each, np.full(20, 0.05), criterion, name)
+        answer = Design.from_blocks(blocks).select(4, criterion, "exact")
+        assert answer.proven and answer.nodes > 1
+        assert answer.indices.tolist() == list(subsets[worth.argmax()])
+
+
 def test_rules_hold_and_the_best_within_them_is_found() -> None:
     """Masks, must-keep, replicates, what was measured, a prior: against brute force."""
     rng = np.random.default_rng(5)
