@@ -16,7 +16,7 @@ from rig.faults import EXIT_FAULT, EXIT_OK, EXIT_RECALIBRATE, Refused
 if TYPE_CHECKING:
     from rig.config import RigConfig
     from rig.simulator import Simulator
-    from rig.workbench.commission.steps import Place
+    from rig.workbench.commission.steps import Site
 
 
 def _axes(text: str) -> list[str]:
@@ -191,11 +191,11 @@ def setup(
                     "one, or leave out --config or --simulate"
                 )
         config = wizard.begin(path, asked, operator)
-        place = steps.Place(
+        site = steps.Site(
             config, DeviceRecord.load(config.device_path), operator, path,
             reset_alarms=given.reset_alarms, full_speed=given.simulate,
         )  # fmt: skip
-        return wizard.go(place, asked)
+        return wizard.go(site, asked)
 
 
 def ports() -> int:
@@ -212,17 +212,17 @@ def scan(given: Target, *, bus: BusName = "", units: Units = 16) -> int:
     from rig.workbench.commission import steps
 
     if bus and not given.simulate:
-        found = scanning.scan(scanning.parse_bus(bus), units, _say)
+        units_found = scanning.scan(scanning.parse_bus(bus), units, _say)
     else:
-        with _place(given) as place:
-            maps = tuple(axis.map for axis in place.config.axes)
+        with _place(given) as site:
+            maps = tuple(axis.map for axis in site.config.axes)
             # Units of other lines than Modbus are those of rig.toml.
-            found = list[Any](maps)
-            if place.config.bus.transport in scanning.OF_BUS:
-                found = list(scanning.scan(place.config.bus, units, _say, maps))
-            if found:
-                steps.identify(place)
-    return EXIT_OK if found else EXIT_FAULT
+            units_found = list[Any](maps)
+            if site.config.bus.transport in scanning.OF_BUS:
+                units_found = list(scanning.scan(site.config.bus, units, _say, maps))
+            if units_found:
+                steps.identify(site)
+    return EXIT_OK if units_found else EXIT_FAULT
 
 
 def imu(
@@ -231,8 +231,8 @@ def imu(
     """what to type into the phone, and what it sends"""
     from rig.workbench.commission import setup, steps
 
-    with _place(given) as place:
-        setup.pin(place, steps.look_at_phone(place, seconds))
+    with _place(given) as site:
+        setup.pin(site, steps.look_at_phone(site, seconds))
     return EXIT_OK
 
 
@@ -272,13 +272,13 @@ def _step(given: Step, state: str, name: str, *options: Any) -> int:
     """Run a function of ``steps`` at the device."""
     from rig.workbench.commission import steps
 
-    with _place(given, state) as place:
-        code: int = getattr(steps, name)(place, *options)
+    with _place(given, state) as site:
+        code: int = getattr(steps, name)(site, *options)
         return code
 
 
 @contextlib.contextmanager
-def _place(given: Target, state: str = "") -> Iterator[Place]:
+def _place(given: Target, state: str = "") -> Iterator[Site]:
     """The device that a command is about, which has reached a state."""
     from rig.journal import DeviceRecord
     from rig.workbench.commission import steps
@@ -290,16 +290,16 @@ def _place(given: Target, state: str = "") -> Iterator[Place]:
             config = stack.enter_context(simulator).start()
             path = steps.own_folder(config) / "device.json"
             record = steps.commissioned(path, config, state)
-            place = steps.Place(
+            site = steps.Site(
                 config, record, operator, full_speed=True, listeners=(simulator.hear,)
             )
         else:
             record = DeviceRecord.load(config.device_path)
             if state and (lack := record.missing(config, state)):
                 raise Refused(lack)
-            place = steps.Place(config, record, operator, given.config)
-        place.reset_alarms = getattr(given, "reset_alarms", False)
-        yield place
+            site = steps.Site(config, record, operator, given.config)
+        site.reset_alarms = getattr(given, "reset_alarms", False)
+        yield site
 
 
 def _say(text: str) -> None:
@@ -401,7 +401,7 @@ def identify(given: Target) -> int:
     from rig.drives.line import BusError
 
     code = EXIT_OK
-    with _place(given) as place, place.bus("identify") as drives:
+    with _place(given) as site, site.bus("identify") as drives:
         for drive in drives:
             axis = drive.axis
             unit = f"{axis.name} (unit {axis.unit}"
@@ -439,16 +439,16 @@ def check(file: ConfigPath | None = None, *, config: ConfigPath | None = None) -
     from rig.model import model_of
 
     path = config or file or FILE
-    found = load_config(path)
-    model_of(found)
+    loaded = load_config(path)
+    model_of(loaded)
     print(f"{path}: valid")
-    for axis in found.axes:
+    for axis in loaded.axes:
         print(
             f"  {axis.name}: unit {axis.unit}, {axis.map.name}, "
             f"{axis.pulses_per_deg:.3f} pulses per {axis.unit_name}, "
             f"{axis.min_pulses}..{axis.max_pulses} pulses"
         )
-    print(f"  heartbeat {found.heartbeat_s:.3g} s")
+    print(f"  heartbeat {loaded.heartbeat_s:.3g} s")
     return EXIT_OK
 
 

@@ -35,16 +35,16 @@ class Target:
     """One bus: its lock, and what of it was armed last."""
 
     def __init__(self, bus: dict[str, Any]) -> None:
-        known = {
+        fields = {
             "transport": "",
             "host": "",
             "port": 502,
             "device": "",
             "interface": "",
         }
-        known |= bus
-        where = known["device"] or f"{known['host']}:{known['port']}"
-        settings: Any = SimpleNamespace(**known, where=where)  # pydantic's are heavy
+        fields |= bus
+        where = fields["device"] or f"{fields['host']}:{fields['port']}"
+        settings: Any = SimpleNamespace(**fields, where=where)  # pydantic's are heavy
         self.lock = BusLock(settings)
         self.armed = read_armed(self.lock.armed_path)
         self.since = time.monotonic()
@@ -102,15 +102,15 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
 
     with Signals() as signals:
         signals.armed = True  # it takes seconds at most: a signal does not cut it short
-        found, lack = _targets(path, given)
-        if not found:
+        targets, lack = _targets(path, given)
+        if not targets:
             raise Fault(
                 f"{NOTHING}: {lack}, and no session of this user has armed a device. "
                 f"{LAST_RESORT}"
             )
         if lack:
             _say(f"{lack}: stopping all that sessions of this user have armed")
-        for target in found:
+        for target in targets:
             target.ask()
         # While those asked have time.
         from rig.core import stop  # noqa: F401
@@ -118,8 +118,8 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
 
         results: list[UnitStop] = []
         faults: list[Fault] = []
-        with ThreadPoolExecutor(len(found)) as pool:
-            jobs = [pool.submit(_stop_units, target, path, True) for target in found]
+        with ThreadPoolExecutor(len(targets)) as pool:
+            jobs = [pool.submit(_stop_units, target, path, True) for target in targets]
             for job in as_completed(jobs):
                 try:
                     results += job.result()
@@ -130,7 +130,7 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
             raise faults[0]
         for fault in faults:
             _say(str(fault))
-        _tell_others([target.lock.armed_path for target in found])
+        _tell_others([target.lock.armed_path for target in targets])
         good = all(each.acknowledged and each.standing for each in results)
         return EXIT_OK if good and not faults else EXIT_FAULT
 
@@ -164,9 +164,9 @@ def _targets(path: pathlib.Path, given: bool) -> tuple[list[Target], str]:
         fault = f"{path} names no bus: {' '.join(str(error).split())}"
         if isinstance(error, FileNotFoundError):
             fault = f"there is no {path}" + " here" * (not given)
-    left = [armed for each in armed_files() if (armed := read_armed(each))]
-    moving = [armed for armed in left if not armed["standing"]]
-    return [Target(armed["bus"]) for armed in moving or left], fault
+    every = [armed for each in armed_files() if (armed := read_armed(each))]
+    moving = [armed for armed in every if not armed["standing"]]
+    return [Target(armed["bus"]) for armed in moving or every], fault
 
 
 def _tell_others(stopped: list[pathlib.Path]) -> None:

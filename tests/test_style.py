@@ -11,7 +11,7 @@ ROOT = pathlib.Path(__file__).parents[1]
 LEANING = re.compile(r'"""((?:The same|As|Of|Likewise)\b.*)')
 WORDS = {"each", "found", "known"}
 # What is left of a budget, and what is a thing's own, have names in these rooms.
-ROOMS = ("adaptive", "calibration", "commands", "evaluation", "learning")
+ROOMS = ("adaptive", "calibration", "commands", "evaluation", "learning", "rig")
 MORE = {room: {"left", "own"} for room in ROOMS}
 # Where a file may bind one, which parsing tells.
 PRONOUN = re.compile(
@@ -39,7 +39,8 @@ def test_a_docstring_needs_no_neighbour() -> None:
 
 
 def banned_in(name: str) -> set[str]:
-    return WORDS | MORE.get(name.split("/")[1], set())
+    package, room = name.split("/")[:2]
+    return WORDS | MORE.get("rig" if package == "rig" else room, set())
 
 
 def bound(function: Function) -> Iterator[str]:
@@ -62,7 +63,7 @@ def test_a_variable_is_what_it_holds() -> None:
     """In a function of more than ten lines no variable is a pronoun."""
     riddles = [
         f"{name}:{node.lineno} {node.name}: {', '.join(words)}"
-        for name, text in sources("jaxcal")
+        for name, text in (*sources("jaxcal"), *sources("rig"))
         if PRONOUN.search(text)
         for node in ast.walk(ast.parse(text))
         if isinstance(node, Function) and node.end_lineno - node.lineno >= LONG

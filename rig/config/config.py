@@ -303,24 +303,24 @@ class RigConfig(Section):
         Of a map it is the part that turns counts into places: one that learns another
         register by an update is the same family.
         """
-        found: dict[str, Any] = {}
+        fingerprint: dict[str, Any] = {}
         for axis in self.axes:
             scale = axis.model_dump(include={*Scale.model_fields, "unit", "rotates"})
             if axis.kind == "rotation":  # as records of before say nothing of it
                 del scale["kind"], scale["lead_mm"]
             family = f"{axis.map.name} ({_digest(axis.map.text, PLACES)})"
             values = {"map": family, **scale}
-            found |= {f"axes.{axis.name}.{name}": values[name] for name in values}
+            fingerprint |= {f"axes.{axis.name}.{name}": values[name] for name in values}
         if self.model is not None:
             data = self.model.model_dump() | {"digest": self._model_digest}
-            found |= {f"model.{name}": data[name] for name in data}
+            fingerprint |= {f"model.{name}": data[name] for name in data}
         if self.imu is None:
             assert self.readings is not None
             data = self.readings.model_dump(mode="json", include=set(SENSOR))
-            return found | {f"readings.{name}": data[name] for name in SENSOR}
-        found["mechanism.order"] = self.mechanism.order
+            return fingerprint | {f"readings.{name}": data[name] for name in SENSOR}
+        fingerprint["mechanism.order"] = self.mechanism.order
         imu = self.imu.model_dump(mode="json", include=set(PHONE))
-        return found | {f"imu.{name}": imu[name] for name in PHONE}
+        return fingerprint | {f"imu.{name}": imu[name] for name in PHONE}
 
     @property
     def _model_digest(self) -> str:

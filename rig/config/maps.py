@@ -67,9 +67,9 @@ def _word(word: Any) -> Word:
     if type(word) is int and 0 <= word <= 0xFFFF:
         return Word(word)
     name, _, kind = str(word).partition(":")
-    known: dict[str, Kind] = {each: each for each in FORMATS}
-    if isinstance(word, str) and name in VALUES and kind in known:
-        return Word(name, known[kind])
+    kinds: dict[str, Kind] = {each: each for each in FORMATS}
+    if isinstance(word, str) and name in VALUES and kind in kinds:
+        return Word(name, kinds[kind])
     raise ValueError(
         f"must be 0..65535 or NAME:TYPE with NAME of {', '.join(VALUES)} and TYPE of "
         f"{', '.join(FORMATS)}, got {word!r}"
@@ -448,6 +448,6 @@ def parse_map(text: str, source: str, folder: pathlib.Path) -> DriveMap:
     with contextlib.suppress(tomllib.TOMLDecodeError):  # which `parse` words
         if tomllib.loads(text).get("drive", "modbus") != "modbus":
             kind = DriveMap
-    found = parse(kind, text, source)
-    found._folder = folder.resolve()
-    return found
+    drive_map = parse(kind, text, source)
+    drive_map._folder = folder.resolve()
+    return drive_map

@@ -127,8 +127,8 @@ def parse(
         result = model.model_validate_json(plain, context=context)
     except ValidationError as error:
         schema = model.model_json_schema()
-        each = error.errors(include_url=False)
-        faults = [text for e in each for text in _texts(e, data, schema)] + faults
+        listed = error.errors(include_url=False)
+        faults = [text for e in listed for text in _texts(e, data, schema)] + faults
     if faults:
         raise ConfigError(source, faults)
     result._text = text
@@ -148,9 +148,11 @@ def resolved(described: dict[str, Any], root: dict[str, Any]) -> dict[str, Any]:
 def rule(described: dict[str, Any], root: dict[str, Any]) -> str:
     """What a value must be, in words, from its JSON schema."""
     described = resolved(described, root)
-    known = described.get("enum", [described["const"]] if "const" in described else [])
-    if known:
-        words = [str(word) for word in known]
+    choices = described.get(
+        "enum", [described["const"]] if "const" in described else []
+    )
+    if choices:
+        words = [str(word) for word in choices]
         return " or ".join(words) if len(words) < 3 else "one of " + ", ".join(words)
     kind = described.get("type")
     if kind == "array":
@@ -173,7 +175,7 @@ def rule(described: dict[str, Any], root: dict[str, Any]) -> str:
 
 def _texts(error: Any, value: Any, root: dict[str, Any]) -> list[str]:
     """Faults of one pydantic error; axes are called by their names."""
-    kind, path, here, known = error["type"], "", root, []
+    kind, path, here, keys = error["type"], "", root, []
     if kind == "default_factory_not_called":
         return []  # it is made from a key that is at fault itself
     for part in error["loc"]:
@@ -191,7 +193,7 @@ def _texts(error: Any, value: Any, root: dict[str, Any]) -> list[str]:
             here = table.get("items") or table["prefixItems"][part]
         else:
             path += f".{name}" if path else name
-            known = sorted(table.get("properties", ()))
+            keys = sorted(table.get("properties", ()))
             others = table.get("additionalProperties") or {}
             here = table.get("properties", {}).get(part, others)
     if kind == "rules":
@@ -202,9 +204,9 @@ def _texts(error: Any, value: Any, root: dict[str, Any]) -> list[str]:
             return [f"{path}: {inner.source}: {fault}" for fault in inner.faults]
         return [f"{path}: {inner}"]
     if kind == "extra_forbidden":
-        near = difflib.get_close_matches(error["loc"][-1], known, 1)
+        near = difflib.get_close_matches(error["loc"][-1], keys, 1)
         hint = f"did you mean {near[0]}? " if near else ""
-        return [f"{path}: unknown key; {hint}known here: {', '.join(known)}"]
+        return [f"{path}: unknown key; {hint}known here: {', '.join(keys)}"]
     wanted = rule(here, root)
     if kind == "missing":
         return [f"{path}: missing; {wanted} is required"]

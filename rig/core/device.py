@@ -157,9 +157,11 @@ class LineWatch:
                     f"{drive.axis.map.name}, or leave it out"
                 ) from None
             counts = drive.watch_counts(self._timeouts_s[name])
-            left = self._left.get(name)
-            if left and before == left["counts"]:  # a killed session's, not the drive's
-                before = left["before"]
+            taken = self._left.get(name)
+            if (
+                taken and before == taken["counts"]
+            ):  # a killed session's, not the drive's
+                before = taken["before"]
             lent = {"axis": name, "before": before, "counts": counts}
             self._emit("comm_timeout", sync=True, **lent)
             self._before[name] = before

@@ -127,14 +127,14 @@ def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
     times = np.array([reading.time for reading in readings])
     times = times - times.mean()
     slope = np.abs(times @ (angles - angles.mean(axis=0)) / (times @ times))
-    for what, found, limit, unit in (
+    for what, values, limit, unit in (
         ("std_deg", angles.std(axis=0, ddof=1), settle.std_deg, told),
         ("slope_deg_s", slope, settle.slope_deg_s, f"{told}/s"),
     ):
-        worst = int(np.argmax(found))
-        if found[worst] > limit:
+        worst = int(np.argmax(values))
+        if values[worst] > limit:
             return (
-                f"{names[worst]} reads {found[worst]:.3f} {unit} (settle.{what} = "
+                f"{names[worst]} reads {values[worst]:.3f} {unit} (settle.{what} = "
                 f"{limit:g}). Either something still shakes, or the limit is below "
                 f"{device.imu.whose}'s noise: `jaxcal-rig imu` shows that; raise the "
                 "key above it"

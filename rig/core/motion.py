@@ -96,7 +96,7 @@ def _send(device: Device, drive: Drive, start: Status, pulses: int) -> None:
     """
     motion, axis = device.config.motion, drive.axis
     tolerance = axis.pulses_within(motion.position_tolerance_deg)
-    for left in reversed(range(1 + device.config.bus.read_retries)):
+    for tries_left in reversed(range(1 + device.config.bus.read_retries)):
         try:
             return drive.go(pulses)
         except BusError as error:
@@ -106,11 +106,11 @@ def _send(device: Device, drive: Drive, start: Status, pulses: int) -> None:
                 drive.sound()  # an alarm says more than a refusal
                 raise
             took = drive.took(pulses, start, tolerance)
-            found = {True: "obeyed", False: "not taken", None: "unknown"}[took]
-            device.emit("lost_reply", axis=axis.name, pulses=pulses, outcome=found)
+            outcome = {True: "obeyed", False: "not taken", None: "unknown"}[took]
+            device.emit("lost_reply", axis=axis.name, pulses=pulses, outcome=outcome)
             if took:
                 return None
-            if took is None or not left:
+            if took is None or not tries_left:
                 raise
             device.guard(moving=True)  # no move once a stop was asked for
 
@@ -159,19 +159,18 @@ def _watch(
                 if in_turn:  # who waits for it does not stall
                     last = [(place, status.time) for place, _ in last]
             elif (stood := status.time - last[index][1]) > motion.stall_s:
-                left = abs(end - angle)
+                short_by = abs(end - angle)
                 moved = abs(status.position - start) > tolerance
                 if status.done and not status.moving and moved:
                     raise EndedShort(
-                        f"{axis.name} ended {left:.3f} {axis.unit_name} short of its "
-                        f"target, at {angle:.3f}, and its drive says that it is done. "
-                        "Look "
-                        "who stopped it: another controller, an emergency stop that "
-                        "was released, a limit of the drive itself",
+                        f"{axis.name} ended {short_by:.3f} {axis.unit_name} short of "
+                        f"its target, at {angle:.3f}, and its drive says that it is "
+                        "done. Look who stopped it: another controller, an emergency "
+                        "stop that was released, a limit of the drive itself",
                         axis.name, status.position,
                     )  # fmt: skip
                 raise MotionFault(
-                    f"{axis.name} does not follow: it stands {left:.3f} "
+                    f"{axis.name} does not follow: it stands {short_by:.3f} "
                     f"{axis.unit_name} from its target for {stood:.2f} s (limit "
                     "motion.stall_s = "
                     f"{motion.stall_s:g}). Look for an obstacle, a loose coupling, "

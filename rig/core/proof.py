@@ -252,8 +252,8 @@ class Proof:
             self.stay_near(attitude)
         if not self._unit_seen:
             self._unit_seen = True
-            known = unit_proved(imu.settings, attitude)
-            for reach in unproved if not known else ():
+            unit_known = unit_proved(imu.settings, attitude)
+            for reach in unproved if not unit_known else ():
                 reach.factor = RADIANS
         self._start = self._start or here
         most = math.inf if self._near is None else self._near[1]
@@ -268,8 +268,8 @@ class Proof:
                 # A pulse more, or a last one would be a move of its own.
                 share = min(share, (longest + 1) / abs(b - a))
         if share < 1.0:
-            each = zip(here, goal, strict=True)
-            goal = tuple(a + round((b - a) * share) for a, b in each)
+            pairs = zip(here, goal, strict=True)
+            goal = tuple(a + round((b - a) * share) for a, b in pairs)
         ways = zip(self.reaches, here, goal, strict=True)
         way = sum(
             abs(reach.axis.to_deg(b - a)) * (reach.gain or 1.0) for reach, a, b in ways

@@ -74,7 +74,7 @@ def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
     """Why the drive's pulses may no longer mean the place that they meant."""
     axis, status = drive.axis, drive.steady()
     pulses, homed = record.left()
-    left = pulses.get(axis.name, status.position)
+    left_at = pulses.get(axis.name, status.position)
     if axis.map.absolute_encoder:
         return ""
     if status.fault:
@@ -82,7 +82,7 @@ def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
     if axis.name in homed:
         if not drive.says_homed:
             return "the homed bit is gone, so the drive was without power"
-    elif left is None:
+    elif left_at is None:
         return (
             "the last session ended without reading where it stands, and the drive "
             "does not say that it kept its power"
@@ -94,12 +94,12 @@ def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
             "homed, so the drive was without power"
         )
     tolerance = axis.pulses_within(config.motion.position_tolerance_deg)
-    if left is None or abs(status.position - left) <= tolerance:
+    if left_at is None or abs(status.position - left_at) <= tolerance:
         return ""
     return (
         f"it stands at {status.position} pulses, "
-        f"{abs(axis.to_deg(status.position - left)):.2f} deg from {left}, where it was "
-        "left: the drive was without power, or another controller moved it"
+        f"{abs(axis.to_deg(status.position - left_at)):.2f} deg from {left_at}, where "
+        "it was left: the drive was without power, or another controller moved it"
     )
 
 

@@ -193,12 +193,12 @@ def take_zero(
     while True:
         connection = device.imu.connections
         # Every posture is measured against this one: its noise must be the smaller.
-        found = measure(standing, ZERO_FACTOR * config.settle.samples)
+        zero_record = measure(standing, ZERO_FACTOR * config.settle.samples)
         if device.imu.connections == connection:
             break
-    attitude = np.array(found["attitude"])
+    attitude = np.array(zero_record["attitude"])
     _compare_zero(device, zero.pulses, attitude, kept)
-    device.emit("zero", sync=True, **found)
+    device.emit("zero", sync=True, **zero_record)
     zeroed(device, device.geometry.frame(attitude), zero)
     show(device)
     zeroed(device, device.geometry.frame(attitude), zero)
@@ -219,8 +219,8 @@ def _compare_zero(
             )
         except MotionFault as fault:  # a phone mounted anew is calibrated anew
             device.emit("note", text=f"WARNING: {fault}")
-    found = {"pulses": list(pulses), "attitude": attitude.tolist()}
-    device.record.reach(ZEROED, config, **found)
+    evidence = {"pulses": list(pulses), "attitude": attitude.tolist()}
+    device.record.reach(ZEROED, config, **evidence)
 
 
 def _check_reference(device: Device, zero: Posture) -> None:
@@ -256,10 +256,10 @@ def _reorient(device: Device) -> None:
         count = device.imu.connections
         device.emit("imu_reconnected", sync=True, connection=count)
         device.frame = None  # no comparison with the drives before it is known
-        found = measure(move(device, Posture("reference", zero.pulses)))
+        measured = measure(move(device, Posture("reference", zero.pulses)))
         if device.imu.connections != count:
             continue
-        now = np.array(found["attitude"])
+        now = np.array(measured["attitude"])
         told = record_check.check_zero(config, frame.zero, now, "this run")
         assert isinstance(device.geometry, Attitudes)  # numbers stay as they are
         turn = device.geometry.heading_turn(frame.zero, now)
@@ -288,11 +288,13 @@ def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
         return None
     device.requests.check_pause()
     device.emit("visit", name=name, pulses=list(posture.pulses))
-    found = None
+    measurement = None
     try:
-        while found is None or not device.oriented:  # the phone came back in between
+        while (
+            measurement is None or not device.oriented
+        ):  # the phone came back in between
             _reorient(device)
-            found = measure(move(device, posture))
+            measurement = measure(move(device, posture))
     except NotFollowing:
         _withdraw(run)
         raise
@@ -308,7 +310,7 @@ def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
         _leave_out(device, name, str(reason))
         return None
     device.emit("phase", phase="saving")
-    record = device.emit("posture", sync=True, name=name, **found, **fields)
+    record = device.emit("posture", sync=True, name=name, **measurement, **fields)
     device.requests.check_pause()
     return record
 

@@ -41,8 +41,8 @@ def kind_of(drive_map: DriveMap) -> type[Drive]:
             spec.loader.exec_module(module)
         else:
             module = importlib.import_module(place)
-        found = getattr(module, name)
-        if not issubclass(found, Drive):
+        drive_type = getattr(module, name)
+        if not issubclass(drive_type, Drive):
             raise TypeError(f"{name} is no subclass of rig.drives.Drive")
     except Exception as error:  # whatever the import of foreign code raises
         raise Refused(
@@ -50,7 +50,7 @@ def kind_of(drive_map: DriveMap) -> type[Drive]:
             f"be loaded: {type(error).__name__}: {error}. It must be one of "
             f"{', '.join(KINDS)}, FILE.py:CLASS or MODULE:CLASS"
         ) from None
-    return found
+    return drive_type
 
 
 def make_drives(

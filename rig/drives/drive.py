@@ -112,14 +112,14 @@ class Drive:
 
     def look(self, retries: int) -> Look:
         """All that ``status`` needs; in one exchange, where the drive can."""
-        for left in reversed(range(1 + retries)):
+        for tries_left in reversed(range(1 + retries)):
             try:
                 standing, alarm = self.standing(), self.alarm()
                 return Look(
                     self.position(), self.enabled(), standing, not standing, bool(alarm)
                 )
             except BusError as error:
-                if error.refused or not left:
+                if error.refused or not tries_left:
                     raise
         raise AssertionError("unreachable")
 

@@ -126,10 +126,10 @@ class GCodeDrive(Drive):
     def _look_grbl(self) -> Look:
         unit = self.axis.unit
         *_, line = self.line.ask(unit, b"?", lambda line: line.startswith("<"))
-        found = re.fullmatch(r"<(\w+)(?::(\d+))?\|MPos:([-\d.,]+)\|?.*>", line)
-        if found is None:
+        report = re.fullmatch(r"<(\w+)(?::(\d+))?\|MPos:([-\d.,]+)\|?.*>", line)
+        if report is None:
             raise BusError(f"unit {unit}: {line!r} has no MPos: set $10=1")
-        state, part, places = found.groups()
+        state, part, places = report.groups()
         count = round(float(places.split(",")[self._number]) * self._scale)
         moving = state in ("Run", "Jog", "Home") or (state, part) == ("Hold", "1")
         fault = state in ("Alarm", "Door")

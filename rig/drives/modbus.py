@@ -127,7 +127,7 @@ class Bus(Line):
             Rejected: the drive answered with an exception, every time.
         """
         tries = 1 + (self.settings.read_retries if retries is None else retries)
-        for left in reversed(range(tries)):
+        for tries_left in reversed(range(tries)):
             try:
                 self._catch_up(unit, address)
                 words = self._read(unit, address, count)
@@ -139,7 +139,7 @@ class Bus(Line):
                     f"got {len(words)}"
                 )
             except BusError as error:
-                if not left:
+                if not tries_left:
                     error.args = (f"{error}, tried {tries} times",)
                     raise
         raise AssertionError("unreachable")
@@ -193,15 +193,15 @@ class Bus(Line):
             lengths = [length for length, _ in owed]
             count = next(n for n in range(1, 99) if n not in lengths)
             try:
-                found = len(self._read(unit, address, count))
+                received = len(self._read(unit, address, count))
             except Rejected:  # or the oldest was answered like this
                 del owed[0]
                 owed.append((count, time.monotonic()))
                 continue
-            if found == count:
+            if received == count:
                 owed.clear()
-            elif found in lengths:
-                del owed[: lengths.index(found) + 1]
+            elif received in lengths:
+                del owed[: lengths.index(received) + 1]
         if self._owed.get(unit):
             raise BusError(
                 f"unit {unit}: its replies come too late to be told apart",
@@ -276,8 +276,8 @@ class Bus(Line):
             if self._client is None:
                 return
             if self.settings.transport != "tcp":
-                known = self._owed.setdefault(unit, [])
-                known.append((owed, time.monotonic()))
+                replies_owed = self._owed.setdefault(unit, [])
+                replies_owed.append((owed, time.monotonic()))
             port = self._client.socket
             if self.settings.transport != "rtu" or port is None:
                 self._client.close()  # the next request connects again
@@ -454,11 +454,11 @@ class ModbusDrive(Drive):
             table is each for each in (self.map.move, self.map.home, self.map.stop)
         )
         tries = 1 if once else 1 + self.line.settings.read_retries
-        for left in reversed(range(tries)):
+        for tries_left in reversed(range(tries)):
             try:
                 return self._write(table, values)
             except BusError as error:
-                if not left or error.refused:
+                if not tries_left or error.refused:
                     raise
 
     def _write(self, table: Writes | None, values: dict[str, int]) -> None:

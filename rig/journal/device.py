@@ -128,11 +128,11 @@ class DeviceRecord:
     def _fault(self, name: str, config: RigConfig) -> str | None:
         from rig.config.config import differences
 
-        known = self._states.get(name)
-        if known is None:
+        state = self._states.get(name)
+        if state is None:
             lost = self._voided.get(name)
             return lost["reason"] if lost else "it never was"
-        then, now = known["fingerprint"], _fingerprint(name, config)
+        then, now = state["fingerprint"], _fingerprint(name, config)
         if name in (IDENTIFIED, HOMED):  # pulses: no gearing, direction or phone in it
             drives = (".unit", ".map")
             then, now = (
@@ -155,8 +155,8 @@ class DeviceRecord:
             positions: pulses by axis; None where it is not known, as while armed.
             homed: names of the axes whose drives say that they are homed.
         """
-        left = {"pulses": dict(positions), "homed": list(homed)}
-        self._left = {"time": _now(), **left}
+        standing = {"pulses": dict(positions), "homed": list(homed)}
+        self._left = {"time": _now(), **standing}
         self.save()
 
     def left(self) -> tuple[dict[str, int | None], list[str]]:

@@ -228,10 +228,10 @@ def _identity(settings: BusSettings) -> str:
     if settings.transport == "can":
         return f"{settings.interface}:{settings.device}"
     try:
-        found = socket.getaddrinfo(
+        entries = socket.getaddrinfo(
             settings.host, settings.port, type=socket.SOCK_STREAM
         )
-        addresses = {str(entry[4][0]).removeprefix("::ffff:") for entry in found}
+        addresses = {str(entry[4][0]).removeprefix("::ffff:") for entry in entries}
         # A name with addresses of both kinds is known by that of version 4.
         address = min(addresses, key=lambda text: (":" in text, text))
     except OSError:

@@ -155,8 +155,8 @@ class RunFolder:
             "arguments": sys.argv[1:],
             "started": now.isoformat(timespec="seconds"),
         }
-        if known := self.journal.events("start"):
-            if changed := self.config.changed_since(known[0]["config"]):
+        if starts := self.journal.events("start"):
+            if changed := self.config.changed_since(starts[0]["config"]):
                 raise ValueError(
                     f"{self.folder}: rig.toml differs from when this run began: "
                     f"{'; '.join(changed)}. What is measured now would not be "

@@ -155,58 +155,63 @@ class Receiver:
         ):
             async with asyncio.timeout(PATIENCE_S):
                 streams = await asyncio.open_connection(limit=MAX_HEAD, **how)
-            each = Connection(*streams, address, time.monotonic())
+            connection = Connection(*streams, address, time.monotonic())
             stays = True
             try:
                 while stays:  # not wait_for, which may lose the cancelling of a task
                     async with asyncio.timeout(PATIENCE_S):
-                        stays = await (self._message if pushed else self._lines)(each)
+                        stays = await (self._message if pushed else self._lines)(
+                            connection
+                        )
                     self._has_sent(asyncio.current_task())
             finally:
-                each.writer.close()
-                self._current = None if self._current is each else self._current
+                connection.writer.close()
+                self._current = None if self._current is connection else self._current
 
-    async def _lines(self, each: Connection) -> bool:
+    async def _lines(self, connection: Connection) -> bool:
         """Take what has come in; whether the connection stays open."""
-        data = await each.reader.read(4096)
+        data = await connection.reader.read(4096)
         now, current = time.monotonic(), self._current
         stale_s = self._settings.stale_s
-        if data and current is not each:
+        if data and current is not connection:
             if current and now - max(current.since, current.used) <= stale_s:
-                if goes_on := current.used > each.since + stale_s:
+                if goes_on := current.used > connection.since + stale_s:
                     why = f"{current.address} is connected already, and sends"
-                    self.refuse(each.address, why)
+                    self.refuse(connection.address, why)
                 return not goes_on  # old once it may be heard, so it is lost
             if current:
                 current.writer.close()
-            self._current, each.since = each, now
+            self._current, connection.since = connection, now
             self._imu.begin()
-        if self._imu.take_lines(each.splitter.feed(data), now):
-            each.used, self.phone = now, each.address
+        if self._imu.take_lines(connection.splitter.feed(data), now):
+            connection.used, self.phone = now, connection.address
         return bool(data)
 
-    async def _message(self, each: Connection) -> bool:
+    async def _message(self, connection: Connection) -> bool:
         """Answer one message; whether the connection stays open."""
-        head = (await each.reader.readuntil(b"\r\n\r\n")).decode("latin-1")
+        head = (await connection.reader.readuntil(b"\r\n\r\n")).decode("latin-1")
         first, *lines = head.lower().split("\r\n")
         parts = (line.partition(":") for line in lines)
         fields = {name.strip(): value.strip() for name, _, value in parts}
         length = fields.get("content-length", "")
-        known, code = False, 413
+        admitted, code = False, 413
         if first.startswith("post ") and length.isdecimal() and int(length) <= MAX_BODY:
             if fields.get("expect") == "100-continue":
-                each.writer.write(b"HTTP/1.1 100 Continue\r\n\r\n")
-            body = await each.reader.readexactly(int(length))
-            if known := self._admits(each.address):
+                connection.writer.write(b"HTTP/1.1 100 Continue\r\n\r\n")
+            body = await connection.reader.readexactly(int(length))
+            if admitted := self._admits(connection.address):
                 used, foreign = self._imu.take_body(body)
                 if foreign:
                     why = "another device than before sends from there"
-                    self.refuse(each.address, why)
-                known, self.phone = not foreign, each.address if used else self.phone
-            code = 200 if known else 403
-        stays = known and fields.get("connection") != "close"
-        each.writer.write(_answer(code, stays))
-        await each.writer.drain()
+                    self.refuse(connection.address, why)
+                admitted, self.phone = (
+                    not foreign,
+                    connection.address if used else self.phone,
+                )
+            code = 200 if admitted else 403
+        stays = admitted and fields.get("connection") != "close"
+        connection.writer.write(_answer(code, stays))
+        await connection.writer.drain()
         return stays
 
 

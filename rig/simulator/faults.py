@@ -65,23 +65,23 @@ def parse_fault(text: str, names: Sequence[str] = AXIS_NAMES) -> FaultSpec:
     kind, _, when = head.partition("@")
     if kind not in KINDS:
         raise ValueError(f"unknown fault {kind!r}: have {', '.join(KINDS)}")
-    found: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     readers: dict[str, Any] = {"count": int, "seconds": float, "share": float}
     readers["factor"] = float
     readers["axis"] = list(names).index
     try:
         if when:
-            found["phase"] = PHASES[PHASES.index(when)]
+            fields["phase"] = PHASES[PHASES.index(when)]
         for option in options:
             name, _, value = option.partition("=")
-            found[name] = readers[name](value)
+            fields[name] = readers[name](value)
     except (KeyError, ValueError):
         raise ValueError(
             f"fault {text!r}: after @ comes one of {', '.join(PHASES)}; "
             "options are count=N, seconds=S, share=P, factor=F, axis=NAME of "
             f"{', '.join(names)}"
         ) from None
-    return FaultSpec(kind, **found)
+    return FaultSpec(kind, **fields)
 
 
 class FaultInjector:

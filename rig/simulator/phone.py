@@ -7,7 +7,6 @@ import http.client
 import json
 import random
 import socket
-import threading
 import time
 from collections.abc import Callable
 
@@ -17,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from rig.config.settings import ImuSettings
 from rig.readings.attitude import Array, euler_to_matrix, matrix_to_euler
 from rig.simulator.faults import FaultInjector
+from rig.simulator.sender import Sender
 
 INTRUSION_S = 0.15  # that another sender is heard, where it is let
 BATCH = 5  # readings that Sensor Logger pushes at once
@@ -44,8 +44,10 @@ def format_line(
     return settings.separator.join(fields)
 
 
-class Phone:
-    """Sends ``attitude()`` at ``rate_hz`` until closed; connects again by itself."""
+class Phone(Sender):
+    """Sends ``attitude()`` as the app of a phone does."""
+
+    listens = "connect"
 
     def __init__(
         self,
@@ -55,47 +57,17 @@ class Phone:
         rate_hz: float = 100.0,
         seed: int = 0,
     ) -> None:
-        self.settings = settings
+        super().__init__(settings, faults, rate_hz)
         self._attitude = attitude
-        self._take = faults.take
-        self._period = 1.0 / rate_hz
         self._random = random.Random(seed)
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._port = settings.port
-        self._listener: socket.socket | None = None
         self._frozen = np.eye(3)
         self._session = 0  # of the app, counted
 
-    def start(self, port: int) -> int:
-        """Send to the port the rig listens on, or listen there; returns the port."""
-        self._port = port
-        if not self._thread.is_alive():
-            if self.settings.transport == "connect":
-                self._listener = socket.create_server(("127.0.0.1", port), backlog=1)
-                self._listener.settimeout(0.1)
-                self._port = int(self._listener.getsockname()[1])
-            self._thread.start()
-        return self._port
-
-    def close(self) -> None:
-        self._closing.set()
-        if self._thread.is_alive():
-            self._thread.join(2.0)
-        if self._listener:
-            self._listener.close()
-
-    def _run(self) -> None:
-        while not self._closing.is_set():
-            with contextlib.suppress(OSError, http.client.HTTPException):
-                if self.settings.format == "sensorlogger":
-                    self._push()
-                elif self._listener is not None:
-                    self._stream(self._listener.accept()[0])
-                else:
-                    address = ("127.0.0.1", self._port)
-                    self._stream(socket.create_connection(address, timeout=1.0))
-            self._closing.wait(0.05)
+    def send(self) -> None:
+        if self.settings.format == "sensorlogger":
+            self._push()
+        else:
+            self._stream(self.connected())
 
     def _stream(self, connection: socket.socket) -> None:
         held = b""

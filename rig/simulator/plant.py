@@ -44,8 +44,8 @@ class Plant:
         self._centre = self._drive_deg + truth.dead_centre_deg
         self._model = model_of(config)
         if self._model is not None:
-            known = self._model.model.nominal
-            self._parameters = np.array(truth.parameters or known)
+            nominal = self._model.model.nominal
+            self._parameters = np.array(truth.parameters or nominal)
             if config.is_arm:
                 self._attitude_of = self._model.attitude_with(self._parameters)
         mounting = config.imu.mounting_deg if config.imu else (0.0, 0.0, 0.0)

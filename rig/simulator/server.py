@@ -147,8 +147,8 @@ class ModbusServer:
         """
         faults, function = self.faults, pdu[0]
         if unit == 0 and function in (6, 16):
-            for each, drive in self.drives.items():
-                dead = faults.take("dead_drive", self._axis[each])
+            for unit_id, drive in self.drives.items():
+                dead = faults.take("dead_drive", self._axis[unit_id])
                 if drive.map.broadcast_stop and not dead:
                     self._execute(drive, pdu, broadcast=True)
         axis = self._axis.get(unit)

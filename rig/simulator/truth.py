@@ -50,12 +50,12 @@ class Truth:
     @classmethod
     def of_axes(cls, count: int, outputs: int | None = None, **more: Any) -> Truth:
         """A truth of ``count`` axes, and of as many outputs unless said otherwise."""
-        shape, known = (outputs or count, count), cls()
+        shape, paper = (outputs or count, count), cls()
         matrix = 0.01 * np.cos(np.arange(shape[0] * count)).reshape(shape)
         matrix += 0.8 * np.eye(*shape)
-        least = min(*shape, len(known.matrix))
-        matrix[:least, :least] = np.array(known.matrix)[:least, :least]
-        bias = [*known.bias, 1.3, -2.2, 0.7][: shape[0]]
+        least = min(*shape, len(paper.matrix))
+        matrix[:least, :least] = np.array(paper.matrix)[:least, :least]
+        bias = [*paper.bias, 1.3, -2.2, 0.7][: shape[0]]
         given = {
             "matrix": tuple(map(tuple, matrix.tolist())),
             "bias": tuple(bias),
@@ -110,8 +110,8 @@ def truth_of(options: dict[str, Any], config: RigConfig) -> Truth:
     order = list(range(len(names)))
     for key in ("swapped", "reversed"):
         if unknown := set(options[key] or ()) - set(names):
-            known = ", ".join(names)
-            raise ValueError(f"--{key}: no axis {min(unknown)!r}: have {known}")
+            axis_names = ", ".join(names)
+            raise ValueError(f"--{key}: no axis {min(unknown)!r}: have {axis_names}")
     if swapped := options["swapped"]:
         if len(set(swapped)) != 2:
             raise ValueError(f"--swapped must name two axes, got {','.join(swapped)}")

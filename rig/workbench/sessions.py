@@ -131,13 +131,13 @@ def _procedure(
             "goto: an arm is moved by its own controller. Give it calibrated.urdf of "
             "the calibration's folder in place of the URDF"
         )
-    found, kept = verify.load_calibration(
+    calibration, kept = verify.load_calibration(
         pathlib.Path(inputs["calibration"]), config, start["simulated"] is not None
     )
     if mode == "verify":
-        return lambda run: verify.verify(run, found, inputs["count"]), kept, []
-    doubts = verify.doubts(found)
-    return lambda run: goto(run, found, inputs["to"]), kept, doubts
+        return lambda run: verify.verify(run, calibration, inputs["count"]), kept, []
+    doubts = verify.doubts(calibration)
+    return lambda run: goto(run, calibration, inputs["to"]), kept, doubts
 
 
 def _confirm(given: SessionOptions, doubts: list[str], session: Run) -> None:

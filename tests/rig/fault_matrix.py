@@ -56,7 +56,7 @@ from rig.journal import (
 from rig.journal.errors import Refused
 from rig.simulator import Truth, parse_fault
 from rig.workbench.commission.operator import Operator
-from rig.workbench.commission.steps import Place, go_home, identify
+from rig.workbench.commission.steps import Site, go_home, identify
 from rig.workbench.commission.steps import axes as check_the_axes
 from rig.workbench.run import Run
 
@@ -348,7 +348,7 @@ def _unknown_cell(fault: str, folder: pathlib.Path) -> Outcome:
         served = changed(sim.start(), output=str(folder))
         record = DeviceRecord(folder / "device.json")
         operator = Operator(yes=True, say=said.append)
-        place = Place(served, record, operator, full_speed=True, listeners=(sim.hear,))
+        place = Site(served, record, operator, full_speed=True, listeners=(sim.hear,))
         identify(place)
         assert go_home(place, here=True) == 0, said
         record.reach(SIGN_CHECKED, served)
@@ -473,7 +473,7 @@ def _axes_cell(fault: str, folder: pathlib.Path) -> Outcome:
         for state in (IDENTIFIED, HOMED):
             record.reach(state, wrong)
         operator = Operator(yes=fault != ENTER, read=lambda _: "", say=said.append)
-        place = Place(wrong, record, operator, listeners=(sim.answer,))
+        place = Site(wrong, record, operator, listeners=(sim.answer,))
         far, _ = _watch_joints(sim)
         try:
             code = check_the_axes(place)

@@ -70,4 +70,4 @@ def place_of(config, folder, said):
     record = DeviceRecord.load(folder / "device.json")
     config = config.model_copy(update={"output": str(folder)})
     operator = Operator(yes=True, say=said.append)
-    return steps.Place(config, record, operator, full_speed=True)
+    return steps.Site(config, record, operator, full_speed=True)

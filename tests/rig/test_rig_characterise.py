@@ -33,7 +33,7 @@ def measured(tmp_path, monkeypatch):
         with simulator(config, truth=Truth(**truth)) as sim:
             served = sim.start()
             record = commissioned(served, tmp_path)
-            place = steps.Place(
+            place = steps.Site(
                 served, record, Operator(yes=True, say=told.append),
                 full_speed=True, listeners=(sim.answer,),
             )  # fmt: skip

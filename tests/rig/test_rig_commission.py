@@ -139,7 +139,7 @@ def test_a_declined_correction_leaves_the_file_and_the_state(at):
         record = DeviceRecord.load(config.device_path)
         operator = Operator(say=told.append, read=read)
         with pytest.raises(Refused):
-            steps.axes(steps.Place(config, record, operator, at / "rig.toml"))
+            steps.axes(steps.Site(config, record, operator, at / "rig.toml"))
     assert (at / "rig.toml").read_text() == before
     assert record.state(SIGN_CHECKED) is None
     assert any("axes.roll.direction = -1" in line for line in told)
@@ -177,7 +177,7 @@ def test_a_count_of_0_after_a_power_cycle_is_not_home(at, name, obeys, monkeypat
         served = changed(sim.start(), output=str(at))
         record = DeviceRecord(at / "device.json")
         operator = Operator(yes=True, say=told.append)
-        place = steps.Place(served, record, operator, full_speed=True,
+        place = steps.Site(served, record, operator, full_speed=True,
                             listeners=(sim.hear,))  # fmt: skip
         steps.identify(place)
         assert steps.go_home(place, here=True) == 0

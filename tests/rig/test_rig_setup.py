@@ -19,7 +19,7 @@ from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED, DeviceRecord
 from rig.simulator import Truth
 from rig.workbench.commission import setup, steps
 from rig.workbench.commission.operator import Operator
-from rig.workbench.commission.scan import Found
+from rig.workbench.commission.scan import Answer
 
 
 @pytest.mark.slow
@@ -120,10 +120,12 @@ def test_setup_asks_with_defaults_and_moves_nothing_without_a_yes(at):
     with device() as (sim, bus, port):
         operator = Operator(say=told.append, read=read)
         values = dict(setup.setting(value) for value in QUICK)
-        given = setup.Given(bus=bus, imu=f"hyperimu:{port}", units=4, values=values)
+        given = setup.SetupOptions(
+            bus=bus, imu=f"hyperimu:{port}", units=4, values=values
+        )
         config = setup.write_config(at / "rig.toml", given, operator)
         record = DeviceRecord.load(config.device_path)
-        place = steps.Place(config, record, operator, at / "rig.toml")
+        place = steps.Site(config, record, operator, at / "rig.toml")
         with pytest.raises(Refused, match="not confirmed"):
             setup.go(place, given)
         assert sim.executions() == [[], [], []]
@@ -152,7 +154,7 @@ def test_setup_writes_files_of_other_devices(
     tmp_path, monkeypatch, options, kinds, told
 ):
     """Each passes its own check, and the drives' line is that of their map."""
-    units = [Found(unit, ("leadshine_pr",), {}, 10000) for unit in range(1, 7)]
+    units = [Answer(unit, ("leadshine_pr",), {}, 10000) for unit in range(1, 7)]
     monkeypatch.setattr(setup, "scan", lambda *_: units)
     given = setup.asked(**OPTIONS | options)
     if not given.bus:
@@ -192,8 +194,8 @@ def test_the_next_command_of_a_simulated_device_simulates_it(
     record = DeviceRecord.load(config.device_path)
     record.reach(ZEROED, config)
     operator = Operator(yes=True, say=told.append)
-    place = steps.Place(config, record, operator, at / "rig.toml", full_speed=simulated)
-    assert setup.go(place, setup.Given()) == 0
+    place = steps.Site(config, record, operator, at / "rig.toml", full_speed=simulated)
+    assert setup.go(place, setup.SetupOptions()) == 0
     again = " --simulate" if simulated else ""
     assert told[-1] == f"next: jaxcal-rig calibrate{again} --config rig.toml"
 

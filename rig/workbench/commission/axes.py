@@ -54,15 +54,15 @@ def check_axes(run: Run, device: Device) -> list[Change]:
         return _conclude(run, device, stands, changes, ratios, {})
     if model is not None and model.rotations is not None:
         expected = model.axes_at(run.config.to_deg(start))
-    found = find(run.config, stands, expected)
+    findings = find(run.config, stands, expected)
     told = [drive.pulses_per_rev() for drive in device.drives]
-    ratios = ratios_of(run.config, found)
+    ratios = ratios_of(run.config, findings)
     if run.config.phone.unit == "rad":
         require_unit(run.config, ratios, proved=True)
     require_gearing(run.config, ratios, told)
-    changes = proposals(run.config, found, told)
-    run.say(*lines(run.config, found))
-    more = {"phone_turned_deg": round(found.turned_deg, 2)}
+    changes = proposals(run.config, findings, told)
+    run.say(*lines(run.config, findings))
+    more = {"phone_turned_deg": round(findings.turned_deg, 2)}
     return _conclude(run, device, stands, changes, ratios, more)
 
 

@@ -95,8 +95,7 @@ def turn(base: Array, attitude: Array) -> Array:
 
 
 def rates_of(config: RigConfig, stands: Mapping[str, Stand]) -> Array:
-    """(3, n) columns: rotation vector for one pulse of each drive; (m, n) of "
-    "numbers."""
+    """(3, n) columns, rotation vector for one pulse of each drive; (m, n) numbers."""
     base, columns, way = stands["start"].attitude, [], geometry_of(config).way
     for j, name in enumerate(config.axis_names):
         parts = ("look", "plus", "back", "minus")
@@ -105,8 +104,8 @@ def rates_of(config: RigConfig, stands: Mapping[str, Stand]) -> Array:
         at = [each.pulses[j] for each in places]
         # On the way up and on the way down the play is taken up: no reversal between.
         moved = np.array([at[1] - at[0], at[3] - at[2]])
-        each = np.array([plus - look, minus - back]) / moved[:, None]
-        columns.append(np.average(each, axis=0, weights=abs(moved)))
+        rates = np.array([plus - look, minus - back]) / moved[:, None]
+        columns.append(np.average(rates, axis=0, weights=abs(moved)))
     return np.column_stack(columns)
 
 
@@ -171,14 +170,15 @@ def check_numbers(
             continue
         if axis.name not in config.output_names:
             continue
-        own = per_unit[config.output_names.index(axis.name)]
+        rate = per_unit[config.output_names.index(axis.name)]
         same = config.output_unit == axis.unit_name
-        if same and not low <= abs(own) <= high:
+        if same and not low <= abs(rate) <= high:
             raise MotionFault(
-                f"{axis.name} was measured to move {abs(own):.3g} {axis.unit_name} for "
-                f"each that it was commanded; sound is {low:g} to {high:g}. {BY_PLATE}"
+                f"{axis.name} was measured to move {abs(rate):.3g} {axis.unit_name} "
+                f"for each that it was commanded; sound is {low:g} to {high:g}. "
+                f"{BY_PLATE}"
             )
-        if own < 0:
+        if rate < 0:
             reason = f"what is measured as {axis.name} falls as it is commanded up"
             key = f"axes.{axis.name}.direction"
             changes.append(Change(key, axis.direction, -axis.direction, reason))
@@ -297,23 +297,23 @@ def _placed(
             - EXCHANGED * (order != tuple(range(len(order))))
         ),
     )
-    own = cosines[joints, range(len(joints))]
-    signs = np.sign(own)
-    if np.abs(own).min() < NEAREST:
-        unit = config.axes[int(np.abs(own).argmin())].unit
+    cosine = cosines[joints, range(len(joints))]
+    signs = np.sign(cosine)
+    if np.abs(cosine).min() < NEAREST:
+        unit = config.axes[int(np.abs(cosine).argmin())].unit
         raise MotionFault(
             f"unit {unit} turns the phone about an axis more than 45 deg from every "
             "joint's, so the phone is not placed as imu.mounting_deg says. Correct "
             "that roughly, then run `jaxcal-rig axes` again"
         )
-    wanted, found = expected[:, joints] * signs, told @ axes
+    wanted, turned = expected[:, joints] * signs, told @ axes
     if len(joints) == 1:  # the least turn that fits it
-        across = np.cross(found[:, 0], wanted[:, 0])
+        across = np.cross(turned[:, 0], wanted[:, 0])
         sine = np.linalg.norm(across)
-        angle = np.arctan2(sine, found[:, 0] @ wanted[:, 0])
+        angle = np.arctan2(sine, turned[:, 0] @ wanted[:, 0])
         correction = Rotation.from_rotvec(across * (angle / max(sine, 1e-12)))
     else:
-        correction, _ = Rotation.align_vectors(wanted.T, found.T)
+        correction, _ = Rotation.align_vectors(wanted.T, turned.T)
     return joints, signs, correction.as_matrix() @ told
 
 
@@ -335,9 +335,9 @@ class Change:
         return f"{self.key} = {self.new!r} (is {self.old!r}): {self.reason}"
 
 
-def ratios_of(config: RigConfig, found: Findings) -> list[float]:
+def ratios_of(config: RigConfig, findings: Findings) -> list[float]:
     """What each drive turned the phone, as a share of what it was commanded."""
-    pairs = zip(found.deg_per_pulse, config.axes, strict=True)
+    pairs = zip(findings.deg_per_pulse, config.axes, strict=True)
     return [float(abs(each * axis.pulses_per_deg)) for each, axis in pairs]
 
 
@@ -414,19 +414,19 @@ def _seen(config: RigConfig, ratios: Sequence[float]) -> str:
 
 
 def proposals(
-    config: RigConfig, found: Findings, told: Sequence[int | None]
+    config: RigConfig, findings: Findings, told: Sequence[int | None]
 ) -> list[Change]:
     """Corrections of the configuration.
 
     Args:
         config: as the moves were made, with a phone whose unit is proved.
-        found: what they showed.
+        findings: what they showed.
         told: pulses for one turn by each drive's own word, None where it has none.
     """
     tables = {table["name"]: table for table in tomllib.loads(config.text)["axes"]}
     changes: list[Change] = []
     low, high = SOUND_RATIO
-    for drive, joint in enumerate(found.joints):
+    for drive, joint in enumerate(findings.joints):
         source, axis = config.axes[drive], config.axes[joint]
         wanted: dict[str, tuple[Any, Any, str]] = {}  # key: old, new, reason
         for name in OF_DRIVE:
@@ -436,7 +436,10 @@ def proposals(
             if name == "pulses_per_rev" and told[drive] not in (None, new):
                 new, reason = told[drive], f"unit {source.unit} says so itself"
             wanted[name] = old, new, reason
-        rate, pulses = found.deg_per_pulse[drive], told[drive] or source.pulses_per_rev
+        rate, pulses = (
+            findings.deg_per_pulse[drive],
+            told[drive] or source.pulses_per_rev,
+        )
         reason = f"positive pulses turn it the {_way(rate)} way"
         wanted["direction"] = axis.direction, 1 if rate > 0 else -1, reason
         geared = axis.model_copy(update={"pulses_per_rev": pulses})
@@ -445,17 +448,17 @@ def proposals(
             new = float(f"{axis.reduction / ratio:.{DIGITS}g}")
             reason = f"it turns {ratio:.3g} of what is commanded; sound is {low:g} to "
             wanted["reduction"] = axis.reduction, new, f"{reason}{high:g}"
-        for name, each in wanted.items():
-            if each[0] != each[1]:
-                changes.append(Change(f"axes.{axis.name}.{name}", *each))
-    if found.turned_deg > MOUNTING_DEG:
-        angles = matrix_to_euler(found.mounting, "ZYX").round(2) + 0.0
+        for name, values in wanted.items():
+            if values[0] != values[1]:
+                changes.append(Change(f"axes.{axis.name}.{name}", *values))
+    if findings.turned_deg > MOUNTING_DEG:
+        angles = matrix_to_euler(findings.mounting, "ZYX").round(2) + 0.0
         before, reason = list(config.phone.mounting_deg), "the axes put the phone"
-        reason += f" {found.turned_deg:.1f} deg from there"
+        reason += f" {findings.turned_deg:.1f} deg from there"
         changes.append(Change("imu.mounting_deg", before, angles.tolist(), reason))
-    if found.order is not None and found.order != config.joint_order:
+    if findings.order is not None and findings.order != config.joint_order:
         reason = "combined moves show which joint carries which"
-        order, seen = config.mechanism.order, iter(str(found.order))
+        order, seen = config.mechanism.order, iter(str(findings.order))
         # What no joint turns about keeps its place.
         new = "".join(next(seen) if at in config.letters else at for at in order)
         changes.append(Change("mechanism.order", order, new, reason))
@@ -466,24 +469,24 @@ def _way(rate: float) -> str:
     return "positive" if rate > 0 else "negative"
 
 
-def lines(config: RigConfig, found: Findings) -> list[str]:
+def lines(config: RigConfig, findings: Findings) -> list[str]:
     """The findings in words, a line for each drive and each thing found."""
-    ratios = ratios_of(config, found)
+    ratios = ratios_of(config, findings)
     text = ["  unit  turns   sense     measured/commanded"]
-    for drive, joint in enumerate(found.joints):
+    for drive, joint in enumerate(findings.joints):
         axis, unit = config.axes[joint], config.axes[drive].unit
         text.append(
-            f"  {unit:>4}  {axis.name:<6}  {_way(found.deg_per_pulse[drive]):<8}  "
+            f"  {unit:>4}  {axis.name:<6}  {_way(findings.deg_per_pulse[drive]):<8}  "
             f"{ratios[drive]:18.3f}"
         )
-    angles = matrix_to_euler(found.mounting, "ZYX")
+    angles = matrix_to_euler(findings.mounting, "ZYX")
     text.append(
         f"  phone: turned by [{' '.join(f'{angle:.1f}' for angle in angles)}] deg "
-        f"about Z, Y, X, {found.turned_deg:.1f} from imu.mounting_deg"
+        f"about Z, Y, X, {findings.turned_deg:.1f} from imu.mounting_deg"
     )
     if config.is_arm:
         text.append("  parallel joints look alike: watch that each is the one named")
     else:
-        order = found.order or "not clear from these moves"
+        order = findings.order or "not clear from these moves"
         text.append(f"  joints from the base outwards: {order}")
     return text

@@ -109,9 +109,9 @@ class Probe:
         turns = [self.geometry.way(self._base, each.attitude) for each in [*up, *down]]
         deg = (self.way(up[1]) - self.way(up[0]) + self.way(down[0])) / 2.0
         deg -= self.way(down[1]) / 2.0
-        each = (turns[1] - turns[0] + turns[2] - turns[3]) / 2.0 / deg
-        self._rate = float(np.linalg.norm(each))
-        self._line = each / self._rate
+        rate = (turns[1] - turns[0] + turns[2] - turns[3]) / 2.0 / deg
+        self._rate = float(np.linalg.norm(rate))
+        self._line = rate / self._rate
         if self._rate * deg < SEEN_DEG:
             raise MotionFault(
                 f"{self.name} was moved by {deg:g} and {self.geometry.told} "
@@ -159,9 +159,9 @@ class Probe:
             after = self.stand(f"{label}:on", BASE_DEG + direction * step)
             way = (self.read(after) - self.read(before)) * direction
             belief.saw(side, number, way > step / 2.0)
-        for each in (up, down):
-            if each.high > (STEPS - 0.5) * least:
-                raise self.too_much("breakaway", each.mean, STEPS * least)
+        for yields in (up, down):
+            if yields.high > (STEPS - 0.5) * least:
+                raise self.too_much("breakaway", yields.mean, STEPS * least)
         return up, down
 
     def too_much(self, what: str, deg: float, most: float) -> MotionFault:
@@ -187,10 +187,10 @@ def characterise(run: Run, device: Device, axis: int) -> None:
     told = {
         "play": play, "dead zone": zone, "breakaway up": up, "breakaway down": down
     }  # fmt: skip
-    for name, each in told.items():
+    for name, estimate in told.items():
         run.say(
-            f"{probe.name}: {name} {each.mean:.4f} deg of its commands, {LEVEL:.0%} in "
-            f"{each.low:.4f}..{each.high:.4f}"
+            f"{probe.name}: {name} {estimate.mean:.4f} deg of its commands, "
+            f"{LEVEL:.0%} in {estimate.low:.4f}..{estimate.high:.4f}"
         )
     run.say(
         f"from {probe.count} measurements. Where the play is over the accuracy you "

@@ -171,7 +171,7 @@ def identity(drives: list[Drive]) -> dict[str, dict[str, int | str]]:
     Raises:
         Refused: a unit does not answer as the family that is configured.
     """
-    found: dict[str, dict[str, int | str]] = {}
+    identities: dict[str, dict[str, int | str]] = {}
     for drive in drives:
         axis = drive.axis
         try:
@@ -187,5 +187,5 @@ def identity(drives: list[Drive]) -> dict[str, dict[str, int | str]]:
                 f"{axis.name} (unit {axis.unit}) is no {axis.map.name}: {fault}. Run "
                 "`jaxcal-rig scan`"
             )
-        found[axis.name] = drive.lasting(values)
-    return found
+        identities[axis.name] = drive.lasting(values)
+    return identities

@@ -28,7 +28,7 @@ OF_OTHERS = {"serial": ("device", "baudrate"), "can": ("device", "baudrate")}
 
 
 @dataclasses.dataclass(frozen=True)
-class Found:
+class Answer:
     """A unit that answered."""
 
     unit: int
@@ -74,43 +74,43 @@ def scan(
     units: int,
     say: Callable[[str], None],
     maps: tuple[DriveMap, ...] = (),
-) -> list[Found]:
+) -> list[Answer]:
     """Ask units 1 to ``units`` for their identity; ``maps`` beside those that ship.
 
     It holds the lock of the bus until it ends.
     """
     every = [*maps, *(load_map(name) for name in available_maps())]
     named = {each.name: each for each in every}.values()
-    known = [each for each in named if isinstance(each, RegisterMap)]
+    families = [each for each in named if isinstance(each, RegisterMap)]
     short = settings.model_copy(
         update={
             "timeout_s": min(settings.timeout_s, SCAN_TIMEOUT_S),
             "read_retries": RETRIES,
         }
     )
-    found: list[Found] = []
-    silence_s = max(each.inter_frame_s for each in known)
+    answers: list[Answer] = []
+    silence_s = max(each.inter_frame_s for each in families)
     with BusLock(settings).acquire("scan"), Bus(short, silence_s) as bus:
         for unit in range(1, units + 1):
-            if answer := _ask(bus, unit, known):
-                found.append(answer)
+            if answer := _ask(bus, unit, families):
+                answers.append(answer)
                 say(str(answer))
             if unit % 10 == 0 or unit == units:
                 say(f"  {unit} of {units} units asked")
-    if not found:
+    if not answers:
         say(
             "no unit answers. Check power, wiring, termination, the line format (baud "
             "rate and parity) and the units' ids"
         )
-    return found
+    return answers
 
 
-def _ask(bus: Bus, unit: int, known: list[RegisterMap]) -> Found | None:
+def _ask(bus: Bus, unit: int, families: list[RegisterMap]) -> Answer | None:
     """What a unit is; None where it is silent, or a gateway says that it is."""
     there = False
     fitting: list[tuple[tuple[int, int], ModbusDrive, dict[str, int]]] = []
-    for each in known:
-        drive = ModbusDrive(bus, Axis.unmoved("", unit, each))
+    for family in families:
+        drive = ModbusDrive(bus, Axis.unmoved("", unit, family))
         try:
             drive.status(RETRIES)
         except Rejected as refusal:
@@ -126,18 +126,20 @@ def _ask(bus: Bus, unit: int, known: list[RegisterMap]) -> Found | None:
             told = drive.ids().items()
             identity = {name: value for name, value in told if isinstance(value, int)}
         proofs = [
-            (identity[n], *each.recognise[n]) for n in each.recognise if n in identity
+            (identity[n], *family.recognise[n])
+            for n in family.recognise
+            if n in identity
         ]
         if all(low <= value <= high for value, low, high in proofs):
             # Registers that are not there read as 0 in some drives.
             proved = sum(value != 0 for value, *_ in proofs)
             fitting.append(((proved, len(identity)), drive, identity))
     if not fitting:
-        return Found(unit, (), {}) if there else None
+        return Answer(unit, (), {}) if there else None
     fitting.sort(key=lambda one: one[0], reverse=True)
     _, first, identity = fitting[0]
     names = tuple(drive.axis.map.name for _, drive, _ in fitting)
     pulses = None
     with contextlib.suppress(BusError):
         pulses = first.pulses_per_rev()
-    return Found(unit, names, identity, pulses)
+    return Answer(unit, names, identity, pulses)

@@ -19,7 +19,7 @@ from rig.workbench.commission import steps
 from rig.workbench.commission.home import can_home
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.phone import serial_lines
-from rig.workbench.commission.scan import Found, parse_bus, scan
+from rig.workbench.commission.scan import Answer, parse_bus, scan
 from rig.workbench.toml import edit, new_text, set_values
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ SAFETY = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Given:
+class SetupOptions:
     """What the command line says, so that it is not asked."""
 
     bus: str = ""
@@ -90,7 +90,7 @@ def axis_kinds(text: str) -> dict[str, str]:
     return kinds
 
 
-def asked(*, axes: str, example: str, **given: Any) -> Given:
+def asked(*, axes: str, example: str, **given: Any) -> SetupOptions:
     """What the command line says, where it says nothing as of the example.
 
     Raises:
@@ -105,7 +105,7 @@ def asked(*, axes: str, example: str, **given: Any) -> Given:
             raise Refused(f"--axes {error}") from None
     elif urdf := options.get("model"):
         options["axes"] = dict.fromkeys(joint_names(urdf), "deg")
-    made = Given(**options)
+    made = SetupOptions(**options)
     if options.get("readings") and options.get("imu"):
         raise Refused("--imu and --readings: either a phone or a sensor measures")
     by_phone = {"X", "Y", "Z"} | ({"deg"} if made.model else set())
@@ -149,7 +149,7 @@ def setting(text: str) -> tuple[str, Any]:
         return key, value
 
 
-def simulated(simulator: Simulator, given: Given) -> Given:
+def simulated(simulator: Simulator, given: SetupOptions) -> SetupOptions:
     """What an operator would answer of a simulated device, and its phone started."""
     bus = simulator.start().bus
     where = f"{bus.transport}:{bus.host}:{bus.port}"
@@ -168,7 +168,7 @@ def simulated(simulator: Simulator, given: Given) -> Given:
     )
 
 
-def begin(path: pathlib.Path, given: Given, operator: Operator) -> RigConfig:
+def begin(path: pathlib.Path, given: SetupOptions, operator: Operator) -> RigConfig:
     """The configuration of a file, which is written where there is none."""
     operator.confirm(SAFETY, "setup")
     if not path.exists():
@@ -179,7 +179,9 @@ def begin(path: pathlib.Path, given: Given, operator: Operator) -> RigConfig:
     return load_config(path)
 
 
-def write_config(path: pathlib.Path, given: Given, operator: Operator) -> RigConfig:
+def write_config(
+    path: pathlib.Path, given: SetupOptions, operator: Operator
+) -> RigConfig:
     """Ask for bus, axes and phone, and write a new rig.toml."""
     say = operator.say
     say("1 ports")
@@ -189,14 +191,14 @@ def write_config(path: pathlib.Path, given: Given, operator: Operator) -> RigCon
     default = f"rtu:{lines[0].partition(':')[0]},115200,N,8,1" if lines else ""
     question = "bus, as rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT"
     bus = parse_bus(given.bus or operator.ask(question, default))
-    found: list[Found] = []
+    answers: list[Answer] = []
     if given.drives:
         say(f"2 scan: none of drives named by --drives {given.drives}")
     else:
         say(f"2 scan: units 1 to {given.units} on {bus.where}; reads only")
-        found = scan(bus, given.units, lambda text: say(f"  {text}"))
+        answers = scan(bus, given.units, lambda text: say(f"  {text}"))
     say("3 axes: which unit drives which joint. Step 8 checks it by moving them")
-    axes = _ask_axes(found, given, operator)
+    axes = _ask_axes(answers, given, operator)
     source: dict[str, Any]
     if given.readings:
         say("4 sensor")
@@ -229,13 +231,13 @@ def write_config(path: pathlib.Path, given: Given, operator: Operator) -> RigCon
 
 
 def _ask_axes(
-    found: list[Found], given: Given, operator: Operator
+    answers: list[Answer], given: SetupOptions, operator: Operator
 ) -> list[dict[str, Any]]:
-    usable = {each.unit: each for each in found if each.families}
+    usable = {each.unit: each for each in answers if each.families}
     if given.drives:
-        usable = {unit: Found(unit, (given.drives,), {}) for unit in range(1, 7)}
+        usable = {unit: Answer(unit, (given.drives,), {}) for unit in range(1, 7)}
     if len(usable) < len(given.names):
-        unknown = [each.unit for each in found if not each.families]
+        unknown = [each.unit for each in answers if not each.families]
         raise Refused(
             f"{len(given.names)} drives of a known family are needed, for "
             f"{', '.join(given.names)}; found {len(usable)}"
@@ -243,17 +245,17 @@ def _ask_axes(
             + ". Check power, wiring, termination, the line format, and that every "
             "drive has a unit id of its own; another family needs a map (docs/rig.md)"
         )
-    left, axes = sorted(usable), []
+    free, axes = sorted(usable), []
     for name, kind in given.axes.items():
-        choices = [str(unit) for unit in left]
+        choices = [str(unit) for unit in free]
         unit = int(operator.choose(f"unit of {name}", choices, choices[0]))
-        left.remove(unit)
-        each = usable[unit]
-        family = each.families[0]
-        if len(each.families) > 1:
-            question = f"unit {unit} could be {' or '.join(each.families)}: which"
-            family = operator.choose(question, list(each.families), family)
-        pulses = each.pulses_per_rev or int(
+        free.remove(unit)
+        answer = usable[unit]
+        family = answer.families[0]
+        if len(answer.families) > 1:
+            question = f"unit {unit} could be {' or '.join(answer.families)}: which"
+            family = operator.choose(question, list(answer.families), family)
+        pulses = answer.pulses_per_rev or int(
             operator.number(f"{name}: pulses for one motor turn", 10000)
         )
         axis = dict(name=name, kind=kind, unit=unit, family=family, pulses=pulses)
@@ -264,68 +266,68 @@ def _ask_axes(
     return axes
 
 
-def go(place: steps.Place, given: Given) -> int:
+def go(site: steps.Site, given: SetupOptions) -> int:
     """All steps from IDENTIFIED on; those that stand already are left out."""
-    operator, say, record = place.operator, place.say, place.record
-    assert place.path is not None
+    operator, say, record = site.operator, site.say, site.record
+    assert site.path is not None
     say(f"device record: {record.path}")
-    if record.missing(place.config, IDENTIFIED):
-        steps.identify(place)
+    if record.missing(site.config, IDENTIFIED):
+        steps.identify(site)
     say("5 imu")
-    pin(place, steps.look_at_phone(place))
-    if record.missing(place.config, HOMED):
+    pin(site, steps.look_at_phone(site))
+    if record.missing(site.config, HOMED):
         say("6 jog and home")
-        names = place.config.axis_names
+        names = site.config.axis_names
         choices = [*names, "no"]
         question = f"move an axis towards the zero posture ({', '.join(choices)})"
         while not operator.yes:
             if (name := operator.choose(question, choices, "no")) == "no":
                 break
             way = operator.number(f"{name}: degrees", 1.0, steps.MOST_JOG_DEG)
-            steps.jog(place, name, way)
+            steps.jog(site, name, way)
         how = "here"
-        if can_home(place.config):
+        if can_home(site.config):
             question = (
                 "home here (the device stands in its zero posture), or drive (each "
                 "drive runs its own homing)"
             )
             how = operator.choose(question, ["here", "drive"], given.home)
-        if code := steps.go_home(place, how == "here"):
+        if code := steps.go_home(site, how == "here"):
             return code
         say("7 limits")
-        _ask_limits(place)
-    if record.missing(place.config, STOP_PROVED):
+        _ask_limits(site)
+    if record.missing(site.config, STOP_PROVED):
         say("8 axes")
-        if code := steps.axes(place):
+        if code := steps.axes(site):
             return code
-    if record.missing(place.config, ZEROED):
+    if record.missing(site.config, ZEROED):
         say("9 zero")
-        if code := steps.take_zero(place):
+        if code := steps.take_zero(site):
             return code
     say(f"the device is commissioned: {record.path}")
-    say(f"next: {place.command('calibrate')}")
+    say(f"next: {site.command('calibrate')}")
     return EXIT_OK
 
 
-def pin(place: steps.Place, sender: str) -> None:
+def pin(site: steps.Site, sender: str) -> None:
     """Only this phone is listened to from now on."""
-    phone = place.config.imu
-    if place.path is None or not sender or phone is None or sender in phone.allow:
+    phone = site.config.imu
+    if site.path is None or not sender or phone is None or sender in phone.allow:
         return
-    place.operator.confirm(
+    site.operator.confirm(
         f"imu: listen to {sender} only, and to no other sender", "listen"
     )
-    place.take(edit(place.path, {"imu.allow": [sender]}))
+    site.take(edit(site.path, {"imu.allow": [sender]}))
 
 
-def _ask_limits(place: steps.Place) -> None:
-    assert place.path is not None
+def _ask_limits(site: steps.Site) -> None:
+    assert site.path is not None
     values: dict[str, float] = {}
-    for axis in place.config.axes:
+    for axis in site.config.axes:
         for end, name in (("lowest", "min_deg"), ("highest", "max_deg")):
             now = getattr(axis, name)
             question = f"{axis.name}: {end} angle that is safe, deg from home"
-            if (number := place.operator.number(question, now)) != now:
+            if (number := site.operator.number(question, now)) != now:
                 values[f"axes.{axis.name}.{name}"] = number
     if values:
-        place.take(edit(place.path, values))
+        site.take(edit(site.path, values))

@@ -46,7 +46,7 @@ class Enough(Exception):
 
 
 @dataclasses.dataclass
-class Place:
+class Site:
     """A device, its files, and who stands at it."""
 
     config: RigConfig  # with the addresses that are really used
@@ -123,40 +123,40 @@ def own_folder(config: RigConfig) -> pathlib.Path:
     return new_run_folder(pathlib.Path(config.output), "simulated")
 
 
-def identify(place: Place) -> None:
+def identify(site: Site) -> None:
     """The configured units answer as the configured families: IDENTIFIED."""
-    with place.bus("scan") as drives:
+    with site.bus("scan") as drives:
         found = identity(drives)
-    place.record.reach(IDENTIFIED, place.config, identity=found)
-    each = [f"{axis.name} is unit {axis.unit}" for axis in place.config.axes]
-    place.say(f"IDENTIFIED: {', '.join(each)}")
+    site.record.reach(IDENTIFIED, site.config, identity=found)
+    each = [f"{axis.name} is unit {axis.unit}" for axis in site.config.axes]
+    site.say(f"IDENTIFIED: {', '.join(each)}")
 
 
-def look_at_phone(place: Place, seconds: float = WATCH_S) -> str:
+def look_at_phone(site: Site, seconds: float = WATCH_S) -> str:
     """Wait for the phone and tell what it sends; its address."""
-    config = place.config
+    config = site.config
     with make_source(config) as imu:
         where = (
             addresses_text(config.imu, imu.port)
             if config.imu
             else sensor_text(config.source, imu.port)  # type: ignore[arg-type]
         )
-        place.say(
+        site.say(
             f"imu: {where}; then start its stream "
             f"(waiting for it up to {session.STREAM_WAIT_S:g} s)"
         )
-        for listener in place.listeners:
+        for listener in site.listeners:
             listener({"event": "listening", "port": imu.port})
         geometry = geometry_of(config)
-        watch(imu, geometry, seconds, session.STREAM_WAIT_S, place.say)
+        watch(imu, geometry, seconds, session.STREAM_WAIT_S, site.say)
         return imu.sender
 
 
-def go_home(place: Place, here: bool) -> int:
+def go_home(site: Site, here: bool) -> int:
     """Make the counts mean a place: HOMED."""
-    names = [axis.name for axis in place.config.axes]
-    if not here and not can_home(place.config):
-        without = {a.map.name for a in place.config.axes if not a.map.homes}
+    names = [axis.name for axis in site.config.axes]
+    if not here and not can_home(site.config):
+        without = {a.map.name for a in site.config.axes if not a.map.homes}
         raise Refused(
             f"the map {', '.join(sorted(without))} has no homing. Put the device into "
             "its home posture, then run `jaxcal-rig home --here`"
@@ -167,13 +167,13 @@ def go_home(place: Place, here: bool) -> int:
             f"the drives run their own homing one after another, {', '.join(names)}, "
         )
         what += "as far and as fast as they are set to"
-    place.operator.confirm(
+    site.operator.confirm(
         "home: the drives are armed; keep out of the device's reach, hand on the "
         f"emergency stop; {what}",
         "home",
     )
-    return place.run(
-        "home", lambda run, dev: home(run, dev, place.config, here), limits=False,
+    return site.run(
+        "home", lambda run, dev: home(run, dev, site.config, here), limits=False,
         again="home" + " --here" * here,
     )  # fmt: skip
 
@@ -185,25 +185,23 @@ def number_of(config: RigConfig, name: str) -> int:
     return config.axis_names.index(name)
 
 
-def jog(place: Place, name: str, way_deg: float) -> int:
+def jog(site: Site, name: str, way_deg: float) -> int:
     """Move one axis by so many degrees, cut at its limits.
 
     Where its gearing is not proved it stops once the phone has turned so far.
     """
-    axis = number_of(place.config, name)
-    unit = place.config.axes[axis].unit_name
-    homed = place.record.missing(place.config, HOMED) is None
+    axis = number_of(site.config, name)
+    unit = site.config.axes[axis].unit_name
+    homed = site.record.missing(site.config, HOMED) is None
     if not homed:
-        place.say("the device is not HOMED: the soft limits are not in force")
-    place.operator.confirm(
-        f"jog: {name} will move by {way_deg:g} {unit}, slowly", "jog"
-    )
+        site.say("the device is not HOMED: the soft limits are not in force")
+    site.operator.confirm(f"jog: {name} will move by {way_deg:g} {unit}, slowly", "jog")
 
     def procedure(run: Run, device: Device) -> None:
-        each, here = run.config.axes[axis], list(device.positions())
+        moved, here = run.config.axes[axis], list(device.positions())
         start, checked = here[axis], device.proof.reaches[axis].checked
-        goal = min(max(each.to_deg(start) + way_deg, each.min_deg), each.max_deg)
-        here[axis] = each.to_pulses(goal)
+        goal = min(max(moved.to_deg(start) + way_deg, moved.min_deg), moved.max_deg)
+        here[axis] = moved.to_pulses(goal)
         base = device.attitude()
         device.proof.stay_near(base, max(ALLOWED_DEG, 2.0 * abs(way_deg)))
 
@@ -217,84 +215,84 @@ def jog(place: Place, name: str, way_deg: float) -> int:
             move(device, Posture("jog", tuple(here)))
         except Enough as turned:
             device.stopper.stop("far enough by what is measured", latch=False)
-            gone = abs(each.to_deg(device.positions()[axis] - start))
+            gone = abs(moved.to_deg(device.positions()[axis] - start))
             run.say(
                 f"  stopped: {device.geometry.told} {turned} {device.geometry.unit} "
                 f"after {gone:.2g} {unit} commanded. Check the reduction of {name}"
             )
         run.say(
-            f"  {name} stands at {each.to_deg(device.positions()[axis]):.3f} {unit}"
+            f"  {name} stands at {moved.to_deg(device.positions()[axis]):.3f} {unit}"
         )
 
-    return place.run("jog", procedure, limits=homed, again=f"jog {name} {way_deg:g}")
+    return site.run("jog", procedure, limits=homed, again=f"jog {name} {way_deg:g}")
 
 
-def characterise(place: Place, name: str) -> int:
+def characterise(site: Site, name: str) -> int:
     """Measure play, dead zone and breakaway of an axis."""
     from rig.workbench.commission import characterise as measured
 
-    axis = number_of(place.config, name)
+    axis = number_of(site.config, name)
     most = measured.BASE_DEG + measured.FAR_DEG
-    place.operator.confirm(
+    site.operator.confirm(
         f"characterise: {name} will move up to {most:.2f} "
-        f"{place.config.axes[axis].unit_name} from where it stands, "
+        f"{site.config.axes[axis].unit_name} from where it stands, "
         "many times. Keep out of the device's reach",
         "characterise",
     )
 
-    return place.run(
+    return site.run(
         "characterise", lambda run, device: measured.characterise(run, device, axis),
         again=f"characterise {name}",
     )  # fmt: skip
 
 
-def axes(place: Place) -> int:
+def axes(site: Site) -> int:
     """Check each axis, correct rig.toml after a yes, and check again: SIGN_CHECKED."""
-    place.operator.confirm(
+    site.operator.confirm(
         "axes: the device stands in its zero posture. Each axis in turn will move a "
         "little, then up to 3 deg either way; then all by turns, up to 6 deg. "
         "Watch that the joint that moves is the one that is named, and keep out of the "
         "device's reach",
         "axes",
     )
-    return _check_axes(place)
+    return _check_axes(site)
 
 
-def _check_axes(place: Place, again: bool = False) -> int:
+def _check_axes(site: Site, again: bool = False) -> int:
     changes: list[Change] = []
-    code = place.run("axes", lambda run, dev: changes.extend(check_axes(run, dev)))
+    code = site.run("axes", lambda run, dev: changes.extend(check_axes(run, dev)))
     if code or not changes:
         return code
-    place.say("rig.toml does not say what the device does:")
+    site.say("rig.toml does not say what the device does:")
     for change in changes:
-        place.say(f"  {change}")
-    if again or place.path is None:
-        place.say(
+        site.say(f"  {change}")
+    if again or site.path is None:
+        site.say(
             "the device is NOT SIGN_CHECKED: correct rig.toml, then run `jaxcal-rig "
             "axes` again"
         )
         return EXIT_RECALIBRATE
-    place.operator.confirm(
-        f"axes: write this to {place.path}, then move the axes again", "correct"
+    site.operator.confirm(
+        f"axes: write this to {site.path}, then move the axes again", "correct"
     )
     # What was proved of the drives goes with their cables.
-    place.take(edit(place.path, {change.key: change.new for change in changes}))
-    place.say(f"  written; the old file is kept beside {place.path}")
-    homed = place.record.state(HOMED) or {}
-    identify(place)
+    site.take(edit(site.path, {change.key: change.new for change in changes}))
+    site.say(f"  written; the old file is kept beside {site.path}")
+    homed = site.record.state(HOMED) or {}
+    identify(site)
     # Which also forgets where each named axis was left: it is not what it was.
-    place.record.reach(HOMED, place.config, **homed)
-    return _check_axes(place, again=True)
+    site.record.reach(HOMED, site.config, **homed)
+    return _check_axes(site, again=True)
 
 
-def take_zero(place: Place) -> int:
+def take_zero(site: Site) -> int:
     """Measure the zero posture: ZEROED."""
-    place.operator.confirm(
+    site.operator.confirm(
         "zero: the device stands in its zero posture (jig, level), or moves to pulse 0 "
         'with session.zero = "drive"; what is measured there is its zero',
         "zero",
     )
-    return place.run("zero", lambda run, device: session.take_zero(device))
+    return site.run("zero", lambda run, device: session.take_zero(device))
 
 
 def commissioned(path: pathlib.Path, config: RigConfig, through: str) -> DeviceRecord:

@@ -234,8 +234,11 @@ def _reset_alarms(run: Run, device: Device, name: str) -> None:
     for drive in device.drives:
         if not drive.status().fault:
             continue
-        known = drive.can_reset
-        if not known or drive.bring(drive.reset, lambda status: not status.fault).fault:
+        resettable = drive.can_reset
+        if (
+            not resettable
+            or drive.bring(drive.reset, lambda status: not status.fault).fault
+        ):
             raise MotionFault(
                 f"{drive.axis.name} stays in alarm after {name}: {drive.alarm()}. "
                 "Reset it, then run `jaxcal-rig axes` again"

@@ -122,9 +122,9 @@ def order_residuals(
     attitudes = np.array([r["attitude"] for r in records])
     rms: dict[str, float] = {}
     for order in ORDERS:
-        left = across @ frame.angles(attitudes, order)
+        residual = across @ frame.angles(attitudes, order)
         rms[order] = float(
-            np.sqrt((left**2).sum() / (left.shape[1] * (len(records) - count)))
+            np.sqrt((residual**2).sum() / (residual.shape[1] * (len(records) - count)))
         )
     best = min(rms, key=lambda order: rms[order])
     noise = float(np.mean([r["std_deg"] for r in records]))
@@ -161,9 +161,9 @@ def check_matrix(config: RigConfig, matrix: ArrayLike) -> list[str]:
     for i, name in enumerate(config.output_names):
         if name not in names:
             continue
-        own, strongest = names.index(name), int(np.abs(gains[i]).argmax())
-        gain = gains[i, own]
-        if strongest != own:
+        column, strongest = names.index(name), int(np.abs(gains[i]).argmax())
+        gain = gains[i, column]
+        if strongest != column:
             faults.append(
                 f"{name} follows the command of {names[strongest]} "
                 f"({gains[i, strongest]:.2f} deg for each degree) more than its own "

@@ -50,16 +50,16 @@ def estimate_drift(
     size, end = float(np.abs(seen).max()), np.abs(seen[-1])
     straight = bool((bend <= np.maximum(least, STRAIGHT * end.max())).all())
     corrected = len(visits) == 3 and straight and bool((end > least).any())
-    left = float(bend.max()) if corrected else size
+    remaining = float(bend.max()) if corrected else size
     return {
         "minutes": minutes.round(4).tolist(),
         "angles_deg": seen.tolist(),
         "size_deg": size,
         "turn_deg_per_min": turn.tolist(),
         "corrected": corrected,
-        "left_deg": left,
+        "left_deg": remaining,
         "limit_deg": limit_deg,
-        "over": left > limit_deg,
+        "over": remaining > limit_deg,
     }
 
 

@@ -111,14 +111,14 @@ def spread(off: Array) -> dict[str, Any]:
 
 
 def held_out_errors(
-    config: RigConfig, held: list[Any], found: dict[str, Record], calibration: Any
+    config: RigConfig, held: list[Any], postures: dict[str, Record], calibration: Any
 ) -> tuple[list[Record], dict[str, Any]]:
     """Errors at held-out targets ``before`` and ``after`` compensation, in degrees.
 
     Args:
         config: the device's.
         held: pairs of pulses, raw and compensated.
-        found: records by the names ``before:0``, ``after:0``, ...
+        postures: records by the names ``before:0``, ``after:0``, ...
         calibration: what predicts the measurements.
 
     Returns:
@@ -126,11 +126,13 @@ def held_out_errors(
         those of the ``prediction``; nothing where there are none.
     """
     roles = ("before", "after")
-    both = [i for i in range(len(held)) if found.keys() >= {f"{r}:{i}" for r in roles}]
+    both = [
+        i for i in range(len(held)) if postures.keys() >= {f"{r}:{i}" for r in roles}
+    ]
     if not both:
         return [], {}
     desired = config.to_deg([held[i][0] for i in both])
-    visited = {role: [found[f"{role}:{i}"] for i in both] for role in roles}
+    visited = {role: [postures[f"{role}:{i}"] for i in both] for role in roles}
     errors = {role: spread(pairs(r)[1] - desired) for role, r in visited.items()}
     records = visited["before"] + visited["after"]
     commands, measured = pairs(records)

@@ -57,10 +57,10 @@ def held_out_errors(
         return {}
     commands, measured = outputs(config, records)
     designed = model.model.predict(commands)
-    found = calibration.predict(commands)
+    predicted = calibration.predict(commands)
     return {
         "before": spread(measured - designed),
-        "prediction": spread(measured - found),
+        "prediction": spread(measured - predicted),
     }
 
 
@@ -79,13 +79,13 @@ def conclude(
     )
     calibration = identify(config, model, chosen)
     errors = held_out_errors(config, model, calibration, held)
-    own = calibration.verdict
+    verdict = calibration.verdict
     summary = told | errors | {
         "model": calibration.model.title,
         "parameters": parameters(calibration),
         "noise_std_deg": np.ravel(calibration.noise_std).tolist()
         if calibration.noise_std is not None else None,
-        "fit": {"good": bool(own.good), "reasons": list(own.reasons)},
+        "fit": {"good": bool(verdict.good), "reasons": list(verdict.reasons)},
     }  # fmt: skip
     reasons = recalibrate(summary, config.session.verify_limit_deg)
     notes |= {"verdict": {"good": not reasons, "reasons": reasons}}

@@ -59,9 +59,9 @@ def guarded(app: ASGIApp) -> ASGIApp:
 
         if scope["type"] in ("http", "websocket"):
             headers = Headers(scope=scope)
-            own = f"http://{headers['host']}"
+            origin = f"http://{headers['host']}"
             reads = scope.get("method") in ("GET", "HEAD")
-            if headers.get("origin", own if reads else "").lower() != own.lower():
+            if headers.get("origin", origin if reads else "").lower() != origin.lower():
                 refusal = PlainTextResponse(
                     "Refused: a request of another site.\n", 403
                 )

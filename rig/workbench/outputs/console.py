@@ -29,11 +29,11 @@ def listen(run: Run) -> None:
         state.apply(record)
         lines = event_lines(record)
         if record["event"] == "posture":
-            left = f", about {state.left_s():.0f} s left" if state.left_s() else ""
+            remaining = f", about {state.left_s():.0f} s left" if state.left_s() else ""
             lines = [
                 f"  [{len(state.done):>3}/{state.planned}] {record['name']:<12} "
                 f"u [{numbers(record['commanded_deg'], 8, 3)}]  "
-                f"y [{numbers(record['measured_deg'], 8, 3)}]{left}"
+                f"y [{numbers(record['measured_deg'], 8, 3)}]{remaining}"
             ]
         if threading.current_thread() is threading.main_thread():
             run.say(*lines)

@@ -196,8 +196,8 @@ def _ros(inverse: dict[str, Any]) -> str:
     lines += ["/**:", "  ros__parameters:", "    jaxcal:"]
     for name, value in (inverse | texts).items():
         values = np.ravel(value).tolist()
-        each = [_real(v) if isinstance(v, float) else json.dumps(v) for v in values]
-        text = each[0] if isinstance(value, str) else f"[{', '.join(each)}]"
+        written = [_real(v) if isinstance(v, float) else json.dumps(v) for v in values]
+        text = written[0] if isinstance(value, str) else f"[{', '.join(written)}]"
         lines.append(f"      {name}: {text}")
     return "\n".join([*lines, ""])
 

@@ -96,22 +96,22 @@ def _result(state: RunState, summary: Record) -> list[Section]:
         shown = {"raw": "before", "compensated": "after"}
         if state.start["config"].get("model"):
             shown = {"as designed": "before", "calibrated": "prediction"}
-        each = {t: summary[key]["each"] for t, key in shown.items() if key in summary}
-        alt = f"held-out errors in {state.unit}, {' and '.join(each)}"
+        errors = {t: summary[key]["each"] for t, key in shown.items() if key in summary}
+        alt = f"held-out errors in {state.unit}, {' and '.join(errors)}"
         names = summary.get("outputs", state.names[1])
         draw = functools.partial(draw_errors, names=names, unit=state.unit)
-        parts.append(drawn(draw, each, (9, 3.4), alt))
+        parts.append(drawn(draw, errors, (9, 3.4), alt))
     if rms := summary.get("orders", {}).get("rms"):
         rows = [[order, f"{left:.4f}"] for order, left in rms.items()]
         told = f"configured: {summary['orders']['configured']}"
         parts.append(Table(["Euler order", "residual, degrees rms"], rows, told))
-    found = [Section("Result", parts)] if parts else []
+    sections = [Section("Result", parts)] if parts else []
     if changes := summary.get("changed"):
         rows = [[key, str(old), str(new)] for key, (old, new) in changes.items()]
         head = ["key of rig.toml", "as recorded", "here"]
         title = f"Identified anew from {summary['refit_of']}"
-        found.append(Section(title, [Table(head, rows, numeric=False)]))
-    return found
+        sections.append(Section(title, [Table(head, rows, numeric=False)]))
+    return sections
 
 
 def _measured(state: RunState, records: list[Record]) -> Section:

@@ -101,8 +101,8 @@ class RunState:
             case "plan" | "replan":
                 points = [self.to_deg(p) for p in record.get("candidates", [])]
                 self.candidates = points or self.candidates
-                for name, each in [*self.postures.items()]:
-                    if each.role == "select" and each.state == "waiting":
+                for name, visited in [*self.postures.items()]:
+                    if visited.role == "select" and visited.state == "waiting":
                         del self.postures[name]
                 for index in record["choice"]["indices"]:
                     self._posture(f"select:{index}").commanded = self.candidates[index]

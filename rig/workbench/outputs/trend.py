@@ -43,7 +43,7 @@ def read_runs(folder: pathlib.Path) -> tuple[list[Device], list[str]]:
     Returns:
         The devices, and a line for each journal that could not be read.
     """
-    found: dict[str, list[Record]] = {}
+    runs_of_device: dict[str, list[Record]] = {}
     skipped = []
     for path in sorted(folder.rglob("journal.jsonl")):
         try:
@@ -62,8 +62,8 @@ def read_runs(folder: pathlib.Path) -> tuple[list[Device], list[str]]:
         except (OSError, JournalError, ValueError, KeyError, IndexError) as error:
             skipped.append(f"{path.parent}: {error}")
             continue
-        found.setdefault(json.dumps(device, sort_keys=True), []).append(run)
-    return [_device(runs) for runs in found.values()], skipped
+        runs_of_device.setdefault(json.dumps(device, sort_keys=True), []).append(run)
+    return [_device(runs) for runs in runs_of_device.values()], skipped
 
 
 def _device(runs: list[Record]) -> Device:
@@ -105,11 +105,11 @@ def _moved(before: Record, now: Record) -> list[str]:
 def _moved_parameters(before: Record, now: Record) -> list[str]:
     """Parameters of a model that differ by more than their intervals allow."""
     moved = []
-    for name, found in now.items():
-        if name not in before or found["half_width"] is None:
+    for name, parameter in now.items():
+        if name not in before or parameter["half_width"] is None:
             continue
-        change = found["value"] - before[name]["value"]
-        allowed = math.hypot(found["half_width"], before[name]["half_width"] or 0.0)
+        change = parameter["value"] - before[name]["value"]
+        allowed = math.hypot(parameter["half_width"], before[name]["half_width"] or 0.0)
         if abs(change) > allowed:
             moved.append(f"{name} {change:+.4g} (interval {allowed:.4g})")
     return moved

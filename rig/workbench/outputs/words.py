@@ -151,10 +151,10 @@ def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
     )
     if "after" in summary:
         lines.append(f"held-out {error_text(summary, unit)}")
-    elif found := summary.get("prediction"):  # a refit: nothing was compensated by it
+    elif errors := summary.get("prediction"):  # a refit: nothing was compensated by it
         lines.append(
-            f"held-out postures predicted to {found['rms']:.4f} {unit} rms "
-            f"(max {found['max']:.4f})"
+            f"held-out postures predicted to {errors['rms']:.4f} {unit} rms "
+            f"(max {errors['max']:.4f})"
         )
     if summary.get("drift"):
         lines.append(f"drift: {drift_text(summary['drift'], outputs, unit)}")
@@ -179,12 +179,12 @@ def _model_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
     """Parameters of a model with their intervals, the errors and the verdict."""
     unit, count = summary["unit"], len(summary["postures"])
     lines = [f"model {summary['model']}, fitted to {count} postures, +- 95 % each:"]
-    for name, found in summary["parameters"].items():
-        wide = found["half_width"]
+    for name, parameter in summary["parameters"].items():
+        wide = parameter["half_width"]
         sure = "" if wide is None else f" +- {wide:.4g}"
         lines.append(
-            f"  {name:<14} {found['value']:11.5g}{sure}  (designed "
-            f"{found['designed']:.5g})"
+            f"  {name:<14} {parameter['value']:11.5g}{sure}  (designed "
+            f"{parameter['designed']:.5g})"
         )
     if "prediction" in summary:
         lines.append(f"held-out {prediction_text(summary, unit)}")

@@ -130,25 +130,25 @@ def _held_out(run: Run, calibration: Any) -> list[Any]:
     Where a chosen posture was withdrawn since, the compensated commands came from a
     wrong calibration: they are drawn again, and what was measured there is withdrawn.
     """
-    known = run.journal.events("held_out")
+    drawn = run.journal.events("held_out")
     voids = [
         record["seq"]
         for record in run.journal.events("void")
         if any(name.startswith("select:") for name in record["names"])
     ]
-    if known and not (voids and voids[-1] > known[-1]["seq"]):
-        return known[-1]["pairs"]
+    if drawn and not (voids and voids[-1] > drawn[-1]["seq"]):
+        return drawn[-1]["pairs"]
     stale = [n for n in run.postures() if n.startswith(("before:", "after:", "held:"))]
     if stale:
         run.emit("void", sync=True, names=stale)
     wanted = run.config.session.verify_postures
-    found = draw_held_out(run.config, calibration, wanted)
-    if len(found) < wanted:
+    targets = draw_held_out(run.config, calibration, wanted)
+    if len(targets) < wanted:
         run.say(
-            f"  note: only {len(found)} of {wanted} held-out targets can be reached "
+            f"  note: only {len(targets)} of {wanted} held-out targets can be reached "
             "compensated within the ranges"
         )
-    return run.emit("held_out", sync=True, pairs=found)["pairs"]
+    return run.emit("held_out", sync=True, pairs=targets)["pairs"]
 
 
 def pair_names(held: list[Any]) -> list[str]:

@@ -160,10 +160,10 @@ def travel_order(config: RigConfig, points_deg: Array, start_deg: Array) -> list
         times = travel_times(points_deg, points_deg, motion)
         return [int(i) for i in fastest_tour(times, here)[0]]
     order: list[int] = []
-    left = np.arange(len(points_deg))
-    while len(left):
-        order.append(int(left[here[left].argmin()]))
-        left = left[left != order[-1]]
+    unvisited = np.arange(len(points_deg))
+    while len(unvisited):
+        order.append(int(unvisited[here[unvisited].argmin()]))
+        unvisited = unvisited[unvisited != order[-1]]
         here = travel_times(points_deg[order[-1:]], points_deg, motion)[0]
     return order
 

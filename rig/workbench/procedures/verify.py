@@ -42,8 +42,8 @@ def load_calibration(
     path = path / "calibration.json" if path.is_dir() else path
     try:
         made = None if config.is_arm else model_of(config)  # a file holds an arm
-        own = None if made is None else made.model
-        calibration = jaxcal.Calibration.load(path, model=own)
+        model = None if made is None else made.model
+        calibration = jaxcal.Calibration.load(path, model=model)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise Refused(f"{path}: not a calibration: {error}") from None
     notes = calibration.provenance.get("notes", {})
@@ -99,10 +99,10 @@ def verify(run: Run, calibration: Any, count: int) -> int:
             run.emit("phase", phase="saving")
     if run.model is not None:
         records = [r for r in run.postures().values() if r["role"] == "held"]
-        found = of_model.held_out_errors(config, run.model, calibration, records)
+        errors = of_model.held_out_errors(config, run.model, calibration, records)
     else:
-        records, found = held_out_errors(config, held, run.postures(), calibration)
-    if not found:
+        records, errors = held_out_errors(config, held, run.postures(), calibration)
+    if not errors:
         raise Refused(
             "no held-out posture could be reached. Narrow session.*_range_deg to what "
             "the device reaches"
@@ -110,10 +110,10 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     limit = config.session.verify_limit_deg
     worst = "after" if run.model is None else "prediction"
     words = error_text if run.model is None else prediction_text
-    again = found[worst]["max"] > limit
+    again = errors[worst]["max"] > limit
     run.save_pairs()
-    run.save_summary({**found, "limit_deg": limit, "recalibrate": again})
-    run.say(f"{words(found, config.output_unit)}, limit {limit:g}")
+    run.save_summary({**errors, "limit_deg": limit, "recalibrate": again})
+    run.say(f"{words(errors, config.output_unit)}, limit {limit:g}")
     if calibration.noise_std is not None:
         rows = of_model.outputs(config, records) if run.model else pairs(records)
         told = calibration.check(*rows, tolerance=limit)
