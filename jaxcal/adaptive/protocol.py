@@ -76,11 +76,10 @@ def listen(loop: Loop, path: str | os.PathLike[str]) -> None:
             server.listen(1)
             while True:
                 connection, _ = server.accept()
-                with connection, connection.makefile("rw", encoding="utf-8") as file:
-                    try:
+                with connection, connection.makefile("r", encoding="utf-8") as file:
+                    try:  # a buffer would be flushed again where it is closed
                         for answer in answers(loop, file):
-                            file.write(answer)
-                            file.flush()
+                            connection.sendall(answer.encode())
                     except (BrokenPipeError, ConnectionResetError):
                         continue
         finally:

@@ -148,6 +148,9 @@ def test_a_local_socket_answers_one_program_after_the_other(file, tmp_path):
         end = time.monotonic() + 120.0
         while not path.exists() and time.monotonic() < end:
             time.sleep(0.05)
+        with socket.socket(socket.AF_UNIX) as gone:  # before its answers are there
+            gone.connect(os.fspath(path))
+            gone.sendall(b'{"do": "state"}\n' * 3)
         for number in range(2):
             with socket.socket(socket.AF_UNIX) as mine:
                 mine.connect(os.fspath(path))
