@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import statistics
 import time
+from typing import Any
 
 import numpy as np
 
 from benchmarks.harness import Budget, Line, Row, Verdict
 from jaxcal import Design, Mean, Worst
+from jaxcal.selection.exact.exact import relaxed
 from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
 
 NAME = "scenarios"
@@ -47,6 +49,11 @@ def run(budget: Budget) -> Row:
                 case = f"{criterion}, {apart:.0%} apart"
                 _searches(row, case, designs, criterion)
                 _proofs(row, case, designs[:many], criterion, limit)
+                _root(row, case, designs[0], criterion, budget)
+    for letter in "DA":  # of one scenario, as many readings as parameters
+        blocks = np.random.default_rng(0).standard_normal((_M, 1, _P))
+        one = [Design.from_blocks(blocks)]
+        _proofs(row, f"{letter}, one scenario, one reading", one, letter, limit)
     row.notes.append(
         "processor time of one thread; a proof is `select(12, criterion, "
         f"least_efficiency={_WANTED}, time_limit={limit})`, the whole call"
@@ -75,8 +82,26 @@ def _searches(
         row.verdicts.append(Verdict(f"{case}: {name}", middle, _WANTED_MS, False, "ms"))
 
 
+def _root(
+    row: Row, case: str, one: Design, criterion: Mean | Worst, budget: Budget
+) -> None:
+    """What the relaxation alone proves of a selection found with much time."""
+    problem = one.problem(_K, criterion)
+    starts = budget.pick(12 if problem.criterion.kind == "least" else 100, 2)
+    chosen = np.sort(exchange_indices(problem, starts, seed=1))
+    best, usual = problem.values(
+        np.stack([chosen, np.sort(exchange_indices(problem))])
+    )[0]
+    bound = float(problem.criterion.reported(relaxed(problem, chosen)))
+    share = problem.criterion.efficiency
+    note = f"best of {starts} starts; the default exchange: {share(usual, best):.4f}"
+    row.lines.append(
+        Line(case, "efficiency by the relaxation", share(best, bound), "", note)
+    )
+
+
 def _proofs(
-    row: Row, case: str, designs: list[Design], criterion: Mean | Worst, limit: float
+    row: Row, case: str, designs: list[Design], criterion: Any, limit: float
 ) -> None:
     seconds, efficiencies = [], []
     for one in designs:
