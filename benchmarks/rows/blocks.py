@@ -122,7 +122,8 @@ def _relaxation(row: Row, joints: Array, criterion: str, budget: Budget) -> None
         problem = _problem(joints, k, criterion)
         start = np.bincount(greedy_indices(problem), minlength=len(joints))
         solve = functools.partial(
-            search.branch_and_bound, problem.blocks, problem.prior, problem.criterion,
+            search.branch_and_bound,
+            search.Scenario(problem.blocks, problem.prior, problem.criterion),
             problem.lower, problem.upper, start, root_only=True,
         )  # fmt: skip
         bound = solve().bound

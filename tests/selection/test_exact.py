@@ -12,7 +12,7 @@ from questions import make_problem, score
 from jaxcal.models import Affine
 from jaxcal.selection import exact_batch, exchange_batch, select
 from jaxcal.selection.exact import exact as exact_module
-from jaxcal.selection.exact.branch_and_bound import branch_and_bound
+from jaxcal.selection.exact.branch_and_bound import Scenario, branch_and_bound
 from jaxcal.selection.exact.exact import solve_exact, upper_bound
 from jaxcal.selection.exact.volume import largest_volumes
 from jaxcal.selection.exchange.exchange import exchange_indices
@@ -179,10 +179,8 @@ def test_hull_enumeration_and_branch_and_bound_agree_on_a_sphere():
     problem = make_problem(sphere(0, 40), 4)
     enumerated = solve_exact(problem)
     start = np.bincount(exchange_indices(problem, 5), minlength=40)
-    branched = branch_and_bound(
-        problem.blocks, problem.prior, problem.criterion, problem.lower, problem.upper,
-        start,
-    )  # fmt: skip
+    alone = Scenario(problem.blocks, problem.prior, problem.criterion)
+    branched = branch_and_bound(alone, problem.lower, problem.upper, start)
     assert branched.proven
     assert problem.log_det(enumerated.indices) == pytest.approx(
         problem.log_det(np.flatnonzero(branched.counts[0])), abs=1e-8

@@ -16,7 +16,7 @@ from jaxcal.deadline import Deadline
 from jaxcal.models import Affine
 from jaxcal.selection import select
 from jaxcal.selection.criteria import CRITERIA, Criterion
-from jaxcal.selection.exact.branch_and_bound import branch_and_bound
+from jaxcal.selection.exact.branch_and_bound import Scenario, branch_and_bound
 from jaxcal.selection.exact.exact import upper_bound
 
 Array = np.ndarray
@@ -82,7 +82,7 @@ def test_branch_and_bound_is_brute_force(
     )
     order = np.argsort(-values)
     start = counts[order[len(order) // 2]]
-    arguments = (blocks, prior, criterion, lower, upper, start)
+    arguments = (Scenario(blocks, prior, criterion), lower, upper, start)
     found = branch_and_bound(*arguments, best=best)
     wanted = values[order[:best]]
     assert found.proven
@@ -113,9 +113,8 @@ def test_the_relaxation_is_that_of_a_general_solver(name: str) -> None:
     counts = [np.bincount(s, minlength=12) for s in subsets(12, 6)]
     start = max(counts, key=lambda c: phi(blocks, prior, criterion, np.flatnonzero(c)))
     whole = np.ones(12, dtype=np.int64)
-    found = branch_and_bound(
-        blocks, prior, criterion, 0 * whole, whole, start, root_only=True
-    )
+    scenario = Scenario(blocks, prior, criterion)
+    found = branch_and_bound(scenario, 0 * whole, whole, start, root_only=True)
     optimum = phi(blocks, prior, criterion, np.flatnonzero(start))
     relaxed = -float(solved.fun)
     slack = 0.06 * (relaxed - optimum) + 1e-3 * abs(relaxed) * (name == "E") + 1e-7
@@ -149,9 +148,8 @@ def test_few_readings_are_bounded_far_below_the_natural_relaxation() -> None:
     start = np.bincount([0, 1], minlength=20)
     plain = CRITERIA["D"].of_rows(np.eye(12))
     prior = 1e-4 * np.eye(12)
-    sharp = branch_and_bound(
-        blocks, prior, plain, 0 * whole, whole, start, root_only=True
-    )
+    scenario = Scenario(blocks, prior, plain)
+    sharp = branch_and_bound(scenario, 0 * whole, whole, start, root_only=True)
     spread = prior + np.einsum("iqa,iqb->ab", blocks, blocks) * 0.1
     assert sharp.bound < float(np.linalg.slogdet(spread)[1]) - 10.0
 

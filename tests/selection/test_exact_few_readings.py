@@ -16,7 +16,7 @@ from jaxcal.commands.main import main
 from jaxcal.deadline import Deadline
 from jaxcal.selection import select
 from jaxcal.selection.criteria import CRITERIA, Criterion
-from jaxcal.selection.exact.branch_and_bound import branch_and_bound
+from jaxcal.selection.exact.branch_and_bound import Scenario, branch_and_bound
 
 Array = np.ndarray
 laws = settings(max_examples=60, deadline=None)
@@ -65,7 +65,8 @@ def test_few_readings_of_many_parameters_are_brute_force(
     counts = [c for c in counts if (c >= lower).all() and (c <= upper).all()]
     values = np.array([phi(blocks, prior, criterion, c) for c in counts])
     order = np.argsort(-values)
-    arguments = (blocks, prior, criterion, lower, upper, counts[order[-1]])
+    scenario = Scenario(blocks, prior, criterion)
+    arguments = (scenario, lower, upper, counts[order[-1]])
     root = branch_and_bound(*arguments, root_only=True)
     assert root.bound >= values.max() - 1e-8 * max(1.0, abs(values.max()))
     found = branch_and_bound(*arguments, best=best)
@@ -85,9 +86,8 @@ def test_variances_that_no_reading_is_left_for_stay(name: str) -> None:
     root = np.eye(12) if name == "A" else rng.normal(size=(12, 12))
     criterion = CRITERIA[name].of_rows(root)
     arguments = (0 * whole, whole, np.bincount([0, 1], minlength=60))
-    bound = branch_and_bound(
-        blocks, np.eye(12), criterion, *arguments, root_only=True
-    ).bound
+    scenario = Scenario(blocks, np.eye(12), criterion)
+    bound = branch_and_bound(scenario, *arguments, root_only=True).bound
     stays = np.linalg.eigvalsh(root.T @ root)[:6].sum()
     natural = -criterion.value(np.eye(12) + np.einsum("iqa,iqb->ab", blocks, blocks))
     assert natural < 1e-3 * stays
@@ -99,7 +99,7 @@ def test_a_time_limit_is_kept_while_nodes_are_slow() -> None:
     rng = np.random.default_rng(1)
     blocks, whole = rng.normal(size=(120, 3, 60)), np.ones(120, dtype=np.int64)
     criterion = CRITERIA["A"].of_rows(np.eye(60))
-    arguments = (blocks, 1e-2 * np.eye(60), criterion, 0 * whole)
+    arguments = (Scenario(blocks, 1e-2 * np.eye(60), criterion), 0 * whole)
     start = np.bincount(np.arange(15), minlength=120)
     first = branch_and_bound(*arguments, whole, start, deadline=Deadline(0.0))
     assert first.nodes == 1

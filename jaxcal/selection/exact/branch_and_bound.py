@@ -22,7 +22,7 @@ from jaxcal.deadline import NEVER, Deadline
 from jaxcal.information.blocks import gram, largest_rank
 from jaxcal.selection.criteria import Criterion, Joined
 
-__all__ = ["Scenario", "branch_and_bound", "joint_branch_and_bound"]
+__all__ = ["JointScenarios", "Scenario", "branch_and_bound"]
 
 TOLERANCE = 1e-10  # of phi of "det"; of the others a share of it
 _MEMORY = 64 * 2**20  # bytes of open nodes up to which the best bound goes first
@@ -44,10 +44,35 @@ class BranchResult:
     proven: bool
 
 
+class Scenario(NamedTuple):
+    """What a choice is judged by, in its own coordinates."""
+
+    blocks: Array  # (M, q, p) whitened
+    prior: Array  # (p, p) precision
+    criterion: Criterion
+
+
+class JointScenarios(NamedTuple):
+    """Several scenarios over the same candidates, and how their phi are joined."""
+
+    members: Sequence[Scenario]
+    criterion: Joined
+    weights: Array  # (S,) of sum 1
+    terms: tuple[Array, Array]  # (S,) scale and shift of phi, see ``Joined.terms``
+
+
+class _Started(NamedTuple):
+    """The kernel's search, in whose units phi is near 1."""
+
+    search: Any
+    scale: float  # phi of the caller is scale times the kernel's, plus shift
+    shift: float
+    largest: float  # the kernel's phi at most
+    work: int  # multiplications of one evaluation of all candidates
+
+
 def branch_and_bound(
-    blocks: Array,
-    prior: Array,
-    criterion: Criterion,
+    judged_by: Scenario | JointScenarios,
     lower: Indices,
     upper: Indices,
     start: Indices,
@@ -59,9 +84,7 @@ def branch_and_bound(
     """The ``best`` selections by phi of the criterion, with proof.
 
     Args:
-        blocks: (M, q, p) whitened.
-        prior: (p, p) precision in the same coordinates.
-        criterion: in the same coordinates.
+        judged_by: blocks, prior and criterion, of one scenario or of several.
         lower: (M,) least counts.
         upper: (M,) largest counts.
         start: (M,) counts of a good selection, sum k.
@@ -71,90 +94,72 @@ def branch_and_bound(
             proof has had a fair try.
         root_only: stop at the bound of the relaxation.
     """
-    root, scale, shift, trivial = _near_one(blocks, prior, criterion, start, upper)
-    useful = min(trivial, _USEFUL.get(criterion.kind, np.inf))
-    incumbents = _incumbents(best, len(blocks))
+    incumbents = _incumbents(best, len(start))
+    if isinstance(judged_by, Scenario):
+        started = _search(judged_by, upper, start, incumbents)
+    else:
+        started = _joint_search(judged_by, upper, start, incumbents)
+    counts = np.array([lower, upper, start], dtype=np.float64)
+    good = (0.0, np.inf) if root_only else (0.0, -np.inf)
+    if enough is not None:
+        slope, shift = judged_by.criterion.enough(enough)
+        good = slope, shift / started.scale
+    return _searched(started, incumbents, counts, deadline, good, root_only)
+
+
+def _search(
+    scenario: Scenario, upper: Indices, start: Indices, incumbents: Any
+) -> _Started:
+    """The search of one scenario."""
+    root, scale, shift, largest = _near_one(*scenario, start, upper)
+    blocks, prior, criterion = scenario
+    useful = min(largest, _USEFUL.get(criterion.kind, np.inf))
     search = compiled.kernel("jaxcal.selection.exact.branch_kernel").Search(
         criterion.form, blocks, prior, root, start.sum(), largest_rank(blocks), useful,
         *incumbents,
     )  # fmt: skip
-    counts = np.array([lower, upper, start], dtype=np.float64)
-    good = criterion.enough(enough) if enough is not None else None
-    units, work = (scale, shift, trivial), blocks.size * blocks.shape[2]
-    return _searched(search, incumbents, counts, units, work, deadline, good, root_only)
+    return _Started(search, scale, shift, largest, blocks.size * blocks.shape[2])
 
 
-class Scenario(NamedTuple):
-    """One of several in which a choice is judged, in its own coordinates."""
-
-    blocks: Array  # (M, q, p)
-    prior: Array  # (p, p)
-    criterion: Criterion
-
-
-def joint_branch_and_bound(
-    scenarios: Sequence[Scenario],
-    criterion: Joined,
-    weights: Array,
-    terms: tuple[Array, Array],
-    lower: Indices,
-    upper: Indices,
-    start: Indices,
-    best: int = 1,
-    deadline: Deadline = NEVER,
-    enough: float | None = None,
-    root_only: bool = False,
-) -> BranchResult:
-    """The ``best`` selections by what ``criterion`` joins, with proof.
-
-    Args:
-        scenarios: over the same candidates.
-        criterion: how phi of the scenarios is joined.
-        weights: (S,) of sum 1.
-        terms: (S,) scale and shift of phi, see ``Joined.terms``.
-        lower, upper, start, best, deadline, enough, root_only: as of
-            ``branch_and_bound``.
-    """
+def _joint_search(
+    joint: JointScenarios, upper: Indices, start: Indices, incumbents: Any
+) -> _Started:
+    """The search of several scenarios; ``upper`` (M,), ``start`` (M,) counts."""
+    scenarios, criterion, weights, terms = joint
     kernel = compiled.kernel("jaxcal.selection.exact.branch_kernel")
     near = [_near_one(*scenario, start, upper) for scenario in scenarios]
+    roots, units, origins, tops = zip(*near, strict=True)
     scale, shift = terms
-    shift = shift + scale * [one[2] for one in near]
-    scale = scale * [one[1] for one in near]
-    most = scale * [one[3] for one in near] + shift
-    trivial = float(most.min() if criterion.least else weights @ most)
+    shift = shift + scale * origins
+    scale = scale * units
+    most = scale * tops + shift
+    largest = float(most.min() if criterion.least else weights @ most)
     unit = 1.0
     if criterion.kind != "det":  # values near 1
         begun = [-1.0 if criterion.kind == "trace" else 1.0] * scale + shift
         unit = float(
             np.abs(begun).max() if criterion.least else weights @ np.abs(begun)
         )
-        scale, shift, trivial = scale / unit, shift / unit, trivial / unit
-    useful = min(trivial, _USEFUL.get(criterion.kind, np.inf))
-    incumbents, k = _incumbents(best, len(start)), start.sum()
+        scale, shift, largest = scale / unit, shift / unit, largest / unit
+    useful = min(largest, _USEFUL.get(criterion.kind, np.inf))
+    k = start.sum()
     packs = _packs(len(scenarios), scenarios[0].blocks)
     members = [
         kernel.Search(
-            scenario.criterion.form, scenario.blocks, scenario.prior, one[0], k,
+            scenario.criterion.form, scenario.blocks, scenario.prior, root, k,
             largest_rank(scenario.blocks), useful, *_incumbents(1, len(start)), True,
             packs,
         )
-        for scenario, one in zip(scenarios, near, strict=True)
+        for scenario, root in zip(scenarios, roots, strict=True)
     ]  # fmt: skip
     first = scenarios[0]
     search = kernel.JointSearch(
-        first.criterion.form, first.blocks, first.prior, near[0][0], k, 1, useful,
+        first.criterion.form, first.blocks, first.prior, roots[0], k, 1, useful,
         *incumbents,
     )  # fmt: skip
     search.join(members, weights, scale, shift, criterion.least)
-    counts = np.array([lower, upper, start], dtype=np.float64)
-    good = criterion.enough(enough) if enough is not None else None
-    if good is not None:
-        good = good[0], good[1] / unit
     work = len(scenarios) * first.blocks.size * first.blocks.shape[2]
-    return _searched(
-        search, incumbents, counts, (unit, 0.0, trivial), work, deadline, good,
-        root_only,
-    )  # fmt: skip
+    return _Started(search, unit, 0.0, largest, work)
 
 
 def _packs(num_scenarios: int, blocks: Array) -> bool:
@@ -173,35 +178,30 @@ def _incumbents(best: int, num_blocks: int) -> tuple[Array, Array, Indices]:
 
 
 def _searched(
-    search: Any,
+    started: _Started,
     incumbents: tuple[Array, Array, Indices],
     begun: Array,
-    units: tuple[float, float, float],
-    work: int,
     deadline: Deadline,
-    enough: tuple[float, float] | None,
+    good: tuple[float, float],
     root_only: bool,
 ) -> BranchResult:
     """Branch from the whole problem until it is solved, or as far as is asked for.
 
     Args:
-        search: the kernel's.
+        started: the kernel's search.
         incumbents: its best selections.
         begun: (3, M) lower and upper bounds of the counts, and a good selection.
-        units: of phi the unit and the origin, and in these the largest there can be.
-        work: multiplications of one evaluation of all candidates.
-        deadline, root_only: as of ``branch_and_bound``.
-        enough: a bound of at most the first times the best, plus the second.
+        deadline: when to stop with what there is.
+        good: enough is a bound of at most the first times the best, plus the second.
+        root_only: stop at the bound of the relaxation.
     """
+    search, scale, shift, largest, work = started
     best_counts, best_values, order = incumbents
-    (low, high, counts), (scale, shift, trivial) = begun, units
+    low, high, counts = begun
     num_blocks = len(low)
     search.offer(low, high, counts, deadline.remaining_s)
     nodes, bounds = np.empty((64, 3, num_blocks)), np.full(64, np.inf)
     nodes[0] = low, high, counts
-    good = (0.0, np.inf) if root_only else (0.0, -np.inf)
-    if enough is not None:
-        good = enough
     tries = 1 if root_only else int(_FREE / work)
     size, done, bound, going = 1, 0, np.inf, True
     while size and going:
@@ -216,7 +216,7 @@ def _searched(
         done += more
     if size:
         bound = max(bounds[:size].max(), best_values[0])
-        bound = min(bound, trivial)
+        bound = min(bound, largest)
     reached = np.isfinite(best_values)
     return BranchResult(
         best_counts[order[reached]].astype(np.int64),

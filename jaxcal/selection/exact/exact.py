@@ -20,9 +20,9 @@ from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection.criteria import Joined
 from jaxcal.selection.exact.branch_and_bound import (
     BranchResult,
+    JointScenarios,
     Scenario,
     branch_and_bound,
-    joint_branch_and_bound,
 )
 from jaxcal.selection.exact.volume import largest_volumes
 from jaxcal.selection.exchange.exchange import (
@@ -242,15 +242,14 @@ def _branched(
 ) -> BranchResult:
     """Branch and bound over the candidates ``keep``, in all scenarios."""
     if not isinstance(problem, ScenarioProblem):
-        blocks, criterion = problem.blocks[keep], problem.criterion
-        return branch_and_bound(blocks, problem.prior, criterion, *rules, **options)
-    scenarios = [
+        alone = Scenario(problem.blocks[keep], problem.prior, problem.criterion)
+        return branch_and_bound(alone, *rules, **options)
+    members = [
         Scenario(member.blocks[keep], member.prior, member.criterion)
         for member in problem.members
     ]
-    joined, weights = problem.joined, problem.weights
-    terms = problem.terms()
-    return joint_branch_and_bound(scenarios, joined, weights, terms, *rules, **options)
+    joint = JointScenarios(members, problem.joined, problem.weights, problem.terms())
+    return branch_and_bound(joint, *rules, **options)
 
 
 def _pool(problem: Problem, hull: bool) -> Indices:
