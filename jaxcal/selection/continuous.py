@@ -37,6 +37,7 @@ from jaxcal.checks import (
     seconds,
     whole_number,
 )
+from jaxcal.deadline import Deadline
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, as_model
 from jaxcal.models.uncertainty import Noise, Prior
@@ -171,7 +172,7 @@ def optimise(
     offer = CandidateSet.of_commands(
         pool, model, prior, noise, measured, max_replicates=_POOL, scenarios=scenarios
     )
-    search = _Search(offer, box, allowed, k, criterion, region, seed, time_limit)
+    search = _Ascent(offer, box, allowed, k, criterion, region, seed, time_limit)
     return search.run(None, whole_number("starts", starts, 1))
 
 
@@ -213,16 +214,8 @@ def refine(
     outside = (rows < 0) | (rows >= len(candidates))
     require_none(outside, rows, f"selection must lie in [0, {len(candidates)})")
     if criterion is None and isinstance(selection, Selection):
-        criterion = _asked(selection)
-    usable = candidates[available]
-    given = limits
-    if given is None:
-        given = np.stack([usable.min(axis=0), usable.max(axis=0)], axis=1)
-        own = np.asarray(getattr(allowed, "limits", np.zeros((0, 2))))  # of an arm
-        given[: len(own)] = own
-        still = given[:, 0] == given[:, 1]  # a column that holds one value
-        given[still, 1] += 1e-9 * np.maximum(np.abs(given[still, 1]), 1.0)
-    box = _limits(given)
+        criterion = _same_criterion(selection)
+    box = _limits(_range(candidates[available], allowed) if limits is None else limits)
     begun = candidates[rows]
     beyond = (begun < box[:, 0]) | (begun > box[:, 1])
     require_none(beyond, begun, "selection must be within the limits")
@@ -233,13 +226,23 @@ def refine(
                 "allowed must hold for the commands that are refined, got False for "
                 f"{in_words(begun[bad][0])}"
             )
-    search = _Search(
+    search = _Ascent(
         offer, box, allowed, len(begun), criterion, region, seed, time_limit
     )
     return search.run(begun, whole_number("starts", starts, 1))
 
 
-def _asked(selection: Selection) -> Any:
+def _range(commands: Array, allowed: Allowed | None) -> Array:
+    """(n, 2) least and greatest of commands (N, n), of joints the arm's own limits."""
+    limits = np.stack([commands.min(axis=0), commands.max(axis=0)], axis=1)
+    joints = np.asarray(getattr(allowed, "limits", np.zeros((0, 2))))
+    limits[: len(joints)] = joints
+    still = limits[:, 0] == limits[:, 1]  # a column that holds one value
+    limits[still, 1] += 1e-9 * np.maximum(np.abs(limits[still, 1]), 1.0)
+    return limits
+
+
+def _same_criterion(selection: Selection) -> Any:
     """The criterion of a selection, asked for again."""
     if isinstance(selection.problem.criterion, Joined):
         return selection.problem.criterion
@@ -389,7 +392,17 @@ def _among(problem: Problem, available: NDArray[np.bool_]) -> Problem:
     return dataclasses.replace(problem, **rules)
 
 
-class _Search:
+def _require_one_noise(noise: Noise) -> None:
+    """Refuse noise of each candidate: other commands have none."""
+    for size, axes in ((noise.std, 1), (noise.covariance, 2)):
+        if size is not None and np.ndim(size) > axes:
+            raise ValueError(
+                "noise must be the same for all commands, got one for each of the "
+                "candidates"
+            )
+
+
+class _Ascent:
     """Blocks of any command, the criterion, and the moves of a search."""
 
     def __init__(
@@ -405,7 +418,7 @@ class _Search:
     ) -> None:
         self.started = time.perf_counter()
         limit = _MINUTE if time_limit is None else seconds("time_limit", time_limit)
-        self.end = self.started + limit
+        self.deadline = Deadline(limit)
         self.offer, self.box = offer, box
         self.allowed, self.seed = allowed, seed
         self.low, self.span = box[:, 0], np.ptp(box, axis=1)
@@ -413,13 +426,7 @@ class _Search:
         n = offer.candidates.shape[1]
         if len(box) != n:
             raise ValueError(f"limits must be ({n}, 2) for this model, got {box.shape}")
-        noise = offer.noise or Noise()
-        for given, axes in ((noise.std, 1), (noise.covariance, 2)):
-            if given is not None and np.ndim(given) > axes:
-                raise ValueError(
-                    "noise must be the same for all commands, got one for each of "
-                    "the candidates"
-                )
+        _require_one_noise(offer.noise or Noise())
         self.asked, self.region = criterion, region
         if offer.uncertain:
             raise ValueError(
@@ -577,8 +584,8 @@ class _Search:
         total, many = np.zeros_like(commands), _filled(commands)
         for s, member in enumerate(self.members):
             basis = member.white.basis
-            own = basis @ metric[s] @ basis.T
-            slopes = self.block_makers[s].leverage_slopes(many, own)
+            unwhitened = basis @ metric[s] @ basis.T
+            slopes = self.block_makers[s].leverage_slopes(many, unwhitened)
             if slopes is None:
                 return None
             total += slopes[: len(commands)]
@@ -597,7 +604,7 @@ class _Search:
             commands, phi = self._climbed(start)
             if phi > best_phi:
                 best, best_phi = commands, phi
-            if self._late():
+            if self.deadline.passed:
                 break
         if best is None or not np.isfinite(best_phi):
             raise ValueError(
@@ -625,9 +632,6 @@ class _Search:
             search_error=error,
             certain=certain,
         )
-
-    def _late(self) -> bool:
-        return time.perf_counter() > self.end
 
     def _starts(self, begun: Array | None, count: int, rng: np.random.Generator) -> Any:
         """Designs (k, n), the best guesses first; none of them singular."""
@@ -666,7 +670,7 @@ class _Search:
             at = self.low + x.reshape(shape) * self.span
             information = self.information(self.blocks(at))
             phi = float(self.phi(information))
-            if not np.isfinite(phi) or self._late():
+            if not np.isfinite(phi) or self.deadline.passed:
                 return 1e10, np.zeros_like(x)
             if self.smooth:
                 value, metric, _ = self.soft(information, _SHARP[-1] / unit)
@@ -694,7 +698,7 @@ class _Search:
         radius = np.full(len(commands), 0.1)
         ahead = np.zeros_like(commands)  # the way that was last taken
         blocks = self.blocks(commands)
-        while radius.max() > _SMALLEST and not self._late():
+        while radius.max() > _SMALLEST and not self.deadline.passed:
             for i in np.flatnonzero(radius > _SMALLEST):
                 information = self.information(blocks)
                 metric = self.gradient(information)
@@ -757,7 +761,7 @@ class _Search:
             rest = information - self.squares(blocks)  # (k, S, p, p)
             gained = self.phi(rest[:, None] + self.squares(new)[None])
             i, j = np.unravel_index(np.argmax(gained), gained.shape)
-            if not gained[i, j] > phi or self._late():
+            if not gained[i, j] > phi or self.deadline.passed:
                 break
             trial = commands.copy()
             trial[i] = peaks[j]
@@ -876,7 +880,7 @@ class _Search:
             if bound < best:
                 best, error = bound, differ / max(float(heights.max()), 1e-300)
             gap = self._share(phi, best)
-            if gap > 1.0 - 1e-9 or self._late():
+            if gap > 1.0 - 1e-9 or self.deadline.passed:
                 break
             if np.isfinite(before) and gap - self._share(phi, before) < _TOLD:
                 slack = self.k * float(heights.max()) + off
@@ -946,10 +950,10 @@ class _Search:
         if len(self.members) > 1:
             assert offer.scenarios is not None
             scenarios = offer.scenarios.parameters, offer.scenarios.weights
-        own = CandidateSet.of_commands(
+        beside = CandidateSet.of_commands(
             np.concatenate([commands, pool]), offer.model, offer.prior, offer.noise,
             offer.measured, scenarios=scenarios,
         )  # fmt: skip
-        problem = problem_of(own, self.k, self.asked, region)
+        problem = problem_of(beside, self.k, self.asked, region)
         value, log_det = values(problem, np.arange(self.k)[None])
         return problem, float(value[0]), float(log_det[0])

@@ -33,6 +33,7 @@ from jaxcal.selection.solvers import SOLVERS, checked_options
 __all__ = ["Design", "select"]
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 _REFERENCES = ("bound", "exact")
 _PROVEN = 1e-9  # a value this near a proven optimum, relative above 1, is that optimum
@@ -268,24 +269,31 @@ class Design:
         one_of("reference", reference, _REFERENCES)
         limit = TIME_LIMIT if time_limit is None else seconds("time_limit", time_limit)
         start = time.perf_counter()
-        subset, count = np.asarray(indices), len(self.available)
-        if subset.ndim != 1 or not np.issubdtype(subset.dtype, np.integer):
-            raise ValueError(
-                "indices must be a (k,) array of whole numbers, got shape "
-                f"{subset.shape} and dtype {subset.dtype}"
-            )
-        if not len(subset):
-            raise ValueError("indices must name at least one candidate, got none")
+        subset = _whole_numbers(indices)
+        problem = with_optima(self._problem_with(subset, criterion))
+        if reference == "bound":
+            return self._judged(problem, Solution(subset), "score", start)
+        optimum = solve_exact(problem, deadline=Deadline(limit))
+        value = float(values(problem, subset[None])[0][0])
+        assert optimum.bound is not None
+        near = abs(value - optimum.bound) <= _PROVEN * max(1.0, abs(optimum.bound))
+        proven = optimum.proven and near
+        solution = Solution(subset, bound=optimum.bound, proven=proven)
+        return self._judged(problem, solution, "score", start)
+
+    def _problem_with(self, subset: Indices, criterion: Any) -> Problem:
+        """The problem of which a subset (k,) may be the answer; refuses any other."""
+        count = len(self.available)
         outside = (subset < 0) | (subset >= count)
         require_none(outside, subset, f"indices must lie in [0, {count})")
         masked = ~self.available[subset]
         require_none(masked, subset, "indices must be available", ", which is masked")
-        problem = with_optima(self.problem(len(subset), criterion))
+        problem = self.problem(len(subset), criterion)
         times = np.bincount(subset, minlength=count)
-        left = problem.required[times[problem.required] == 0]
-        if len(left):
+        missing = problem.required[times[problem.required] == 0]
+        if len(missing):
             raise ValueError(
-                f"indices must hold every required candidate, got no {left[0]}"
+                f"indices must hold every required candidate, got no {missing[0]}"
             )
         repeats = int(times.max())
         if repeats > problem.max_replicates:
@@ -293,17 +301,7 @@ class Design:
                 "indices must repeat a candidate at most max_replicates = "
                 f"{problem.max_replicates} times, got {repeats}"
             )
-        solution = Solution(subset.astype(np.int64))
-        if reference == "bound":
-            return self._judged(problem, solution, "score", start)
-        optimum = solve_exact(problem, deadline=Deadline(limit))
-        value = float(values(problem, solution.indices[None])[0][0])
-        assert optimum.bound is not None
-        near = abs(value - optimum.bound) <= _PROVEN * max(1.0, abs(optimum.bound))
-        solution = Solution(
-            solution.indices, bound=optimum.bound, proven=optimum.proven and near
-        )
-        return self._judged(problem, solution, "score", start)
+        return problem
 
     plan = plan
     fastest = fastest
@@ -319,22 +317,16 @@ class Design:
             RuntimeError: it is no selection of this problem: the solver is wrong.
         """
         indices, value = np.asarray(solution.indices), solution.value
-        counts = np.bincount(indices, minlength=len(problem.blocks))
-        right = len(indices) == problem.k and len(counts) == len(problem.blocks)
-        if not right or ((counts < problem.lower) | (counts > problem.upper)).any():
-            raise RuntimeError(
-                f"method {method!r} must return {problem.k} candidates within lower "
-                f"and upper of its problem, got {indices.tolist()}"
-            )
+        _require_allowed(problem, indices, method)
         log_det = solution.log_det
         if value is None or log_det is None:
-            value, log_det = (float(each[0]) for each in values(problem, indices[None]))
+            value, log_det = (float(pair[0]) for pair in values(problem, indices[None]))
         if np.isneginf(log_det):
             name = "indices" if method == "score" else "method"
-            what = "" if method == "score" else f", which {method!r} returned"
+            whose = "" if method == "score" else f", which {method!r} returned"
             raise ValueError(
                 f"{name} must give an invertible information matrix, but that of "
-                f"{indices.tolist()}{what} is singular{self._why_singular(indices)}"
+                f"{indices.tolist()}{whose} is singular{self._why_singular(indices)}"
             )
         least = problem.criterion.kind == "least"
         if not np.isfinite(value) or (least and not value > 0.0):
@@ -342,11 +334,6 @@ class Design:
                 f"criterion {problem.criterion.name} must be a number in double "
                 f"precision, got {value} in these units; give the commands in others"
             )
-        subsets = [Subset(indices, value, log_det)]
-        if len(solution.alternatives) > 1:
-            others = np.stack([each for each, _ in solution.alternatives])
-            pairs = np.stack(values(problem, others), axis=1).tolist()
-            subsets = [Subset(i, *pair) for i, pair in zip(others, pairs, strict=True)]
         return Selection(
             indices=indices,
             value=value,
@@ -359,13 +346,14 @@ class Design:
             seed=solution.seed,
             restarts=solution.restarts,
             nodes=solution.nodes,
-            alternatives=tuple(subsets),
+            alternatives=_alternatives(problem, solution)
+            or (Subset(indices, value, log_det),),
             known_bound=solution.bound,
             names=self.names,
             axes=self.axes,
         )
 
-    def _why_singular(self, indices: NDArray[np.int64]) -> str:
+    def _why_singular(self, indices: Indices) -> str:
         """What choosing among these candidates alone would be refused for."""
         alone = dataclasses.replace(
             self.candidate_set,
@@ -378,6 +366,39 @@ class Design:
         except ValueError as error:
             return f": {error}"
         return ""
+
+
+def _whole_numbers(indices: ArrayLike) -> Indices:
+    """A subset (k,) as the caller gives it, k at least 1."""
+    subset = np.asarray(indices)
+    if subset.ndim != 1 or not np.issubdtype(subset.dtype, np.integer):
+        raise ValueError(
+            "indices must be a (k,) array of whole numbers, got shape "
+            f"{subset.shape} and dtype {subset.dtype}"
+        )
+    if not len(subset):
+        raise ValueError("indices must name at least one candidate, got none")
+    return subset.astype(np.int64)
+
+
+def _require_allowed(problem: Problem, indices: Indices, method: str) -> None:
+    """Refuse what is no selection of this problem: the solver is wrong."""
+    counts = np.bincount(indices, minlength=len(problem.blocks))
+    right = len(indices) == problem.k and len(counts) == len(problem.blocks)
+    if not right or ((counts < problem.lower) | (counts > problem.upper)).any():
+        raise RuntimeError(
+            f"method {method!r} must return {problem.k} candidates within lower "
+            f"and upper of its problem, got {indices.tolist()}"
+        )
+
+
+def _alternatives(problem: Problem, solution: Solution) -> tuple[Subset, ...]:
+    """The best subsets, best first, where a solver has several."""
+    if len(solution.alternatives) < 2:
+        return ()
+    subsets = np.stack([indices for indices, _ in solution.alternatives])
+    pairs = np.stack(values(problem, subsets), axis=1).tolist()
+    return tuple(Subset(i, *pair) for i, pair in zip(subsets, pairs, strict=True))
 
 
 def select(

@@ -47,9 +47,9 @@ def solve_random(problem: Problem, *, seed: int | np.random.Generator) -> Soluti
                 return Solution(indices, seed=seed if isinstance(seed, int) else None)
         return exchange.solve_greedy(problem)
     indices, values = random_indices([problem], rng)
-    log_det, own = float(values[0]), seed if isinstance(seed, int) else None
+    log_det, number = float(values[0]), seed if isinstance(seed, int) else None
     value = log_det if problem.criterion.name == "D" else None
-    return Solution(indices[0], value, log_det, seed=own)
+    return Solution(indices[0], value, log_det, seed=number)
 
 
 def random_indices(
@@ -57,21 +57,25 @@ def random_indices(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """(B, k) drawn until none is singular, of problems of one shape, and log det S."""
     k, cap = problems[0].k, min(problems[0].max_replicates, problems[0].k)
-    required, count = np.array([each.required for each in problems]), len(problems)
-    taken = ~np.array([each.available for each in problems]).repeat(cap, axis=1)
+    required, count = np.array([p.required for p in problems]), len(problems)
+    taken = ~np.array([p.available for p in problems]).repeat(cap, axis=1)
     indices, values = np.empty((count, k), np.int64), np.empty(count)
-    forced, left = required.shape[1], np.arange(count)
+    forced, singular = required.shape[1], np.arange(count)
     indices[:, :forced] = required
     if forced:
-        taken[left[:, None], required * cap] = True
+        taken[singular[:, None], required * cap] = True
     for _ in range(_TRIES):
-        order = (rng.random((len(left), taken.shape[1])) + taken[left]).argsort(axis=1)
-        indices[left, forced:] = order[:, : k - forced] // cap
-        values[left] = log_dets([problems[b] for b in left.tolist()], indices[left])
-        left = left[np.isneginf(values[left])]
-        if not left.size:
+        order = (rng.random((len(singular), taken.shape[1])) + taken[singular]).argsort(
+            axis=1
+        )
+        indices[singular, forced:] = order[:, : k - forced] // cap
+        values[singular] = log_dets(
+            [problems[b] for b in singular.tolist()], indices[singular]
+        )
+        singular = singular[np.isneginf(values[singular])]
+        if not singular.size:
             return indices, values
-    for b in left.tolist():  # tables that are nearly all duplicates
+    for b in singular.tolist():  # tables that are nearly all duplicates
         indices[b] = exchange.greedy_indices(problems[b])
     return indices, log_dets(problems, indices)
 

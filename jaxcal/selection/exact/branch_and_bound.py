@@ -61,7 +61,7 @@ class JointScenarios(NamedTuple):
     terms: tuple[Array, Array]  # (S,) scale and shift of phi, see ``Joined.terms``
 
 
-class _Started(NamedTuple):
+class _KernelSearch(NamedTuple):
     """The kernel's search, in whose units phi is near 1."""
 
     search: Any
@@ -109,7 +109,7 @@ def branch_and_bound(
 
 def _search(
     scenario: Scenario, upper: Indices, start: Indices, incumbents: Any
-) -> _Started:
+) -> _KernelSearch:
     """The search of one scenario."""
     root, scale, shift, largest = _near_one(*scenario, start, upper)
     blocks, prior, criterion = scenario
@@ -118,12 +118,12 @@ def _search(
         criterion.form, blocks, prior, root, start.sum(), largest_rank(blocks), useful,
         *incumbents,
     )  # fmt: skip
-    return _Started(search, scale, shift, largest, blocks.size * blocks.shape[2])
+    return _KernelSearch(search, scale, shift, largest, blocks.size * blocks.shape[2])
 
 
 def _joint_search(
     joint: JointScenarios, upper: Indices, start: Indices, incumbents: Any
-) -> _Started:
+) -> _KernelSearch:
     """The search of several scenarios; ``upper`` (M,), ``start`` (M,) counts."""
     scenarios, criterion, weights, terms = joint
     kernel = compiled.kernel("jaxcal.selection.exact.branch_kernel")
@@ -159,7 +159,7 @@ def _joint_search(
     )  # fmt: skip
     search.join(members, weights, scale, shift, criterion.least)
     work = len(scenarios) * first.blocks.size * first.blocks.shape[2]
-    return _Started(search, unit, 0.0, largest, work)
+    return _KernelSearch(search, unit, 0.0, largest, work)
 
 
 def _packs(num_scenarios: int, blocks: Array) -> bool:
@@ -178,7 +178,7 @@ def _incumbents(best: int, num_blocks: int) -> tuple[Array, Array, Indices]:
 
 
 def _searched(
-    started: _Started,
+    started: _KernelSearch,
     incumbents: tuple[Array, Array, Indices],
     begun: Array,
     deadline: Deadline,

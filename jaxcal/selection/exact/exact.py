@@ -372,12 +372,14 @@ def _expand(
     if len(first) == len(keep):
         return np.repeat(keep, counts)
     chosen: list[int] = []
-    for members, left in zip(np.split(keep, first[1:]), counts.tolist(), strict=True):
+    for members, missing in zip(
+        np.split(keep, first[1:]), counts.tolist(), strict=True
+    ):
         take = problem.lower[members]
-        left -= int(take.sum())
+        missing -= int(take.sum())
         for position, room in enumerate((problem.upper[members] - take).tolist()):
-            more = min(left, room)
-            take[position] += more
-            left -= more
+            taken = min(missing, room)
+            take[position] += taken
+            missing -= taken
         chosen.extend(np.repeat(members, take))
     return np.sort(np.asarray(chosen, dtype=np.int64))

@@ -26,7 +26,12 @@ from jaxcal.deadline import Deadline
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.fastest.motion import Motion, travel_times
-from jaxcal.selection.problem import CandidateSet, HasCandidates, problem_of
+from jaxcal.selection.problem import (
+    CandidateSet,
+    HasCandidates,
+    Problem,
+    problem_of,
+)
 from jaxcal.selection.solvers import checked_seed
 
 __all__ = ["FastSelection", "ParetoFront", "fastest", "pareto"]
@@ -101,7 +106,9 @@ def fastest(
         The selection; among runs of equal time the one with the largest determinant.
     """
     least = share("least_efficiency", least_efficiency)
-    search = _Search(design.candidate_set, k, motion, start, method, time_limit, seed)
+    search = _TourSearch(
+        design.candidate_set, k, motion, start, method, time_limit, seed
+    )
     answer = search.answer(least, None)
     if answer is None:
         raise ValueError(
@@ -131,7 +138,7 @@ def pareto(
     """
     least = share("least_efficiency", least_efficiency)
     defaults = {"start": None, "method": None, "time_limit": 60.0, "seed": 0}
-    search = _Search(design.candidate_set, k, motion, **(defaults | options))
+    search = _TourSearch(design.candidate_set, k, motion, **(defaults | options))
     points: list[FastSelection] = []
     point = search.answer(least, None)
     while point is not None and len(points) < _MOST_POINTS:
@@ -148,7 +155,16 @@ def pareto(
     return ParetoFront(tuple(kept), least, proven)
 
 
-class _Search:
+def _pool(problem: Problem) -> Indices:
+    """Candidates of the search, the required first, then by falling leverage."""
+    if len(problem.required) == problem.k:
+        return problem.required
+    free = np.setdiff1d(np.flatnonzero(problem.available), problem.required)
+    leverage = (problem.blocks[free] ** 2).sum(axis=(1, 2))
+    return np.concatenate([problem.required, free[np.argsort(-leverage)]])
+
+
+class _TourSearch:
     """One problem, cut down to the candidates that may be chosen: the pool."""
 
     def __init__(
@@ -182,13 +198,7 @@ class _Search:
             raise ValueError(
                 f"k must be at most {_MOST_EXACT} with exact, got {self.k}"
             )
-        self.seed = checked_seed(seed)
-        # The required first, then by falling leverage.
-        self.pool = problem.required
-        if len(self.pool) < self.k:
-            free = np.setdiff1d(np.flatnonzero(problem.available), self.pool)
-            leverage = (problem.blocks[free] ** 2).sum(axis=(1, 2))
-            self.pool = np.concatenate([self.pool, free[np.argsort(-leverage)]])
+        self.seed, self.pool = checked_seed(seed), _pool(problem)
         # Held in every search; one is always left to choose: where all k are required
         # the pool is just those.
         self.fixed = min(len(problem.required), self.k - 1)

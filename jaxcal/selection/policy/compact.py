@@ -145,16 +145,22 @@ class CompactScorer:
         """(E, M) scores of the choice after ``count``; lowest where not free."""
         x, h = memory
         p, k = x.shape[1], chosen.shape[1]
-        left = k - count
-        exact = left <= self._unlearned
+        remaining = k - count
+        exact = remaining <= self._unlearned
         only = exact and best_only
-        seen = self._described(x, chosen[:, :count].copy(), free, k, left, only)
+        seen = self._described(x, chosen[:, :count].copy(), free, k, remaining, only)
         if exact:
             return np.where(free, _SHARP * seen.ahead, -np.inf)
         episode = np.arange(len(h))[:, None]
         mean = h[episode, chosen[:, :count]].sum(axis=1) / np.float32(max(count, 1))
-        progress = [left == 1, left == 2, left == 3, 1 / left, count / p]
-        progress += [min(left / p, 3.0), k > p]
+        progress = [
+            remaining == 1,
+            remaining == 2,
+            remaining == 3,
+            1 / remaining,
+            count / p,
+        ]
+        progress += [min(remaining / p, 3.0), k > p]
         scalars = np.tile(np.array(progress, np.float32), (len(h), 1))
         state = np.concatenate([mean, scalars], axis=1)
         g = self._dense("join", np.concatenate([h, seen.features], axis=2), state)

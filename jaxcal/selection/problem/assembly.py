@@ -237,19 +237,12 @@ def _checked_problem(
         sets = raw[None], available[None]
         white = whiten(*sets, root, coarse=coarse, computed=computed)[0]
     if white is None:
-        used = raw[available]
         if not names and candidates is not None:
             names = (*axis_names("names", None, "u", candidates.shape[1]), "the bias")
             if not len(root):
-                used, what = candidates[available], ("candidates", "available ones")
-                require_excited(used, names[:-1], *what, coarse)
-        null = missing_directions(used, root, coarse, computed)
-        raise ValueError(
-            "blocks must inform every parameter, but the available ones"
-            + (" and what is known" if len(root) else "")
-            + directions_in_words(" say nothing of the direction{} ", null, names)
-            + "; give prior, a precision of what is known of them"
-        )
+                about = "candidates", "available ones"
+                require_excited(candidates[available], names[:-1], *about, coarse)
+        raise _uninformed(raw[available], root, coarse, computed, names)
     at = Coordinates(white, names, count, region, times)
     problem = Problem(
         white, k, available, forced, cap, criterion.within(at), times, raw, readings,
@@ -260,6 +253,19 @@ def _checked_problem(
     if len(forced):
         _check_required_rank(problem)
     return problem
+
+
+def _uninformed(
+    blocks: Array, root: Array, coarse: float, computed: bool, names: tuple[str, ...]
+) -> ValueError:
+    """Of which directions blocks (N, q, p) and the root say nothing."""
+    null = missing_directions(blocks, root, coarse, computed)
+    return ValueError(
+        "blocks must inform every parameter, but the available ones"
+        + (" and what is known" if len(root) else "")
+        + directions_in_words(" say nothing of the direction{} ", null, names)
+        + "; give prior, a precision of what is known of them"
+    )
 
 
 def _check_counts(
@@ -275,16 +281,14 @@ def _check_counts(
             + (f", each at most {cap} times" if cap > 1 else "")
             + f", got {k}"
         )
-    if required is None:
+    array = np.zeros(0) if required is None else one_array("required", required)
+    if not array.size:
         return np.zeros(0, dtype=np.int64)
-    given = one_array("required", required)
-    if not given.size:
-        return np.zeros(0, dtype=np.int64)
-    if given.ndim != 1:
-        raise ValueError(f"required must have shape (r,), got {given.shape}")
-    if not np.issubdtype(given.dtype, np.integer):
-        raise ValueError(f"required must hold whole numbers, got dtype {given.dtype}")
-    forced = given.astype(np.int64)
+    if array.ndim != 1:
+        raise ValueError(f"required must have shape (r,), got {array.shape}")
+    if not np.issubdtype(array.dtype, np.integer):
+        raise ValueError(f"required must hold whole numbers, got dtype {array.dtype}")
+    forced = array.astype(np.int64)
     if len(forced) > k:
         raise ValueError(
             f"required must name at most k = {k} candidates, got {len(forced)}"

@@ -10,15 +10,14 @@ information in units of the noise. Two summaries over the region of interest:
 
 The standard errors of the parameters are those of a region of unit vectors.
 
-For each K ``designs`` looks for a good design and says what no design of K measurements
-beats. The K returned is proven the smallest where the bound of K - 1 lies
+For each K ``best_of_size`` looks for a good design and says what no design of K
+measurements beats. The K returned is proven the smallest where the bound of K - 1 lies
 above the target. Source: Atkinson, Donev and Tobias, Optimum Experimental Designs.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import time
 from typing import Any, NamedTuple
 
@@ -30,7 +29,7 @@ from jaxcal.information.blocks import largest_rank
 from jaxcal.models.uncertainty import Noise
 from jaxcal.selection.criteria import Mean, positions
 from jaxcal.selection.exchange.exchange import greedy_indices
-from jaxcal.selection.plan.designs import (
+from jaxcal.selection.plan.best_of_size import (
     Case,
     best_design,
     lower_bound,
@@ -38,6 +37,7 @@ from jaxcal.selection.plan.designs import (
     variances_of,
 )
 from jaxcal.selection.problem import (
+    Blocks,
     CandidateSet,
     HasCandidates,
     Problem,
@@ -172,69 +172,21 @@ def plan(
         raise ValueError("lost and reliability must be left out with plan")
     one_of("criterion", criterion, tuple(_SUMMARIES))
     more, start = whole_number("more", more, 0), checked_seed(seed)
-    how = "I" if criterion == "I" else "G"
-    given = criterion, accuracy, noise_std, parameters, region
-    requests = [_request(one, *given) for one in offer.by_scenario()]
-    request = requests[0]
-    cases = [Case(one.problem, one.points) for one in requests]
-    unit, problem = request.unit, request.problem
+    requests = [
+        _request(alone, criterion, accuracy, noise_std, parameters, region)
+        for alone in offer.by_scenario()
+    ]
+    request, problem = requests[0], requests[0].problem
     if offer.scenarios is not None:
-        problems = [case.problem for case in cases]
-        weights = offer.scenarios.weights
-        problem = joined_problem(problems, weights, Mean("D"), None)
-    total, (identify, least_k) = problem.k, _fewest(problem)
-    if max_k is None:
-        max_k = min(total, max(_LARGEST_K, least_k))
-    max_k = whole_number("max_k", max_k, least_k)
-    if max_k > total:
-        raise ValueError(
-            f"max_k must not exceed the {total} measurements allowed, got {max_k}"
-        )
-    roots = [region_root(case.points, how) for case in cases]
-
-    @functools.cache
-    def bound_of(k: int) -> float:
-        if k == total:  # there is one design only
-            every = np.repeat(np.arange(len(problem.blocks)), problem.upper)
-            return float(variances_of(cases, every, how).max())
-        return max(
-            lower_bound(case.problem, root, k)
-            for case, root in zip(cases, roots, strict=True)
-        )
-
-    def best(k: int, previous: Indices | None) -> tuple[Indices, Array]:
-        indices = best_design(problem.of_size(k), cases, how, previous, start)
-        return indices, variances_of(cases, indices, how)
-
-    rows: list[PlanRow] = []
-    chosen: PlanRow | None = None
-    last: Indices | None = None
-    ks = range(least_k, max_k + 1) if bound_of(max_k) <= _ENOUGH else ()
-    for k in ks:  # none where no K allowed is enough
-        last, variance = best(k, last)
-        row = PlanRow(
-            k=k,
-            indices=last,
-            standard_error=unit * np.sqrt(variance),
-            least_error=unit * np.sqrt(max(min(bound_of(k), variance.max()), 0.0)),
-        )
-        rows.append(row)
-        if chosen is None and variance.max() <= _ENOUGH:
-            chosen = row
-        if chosen is not None and k >= chosen.k + more:
-            break
+        problems = [request.problem for request in requests]
+        problem = joined_problem(problems, offer.scenarios.weights, Mean("D"), None)
+    identify, least_k = _fewest(problem)
+    max_k = _checked_max_k(max_k, least_k, problem.k)
+    cases = [Case(request.problem, request.points) for request in requests]
+    sizes = _Sizes(problem, cases, "I" if criterion == "I" else "G", start)
+    rows, chosen = _rows(sizes, request.unit, least_k, max_k, more)
     if chosen is None:
-        if last is None:
-            variance = best(max_k, None)[1]
-        one = int((unit * np.sqrt(variance) / request.target).argmax())
-        reached, least = unit[one] * np.sqrt([variance.max(), bound_of(max_k)])
-        every = " (all that are allowed)" if max_k == total else ""
-        raise ValueError(
-            f"accuracy must be reachable with max_k = {max_k} measurements{every}: "
-            f"the best design found has a {_SUMMARIES[criterion]} standard error "
-            f"of {reached:.6g}, no design has less than {least:.6g}, got "
-            f"{request.target[one]:g}"
-        )
+        raise _unreachable(sizes, request, rows, max_k, _SUMMARIES[criterion])
     return Plan(
         k=chosen.k,
         indices=chosen.indices,
@@ -243,9 +195,100 @@ def plan(
         noise_std=request.noise_std,
         names=request.names,
         criterion=criterion,
-        smallest_proven=chosen.k == identify or bound_of(chosen.k - 1) > 1.0,
+        smallest_proven=chosen.k == identify or sizes.bound(chosen.k - 1) > 1.0,
         rows=tuple(rows),
         seconds=time.perf_counter() - begun,
+    )
+
+
+def _checked_max_k(max_k: int | None, least_k: int, total: int) -> int:
+    """The largest K to try: at least ``least_k``, of ``total`` that may be measured."""
+    if max_k is None:
+        return min(total, max(_LARGEST_K, least_k))
+    max_k = whole_number("max_k", max_k, least_k)
+    if max_k > total:
+        raise ValueError(
+            f"max_k must not exceed the {total} measurements allowed, got {max_k}"
+        )
+    return max_k
+
+
+class _Sizes:
+    """Designs of every K, with variances of which 1 is accurate enough.
+
+    Args:
+        problem: of all that may be measured.
+        cases: its scenarios.
+        how: the criterion, "G" or "I".
+        seed: of the exchange.
+    """
+
+    def __init__(
+        self, problem: Problem, cases: list[Case], how: str, seed: int
+    ) -> None:
+        self.problem, self.cases, self.how, self.seed = problem, cases, how, seed
+        self._roots = [region_root(case.points, how) for case in cases]
+        self._bounds: dict[int, float] = {}
+
+    def bound(self, k: int) -> float:
+        """No design of k has a smaller largest variance."""
+        if k not in self._bounds:
+            self._bounds[k] = self._bound(k)
+        return self._bounds[k]
+
+    def _bound(self, k: int) -> float:
+        if k == self.problem.k:  # there is one design only
+            every = np.repeat(np.arange(len(self.problem.blocks)), self.problem.upper)
+            return float(variances_of(self.cases, every, self.how).max())
+        return max(
+            lower_bound(case.problem, root, k)
+            for case, root in zip(self.cases, self._roots, strict=True)
+        )
+
+    def best(self, k: int, previous: Indices | None) -> tuple[Indices, Array]:
+        """(k,) the best design, from that of k - 1, and its variances (m,)."""
+        of_size = self.problem.of_size(k)
+        indices = best_design(of_size, self.cases, self.how, previous, self.seed)
+        return indices, variances_of(self.cases, indices, self.how)
+
+
+def _rows(
+    sizes: _Sizes, unit: Array, least_k: int, max_k: int, more: int
+) -> tuple[list[PlanRow], PlanRow | None]:
+    """A row of every K up to ``more`` beyond the first that suffices, and that one."""
+    rows: list[PlanRow] = []
+    chosen: PlanRow | None = None
+    indices: Indices | None = None
+    ks = range(least_k, max_k + 1) if sizes.bound(max_k) <= _ENOUGH else ()
+    for k in ks:  # none where no K allowed is enough
+        indices, variance = sizes.best(k, indices)
+        bound = max(min(sizes.bound(k), variance.max()), 0.0)
+        row = PlanRow(k, indices, unit * np.sqrt(variance), unit * np.sqrt(bound))
+        rows.append(row)
+        if chosen is None and variance.max() <= _ENOUGH:
+            chosen = row
+        if chosen is not None and k >= chosen.k + more:
+            break
+    return rows, chosen
+
+
+def _unreachable(
+    sizes: _Sizes, request: _Request, rows: list[PlanRow], max_k: int, summary: str
+) -> ValueError:
+    """What can be reached with ``max_k``, where that is not accurate enough."""
+    if rows:
+        variance = variances_of(sizes.cases, rows[-1].indices, sizes.how)
+    else:
+        variance = sizes.best(max_k, None)[1]
+    unit = request.unit
+    hardest = int((unit * np.sqrt(variance) / request.target).argmax())
+    bound = sizes.bound(max_k)
+    reached, least = unit[hardest] * np.sqrt([variance.max(), bound])
+    every = " (all that are allowed)" if max_k == sizes.problem.k else ""
+    return ValueError(
+        f"accuracy must be reachable with max_k = {max_k} measurements{every}: the "
+        f"best design found has a {summary} standard error of {reached:.6g}, no design "
+        f"has less than {least:.6g}, got {request.target[hardest]:g}"
     )
 
 
@@ -274,39 +317,15 @@ def _request(
         raise ValueError("parameters must come with criterion parameters only")
     cap = whole_number("max_replicates", offer.max_replicates, 1)
     total = max(1, int(offer.available.sum()) * cap)
-    model, prior, noise = offer.model, offer.prior, offer.noise
+    model, std = offer.model, _reading_std(offer, noise_std)
     shared = False  # one regressor for all outputs?
-    if model is None:
-        if not (noise_std is noise is None):
-            raise ValueError(
-                "noise and noise_std must be left out with blocks, which are in units "
-                "of the noise"
-            )
-    else:
-        if noise_std is None:
-            if noise is None:
-                raise ValueError("noise_std must be given: the design has no noise")
-            if noise.covariance is noise.command_std is None:
-                std = 1.0 if noise.std is None else noise.std
-                noise_std = std if np.ndim(std) < 2 else None
-        if noise_std is not None:
-            noise_std = levels("noise_std", noise_std, model.num_outputs)
-            shared = not of_parameters and shares_regressor(model, prior, None)
-            # Where outputs share a regressor the noise is in the targets.
-            offer = dataclasses.replace(
-                offer, noise=None if shared else Noise(noise_std)
-            )
+    if model is not None and std is not None:
+        shared = not of_parameters and shares_regressor(model, offer.prior, None)
+        # Where outputs share a regressor the noise is in the targets.
+        offer = dataclasses.replace(offer, noise=None if shared else Noise(std))
     problem = problem_of(offer, total, "D")
     blocks = blocks_of(dataclasses.replace(offer, noise=None), not shared)
-    names = blocks.names
-    if model is not None:
-        assert problem.candidates is not None
-        where = problem.candidates[problem.available] if region is None else region
-        rows = blocks.at("region", where, readings=False)
-    elif region is None:
-        rows = problem.readings[problem.available]
-    else:
-        rows = array_of("region", region, "R", "m", len(names))
+    names, rows = blocks.names, _region_rows(blocks, problem, region)
     if of_parameters:
         at = positions(names if parameters is None else parameters, names)
         rows, names = np.eye(len(names))[None, at], tuple(names[i] for i in at)
@@ -317,16 +336,51 @@ def _request(
         names = tuple(f"output {i + 1}" for i in range(m))
     target = levels("accuracy", accuracy, m)
     scale = unit = target
-    if noise_std is not None and shared:
-        scale = (target / noise_std).min(keepdims=True)
-        unit = noise_std * scale
+    if std is not None and shared:
+        scale = (target / std).min(keepdims=True)
+        unit = std * scale
     elif model is None:
-        noise_std = np.ones(m)
+        std = np.ones(m)
     points = problem.white.of(rows) / scale[:, None]
     if criterion == "I" and len(points) > points.shape[2]:  # fewer rows, the same mean
         root = np.linalg.qr(np.moveaxis(points, 1, 0))[1]
         points = np.moveaxis(root, 0, 1) * np.sqrt(root.shape[1] / len(points))
-    return _Request(problem, points, unit, target, noise_std, names)
+    return _Request(problem, points, unit, target, std, names)
+
+
+def _reading_std(offer: CandidateSet, noise_std: ArrayLike | None) -> Array | None:
+    """(m,) of one reading, as given or of the design; None where its noise says more.
+
+    None with blocks too, which are in units of the noise.
+    """
+    noise = offer.noise
+    if offer.model is None:
+        if not (noise_std is noise is None):
+            raise ValueError(
+                "noise and noise_std must be left out with blocks, which are in units "
+                "of the noise"
+            )
+        return None
+    if noise_std is None:
+        if noise is None:
+            raise ValueError("noise_std must be given: the design has no noise")
+        if noise.covariance is not None or noise.command_std is not None:
+            return None
+        noise_std = 1.0 if noise.std is None else noise.std
+        if np.ndim(noise_std) > 1:  # of each candidate
+            return None
+    return levels("noise_std", noise_std, offer.model.num_outputs)
+
+
+def _region_rows(blocks: Blocks, problem: Problem, region: ArrayLike | None) -> Array:
+    """(R, m, p) what is predicted in the region; of what is available if not given."""
+    if problem.model is None:
+        if region is None:
+            return problem.readings[problem.available]
+        return array_of("region", region, "R", "m", len(blocks.names))
+    assert problem.candidates is not None
+    where = problem.candidates[problem.available] if region is None else region
+    return blocks.at("region", where, readings=False)
 
 
 def _fewest(problem: Problem) -> tuple[int, int]:
