@@ -310,7 +310,7 @@ class Search:
         return values[0] - log(total) / self.smoothing
 
     def _shared_out(self, kind):
-        """The same of F at N in the metric of P; the f of A is ``-mu / (1 + l)``."""
+        """Bound F at N in the metric of P, slopes and base; f of A is -mu / (1 + l)."""
         p: cython.int = self.p
         values = self.values
         multiply(False, False, p, p, p, self.half, self.rest, self.scaled)
@@ -422,7 +422,7 @@ class Search:
         return True
 
     def _best_place(self):
-        """Of the eigenvalues of U the best mu at the present N; -1: the natural bound.
+        """The best mu at N, of the eigenvalues of U; -1: the natural bound.
 
         The bound is convex and piecewise linear in mu, with slope minus the total that
         the eigenvectors above mu lose by N, plus what F allows the t readings to take.
@@ -1197,7 +1197,7 @@ class JointSearch(Search):
                     self.leverage[self.open[o]] += share * one[self.open[o]]
 
     def _hessian(self, kind, m):
-        """Of some scenarios in place of all: it only says where to step and branch.
+        """The curvature in some scenarios in place of all: only a step depends on it.
 
         Which these are changes with every call. The part of a smoothed least that the
         slopes of its scenarios make is of all.

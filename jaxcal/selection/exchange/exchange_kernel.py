@@ -162,7 +162,7 @@ def _lower(grown, left, right, rows, q):
 
 
 def _largest(values):
-    """Of (WIDE,), by halves: the compiler knows how to compare vectors."""
+    """The largest of (WIDE,), by halves: compilers know how to compare vectors."""
     half = cython.declare(cython.double[32])
     for j in range(32):
         half[j] = values[j] if values[j] > values[j + 32] else values[j + 32]

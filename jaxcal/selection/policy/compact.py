@@ -80,7 +80,7 @@ class CompactScorer:
     def __call__(
         self, problems: Sequence[Problem], decoding: str, num: int, seed: int
     ) -> Indices:
-        """See ``jaxcal.selection.policy.api.Chooser``."""
+        """(B, k) candidates of each problem, as a ``Chooser`` orders them."""
         tries = 1 if decoding == "greedy" else num
         size = max(1, _ROWS // (len(problems[0].rows) * tries))
 

@@ -258,7 +258,7 @@ def _checked_problem(
 def _uninformed(
     blocks: Array, root: Array, coarse: float, computed: bool, names: tuple[str, ...]
 ) -> ValueError:
-    """Of which directions blocks (N, q, p) and the root say nothing."""
+    """The refusal of blocks (N, q, p): directions that they and the root leave open."""
     null = missing_directions(blocks, root, coarse, computed)
     return ValueError(
         "blocks must inform every parameter, but the available ones"

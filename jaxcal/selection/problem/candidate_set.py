@@ -123,9 +123,10 @@ class CandidateSet:
         cases = [None if self.prior is None else self.prior.resolve(model).mean]
         if self.scenarios is not None and self.scenarios.parameters is not None:
             cases += list(self.scenarios.parameters)
+        masked = not self.available.any()  # by the caller, who is told with k
         for parameters in cases:
             rows = np.flatnonzero(self.available)
-            if not len(rows):
+            if not masked and not len(rows):
                 raise ValueError(
                     "model must give finite readings for some candidate in every "
                     "scenario, but fails for all"
