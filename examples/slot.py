@@ -89,12 +89,12 @@ def study(full: bool) -> Study:
 def rows(found: Study) -> common.Rows:
     """Nats that each method gains in a session, those of ``ahead`` subtracted, and the
     time of a choice."""
-    base = found.results["ahead"].found
+    base = found.results["ahead"].comparison
     ahead = base.gain[base.names.index("ahead")]
     table = []
     for name, result in found.results.items():
-        row = result.found.names.index(name.split()[0])
-        gain = result.found.gain[row]
+        row = result.comparison.names.index(name.split()[0])
+        gain = result.comparison.gain[row]
         numbers = [mean for values in (gain, gain - ahead) for mean in _mean(values)]
         numbers.append(1e3 * result.seconds[row])
         table.append(

@@ -204,8 +204,8 @@ def test_a_policy_of_a_slot_is_no_worse_than_the_rule_it_begins_as(tmp_path):
     names = ["gain", "state", "shares", "ahead", "policy 0"]
     assert [row["method"] for row in rows] == names
     gains = {
-        name: found.results[name].found.gain[
-            found.results[name].found.names.index(name.split()[0])
+        name: found.results[name].comparison.gain[
+            found.results[name].comparison.names.index(name.split()[0])
         ]
         for name in names
     }

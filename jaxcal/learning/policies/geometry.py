@@ -181,7 +181,7 @@ def lookahead(
         gains = jnp.where(column == newest[..., None], _TAKEN, gains)
         along = back[..., :, None] * back[..., None, :]
         metric = metric - shrink[..., None, None] * along
-        newest = jnp.argmax(gains, axis=-1)
+        newest = jnp.argmax(gains, axis=-1).astype(newest.dtype)
         grown = jnp.maximum(base + jnp.maximum(gains.max(-1), 0.0), _LEAST_GAIN)
         reached = values[3] + jnp.log(grown)
         ends = (d < 2, d < 3, jnp.array(True))  # the pair, the triple, the last
