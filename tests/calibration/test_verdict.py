@@ -24,10 +24,10 @@ from ..models.arms import ur5, ur5_data
 PLACE = contacts.load("panda_1")["front"]
 
 
-def _fit(name, joints, sockets):
+def _fit(name, joints, sockets, offset=0.0):
     commands = np.column_stack([joints, sockets])
-    zeros = np.zeros((len(sockets), 3))
-    return jaxcal.identify(commands, zeros, model=contacts.arm(name))
+    offsets = np.full((len(sockets), 3), offset)
+    return jaxcal.identify(commands, offsets, model=contacts.arm(name))
 
 
 def test_good_contacts_get_a_good_verdict():
@@ -161,6 +161,8 @@ def test_contacts_that_no_such_arm_made_are_refused():
         _fit("panda_1", np.vstack([twice, twice]), labels)
     with pytest.raises(ValueError, match="have contacts of socket 1, whose distance"):
         _fit("panda_1", joints, 0.0 * sockets)
+    with pytest.raises(ValueError, match="have contacts of socket 1, whose distance"):
+        _fit("panda_1", joints, 0.0 * sockets, offset=1e-4)
     few = [
         np.concatenate([each, more[:5]])
         for each, more in zip(PLACE, other, strict=True)

@@ -51,6 +51,12 @@ def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
             f"a posture must have the ball in one socket, but row {row} is row "
             f"{first[groups.ravel()[row]]} with another socket: rows of the other file?"
         )
+    named = {int(i) for pair in arm.sensor.distances for i in pair[:2]}
+    for socket in sorted(named - set(which.tolist())):
+        raise ValueError(
+            f"commands must have contacts of socket {socket}, whose distance from "
+            "another is given"
+        )
     if measured.any():  # offsets that were measured, as in a simulation, are of any tip
         return
     points = arm.calibrated(arm.nominal).predict(joints)
@@ -76,12 +82,6 @@ def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
                 "rows of another place?"
             )
     for one, other, distance, _ in arm.sensor.distances:
-        missing = {int(one), int(other)} - set(middles)
-        if missing:
-            raise ValueError(
-                f"commands must have contacts of socket {missing.pop()}, whose "
-                "distance from another is given"
-            )
         distance_seen = float(np.linalg.norm(middles[int(one)] - middles[int(other)]))
         off = abs(distance_seen - distance) / arm.length
         unit = off > _OTHER_UNIT and not 0.1 < distance_seen / distance < 10.0
