@@ -62,13 +62,18 @@ test: $(READY) ## set everything up, lint, and run the quick tests (the ones CI 
 	wait $$rig; rig=$$?; cat $(VENV)/rig-tests.log; exit $$((rig | others))
 
 # A part is a folder of tests/, or `files`, the tests beside them. Each is a run of its own:
-# what one process has compiled it keeps, and the whole suite is too much for one.
+# what one process has compiled it keeps, and the whole suite is too much for one. The rig's
+# part, which mostly waits, runs beside the others.
 PARTS ?= $(notdir $(patsubst %/,%,$(dir $(wildcard tests/*/test_*.py)))) files
+EVERY_TEST = $(BIN)/python -m pytest --hypothesis-profile=new --dist loadfile --no-loadscope-reorder \
+	--durations=5 --durations-min=60 $(ARGS)
 test-all: $(READY) lint ## every test, the slow ones too, hypothesis drawing new examples (some folders: PARTS="rig docs")
-	@failed=; for part in $(sort $(PARTS)); do echo "== $$part"; \
+	@failed=; if [ "$(filter rig,$(PARTS))" ]; then \
+	$(EVERY_TEST) -n 3 --dist load tests/rig >$(VENV)/rig-tests.log 2>&1 & fi; rig=$$!; \
+	for part in $(filter-out rig,$(sort $(PARTS))); do echo "== $$part"; \
 	if [ $$part = files ]; then tests=`ls tests/test_*.py`; else tests=tests/$$part; fi; \
-	$(BIN)/python -m pytest --hypothesis-profile=new -n 3 --dist loadfile --no-loadscope-reorder \
-	--durations=5 --durations-min=60 $$tests $(ARGS) || failed="$$failed $$part"; done; \
+	$(EVERY_TEST) -n 2 $$tests || failed="$$failed $$part"; done; \
+	if [ "$$rig" ]; then wait $$rig || failed="$$failed rig"; echo "== rig"; cat $(VENV)/rig-tests.log; fi; \
 	[ -z "$$failed" ] || { echo "failed:$$failed"; exit 1; }
 
 lint: $(READY) ## ruff (lint and format), mypy and the import contracts
