@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.util
 import os
@@ -54,6 +55,8 @@ def _load(name: str) -> Any:
 def check(package: pathlib.Path) -> None:
     """One line on stderr where a kernel is older than its source.
 
+    Not for ``jaxcal-rig stop``, which calls none: nothing may keep it from the drives.
+
     Args:
         package: folder of a package in a checkout; an installed one holds no sources.
 
@@ -61,6 +64,8 @@ def check(package: pathlib.Path) -> None:
         ImportError: a kernel was never compiled for this Python: neither ``pip install
         .`` nor ``pip install -e .`` was run with it in this checkout.
     """
+    if sys.argv[1:2] == ["stop"]:
+        return
     missing, older = [], []
     for folder, _, names in os.walk(package):
         for name in names:
@@ -79,4 +84,5 @@ def check(package: pathlib.Path) -> None:
             if some is missing:
                 raise ImportError(f"{what}: {files}; {run} -e {package.parent}")
             said = f"{what}: {files}; {run} --no-deps -e {package.parent}"
-            print(f"jaxcal: {said}", file=sys.stderr)
+            with contextlib.suppress(OSError):  # a terminal that is gone
+                print(f"jaxcal: {said}", file=sys.stderr)

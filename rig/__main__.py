@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import re
+import signal
 import sys
 from collections.abc import Sequence
+
+if sys.argv[1:2] == ["stop"]:  # a terminal that is closed meanwhile does not end it
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
 
 from jaxcal.arguments import values_of
 from jaxcal.extras import install
@@ -38,7 +43,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         return 141  # the reader of our output went away, as `| head` does
     except (ValueError, OSError, RuntimeError, ImportError) as error:
-        print(f"jaxcal-rig: {told(error)}", file=sys.stderr)
+        with contextlib.suppress(OSError, UnicodeError):  # the exit code says it too
+            print(f"jaxcal-rig: {told(error)}", file=sys.stderr)
         if isinstance(error, JournalError) and command == "resume":
             return EXIT_BAD_INPUT
         return EXIT_FAULT if isinstance(error, RuntimeError) else code

@@ -37,6 +37,10 @@ class NotFollowing(MotionFault):
     """A drive turned and the IMU did not see it."""
 
 
+class TurnedTooFar(MotionFault):
+    """A move turned the phone further than was proved of it."""
+
+
 class EndedShort(MotionFault):
     """A drive reports its move done but stands short of the target.
 

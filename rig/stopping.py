@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import pathlib
 import signal
+import sys
 import time
 import tomllib
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -186,9 +187,13 @@ def _tell_others(stopped: list[pathlib.Path]) -> None:
 
 
 def _say(text: str) -> None:
-    """Print; a terminal that is gone does not end a stop."""
-    with contextlib.suppress(OSError):
+    """Print; a terminal that is gone, or lacks a letter, does not end a stop."""
+    try:
         print(text, flush=True)
+    except UnicodeError:
+        _say(ascii(text))
+    except OSError:
+        sys.stdout = None  # nothing is left to be flushed at the end
 
 
 def _stop_units(

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 import zipfile
+from unittest import mock
 
 import pytest
 
@@ -50,6 +51,20 @@ def test_a_kernel_that_was_never_compiled_is_an_error(package):
         ImportError, match=r"not compiled: package/some_kernel\.py; run"
     ):
         compiled.check(package)
+
+
+def test_neither_a_terminal_that_is_gone_nor_a_stop_minds_kernels(package, monkeypatch):
+    """`jaxcal-rig stop` loads this package before it stops a drive."""
+    later = time.time() + 10
+    os.utime(package / "some_kernel.py", (later, later))
+    gone = mock.Mock(write=mock.Mock(side_effect=OSError))
+    monkeypatch.setattr(sys, "stderr", gone)
+    compiled.check(package)
+    assert gone.write.called
+    monkeypatch.undo()
+    next(package.glob("*.so")).unlink()
+    monkeypatch.setattr(sys, "argv", ["jaxcal-rig", "stop"])
+    compiled.check(package)
 
 
 # Calls that take minutes, each in another compiled loop.

@@ -13,7 +13,7 @@ from rig.core.device import Device, Posture
 from rig.core.measure import measure
 from rig.core.motion import move
 from rig.core.proof import Turns, slopes
-from rig.faults import MotionFault
+from rig.faults import MotionFault, TurnedTooFar
 from rig.journal import SIGN_CHECKED
 from rig.readings.attitude import Array
 
@@ -48,13 +48,17 @@ def show(device: Device) -> None:
         seen = []
         for pulses in (near, far):
             place = tuple(pulses if i == j else p for i, p in enumerate(start))
-            posture = Posture(f"shown:{axis.name}", place)
-            seen.append(measure(move(device, posture)))
+            posture = Posture(f"show {axis.name}", place)
+            try:
+                seen.append(measure(move(device, posture)))
+            except TurnedTooFar as fault:
+                device.record.void(SIGN_CHECKED, str(fault))
+                raise
         attitudes = [np.array(each["attitude"]) for each in seen]
         turn = device.geometry.way(*attitudes) / axis.to_deg(far - near)
         noise = max(max(each["std_deg"]) / each["samples"] ** 0.5 for each in seen)
         _compare(device, j, turn, expected[:, j], noise / abs(axis.to_deg(far - near)))
-        move(device, Posture("shown", start))
+        move(device, Posture("where it began", start))
     device.shown = True
 
 

@@ -63,7 +63,8 @@ def _piece(device: Device, goal: Pulses, label: str) -> bool:
     for index, drive in enumerate(device.drives):
         drive.axis = proof.paced(index, end[index] - here[index])
     device.untrack()  # until it arrives
-    device.last_move = label, here, end
+    if end != here:
+        device.last_move = label, here, end
     device.heartbeat.feed(moving=True)
     try:
         for index, (drive, pulses) in enumerate(zip(device.drives, end, strict=True)):

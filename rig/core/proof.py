@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from rig.config import RigConfig
 from rig.config.axis import Axis, Pulses
 from rig.config.settings import ImuSettings, ReadingsSettings
-from rig.faults import MotionFault
+from rig.faults import MotionFault, TurnedTooFar
 from rig.journal import SIGN_CHECKED, DeviceRecord
 from rig.readings.attitude import Array, matrix_to_euler
 from rig.readings.geometry import Geometry
@@ -306,7 +306,7 @@ class Proof:
         for since, most in limits:
             turned = self._geometry.apart(since, attitude)
             if turned > most:
-                raise MotionFault(self._geometry.too_far(turned, most))
+                raise TurnedTooFar(self._geometry.too_far(turned, most))
 
     def saw(self, here: Pulses, end: Pulses, attitude: Array) -> None:
         """The phone once the move from here has ended."""
@@ -329,7 +329,7 @@ class Proof:
             and turned_deg > (most * expected + margin * self._scale)
         ):
             geometry = self._geometry
-            raise MotionFault(
+            raise TurnedTooFar(
                 f"{reach.axis.name} {geometry.changed} {turned_deg:.2f} "
                 f"{geometry.unit} in a move that {geometry.again} {expected:.2f} when "
                 "`axes` looked: its drive, its setting or its gearbox was exchanged. "

@@ -310,6 +310,7 @@ def test_a_creeping_device_never_settles():
     [
         ("stuck_axis,axis=yaw@moving", "yaw does not follow"),
         ("alarm,axis=roll", "roll: alarm 0x30. .* go on with --reset-alarms"),
+        ("sto,axis=yaw", "power stage of yaw was switched off while armed"),
         ("imu_gap", "s old"),
         ("dead_drive,axis=pitch", "no valid reply"),
     ],
@@ -326,6 +327,24 @@ def test_trouble_on_the_way_is_noticed(fault, error):
         assert sum(result.acknowledged for result in results) >= 2
         with pytest.raises(StopRequested):
             motion.move_to((0, 0, 0), "after a fault")
+
+
+def test_a_power_stage_that_is_switched_off_at_rest_ends_what_is_measured():
+    """The position may hold still all the same; an axis by gravity sinks later."""
+    with bench() as motion:
+        motion.sim.drives[2].cut(9.0)
+        with pytest.raises(MotionFault, match="power stage of roll was switched off"):
+            motion.measure(motion.device.positions())
+
+
+def test_what_moved_last_is_no_move_of_no_way():
+    with bench() as motion:
+        here = motion.device.positions()
+        motion.move_to(here, "reference")
+        assert motion.device.last_move is None
+        motion.move_to((here[0] + 100, *here[1:]), "x")
+        motion.move_to(motion.device.positions(), "reference")
+        assert motion.device.last_move[0] == "x"
 
 
 def test_a_missed_deadline_stops(monkeypatch):

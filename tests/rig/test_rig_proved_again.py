@@ -214,7 +214,8 @@ def test_a_gearing_that_was_changed_since_is_found_in_small_moves(
         assert code == 3, said
         assert axis in said and "when `axes` looked" in said
         assert far.max() < 5.0, far
-        assert main(["calibrate", "--arm", "--zero"]) in (2, 3)
+    record = DeviceRecord.load(at / "device.json")
+    assert record.state(SIGN_CHECKED) is None
 
 
 def test_a_phone_that_was_turned_on_its_holder_is_found(at, capsys):
@@ -234,7 +235,7 @@ def test_a_session_ends_well_at_the_limits_of_a_real_device(at, capsys, monkeypa
     with proved(at, capsys, speedup=1.0):
         code, said = session(capsys)
         assert code == 0, said
-        assert said.count("acknowledged, at rest") == 3
+        assert "pitch, yaw, roll: acknowledged, at rest" in said
 
 
 # C: speed

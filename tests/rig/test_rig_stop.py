@@ -21,15 +21,17 @@ from harness import (
 )
 from test_rig_motion import bench
 
+from rig import stopping
 from rig.__main__ import main
 from rig.config import load_config
-from rig.core.stop import stop_all
+from rig.core.stop import UnitStop, stop_all
 from rig.drives.modbus import Bus, BusError, ModbusDrive
 from rig.faults import StopRequested
 from rig.journal import lock
 from rig.journal.lock import BusLock, read_armed
 from rig.signals import Signals
 from rig.simulator import parse_fault
+from rig.workbench.outputs.words import event_lines
 from rig.workbench.procedures.collect import collect
 from rig.workbench.run import run_safely
 
@@ -569,3 +571,47 @@ def test_a_file_of_no_use_says_that_nothing_was_stopped(
     for given in (["--config", str(path)], []):
         assert main(["stop", *given]) == 3
         assert "NOTHING WAS STOPPED BY THIS COMMAND" in capsys.readouterr().err
+
+
+def test_units_are_told_one_by_one_where_there_is_something_to_say():
+    units = [vars(UnitStop(name, unit, True, True)) for unit, name in enumerate("ab")]
+    stopped = {"event": "stop", "reason": "x", "units": units}
+    assert event_lines(stopped) == ["stop: x", "  a, b: acknowledged, at rest"]
+    units[1]["standing"] = False
+    assert [line.split(":")[0] for line in event_lines(stopped)[1:]] == [
+        "  a (unit 0)", "  b (unit 1)",
+    ]  # fmt: skip
+
+
+# Where nobody reads
+
+CLOSED = """
+import os, signal, sys
+from rig.__main__ import main
+os.kill(os.getpid(), signal.SIGHUP)
+sys.exit(main())
+"""
+
+
+def test_a_closed_terminal_takes_nothing_from_a_stop_but_its_words(tmp_path):
+    """Neither its hang-up nor what cannot be written: the exit code is a stop's."""
+    computer, terminal = os.openpty()
+    words = ["-c", CLOSED, "stop", "--config", str(tmp_path / "none.toml")]
+    with os.fdopen(terminal, "w") as gone:
+        os.close(computer)
+        code = subprocess.run(
+            [sys.executable, *words], stdin=gone, stdout=gone, stderr=gone, timeout=30
+        ).returncode
+    assert code == 3
+
+
+def test_a_stop_goes_on_where_its_words_cannot_be_written(rig, capsys, monkeypatch):
+    """Of a folder with letters that the terminal lacks, on a disk that is full."""
+    with open("/dev/full", "w", encoding="ascii") as full, monkeypatch.context() as m:
+        m.setattr(sys, "stdout", full)
+        stopping._say("/home/jürgen/rig.toml")
+        assert sys.stdout is None  # of which nothing is flushed when it ends
+        assert main(["stop", "--config", str(rig.path)]) == 0
+        with contextlib.suppress(OSError):
+            full.close()
+    assert all(drive.stops for drive in rig.drives)

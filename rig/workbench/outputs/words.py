@@ -74,8 +74,12 @@ def _last_move(record: Record) -> str:
 
 
 def _stop(record: Record) -> str:
-    units = "".join(f"\n  {UnitStop(**unit)}" for unit in record["units"])
-    return f"stop: {record['reason'] or 'end of run'}{units}"
+    """Unit by unit where something is to be said of one; `stayed` does it later."""
+    units = [UnitStop(**unit) for unit in record["units"]]
+    told = "".join(f"\n  {unit}" for unit in units)
+    if all(u.acknowledged and u.standing and not u.detail for u in units):
+        told = f"\n  {', '.join(unit.axis for unit in units)}: acknowledged, at rest"
+    return f"stop: {record['reason'] or 'end of run'}{told}"
 
 
 # An event of the run in words, for console, page and report: its fields are put in.
