@@ -43,10 +43,13 @@ def constants(loss: Loss, q: int) -> tuple[float, float, float]:
         Mean weighted squared residual of a reading of unit noise; mean weight;
         efficiency relative to least squares.
     """
-    from scipy import special
+    from scipy import linalg
 
-    node, share = special.roots_genlaguerre(60, q / 2.0 - 1.0)
-    share, square = share / share.sum(), 2.0 * node
+    # Golub and Welsch: Gauss-Laguerre nodes, whatever q is (gamma(q / 2) overflows).
+    index, order = np.arange(60.0), q / 2.0 - 1.0
+    beside = np.sqrt(index[1:] * (index[1:] + order))
+    node, vectors = linalg.eigh_tridiagonal(2.0 * index + 1.0 + order, beside)
+    share, square = vectors[0] ** 2, 2.0 * node
     weight = loss.weight(square, q)
     slope = share @ (weight + 2.0 * square * loss.slope(square, q) / q)
     efficiency = slope**2 / (share @ (weight**2 * square) / q)

@@ -72,7 +72,8 @@ def _lengths(
     """
     resolution = _EPS * max(count, 1)
     lengths = np.sqrt((columns * columns).sum(axis=1))
-    beside = largest / np.maximum(lengths, _TINY)
+    with np.errstate(over="ignore"):  # of a column without a length
+        beside = largest / np.maximum(lengths, _TINY)
     most = beside.max(axis=1, initial=8.0)
     if not most.max() < 1.0 / resolution:
         lengths[beside >= 1.0 / resolution] = 0.0

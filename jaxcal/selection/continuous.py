@@ -217,6 +217,7 @@ def refine(
         criterion = _same_criterion(selection)
     box = _limits(_range(candidates[available], allowed) if limits is None else limits)
     begun = candidates[rows]
+    _require_inputs(box, candidates)
     beyond = (begun < box[:, 0]) | (begun > box[:, 1])
     require_none(beyond, begun, "selection must be within the limits")
     if allowed is not None:
@@ -266,6 +267,12 @@ def _limits(limits: ArrayLike) -> Array:
     return box
 
 
+def _require_inputs(box: Array, commands: Array) -> None:
+    n = commands.shape[1]
+    if len(box) != n:
+        raise ValueError(f"limits must be ({n}, 2) for this model, got {box.shape}")
+
+
 def _moved(allowed: Allowed | None, commands: Array) -> Array:
     """(L, n) commands that are allowed; an arm's are moved to where it is measured."""
     onto = getattr(allowed, "onto", None)
@@ -278,6 +285,8 @@ def _moved(allowed: Allowed | None, commands: Array) -> Array:
 def _permitted(allowed: Allowed | None, commands: Array) -> NDArray[np.bool_]:
     if allowed is None:
         return np.ones(len(commands), dtype=np.bool_)
+    if not callable(allowed):
+        raise ValueError(f"allowed must be a function of one command, got {allowed!r}")
     return np.array([bool(allowed(row.copy())) for row in commands], dtype=np.bool_)
 
 
@@ -423,9 +432,7 @@ class _Ascent:
         self.allowed, self.seed = allowed, seed
         self.low, self.span = box[:, 0], np.ptp(box, axis=1)
         assert offer.candidates is not None and offer.model is not None
-        n = offer.candidates.shape[1]
-        if len(box) != n:
-            raise ValueError(f"limits must be ({n}, 2) for this model, got {box.shape}")
+        _require_inputs(box, offer.candidates)
         _require_one_noise(offer.noise or Noise())
         self.asked, self.region = criterion, region
         if offer.uncertain:

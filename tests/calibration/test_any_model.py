@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import optimize
+from scipy import optimize, stats
 
 import jaxcal
 from jaxcal.calibration import Calibration, identify
-from jaxcal.calibration.losses import LOSSES, Loss
+from jaxcal.calibration.losses import LOSSES, Loss, constants
 from jaxcal.models import (
     Affine,
+    FromFunction,
     FromJax,
     Linear,
     Model,
@@ -700,3 +701,36 @@ def test_seven_names_are_a_model():
     np.testing.assert_allclose(least.estimate, line.estimate, atol=1e-9)
     assert jaxcal.select(commands, 2, model=Least()).log_det > 0.0
     assert identifiability(Least(), commands).rank == 2
+
+
+@pytest.mark.parametrize("q", [3, 1500])
+def test_what_a_loss_does_to_normal_noise_is_an_integral(q):
+    """By quadrature over the quantiles of the squared distance."""
+    student = LOSSES["student"]
+    assert student is not None
+    square = stats.chi2.ppf((np.arange(4000) + 0.5) / 4000, q)
+    weight, slope = student.weight(square, q), student.slope(square, q)
+    by_residual = np.mean(weight + 2.0 * square * slope / q)
+    expected = [
+        np.mean(weight * square) / q,
+        np.mean(weight),
+        by_residual**2 / (np.mean(weight**2 * square) / q),
+    ]
+    np.testing.assert_allclose(constants(student, q), expected, rtol=2e-4)
+
+
+def test_trajectories_of_a_thousand_readings_are_identified():
+    """By least squares of scipy: no measurement is far from the others."""
+    times, u = np.linspace(0.0, 1.0, 1500), np.linspace(0.1, 3.0, 6)[:, None]
+
+    def trajectory(u, theta):
+        return theta[0] * np.exp(-theta[1] * times * u)
+
+    model = FromFunction(trajectory, [1.0, 0.5], batch=True, quiet=True)
+    measured = trajectory(u, [1.1, 0.45])
+    measured += np.random.default_rng(0).normal(0.0, 0.1, measured.shape)
+    fit = identify(u, measured, model=model, noise=Noise(0.1))
+    least = optimize.least_squares(
+        lambda theta: (trajectory(u, theta) - measured).ravel(), [1.0, 0.5]
+    )
+    assert (np.abs(fit.parameters - least.x) < 0.1 * fit.standard_errors).all()

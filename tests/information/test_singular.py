@@ -108,3 +108,9 @@ def test_derivatives_are_less_exact_than_the_numbers_given(
     largest = np.abs(columns).max(axis=1)
     rank = rank_rule(columns, largest, computed=computed)[0][0]
     assert rank == (3 if computed and share < 1e-10 else 4)
+
+
+def test_a_column_of_zeros_beside_large_numbers_brings_no_warning(recwarn):
+    columns = np.array([[[1.0, 0.0], [2.0, 0.0]]])
+    assert rank_rule(columns, np.array([[2.0, 10.0]]))[0] == [1]
+    assert not recwarn.list

@@ -230,7 +230,9 @@ def test_bad_input_is_named():
     with pytest.raises(ValueError, match=r"limits must be \(n, 2\), least below"):
         jaxcal.optimise([[1.0, 0.0]], 2, Affine(1, 1))
     with pytest.raises(ValueError, match=r"limits must be \(2, 2\) for this model"):
-        design.refine([0, 1, 2], [[0.0, 1.0]])
+        design.refine([0, 1, 2], [[0.0, 0.1]])
+    with pytest.raises(ValueError, match="allowed must be a function of one command"):
+        design.refine([0, 1, 2], allowed=3)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="selection must be within the limits"):
         design.refine([0, 1, 2], [[0.0, 0.1]] * 2)
     with pytest.raises(ValueError, match=r"selection must lie in \[0, 9\), got 9"):
