@@ -30,6 +30,8 @@ from jaxcal.adaptive.session import Decider, SequentialTask, Session
 
 __all__ = ["Loop", "Proposal", "SessionResult", "next_measurement", "run"]
 
+_DRAWS = 32  # of the gain that is told, which a single one leaves uncertain by a third
+
 
 @dataclasses.dataclass(frozen=True)
 class Proposal:
@@ -263,7 +265,8 @@ def _choose(
     index = decider(task, belief, session, options, keys.choice)
     seconds, uses = task.expected(belief, session, options)
     design = jax.tree.map(lambda leaf: leaf[index], options.designs)
-    gain = belief.gain(task, design, keys.gain)
+    draws = jax.random.split(keys.gain, _DRAWS)
+    gain = jax.vmap(lambda key: belief.gain(task, design, key))(draws).mean()
     return design, gain, seconds[index], uses[index], options.allowed.any()
 
 

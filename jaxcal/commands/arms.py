@@ -244,13 +244,13 @@ def _run_model(path: str) -> Model:
     file.read_bytes()
     sys.path.insert(0, str(file.parent))
     try:
-        model = importlib.import_module(file.stem).model
-    except AttributeError:
-        raise ValueError(f"{path}: it must set `model`, one of jaxcal.models") from None
+        module = importlib.import_module(file.stem)
     except Exception as error:
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+    if not hasattr(module, "model"):
+        raise ValueError(f"{path}: it must set `model`, one of jaxcal.models")
     try:
-        return as_model(model)
+        return as_model(module.model)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 

@@ -48,6 +48,21 @@ def test_a_linear_model_is_known_as_by_bayes_in_closed_form():
 
 
 @pytest.mark.slow
+def test_the_gain_that_is_told_is_that_of_bayes_whatever_the_seed():
+    at, history = np.linspace(-1.0, 1.0, 9)[:, None], [(0, -0.4), (8, 1.9), (4, 0.6)]
+    task = ParticleTask.of(
+        Polynomial(1, 1), Prior(1.0), Noise(std=0.3), at, measurements=8
+    )
+    rows = np.array([[[1.0, u]] for u in at[:, 0]])
+    spread = normal_posterior(rows[[0, 8, 4]], [0.0] * 3, 1.0, np.diag([0.09]))[1]
+    for seed in range(6):  # one draw of the gain has a standard deviation of .08
+        proposal = next_measurement(task, history, seed=seed)
+        row = rows[proposal.design]
+        gain = 0.5 * np.log1p((row @ spread @ row.T).item() / 0.09)
+        assert proposal.gain == pytest.approx(gain, abs=0.06)
+
+
+@pytest.mark.slow
 def test_readings_of_two_outputs_count_by_their_covariance():
     covariance = np.array([[0.09, 0.04], [0.04, 0.04]])
     model = Linear("1 + x", 2)

@@ -193,6 +193,9 @@ def test_tasks_that_are_not_there_are_refused(tmp_path):
     (tmp_path / "empty.py").write_text("")
     with pytest.raises(ValueError, match="must define ENTRY"):
         registry.load(str(tmp_path / "empty.py"))
+    (tmp_path / "fails.py").write_text("1 / 0")
+    with pytest.raises(ValueError, match=r"fails\.py: ZeroDivisionError: division by"):
+        registry.load(str(tmp_path / "fails.py"))
 
 
 @pytest.mark.slow

@@ -61,7 +61,7 @@ def load(name: str) -> Entry:
         name: as registered, or a Python file that defines ``ENTRY``.
 
     Raises:
-        ValueError: no such task, or a file without an entry.
+        ValueError: no such task, or a file that fails or has no entry.
     """
     if name.endswith(".py"):
         entry = _of_file(pathlib.Path(name))
@@ -89,6 +89,9 @@ def _of_file(path: pathlib.Path) -> Any:
     sys.path.insert(0, folder := str(path.parent.resolve()))  # as Python runs a file
     try:
         spec.loader.exec_module(module)
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise ValueError(f"task file {path}: {reason}") from error
     finally:
         sys.path.remove(folder)
     if not hasattr(module, "ENTRY"):
