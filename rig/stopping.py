@@ -233,28 +233,45 @@ def _stop_units(
 def _drives(
     armed: dict[str, Any] | None, path: pathlib.Path | None
 ) -> tuple[Any, float, list[Any]]:
-    """Bus, silence and axes: of what is armed, else of the file, else as armed last."""
+    """Bus, silence and axes: of what is armed, else of the file, else as armed last.
+
+    Raises:
+        Fault: neither can be read.
+    """
+    faults: list[str] = []
+    moving = armed is not None and not armed["standing"]
+    for source in (armed, path) if moving else (path, armed):
+        if source is None:
+            continue
+        try:
+            drives = _read(source)
+        except Exception as error:  # left by another version; edited since
+            lost = f"what was armed cannot be read ({type(error).__name__}: {error})"
+            faults.append(str(error) if source is path else lost)
+            continue
+        if faults:
+            which = f"of {path}" if source is path else "that were armed last"
+            _say(f"{faults[0]}\nstopping the drives {which} instead")
+        return drives
+    raise Fault(f"{NOTHING}: {'; '.join(faults)}. {LAST_RESORT}")
+
+
+def _read(source: dict[str, Any] | pathlib.Path) -> tuple[Any, float, list[Any]]:
+    """Bus, silence and axes, of what a session left or of a configuration file."""
     from rig.config.axis import Axis
     from rig.config.config import load_config
     from rig.config.maps import parse_map
-    from rig.config.schema import ConfigError
     from rig.config.settings import BusSettings
 
-    if path is not None and (armed is None or armed["standing"]):
-        try:
-            config = load_config(path)
-            return config.bus, config.silence_s, [*config.axes]
-        except ConfigError as error:
-            if armed is None:
-                raise Fault(f"{NOTHING}: {error}. {LAST_RESORT}") from None
-            _say(f"{error}\nstopping the drives that were armed last instead")
-    assert armed is not None
+    if isinstance(source, pathlib.Path):
+        config = load_config(source)
+        return config.bus, config.silence_s, [*config.axes]
     axes = [
         Axis.unmoved(
             each["name"],
             each["unit"],
             parse_map(each["map"], "map", pathlib.Path(each.get("folder", ""))),
         )
-        for each in armed["drives"]
+        for each in source["drives"]
     ]
-    return BusSettings.model_validate(armed["bus"]), armed["silence_s"], axes
+    return BusSettings.model_validate(source["bus"]), source["silence_s"], axes

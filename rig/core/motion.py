@@ -192,13 +192,14 @@ def _check_speed(device: Device, axis: Axis, seen: list[Status]) -> None:
     """A drive is no faster than it was told to be.
 
     It was where it was at some time after it was asked and before it answered, so that
-    a slow reply makes no speed.
+    a slow reply makes no speed; nor do counts by which two readings may differ.
     """
     (first, *_, last), asked = seen, axis.drive_motion[0]
     marks = [s for s in seen[1:-1] if last.time - s.asked > SPAN_S]
     ways = [
-        (abs(axis.to_deg(last.position - s.position)), last.time - s.asked)
+        (abs(axis.to_deg(max(0, counts - STILL_COUNTS))), last.time - s.asked)
         for s in (first, *marks[-1:])
+        for counts in [abs(last.position - s.position)]
     ]
     speed = max(way / seconds for way, seconds in ways)
     before, way = device.paces.get(axis.name), ways[0][0]

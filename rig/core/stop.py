@@ -206,4 +206,4 @@ class Stopper:
     def check(self) -> None:
         """Raise StopRequested where a stop has latched."""
         if self.reason:
-            raise StopRequested(f"stopped: {self.reason}", EXIT_FAULT)
+            raise StopRequested(self.reason, EXIT_FAULT)

@@ -205,7 +205,8 @@ def read_armed(path: pathlib.Path) -> dict[str, Any] | None:
     """What was left for a stop; None where there is nothing, or nothing of use."""
     try:
         told = json.loads(path.read_text(encoding="utf-8"))
-        return told if told["bus"] and told["drives"] else None
+        useful = told["bus"] and told["drives"]
+        return {"standing": False, **told} if useful else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

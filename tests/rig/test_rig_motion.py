@@ -337,6 +337,23 @@ def test_a_power_stage_that_is_switched_off_at_rest_ends_what_is_measured():
             motion.measure(motion.device.positions())
 
 
+@pytest.mark.parametrize(("counts", "fast"), [(2, False), (20, True)])
+def test_a_count_that_jumps_is_no_speed(counts, fast, monkeypatch):
+    """A stepper of 1,000 counts a turn: its first move is of one or two."""
+    monkeypatch.setattr(moving, "TOO_FAST", 1.6)
+    config = SimpleNamespace(name="stepper")
+    axis = SimpleNamespace(
+        name="x", unit_name="mm", map=config, drive_motion=(0.002, 0.02),
+        to_deg=lambda count: count / 1000.0,
+    )  # fmt: skip
+    device = SimpleNamespace(simulated=False, paces={})
+    seen = [SimpleNamespace(position=0, asked=0.0, time=0.01),
+            SimpleNamespace(position=counts, asked=0.5, time=0.51)]  # fmt: skip
+    told = pytest.raises(MotionFault, match=r"moves at 0\.0353 mm/s or faster")
+    with told if fast else contextlib.nullcontext():
+        moving._check_speed(device, axis, seen)
+
+
 def test_what_moved_last_is_no_move_of_no_way():
     with bench() as motion:
         here = motion.device.positions()

@@ -522,6 +522,21 @@ def test_what_was_armed_is_stopped_whatever_the_file_says(name, standing, rig, c
     assert all(drive.stops for drive in rig.drives)
 
 
+@pytest.mark.parametrize("lost", ["name", "map"])
+def test_what_another_version_armed_is_stopped_by_the_file(lost, rig, capsys):
+    config = load_config(rig.path)
+    bus = BusLock(config.bus)
+    bus.leave(config)
+    armed = json.loads(bus.armed_path.read_text())
+    armed["drives"][1][lost] = "schema = 99"
+    if lost == "name":
+        del armed["drives"][1]["name"]
+    bus.armed_path.write_text(json.dumps(armed))
+    assert main(["stop", "--config", str(rig.path)]) == 0
+    assert "what was armed cannot be read" in capsys.readouterr().out
+    assert all(drive.stops for drive in rig.drives)
+
+
 def test_a_device_whose_drives_stand_is_left_alone_by_a_stop_of_another(rig, tmp_path):
     """Without a file of use, what is armed is stopped, not what was once."""
     with simulator(fast_config(), speedup=0.02) as other:

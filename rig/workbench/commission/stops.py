@@ -99,7 +99,7 @@ def _prove(
     """Stop a move from low to high; degrees that each axis went on after its stop."""
     for number in range(TRIES):
         device.proof.ceiling_deg_s = None
-        move(device, Posture("stop:from", low))
+        move(device, Posture("the start of the stop", low))
         device.proof.ceiling_deg_s = speed_deg_s / 2**number
         places = _go(device, low, high)
         if max(_shares(device, low, high, places)) <= LATE:
@@ -163,7 +163,7 @@ def _go(device: Device, low: Pulses, high: Pulses) -> list[int]:
 
     device.meanwhile = look
     try:
-        move(device, Posture("stop:to", high))
+        move(device, Posture("try the stop", high))
     except _OnTheWay:
         pass
     finally:
