@@ -247,6 +247,10 @@ def _run_model(path: str) -> Model:
         module = importlib.import_module(file.stem)
     except Exception as error:
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+    if pathlib.Path(getattr(module, "__file__", None) or "").resolve() != file:
+        raise ValueError(
+            f"{path}: it must have a name of its own, {file.stem} is another module's"
+        )
     if not hasattr(module, "model"):
         raise ValueError(f"{path}: it must set `model`, one of jaxcal.models")
     try:

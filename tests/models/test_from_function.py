@@ -277,6 +277,9 @@ def test_a_file_of_python_is_a_model_on_the_command_line(tmp_path, capsys):
     (tmp_path / "nothing.py").write_text("x = 1\n")
     code = jaxcal_main(["select", str(table), "--model", str(tmp_path / "nothing.py")])
     assert code == 2 and "it must set `model`" in capsys.readouterr().err
+    (tmp_path / "signal.py").write_text("model = None")
+    code = jaxcal_main(["select", str(table), "--model", str(tmp_path / "signal.py")])
+    assert code == 2 and "signal is another module's" in capsys.readouterr().err
     (tmp_path / "misspelt.py").write_text("import math\nmodel = math.nothing")
     code = jaxcal_main(["select", str(table), "--model", str(tmp_path / "misspelt.py")])
     assert code == 2 and "no attribute 'nothing'" in capsys.readouterr().err
