@@ -127,11 +127,11 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
                     _say("\n".join(map(str, job.result())))
                 except Fault as error:
                     faults.append(error)
+        _tell_others([target.lock.armed_path for target in targets])
         if len(faults) == len(jobs):
             raise faults[0]
         for fault in faults:
             _say(str(fault))
-        _tell_others([target.lock.armed_path for target in targets])
         good = all(each.acknowledged and each.standing for each in results)
         return EXIT_OK if good and not faults else EXIT_FAULT
 

@@ -8,11 +8,19 @@ from harness import (
     changed,
     fast_config,
     fast_text,
+    measured_text,
 )
 
 import jaxcal
 from rig.config import example_text, parse_config
-from rig.workbench.procedures.plan import choose, draw_candidates, travel_order
+from rig.workbench.identification.fit import held_out_errors
+from rig.workbench.procedures.goto import _command
+from rig.workbench.procedures.plan import (
+    choose,
+    draw_candidates,
+    draw_held_out,
+    travel_order,
+)
 
 
 @pytest.mark.slow
@@ -124,3 +132,29 @@ def test_travel_order_takes_the_least_time(rng):
         many = travel_order(config, rng.uniform(-20, 20, (count, 3)), np.zeros(3))
         assert sorted(many) == list(range(count))
     assert travel_order(config, np.empty((0, 3)), np.zeros(3)) == []
+
+
+def test_of_more_numbers_than_axes_targets_are_what_the_calibration_says(rng):
+    """Two translations, three gauges: there is no measurement that equals a command."""
+    axes = {"x": "translation", "y": "translation"}
+    names = measured_text(axes).replace("['x', 'y']", "['a', 'b', 'c']")
+    config = parse_config(names)
+    matrix, bias = np.array([[1.0, 0.1], [0.0, 0.9], [0.5, -0.3]]), np.arange(3.0)
+    u = rng.uniform(-20, 20, (6, 2))
+    calibration = jaxcal.identify(u, u @ matrix.T + bias)
+    held = draw_held_out(config, calibration, 3)
+    assert len(held) == 3
+    off = np.array([0.0, 0.02, 0.0])
+    records = {
+        f"{role}:{i}": {
+            "commanded_deg": config.to_deg(pulses).tolist(),
+            "measured_deg": (matrix @ config.to_deg(pulses) + bias + off).tolist(),
+        }
+        for i, pair in enumerate(held)
+        for role, pulses in zip(("before", "after"), pair, strict=True)
+    }
+    _, errors = held_out_errors(config, held, records, calibration)
+    assert errors["after"]["max"] == pytest.approx(0.02, abs=2e-3)
+    near = matrix @ [3.0, -4.0] + bias + np.cross(*matrix.T)  # nothing reaches it
+    command = _command(config, calibration, near)
+    np.testing.assert_allclose(command, [3.0, -4.0], atol=1e-9)

@@ -88,6 +88,9 @@ def test_stop_names_the_devices_that_it_did_not_stop(tmp_path, monkeypatch, caps
     assert "NOT stopped, another device: 127.0.0.1:6002" in said
     assert str(tmp_path / "6002" / "device.json") in said
     assert "6001" not in said and "6003" not in said
+    (tmp_path / "rig.toml").write_text('[bus]\ntransport = "tcp"\nport = 1\n')
+    assert main(["stop", "--config", str(tmp_path / "rig.toml")]) == 3
+    assert "another device: 127.0.0.1:6002" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

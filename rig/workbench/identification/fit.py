@@ -110,6 +110,18 @@ def spread(off: Array) -> dict[str, Any]:
     }
 
 
+def desired_at(config: RigConfig, calibration: Any, pulses: Any) -> Array:
+    """(..., m) that held-out targets of (..., n) pulses should measure.
+
+    What is commanded, as an ideal device would; of other numbers than axes there is no
+    ideal, and it is what the calibration says.
+    """
+    degrees: Array = config.to_deg(pulses)
+    if len(config.output_names) == len(config.axes):
+        return degrees
+    return np.asarray(calibration.predict(degrees), dtype=np.float64)
+
+
 def held_out_errors(
     config: RigConfig, held: list[Any], postures: dict[str, Record], calibration: Any
 ) -> tuple[list[Record], dict[str, Any]]:
@@ -131,7 +143,7 @@ def held_out_errors(
     ]
     if not both:
         return [], {}
-    desired = config.to_deg([held[i][0] for i in both])
+    desired = desired_at(config, calibration, [held[i][0] for i in both])
     visited = {role: [postures[f"{role}:{i}"] for i in both] for role in roles}
     errors = {role: spread(pairs(r)[1] - desired) for role, r in visited.items()}
     records = visited["before"] + visited["after"]

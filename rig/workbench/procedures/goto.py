@@ -63,6 +63,10 @@ def goto(run: Run, calibration: Any, to: Sequence[float]) -> int:
 def _command(config: RigConfig, calibration: Any, desired: Array) -> Array:
     """(n,) what gives (m,) desired measurements."""
     more: dict[str, Any] = {}
+    if config.model is None and len(desired) > len(config.axes):  # as near as they can
+        at_zero, *others = calibration.predict(np.eye(len(config.axes) + 1)[:, 1:])
+        matrix = np.transpose(others) - at_zero[:, None]
+        return np.asarray(np.linalg.lstsq(matrix, desired - at_zero)[0])
     if config.model is not None:
         more["limits"] = [(axis.min_deg, axis.max_deg) for axis in config.axes]
     try:

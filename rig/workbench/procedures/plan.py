@@ -174,7 +174,8 @@ def draw_held_out(
     """Held-out targets in pulses, each as it is and as its compensated command.
 
     Fewer than ``count`` where little of the range can be reached compensated. By a
-    ``[model]`` they are predicted, and visited once.
+    ``[model]`` they are predicted, and visited once. Of other numbers than axes what
+    the calibration says there is the target, and both are the same.
     """
     if config.model is not None:
         return [(tuple(pulses.tolist()),) for pulses in draw(config, count, 1)]
@@ -183,7 +184,9 @@ def draw_held_out(
     for pulses in draw(config, 200 * count, 1):
         if len(pairs) == count:
             break
-        command = calibration.command_for(config.to_deg(pulses))
+        command = config.to_deg(pulses)
+        if len(config.output_names) == len(config.axes):
+            command = calibration.command_for(command)
         if ((command >= low) & (command <= high)).all():
             pairs.append((tuple(pulses.tolist()), config.to_pulses(command)))
     return pairs
