@@ -117,7 +117,7 @@ class Criterion:
             return self.of_rows(root / units, times, offset=offset)
         if not root.any():
             return self.of_rows(root, times)
-        size = 2.0 ** math.frexp(np.abs(root).max())[1]
+        size = 2.0 ** min(math.frexp(np.abs(root).max())[1], 1023)
         root = root / size
         rest = 2.0 ** math.frexp(math.sqrt((root * root).sum()))[1]
         try:

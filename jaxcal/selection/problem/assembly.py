@@ -109,7 +109,8 @@ def _problem_of_scenarios(
             members.append(_problem_of_one(alone, k, criterion))
         except ValueError as error:
             raise ValueError(f"in scenario {s}: {error}") from None
-    nominal = None if offer.model is None else _problem_of_one(offer, k, criterion)
+    compared = offer.model is not None and len(members) > 1
+    nominal = _problem_of_one(offer, k, criterion) if compared else None
     return joined_problem(members, offer.scenarios.weights, joined, nominal)
 
 
