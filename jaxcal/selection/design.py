@@ -64,7 +64,8 @@ class Design:
         lost: measurements, 1 or 2, that may fail: what is best is what the worst such
             loss leaves. Of several scenarios with ``jaxcal.Worst`` only.
         reliability: (M,) probabilities that a candidate can be measured; the mean of
-            the criterion over 64 draws (seeded) of what arrives counts.
+            the criterion over what arrives counts: over every case where at most six
+            may fail, else over 64 draws (seeded).
         names: (M,) names of the candidates, for the answers.
 
     Raises:

@@ -26,7 +26,8 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Loss = tuple[int, ...]  # candidates that fail together
 
-_DRAWS = 64  # of what arrives
+_MOST_FAILING = 6  # candidates that may fail of which every case counts
+_DRAWS = 64  # of what arrives, where more may fail
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -149,8 +150,7 @@ def with_arrivals(problem: Problem, reliability: Array, criterion: Joined) -> Pr
             "reliability must come with a mean over scenarios, got Worst; of the worst "
             "loss it is lost=1"
         )
-    arrives = np.random.default_rng(0).random((_DRAWS, len(reliability)))
-    missing = [np.flatnonzero(row >= reliability).tolist() for row in arrives]
+    missing, chances = _arrivals(reliability)
     whole = getattr(problem, "members", (problem,))
     weights = getattr(problem, "weights", np.ones(1))
     members = [_without(one, lost) for one in whole for lost in missing]
@@ -159,6 +159,22 @@ def with_arrivals(problem: Problem, reliability: Array, criterion: Joined) -> Pr
     return ScenarioProblem(
         **fields,
         members=tuple(members),
-        weights=np.repeat(weights / _DRAWS, _DRAWS),
+        weights=np.outer(weights, chances).ravel(),
         told=False,
     )
+
+
+def _arrivals(reliability: Array) -> tuple[list[list[int]], Array]:
+    """Which candidates fail in each case, and the probabilities of the cases.
+
+    Every case where at most six may fail; draws, equally likely, where more may.
+    """
+    failing = np.flatnonzero(reliability < 1.0)
+    if len(failing) > _MOST_FAILING:
+        arrives = np.random.default_rng(0).random((_DRAWS, len(reliability)))
+        missing = [np.flatnonzero(row >= reliability).tolist() for row in arrives]
+        return missing, np.full(_DRAWS, 1.0 / _DRAWS)
+    cases = list(itertools.product([False, True], repeat=len(failing)))
+    fails = np.array(cases, dtype=bool)
+    chances = np.where(fails, 1.0 - reliability[failing], reliability[failing])
+    return [failing[row].tolist() for row in fails], chances.prod(axis=1)
