@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import pathlib
+import re
 import sys
 from typing import Any
 
@@ -113,7 +114,9 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """The home page shows the table of figures that README has."""
+    """The home page shows README's table; an example's picture is found in the site."""
+    if "/" not in page.file.src_uri:
+        markdown = re.sub(r"(!\[[^]]*\]\()\.\./examples/", r"\1examples/", markdown)
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     figures = readme.partition("<!-- figures -->")[2].partition("<!-- end -->")[0]
     return markdown.replace(
