@@ -3,8 +3,8 @@
     python examples/real_camera.py           # 5 random draws
     python examples/real_camera.py --full    # 100, and real_camera.md
 
-The model is that of camera.py: the board's pose in a view is six commands known by
-nobody (``command_std=inf``), so a view counts by what it says beyond its own pose. The
+The model is that of camera.py: the board's pose in a view is six unknown commands
+(``command_std=inf``), so a view is worth what it adds once its own pose is fitted. The
 error is the mean distance of a corner from where the camera has it, in the views that
 were not chosen, with their poses fitted.
 """

@@ -18,9 +18,9 @@ def on_host(
     """``function(*arrays)`` on the host, of numpy arrays.
 
     Under ``vmap`` arrays get leading axes that broadcast (``expand_dims``).
-    ``pure_callback`` copies the arguments on a thread of the CPU's pool and waits for
-    it: on a single core that is the thread that waits, for ever. Here the function sees
-    the program's own memory, which it must not keep.
+    On a CPU the function reads the program's own memory and must not keep it:
+    ``pure_callback`` copies its arguments on the thread pool, and on a single core it
+    deadlocks, because the pool's only thread is the one waiting for the copy.
 
     Args:
         function: returns an array of the result's shape and type.

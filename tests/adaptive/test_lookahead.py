@@ -168,7 +168,7 @@ pytestmark = pytest.mark.slow  # minutes together
 
 @pytest.mark.slow
 def test_ahead_plays_on_a_single_core():
-    """A callback whose arguments are copied on the pool's one thread waits for ever."""
+    """On one core ``pure_callback`` deadlocks; the look-ahead must finish there."""
     code = """
 import os
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})

@@ -598,7 +598,7 @@ def test_units_are_told_one_by_one_where_there_is_something_to_say():
     ]  # fmt: skip
 
 
-# Where nobody reads
+# Output that cannot be written
 
 CLOSED = """
 import os, signal, sys

@@ -190,7 +190,7 @@ def postures(
     view: View | None = None,
     room: Room | None = None,
 ) -> Array:
-    """See ``jaxcal.models.SerialChain.postures``."""
+    """Candidate postures (M, n) of an arm; arguments as ``SerialChain.postures``."""
     whole_number("count", count, 1)
     if view is not None and not isinstance(arm.sensor, Board):
         raise ValueError("camera is of an arm with sensor=Board(...)")
