@@ -96,7 +96,7 @@ class CommandLine:
 
 
 class Runs:
-    """See the top of the module.
+    """Runs of a caller's function, several at a time; made ones are read from a file.
 
     Args:
         f: one command and the parameters, or with ``batch`` many commands.
