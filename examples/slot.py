@@ -62,7 +62,7 @@ ENTRY = Entry(slot, about="the walls of a slot", rules={"state": TUNED})
 class Study:
     """Methods on the same sessions; a policy of each seed."""
 
-    results: dict[str, sequential.Result]
+    results: dict[str, sequential.SessionResult]
 
 
 def study(full: bool) -> Study:
@@ -71,32 +71,31 @@ def study(full: bool) -> Study:
     sessions = 4096 if full else 1024
 
     def played(methods: tuple[str, ...], checkpoint: str | None = None):
-        return sequential.evaluate(
+        evaluation = sequential.evaluate(
             __file__, ENTRY, {}, methods, checkpoint=checkpoint, episodes=sessions
         )
+        return evaluation.results
 
-    results = dict.fromkeys(METHODS, played(METHODS))
+    results = dict(zip(METHODS, played(METHODS), strict=True))
     for seed in range(3 if full else 1):
         config = PolicyConfig(__file__, ENTRY.rules["state"], ppo=ppo, seed=seed)
         with tempfile.TemporaryDirectory() as folder:
             begun = time.perf_counter()
             train(config, folder)
             print(f"trained in {time.perf_counter() - begun:.0f} s")
-            results[f"policy {seed}"] = played(("policy",), folder)
+            (results[f"policy {seed}"],) = played(("policy",), folder)
     return Study(results)
 
 
 def rows(found: Study) -> common.Rows:
     """Nats that each method gains in a session, those of ``ahead`` subtracted, and the
     time of a choice."""
-    base = found.results["ahead"].comparison
-    ahead = base.gain[base.names.index("ahead")]
+    ahead = found.results["ahead"].values[:, 0]
     table = []
     for name, result in found.results.items():
-        row = result.comparison.names.index(name.split()[0])
-        gain = result.comparison.gain[row]
+        gain = result.values[:, 0]
         numbers = [mean for values in (gain, gain - ahead) for mean in _mean(values)]
-        numbers.append(1e3 * result.seconds[row])
+        numbers.append(1e3 * result.seconds)
         table.append(
             common.row({"method": name, "sessions": len(gain)},
                        ("nats", "error", "less_ahead", "its_error", "ms"),

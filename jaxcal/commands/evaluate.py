@@ -266,7 +266,6 @@ def _terminate(number: int, frame: object) -> NoReturn:
 
 def _run(options: EvaluateOptions) -> None:
     from jaxcal.evaluation.methods import POLICIES, methods_by
-    from jaxcal.evaluation.report import json_document, text_table, write_report
     from jaxcal.progress import Progress
 
     methods = methods_by("D", options.methods)
@@ -281,27 +280,40 @@ def _run(options: EvaluateOptions) -> None:
         cache.keep_compiled_programs()
         methods = methods_by(_criterion(options), options.methods)
     _check_outputs(options)
-    many = len(options.checkpoints) > 1
-    summaries: list[Summary] = []
-    whole: list[Evaluation] = []
     evaluated = _whole if options.stream is None else _streamed
     progress = Progress(quiet=options.quiet)
+    runs = _run_folders(options.run, options.checkpoints)
+    whole = evaluated(options, methods, progress)
+    _show(options, whole, "evaluation_figures", progress, runs)
+
+
+def _show(
+    options: Outputs,
+    evaluated: Iterator[tuple[Summary, Evaluation | None]],
+    figures: str,
+    progress: Progress,
+    runs: Sequence[Path] = (),
+) -> None:
+    """Print the table of each evaluation, write the page and the JSON of all."""
+    from jaxcal.evaluation.report import json_document, text_table, write_report
+
+    summaries: list[Summary] = []
+    whole: list[Evaluation] = []
     try:
-        for summary, evaluation in evaluated(options, methods, progress):
+        for summary, evaluation in evaluated:
             progress.clear()
             if summaries:
                 print()
-            print(text_table(summary, many=many), flush=True)
+            print(text_table(summary), flush=True)
             summaries.append(summary)
             whole += [] if evaluation is None else [evaluation]
     finally:
         progress.clear()
     if options.report is not None:
-        runs = _run_folders(options.run, options.checkpoints)
-        number = write_report(
-            options.report, whole, runs, command=options.command, many=many
-        )
-        print(f"saved: {options.report}/index.html and {number} figures")
+        draw = getattr(importlib.import_module("jaxcal.evaluation.figures"), figures)
+        count = write_report(options.report, whole, draw, runs, command=options.command)
+        drawn = "1 figure" if count == 1 else f"{count} figures"
+        print(f"saved: {options.report}/index.html and {drawn}")
     options.write_json(json_document(summaries, command=options.command))
 
 
@@ -435,11 +447,20 @@ def _run_folders(given: Sequence[Path], checkpoints: list[str | None]) -> list[P
 
 
 def _run_task(options: TaskOptions) -> None:
-    from jaxcal.adaptive.tasks import registry
-    from jaxcal.evaluation import sequential, sequential_report
     from jaxcal.progress import Progress
 
     options.require_writable()
+    progress = Progress(quiet=options.quiet)
+    _show(options, _sessions(options, progress), "session_figures", progress)
+
+
+def _sessions(
+    options: TaskOptions, progress: Progress
+) -> Iterator[tuple[Summary, Evaluation]]:
+    """The methods on the sessions of the task."""
+    from jaxcal.adaptive.tasks import registry
+    from jaxcal.evaluation import sequential
+
     entry = registry.load(options.task)
     methods = options.methods or list(entry.methods)
     if not methods:
@@ -450,24 +471,15 @@ def _run_task(options: TaskOptions) -> None:
         if options.methods:
             raise ValueError("--checkpoint is given, but policy is not among --methods")
         methods.append("policy")
-    chosen = registry.options_from(entry, options.with_)
-    progress = Progress(quiet=options.quiet)
-    try:
-        result = sequential.evaluate(
-            options.task,
-            entry,
-            chosen,
-            methods,
-            checkpoint=options.checkpoint,
-            episodes=options.episodes or entry.episodes,
-            seed=options.seed,
-            retune=options.retune,
-            progress=progress,
-        )
-    finally:
-        progress.clear()
-    print(sequential_report.text_table(result))
-    if options.report is not None:
-        sequential_report.write_report(options.report, result, command=options.command)
-        print(f"saved: {options.report}/index.html and 1 figure")
-    options.write_json(sequential_report.json_document(result, command=options.command))
+    evaluation = sequential.evaluate(
+        options.task,
+        entry,
+        registry.options_from(entry, options.with_),
+        methods,
+        checkpoint=options.checkpoint,
+        episodes=options.episodes or entry.episodes,
+        seed=options.seed,
+        retune=options.retune,
+        progress=progress,
+    )
+    yield evaluation.summarise(), evaluation

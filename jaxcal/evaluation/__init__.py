@@ -3,12 +3,14 @@
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import load_dataset, save_csv, save_npz
 from jaxcal.evaluation.methods import evaluate
+from jaxcal.evaluation.postures import PostureEvaluation
 from jaxcal.evaluation.report import text_table
 from jaxcal.evaluation.results import Evaluation, Summary
 
 __all__ = [
     "Dataset",
     "Evaluation",
+    "PostureEvaluation",
     "Summary",
     "evaluate",
     "load_dataset",

@@ -8,14 +8,16 @@ from __future__ import annotations
 import itertools
 import pathlib
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
-from jaxcal.evaluation.results import Evaluation, MethodResult, log_mean
+from jaxcal.evaluation.postures import PostureEvaluation as Evaluation
+from jaxcal.evaluation.postures import PostureResult, log_mean
+from jaxcal.evaluation.results import MethodResult
 from jaxcal.models import Affine
 from jaxcal.plots import selection
 from jaxcal.plots.style import (
@@ -29,6 +31,9 @@ from jaxcal.plots.style import (
 )
 from jaxcal.plots.style import panels as _panels
 
+if TYPE_CHECKING:
+    from jaxcal.evaluation.sequential import SessionEvaluation  # loads JAX
+
 __all__ = [
     "best_so_far",
     "det_distributions",
@@ -37,6 +42,7 @@ __all__ = [
     "evaluation_figures",
     "first_selection",
     "gap_to_optimum",
+    "session_figures",
     "variances",
 ]
 
@@ -116,26 +122,58 @@ def det_means(evaluation: Evaluation) -> Figure:
     results = _with_random(evaluation)
     height = 0.9 + 0.42 * len(results)
     figure, axes = _figure(evaluation, "Mean det S by method", height)
-    for row, (name, log_det, style) in enumerate(results):
+    ends = []
+    for row, (name, log_det, _) in enumerate(results):
         values = np.exp(log_det - log_det.max()).mean(axis=1)
-        mean = values.mean()
-        half = 1.96 * values.std() / np.sqrt(len(values))
-        ends = np.array([max(mean - half, 0.1 * mean), mean, mean + half])
-        low, centre, high = np.log10(ends) + log_det.max() / np.log(10.0)
-        error, look = [[centre - low], [high - centre]], style["marker"]
-        axes.errorbar(
-            centre, row, xerr=error, fmt=look, color=style["color"], capsize=3
-        )
+        mean, half = values.mean(), 1.96 * values.std() / np.sqrt(len(values))
+        interval = np.array([max(mean - half, 0.1 * mean), mean, mean + half])
+        ends.append(np.log10(interval) + log_det.max() / np.log(10.0))
         if name != "random":
             times = np.exp(log_mean(log_det) - log_mean(evaluation.random_log_det))
             place = {"xytext": (0, 7), "textcoords": "offset points", "ha": "center"}
             text = f"{times:,.0f} x random"
-            axes.annotate(text, (centre, row), fontsize=8, **place)
-    axes.set_yticks(range(len(results)), [name for name, _, _ in results])
-    axes.set_ylim(len(results) - 0.5, -0.7)
+            axes.annotate(text, (ends[-1][1], row), fontsize=8, **place)
+    names, _, styles = zip(*results, strict=True)
+    _intervals(axes, names, ends, styles)
     axes.margins(x=0.12)
     _det_axis(axes.xaxis, evaluation, "mean {}, with its 95 % interval")
     return figure
+
+
+def session_figures(evaluation: SessionEvaluation) -> dict[str, Figure]:
+    """Mean nats by method, and less those of the rival in pairs, 95 % intervals."""
+    results, rival = evaluation.results, evaluation.rival
+    names = [result.method for result in results]
+    size = (9.0, 0.9 + 0.42 * len(names))
+    figure, panels = _panels(size, shape=(1, 2))
+    nats_of = [result.values[:, 0] for result in results]
+    less = [evaluation.less(result)[:, 0] for result in results]
+    for axes, samples in zip(panels, (nats_of, less), strict=True):
+        ends = []
+        for values in samples:
+            half = 1.96 * values.std(ddof=1) / np.sqrt(len(values))
+            ends.append(values.mean() + np.array([-half, 0.0, half]))
+        _intervals(axes, names, ends, _styles(results))
+    panels[0].set_xlabel("information gained in a session (nats)")
+    panels[1].set_xlabel(f"less that of {rival}, in pairs (nats)")
+    panels[1].axvline(0.0, color=GREY, linestyle="--", zorder=0)
+    return {"sequential": figure}
+
+
+def _intervals(
+    axes: Any,
+    names: Sequence[str],
+    ends: Sequence[Array],
+    styles: Sequence[dict[str, Any]],
+) -> None:
+    """A marker in its interval for each name; ``ends``: (3,) lower, centre, upper."""
+    for row, ((low, centre, high), style) in enumerate(zip(ends, styles, strict=True)):
+        error, look = [[centre - low], [high - centre]], style["marker"]
+        axes.errorbar(
+            centre, row, xerr=error, fmt=look, color=style["color"], capsize=3
+        )
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.5, -0.7)
 
 
 def det_distributions(evaluation: Evaluation) -> Figure:
@@ -199,7 +237,9 @@ def parameter_variance(evaluation: Evaluation) -> Figure:
     """Variance over the episodes of each identified parameter (paper, Figure 5)."""
     dataset = evaluation.dataset
     rows = []
-    for result, style in zip(evaluation.results, _styles(evaluation), strict=True):
+    for result, style in zip(
+        evaluation.results, _styles(evaluation.results), strict=True
+    ):
         random = result.method == "random"
         label = "random, median over draws" if random else _label(evaluation, result)
         rows.append((label, evaluation.parameter_variance(result), None, style))
@@ -273,7 +313,7 @@ def _reference_name(evaluation: Evaluation) -> str:
     return "proven optimum" if evaluation.proven.all() else "optimum or its upper bound"
 
 
-def _label(evaluation: Evaluation, result: MethodResult) -> str:
+def _label(evaluation: Evaluation, result: PostureResult) -> str:
     """The method in words, with its checkpoint where there are several."""
     policies = {r.checkpoint for r in evaluation.results if r.is_policy}
     if not result.is_policy or len(policies) < 2:
@@ -282,13 +322,10 @@ def _label(evaluation: Evaluation, result: MethodResult) -> str:
     return f"{result.label}, {pathlib.Path(name).name}"
 
 
-def _styles(evaluation: Evaluation) -> list[dict[str, Any]]:
+def _styles(results: Sequence[MethodResult]) -> list[dict[str, Any]]:
     """Colour, line and marker of each; random and exact look the same everywhere."""
     number = itertools.count()
-    return [
-        _FIXED.get(result.method) or numbered(next(number))
-        for result in evaluation.results
-    ]
+    return [_FIXED.get(result.method) or numbered(next(number)) for result in results]
 
 
 def _line(style: dict[str, Any]) -> dict[str, Any]:
@@ -299,12 +336,14 @@ def _line(style: dict[str, Any]) -> dict[str, Any]:
     return line
 
 
-def _with_random(evaluation: Evaluation) -> list[tuple[str, Array, dict[str, Any]]]:
+def _with_random(
+    evaluation: Evaluation,
+) -> list[tuple[str, Array, dict[str, Any]]]:
     """Name, (E, R) log det S and style of every method; random also when not asked."""
     results = evaluation.results
     rows = [
         (_label(evaluation, result), result.log_det, style)
-        for result, style in zip(results, _styles(evaluation), strict=True)
+        for result, style in zip(results, _styles(results), strict=True)
     ]
     if all(result.method != "random" for result in results):
         rows.append(("random", evaluation.random_log_det, _FIXED["random"]))

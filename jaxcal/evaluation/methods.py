@@ -19,7 +19,7 @@ from jaxcal import selection
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.parameters import estimate_parameters
-from jaxcal.evaluation.results import Evaluation, MethodResult
+from jaxcal.evaluation.postures import PostureEvaluation, PostureResult
 from jaxcal.information.regression import log_det_gram, log_worth
 from jaxcal.models import Affine
 
@@ -125,7 +125,7 @@ def evaluate(
     time_limit: float | None = None,
     criterion: str = "D",
     progress: Progress | None = None,
-) -> Evaluation:
+) -> PostureEvaluation:
     """Run methods on a dataset and judge them against the proven optimum.
 
     Args:
@@ -162,7 +162,7 @@ def evaluate(
     for row in rows:
         if row not in results:
             results[row] = run.solver(row[0])
-    return Evaluation(
+    return PostureEvaluation(
         dataset=dataset,
         k=k,
         seed=seed,
@@ -192,16 +192,16 @@ class _Run:
         seconds: float,
         checkpoint: str | None = None,
         gram: Array | None = None,
-    ) -> MethodResult:
+    ) -> PostureResult:
         """Judge (E, R, k) indices, unless their (E, R) log det of Z.T Z is known."""
         if gram is None:
             gram = np.concatenate([self.worth(c, indices[c]) for c in self.pieces()])
-        return MethodResult(
+        return PostureResult(
             method=method,
             label=label_of(method, self.num),
             checkpoint=checkpoint,
             indices=indices,
-            log_det=self.dataset.num_outputs * gram,
+            values=self.dataset.num_outputs * gram,
             seconds=seconds / self.dataset.num_episodes,
             parameters=estimate_parameters(self.dataset, indices),
         )
@@ -265,7 +265,7 @@ class _Run:
             self.progress(label, cut.stop, total)
         return choices, seconds
 
-    def policy(self, method: str, checkpoint: str | None) -> MethodResult:
+    def policy(self, method: str, checkpoint: str | None) -> PostureResult:
         """One decoding of one checkpoint."""
         from jaxcal.selection.policy import select_batch
 
@@ -303,7 +303,7 @@ class _Run:
                 f"{indices[episode].tolist()} in episode {episode}"
             )
 
-    def solver(self, method: str) -> MethodResult:
+    def solver(self, method: str) -> PostureResult:
         """A method without proof and without weights."""
 
         def choose(cut: slice) -> Indices:
@@ -320,7 +320,7 @@ class _Run:
 
     def exact(
         self, time_limit: float | None
-    ) -> tuple[MethodResult, Array, NDArray[np.bool_]]:
+    ) -> tuple[PostureResult, Array, NDArray[np.bool_]]:
         """The optimum, its (E,) log det S or an upper bound, and (E,) where proven."""
         m = self.dataset.num_outputs
         p = m * (self.dataset.num_inputs + 1)
@@ -351,7 +351,7 @@ class _Run:
         reached = result.log_det[:, 0]
         return result, np.where(proven, reached, np.maximum(bound, reached)), proven
 
-    def random(self, draws: int) -> MethodResult:
+    def random(self, draws: int) -> PostureResult:
         """``draws`` selections an episode; the time is that of ``random_batch``."""
         batch = selection.random_batch(**self.part(slice(None)), seed=self.seed)
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(0,)))

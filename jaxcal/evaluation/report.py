@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from jaxcal.checks import aligned
@@ -13,156 +13,73 @@ from jaxcal.extras import versions
 from jaxcal.files import atomic_write
 from jaxcal.pages import Block, Code, Figure, Page, Section, Table, Text, render
 
-__all__ = [
-    "document",
-    "file_prefixes",
-    "json_document",
-    "notes",
-    "text_table",
-    "write_folder",
-    "write_report",
-]
-
-_COLUMNS = (
-    *("method", "mean det S", "median det S", "det S/det S*", "hit rate"),
-    *("D-eff.", "x random", "time each"),
-)
-_BY_OTHERS = ("method", "efficiency", "least", "hit rate", "time each")
-_ABOUT = (
-    "det S is quoted in the unit of the dataset's commands; S is the information "
-    "matrix AᵀA of the chosen postures and S* that of the best choice there is. Hit "
-    "rate: share of selections whose determinant equals the optimum's to a billionth. "
-    "D-eff.: mean of (det S / det S*)^(1/p), p parameters. x random: mean det S over "
-    "that of random selection. Time: a selection, averaged over the batch."
-)
+__all__ = ["file_prefixes", "json_document", "text_table", "write_report"]
 
 
-def text_table(shown: Summary, *, many: bool = False) -> str:
-    """One dataset as a table; where there are ``many``, a policy's checkpoint too."""
-    columns = _COLUMNS if shown.criterion == "D" else _BY_OTHERS
-    lines = aligned([columns, *_rows(shown, many)], "<>", ruled=True)
-    return "\n  ".join([_heading(shown), *lines, *notes(shown)])
-
-
-def notes(shown: Summary) -> list[str]:
-    """What a reader must know beside the numbers."""
-    texts = []
-    episodes = shown.dataset["episodes"]
-    unproven = episodes - shown.num_proven
-    if unproven:
-        texts.append(
-            f"{unproven} of {episodes} optima are not proven: there an upper bound "
-            "stands for det S*, so ratios and efficiencies are at least what is shown "
-            "and no selection counts as a hit"
-        )
-    if shown.k == shown.dataset["num_inputs"] + 1:
-        texts.append(
-            f"k = {shown.k} fits {shown.num_parameters} parameters with as many "
-            "equations: no residual, so no estimate of the noise; a larger k leaves one"
-        )
-    return texts
+def text_table(shown: Summary) -> str:
+    """One evaluation as a table, with its notes."""
+    lines = aligned(_rows(shown), "<>", ruled=True)
+    return "\n  ".join([shown.heading, *lines, *shown.notes])
 
 
 def json_document(summaries: Sequence[Summary], *, command: Sequence[str]) -> str:
-    """The numbers of several datasets; the layout is in docs/evaluation.md."""
-    return document(
-        [entry for shown in summaries for entry in _entries(shown)], command
-    )
-
-
-def write_report(
-    folder: pathlib.Path,
-    evaluations: Sequence[Evaluation],
-    runs: Sequence[pathlib.Path] = (),
-    *,
-    command: Sequence[str],
-    many: bool = False,
-) -> int:
-    """Draw everything, then write each figure as SVG and PNG, and ``index.html`` last.
-
-    Args:
-        folder: made where it is missing.
-        evaluations: one a dataset.
-        runs: folders of training runs to draw curves of.
-        command: what was typed, for the record.
-        many: name the checkpoint of each policy.
-
-    Returns:
-        How many figures there are.
-    """
-    from jaxcal.evaluation.figures import evaluation_figures
-    from jaxcal.evaluation.training_figure import (
-        training_curves,
-        training_diagnostics,
-    )
-
-    sections: dict[str, Part] = {}
-    prefixes = file_prefixes([found.dataset.name for found in evaluations])
-    for evaluation, prefix in zip(evaluations, prefixes, strict=True):
-        shown = evaluation.summarise()
-        blocks: list[Block] = [Table(_COLUMNS, _rows(shown, many))]
-        blocks += [Text(note, "note") for note in notes(shown)]
-        drawn = evaluation_figures(evaluation).items()
-        figures = {f"{prefix}_{name}": figure for name, figure in drawn}
-        sections[_heading(shown)] = blocks, figures
-    if runs:
-        folders = {run.name: run for run in runs}
-        curves = {"training_curves": training_curves(folders)}
-        if (diagnostics := training_diagnostics(folders)) is not None:
-            curves["training_diagnostics"] = diagnostics
-        sections["Training"] = (), curves
-    title = "Posture selection against the proven optimum"
-    return write_folder(folder, title, sections, command, _ABOUT)
-
-
-Part = tuple[Sequence[Block], Mapping[str, Any]]  # of a page: blocks, then figures
-
-
-def write_folder(
-    folder: pathlib.Path,
-    title: str,
-    sections: Mapping[str, Part],
-    command: Sequence[str],
-    about: str,
-) -> int:
-    """Write each figure as SVG and PNG, and ``index.html`` last; how many figures."""
-    from jaxcal.plots.style import as_files
-
-    files: dict[str, bytes] = {}
-    parts = []
-    for heading, (blocks, figures) in sections.items():
-        whole = list(blocks)
-        for name, figure in figures.items():
-            svg, files[f"{name}.png"] = as_files(figure, "svg", "png")
-            files[f"{name}.svg"] = svg
-            whole.append(Figure(svg, name.replace("_", " ")))
-        parts.append(Section(heading, whole))
-    count = len(files) // 2
-    made_with = ", ".join(f"{name} {v}" for name, v in versions().items())
-    page = Page(
-        title,
-        parts,
-        intro=[Text(Code(" ".join(command)), "note"), Text(made_with, "note")],
-        footer=[Text(about, "note")],
-    )
-    files["index.html"] = render(page).encode()
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, data in files.items():
-        with atomic_write(folder / name) as file:
-            file.write(data)
-    return count
-
-
-def document(results: Sequence[dict[str, Any]], command: Sequence[str]) -> str:
-    """What every evaluation's JSON holds beside its results."""
+    """The numbers of several evaluations; the layout is in docs/evaluation.md."""
     whole = {
         "format": "jaxcal-evaluation",
         "version": 1,
         "command": list(command),
         "versions": versions(),
-        "results": list(results),
+        "results": [entry for shown in summaries for entry in _entries(shown)],
     }
     return json.dumps(whole, indent=1, allow_nan=False) + "\n"
+
+
+def write_report(
+    folder: pathlib.Path,
+    evaluations: Sequence[Evaluation],
+    draw: Callable[[Any], Mapping[str, Any]],
+    runs: Sequence[pathlib.Path] = (),
+    *,
+    command: Sequence[str],
+) -> int:
+    """Draw everything, then write each figure as SVG and PNG, and ``index.html`` last.
+
+    Args:
+        folder: made where it is missing.
+        evaluations: a section each.
+        draw: figures of an evaluation by name, of ``jaxcal.evaluation.figures``.
+        runs: folders of training runs to draw curves of.
+        command: what was typed, for the record.
+
+    Returns:
+        How many figures there are.
+    """
+    files: dict[str, bytes] = {}
+    summaries = [evaluation.summarise() for evaluation in evaluations]
+    prefixes = file_prefixes([shown.name for shown in summaries])
+    sections = []
+    for evaluation, shown, prefix in zip(evaluations, summaries, prefixes, strict=True):
+        head, *rows = _rows(shown)
+        blocks: list[Block] = [Table(head, rows)]
+        blocks += [Text(note, "note") for note in shown.notes]
+        blocks += _drawn(draw(evaluation), files, prefix and f"{prefix}_")
+        sections.append(Section(shown.heading, blocks))
+    if runs:
+        sections.append(Section("Training", _drawn(_training(runs), files)))
+    made_with = ", ".join(f"{name} {v}" for name, v in versions().items())
+    page = Page(
+        evaluations[0].title,
+        sections,
+        intro=[Text(Code(" ".join(command)), "note"), Text(made_with, "note")],
+        footer=[Text(evaluations[0].about, "note")],
+    )
+    number = len(files) // 2
+    files["index.html"] = render(page).encode()
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, data in files.items():
+        with atomic_write(folder / name) as file:
+            file.write(data)
+    return number
 
 
 def file_prefixes(names: Sequence[str]) -> list[str]:
@@ -179,77 +96,64 @@ def file_prefixes(names: Sequence[str]) -> list[str]:
     ]
 
 
-def _heading(shown: Summary) -> str:
-    data = shown.dataset
-    seed = "" if data["seed"] is None else f", seed {data['seed']}"
-    return (
-        f"{data['name']}{seed}: {data['episodes']:,} episodes, "
-        f"{shown.k} of {data['num_candidates']} postures, "
-        f"{data['num_inputs']} inputs, {data['num_outputs']} outputs"
-        + ("" if shown.criterion == "D" else f", criterion {shown.criterion}")
-    )
+def _training(runs: Sequence[pathlib.Path]) -> dict[str, Any]:
+    """Figures of training runs."""
+    from jaxcal.evaluation.training_figure import training_curves, training_diagnostics
+
+    folders = {run.name: run for run in runs}
+    curves = {"training_curves": training_curves(folders)}
+    if (diagnostics := training_diagnostics(folders)) is not None:
+        curves["training_diagnostics"] = diagnostics
+    return curves
 
 
-def _rows(shown: Summary, many: bool) -> list[tuple[str, ...]]:
-    """The rows of the table, a cell for each column of the criterion."""
-    rows = []
+def _drawn(
+    figures: Mapping[str, Any], files: dict[str, bytes], prefix: str = ""
+) -> list[Block]:
+    """Figures of a page; their files are added to those that are given."""
+    from jaxcal.plots.style import as_files
+
+    blocks: list[Block] = []
+    for name, figure in ((prefix + name, figures[name]) for name in figures):
+        svg, files[f"{name}.png"] = as_files(figure, "svg", "png")
+        files[f"{name}.svg"] = svg
+        blocks.append(Figure(svg, name.replace("_", " ")))
+    return blocks
+
+
+def _rows(shown: Summary) -> list[tuple[str, ...]]:
+    """Head and rows of the table; of several checkpoints each row names its own."""
+    many = len(_checkpoints(shown)) > 1
+    table = [tuple(title for title, _ in shown.columns)]
     for row in shown.rows:
-        numbers = row.numbers
-        name = numbers["label"]
+        name, *cells = (cell(row) for _, cell in shown.columns)
         if many and row.is_policy:
             name += f" ({row.checkpoint or 'default'})"
-        if shown.criterion != "D":
-            shares = [numbers["efficiency"]["mean"], numbers["least_efficiency"]]
-            shares = [_share(share) for share in (*shares, numbers["hit_rate"])]
-            rows.append((name, *shares, _time(numbers["seconds_per_selection"])))
-            continue
-        times = numbers["ratio_to_random"]
-        middle = (numbers["det_s"][moment] for moment in ("mean", "median"))
-        ratios = ("ratio_to_exact", "hit_rate", "d_efficiency")
-        rows.append(
-            (
-                name,
-                *("-" if value is None else f"{value:.4g}" for value in middle),
-                *(_share(numbers[ratio]) for ratio in ratios),
-                "-" if times is None else f"{times:,.0f}",
-                _time(numbers["seconds_per_selection"]),
-            )
-        )
-    return rows
+        table.append((name, *cells))
+    return table
+
+
+def _checkpoints(shown: Summary) -> list[Any]:
+    """Those of the policies, each once."""
+    checkpoints: list[Any] = []
+    for row in shown.rows:
+        if row.is_policy and row.checkpoint not in checkpoints:
+            checkpoints.append(row.checkpoint)
+    return checkpoints
 
 
 def _entries(shown: Summary) -> list[dict[str, Any]]:
     """One entry a checkpoint, each with every baseline; one without where no policy."""
-    policies = [row for row in shown.rows if row.is_policy]
-    checkpoints = list(dict.fromkeys(row.checkpoint for row in policies)) or [None]
-    names = shown.parameter_names
+    checkpoints = _checkpoints(shown)
     return [
         {
-            "dataset": shown.dataset,
-            "k": shown.k,
-            "seed": shown.seed,
-            "criterion": shown.criterion,
-            "checkpoint": (checkpoint or "default") if policies else None,
-            "proven": shown.num_proven / shown.dataset["episodes"],
-            "notes": notes(shown),
+            **shown.facts,
+            "checkpoint": (checkpoint or "default") if checkpoints else None,
             "methods": {
                 row.method: row.numbers
                 for row in shown.rows
                 if not row.is_policy or row.checkpoint == checkpoint
             },
         }
-        | ({} if names is None else {"parameter_names": list(names)})
-        for checkpoint in checkpoints
+        for checkpoint in checkpoints or [None]
     ]
-
-
-def _share(value: float) -> str:
-    """Four decimals, and never 1.0000 for what is below it."""
-    text = f"{value:.4f}"
-    return "0.9999+" if text == "1.0000" and value < 1.0 - 1e-12 else text
-
-
-def _time(seconds: float) -> str:
-    units = {"s": 1.0, "ms": 1e-3, "µs": 1e-6}
-    unit = next((unit for unit, size in units.items() if seconds >= size), "µs")
-    return f"{seconds / units[unit]:.3g} {unit}"

@@ -6,14 +6,14 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.adaptive.episodes import Comparison, compare
+from jaxcal.adaptive.episodes import compare
 from jaxcal.adaptive.fit_ahead import fit, outside
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import AHEAD
@@ -29,8 +29,17 @@ from jaxcal.adaptive.rules import (
 )
 from jaxcal.adaptive.tasks.registry import Entry
 from jaxcal.adaptive.tuning import tune
+from jaxcal.evaluation.results import Evaluation, MethodResult, Summary, finite
 
-__all__ = ["METHODS", "Result", "evaluate", "seconds_a_choice"]
+__all__ = [
+    "METHODS",
+    "SessionEvaluation",
+    "SessionResult",
+    "evaluate",
+    "seconds_a_choice",
+]
+
+Array = NDArray[np.float64]
 
 METHODS = {
     "random": "any measurement",
@@ -42,6 +51,7 @@ METHODS = {
     "state": "the same with prices that follow what is left, tuned",
     "policy": "the network that corrects the state rule",
 }
+_RIVALS = ("state", "ahead", "shares", "priced", "rate", "gain")
 _GENERATIONS = 20  # of tuning
 _TIMED = 128  # sessions on which a choice is timed
 _BATCH = 1024  # sessions at once
@@ -49,19 +59,101 @@ _BATCH = 1024  # sessions at once
 Progress = Callable[[str, int, int], None]
 
 
-@dataclasses.dataclass(frozen=True)
-class Result:
-    """A table: what each method gains on the same sessions."""
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class SessionResult(MethodResult):
+    """What one method learned in every session; ``values`` (B, 1) in nats."""
+
+    entropy_drop: Array  # (B,) nats
+    log_ratio: Array  # (B,) log posterior less log prior, at the truth
+    choices: Array  # (B,) measurements made
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class SessionEvaluation(Evaluation):
+    """Deciders on the same sessions; ``reference`` (B,) are the nats of ``rival``."""
+
+    title: ClassVar[str] = "Deciders of sequential measurement on equal sessions"
+    about: ClassVar[str] = (
+        "All methods play the same sessions: the truth, the budget and the noise of "
+        "every measurement are equal. Nats: the sum of the expected information gains "
+        "of the measurements made, with its standard error (95 % intervals in the "
+        "figure). Time: of one core, a choice, averaged over a batch."
+    )
 
     task: str
     options: Mapping[str, Any]
-    seed: int
-    reference: str  # whom the others are compared with in pairs
-    comparison: Comparison
-    seconds: NDArray[np.float64]  # (D,) of one core, a choice
+    results: tuple[SessionResult, ...]
+    rival: str  # the method that the others are compared with in pairs
     rules: Mapping[str, CostRule]
-    checkpoint: Mapping[str, Any] | None  # meta of the policy
     outside: tuple[str, ...]  # sizes beyond those that ``ahead`` was measured on
+
+    def __getitem__(self, method: str) -> SessionResult:
+        """The result of a method."""
+        return next(result for result in self.results if result.method == method)
+
+    def summarise(self) -> Summary:
+        """What table, page and JSON show."""
+        shown = ", ".join(f"{name} = {value}" for name, value in self.options.items())
+        beyond = "; ".join(self.outside)
+        sessions, rival = len(self.reference), self.rival
+        return Summary(
+            "",
+            f"{self.task}{f' ({shown})' if shown else ''}, seed {self.seed}: "
+            f"{sessions:,} sessions, information gained in nats"
+            f"{f'; ahead is used beyond its tests: {beyond}' if beyond else ''}",
+            (
+                ("method", lambda row: row.method),
+                ("nats", lambda row: _interval(row.numbers["nats"], "")),
+                (
+                    f"less {rival}, paired",
+                    lambda row: _interval(row.numbers["paired"].get(rival), "+"),
+                ),
+                ("choices", lambda row: f"{row.numbers['choices']:.1f}"),
+                (
+                    "time each",
+                    lambda row: f"{1e3 * row.numbers['seconds_per_choice']:.3g} ms",
+                ),
+            ),
+            self.rows(),
+            {
+                "task": self.task,
+                "options": dict(self.options),
+                "episodes": sessions,
+                "seed": self.seed,
+            },
+        )
+
+    def summary(self, result: SessionResult) -> dict[str, Any]:
+        """The numbers of one method, as documented in docs/adaptive.md."""
+        numbers = {
+            "label": result.label,
+            "nats": _moments(result.values[:, 0]),
+            "entropy_drop": _moments(result.entropy_drop),
+            "log_ratio_at_truth": _moments(result.log_ratio),
+            "choices": float(result.choices.mean()),
+            "seconds_per_choice": float(result.seconds),
+            "paired": {
+                other.method: _moments((result.values - other.values)[:, 0])
+                for other in self.results
+                if other is not result
+            },
+        }
+        if result.method in self.rules:
+            rule: Any = self.rules[result.method]
+            constants = dataclasses.asdict(rule)
+            numbers["constants"] = {name: float(x) for name, x in constants.items()}
+        return numbers
+
+
+def _moments(values: Array) -> dict[str, float | None]:
+    error = values.std(ddof=1) / np.sqrt(len(values))
+    return {"mean": finite(values.mean()), "standard_error": finite(error)}
+
+
+def _interval(numbers: Mapping[str, Any] | None, sign: str) -> str:
+    if numbers is None or numbers["mean"] is None:  # the rival itself
+        return ""
+    return f"{numbers['mean']:{sign}.3f} ± {numbers['standard_error']:.3f}"
 
 
 def evaluate(
@@ -75,7 +167,7 @@ def evaluate(
     seed: int = 0,
     retune: bool = False,
     progress: Progress = lambda what, done, of: None,
-) -> Result:
+) -> SessionEvaluation:
     """Play every method on the same sessions.
 
     Args:
@@ -98,7 +190,7 @@ def evaluate(
     trained = policies.load(checkpoint) if "policy" in methods else None
     needed = [m for m in ("priced", "state") if m in methods]
     rules = _rules(entry, task, needed, retune, seed, progress)
-    played_by, seconds = [], []
+    results = []
     for method in methods:
         if method == "policy":
             assert trained is not None  # loaded above
@@ -117,29 +209,26 @@ def evaluate(
             batch=_BATCH,
             progress=lambda done, method=method: progress(method, done, episodes),  # type: ignore[misc]  # default binds the loop's value
         )
-        played_by.append(played)
-        seconds.append(seconds_a_choice(task, decider, seed))
-    whole = Comparison(
-        tuple(methods),
-        *(
-            np.concatenate([getattr(one, field) for one in played_by])
-            for field in ("gain", "entropy_drop", "log_ratio", "choices")
-        ),
-    )
-    rivals = [
-        m
-        for m in ("state", "ahead", "shares", "priced", "rate", "gain")
-        if m in methods
-    ]
-    return Result(
+        result = SessionResult(
+            method=method,
+            checkpoint=trained.meta if trained and method == "policy" else None,
+            label=METHODS[method],
+            values=played.gain.T,
+            seconds=seconds_a_choice(task, decider, seed),
+            entropy_drop=played.entropy_drop[0],
+            log_ratio=played.log_ratio[0],
+            choices=played.choices[0],
+        )
+        results.append(result)
+    rival = next((name for name in _RIVALS if name in methods), methods[0])
+    return SessionEvaluation(
         task=name,
         options=options,
         seed=seed,
-        reference=[*rivals, methods[0]][0],
-        comparison=whole,
-        seconds=np.array(seconds),
+        results=tuple(results),
+        reference=results[methods.index(rival)].values[:, 0],
+        rival=rival,
         rules=rules,
-        checkpoint=None if trained is None else trained.meta,
         outside=outside(task) if "ahead" in methods else (),
     )
 

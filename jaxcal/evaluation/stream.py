@@ -19,6 +19,7 @@ import numpy as np
 
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.methods import POLICIES, evaluate
+from jaxcal.evaluation.postures import summary_of
 from jaxcal.evaluation.results import Row, Summary, finite
 from jaxcal.extras import versions
 from jaxcal.files import write_text
@@ -60,7 +61,7 @@ def evaluate_stream(
         seed = options["seed"] + begin
         return evaluate(draw(begin, end), **options | {"seed": seed}).summarise()
 
-    data = solve(0, 1).dataset  # what is wrong is said before anything is kept
+    facts = solve(0, 1).facts  # what is wrong is said before anything is kept
     _open(folder, plan)
     cuts = [(begin, min(begin + PART, episodes)) for begin in range(0, episodes, PART)]
     files = {folder / f"part-{a:012d}-{b:012d}.json": (a, b) for a, b in cuts}
@@ -69,28 +70,31 @@ def evaluate_stream(
     for number, path in enumerate(todo):
         progress("parts", number, len(todo))
         if not path.exists():  # no other process was sooner
-            summary = solve(*files[path])
-            rows = [(row.method, row.checkpoint, row.numbers) for row in summary.rows]
-            write_text(path, json.dumps({"proven": summary.num_proven, "rows": rows}))
+            begin, end = files[path]
+            part = solve(begin, end)
+            kept = [(row.method, row.checkpoint, row.numbers) for row in part.rows]
+            proven = round(part.facts["proven"] * (end - begin))
+            write_text(path, json.dumps({"proven": proven, "rows": kept}))
     progress("parts", len(todo), len(todo))
 
     parts = [_read(path) for path in files]
     counts = [end - begin for begin, end in cuts]
-    kept = []
+    rows = []
     for i, (method, checkpoint, _) in enumerate(parts[0]["rows"]):
         numbers = total(counts, [part["rows"][i][2] for part in parts])
-        kept.append(Row(method, checkpoint, numbers))
-    middle = {row.method: row.numbers["det_s"]["mean"] for row in kept}["random"]
-    for row in kept:
+        rows.append(Row(method, checkpoint, numbers))
+    middle = {row.method: row.numbers["det_s"]["mean"] for row in rows}["random"]
+    for row in rows:
         mean = row.numbers["det_s"]["mean"]
         row.numbers["ratio_to_random"] = mean / middle if mean and middle else None
-    return Summary(
-        data | {"episodes": episodes},
-        options["k"],
-        options["seed"],
-        sum(part["proven"] for part in parts),
-        tuple(row for row in kept if row.method in plan["methods"]),
-    )
+    facts = {
+        "dataset": facts["dataset"] | {"episodes": episodes},
+        "k": options["k"],
+        "seed": options["seed"],
+        "criterion": "D",
+    }
+    asked = tuple(row for row in rows if row.method in plan["methods"])
+    return summary_of(facts, asked, sum(part["proven"] for part in parts))
 
 
 def total(counts: list[int], parts: list[dict[str, Any]]) -> dict[str, Any]:

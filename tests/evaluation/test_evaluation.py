@@ -21,13 +21,13 @@ from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.figures import evaluation_figures
 from jaxcal.evaluation.methods import check_methods, evaluate
 from jaxcal.evaluation.parameters import estimate_parameters
+from jaxcal.evaluation.postures import PostureEvaluation, PostureResult
 from jaxcal.evaluation.report import (
     file_prefixes,
     json_document,
     text_table,
     write_report,
 )
-from jaxcal.evaluation.results import Evaluation, MethodResult
 from jaxcal.evaluation.training_figure import training_curves, training_diagnostics
 from jaxcal.information.regression import regression_matrix
 from jaxcal.models import Affine
@@ -144,18 +144,18 @@ def test_a_hit_is_told_by_value_not_by_index() -> None:
     doubled = Dataset("twins", twins)
     found = evaluate(doubled, 4, ["exact"])
     best = found.results[0].indices[0, 0]
-    other = MethodResult(
+    other = PostureResult(
         method="greedy",
         label="greedy",
         checkpoint=None,
         indices=((best + 6) % 12)[None, None],
-        log_det=found.results[0].log_det,
+        values=found.results[0].values,
         seconds=1.0,
         parameters=None,
     )
     assert found.summary(other)["hit_rate"] == 1.0
     behind = np.array([[-1e-6]])
-    miss = MethodResult(**{**vars(other), "log_det": other.log_det + behind})
+    miss = PostureResult(**{**vars(other), "values": other.values + behind})
     assert found.summary(miss)["hit_rate"] == 0.0
 
 
@@ -369,13 +369,13 @@ def test_a_flat_episode_is_named() -> None:
 
 
 @pytest.fixture
-def shown(calls: list[dict[str, Any]]) -> Evaluation:
+def shown(calls: list[dict[str, Any]]) -> PostureEvaluation:
     dataset = make_dataset("dataset3", episodes=12)
     return evaluate(dataset, 4, ("policy", *BASELINES), ["runs/a", "runs/b"])
 
 
-def test_the_table_has_a_row_for_each_method(shown: Evaluation) -> None:
-    text = text_table(shown.summarise(), many=True)
+def test_the_table_has_a_row_for_each_method(shown: PostureEvaluation) -> None:
+    text = text_table(shown.summarise())
     assert "policy (runs/a)" in text and "policy (runs/b)" in text
     for method in BASELINES:
         assert f"\n  {method}" in text
@@ -384,7 +384,7 @@ def test_the_table_has_a_row_for_each_method(shown: Evaluation) -> None:
     assert line.split()[3:6] == ["1.0000", "1.0000", "1.0000"]
 
 
-def test_the_json_has_an_entry_for_each_checkpoint(shown: Evaluation) -> None:
+def test_the_json_has_an_entry_for_each_checkpoint(shown: PostureEvaluation) -> None:
     document = json.loads(json_document([shown.summarise(indices=True)], command=["x"]))
     assert document["format"] == "jaxcal-evaluation" and document["version"] == 1
     assert {"python", "numpy", "jaxcal"} <= set(document["versions"])
@@ -400,7 +400,7 @@ def test_the_json_has_an_entry_for_each_checkpoint(shown: Evaluation) -> None:
 
 
 @pytest.mark.slow
-def test_figures_have_axes_units_and_legends(shown: Evaluation) -> None:
+def test_figures_have_axes_units_and_legends(shown: PostureEvaluation) -> None:
     drawn = evaluation_figures(shown)
     assert set(drawn) == {
         "first_selection",
@@ -428,13 +428,12 @@ def test_figures_have_axes_units_and_legends(shown: Evaluation) -> None:
 
 
 def test_the_page_holds_everything_in_itself(
-    shown: Evaluation, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+    shown: PostureEvaluation, tmp_path: pathlib.Path
 ) -> None:
     metrics(tmp_path)
     one = {"det_means": figures.det_means(shown)}  # the command's test draws all
-    monkeypatch.setattr(figures, "evaluation_figures", lambda _: one)
     out = tmp_path / "deep" / "report"
-    number = write_report(out, [shown], [tmp_path], command=["a", "<b>"], many=True)
+    number = write_report(out, [shown], lambda _: one, [tmp_path], command=["a", "<b>"])
     page = (out / "index.html").read_text()
     images = sorted(path.name for path in out.glob("*.svg"))
     assert page.count("data:image/svg+xml;base64,") == len(images) == number == 2

@@ -203,12 +203,7 @@ def test_a_policy_of_a_slot_is_no_worse_than_the_rule_it_begins_as(tmp_path):
     found, rows = quick("slot", tmp_path)
     names = ["gain", "state", "shares", "ahead", "policy 0"]
     assert [row["method"] for row in rows] == names
-    gains = {
-        name: found.results[name].comparison.gain[
-            found.results[name].comparison.names.index(name.split()[0])
-        ]
-        for name in names
-    }
+    gains = {name: found.results[name].values[:, 0] for name in names}
     for row in rows:
         assert float(row["nats"]) == pytest.approx(
             gains[row["method"]].mean(), abs=1e-3

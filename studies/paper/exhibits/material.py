@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.methods import Progress, evaluate
 from jaxcal.evaluation.parameters import least_squares
-from jaxcal.evaluation.results import Evaluation, MethodResult
+from jaxcal.evaluation.postures import PostureEvaluation, PostureResult
 from jaxcal.paper.datasets import make_dataset
 
 Array = NDArray[np.float64]
@@ -88,7 +88,7 @@ class Material:
         self.stage = ""  # what the report is at, in front of every task
         self._progress = progress
         self._datasets: dict[str, Dataset] = {}
-        self._evaluations: dict[str, Evaluation] = {}
+        self._evaluations: dict[str, PostureEvaluation] = {}
 
     def progress(self, task: str, done: int, total: int) -> None:
         """Tell how far a task is."""
@@ -109,7 +109,7 @@ class Material:
             )
         return self._datasets[name]
 
-    def evaluation(self, name: str) -> Evaluation:
+    def evaluation(self, name: str) -> PostureEvaluation:
         """Four postures by every method, judged against the proven optimum."""
         if name not in self._evaluations:
             self._evaluations[name] = evaluate(
@@ -122,7 +122,7 @@ class Material:
             )
         return self._evaluations[name]
 
-    def result(self, name: str, method: str) -> MethodResult:
+    def result(self, name: str, method: str) -> PostureResult:
         """What one method chose on a dataset."""
         found = self.evaluation(name).results
         return next(result for result in found if result.method == method)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from jaxcal.evaluation import figures
-from jaxcal.evaluation.results import HIT_TOLERANCE, Evaluation
+from jaxcal.evaluation.postures import HIT_TOLERANCE, PostureEvaluation
 from jaxcal.plots.style import BLACK, COLOURS, legend_right, panels
 from studies.paper.exhibits.exhibit import Columns, Exhibit, judge
 from studies.paper.exhibits.intervals import (
@@ -45,11 +45,11 @@ def words_of(material: Material, name: str, title: str) -> dict[str, Any]:
     return words | {"count": count, "draws": draws}
 
 
-def _by_episode(evaluation: Evaluation) -> dict[str, Any]:
+def _by_episode(evaluation: PostureEvaluation) -> dict[str, Any]:
     return {"episode": np.arange(1, len(evaluation.reference) + 1)}
 
 
-def _comparison(evaluation: Evaluation, settings: Settings) -> dict[str, Any]:
+def _comparison(evaluation: PostureEvaluation, settings: Settings) -> dict[str, Any]:
     """Policy, greedy and optimum against random: ratios, spreads, hits, intervals."""
     rng = settings.rng(STREAM.get(evaluation.dataset.name, 9), 0)
     resamples = settings.size("resamples")

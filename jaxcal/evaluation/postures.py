@@ -1,0 +1,212 @@
+"""An evaluation of ways to choose postures: against the optimum, set by set."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from jaxcal.evaluation.dataset import Dataset
+from jaxcal.evaluation.results import (
+    Column,
+    Evaluation,
+    MethodResult,
+    Row,
+    Summary,
+    finite,
+    moments,
+)
+from jaxcal.models import Affine
+
+__all__ = [
+    "HIT_TOLERANCE",
+    "PostureEvaluation",
+    "PostureResult",
+    "log_mean",
+    "summary_of",
+]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+HIT_TOLERANCE = 1e-9  # of log det(Z.T Z): the same determinant to a billionth
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class PostureResult(MethodResult):
+    """What one method chose in every episode of a dataset."""
+
+    indices: Indices  # (E, R, k)
+    parameters: Array | None  # (E, R, m (n + 1)) identified from the chosen postures
+
+    @property
+    def log_det(self) -> Array:
+        """(E, R) log det S; by another criterion what stands for it."""
+        return self.values
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class PostureEvaluation(Evaluation):
+    """All methods on one dataset, selection by selection.
+
+    ``reference`` (E,) is log det S* where proven, else an upper bound on it. By another
+    criterion than D ``log_worth`` times the outputs stands for log det S.
+    """
+
+    title: ClassVar[str] = "Posture selection against the proven optimum"
+    about: ClassVar[str] = (
+        "det S is quoted in the unit of the dataset's commands; S is the information "
+        "matrix AᵀA of the chosen postures and S* that of the best choice there is. "
+        "Hit rate: share of selections whose determinant equals the optimum's to a "
+        "billionth. D-eff.: mean of (det S / det S*)^(1/p), p parameters. x random: "
+        "mean det S over that of random selection. Time: a selection, averaged over "
+        "the batch."
+    )
+
+    dataset: Dataset
+    k: int  # postures chosen
+    results: tuple[PostureResult, ...]
+    proven: NDArray[np.bool_]  # (E,)
+    random_log_det: Array  # (E, R) the baseline behind ratio_to_random
+    criterion: str = "D"
+
+    def summarise(self, *, indices: bool = False) -> Summary:
+        """The numbers of every method.
+
+        With ``indices`` also what each chose in every episode (random: its first draw).
+        """
+        rows, data = self.rows(), self.dataset
+        if indices:
+            for row, result in zip(rows, self.results, strict=True):
+                row.numbers["indices"] = result.indices[:, 0].tolist()
+        facts: dict[str, Any] = {"dataset": data.facts(), "k": self.k}
+        facts |= {"seed": self.seed, "criterion": self.criterion}
+        if data.measured is not None:
+            names = Affine(data.num_inputs, data.num_outputs).names
+            facts["parameter_names"] = list(names)
+        return summary_of(facts, rows, int(self.proven.sum()))
+
+    def summary(self, result: PostureResult) -> dict[str, Any]:
+        """The numbers of one method, as documented in docs/evaluation.md."""
+        m = self.dataset.num_outputs
+        behind = self.less(result)
+        hits = self.proven[:, None] & (behind >= -HIT_TOLERANCE * m)
+        behind = np.minimum(behind, 0.0)
+        efficiency = np.exp(behind / (m * (self.dataset.num_inputs + 1)))
+        row: dict[str, Any] = {"label": result.label}
+        if self.criterion == "D":
+            with np.errstate(over="ignore"):
+                det = np.exp(result.log_det)
+                times = np.exp(log_mean(result.log_det) - log_mean(self.random_log_det))
+            row |= {
+                "det_s": moments(det),
+                "log_det_s": moments(result.log_det),
+                "ratio_to_exact": float(np.exp(behind).mean()),
+                "hit_rate": float(hits.mean()),
+                "d_efficiency": float(efficiency.mean()),
+                "ratio_to_random": finite(times),
+            }
+        else:
+            row |= {
+                "efficiency": moments(efficiency),
+                "least_efficiency": float(efficiency.min()),
+                "hit_rate": float(hits.mean()),
+            }
+        row["seconds_per_selection"] = result.seconds
+        row["draws_per_episode"] = result.log_det.shape[1]
+        if self.criterion == "D" and result.parameters is not None:
+            row["parameter_variance"] = self.parameter_variance(result).tolist()
+        return row
+
+    def parameter_variance(self, result: PostureResult) -> Array:
+        """(m (n + 1),) variance over the episodes of each identified parameter.
+
+        Of several draws an episode the median variance: that of random has so heavy a
+        tail that a mean over draws shows the worst of them only.
+        """
+        if result.parameters is None:
+            raise ValueError(f"{self.dataset.name} holds no measured outputs")
+        return np.median(result.parameters.var(axis=0), axis=0)
+
+
+def summary_of(facts: dict[str, Any], rows: tuple[Row, ...], proven: int) -> Summary:
+    """The summary of one dataset.
+
+    Args:
+        facts: for the JSON: dataset, k, seed, criterion.
+        rows: a method each.
+        proven: how many of the episodes' optima.
+    """
+    data, k, criterion = facts["dataset"], facts["k"], facts["criterion"]
+    seed = "" if data["seed"] is None else f", seed {data['seed']}"
+    heading = (
+        f"{data['name']}{seed}: {data['episodes']:,} episodes, "
+        f"{k} of {data['num_candidates']} postures, "
+        f"{data['num_inputs']} inputs, {data['num_outputs']} outputs"
+        + ("" if criterion == "D" else f", criterion {criterion}")
+    )
+    notes = []
+    if proven < data["episodes"]:
+        notes.append(
+            f"{data['episodes'] - proven} of {data['episodes']} optima are not proven: "
+            "there an upper bound stands for det S*, so ratios and efficiencies are at "
+            "least what is shown and no selection counts as a hit"
+        )
+    if k == data["num_inputs"] + 1:
+        notes.append(
+            f"k = {k} fits {k * data['num_outputs']} parameters with as many "
+            "equations: no residual, so no estimate of the noise; a larger k leaves one"
+        )
+    facts = facts | {"proven": proven / data["episodes"], "notes": notes}
+    columns = _BY_D if criterion == "D" else _BY_OTHERS
+    return Summary(data["name"], heading, columns, rows, facts, tuple(notes))
+
+
+def log_mean(log_values: Array) -> float:
+    """Log of the mean of exp, without overflow."""
+    return float(logsumexp(log_values) - np.log(log_values.size))
+
+
+def _det(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
+
+
+def _share(value: float) -> str:
+    """Four decimals, and never 1.0000 for what is below it."""
+    text = f"{value:.4f}"
+    return "0.9999+" if text == "1.0000" and value < 1.0 - 1e-12 else text
+
+
+def _times(value: float | None) -> str:
+    return "-" if value is None else f"{value:,.0f}"
+
+
+def _time(seconds: float) -> str:
+    units = {"s": 1.0, "ms": 1e-3, "µs": 1e-6}
+    unit = next((unit for unit, size in units.items() if seconds >= size), "µs")
+    return f"{seconds / units[unit]:.3g} {unit}"
+
+
+_METHOD: Column = "method", lambda row: row.numbers["label"]
+_HITS: Column = "hit rate", lambda row: _share(row.numbers["hit_rate"])
+_TIME: Column = "time each", lambda row: _time(row.numbers["seconds_per_selection"])
+_BY_D: tuple[Column, ...] = (
+    _METHOD,
+    ("mean det S", lambda row: _det(row.numbers["det_s"]["mean"])),
+    ("median det S", lambda row: _det(row.numbers["det_s"]["median"])),
+    ("det S/det S*", lambda row: _share(row.numbers["ratio_to_exact"])),
+    _HITS,
+    ("D-eff.", lambda row: _share(row.numbers["d_efficiency"])),
+    ("x random", lambda row: _times(row.numbers["ratio_to_random"])),
+    _TIME,
+)
+_BY_OTHERS: tuple[Column, ...] = (
+    _METHOD,
+    ("efficiency", lambda row: _share(row.numbers["efficiency"]["mean"])),
+    ("least", lambda row: _share(row.numbers["least_efficiency"])),
+    _HITS,
+    _TIME,
+)
