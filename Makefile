@@ -50,14 +50,15 @@ reproduce: $(READY) ## the paper's figures, tables and claims from our own runs,
 # Hundreds of programs are started: what one has compiled the others load.
 test: export PYTHONDONTWRITEBYTECODE =
 # The rig's tests mostly wait for a device and import no JAX: three processes of them run
-# beside two of the others, which compile. Files stay in order: xdist would put the files of
-# few long tests last. Each process would compile everything that the tests import: one does
-# it before, while mypy runs.
+# beside the linters and two processes of the others, which compile. Files stay in order:
+# xdist would put the files of few long tests last. Each process would compile everything
+# that the tests import: one does it before, while mypy runs.
 QUICK_TESTS = $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -m 'not slow' $(ARGS)
 test: $(READY) ## set everything up, lint, and run the quick tests (the ones CI runs)
-	$(BIN)/python -m pytest --collect-only -qq >/dev/null & $(MAKE) --no-print-directory lint && wait
-	@export XLA_FLAGS="$${XLA_FLAGS-$(QUICK_XLA)}"; \
-	$(QUICK_TESTS) -n 3 tests/rig >$(VENV)/rig-tests.log 2>&1 & rig=$$!; \
+	@$(QUICK_TESTS) -n 3 tests/rig >$(VENV)/rig-tests.log 2>&1 & rig=$$!; \
+	$(BIN)/python -m pytest --collect-only -qq >/dev/null & imports=$$!; \
+	$(MAKE) --no-print-directory lint || { kill $$rig $$imports; exit 1; }; wait $$imports; \
+	export XLA_FLAGS="$${XLA_FLAGS-$(QUICK_XLA)}"; \
 	$(QUICK_TESTS) -n 2 tests --ignore tests/rig; others=$$?; \
 	wait $$rig; rig=$$?; cat $(VENV)/rig-tests.log; exit $$((rig | others))
 

@@ -254,7 +254,8 @@ def test_identify_only_reads():
 
 
 def test_stop_reaches_the_others_when_one_unit_is_dead():
-    config = fast_config(HASTY)
+    # A move of seconds, for a stop that comes late on a busy computer.
+    config = fast_config({**HASTY, "speed_deg_s = 400": "speed_deg_s = 4"})
     with simulator(config) as sim, Bus(sim.start().bus) as bus:
         drives = [ModbusDrive(bus, axis) for axis in config.axes]
         for drive in drives:
