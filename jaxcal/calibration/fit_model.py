@@ -80,12 +80,10 @@ def fit_model(
     """
     one_of("loss", loss, tuple(LOSSES))
     require_kind("prior", prior, Prior)
-    weights, noise = (
-        _distinct_weights(model, commands, measured, weights),
-        noise or Noise(),
-    )
+    weights = _distinct_weights(model, commands, measured, weights)
+    noise, used = noise or Noise(), _used(weights)
     spread = _command_noise(noise, commands, measured.shape[1])
-    exact, used = not spread.any(), _used(weights)
+    exact = not spread.any()
     if not exact and model.relative:
         raise ValueError(
             "command_std must not be given with a Pose: the orientations are "
@@ -169,13 +167,13 @@ def _distinct_weights(
     model: Model, commands: Array, measured: Array, weights: Array
 ) -> Array:
     """(N,) the weights of the measurements that count, 0 elsewhere."""
-    rows = np.flatnonzero(weights)
-    if not rows.size:
+    if not weights.any():
         raise ValueError("weights must be positive for one measurement at least")
-    once = model.distinct(commands[rows], measured[rows])
+    used = _used(weights)
+    once = model.distinct(commands[used], measured[used])
     if len(once) == len(weights):
         return weights
-    rows, distinct = rows[once], np.zeros_like(weights)
+    rows, distinct = np.flatnonzero(weights)[once], np.zeros_like(weights)
     distinct[rows] = weights[rows]
     return distinct
 
@@ -409,8 +407,8 @@ def _fields(
             noise_std, noise_dof = None, 0.0
     residuals = np.empty_like(measured)
     residuals[used] = solution.residuals
-    unused = weights == 0.0
-    if unused.any():
+    if isinstance(used, np.ndarray):
+        unused = ~used
         elsewhere = commands[unused] - (0.0 if centre is None else centre)
         off = measured[unused] - problem.model.predict(elsewhere, solution.parameters)
         residuals[unused] = problem.model.wrapped(off, elsewhere)

@@ -69,6 +69,7 @@ def solve(
 ) -> FitSolution:
     """The most probable parameters, from the prior's mean or from ``start``.
 
+    ``start`` is a solution of a problem that differs by prior, levels or loss alone.
     ``rough`` is to .1 standard deviations, the weights of the loss to .03, for what
     another fit begins at.
 
@@ -172,7 +173,7 @@ class FitSolution:
         self.change = (3e-2, 3e-2) if rough else (1e-5, 1e-4)  # of weights and levels
         # (R, r) roots of the hat matrix, hardly damped, where a step had them.
         self.solved: Array | None = None
-        count, q = problem.measured.shape
+        q = problem.measured.shape[1]
         self.uncertain = problem.command_std > 0.0
         self.command_root = 1.0 / problem.command_std[self.uncertain]  # 0: unknown
         self.num_readings = q - int((self.command_root == 0.0).sum())
@@ -181,29 +182,46 @@ class FitSolution:
         self.basis: Array | None = None  # (F, r) directions of a linear model
         self.freedom = np.zeros(q)
         self._share(problem.levels)
-        self.parameters = problem.mean if start is None else start.parameters
-        linear = problem.model.linear and not len(self.command_root)
+        # The last step of the logarithms of the levels, and how much of one is taken.
+        self.climbed, self.trust = np.zeros(q), 1.0
         self.informed = problem.precision[problem.free].any()
+        linear = problem.model.linear and not len(self.command_root)
         from_zero = linear and start is None and not self.informed
-        self.commands = problem.commands if start is None else start.commands
-        if from_zero:  # the answer is then as exact as its step
+        if start is None:
+            self._begin(from_zero)
+        else:
+            self._continue(start)
+        if linear:
+            self.basis, self.damping = self._directions(), _LEAST_DAMPING
+            if from_zero and self.basis.shape[1] < len(self.basis):
+                self._keep_undetermined()
+
+    def _begin(self, from_zero: bool) -> None:
+        """At the prior's mean, or at parameters of zero: a linear model without a prior
+        is then as exact as its step."""
+        problem = self.problem
+        self.parameters, self.commands = problem.mean, problem.commands
+        if from_zero:
             self.parameters = np.where(problem.free, 0.0, problem.mean)
         if from_zero and problem.free.all():
             self._take(problem.measured)
         else:
             self._predict()
-        # The last step of the logarithms of the levels, and how much of one is taken.
-        self.climbed, self.trust = np.zeros(q), 1.0
-        if start is None:
-            self.weights, self.level = np.ones(count), self._first_level()
-        else:
-            self.weights, self.level = start.weights, start.level
+        self.weights, self.level = np.ones(len(problem.measured)), self._first_level()
         self.facts, self.fact_rows = problem.model.facts(self.parameters)
         self._linearise()
-        if linear:
-            self.basis, self.damping = self._directions(), _LEAST_DAMPING
-            if from_zero and self.basis.shape[1] < len(self.basis):
-                self._keep_undetermined()
+
+    def _continue(self, start: FitSolution) -> None:
+        """Where another search ended, of the same model and measurements."""
+        self.parameters, self.commands = start.parameters, start.commands
+        self.residuals, self.white = start.residuals, start.white
+        self.weights, self.level = start.weights, start.level
+        self.facts, self.fact_rows = start.facts, start.fact_rows
+        self.by_theta = start.by_theta
+        if len(self.command_root):
+            self.by_command = start.by_command
+        if not self.problem.model.linear:
+            self.sizes = start.sizes
 
     @functools.cached_property
     def sizes(self) -> Array:
@@ -303,8 +321,8 @@ class FitSolution:
         rows, right, scale = self.system
         if self.solved is None:
             rows, right, scale = self._system(0.0)
-            inverse, _ = _factor(rows, right, self.damping)
-            self.solved, basis = rows @ inverse, basis / scale @ inverse
+            inverse, self.solved = _factor(rows, self.damping)
+            basis = basis / scale @ inverse
         cost, target = float(right @ right), self.solved.T @ right
         self.parameters = self.parameters.copy()
         self.parameters[problem.free] += basis @ target
@@ -415,9 +433,9 @@ class FitSolution:
         cost = self.cost
         while True:
             rows, right, scale = self._system(self.damping)
-            inverse, target = _factor(rows, right, self.damping)
-            self.solved = rows @ inverse if self.damping < 1e-9 else None
-            step = inverse @ target
+            inverse, across = _factor(rows, self.damping)
+            self.solved = across if self.damping < 1e-9 else None
+            step = inverse @ (across.T @ right)
             rest = rows @ step - right
             gain = float(right @ right - rest @ rest)
             step = step / scale if self.basis is None else self.basis @ (step / scale)
@@ -508,8 +526,7 @@ class FitSolution:
     def _leverage(self, root: Array | None = None) -> Array:
         """(N, R, F) roots of the hat matrix, of the readings, at any level."""
         if root is None:
-            rows, right, _ = self._system(0.0)
-            root = rows @ _factor(rows, right, _LEAST_DAMPING)[0]
+            root = _factor(self._system(0.0)[0], _LEAST_DAMPING)[1]
         count, width = len(self.weights), root.shape[1]
         readings = self.residuals.shape[1] + len(self.command_root)
         return root[: count * readings].reshape(count, readings, width)
@@ -541,13 +558,11 @@ class FitSolution:
 
         ``solved`` are the roots of the hat matrix there, if they are known.
         """
-        readings = self._leverage(solved)
-        right = self._reduce(0.0)[1]
+        readings, uncertain = self._leverage(solved), len(self.command_root)
+        right = self._reduce(0.0)[1] if uncertain else self.white / self.level
         if solved is None or self.problem.noise_known:
             self.freedom = self._freedom(readings)
-        self.distance = (right**2).sum(axis=1)
-        if len(self.command_root):
-            self.distance = self._distance(self.white, self.commands)
+        self.distance = self._distance(self.white, self.commands)
         deleted = _deleted(readings, right)
         self.deleted = np.maximum((right * deleted).sum(axis=1), 0.0)
         return self
@@ -571,14 +586,14 @@ def _deleted(readings: Array, right: Array) -> Array:
     return np.asarray((right + (readings @ along)[..., 0]) / one)
 
 
-def _factor(rows: Array, right: Array, damping: float) -> tuple[Array, Array]:
-    """The inverse of R and ``Q.T right`` of the damped rows (R, F)."""
+def _factor(rows: Array, damping: float) -> tuple[Array, Array]:
+    """The inverse of R (F, F), and Q (R, F), of the damped rows (R, F)."""
     inverse, across = _cholesky(rows, damping)
     if inverse is not None:
-        return inverse, across.T @ right
+        return inverse, across
     damp = np.sqrt(damping) * np.eye(rows.shape[1])
     whole, triangle = np.linalg.qr(np.concatenate([rows, damp]))
-    return np.linalg.inv(triangle), whole[: len(rows)].T @ right
+    return np.linalg.inv(triangle), whole[: len(rows)]
 
 
 @functools.cache

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -56,19 +56,17 @@ def group_scales(
     of_model = problem.model.error_groups()
     assert of_model is not None
     groups, num_groups = of_model.members, len(of_model.medians)
-    middle, wide = _thought(of_model)
-    cost = _evidence(problem, solution, of_model)
+    evidence = _Evidence(problem, solution, of_model)
     # A level that is known floats too: misfit beyond it is no size of the errors.
-    best = middle if start is None else start.logs
-    least, slope, curve = cost(best)
+    best = evidence.middle if start is None else start.logs
+    least = evidence.at(best)
     for _ in range(_SCORES):
-        step = np.linalg.solve(curve, slope)
+        step = np.linalg.solve(least.curvature, least.slope)
         trial = np.clip(best - step, -_MOST, _MOST)
-        while (after := cost(trial))[0] > least + 1e-9:
+        while (after := evidence.at(trial)).value > least.value + 1e-9:
             step *= 0.5
             trial = np.clip(best - step, -_MOST, _MOST)
-        gain, best = least - after[0], trial
-        least, slope, curve = after
+        gain, best, least = least.value - after.value, trial, after
         if gain < 1e-4:
             break
     factors = np.ones(p)
@@ -76,8 +74,12 @@ def group_scales(
     if start is None:  # of a rough fit, which begin the next
         return PriorScales(best, factors, groups, np.zeros((num_groups, num_groups)))
     steps = 1e-3 * np.eye(len(best))
-    curves = [cost(best + step)[1] - cost(best - step)[1] for step in steps]
-    # Half the cost's, in units of what was thought, which the readings only sharpen.
+    curves = [
+        evidence.at(best + step).slope - evidence.at(best - step).slope
+        for step in steps
+    ]
+    # Half the value's, in units of what was thought, which the readings only sharpen.
+    wide = evidence.wide
     curve = np.array(curves) / 4e-3 * np.outer(wide, wide)
     size, axes = np.linalg.eigh(curve)
     axes = wide[:, None] * axes
@@ -91,54 +93,93 @@ def _thought(groups: ErrorGroups) -> tuple[Array, Array]:
     return np.log(np.append(groups.medians, 1.0)), wide
 
 
-def _evidence(
-    problem: FitProblem, solution: FitSolution, groups: ErrorGroups
-) -> Callable[[Array], tuple[float, Array, Array]]:
-    """-2 log marginal likelihood of the logarithms (G + 1,), with slope and curve."""
-    from scipy.linalg.lapack import dpotrf, dtrtri
+class _Evidence:
+    """-2 log marginal likelihood of the scales, with what is thought of them.
 
-    middle, wide = _thought(groups)
-    rows, right = _reduced(problem, solution)
-    sized = groups.members[problem.free & (problem.precision > 0.0)]
-    count, width = len(right), rows.shape[1]
-    # All that the readings say is in a triangle; the rest of them is noise alone.
-    factor = triangle(np.column_stack([rows, right]))
-    top = min(width, len(factor))
-    rest = float((factor[top:, width] ** 2).sum())
-    rows, right = factor[:top, :width], factor[:top, width]
-    member = sized == np.arange(len(groups.medians))[:, None]  # (groups, s)
+    The model is linear about a solution; scales are the logarithms (G + 1,) of the
+    groups' factors and the level.
+    """
 
-    def cost(logs: Array) -> tuple[float, Array, Array]:
-        """-2 log marginal likelihood with what is thought of the factors.
+    def __init__(
+        self, problem: FitProblem, solution: FitSolution, groups: ErrorGroups
+    ) -> None:
+        rows, right = _reduced(problem, solution)
+        sized = groups.members[problem.free & (problem.precision > 0.0)]
+        group = np.arange(len(groups.medians))
+        self.members = sized == group[:, None]  # (G, s)
+        self.middle, self.wide = _thought(groups)
+        self.count, width = len(right), rows.shape[1]
+        # All that the readings say is in a triangle; the rest of them is noise alone.
+        factor = triangle(np.column_stack([rows, right]))
+        top = min(width, len(factor))
+        self.rest = float((factor[top:, width] ** 2).sum())
+        self.rows, self.right = factor[:top, :width], factor[:top, width]
 
-        Its slope and what its curvature is expected to be beside it.
-        """
-        scaled = rows * np.exp(logs[:-1] @ member)
-        level = np.exp(2.0 * logs[-1])
-        square = gram(scaled.T) + level * np.eye(top)
-        root, failed = dpotrf(square)
-        if failed:  # beyond rounding
-            inverse, log_det = np.linalg.inv(square), np.linalg.slogdet(square)[1]
+    def at(self, logs: Array) -> _EvidenceOfScales:
+        """The evidence of the logarithms (G + 1,)."""
+        return _EvidenceOfScales(self, logs)
+
+
+class _EvidenceOfScales:
+    """The value for some scales; slope and curvature where they are asked for."""
+
+    def __init__(self, evidence: _Evidence, logs: Array) -> None:
+        from scipy.linalg.lapack import dpotrf
+
+        self.evidence = evidence
+        self.scaled = evidence.rows * np.exp(logs[:-1] @ evidence.members)
+        self.level, self.top = np.exp(2.0 * logs[-1]), len(evidence.right)
+        self.covariance = gram(self.scaled.T) + self.level * np.eye(self.top)
+        self.root, self.failed = dpotrf(self.covariance)
+        if self.failed:  # beyond rounding
+            log_det = np.linalg.slogdet(self.covariance)[1]
         else:
-            inverse = gram(dtrtri(root)[0].T)
-            log_det = 2.0 * np.log(root.diagonal()).sum()
-        white, seen = inverse @ right, inverse @ scaled
-        spread = member @ (seen * scaled).sum(axis=0)
-        alone = (count - top) * 2.0 * logs[-1] + rest / level
-        value = right @ white + alone + log_det
-        slope = np.append(
-            spread - member @ (white @ scaled) ** 2,
-            level * (np.trace(inverse) - white @ white) + count - top - rest / level,
-        )
-        curve = np.diag(wide**-2.0)
-        curve[:-1, :-1] += 2.0 * member @ (scaled.T @ seen) ** 2 @ member.T
-        curve[-1, :-1] = curve[:-1, -1] = 2.0 * level * member @ (seen**2).sum(axis=0)
-        curve[-1, -1] += 2.0 * (level**2 * (inverse**2).sum() + count - top)
-        off = (logs - middle) / wide
-        value = float(value + off @ off)
-        return value, 2.0 * (slope + off / wide), 2.0 * curve
+            log_det = 2.0 * np.log(self.root.diagonal()).sum()
+        self.white = self.inverse @ evidence.right
+        alone = (evidence.count - self.top) * 2.0 * logs[-1]
+        alone += evidence.rest / self.level
+        self.off = (logs - evidence.middle) / evidence.wide
+        value = evidence.right @ self.white + alone + log_det
+        self.value = float(value + self.off @ self.off)
 
-    return cost
+    @functools.cached_property
+    def inverse(self) -> Array:
+        """(top, top) of ``covariance``, that of the readings."""
+        from scipy.linalg.lapack import dtrtri
+
+        if self.failed:
+            return np.asarray(np.linalg.inv(self.covariance))
+        return gram(dtrtri(self.root)[0].T)
+
+    @functools.cached_property
+    def shown(self) -> Array:
+        """(top, s) ``inverse @ scaled``."""
+        return np.asarray(self.inverse @ self.scaled)
+
+    @property
+    def slope(self) -> Array:
+        """(G + 1,)."""
+        evidence, white = self.evidence, self.white
+        members, square = evidence.members, white @ white
+        by_factors = members @ (self.shown * self.scaled).sum(axis=0)
+        by_factors = by_factors - members @ (white @ self.scaled) ** 2
+        by_level = self.level * (np.trace(self.inverse) - square) + evidence.count
+        by_level = by_level - self.top - evidence.rest / self.level
+        slope = np.append(by_factors, by_level)
+        return np.asarray(2.0 * (slope + self.off / evidence.wide))
+
+    @property
+    def curvature(self) -> Array:
+        """(G + 1, G + 1) as it is expected to be."""
+        evidence, level, shown = self.evidence, self.level, self.shown
+        members = evidence.members
+        curve = np.diag(evidence.wide**-2.0)
+        curve[:-1, :-1] += 2.0 * members @ (self.scaled.T @ shown) ** 2 @ members.T
+        across = 2.0 * level * members @ (shown**2).sum(axis=0)
+        curve[-1, :-1] = curve[:-1, -1] = across
+        square = level**2 * (self.inverse**2).sum()
+        curve[-1, -1] += 2.0 * (square + evidence.count - self.top)
+        return 2.0 * curve
 
 
 def misfit_scale(
@@ -169,20 +210,21 @@ def misfit_scale(
         precision=np.append(problem.precision, std**-2.0),
         free=np.append(problem.free, np.ones(more, dtype=np.bool_)),
     )
-    cost = _evidence(whole, beside, groups)
-    middle, wide = _thought(groups)
+    evidence = _Evidence(whole, beside, groups)
     logs, least = scales.logs.copy(), np.zeros(len(_TRIED))
     rest = np.flatnonzero(np.arange(len(logs)) != len(logs) - 2)
     for k, tried in enumerate(_TRIED):
         logs[-2] = tried
         for _ in range(2):  # steps of the other scales
-            _, slope, curve = cost(logs)
-            step = np.linalg.solve(curve[np.ix_(rest, rest)], slope[rest])
+            trial = evidence.at(logs)
+            curve = trial.curvature[np.ix_(rest, rest)]
+            step = np.linalg.solve(curve, trial.slope[rest])
             logs[rest] = np.clip(logs[rest] - np.clip(step, -1.0, 1.0), -_MOST, _MOST)
-        least[k] = cost(logs)[0]
+        least[k] = evidence.at(logs).value
     shares = np.exp(-0.5 * (least - least.min()))
     square = float(shares @ np.exp(2.0 * _TRIED) / shares.sum())
-    gains = least - ((_TRIED - middle[-2]) / wide[-2]) ** 2
+    thought = (_TRIED - evidence.middle[-2]) / evidence.wide[-2]
+    gains = least - thought**2
     return float(gains[0] - gains.min()), float(np.sqrt(square))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, numbers
 from jaxcal.models.model import as_commands
-from jaxcal.models.sensors import Sensor, Tip
+from jaxcal.models.sensors import Reading, Sensor, Tip
 from jaxcal.models.serial.kernel import forward
 
 __all__ = ["Arm", "Load"]
@@ -118,6 +118,10 @@ class Arm:
         turn = Rotation.from_rotvec(numbers("vectors", vectors), degrees=True)
         return np.asarray(turn.as_matrix() @ self._nominal_rotations(commands))
 
+    def nominal_tips(self, commands: Array) -> Array:
+        """(N, 3) the measured point of the nominal arm."""
+        return np.ascontiguousarray(self._chain(commands, self.nominal)[0][3].T)
+
     def _nominal_rotations(self, commands: Array) -> Array:
         """(N, 3, 3) from the tool to the measuring frame."""
         frame = self._chain(commands, self.nominal)[0]
@@ -129,10 +133,14 @@ class Arm:
         return ["x y z rx ry rz".split().index(axis) for axis in self.sensor.tool]
 
     @functools.cached_property
+    def _order(self) -> NDArray[np.intp]:
+        """Columns of the table in the order of the steps of a row."""
+        return np.argsort(_ORDER[self.convention])
+
+    @functools.cached_property
     def _steps(self) -> tuple[NDArray[np.intp], Array]:
         """(S,) kinds of the steps of the chain, and constant rotations (2, 3, 3)."""
-        order = np.argsort(_ORDER[self.convention])
-        rows = [*np.array(_ROW)[order]] * len(self.joints)
+        rows = [*np.array(_ROW)[self._order]] * len(self.joints)
         kinds = np.array([*_BASE, *rows, *_TOOL], dtype=np.intp)
         return kinds, np.stack([self.base[:3, :3], self.tool[:3, :3]])
 
@@ -222,13 +230,13 @@ class Arm:
         return self._kept(
             "_last_chain",
             (commands, parameters),
-            lambda: self._after(commands, parameters),
+            lambda: self._frames(commands, parameters)[:3],
         )
 
-    def _after(
-        self, commands: Array, parameters: Array, links: int | None = None
-    ) -> tuple[Array, ...]:
-        """Frame, axes and origins up to the tool, or only to the end of some links."""
+    def _frames(
+        self, commands: Array, parameters: Array, links: Sequence[int] = ()
+    ) -> tuple[Array, Array, Array, Array]:
+        """What ``_chain`` has, and the frames (L, 4, 3, N) at the ends of ``links``."""
         n = len(self.joints)
         gears, compliance, waves = self._drives(parameters)
         moves = gears[:, None] * self._moves(commands).T
@@ -242,17 +250,27 @@ class Arm:
             )
         base, tool, _ = self._split(parameters)
         rows = parameters[: 5 * n].reshape(n, 5)
-        rows = rows[:, np.argsort(_ORDER[self.convention])]
+        rows = rows[:, self._order]
         one = np.concatenate([base, [0.0], rows.ravel(), tool[:3], [0.0], tool[3:]])
         values = np.repeat(one[:, None], len(commands), axis=1)
         values[self._steps_of_joints] += moves
         kinds, fixed = self._steps
-        end = None if links is None else len(_BASE) + len(_ROW) * links
-        frames: tuple[Array, ...] = forward(kinds[:end], values[:end], fixed)
-        return frames
+        ends = [*(len(_BASE) + len(_ROW) * link for link in links), len(kinds)]
+        frames, axes, origins = forward(kinds, values, fixed, np.array(ends, np.intp))
+        return frames[-1], axes, origins, frames[:-1]
 
     def _tip_at(self, commands: Array, frame: Array) -> Tip:
         return Tip(frame, lambda: self._nominal_rotations(commands), self.length)
+
+    def _reading(self, commands: Array, parameters: Array) -> Reading:
+        """What the sensor reads."""
+
+        def find() -> Reading:
+            tip = self._tip_at(commands, self._chain(commands, parameters)[0])
+            inputs = commands[:, self.num_joints :]
+            return self.sensor.read(tip, inputs, self._split(parameters)[2])
+
+        return Reading(*self._kept("_last_reading", (commands, parameters), find))
 
     def _motion(
         self, commands: Array, parameters: Array, at: NDArray[np.int64]
@@ -261,6 +279,7 @@ class Arm:
 
         The second is by the sensor's own parameters.
         """
+        reading = self._reading(commands, parameters)
         frame, axes, origins = self._chain(commands, parameters)
         motion = np.zeros((len(at), 6, len(commands)))  # shift and turn of the tip
         turns = self._steps[0][at] > 2
@@ -268,8 +287,6 @@ class Arm:
         motion[turns, :3] = _cross(about, frame[3] - origins[at[turns]])
         motion[turns, 3:] = about
         motion[~turns, :3] = axes[at[~turns]]
-        tip, inputs = self._tip_at(commands, frame), commands[:, self.num_joints :]
-        reading = self.sensor.read(tip, inputs, self._split(parameters)[2])
         by_steps = np.ascontiguousarray(motion.transpose(2, 1, 0))
         return reading.by_tip @ by_steps, reading.by_own
 
@@ -286,12 +303,12 @@ class Arm:
         first = self.table.size + len(self.gears)
         stiff = self.nominal
         stiff[first : first + len(self.compliance)] = 0.0
-        _, axes, origins = self._after(commands, stiff)
+        links = [link for link, _, _ in self.loads]
+        _, axes, origins, ends = self._frames(commands, stiff, links)
         axes, origins = axes[self._steps_of_joints], origins[self._steps_of_joints]
         pulls = []
-        for link, weight, centre in self.loads:
-            reached = self._after(commands, stiff, link)[0]
-            point = reached[3] + np.einsum("k,kcn->cn", centre, reached[:3])
+        for (link, weight, centre), end in zip(self.loads, ends, strict=True):
+            point = end[3] + np.einsum("k,kcn->cn", centre, end[:3])
             motion = _cross(axes, point - origins)
             motion[~self._revolute] = axes[~self._revolute]
             motion[link:] = 0.0

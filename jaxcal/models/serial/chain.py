@@ -800,9 +800,7 @@ class SerialChain(Arm, Model):
         """Readings (N, q)."""
         commands = as_commands(self, commands)
         parameters = as_parameters(self, parameters)
-        frame = self._chain(commands, parameters)[0]
-        tip, inputs = self._tip_at(commands, frame), commands[:, self.num_joints :]
-        return self.sensor.read(tip, inputs, self._split(parameters)[2]).values
+        return self._reading(commands, parameters).values.copy()
 
     def jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None

@@ -14,24 +14,26 @@ from cython.cimports.libc.math import M_PI, cos, sin
 __all__ = ["forward"]
 
 
-def forward(kinds, values, fixed):
-    """Frame after the last step, from the identity, and where each step acted.
+def forward(kinds, values, fixed, ends):
+    """Frames after some of the steps, from the identity, and where each step acted.
 
     Args:
         kinds: (S,) int64: 0, 1, 2 a translation along x, y, z of the frame reached so
             far, 3, 4, 5 a rotation about it; 6 and on a constant rotation.
         values: (S, N) float64 lengths and degrees.
         fixed: (F, 3, 3) float64, the constant rotation of step kind 6 + i.
+        ends: (L,) int64, after how many steps, at most S, a frame is asked for.
 
     Returns:
-        (4, 3, N) axes x, y, z of the frame and its origin; of each step the axis w
-        (S, 3, N) and the origin o (S, 3, N).
+        (L, 4, 3, N) axes x, y, z of the frames and their origins; of each step the axis
+        w (S, 3, N) and the origin o (S, 3, N).
     """
     size, count = values.shape
-    frame = np.empty((4, 3, count))
+    frames = np.empty((len(ends), 4, 3, count))
     axes, origins = np.empty((2, size, 3, count))
-    _forward(kinds, values, fixed, frame, axes, origins)
-    return frame, axes, origins
+    turns = np.array([[0.0], [1.0], [0.0]]).repeat(size, axis=1)
+    _forward(kinds, values, fixed, ends, turns, frames, axes, origins)
+    return frames, axes, origins
 
 
 @cython.cfunc
@@ -41,17 +43,26 @@ def _forward(
     kinds: cython.Py_ssize_t[::1],
     values: cython.double[:, ::1],
     fixed: cython.double[:, :, ::1],
-    frame: cython.double[:, :, ::1],
+    ends: cython.Py_ssize_t[::1],
+    turns: cython.double[:, ::1],  # angle, cosine, sine of each step: most stay
+    frames: cython.double[:, :, :, ::1],
     axes: cython.double[:, :, ::1],
     origins: cython.double[:, :, ::1],
 ) -> cython.void:
-    at = cython.declare(cython.double[4][3])
+    at = cython.declare(cython.double[3][4])  # in C at[4][3]: four of three
     old = cython.declare(cython.double[3][3])
     for n in range(values.shape[1]):
         for j in range(4):
             for c in range(3):
                 at[j][c] = j == c
-        for s in range(values.shape[0]):
+        for s in range(values.shape[0] + 1):
+            for i in range(ends.shape[0]):
+                if ends[i] == s:
+                    for j in range(4):
+                        for c in range(3):
+                            frames[i, j, c, n] = at[j][c]
+            if s == values.shape[0]:
+                break
             kind: cython.Py_ssize_t = kinds[s]
             axis = kind % 3 if kind < 6 else 0
             for c in range(3):
@@ -73,12 +84,13 @@ def _forward(
                 for c in range(3):
                     at[3][c] += value * at[axis][c]
             else:
-                cosine, sine = cos(value * (M_PI / 180.0)), sin(value * (M_PI / 180.0))
+                if value != turns[0, s]:
+                    turns[0, s] = value
+                    turns[1, s] = cos(value * (M_PI / 180.0))
+                    turns[2, s] = sin(value * (M_PI / 180.0))
+                cosine, sine = turns[1, s], turns[2, s]
                 one, two = (axis + 1) % 3, (axis + 2) % 3
                 for c in range(3):
                     first, second = at[one][c], at[two][c]
                     at[one][c] = cosine * first + sine * second
                     at[two][c] = cosine * second - sine * first
-        for j in range(4):
-            for c in range(3):
-                frame[j, c, n] = at[j][c]

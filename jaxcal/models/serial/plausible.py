@@ -59,7 +59,7 @@ def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
         )
     if measured.any():  # offsets that were measured, as in a simulation, are of any tip
         return
-    points = arm.calibrated(arm.nominal).predict(joints)
+    points = arm.nominal_tips(joints)
     most, middles = _NOMINAL * arm.length, {}
     constant = np.flatnonzero((joints == joints[0]).all(axis=0))
     still = ", ".join(arm.joint_names[i] for i in constant)

@@ -373,11 +373,7 @@ def _reach(
         return _touching(arm, commands, low, high)
     if targets is None:
         return commands, [""] * len(commands)
-    from jaxcal.models.sensors import Position
-
-    points = arm.calibrated(arm.nominal, Position()).predict(
-        commands[:, : arm.num_joints]
-    )
+    points = arm.nominal_tips(commands)
     far = np.linalg.norm(points[:, None] - targets[:, :3], axis=-1)
     near = (far <= targets[:, 3]).any(axis=1)
     return commands, ["" if one else "are not near" for one in near]

@@ -417,7 +417,7 @@ def _anywhere(calibration: Fit, model: Chain, commands: Array) -> float:
         and depends(slopes, calibration.unidentified).any()
     ):
         return np.nan
-    points = model.calibrated(model.nominal).predict(drawn)
+    points = model.nominal_tips(drawn)
     whole = np.repeat(np.eye(3, 6)[None], _DRAWN, axis=0)
     whole[..., 3:] = hats(points - points.mean(axis=0))
     moves, whole = slopes.reshape(3 * _DRAWN, -1), whole.reshape(-1, 6)
@@ -514,7 +514,7 @@ def _swapped(
     if isinstance(sensor, Socket) and not explains:
         # So many that none is an outlier: by the arm as described, where that can tell.
         joints, columns = np.split(calibration.commands[used], [model.num_joints], 1)
-        points = model.calibrated(model.nominal).predict(joints)
+        points = model.nominal_tips(joints)
         labels, which = np.unique(sensor.of_rows(columns), return_inverse=True)
         middles = [np.median(points[which == i], axis=0) for i in range(len(labels))]
         apart = np.linalg.norm(points[:, None] - middles, axis=-1)
