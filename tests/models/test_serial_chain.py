@@ -113,9 +113,10 @@ def _outputs(model, command, parameters):
 def test_outputs_are_those_of_products_of_matrices(arm):
     model, commands, parameters = arm
     expected = [_outputs(model, command, parameters) for command in commands]
-    np.testing.assert_allclose(
-        model.predict(commands, parameters), expected, atol=1e-11
-    )
+    for _ in range(2):
+        outputs = model.predict(commands, parameters)
+        np.testing.assert_allclose(outputs, expected, atol=1e-11)
+        outputs[:] = np.nan  # they are the caller's
 
 
 @hypothesis.settings(max_examples=25)
