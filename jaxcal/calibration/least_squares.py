@@ -156,6 +156,8 @@ class FitSolution:
     commands: Array  # (N, n) as estimated; as given where they are exact
     residuals: Array  # (N, q) measured less predicted at these commands
     white: Array  # (N, q) residuals, whitened at level 1
+    by_theta: Array  # (N, q, F) derivatives, whitened at level 1
+    by_command: Array  # (N, q, k) likewise, by the commands that are uncertain
     level: Array  # (q,) of the noise
     weights: Array  # (N,) of the loss, 1 for least squares
     distance: Array  # (N,) squared, of each measurement from the fit, in noise
