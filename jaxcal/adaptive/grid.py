@@ -186,32 +186,21 @@ class GridTask:
             seconds: budget of a session, or (least, most) to draw it from.
             num_uses: uses that end a session, or the list it is drawn from.
             horizon: measurements after which a session ends in any case.
-            overrun: True: a measurement may begin while any time and uses are left, so
-                the last one may cost more than there is. By default one whose dearest
-                possible outcome cannot be paid may not be made, and a session in which
-                none can is over.
+            overrun: True: a measurement may begin while any time and uses are left. By
+                default only one whose dearest possible outcome can be paid; a session
+                in which none can is over.
 
         Raises:
             ValueError: naming the table, the rule and the value.
         """
         at, grid = _columns("designs", designs), _columns("theta", theta)
-        count = len(at)
         table = _probabilities(likelihood, at, grid)
-        weights = _weights(prior, len(grid))
-        times = _times(travel, count)
-        shape = table.shape[:2]
+        weights, possible = _weights(prior, table)
+        shape, lengths = table.shape[:2], _grid(grid)
+        times, after, first = _places(travel, place_after, place, shape)
         more, used = _costs("extra", extra, shape), _costs("uses", uses, shape)
-        itself = np.arange(count)[:, None]
-        after = _table(
-            "place_after", itself if place_after is None else place_after, shape
-        )
-        first = len(times) - 1 if place is None else place
-        _require_places("place_after", after, len(times))
-        _require_places("place", np.asarray(first), len(times))
-        group = _groups(groups, count)
-        lengths = _grid(grid)
+        group = _groups(groups, len(at))
         parts, order = _split(table, lengths)
-        possible = (table.astype(np.float32) > 0.0)[..., weights > 0.0].any(axis=-1)
         task = GridTask(
             theta=_single(grid),
             prior=_single(weights / weights.sum()),
@@ -352,15 +341,16 @@ def _probabilities(
     return table / total[:, None]
 
 
-def _weights(prior: ArrayLike | None, size: int) -> Array:
-    """(S,) prior weights, not normalised."""
+def _weights(prior: ArrayLike | None, table: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """(S,) prior weights, not normalised; (A, Y) outcomes that they make possible."""
+    size = table.shape[2]
     weights = np.full(size, 1.0) if prior is None else numbers("prior", prior)
     if weights.shape != (size,) or (weights < 0.0).any() or not weights.sum() > 0.0:
         raise ValueError(
             f"prior must hold {size} weights, none below 0 and one above, "
             f"got shape {weights.shape}, least {weights.min():g}"
         )
-    return weights
+    return weights, (table.astype(np.float32) > 0.0)[..., weights > 0.0].any(axis=-1)
 
 
 def _times(travel: ArrayLike, count: int) -> Array:
@@ -374,6 +364,23 @@ def _times(travel: ArrayLike, count: int) -> Array:
             f"{count} places, got shape {times.shape}"
         )
     return _not_negative("travel", times)
+
+
+def _places(
+    travel: ArrayLike,
+    place_after: ArrayLike | None,
+    place: int | None,
+    shape: tuple[int, int],
+) -> tuple[Array, Array, int]:
+    """(P, A) seconds of travel, (A, Y) places after outcomes, and the first place."""
+    times = _times(travel, shape[0])
+    if place_after is None:
+        place_after = np.arange(shape[0])[:, None]  # the design itself
+    after = _table("place_after", place_after, shape)
+    first = len(times) - 1 if place is None else place
+    _require_places("place_after", after, len(times))
+    _require_places("place", np.asarray(first), len(times))
+    return times, after, first
 
 
 def _costs(name: str, values: ArrayLike, shape: tuple[int, int]) -> Array:

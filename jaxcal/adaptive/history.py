@@ -131,53 +131,6 @@ def checked_entry(
 ) -> tuple[Any, Any]:
     """Design and outcome as the task has them, of a measurement that can be paid.
 
-    Raises:
-        ValueError: naming the entry, the rule and the value.
-    """
-    entry = _checked(task, belief, session, design, outcome, where)
-    _require_paid(task, session, entry[0], where)
-    return entry
-
-
-def _require_paid(
-    task: SequentialTask, session: Session, design: Any, where: str
-) -> None:
-    """Refuse a measurement that the budget could not pay."""
-    if isinstance(task, GridTask) and not task.payable(session)[design]:
-        cost = task.travel[session.place, design] + task.most_extra[design]
-        raise ValueError(
-            f"{where} takes up to {float(cost):.6g} s and "
-            f"{int(task.most_uses[design])} uses: {_left(session)}; a task made with "
-            "overrun=True may spend more"
-        )
-
-
-@jax.jit
-def after(
-    task: SequentialTask,
-    belief: Any,
-    session: Session,
-    design: Any,
-    outcome: Any,
-    key: jax.Array,
-) -> tuple[Any, Session]:
-    """Belief and session after one measurement."""
-    return (
-        belief.update(task, design, outcome, key),
-        task.spend(session, design, outcome),
-    )
-
-
-def _checked(
-    task: SequentialTask,
-    belief: Any,
-    session: Session,
-    design: Any,
-    outcome: Any,
-    where: str,
-) -> tuple[Any, Any]:
-    """Design and outcome as the task has them.
-
     A task with a table ``designs`` (A, e) takes a whole number as an index of it and
     anything else as coordinates; other tasks take designs as their options have them.
 
@@ -191,21 +144,44 @@ def _checked(
     else:
         design = _as_designs(task, belief, session, design, f"{where}: design")
     if isinstance(task, GridTask):
-        count = task.likelihood.shape[1]
-        index = _whole(outcome)
-        if index is None or not 0 <= index < count:
-            raise ValueError(
-                f"{where}: outcome must be a whole number in [0, {count}), "
-                f"got {outcome!r}"
-            )
-        likelihood = np.asarray(task.likelihood[design, index], np.float64)
-        if not (likelihood * np.asarray(belief.weights, np.float64)).sum() > 0.0:
-            raise ValueError(
-                f"{where}: outcome {index} of design "
-                f"{in_words(np.asarray(task.designs[design], np.float64))} cannot "
-                "follow what was measured before: the model gives it probability 0"
-            )
-        return design, jnp.int32(index)
+        return design, _row_outcome(task, belief, session, design, outcome, where)
+    return design, _answer(belief, design, outcome, where)
+
+
+def _row_outcome(
+    task: GridTask,
+    belief: Any,
+    session: Session,
+    design: jax.Array,
+    outcome: Any,
+    where: str,
+) -> jax.Array:
+    """Outcome of a design of a table, which the budget must have paid."""
+    count = task.likelihood.shape[1]
+    index = _whole(outcome)
+    if index is None or not 0 <= index < count:
+        raise ValueError(
+            f"{where}: outcome must be a whole number in [0, {count}), got {outcome!r}"
+        )
+    likelihood = np.asarray(task.likelihood[design, index], np.float64)
+    if not (likelihood * np.asarray(belief.weights, np.float64)).sum() > 0.0:
+        raise ValueError(
+            f"{where}: outcome {index} of design "
+            f"{in_words(np.asarray(task.designs[design], np.float64))} cannot "
+            "follow what was measured before: the model gives it probability 0"
+        )
+    if not task.payable(session)[design]:
+        cost = task.travel[session.place, design] + task.most_extra[design]
+        raise ValueError(
+            f"{where} takes up to {float(cost):.6g} s and "
+            f"{int(task.most_uses[design])} uses: {_left(session)}; a task made with "
+            "overrun=True may spend more"
+        )
+    return jnp.int32(index)
+
+
+def _answer(belief: Any, design: Any, outcome: Any, where: str) -> jax.Array:
+    """Outcome that a particle of the belief can give."""
     values = numbers(f"{where}: outcome", outcome)
     shape = outcome_shape(belief.model)
     if values.shape != shape:
@@ -224,7 +200,23 @@ def _checked(
             f"{where}: outcome {outcome!r} cannot follow what was measured before: "
             "every particle gives it probability 0"
         )
-    return design, answer
+    return answer
+
+
+@jax.jit
+def after(
+    task: SequentialTask,
+    belief: Any,
+    session: Session,
+    design: Any,
+    outcome: Any,
+    key: jax.Array,
+) -> tuple[Any, Session]:
+    """Belief and session after one measurement."""
+    return (
+        belief.update(task, design, outcome, key),
+        task.spend(session, design, outcome),
+    )
 
 
 _can_answer = jax.jit(ParticleBelief.can_answer)

@@ -46,6 +46,7 @@ cdef class Tree:
     cdef void _sum(self, int level) noexcept nogil
     cdef double _value(self, int level, float p, State now, double entropy, int* best) noexcept nogil
     cdef double _propose(self, int level, float p, State now, int* best) noexcept nogil
+    cdef void _open(self, int level, State now) noexcept nogil
     cdef double _follow(self, int level, float p, int a, State now, double entropy) noexcept nogil
 
 cdef float _log(float x) noexcept nogil

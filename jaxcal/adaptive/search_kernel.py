@@ -353,9 +353,6 @@ class Tree:
         seconds = cython.address(self.seconds[level, 0])
         needs = cython.address(self.needs[level, 0])
         travel = cython.address(self.travel[now.place, 0])
-        allowed = cython.address(self.allowed[0])
-        most_extra = cython.address(self.most_extra[0])
-        most_uses = cython.address(self.most_uses[0])
         open = cython.address(self.open[level, 0])
         hints = cython.address(self.hints[min(now.made, self.hints.shape[0] - 1), 0])
         share: cython.float = 1.0 / p
@@ -364,16 +361,9 @@ class Tree:
         zero: cython.float = 0.0
         one: cython.float = 1.0
         closed: cython.float = 1e9
-        rounding: cython.float = 0.9999  # as ``session.pays``
-        seconds_left: cython.float = now.seconds
-        uses_left: cython.float = now.uses
         # One array is written in each loop: more, and the compiler doubts that they are
         # apart.
-        for a in range(designs):
-            cost = rounding * (travel[a] + most_extra[a])
-            open[a] = allowed[a] if cost <= seconds_left else zero
-        for a in range(designs):
-            open[a] = open[a] if most_uses[a] <= uses_left else zero
+        self._open(level, now)
         for a in range(designs):
             gains[a] = sums[(outcomes - 1) * designs + a]
         for a in range(designs):
@@ -428,6 +418,23 @@ class Tree:
         self.work += _EACH * self.wide + _NODE
         best[0] = _argmax(scores, designs)
         return (gains[best[0]] + least) / fmax(scores[best[0]], 1e-30)
+
+    def _open(self, level, now):
+        """Which designs are allowed and paid for by what is left, whatever comes."""
+        travel = cython.address(self.travel[now.place, 0])
+        allowed = cython.address(self.allowed[0])
+        most_extra = cython.address(self.most_extra[0])
+        most_uses = cython.address(self.most_uses[0])
+        open = cython.address(self.open[level, 0])
+        zero: cython.float = 0.0
+        rounding: cython.float = 0.9999  # as ``session.pays``
+        seconds_left: cython.float = now.seconds
+        uses_left: cython.float = now.uses
+        for a in range(self.designs):
+            cost = rounding * (travel[a] + most_extra[a])
+            open[a] = allowed[a] if cost <= seconds_left else zero
+        for a in range(self.designs):
+            open[a] = open[a] if most_uses[a] <= uses_left else zero
 
     def _follow(self, level, p, a, now, entropy):
         """p times the nats that are gained after a measurement."""

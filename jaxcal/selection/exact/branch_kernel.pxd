@@ -101,6 +101,8 @@ cdef class Search:
     cdef double _at(self, int kind, const double* low, const double* c) noexcept nogil
     cdef void _spread(self, const double* low, const double* high, double* c) noexcept nogil
     cdef double _relax(self, int kind, double* low, double* high, double* c, double goal, double share) except? -1.0 nogil
+    cdef double _begin(self, int kind, const double* low, const double* high, double* c) noexcept nogil
+    cdef double _step(self, int kind, const double* low, const double* high, double* c, double value) noexcept nogil
     cdef double _worth(self, const double* counts) noexcept nogil
     cdef void _offer(self, const double* counts) noexcept nogil
     cdef bint _balance(self, const double* low, const double* high, double* c) noexcept nogil

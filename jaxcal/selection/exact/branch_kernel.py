@@ -738,18 +738,9 @@ class Search:
         Returns:
             The bound, -inf where every selection of the node is singular.
         """
-        self.opened = 0
-        for i in range(self.count):
-            self.leverage[i] = 0.0
-            if low[i] < high[i]:
-                self.open[self.opened] = i
-                self.opened += 1
-        value = self._at(kind, low, c)
+        value = self._begin(kind, low, high, c)
         if not value > -INFINITY:
-            self._spread(low, high, c)
-            value = self._at(kind, low, c)
-            if not value > -INFINITY:
-                return value
+            return value
         sharpest: cython.double = INFINITY
         bound: cython.double = INFINITY
         after: cython.double = value
@@ -786,32 +777,51 @@ class Search:
                 continue
             if solved:
                 break
-            m = self._working_set(low, high, c)
-            promised: cython.double = 0.0
-            part: cython.double = 1.0
-            for i in range(m):
-                j = self.which[i]
-                self.before[i], self.slope[i] = c[j], self.leverage[j]
-                self.least[i], self.most[i] = low[j] - c[j], high[j] - c[j]
-            self._hessian(kind, m)
-            self._quadratic_step(m)
-            for i in range(m):
-                promised += self.move[i] * self.leverage[self.which[i]]
-            while True:
-                for i in range(m):
-                    j = self.which[i]
-                    c[j] = self.before[i] + part * self.move[i]
-                    near = floor(c[j] + 0.5)
-                    if fabs(c[j] - near) < _ROUNDING:
-                        c[j] = near
-                after = self._at(kind, low, c)
-                if after >= value + 1e-4 * part * promised or part < 1e-6:
-                    break
-                part *= 0.5
+            after = self._step(kind, low, high, c, value)
             if not after > value:
                 break
             value = after
         return sharpest
+
+    def _begin(self, kind, low, high, c):
+        """phi at the start of a climb; -inf where every selection is singular."""
+        self.opened = 0
+        for i in range(self.count):
+            self.leverage[i] = 0.0
+            if low[i] < high[i]:
+                self.open[self.opened] = i
+                self.opened += 1
+        value = self._at(kind, low, c)
+        if not value > -INFINITY:
+            self._spread(low, high, c)
+            value = self._at(kind, low, c)
+        return value
+
+    def _step(self, kind, low, high, c, value):
+        """phi after a step of the working set, which is halved while it falls short."""
+        m = self._working_set(low, high, c)
+        after: cython.double = value
+        promised: cython.double = 0.0
+        part: cython.double = 1.0
+        for i in range(m):
+            j = self.which[i]
+            self.before[i], self.slope[i] = c[j], self.leverage[j]
+            self.least[i], self.most[i] = low[j] - c[j], high[j] - c[j]
+        self._hessian(kind, m)
+        self._quadratic_step(m)
+        for i in range(m):
+            promised += self.move[i] * self.leverage[self.which[i]]
+        while True:
+            for i in range(m):
+                j = self.which[i]
+                c[j] = self.before[i] + part * self.move[i]
+                near = floor(c[j] + 0.5)
+                if fabs(c[j] - near) < _ROUNDING:
+                    c[j] = near
+            after = self._at(kind, low, c)
+            if after >= value + 1e-4 * part * promised or part < 1e-6:
+                return after
+            part *= 0.5
 
     # --- branching ------------------------------------------------------------------
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rig.config.axis import Axis
 from rig.core.device import Device, Posture
 from rig.core.motion import move
 from rig.core.proof import FIRST_MOTOR_DEG, slopes, unit_proved
@@ -109,102 +110,127 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
             of the phone's angles is not the one that is configured.
     """
     config, start = run.config, device.positions()
-    stands: dict[str, Stand] = {}
-    room: list[float] = []  # degrees from the start to the nearer limit of an axis
-    for axis, pulses in zip(config.axes, start, strict=True):
-        here = axis.to_deg(pulses)
-        room.append(min(here - axis.min_deg, axis.max_deg - here) - ROOM_DEG)
-        if room[-1] < REACH_DEG:
-            raise Refused(
-                f"{axis.name} stands {room[-1] + ROOM_DEG:.1f} deg from a limit; the "
-                f"check moves it {REACH_DEG:g} deg either way. Move it inwards: "
-                f"jaxcal-rig jog {axis.name} DEG"
-            )
-
-    def visit(name: str, offset: dict[int, int], samples: int = 0) -> Stand:
-        """Stand at pulses away from the start, and measure."""
-        target = tuple(p + offset.get(axis, 0) for axis, p in enumerate(start))
-        stands[name] = stand_at(run, device, Posture(name, target), samples)
-        return stands[name]
-
-    names, geometry = config.axis_names, device.geometry
+    room = [_room_deg(axis, at) for axis, at in zip(config.axes, start, strict=True)]
     # Of numbers it does not matter which axis carries which; of an arm it is known.
     corners = corners_of(len(config.axes)) if config.imu and not config.is_arm else []
     run.say(
-        f"axes: about {1 + 7 * len(names) + len(corners)} places; each axis first by "
+        f"axes: about {1 + 7 * len(start) + len(corners)} places; each axis first by "
         f"{FIRST_MOTOR_DEG:g} deg of its motor, then as far as what is seen allows, "
         f"{REACH_DEG:g} deg or mm at most either way"
     )
-    base = visit("start", {}, 4 * config.settle.samples)
-    device.proof.stay_near(base.attitude)
-    noise = SURE_SIGMA * base.std_deg * (2.0 / config.settle.samples) ** 0.5
-    wanted = [axis.to_pulses(REACH_DEG) for axis in config.axes]
+    tour = _Tour(run, device, start)
+    device.proof.stay_near(tour.base.attitude)
+    if not unit_proved(config.source, tour.base.attitude):
+        tour.prove_unit()
+    corner: list[int] = []  # pulses of each axis
+    for j, axis in enumerate(config.axes):
+        far, seen = tour.measure_axis(j)
+        most = min(CORNER_DEG, room[j]) / abs(axis.to_deg(far))
+        corner.append(round(far * min(REACH_DEG / seen, most)))
+    clear = CLEAR * tour.base.std_deg / CORNER_STD_DEG
+    clear = int(np.ceil(clear**2 / max(1, len(corners))))
+    samples = min(max(clear, config.settle.samples), 8 * config.settle.samples)
+    for signs in corners:
+        ways = {j: sign * corner[j] for j, sign in enumerate(signs)}
+        tour.visit(corner_name(config, signs), ways, samples)
+    move(device, Posture("back", start))
+    return tour.stands
 
-    def turned(stand: Stand) -> float:
-        return geometry.apart(base.attitude, stand.attitude)
 
-    def grow(j: int, unit: bool, samples: int = 0) -> tuple[int, ...]:
+def _room_deg(axis: Axis, pulses: int) -> float:
+    """Degrees from here to the nearer limit, less what is left to it.
+
+    Raises:
+        Refused: it is less than the check needs.
+    """
+    here = axis.to_deg(pulses)
+    room = min(here - axis.min_deg, axis.max_deg - here) - ROOM_DEG
+    if room < REACH_DEG:
+        raise Refused(
+            f"{axis.name} stands {room + ROOM_DEG:.1f} deg from a limit; the check "
+            f"moves it {REACH_DEG:g} deg either way. Move it inwards: "
+            f"jaxcal-rig jog {axis.name} DEG"
+        )
+    return room
+
+
+class _Tour:
+    """The places around the start, each of them measured."""
+
+    def __init__(self, run: Run, device: Device, start: tuple[int, ...]) -> None:
+        self.run, self.device, self.start = run, device, start
+        self.stands: dict[str, Stand] = {}
+        samples = run.config.settle.samples
+        self.base = self.visit("start", {}, 4 * samples)
+        self.noise = SURE_SIGMA * self.base.std_deg * (2.0 / samples) ** 0.5
+
+    def visit(self, name: str, offset: dict[int, int], samples: int = 0) -> Stand:
+        """Stand at pulses away from the start, and measure."""
+        target = tuple(p + offset.get(axis, 0) for axis, p in enumerate(self.start))
+        stand = stand_at(self.run, self.device, Posture(name, target), samples)
+        self.stands[name] = stand
+        return stand
+
+    def turned(self, stand: Stand) -> float:
+        """How far the phone turned from the start, or the numbers changed."""
+        return self.device.geometry.apart(self.base.attitude, stand.attitude)
+
+    def grow(self, j: int, unit: bool, samples: int = 0) -> tuple[int, int]:
         """Move an axis further and further; pulses of the last two places."""
-        reach = device.proof.renew(j, unit)
-        way, counts = int(np.sign(wanted[j])), [0]
+        config, geometry = self.run.config, self.device.geometry
+        reach = self.device.proof.renew(j, unit)
+        wanted, counts = config.axes[j].to_pulses(REACH_DEG), [0]
+        way = int(np.sign(wanted))
         while True:
-            count = reach.pulses(wanted[j], REACH_DEG * geometry.scale)
+            count = reach.pulses(wanted, REACH_DEG * geometry.scale)
             if count <= FAR_ENOUGH * counts[-1]:
                 return way * counts[-2], way * counts[-1]
-            look = visit(f"{names[j]}:plus", {j: way * count}, samples)
-            reach.saw(count, turned(look), noise)
+            name = f"{config.axis_names[j]}:plus"
+            stand = self.visit(name, {j: way * count}, samples)
+            reach.saw(count, self.turned(stand), self.noise)
             counts.append(count)
 
-    proved = unit_proved(config.source, base.attitude)
-    if not proved:
-        run.say(
+    def prove_unit(self) -> None:
+        """Short moves that tell degrees of the phone from radians."""
+        config = self.run.config
+        self.run.say(
             "  no angle of the phone is over 6.3, so degrees are not told from "
             "radians: shorter moves show first which they are"
         )
         ratios = []
         for j, axis in enumerate(config.axes):
-            _, far = grow(j, False, 4 * config.settle.samples)
-            seen = turned(stands[f"{names[j]}:plus"])
-            told = device.drives[j].pulses_per_rev() or axis.pulses_per_rev
+            _, far = self.grow(j, False, 4 * config.settle.samples)
+            seen = self.turned(self.stands[f"{axis.name}:plus"])
+            told = self.device.drives[j].pulses_per_rev() or axis.pulses_per_rev
             geared = told / axis.pulses_per_rev
             ratios.append(geared * seen / abs(axis.to_deg(far)))
-            visit(f"{names[j]}:back", {j: 0})
+            self.visit(f"{axis.name}:back", {j: 0})
         require_unit(config, ratios)
-    corner = [0] * len(names)
-    for j, name in enumerate(names):
-        axis = config.axes[j]
-        look, far = grow(j, True)
-        plus = stands[f"{name}:plus"]
-        way = turned(plus)
-        least = SEEN_SIGMA * base.std_deg / plus.samples**0.5
-        if way < max(SEEN_DEG * geometry.scale, least):
+
+    def measure_axis(self, j: int) -> tuple[int, float]:
+        """Places of one axis, both ways; pulses of the furthest, and what it turned."""
+        axis, geometry = self.run.config.axes[j], self.device.geometry
+        look, far = self.grow(j, True)
+        plus = self.stands[f"{axis.name}:plus"]
+        seen = self.turned(plus)
+        commanded = abs(axis.to_deg(far))
+        least = SEEN_SIGMA * self.base.std_deg / plus.samples**0.5
+        if seen < max(SEEN_DEG * geometry.scale, least):
             raise MotionFault(
-                f"unit {axis.unit} turned its motor by {abs(axis.to_deg(far)):g} "
-                f"{axis.unit_name} of {name}, and {geometry.told} {way:.3g}. Look for "
-                "a "
-                "loose "
+                f"unit {axis.unit} turned its motor by {commanded:g} {axis.unit_name} "
+                f"of {axis.name}, and {geometry.told} {seen:.3g}. Look for a loose "
                 "coupling, a stream that does not change, or a reduction that is far "
                 "too small"
             )
         # Once more on the way up, where its play is taken up.
-        down = tuple(p - far * (i == j) for i, p in enumerate(start))
-        move(device, Posture(name, down))
-        visit(f"{name}:look", {j: look if 2 * abs(look) <= abs(far) else far // 4})
-        visit(f"{name}:plus", {j: far})
-        visit(f"{name}:back", {j: 0})
-        visit(f"{name}:minus", {j: -far})
-        move(device, Posture(name, start))
-        most = min(CORNER_DEG, room[j])
-        corner[j] = round(far * min(REACH_DEG / way, most / abs(axis.to_deg(far))))
-        run.say(
-            f"  {name}: {abs(axis.to_deg(far)):.2f} {axis.unit_name} commanded, "
-            f"{geometry.told} {way:.3g}"
+        down = tuple(p - far * (i == j) for i, p in enumerate(self.start))
+        move(self.device, Posture(axis.name, down))
+        near = look if 2 * abs(look) <= abs(far) else far // 4
+        for name, count in ("look", near), ("plus", far), ("back", 0), ("minus", -far):
+            self.visit(f"{axis.name}:{name}", {j: count})
+        move(self.device, Posture(axis.name, self.start))
+        self.run.say(
+            f"  {axis.name}: {commanded:.2f} {axis.unit_name} commanded, "
+            f"{geometry.told} {seen:.3g}"
         )
-    clear = CLEAR * base.std_deg / CORNER_STD_DEG
-    clear = int(np.ceil(clear**2 / max(1, len(corners))))
-    samples = min(max(clear, config.settle.samples), 8 * config.settle.samples)
-    for signs in corners:
-        ways = {j: sign * corner[j] for j, sign in enumerate(signs)}
-        visit(corner_name(config, signs), ways, samples)
-    move(device, Posture("back", start))
-    return stands
+        return far, seen

@@ -99,13 +99,7 @@ class RunState:
                 self.ended = self.stop = self.last_move = None
                 self.phase, self.pausing, self.warnings = "opening", False, []
             case "plan" | "replan":
-                points = [self.to_deg(p) for p in record.get("candidates", [])]
-                self.candidates = points or self.candidates
-                for name, visited in [*self.postures.items()]:
-                    if visited.role == "select" and visited.state == "waiting":
-                        del self.postures[name]
-                for index in record["choice"]["indices"]:
-                    self._posture(f"select:{index}").commanded = self.candidates[index]
+                self._plan(record)
             case "held_out":
                 for number, pair in enumerate(record["pairs"]):
                     for role, pulses in zip(roles_of(pair), pair, strict=True):
@@ -130,31 +124,17 @@ class RunState:
                 posture = self._posture(record["name"], record["pulses"])
                 posture.state, self.target = "moving", posture.commanded
             case "zero":
-                self.target, self.drift = (
-                    record["commanded_deg"],
-                    [(now, [0.0] * len(self.names[1]))],
-                )
+                self.target = record["commanded_deg"]
+                self.drift = [(now, [0.0] * len(self.names[1]))]
             case "reference":
                 self.drift.append((now, record["angles"]))
             case "posture" | "stand":  # a stand, of commissioning, is against no zero
-                posture = self._posture(record["name"], record["pulses"])
-                posture.state, posture.note, posture.time = "done", "", now
-                posture.measured = record.get("measured_deg")
-                posture.std = record["std_deg"]
-                self.current, self.target = None, posture.commanded
-                if posture.role == "reference":
-                    self.drift.append((now, record["measured_deg"]))
-            case "unreachable" | "void":
-                lost, note = (
-                    "withdrawn",
-                    "an axis slipped, perhaps before this was measured",
-                )
-                if event == "unreachable":
-                    lost, note = event, record["reason"]
-                for name in record.get("names") or [record["name"]]:
-                    commanded = self._posture(name).commanded
-                    self.postures[name] = Posture(name, commanded, lost, note, time=now)
-                    self.current = None if self.current == name else self.current
+                self._measured(record, now)
+            case "unreachable":
+                self._lose([record["name"]], event, record["reason"], now)
+            case "void":
+                note = "an axis slipped, perhaps before this was measured"
+                self._lose(record["names"], "withdrawn", note, now)
             case "stop":
                 self.stop = record
             case "stayed" if self.stop:
@@ -172,6 +152,33 @@ class RunState:
         if lines:
             line = "; ".join(line.strip() for line in lines)
             self.log = [*self.log, (now, line)][-LOGGED:]
+
+    def _plan(self, record: Record) -> None:
+        """Postures that were selected take the place of those that still wait."""
+        points = [self.to_deg(p) for p in record.get("candidates", [])]
+        self.candidates = points or self.candidates
+        for name, visited in [*self.postures.items()]:
+            if visited.role == "select" and visited.state == "waiting":
+                del self.postures[name]
+        for index in record["choice"]["indices"]:
+            self._posture(f"select:{index}").commanded = self.candidates[index]
+
+    def _measured(self, record: Record, now: float) -> None:
+        """A posture is done."""
+        posture = self._posture(record["name"], record["pulses"])
+        posture.state, posture.note, posture.time = "done", "", now
+        posture.measured = record.get("measured_deg")
+        posture.std = record["std_deg"]
+        self.current, self.target = None, posture.commanded
+        if posture.role == "reference":
+            self.drift.append((now, record["measured_deg"]))
+
+    def _lose(self, names: Sequence[str], state: str, note: str, now: float) -> None:
+        """Postures are left out or withdrawn, and whatever was measured there."""
+        for name in names:
+            commanded = self._posture(name).commanded
+            self.postures[name] = Posture(name, commanded, state, note, time=now)
+            self.current = None if self.current == name else self.current
 
     def _interrupt(self) -> None:
         """The posture under way is not measured: it waits again."""
