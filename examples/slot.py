@@ -62,7 +62,7 @@ ENTRY = Entry(slot, about="the walls of a slot", rules={"state": TUNED})
 class Study:
     """Methods on the same sessions; a policy of each seed."""
 
-    results: dict[str, sequential.SessionResult]
+    results: dict[str, sequential.DeciderResult]
 
 
 def study(full: bool) -> Study:

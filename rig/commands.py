@@ -66,7 +66,7 @@ class Simulation:
 
 
 @dataclasses.dataclass
-class Target(Simulation):
+class DeviceOptions(Simulation):
     """The device that a command is about."""
 
     config: ConfigPath | None = None
@@ -115,7 +115,7 @@ class Target(Simulation):
 
 
 @dataclasses.dataclass
-class Step(Target):
+class Step(DeviceOptions):
     """How a step of commissioning is begun."""
 
     yes: Annotated[bool, "confirm everything and take every default"] = False
@@ -125,7 +125,7 @@ class Step(Target):
 
 
 @dataclasses.dataclass
-class Session(Target):
+class Session(DeviceOptions):
     """How a session is begun and shown."""
 
     out: Annotated[Path, "folder for the run's folder"] | None = None
@@ -200,13 +200,13 @@ def setup(
 
 def ports() -> int:
     """list serial ports"""
-    from rig.workbench.commission.phone import serial_lines
+    from rig.workbench.commission.connections import serial_lines
 
     print(*(serial_lines() or ["no serial port on this computer"]), sep="\n")
     return EXIT_OK
 
 
-def scan(given: Target, *, bus: BusName = "", units: Units = 16) -> int:
+def scan(given: DeviceOptions, *, bus: BusName = "", units: Units = 16) -> int:
     """which units answer, and of which family; reads only"""
     from rig.workbench.commission import scan as scanning
     from rig.workbench.commission import steps
@@ -278,7 +278,7 @@ def _step(given: Step, state: str, name: str, *options: Any) -> int:
 
 
 @contextlib.contextmanager
-def _place(given: Target, state: str = "") -> Iterator[Site]:
+def _place(given: DeviceOptions, state: str = "") -> Iterator[Site]:
     """The device that a command is about, which has reached a state."""
     from rig.journal import DeviceRecord
     from rig.workbench.commission import steps
@@ -396,7 +396,7 @@ def watch(run: RunPath) -> int:
     return EXIT_OK
 
 
-def identify(given: Target) -> int:
+def identify(given: DeviceOptions) -> int:
     """read identity and status of every drive; write nothing"""
     from rig.drives.line import BusError
 
@@ -537,7 +537,7 @@ def trend(folder: Annotated[Path, "of runs, searched with its subfolders"]) -> i
 
 
 def simulate(
-    given: Target, *, bus_port: Annotated[int, "0: any free one"] | None = None
+    given: DeviceOptions, *, bus_port: Annotated[int, "0: any free one"] | None = None
 ) -> int:
     """serve simulated drives and a phone on loopback"""
     config = given.load(simulated=True)

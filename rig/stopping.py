@@ -32,7 +32,7 @@ NOTHING = "NOTHING WAS STOPPED BY THIS COMMAND"
 LAST_RESORT = "Use the emergency stop"
 
 
-class Target:
+class ArmedBus:
     """One bus: its lock, and what of it was armed last."""
 
     def __init__(self, bus: dict[str, Any]) -> None:
@@ -147,7 +147,7 @@ def stop_run(run: pathlib.Path) -> list[UnitStop]:
     """
     for path in armed_files():
         armed = read_armed(path)
-        target = armed and Target(armed["bus"])
+        target = armed and ArmedBus(armed["bus"])
         if target:
             holder = target.lock.holder()
             if holder and holder.get("run") == str(run.resolve()):
@@ -156,18 +156,18 @@ def stop_run(run: pathlib.Path) -> list[UnitStop]:
     raise Fault(f"{NOTHING}: no session of this computer moves {run.name}")
 
 
-def _targets(path: pathlib.Path, given: bool) -> tuple[list[Target], str]:
+def _targets(path: pathlib.Path, given: bool) -> tuple[list[ArmedBus], str]:
     """The buses to stop, and what is wrong with the file."""
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
-        return [Target(data["bus"])], ""
+        return [ArmedBus(data["bus"])], ""
     except (OSError, ValueError, KeyError, TypeError) as error:
         fault = f"{path} names no bus: {' '.join(str(error).split())}"
         if isinstance(error, FileNotFoundError):
             fault = f"there is no {path}" + " here" * (not given)
     every = [armed for each in armed_files() if (armed := read_armed(each))]
     moving = [armed for armed in every if not armed["standing"]]
-    return [Target(armed["bus"]) for armed in moving or every], fault
+    return [ArmedBus(armed["bus"]) for armed in moving or every], fault
 
 
 def _tell_others(stopped: list[pathlib.Path]) -> None:
@@ -176,7 +176,7 @@ def _tell_others(stopped: list[pathlib.Path]) -> None:
         armed = read_armed(path)
         if path in stopped or armed is None or armed["standing"]:
             continue
-        target = Target(armed["bus"])
+        target = ArmedBus(armed["bus"])
         holder = target.lock.holder()
         device = f", {armed['device']}" if "device" in armed else ""
         _say(
@@ -197,7 +197,7 @@ def _say(text: str) -> None:
 
 
 def _stop_units(
-    target: Target, path: pathlib.Path | None, stay: bool = False
+    target: ArmedBus, path: pathlib.Path | None, stay: bool = False
 ) -> list[UnitStop]:
     """Stop the drives that were armed last, else those of the configuration file.
 

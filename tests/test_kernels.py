@@ -53,7 +53,7 @@ def test_a_kernel_that_was_never_compiled_is_an_error(package):
         compiled.check(package)
 
 
-def test_neither_a_terminal_that_is_gone_nor_a_stop_minds_kernels(package, monkeypatch):
+def test_who_calls_no_kernel_minds_none(package, monkeypatch):
     """`jaxcal-rig stop` loads this package before it stops a drive."""
     later = time.time() + 10
     os.utime(package / "some_kernel.py", (later, later))
@@ -63,8 +63,11 @@ def test_neither_a_terminal_that_is_gone_nor_a_stop_minds_kernels(package, monke
     assert gone.write.called
     monkeypatch.undo()
     next(package.glob("*.so")).unlink()
-    monkeypatch.setattr(sys, "argv", ["jaxcal-rig", "stop"])
+    monkeypatch.setenv(compiled.UNCHECKED, "1")
     compiled.check(package)
+    assert (
+        f'os.environ["{compiled.UNCHECKED}"]' in (ROOT / "rig/__main__.py").read_text()
+    )
 
 
 # Calls that take minutes, each in another compiled loop.

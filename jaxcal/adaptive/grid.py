@@ -350,7 +350,8 @@ def _weights(prior: ArrayLike | None, table: Array) -> tuple[Array, NDArray[np.b
             f"prior must hold {size} weights, none below 0 and one above, "
             f"got shape {weights.shape}, least {weights.min():g}"
         )
-    return weights, (table.astype(np.float32) > 0.0)[..., weights > 0.0].any(axis=-1)
+    possible = table.astype(np.float32)[..., weights > 0.0] > 0.0
+    return weights, np.asarray(possible.any(axis=-1))
 
 
 def _times(travel: ArrayLike, count: int) -> Array:

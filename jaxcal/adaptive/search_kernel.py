@@ -322,7 +322,7 @@ class Tree:
             return gains[first] + rest
         kept: cython.double = 0.0
         guess: cython.double = 0.0
-        own: cython.double = 0.0
+        kept_guess: cython.double = 0.0
         for number in range(self.width[level]):
             first = _argmax(scores, self.designs)
             if scores[first] == 0.0:
@@ -335,8 +335,8 @@ class Tree:
             mine: cython.double = self.guess[level + 1]
             if number == 0:
                 value = kept = total
-                guess = own = mine
-            elif total > value and total > kept + self.doubt * fmax(own, mine):
+                guess = kept_guess = mine
+            elif total > value and total > kept + self.doubt * fmax(kept_guess, mine):
                 value = total
                 guess = mine
                 best[0] = first
@@ -399,10 +399,10 @@ class Tree:
         e: cython.int = max(now.uses, 1)
         n: cython.double = fmax(self.horizon - now.made, 1.0)
         n = fmin(n, fmax(now.uses / fmax(always, 1e-6), 1.0))
-        each: cython.double = seconds[_argmax(scores, designs)]
+        seconds_each: cython.double = seconds[_argmax(scores, designs)]
         limited: cython.bint = now.seconds < 1e30
-        t: cython.double = fmax(now.seconds, 1e-9) if limited else n * each
-        number = fmin(n, fmax(t / each, 0.1))
+        t: cython.double = fmax(now.seconds, 1e-9) if limited else n * seconds_each
+        number = fmin(n, fmax(t / seconds_each, 0.1))
         use: cython.float = self.use_of[min(e, _USES) - 1] * expf(self.a * _log(number))
         last: cython.float = e
         time: cython.float = (self.time if limited else self.haste) / t

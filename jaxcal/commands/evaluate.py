@@ -451,7 +451,7 @@ def _run_task(options: TaskOptions) -> None:
 
     options.require_writable()
     progress = Progress(quiet=options.quiet)
-    _show(options, _sessions(options, progress), "session_figures", progress)
+    _show(options, _sessions(options, progress), "decider_figures", progress)
 
 
 def _sessions(

@@ -32,17 +32,17 @@ from jaxcal.plots.style import (
 from jaxcal.plots.style import panels as _panels
 
 if TYPE_CHECKING:
-    from jaxcal.evaluation.sequential import SessionEvaluation  # loads JAX
+    from jaxcal.evaluation.sequential import DeciderEvaluation  # loads JAX
 
 __all__ = [
     "best_so_far",
+    "decider_figures",
     "det_distributions",
     "det_means",
     "det_per_episode",
     "evaluation_figures",
     "first_selection",
     "gap_to_optimum",
-    "session_figures",
     "variances",
 ]
 
@@ -140,7 +140,7 @@ def det_means(evaluation: Evaluation) -> Figure:
     return figure
 
 
-def session_figures(evaluation: SessionEvaluation) -> dict[str, Figure]:
+def decider_figures(evaluation: DeciderEvaluation) -> dict[str, Figure]:
     """Mean nats by method, and less those of the rival in pairs, 95 % intervals."""
     results, rival = evaluation.results, evaluation.rival
     names = [result.method for result in results]

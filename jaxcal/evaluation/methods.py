@@ -308,11 +308,11 @@ class _Run:
 
         def choose(cut: slice) -> Indices:
             part = self.part(cut)
-            if self.criterion != "D" or method == "auto":
-                return np.array([one.indices for one in self.selected(method, cut)])
-            if method == "greedy":
+            if self.criterion == "D" and method == "greedy":
                 return selection.greedy_batch(**part).indices
-            return selection.exchange_batch(**part, seed=self.seed).indices
+            if self.criterion == "D" and method == "exchange":
+                return selection.exchange_batch(**part, seed=self.seed).indices
+            return np.array([one.indices for one in self.selected(method, cut)])
 
         choose(slice(0, 1))  # not timed: it may compile
         choices, seconds = self.timed(method, choose)

@@ -13,8 +13,8 @@ from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.results import (
     Column,
     Evaluation,
+    MethodNumbers,
     MethodResult,
-    Row,
     Summary,
     finite,
     moments,
@@ -132,7 +132,9 @@ class PostureEvaluation(Evaluation):
         return np.median(result.parameters.var(axis=0), axis=0)
 
 
-def summary_of(facts: dict[str, Any], rows: tuple[Row, ...], proven: int) -> Summary:
+def summary_of(
+    facts: dict[str, Any], rows: tuple[MethodNumbers, ...], proven: int
+) -> Summary:
     """The summary of one dataset.
 
     Args:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 __all__ = [
     "Column",
     "Evaluation",
+    "MethodNumbers",
     "MethodResult",
-    "Row",
     "Summary",
     "finite",
     "moments",
@@ -37,13 +37,13 @@ class _Named:
 
 
 @dataclasses.dataclass(frozen=True)
-class Row(_Named):
+class MethodNumbers(_Named):
     """One method in the numbers that the table, the JSON and the page show."""
 
     numbers: dict[str, Any]  # as documented in docs/evaluation.md; "label": in words
 
 
-Column = tuple[str, Callable[[Row], str]]
+Column = tuple[str, Callable[[MethodNumbers], str]]
 """Title of a column of the table, and its cell in a row"""
 
 
@@ -54,7 +54,7 @@ class Summary:
     name: str  # of the dataset: begins the names of its figures' files, unless empty
     heading: str
     columns: tuple[Column, ...]  # the first names the method
-    rows: tuple[Row, ...]
+    rows: tuple[MethodNumbers, ...]
     facts: Mapping[str, Any]  # what the JSON holds beside the methods
     notes: tuple[str, ...] = ()  # what a reader must know beside the numbers
 
@@ -73,7 +73,7 @@ class Evaluation(abc.ABC):
     """Methods on the same cases, case by case.
 
     How a case is made and scored, and so the numbers, is the subclass's:
-    ``PostureEvaluation`` of candidate sets, ``SessionEvaluation`` of sessions.
+    ``PostureEvaluation`` of candidate sets, ``DeciderEvaluation`` of sessions.
     """
 
     title: ClassVar[str]  # of the page
@@ -87,9 +87,11 @@ class Evaluation(abc.ABC):
         """(E, R) values less the reference of their case."""
         return result.values - self.reference[:, None]
 
-    def rows(self) -> tuple[Row, ...]:
+    def rows(self) -> tuple[MethodNumbers, ...]:
         """The numbers of every method."""
-        return tuple(Row(r.method, r.checkpoint, self.summary(r)) for r in self.results)
+        return tuple(
+            MethodNumbers(r.method, r.checkpoint, self.summary(r)) for r in self.results
+        )
 
     @abc.abstractmethod
     def summary(self, result: Any) -> dict[str, Any]:

@@ -33,8 +33,8 @@ from jaxcal.evaluation.results import Evaluation, MethodResult, Summary, finite
 
 __all__ = [
     "METHODS",
-    "SessionEvaluation",
-    "SessionResult",
+    "DeciderEvaluation",
+    "DeciderResult",
     "evaluate",
     "seconds_a_choice",
 ]
@@ -60,7 +60,7 @@ Progress = Callable[[str, int, int], None]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class SessionResult(MethodResult):
+class DeciderResult(MethodResult):
     """What one method learned in every session; ``values`` (B, 1) in nats."""
 
     entropy_drop: Array  # (B,) nats
@@ -69,7 +69,7 @@ class SessionResult(MethodResult):
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class SessionEvaluation(Evaluation):
+class DeciderEvaluation(Evaluation):
     """Deciders on the same sessions; ``reference`` (B,) are the nats of ``rival``."""
 
     title: ClassVar[str] = "Deciders of sequential measurement on equal sessions"
@@ -82,12 +82,12 @@ class SessionEvaluation(Evaluation):
 
     task: str
     options: Mapping[str, Any]
-    results: tuple[SessionResult, ...]
+    results: tuple[DeciderResult, ...]
     rival: str  # the method that the others are compared with in pairs
     rules: Mapping[str, CostRule]
     outside: tuple[str, ...]  # sizes beyond those that ``ahead`` was measured on
 
-    def __getitem__(self, method: str) -> SessionResult:
+    def __getitem__(self, method: str) -> DeciderResult:
         """The result of a method."""
         return next(result for result in self.results if result.method == method)
 
@@ -123,7 +123,7 @@ class SessionEvaluation(Evaluation):
             },
         )
 
-    def summary(self, result: SessionResult) -> dict[str, Any]:
+    def summary(self, result: DeciderResult) -> dict[str, Any]:
         """The numbers of one method, as documented in docs/adaptive.md."""
         numbers = {
             "label": result.label,
@@ -167,7 +167,7 @@ def evaluate(
     seed: int = 0,
     retune: bool = False,
     progress: Progress = lambda what, done, of: None,
-) -> SessionEvaluation:
+) -> DeciderEvaluation:
     """Play every method on the same sessions.
 
     Args:
@@ -209,7 +209,7 @@ def evaluate(
             batch=_BATCH,
             progress=lambda done, method=method: progress(method, done, episodes),  # type: ignore[misc]  # default binds the loop's value
         )
-        result = SessionResult(
+        result = DeciderResult(
             method=method,
             checkpoint=trained.meta if trained and method == "policy" else None,
             label=METHODS[method],
@@ -221,7 +221,7 @@ def evaluate(
         )
         results.append(result)
     rival = next((name for name in _RIVALS if name in methods), methods[0])
-    return SessionEvaluation(
+    return DeciderEvaluation(
         task=name,
         options=options,
         seed=seed,

@@ -20,7 +20,7 @@ import numpy as np
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.methods import POLICIES, evaluate
 from jaxcal.evaluation.postures import summary_of
-from jaxcal.evaluation.results import Row, Summary, finite
+from jaxcal.evaluation.results import MethodNumbers, Summary, finite
 from jaxcal.extras import versions
 from jaxcal.files import write_text
 
@@ -82,7 +82,7 @@ def evaluate_stream(
     rows = []
     for i, (method, checkpoint, _) in enumerate(parts[0]["rows"]):
         numbers = total(counts, [part["rows"][i][2] for part in parts])
-        rows.append(Row(method, checkpoint, numbers))
+        rows.append(MethodNumbers(method, checkpoint, numbers))
     middle = {row.method: row.numbers["det_s"]["mean"] for row in rows}["random"]
     for row in rows:
         mean = row.numbers["det_s"]["mean"]

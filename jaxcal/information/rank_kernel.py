@@ -80,7 +80,7 @@ def _centred(
 
     False where that is not simple.
     """
-    count, q, known = blocks.shape[1], blocks.shape[2], root.shape[0]
+    count, q, prior_rows = blocks.shape[1], blocks.shape[2], root.shape[0]
     simple: cython.bint = True
     constant: cython.bint = False
     moving: cython.bint = False
@@ -95,7 +95,7 @@ def _centred(
                 most = max(most, fabs(x))
                 differs = differs or x != blocks[n, 0, r, a]
                 some = some or x != 0.0
-        for i in range(known):
+        for i in range(prior_rows):
             columns[a, count * q + i] = root[i, a]
             most = max(most, fabs(root[i, a]))
         simple = simple and ordinary < most and most < 1.0 / ordinary
@@ -115,7 +115,7 @@ def _centred(
             mean /= count
             for i in range(count):
                 columns[a, i] -= mean
-    return q == 1 and known == 0
+    return q == 1 and prior_rows == 0
 
 
 @cython.cfunc

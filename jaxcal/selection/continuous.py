@@ -41,11 +41,11 @@ from jaxcal.deadline import Deadline
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, as_model
 from jaxcal.models.uncertainty import Noise, Prior
-from jaxcal.selection.criteria import CRITERIA, Criterion, Joined
+from jaxcal.selection.criteria import CRITERIA, Criterion, ScenarioCriterion
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.problem import (
     CandidateSet,
-    HasCandidates,
+    DesignProtocol,
     Problem,
     ScenarioProblem,
     blocks_of,
@@ -177,7 +177,7 @@ def optimise(
 
 
 def refine(
-    design: HasCandidates,
+    design: DesignProtocol,
     selection: Selection | ArrayLike,
     limits: ArrayLike | None = None,
     *,
@@ -245,7 +245,7 @@ def _range(commands: Array, allowed: Allowed | None) -> Array:
 
 def _same_criterion(selection: Selection) -> Any:
     """The criterion of a selection, asked for again."""
-    if isinstance(selection.problem.criterion, Joined):
+    if isinstance(selection.problem.criterion, ScenarioCriterion):
         return selection.problem.criterion
     name = selection.criterion
     if name in ("Ds", "As"):

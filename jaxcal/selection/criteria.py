@@ -42,9 +42,9 @@ __all__ = [
     "Criterion",
     "Ds",
     "I",
-    "Joined",
-    "Lost",
+    "LossCriterion",
     "Mean",
+    "ScenarioCriterion",
     "Worst",
     "criterion_of",
     "positions",
@@ -249,7 +249,7 @@ class I(Criterion):  # noqa: E742 - the criterion's own name in the literature
         return np.asarray(size[keep, None] * right[keep] / np.sqrt(count))
 
 
-class _OfSome(Criterion):
+class _SubsetCriterion(Criterion):
     """A criterion of the parameters of interest; the others are nuisance.
 
     Args:
@@ -265,7 +265,7 @@ class _OfSome(Criterion):
         return at.basis[positions(self.parameters, at.names)]
 
 
-class Ds(_OfSome):
+class Ds(_SubsetCriterion):
     """Joint uncertainty of the parameters of interest; the others are nuisance.
 
     Args:
@@ -275,7 +275,7 @@ class Ds(_OfSome):
     name, kind, says = "Ds", "det", "log det V^-1"
 
 
-class As(_OfSome):
+class As(_SubsetCriterion):
     """Sum of the variances of the parameters of interest; the others are nuisance.
 
     Args:
@@ -285,7 +285,7 @@ class As(_OfSome):
     name, kind, says = "As", "trace", "trace V"
 
 
-class Joined:
+class ScenarioCriterion:
     """A criterion over scenarios: ``Mean`` or ``Worst``.
 
     As it is asked for it carries the criterion of each scenario. ``within`` gives that
@@ -302,7 +302,7 @@ class Joined:
     each: Criterion  # of the first scenario
 
     def __init__(self, criterion: Any = None) -> None:
-        if isinstance(criterion, Joined):
+        if isinstance(criterion, ScenarioCriterion):
             raise ValueError(
                 f"{type(self).__name__} must be given a criterion of one scenario, got "
                 f"{type(criterion).__name__}"
@@ -398,7 +398,7 @@ class Joined:
         return -1.0 / np.asarray(joined) if self.kind == "trace" else joined
 
 
-class Mean(Joined):
+class Mean(ScenarioCriterion):
     """The weighted mean over the scenarios of a criterion.
 
     Args:
@@ -408,7 +408,7 @@ class Mean(Joined):
     word, least = "mean", False
 
 
-class Lost(Joined):
+class LossCriterion(ScenarioCriterion):
     """The criterion of what is left where the worst few of the chosen fail."""
 
     least = True
@@ -422,7 +422,7 @@ class Lost(Joined):
         return f"{self.each.name} with {self.word}"
 
 
-class Worst(Joined):
+class Worst(ScenarioCriterion):
     """The criterion in the scenario where it is worst.
 
     Args:

@@ -17,7 +17,7 @@ from jaxcal.deadline import Deadline
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.problem import Problem, ScenarioProblem
 
-__all__ = ["InScenarios", "in_scenarios", "with_optima"]
+__all__ = ["ScenarioTable", "in_scenarios", "with_optima"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -28,7 +28,7 @@ _ENOUGH = 0.999  # an efficiency that ends the search for an optimum
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class InScenarios:
+class ScenarioTable:
     """A selection in each of S scenarios; printing it shows a table."""
 
     weights: Array  # (S,) of sum 1
@@ -109,7 +109,7 @@ def with_optima(problem: Problem) -> Problem:
     return dataclasses.replace(problem, optima=_optima(problem)[0])
 
 
-def in_scenarios(problem: ScenarioProblem, indices: Indices) -> InScenarios:
+def in_scenarios(problem: ScenarioProblem, indices: Indices) -> ScenarioTable:
     """A selection (k,) in each scenario."""
     optima, proven = _optima(problem)
     values = problem.scenario_values(indices[None])[0][:, 0]
@@ -119,7 +119,7 @@ def in_scenarios(problem: ScenarioProblem, indices: Indices) -> InScenarios:
     if problem.nominal is not None:
         nominal = _optimum(problem.nominal, _LIMIT / 4.0)[0]
         nominal_efficiencies = _efficiencies(problem, nominal, optima)
-    return InScenarios(
+    return ScenarioTable(
         weights=problem.weights,
         values=values,
         optima=optima,

@@ -15,7 +15,7 @@ from jaxcal.information.criteria import Criteria, criteria
 from jaxcal.selection.problem import Problem, ScenarioProblem
 
 if TYPE_CHECKING:
-    from jaxcal.selection.in_scenarios import InScenarios
+    from jaxcal.selection.in_scenarios import ScenarioTable
 
 __all__ = ["BatchSelection", "Selection", "Subset"]
 
@@ -97,7 +97,7 @@ class Selection:
         return self.problem.criterion.efficiency(self.value, self.bound)
 
     @cached_property
-    def in_scenarios(self) -> InScenarios | None:
+    def in_scenarios(self) -> ScenarioTable | None:
         """Its efficiency in each scenario; None where there is one only."""
         if not isinstance(self.problem, ScenarioProblem) or not self.problem.told:
             return None

@@ -198,7 +198,7 @@ def timeouts_left(records: list[Record]) -> dict[str, Record]:
 
 
 @dataclasses.dataclass
-class Seen:
+class Observation:
     """What the phone has shown of the axes at the last posture, since the zero."""
 
     commanded: Array  # (n,) degrees of the axes
@@ -249,7 +249,9 @@ class Device:
         self.zero: Posture | None = None  # once it is taken,
         self.frame: Frame | None = None  # and what the phone reads against it
         self.heard = 0  # connection of the phone by which the frame holds
-        self.seen = Seen(np.zeros(len(config.axes)), np.zeros(len(config.output_names)))
+        self.seen = Observation(
+            np.zeros(len(config.axes)), np.zeros(len(config.output_names))
+        )
         self.line_watch = LineWatch(self.drives, run)
         self.heartbeat = Heartbeat(self.stopper, self.requests, config)
         self.line.check = self._before_exchange

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from rig.config.axis import Pulses
-from rig.core.device import Device, Posture, Seen
-from rig.core.motion import Standing
+from rig.core.device import Device, Observation, Posture
+from rig.core.motion import Arrival
 from rig.drives.drive import Status
 from rig.faults import MotionFault, NotFollowing
 from rig.readings.attitude import Array, Reading
@@ -28,10 +28,10 @@ def zeroed(device: Device, frame: Frame, zero: Posture) -> None:
     """Measure against this zero posture from now on."""
     device.frame, device.zero, device.heard = frame, zero, device.imu.connections
     at_deg = device.config.to_deg(zero.pulses)
-    device.seen = Seen(at_deg, np.zeros(len(device.config.output_names)))
+    device.seen = Observation(at_deg, np.zeros(len(device.config.output_names)))
 
 
-def measure(standing: Standing, samples: int | None = None) -> dict[str, Any]:
+def measure(standing: Arrival, samples: int | None = None) -> dict[str, Any]:
     """Wait until the device has settled where it stands, then average fresh readings.
 
     Args:

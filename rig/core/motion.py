@@ -20,14 +20,14 @@ SPAN_S = 0.5  # over which a speed is taken, or from the start of the move
 LAG_S = 0.1  # of the phone behind a move that is longer than those before
 
 
-class Standing(NamedTuple):
+class Arrival(NamedTuple):
     """A device that stands where it was told to go."""
 
     device: Device
     posture: Posture
 
 
-def move(device: Device, posture: Posture) -> Standing:
+def move(device: Device, posture: Posture) -> Arrival:
     """Move all axes to a posture, in pieces, from the chosen side.
 
     Raises:
@@ -44,7 +44,7 @@ def move(device: Device, posture: Posture) -> Standing:
     for point in approach(device.config, posture.pulses):
         while not _piece(device, point, posture.name):
             pass
-    return Standing(device, posture)
+    return Arrival(device, posture)
 
 
 def _piece(device: Device, goal: Pulses, label: str) -> bool:

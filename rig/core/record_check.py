@@ -130,7 +130,7 @@ def leave(drives: Sequence[Drive], record: DeviceRecord) -> None:
 # The zero posture
 
 
-class KeptZero(NamedTuple):
+class ZeroRecord(NamedTuple):
     """The zero posture as a calibration keeps it."""
 
     whose: str  # of messages

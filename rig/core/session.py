@@ -24,7 +24,7 @@ from rig.core import record_check
 from rig.core.device import Device, Posture, check_plan
 from rig.core.joints import show
 from rig.core.measure import measure, zeroed
-from rig.core.motion import Standing, move
+from rig.core.motion import Arrival, move
 from rig.drives import Drive
 from rig.faults import (
     EndedShort,
@@ -158,7 +158,9 @@ def _close(device: Device) -> None:
 
 
 def take_zero(
-    device: Device, at: Pulses | None = None, kept: record_check.KeptZero | None = None
+    device: Device,
+    at: Pulses | None = None,
+    kept: record_check.ZeroRecord | None = None,
 ) -> None:
     """Measure the zero posture, that all others are measured against.
 
@@ -186,7 +188,7 @@ def take_zero(
         show(device)
     device.emit("phase", phase="zeroing")
     zero = Posture("zero", at or device.positions())
-    standing = Standing(device, zero)
+    standing = Arrival(device, zero)
     if at is not None or config.motion.approach_overshoot_deg:
         standing = move(device, zero)  # from the side of all references
     check_plan(config, [zero.pulses])  # it is where a resumed run looks again
@@ -205,7 +207,10 @@ def take_zero(
 
 
 def _compare_zero(
-    device: Device, pulses: Pulses, attitude: Array, kept: record_check.KeptZero | None
+    device: Device,
+    pulses: Pulses,
+    attitude: Array,
+    kept: record_check.ZeroRecord | None,
 ) -> None:
     """With the calibration's zero posture, or else with the last one taken."""
     config, last = device.config, device.record.state(ZEROED)
@@ -214,7 +219,7 @@ def _compare_zero(
     elif last:
         then = np.array(last["attitude"])
         try:
-            record_check.KeptZero("the last session", last["pulses"], then).check(
+            record_check.ZeroRecord("the last session", last["pulses"], then).check(
                 config, pulses, attitude
             )
         except MotionFault as fault:  # a phone mounted anew is calibrated anew

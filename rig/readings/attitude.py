@@ -58,7 +58,7 @@ def mean_rotation(matrices: ArrayLike) -> Array:
 
 
 @dataclasses.dataclass(frozen=True)
-class Frame:
+class AttitudeFrame:
     """From a phone's attitude to the joint angles of the mechanism.
 
     With W the phone's world, B the base, E the end-effector and P the phone, the stream
@@ -89,7 +89,7 @@ def raw_fields(readings: Sequence[Reading]) -> dict[str, Any]:
     }
 
 
-def frame_at(config: RigConfig, zero: Array) -> Frame:
+def frame_at(config: RigConfig, zero: Array) -> AttitudeFrame:
     """The frame in which the (3, 3) attitude ``zero`` of the phone is the zero."""
     mounting = euler_to_matrix(config.phone.mounting_deg, "ZYX")
-    return Frame(zero, mounting, config.mechanism.order, config.letters)
+    return AttitudeFrame(zero, mounting, config.mechanism.order, config.letters)

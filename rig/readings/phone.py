@@ -12,7 +12,7 @@ from rig.config.settings import ImuSettings
 from rig.readings.attitude import Array, Reading
 from rig.readings.receiver import Receiver
 from rig.readings.source import ReadingError, Source
-from rig.readings.stream import Parser
+from rig.readings.stream import StreamParser
 
 
 class Imu(Source):
@@ -31,7 +31,7 @@ class Imu(Source):
         self.settings: ImuSettings = settings
         self.connections = 0
         self.world = np.eye(3)
-        self._parser = Parser(settings)
+        self._parser = StreamParser(settings)
         self._counts = self._parser.counts
         self._receiver: Receiver | None = None
 

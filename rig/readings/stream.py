@@ -61,7 +61,7 @@ def _number(text: str) -> float:
     return float(text)
 
 
-class Parser:
+class StreamParser:
     """Records of one phone to readings on the computer's clock."""
 
     def __init__(self, settings: ImuSettings) -> None:

@@ -12,7 +12,7 @@ from rig.simulator.faults import FaultInjector
 from rig.simulator.sender import Sender
 
 
-class Sensor(Sender):
+class SimSensor(Sender):
     """Sends lines of ``numbers()``."""
 
     listens = "tcp"

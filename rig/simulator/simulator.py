@@ -10,7 +10,7 @@ from rig.simulator.drive import SimDrive
 from rig.simulator.faults import FaultInjector, FaultSpec
 from rig.simulator.phone import Phone
 from rig.simulator.plant import Plant
-from rig.simulator.sensor import Sensor
+from rig.simulator.sensor import SimSensor
 from rig.simulator.server import ModbusServer
 from rig.simulator.truth import Truth
 
@@ -44,12 +44,12 @@ class Simulator:
         units = dict(zip((a.unit for a in config.axes), self.drives, strict=True))
         seed = self.truth.seed
         self.server = ModbusServer(units, self.faults, seed, self.truth.latency_s)
-        self.phone: Phone | Sensor
+        self.phone: Phone | SimSensor
         if config.imu:
             self.phone = Phone(config.imu, self._attitude, self.faults, rate_hz, seed)
         else:
             assert config.readings is not None
-            self.phone = Sensor(config.readings, self._numbers, self.faults, rate_hz)
+            self.phone = SimSensor(config.readings, self._numbers, self.faults, rate_hz)
 
     def start(self, port: int = 0) -> RigConfig:
         """Serve the drives; the phone starts with ``start_phone``."""

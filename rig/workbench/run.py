@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.core.device import Device
-from rig.core.record_check import KeptZero, check_drives
+from rig.core.record_check import ZeroRecord, check_drives
 from rig.core.session import Beside, Check, open_device, take_zero
 from rig.faults import EXIT_FAULT, PlanOnly, Refused, ending
 from rig.journal import DeviceRecord, JournalError, Record, RunFolder
@@ -35,7 +35,7 @@ class Run(RunFolder):
         start: Record | None = None,
         reset_alarms: bool = False,
         zero_at: Pulses | None = None,
-        kept_zero: KeptZero | None = None,
+        kept_zero: ZeroRecord | None = None,
         dry_run: bool = False,
         signals: Signals | None = None,
     ) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from rig.config import RigConfig, load_config, parse_config
-from rig.core.record_check import KeptZero
+from rig.core.record_check import ZeroRecord
 from rig.faults import Refused
 from rig.journal import (
     JOURNAL,
@@ -118,7 +118,7 @@ def run_session(
 
 def _procedure(
     start: dict[str, Any], config: RigConfig
-) -> tuple[Callable[[Run], int], KeptZero | None, list[str]]:
+) -> tuple[Callable[[Run], int], ZeroRecord | None, list[str]]:
     """What a session does, the zero posture that it must find, and why the calibration
     that it moves by is not to be used."""
     mode, inputs = start["mode"], start["inputs"]

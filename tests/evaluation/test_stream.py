@@ -17,7 +17,7 @@ from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.methods import evaluate
 from jaxcal.evaluation.postures import summary_of
 from jaxcal.evaluation.report import json_document, text_table
-from jaxcal.evaluation.results import Row, Summary
+from jaxcal.evaluation.results import MethodNumbers, Summary
 from jaxcal.evaluation.stream import evaluate_stream
 from jaxcal.information.regression import log_det_information
 from jaxcal.paper.datasets.datasets import drawn, make_dataset
@@ -126,9 +126,11 @@ class Quickly:
         )
         best = np.maximum(first, next_four)[:, 0]
         rows = (
-            Row("random", None, numbers_of(np.hstack([first, next_four]), best)),
-            Row("greedy", None, numbers_of(first, best)),
-            Row("exact", None, numbers_of(best[:, None], best)),
+            MethodNumbers(
+                "random", None, numbers_of(np.hstack([first, next_four]), best)
+            ),
+            MethodNumbers("greedy", None, numbers_of(first, best)),
+            MethodNumbers("exact", None, numbers_of(best[:, None], best)),
         )
         proven = int((candidates[:, 8, 0] < 0.9).sum())
         facts = {"dataset": self.dataset.facts(), "k": 4, "seed": 0, "criterion": "D"}

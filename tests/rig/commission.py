@@ -12,7 +12,7 @@ from rig.config import AXIS_NAMES
 from rig.simulator import Truth
 from rig.workbench.commission.scan import parse_bus
 from rig.workbench.commission.setup import setting
-from rig.workbench.toml import set_values
+from rig.workbench.rig_toml import set_values
 
 QUICK = (  # of the new rig.toml: short windows, quick axes
     "settle.window_s=0.04", "settle.min_samples=5", "settle.samples=5",
@@ -53,7 +53,7 @@ def set_up(bus: str, port: int, *more: str, values=QUICK) -> int:
 
 
 def quick_text(bus, port):
-    from rig.workbench.toml import new_text
+    from rig.workbench.rig_toml import new_text
 
     axes = [
         {"name": name, "kind": letter, "unit": unit, "family": "leadshine_pr",

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from rig.readings.attitude import (
     ORDERS,
-    Frame,
+    AttitudeFrame,
     angle_between_deg,
     euler_to_matrix,
     matrix_to_euler,
@@ -81,7 +81,7 @@ def test_frame_recovers_joint_angles_whatever_heading_and_mounting(rng):
         world = euler_to_matrix(rng.uniform(-180, 180, 3), "XYZ")
         pitch, yaw, roll = rng.uniform(-40, 40, 3)
         joints = euler_to_matrix([yaw, pitch, roll], "ZXY")
-        frame = Frame(world @ mounting, mounting, "ZXY", ("X", "Z", "Y"))
+        frame = AttitudeFrame(world @ mounting, mounting, "ZXY", ("X", "Z", "Y"))
         read = frame.angles(world @ joints @ mounting)
         np.testing.assert_allclose(read, [pitch, yaw, roll], atol=1e-9)
 

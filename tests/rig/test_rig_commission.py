@@ -19,7 +19,7 @@ from rig.simulator import Truth
 from rig.simulator.drive import SimDrive
 from rig.workbench.commission import home, steps
 from rig.workbench.commission.operator import Operator
-from rig.workbench.toml import edit
+from rig.workbench.rig_toml import edit
 
 
 @pytest.mark.slow

@@ -11,13 +11,19 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from rig.config import AXIS_NAMES
-from rig.readings.attitude import ORDERS, Frame, Reading, euler_to_matrix, raw_fields
+from rig.readings.attitude import (
+    ORDERS,
+    AttitudeFrame,
+    Reading,
+    euler_to_matrix,
+    raw_fields,
+)
 from rig.readings.geometry import Attitudes
 from rig.simulator import Truth
 from rig.workbench.identification.drift import estimate_drift, without_drift
-from rig.workbench.identification.fit import uncertainty
+from rig.workbench.identification.fit_affine import uncertainty
 from rig.workbench.identification.refit import attitudes
-from rig.workbench.outputs.words import drift_text, recalibrate
+from rig.workbench.outputs.messages import drift_text, recalibrate
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 LETTERS = ("X", "Z", "Y")
@@ -125,7 +131,9 @@ def visit(minute, joints, frame, turn=(0.0, 0.0, 0.0), std=0.001):
 
 def a_frame(order="ZXY", heading=170.0):
     zero = euler_to_matrix([heading, 4.0, -7.0], "ZYX")
-    return Frame(zero, euler_to_matrix([10.0, 20.0, 30.0], "ZYX"), order, LETTERS)
+    return AttitudeFrame(
+        zero, euler_to_matrix([10.0, 20.0, 30.0], "ZYX"), order, LETTERS
+    )
 
 
 @given(

@@ -19,7 +19,7 @@ from rig.workbench import live
 from rig.workbench.live import charts
 from rig.workbench.live.watcher import Tail, Watcher
 from rig.workbench.outputs import view
-from rig.workbench.outputs.state import RunState
+from rig.workbench.outputs.run_state import RunState
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from rig.core import measure as measuring
 from rig.core import motion as moving
 from rig.core.device import Device, Posture, approach, check_plan
 from rig.core.measure import _unquiet, measure
-from rig.core.motion import Standing, move
+from rig.core.motion import Arrival, move
 from rig.core.proof import FIRST_DEG, GROWTH
 from rig.drives.drive import HOME
 from rig.faults import (
@@ -77,7 +77,7 @@ class Motion:
         return move(self.device, Posture(name, target))
 
     def measure(self, target):
-        return measure(Standing(self.device, Posture("", target)))
+        return measure(Arrival(self.device, Posture("", target)))
 
 
 def test_nothing_moves_before_arming():
@@ -129,7 +129,7 @@ def test_a_drive_that_another_controller_moves_ends_what_is_measured(monkeypatch
 
         monkeypatch.setattr(measuring, "_settled", then_moved)
         with pytest.raises(MotionFault, match="moves while the posture is measured"):
-            measure(Standing(motion.device, Posture("", (0, 0, 0))), 200)
+            measure(Arrival(motion.device, Posture("", (0, 0, 0))), 200)
 
 
 def test_a_position_outside_the_limits_keeps_it_from_arming():

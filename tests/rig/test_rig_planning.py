@@ -13,7 +13,7 @@ from harness import (
 
 import jaxcal
 from rig.config import example_text, parse_config
-from rig.workbench.identification.fit import held_out_errors
+from rig.workbench.identification.fit_affine import held_out_errors
 from rig.workbench.procedures.goto import _command
 from rig.workbench.procedures.plan import (
     choose,

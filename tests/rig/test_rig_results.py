@@ -38,8 +38,8 @@ from rig.workbench.identification.refit import attitudes, reread
 from rig.workbench.outputs import trend
 from rig.workbench.outputs.export import LANGUAGES, follow, load_inverse
 from rig.workbench.outputs.export import checksum as checksum_of
+from rig.workbench.outputs.messages import numbers
 from rig.workbench.outputs.report import write_report
-from rig.workbench.outputs.words import numbers
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 SESSION = '\n[session]\nmethod = "exact"\nverify_postures = 2\n'

@@ -11,7 +11,7 @@ from rig.config import ConfigError, parse_config
 from rig.config.config import EXAMPLES
 from rig.simulator.drive import DriveException
 from rig.workbench.commission.scan import parse_bus
-from rig.workbench.toml import edit, set_values
+from rig.workbench.rig_toml import edit, set_values
 
 
 @pytest.mark.slow

@@ -31,7 +31,7 @@ from rig.journal import lock
 from rig.journal.lock import BusLock, read_armed
 from rig.signals import Signals
 from rig.simulator import parse_fault
-from rig.workbench.outputs.words import event_lines
+from rig.workbench.outputs.messages import event_lines
 from rig.workbench.procedures.collect import collect
 from rig.workbench.run import run_safely
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from rig.readings import receiver
 from rig.readings.attitude import angle_between_deg, euler_to_matrix, matrix_to_euler
 from rig.readings.phone import Imu, ReadingError
-from rig.readings.stream import MAX_LINE, LineSplitter, Parser
+from rig.readings.stream import MAX_LINE, LineSplitter, StreamParser
 
 HYPER = changed(fast_config().imu, max_jump_deg=180.0, host="127.0.0.1")
 PLAIN = changed(
@@ -25,7 +25,7 @@ PLAIN = changed(
 
 
 def feed(settings, *lines, parser=None):
-    parser = parser or Parser(settings)
+    parser = parser or StreamParser(settings)
     return parser.lines([line.encode() for line in lines], 100.0), parser
 
 
@@ -47,7 +47,7 @@ def test_hyperimu_line_as_published_is_androids_orientation():
 def test_lines_arrive_in_any_pieces():
     stream = b"".join(b"%d,10.5,1.5,2.5\r\n" % stamp for stamp in range(1, 40))
     for size in (1, 2, 3, 7, 64, len(stream)):
-        splitter, parser, count = LineSplitter(), Parser(HYPER), 0
+        splitter, parser, count = LineSplitter(), StreamParser(HYPER), 0
         for start in range(0, len(stream), size):
             lines = splitter.feed(stream[start : start + size])
             count += len(parser.lines(lines, 100.0))
@@ -133,7 +133,7 @@ def test_a_single_wild_reading_is_dropped_and_a_real_turn_is_accepted():
 
 
 def test_a_reading_that_waited_in_a_buffer_is_as_old_as_it_is():
-    parser = Parser(HYPER)
+    parser = StreamParser(HYPER)
     parser.lines([b"1000,10,2,3"], 50.0)
     late = parser.lines([b"1100,10,2,3"], 53.0)
     assert late[0].time == pytest.approx(50.1, abs=0.01)
@@ -162,7 +162,7 @@ def test_sensor_logger_message_as_published(nested):
     other = {"name": "accelerometer", "time": 1, "values": {"x": 1}}
     message = {"messageId": 1, "sessionId": "s", "deviceId": "d",
                "payload": [other, entry]}  # fmt: skip
-    readings = Parser(HYPER).body(json.dumps(message).encode(), 5.0)
+    readings = StreamParser(HYPER).body(json.dumps(message).encode(), 5.0)
     assert len(readings) == 1
     turned = matrix_to_euler(readings[0].value, "ZYX")
     np.testing.assert_allclose(
@@ -179,7 +179,7 @@ def test_sensor_logger_message_as_published(nested):
      b'"qy": NaN, "qz": 0, "qw": 1}}]}'],
 )  # fmt: skip
 def test_a_malformed_message_is_dropped(body):
-    assert Parser(HYPER).body(body, 1.0) == []
+    assert StreamParser(HYPER).body(body, 1.0) == []
 
 
 def connect(imu):

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from rig.__main__ import main
 from rig.config import example_text, parse_config
-from rig.core.record_check import KeptZero, check_zero, moved
+from rig.core.record_check import ZeroRecord, check_zero, moved
 from rig.faults import MotionFault, Refused
 from rig.journal import (
     HOMED,
@@ -265,7 +265,7 @@ def test_gravity_resolves_the_axes_it_can(rng):
 
 def test_the_pulses_of_the_zero_count_too():
     config = fast_config()
-    kept = KeptZero("it", (0, 0, 0), np.eye(3))
+    kept = ZeroRecord("it", (0, 0, 0), np.eye(3))
     assert "zero posture stands 0.000 deg" in kept.check(config, (3, 0, 0), np.eye(3))
     far = config.to_pulses((0.0, LOST, 0.0))
     with pytest.raises(MotionFault, match=r"yaw \+1\.40 deg"):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from jaxcal import compiled
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.information.blocks import gram, largest_rank
-from jaxcal.selection.criteria import Criterion, Joined
+from jaxcal.selection.criteria import Criterion, ScenarioCriterion
 
 __all__ = ["JointScenarios", "Scenario", "branch_and_bound"]
 
@@ -56,9 +56,9 @@ class JointScenarios(NamedTuple):
     """Several scenarios over the same candidates, and how their phi are joined."""
 
     members: Sequence[Scenario]
-    criterion: Joined
+    criterion: ScenarioCriterion
     weights: Array  # (S,) of sum 1
-    terms: tuple[Array, Array]  # (S,) scale and shift of phi, see ``Joined.terms``
+    terms: tuple[Array, Array]  # (S,) scale and shift of phi
 
 
 class _KernelSearch(NamedTuple):

@@ -61,7 +61,7 @@ from cython.cimports.jaxcal.information.linear_algebra import (
     multiply,
     take,
 )
-from cython.cimports.jaxcal.selection.kinds import DET, LEAST, SUBSET, TRACE
+from cython.cimports.jaxcal.selection.criterion_kinds import DET, LEAST, SUBSET, TRACE
 from cython.cimports.jaxcal.watch import begin, late
 from cython.cimports.libc.math import INFINITY, exp, fabs, floor, log, log1p, sqrt
 
@@ -369,12 +369,12 @@ class Search:
 
     def _kind_of(self, low):
         """Set P; RANK or RANK_TRACE where few readings are left to choose."""
-        left = self.k
+        to_choose = self.k
         self._sum(cython.NULL, low, self.prior, self.known)
         self.smoothing = _SMOOTHING
         for i in range(self.count):
-            left -= low[i]
-        self.places = cython.cast(cython.int, left) * self.rank
+            to_choose -= low[i]
+        self.places = cython.cast(cython.int, to_choose) * self.rank
         sharper: cython.bint = self.kind == DET or self.kind == TRACE
         if not sharper or self.places >= self.p or self.places == 0:
             return self.kind
@@ -527,8 +527,8 @@ class Search:
             self._turn(m, self.gradient, False)
             for f in range(m):
                 at = f * size
-                found = dot(self.picked + at, self.turned + at, size)
-                self.leverage[self.open[done + f]] = found
+                leverage = dot(self.picked + at, self.turned + at, size)
+                self.leverage[self.open[done + f]] = leverage
             done += m
 
     def _linear_gain(self, low, high, c):
@@ -539,9 +539,9 @@ class Search:
         """
         least: cython.double = INFINITY
         most: cython.double = -INFINITY
-        left = self.k
+        to_choose = self.k
         for i in range(self.count):
-            left -= c[i]
+            to_choose -= c[i]
         for o in range(self.opened):
             i = self.open[o]
             if c[i] < high[i]:
@@ -559,9 +559,9 @@ class Search:
             for o in range(self.opened):
                 i = self.open[o]
                 room += (high[i] if self.leverage[i] > cut else low[i]) - c[i]
-            if room > left:
+            if room > to_choose:
                 least = cut
-            elif room < left:
+            elif room < to_choose:
                 most = cut
             else:
                 break
@@ -572,7 +572,7 @@ class Search:
             slope = self.leverage[i] - cut
             gain += ((high[i] if slope > 0.0 else low[i]) - c[i]) * slope
         self.cut = cut
-        return gain + left * cut
+        return gain + to_choose * cut
 
     def _working_set(self, low, high, c):
         """Counts to move: the fractional ones and some of those that should move."""
@@ -1129,13 +1129,13 @@ class JointSearch(Search):
             cython.cast(Search, self.members[s])._sum(
                 low, c, cython.NULL, cython.cast(Search, self.members[s]).rest
             )
-            gram, known, rest = (
+            gram, fixed, rest = (
                 cython.cast(Search, self.members[s]).gram,
                 cython.cast(Search, self.members[s]).known,
                 cython.cast(Search, self.members[s]).rest,
             )
             for a in range(size):
-                gram[a] = known[a] + rest[a]
+                gram[a] = fixed[a] + rest[a]
         return self._evaluate(kind)
 
     def _worth(self, counts):
@@ -1243,10 +1243,10 @@ class JointSearch(Search):
             if not self.least_counts or not share > 0.0:
                 continue
             weight = self.smoothing * self.mixture[s]
-            own, ends = cython.cast(Search, self.members[s]).leverage, self.ends
+            leverage, ends = cython.cast(Search, self.members[s]).leverage, self.ends
             for i in range(m):
                 c = self.which[i]
-                ends[i] = self.scale[s] * own[c] - self.leverage[c]
+                ends[i] = self.scale[s] * leverage[c] - self.leverage[c]
             for i in range(m):
                 for j in range(m):
                     out[i * m + j] += weight * ends[i] * ends[j]

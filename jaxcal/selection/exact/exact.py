@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.deadline import NEVER, Deadline
-from jaxcal.selection.criteria import Joined
+from jaxcal.selection.criteria import ScenarioCriterion
 from jaxcal.selection.exact.branch_and_bound import (
     BranchResult,
     JointScenarios,
@@ -98,7 +98,7 @@ def solve_auto(
         return dataclasses.replace(solution, method="exact", **started)
     letter = problem.criterion.name
     name = f"{'an' if letter[0] in 'AEI' else 'a'} {letter}-efficiency"
-    if isinstance(problem.criterion, Joined):
+    if isinstance(problem.criterion, ScenarioCriterion):
         name = "an efficiency"
     proven_share = problem.criterion.efficiency(solution.value, solution.bound)
     method, reason = "exact", "the exact search proved this optimum"

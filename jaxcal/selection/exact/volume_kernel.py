@@ -115,9 +115,9 @@ def _open(points, index, size, volume, depth, c, reached, room, order):
         order: (2, h) likewise.
     """
     q = points.shape[2]
-    left = q - depth - 1  # dimensions after the choice
+    dimensions = q - depth - 1  # after the choice
     below, names = points[depth + 1], index[depth + 1]
-    length = _length(points[depth], c, left + 1)
+    length = _length(points[depth], c, dimensions + 1)
     volume[depth + 1] = volume[depth] * length
     # The reflection that takes the chosen onto the first axis, which is then dropped.
     first = points[depth, c, 0]
@@ -127,11 +127,11 @@ def _open(points, index, size, volume, depth, c, reached, room, order):
     for k in range(count):
         i = c + 1 + k
         along: cython.double = copysign(length, first) * points[depth, i, 0]
-        for a in range(left + 1):
+        for a in range(dimensions + 1):
             along += points[depth, c, a] * points[depth, i, a]
         along *= factor
         square: cython.double = 0.0
-        for a in range(left):
+        for a in range(dimensions):
             value = points[depth, i, a + 1] - along * points[depth, c, a + 1]
             room[k, a] = value
             square += value * value
@@ -140,7 +140,7 @@ def _open(points, index, size, volume, depth, c, reached, room, order):
     least = INFINITY
     if longest > 0.0:
         least = (1.0 + _TOLERANCE) * reached / volume[depth + 1]
-        for _ in range(left - 1):
+        for _ in range(dimensions - 1):
             least /= longest
     kept: cython.Py_ssize_t = 0
     for k in range(count):
@@ -148,12 +148,12 @@ def _open(points, index, size, volume, depth, c, reached, room, order):
             order[0, kept] = k
             kept += 1
     size[depth + 1] = kept
-    if left > 2:
+    if dimensions > 2:
         _longest_first(room, order, kept)
     for k in range(kept):
         i = order[0, k]
         names[k] = index[depth, c + 1 + i]
-        for a in range(left):
+        for a in range(dimensions):
             below[k, a] = room[i, a]
 
 
@@ -194,14 +194,14 @@ def _best_pairs(plane, index, size, volume, chosen, subsets, largest, watch):
             return 1
         x, y = plane[i, 0], plane[i, 1]
         for j in range(i + 1, count):
-            found = volume[last] * fabs(x * plane[j, 1] - y * plane[j, 0])
-            if found > largest[0]:
+            area = volume[last] * fabs(x * plane[j, 1] - y * plane[j, 0])
+            if area > largest[0]:
                 chosen[last], chosen[last + 1] = index[last, i], index[last, j]
-                _keep(chosen, found, subsets, largest)
+                _keep(chosen, area, subsets, largest)
     return 0
 
 
-def _keep(chosen, found, subsets, largest):
+def _keep(chosen, reached, subsets, largest):
     """Put the chosen in the place of the least incumbent, and the new least first.
 
     The incumbents are a heap: those at 2 k + 1 and 2 k + 2 are no smaller than k.
@@ -212,12 +212,12 @@ def _keep(chosen, found, subsets, largest):
         child: cython.Py_ssize_t = 2 * k + 1
         if child + 1 < best and largest[child + 1] < largest[child]:
             child += 1
-        if largest[child] >= found:
+        if largest[child] >= reached:
             break
         largest[k] = largest[child]
         subsets[k, :] = subsets[child, :]
         k = child
-    largest[k] = found
+    largest[k] = reached
     subsets[k, :] = chosen
 
 

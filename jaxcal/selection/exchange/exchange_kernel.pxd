@@ -31,11 +31,11 @@ cdef class Choice:
     cdef Py_ssize_t _addition(self) noexcept nogil
     cdef Py_ssize_t _replacement(self, Py_ssize_t out, double value, double rise) noexcept nogil
     cdef double _least_of_chosen(self) noexcept nogil
-    cdef Py_ssize_t _strongest(self, Py_ssize_t at, double* found) noexcept nogil
+    cdef Py_ssize_t _strongest(self, Py_ssize_t at, double* least) noexcept nogil
 
 @cython.final
 cdef class Climber(Choice):
-    cdef int kind  # of ``kinds.pxd``
+    cdef int kind  # of ``criterion_kinds.pxd``
     cdef int parts  # 1 where V is enough, 2 with X
     cdef int dets  # of which the determinant counts
     cdef bint rows  # one reading each, and DET
@@ -107,7 +107,7 @@ cdef class JointClimber(Choice):
     cdef double _join(self, const double* phi) noexcept nogil
     cdef void _totals(self, Py_ssize_t c, bint swaps) noexcept nogil
     cdef Py_ssize_t _best(self, bint swaps, double most) noexcept nogil
-    cdef bint _betters(self, Py_ssize_t e, double* found) noexcept nogil
+    cdef bint _betters(self, Py_ssize_t e, double* least) noexcept nogil
 
 cdef void _weigh(double* into, double* weights, double* rows, Py_ssize_t count) noexcept nogil
 cdef void _dots(double* into, double* left, double* right, Py_ssize_t count) noexcept nogil

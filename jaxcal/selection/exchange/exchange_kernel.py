@@ -48,8 +48,8 @@ from cython.cimports.jaxcal.information.linear_algebra import (
     multiply,
     take,
 )
+from cython.cimports.jaxcal.selection.criterion_kinds import DET, SUBSET, TRACE
 from cython.cimports.jaxcal.selection.exchange.exchange_kernel import WIDE
-from cython.cimports.jaxcal.selection.kinds import DET, SUBSET, TRACE
 from cython.cimports.jaxcal.watch import begin, late
 from cython.cimports.libc.math import INFINITY, fabs, log
 
@@ -408,8 +408,8 @@ class Choice:
         """E of the chosen; -inf where it is singular."""
         return -INFINITY
 
-    def _strongest(self, at, found):
-        """The best in place ``at`` by E, which ``found`` becomes; -1: none lifts it."""
+    def _strongest(self, at, least):
+        """The best in place ``at`` by E, which ``least`` becomes; -1: none lifts it."""
         return -1
 
 
@@ -646,17 +646,17 @@ class Climber(Choice):
         """D_jj and H_jj of the group."""
         q, mixed = self.q, self.mixed
         for m in range(self.parts):
-            own, middle = self.cross + 2 * m * self.size, self.middle + 4 * m * q * q
+            cross, middle = self.cross + 2 * m * self.size, self.middle + 4 * m * q * q
             self._cross(c, m, r)
             for a in range(r * q * WIDE):
                 mixed[a] = 0.0
             if m < self.dets:
-                _mix(mixed, 0.5, middle, own, r, q)
+                _mix(mixed, 0.5, middle, cross, r, q)
             else:
-                _mix(mixed, 1.0, self.middle, own, r, q)
-                own = self.cross
-                _mix(mixed, -0.5, middle, own, r, q)
-            _lower(self.grown + (2 * c + m) * self.size, own, mixed, r, q)
+                _mix(mixed, 1.0, self.middle, cross, r, q)
+                cross = self.cross
+                _mix(mixed, -0.5, middle, cross, r, q)
+            _lower(self.grown + (2 * c + m) * self.size, cross, mixed, r, q)
 
     def _cross(self, c, m, r):
         """``tall`` times the blocks of a group, (r, q, WIDE): V, or m = 1: X."""
@@ -776,27 +776,27 @@ class Climber(Choice):
         eigen(self.small, self.values, self.lapack, self.whole, p, vectors)
         return 1.0 / self.values[p - 1]
 
-    def _strongest(self, at, found):
-        """The candidate of the largest E in place ``at``, over ``found``; -1: none."""
+    def _strongest(self, at, least):
+        """The candidate of the largest E in place ``at``, over ``least``; -1: none."""
         p = self.p
-        found[0] *= 1.0 + _LIFTS
+        least[0] *= 1.0 + _LIFTS
         gram, rest = self.gram, self.rest
         if not self._bound_without(at):
             return -1
         best: cython.Py_ssize_t = -1
         while True:
-            e = self._next(found[0])
+            e = self._next(least[0])
             if e < 0:
                 return best
             copy(gram, rest, p * p)
             self._add(e)
             lower = self.lower
             for a in range(p * p):
-                lower[a] = gram[a] - found[0] * self.metric[a]
+                lower[a] = gram[a] - least[0] * self.metric[a]
             if cholesky(lower, lower, p, 0.0) > -INFINITY:
                 value = self._least(False)
-                if value > found[0]:
-                    best, found[0] = e, value
+                if value > least[0]:
+                    best, least[0] = e, value
 
     def _next(self, least):
         """The candidate of the largest bound over ``least``, each once; -1: none."""
@@ -993,10 +993,10 @@ class JointClimber(Choice):
             self.after[s] = self.scale[s] * value + self.shift[s]
         return self._join(cython.address(self.after[0]))
 
-    def _strongest(self, at, found):
+    def _strongest(self, at, least):
         """The candidate of the largest joined E in place ``at``; -1: none over it."""
-        lift = max(_LIFTS * fabs(found[0]), _IMPROVES * max(1.0, fabs(found[0])))
-        found[0] += lift
+        lift = max(_LIFTS * fabs(least[0]), _IMPROVES * max(1.0, fabs(least[0])))
+        least[0] += lift
         groups = self.groups
         bounds = cython.cast(Climber, self.members[0]).bounds
         tops = cython.cast(Climber, self.members[0]).tops
@@ -1021,15 +1021,15 @@ class JointClimber(Choice):
             tops[2 * c] = _largest(bounds + c * WIDE)
         best: cython.Py_ssize_t = -1
         for _ in range(_TRIED):
-            e = cython.cast(Climber, self.members[0])._next(found[0])
+            e = cython.cast(Climber, self.members[0])._next(least[0])
             if e < 0:
                 return best
-            if self._betters(e, found):
+            if self._betters(e, least):
                 best = e
         return best
 
-    def _betters(self, e, found):
-        """Whether the joined E with candidate e is over ``found``, which then is it.
+    def _betters(self, e, least):
+        """Whether the joined E with candidate e is over ``least``, which then is it.
 
         Bounds give way to values one scenario after the other, until it cannot be.
         """
@@ -1063,7 +1063,7 @@ class JointClimber(Choice):
                 total += self.weights[s] * (
                     value - (self.ahead[e] if s == 0 else ahead)
                 )
-            if not total > found[0]:
+            if not total > least[0]:
                 return False
-        found[0] = total
+        least[0] = total
         return True

@@ -28,7 +28,7 @@ from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.fastest.motion import Motion, travel_times
 from jaxcal.selection.problem import (
     CandidateSet,
-    HasCandidates,
+    DesignProtocol,
     Problem,
     problem_of,
 )
@@ -79,7 +79,7 @@ class ParetoFront:
 
 
 def fastest(
-    design: HasCandidates,
+    design: DesignProtocol,
     k: int | None,
     motion: Motion,
     *,
@@ -119,7 +119,7 @@ def fastest(
 
 
 def pareto(
-    design: HasCandidates,
+    design: DesignProtocol,
     k: int | None,
     motion: Motion,
     *,

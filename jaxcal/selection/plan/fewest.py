@@ -39,7 +39,7 @@ from jaxcal.selection.plan.best_of_size import (
 from jaxcal.selection.problem import (
     Blocks,
     CandidateSet,
-    HasCandidates,
+    DesignProtocol,
     Problem,
     blocks_of,
     problem_of,
@@ -133,7 +133,7 @@ class Plan:
 
 
 def plan(
-    design: HasCandidates,
+    design: DesignProtocol,
     accuracy: ArrayLike,
     noise_std: ArrayLike | None = None,
     criterion: str = "G",

@@ -218,13 +218,13 @@ def _look_ahead(y, active, spanned, depth, best_only, factors, values, work, wei
             square[j] = -1.0
         largest = max(largest, square[j])
     least = _least_start(square, largest) if m > _ALL_START else 0.0
-    each = log(max(base + largest, _LEAST_GAIN))
+    most_per_choice = log(max(base + largest, _LEAST_GAIN))
     best: cython.double = _LOWEST
     watch: Watch = begin(INFINITY)
     for i in range(m):
         late(cython.address(watch))
         if square[i] < least or (
-            best_only and values[0, i] + (depth - 1) * each < best
+            best_only and values[0, i] + (depth - 1) * most_per_choice < best
         ):
             continue
         gains[:] = square

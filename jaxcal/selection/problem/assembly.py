@@ -32,8 +32,8 @@ from jaxcal.selection.criteria import (
     CRITERIA,
     Coordinates,
     Criterion,
-    Joined,
     Mean,
+    ScenarioCriterion,
     criterion_of,
 )
 from jaxcal.selection.problem.arrays import (
@@ -70,7 +70,7 @@ def problem_of(
             and blocks, else I.
         region: of I, where it is given by its letter.
     """
-    joined = criterion if isinstance(criterion, Joined) else Mean(criterion)
+    joined = criterion if isinstance(criterion, ScenarioCriterion) else Mean(criterion)
     default = "I" if offer.model and not offer.model.multiplicity else "D"
     of_one = criterion_of(joined.criterion, region, default)
     if offer.lost:
@@ -82,7 +82,7 @@ def problem_of(
 
 
 def _problem_with_losses(
-    offer: CandidateSet, k: int | None, criterion: Criterion, joined: Joined
+    offer: CandidateSet, k: int | None, criterion: Criterion, joined: ScenarioCriterion
 ) -> Problem:
     """The problem where the worst ``offer.lost`` of the chosen fail."""
     if offer.reliability is not None:
@@ -98,7 +98,7 @@ def _problem_with_losses(
 
 
 def _problem_of_scenarios(
-    offer: CandidateSet, k: int | None, criterion: Criterion, joined: Joined
+    offer: CandidateSet, k: int | None, criterion: Criterion, joined: ScenarioCriterion
 ) -> Problem:
     """The problem in all scenarios."""
     if offer.scenarios is None:

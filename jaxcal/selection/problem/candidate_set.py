@@ -23,7 +23,7 @@ from jaxcal.selection.problem.arrays import check_available, filled, usable_numb
 from jaxcal.selection.problem.losses import checked_reliability
 from jaxcal.selection.problem.scenarios import Scenarios, checked_weights, scenarios_of
 
-__all__ = ["CandidateSet", "HasCandidates"]
+__all__ = ["CandidateSet", "DesignProtocol"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -213,7 +213,7 @@ class CandidateSet:
         return alone
 
 
-class HasCandidates(Protocol):
+class DesignProtocol(Protocol):
     """A ``jaxcal.Design``, as the questions to it know it."""
 
     candidate_set: CandidateSet

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of
-from jaxcal.selection.criteria import Joined, Lost
+from jaxcal.selection.criteria import LossCriterion, ScenarioCriterion
 from jaxcal.selection.problem.problem import Problem
 from jaxcal.selection.problem.scenario_problem import ScenarioProblem, fields_of
 
@@ -126,7 +126,7 @@ def with_losses(problem: Problem, lost: int) -> Problem:
                 f"{problem.joined.name}"
             )
         criterion = problem.joined.each
-    fields = fields_of(problem) | {"criterion": Lost(lost).within(criterion)}
+    fields = fields_of(problem) | {"criterion": LossCriterion(lost).within(criterion)}
     return LossProblem(**fields, whole=problem, lost=lost)
 
 
@@ -143,7 +143,9 @@ def checked_reliability(reliability: ArrayLike, count: int) -> Array:
     return checked
 
 
-def with_arrivals(problem: Problem, reliability: Array, criterion: Joined) -> Problem:
+def with_arrivals(
+    problem: Problem, reliability: Array, criterion: ScenarioCriterion
+) -> Problem:
     """The mean over what arrives: over draws of which candidates fail, by one seed."""
     if criterion.least:
         raise ValueError(

@@ -44,7 +44,7 @@ class Problem:
     available: Mask  # (M,) True where a candidate may be chosen
     required: Indices  # (r,) candidates that must be chosen, r <= k
     max_replicates: int  # how often one candidate may be chosen
-    criterion: Any  # Criterion, or Joined of several scenarios, in the same coordinates
+    criterion: Any  # Criterion or ScenarioCriterion, in the same coordinates
     multiplicity: int  # how often log det of the blocks counts
     raw: Array  # (M, q, p) blocks in the caller's numbers, at most p readings each
     readings: Array  # (M, Q, p) these with every reading, as ``raw`` where q is Q

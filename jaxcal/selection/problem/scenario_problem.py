@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.selection.criteria import Joined
+from jaxcal.selection.criteria import ScenarioCriterion
 from jaxcal.selection.problem.problem import Problem, values_of_one
 
 __all__ = ["ScenarioProblem", "fields_of", "joined_problem"]
@@ -37,9 +37,9 @@ class ScenarioProblem(Problem):
     told: bool = True  # whether each scenario is worth a line: losses are not
 
     @property
-    def joined(self) -> Joined:
+    def joined(self) -> ScenarioCriterion:
         """The criterion."""
-        assert isinstance(self.criterion, Joined)
+        assert isinstance(self.criterion, ScenarioCriterion)
         return self.criterion
 
     @property
@@ -94,7 +94,7 @@ class ScenarioProblem(Problem):
         return np.where(regular, value, worst), np.where(regular, log_det, -np.inf)
 
     def terms(self) -> tuple[Array, Array]:
-        """(S,) scale and shift of ``Joined.terms``."""
+        """(S,) scale and shift of ``ScenarioCriterion.terms``."""
         criteria = [member.criterion for member in self.members]
         return self.joined.terms(criteria, self.optima)
 
@@ -107,7 +107,7 @@ def fields_of(problem: Problem) -> dict[str, Any]:
 def joined_problem(
     members: Sequence[Problem],
     weights: Array,
-    criterion: Joined,
+    criterion: ScenarioCriterion,
     nominal: Problem | None,
 ) -> Problem:
     """The problem of scenarios; where all are equal it is that of one.

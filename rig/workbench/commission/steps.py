@@ -28,20 +28,20 @@ from rig.journal import (
 from rig.journal.lock import BusLock
 from rig.readings import make_source
 from rig.readings.geometry import geometry_of
-from rig.workbench.commission.axes import check_axes
 from rig.workbench.commission.axis_check import Change
+from rig.workbench.commission.axis_moves import check_axes
+from rig.workbench.commission.connections import addresses_text, sensor_text, watch
 from rig.workbench.commission.home import can_home, home, identity, unlimited
 from rig.workbench.commission.operator import Operator
-from rig.workbench.commission.phone import addresses_text, sensor_text, watch
 from rig.workbench.outputs.console import listen
+from rig.workbench.rig_toml import edit
 from rig.workbench.run import Run, run_safely
-from rig.workbench.toml import edit
 
 WATCH_S = 5.0
 MOST_JOG_DEG = 10.0  # in one step
 
 
-class Enough(Exception):
+class TurnReached(Exception):
     """The phone has turned as far as the whole step was to turn it."""
 
 
@@ -208,12 +208,12 @@ def jog(site: Site, name: str, way_deg: float) -> int:
         def look() -> None:
             turned = device.geometry.apart(base, device.imu.latest().value)
             if turned > device.geometry.scale * abs(way_deg) and not checked:
-                raise Enough(f"{turned:.1f}")
+                raise TurnReached(f"{turned:.1f}")
 
         device.meanwhile = look
         try:
             move(device, Posture("jog", tuple(here)))
-        except Enough as turned:
+        except TurnReached as turned:
             device.stopper.stop("far enough by what is measured", latch=False)
             gone = abs(moved.to_deg(device.positions()[axis] - start))
             run.say(

@@ -35,7 +35,7 @@ SILENCE_S = 0.5  # besides the drives' own timeout
 TURNED_DEG = 0.3  # of the phone, while the drives stand
 
 
-class _OnTheWay(Exception):
+class _ShareReached(Exception):
     """All axes have gone a share of their way."""
 
 
@@ -159,12 +159,12 @@ def _go(device: Device, low: Pulses, high: Pulses) -> list[int]:
     def look() -> None:
         places = [_last(drive).position for drive in device.drives]
         if min(_shares(device, low, high, places)) >= BEGIN:
-            raise _OnTheWay
+            raise _ShareReached
 
     device.meanwhile = look
     try:
         move(device, Posture("try the stop", high))
-    except _OnTheWay:
+    except _ShareReached:
         pass
     finally:
         device.meanwhile = lambda: None

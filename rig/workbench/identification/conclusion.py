@@ -13,15 +13,15 @@ from rig.journal import Record, measured_postures
 from rig.model import model_of
 from rig.readings.attitude import ORDERS, frame_at
 from rig.readings.geometry import Attitudes, geometry_of
-from rig.workbench.identification import of_model
+from rig.workbench.identification import fit_model
 from rig.workbench.identification.drift import estimate_drift, without_drift
-from rig.workbench.identification.fit import (
+from rig.workbench.identification.fit_affine import (
     held_out_errors,
     identify,
     pairs,
     uncertainty,
 )
-from rig.workbench.outputs.words import recalibrate
+from rig.workbench.outputs.messages import recalibrate
 
 USUAL = (1 / 3, 3.0)  # degrees of a joint for one commanded; outside it is told
 
@@ -74,7 +74,7 @@ def conclude(
         **shared,
     }
     if model is not None:
-        return of_model.conclude(config, model, postures, notes, told)
+        return fit_model.conclude(config, model, postures, notes, told)
     held_out, errors = held_out_errors(config, held, postures, identify(config, chosen))
     zero_share = chosen[0]["samples"] / zero["samples"]
     limits = uncertainty(chosen, held_out, zero_share)

@@ -28,7 +28,7 @@ from rig.readings.attitude import (
 from rig.readings.geometry import geometry_of
 from rig.workbench.identification.conclusion import check_matrix, conclude
 from rig.workbench.outputs.report import save_result
-from rig.workbench.toml import set_values
+from rig.workbench.rig_toml import set_values
 
 
 def attitudes(record: Record) -> Array:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from rig.workbench.outputs.state import ACTIVE, Record, RunState
+from rig.workbench.outputs.run_state import ACTIVE, Record, RunState
 
 # Of axes and of what is measured, in their order; on light and dark.
 AXIS_COLORS = ["#3b9de0", "#e39a12", "#1fae85", "#b07ce8", "#e0568f", "#8c98a6"]

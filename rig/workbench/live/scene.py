@@ -10,7 +10,7 @@ import numpy as np
 from nicegui import ui
 
 from rig.workbench.live.charts import AXIS_COLORS
-from rig.workbench.outputs.state import Degrees
+from rig.workbench.outputs.run_state import Degrees
 
 RADII = (1.5, 1.2)  # of the two rings of the gimbal
 UNIT = {"X": np.eye(3)[0], "Y": np.eye(3)[1], "Z": np.eye(3)[2]}

@@ -19,7 +19,7 @@ from rig.journal import JOURNAL, Record, is_written
 from rig.signals import PAUSE
 from rig.stopping import stop_run
 from rig.workbench.live.charts import SHOWN_S
-from rig.workbench.outputs.state import RunState
+from rig.workbench.outputs.run_state import RunState
 from rig.workbench.outputs.telemetry import PERIOD_S, TELEMETRY
 
 ASK_S = 0.5  # between two looks at the journal's lock; for a session to say it stopped

@@ -20,9 +20,14 @@ from jaxcal.extras import install
 from jaxcal.pages import Code, Figure, Page, Section, Table, Text, write_page
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE
 from rig.journal import JOURNAL, Record, RunFolder, is_written, measured_postures
-from rig.workbench.outputs.state import RunState
+from rig.workbench.outputs.messages import (
+    choice_text,
+    numbers,
+    recalibrate,
+    summary_lines,
+)
+from rig.workbench.outputs.run_state import RunState
 from rig.workbench.outputs.view import headline, trouble, verdict
-from rig.workbench.outputs.words import choice_text, numbers, recalibrate, summary_lines
 
 FOOTER = (
     "Research software, not a medical device. Calibrate with no patient attached; a "

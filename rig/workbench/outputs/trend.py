@@ -13,15 +13,15 @@ import numpy as np
 from jaxcal.checks import aligned
 from jaxcal.pages import Badge, Block, Page, Section, Table, Text, write_page
 from rig.journal import JournalError, Record, read_journal
+from rig.workbench.outputs.messages import held_out, recalibrate
 from rig.workbench.outputs.report import draw_parameters, drawn
-from rig.workbench.outputs.words import held_out, recalibrate
 
 HEAD = ["measured", "run", "mode", "held-out error", "moved since the one before"]
 HOLDS = "the last calibration still holds"
 
 
 @dataclasses.dataclass
-class Device:
+class DeviceHistory:
     """What was found of one device fingerprint, the oldest first."""
 
     fingerprint: Record
@@ -34,7 +34,7 @@ class Device:
         return f"RECALIBRATE: {'; '.join(self.reasons)}" if self.reasons else HOLDS
 
 
-def read_runs(folder: pathlib.Path) -> tuple[list[Device], list[str]]:
+def read_runs(folder: pathlib.Path) -> tuple[list[DeviceHistory], list[str]]:
     """The devices with finished calibrations and verifications under a folder.
 
     Runs of different device fingerprints are never compared. A refit stands at the time
@@ -66,8 +66,8 @@ def read_runs(folder: pathlib.Path) -> tuple[list[Device], list[str]]:
     return [_device(runs) for runs in runs_of_device.values()], skipped
 
 
-def _device(runs: list[Record]) -> Device:
-    device = Device(runs[0]["device"], [], [], [])
+def _device(runs: list[Record]) -> DeviceHistory:
+    device = DeviceHistory(runs[0]["device"], [], [], [])
     for run in sorted(runs, key=lambda run: run["time"]):
         moved, error = "", "not measured"
         if "A" in run or "parameters" in run:
@@ -115,7 +115,7 @@ def _moved_parameters(before: Record, now: Record) -> list[str]:
     return moved
 
 
-def trend_lines(device: Device) -> list[str]:
+def trend_lines(device: DeviceHistory) -> list[str]:
     """The table and the verdict for the console."""
     table = [f"  {line}" for line in aligned([HEAD, *device.rows], "<")]
     told, keys = device.fingerprint, ("map", "unit", "pulses_per_rev", "reduction")
@@ -130,7 +130,7 @@ def trend_lines(device: Device) -> list[str]:
     return [f"device {simulated}{label}", *table, f"  {device.verdict}"]
 
 
-def write_trend(folder: pathlib.Path, devices: list[Device]) -> pathlib.Path:
+def write_trend(folder: pathlib.Path, devices: list[DeviceHistory]) -> pathlib.Path:
     """Write ``trend.html``; returns its path."""
     sections = []
     for number, device in enumerate(devices):

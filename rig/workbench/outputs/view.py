@@ -8,12 +8,18 @@ from typing import Any
 
 from rig.core.stop import UnitStop
 from rig.faults import EXIT_RECALIBRATE
-from rig.workbench.outputs.state import ACTIVE, SESSIONS, Posture, Record, RunState
-from rig.workbench.outputs.words import (
+from rig.workbench.outputs.messages import (
     error_text,
     event_lines,
     prediction_text,
     summary_lines,
+)
+from rig.workbench.outputs.run_state import (
+    ACTIVE,
+    SESSIONS,
+    PostureState,
+    Record,
+    RunState,
 )
 
 SHOWN = 40  # rows of a long queue
@@ -140,7 +146,7 @@ def stream(sample: Record, now: float) -> str:
     return late + ("" if "deg" in sample else "; angles follow once the zero is taken")
 
 
-def queue(state: RunState) -> list[Posture]:
+def queue(state: RunState) -> list[PostureState]:
     """The present posture, those to come, then those done, the newest first."""
     postures = state.postures.values()
     ahead = [p for p in postures if p.state in ("waiting", *ACTIVE)]

@@ -14,9 +14,9 @@ from rig.faults import MotionFault
 from rig.journal import SIGN_CHECKED
 from rig.readings.attitude import Array
 from rig.workbench.identification.conclusion import check_matrix, conclude
-from rig.workbench.identification.fit import identify
+from rig.workbench.identification.fit_affine import identify
 from rig.workbench.outputs.console import plan_lines
-from rig.workbench.outputs.state import roles_of
+from rig.workbench.outputs.run_state import roles_of
 from rig.workbench.procedures.plan import (
     Choice,
     choose,

@@ -8,8 +8,8 @@ from jaxcal.files import atomic_write
 from rig.core.device import Posture
 from rig.core.session import visit
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE
-from rig.workbench.identification.fit import pairs
-from rig.workbench.outputs.words import numbers
+from rig.workbench.identification.fit_affine import pairs
+from rig.workbench.outputs.messages import numbers
 from rig.workbench.procedures.calibrate import END
 from rig.workbench.procedures.plan import draw
 from rig.workbench.run import Run

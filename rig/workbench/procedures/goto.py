@@ -13,7 +13,7 @@ from rig.core.session import visit
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
 from rig.readings.attitude import Array
 from rig.readings.geometry import Frame, geometry_of
-from rig.workbench.identification import of_model
+from rig.workbench.identification import fit_model
 from rig.workbench.run import Run
 
 
@@ -52,7 +52,7 @@ def goto(run: Run, calibration: Any, to: Sequence[float]) -> int:
         return EXIT_RECALIBRATE
     reached = np.array(record["measured_deg"])
     if run.model is not None:
-        reached = of_model.outputs(config, [record])[1][0]
+        reached = fit_model.outputs(config, [record])[1][0]
     run.say(
         f"reached {reached.round(4).tolist()} {config.output_unit}, off by "
         f"{(reached - desired).round(4).tolist()}"

@@ -10,12 +10,12 @@ import numpy as np
 from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.config.config import differences
-from rig.core.record_check import KeptZero
+from rig.core.record_check import ZeroRecord
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
 from rig.model import model_of
-from rig.workbench.identification import of_model
-from rig.workbench.identification.fit import held_out_errors, pairs
-from rig.workbench.outputs.words import error_text, numbers, prediction_text
+from rig.workbench.identification import fit_model
+from rig.workbench.identification.fit_affine import held_out_errors, pairs
+from rig.workbench.outputs.messages import error_text, numbers, prediction_text
 from rig.workbench.procedures.calibrate import pair_names, visit_pairs
 from rig.workbench.procedures.plan import draw_held_out
 from rig.workbench.run import Run
@@ -25,7 +25,7 @@ _OFFERED = 10  # targets to choose each posture of a check from
 
 def load_calibration(
     path: pathlib.Path, config: RigConfig, simulated: bool = False
-) -> tuple[Any, KeptZero]:
+) -> tuple[Any, ZeroRecord]:
     """A calibration made with a device configured as this one, and its zero posture.
 
     Args:
@@ -62,7 +62,7 @@ def load_calibration(
             f"{path}: made with another device: {'; '.join(changed)}. Correct "
             "rig.toml, or calibrate this device"
         )
-    kept = KeptZero(
+    kept = ZeroRecord(
         f"calibration {notes.get('run', path)}",
         tuple(map(int, notes["zero_pulses"])),
         np.array(notes["zero_attitude"], dtype=np.float64),
@@ -99,7 +99,7 @@ def verify(run: Run, calibration: Any, count: int) -> int:
             run.emit("phase", phase="saving")
     if run.model is not None:
         records = [r for r in run.postures().values() if r["role"] == "held"]
-        errors = of_model.held_out_errors(config, run.model, calibration, records)
+        errors = fit_model.held_out_errors(config, run.model, calibration, records)
     else:
         records, errors = held_out_errors(config, held, run.postures(), calibration)
     if not errors:
@@ -115,7 +115,7 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     run.save_summary({**errors, "limit_deg": limit, "recalibrate": again})
     run.say(f"{words(errors, config.output_unit)}, limit {limit:g}")
     if calibration.noise_std is not None:
-        rows = of_model.outputs(config, records) if run.model else pairs(records)
+        rows = fit_model.outputs(config, records) if run.model else pairs(records)
         told = calibration.check(*rows, tolerance=limit)
         run.say(f"a drift that moves it by {limit:g} is seen with {told.power:.0%}")
     over = "RECALIBRATE: over session.verify_limit_deg. Run `jaxcal-rig calibrate`"

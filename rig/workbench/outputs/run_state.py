@@ -13,7 +13,7 @@ from typing import Any
 from rig.config.axis import Scale
 from rig.config.config import names_of, units_of
 from rig.journal import Record
-from rig.workbench.outputs.words import ENDS, event_lines
+from rig.workbench.outputs.messages import ENDS, event_lines
 
 Degrees = list[float]  # in the order of the axes, or of what is measured
 LOGGED = 200  # newest lines of what happened
@@ -37,7 +37,7 @@ def roles_of(held: Sequence[Any]) -> tuple[str, ...]:
 
 
 @dataclasses.dataclass
-class Posture:
+class PostureState:
     """One visit."""
 
     name: str  # "role:number"
@@ -68,7 +68,9 @@ class RunState:
     pausing: bool = False  # a pause was asked for
     current: str | None = None  # name of the posture being visited
     target: Degrees | None = None  # commanded last
-    postures: dict[str, Posture] = dataclasses.field(default_factory=dict)  # to visit
+    postures: dict[str, PostureState] = dataclasses.field(
+        default_factory=dict
+    )  # to visit
     candidates: list[Degrees] = dataclasses.field(default_factory=list)
     drift: list[tuple[float, Degrees]] = dataclasses.field(default_factory=list)
     stop: Record | None = None
@@ -109,7 +111,7 @@ class RunState:
                     self._posture(f"collect:{number}", pulses)
             case "queue":
                 for name in record["names"]:
-                    posture = self.postures.pop(name, None) or Posture(name)
+                    posture = self.postures.pop(name, None) or PostureState(name)
                     if posture.state in LOST:
                         posture.state, posture.note = "waiting", ""
                     self.postures[name] = posture
@@ -177,7 +179,7 @@ class RunState:
         """Postures are left out or withdrawn, and whatever was measured there."""
         for name in names:
             commanded = self._posture(name).commanded
-            self.postures[name] = Posture(name, commanded, state, note, time=now)
+            self.postures[name] = PostureState(name, commanded, state, note, time=now)
             self.current = None if self.current == name else self.current
 
     def _interrupt(self) -> None:
@@ -186,8 +188,8 @@ class RunState:
             self.postures[self.current].state = "waiting"
         self.current = None
 
-    def _posture(self, name: str, pulses: Any = None) -> Posture:
-        posture = self.postures.setdefault(name, Posture(name))
+    def _posture(self, name: str, pulses: Any = None) -> PostureState:
+        posture = self.postures.setdefault(name, PostureState(name))
         if pulses is not None:
             posture.commanded = self.to_deg(pulses)
         return posture
@@ -231,7 +233,7 @@ class RunState:
         return self.start.get("config", {}).get(table, {}).get(key, default)
 
     @property
-    def done(self) -> list[Posture]:
+    def done(self) -> list[PostureState]:
         """What was measured, in the order of measurement."""
         found = [p for p in self.postures.values() if p.state == "done"]
         return sorted(found, key=lambda posture: posture.time)

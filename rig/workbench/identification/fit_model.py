@@ -13,8 +13,8 @@ from rig.journal import Record
 from rig.model import DeviceModel
 from rig.readings.attitude import Array
 from rig.readings.geometry import geometry_of
-from rig.workbench.identification.fit import spread
-from rig.workbench.outputs.words import recalibrate
+from rig.workbench.identification.fit_affine import spread
+from rig.workbench.outputs.messages import recalibrate
 
 WIDE = 1.96  # standard errors, of 95 %
 
