@@ -44,6 +44,7 @@ class Check:
     unseen: tuple[str, ...]  # parameters whose drift by ``tolerance`` could hide
     tolerance: float  # root mean square of the outputs' change that matters
     unit: str = ""  # of the tolerance, where the calibration has one
+    slipped: str = ""  # what most likely changed alone, and by how much
 
     @property
     def good(self) -> bool:
@@ -61,6 +62,8 @@ class Check:
             f" (p = {self.p_value:.3g}, false alarms 5 %); a change by {change} is "
             f"seen with {self.power:.0%} on average"
         )
+        if self.slipped:
+            text += f"; most likely {self.slipped}"
         if self.unseen and not self.good:
             text += f", and could hide in {', '.join(self.unseen)}"
         return (text,)
@@ -93,6 +96,8 @@ def check(
 
     A chi-square test (F where the noise was estimated, one for each level of it) of the
     readings against the predictions, with the uncertainty of both, at 5 % false alarms.
+    Of an arm half of these are left to tests of one joint's zero each (Sidak): a slip
+    of a joint is one direction in many readings.
 
     Args:
         calibration: what is checked.
@@ -131,17 +136,29 @@ def check(
     if not len(white):
         raise ValueError("measured must hold a reading beside what was placed anew")
     of_level = level == np.unique(level)[:, None]
-    test = _Test(of_level.sum(axis=1), calibration.noise_dof or _KNOWN, least)
-    p_value = test.p_value(of_level @ white**2)
     free = (calibration.free[:p] > 0.0) & ~placed
     seen = (of_level @ by**2).T
-    size = test.smallest(seen)
+    slips = free & np.isin(names, calibration.model.slips) & (seen.sum(axis=1) > 0.0)
+    tests = _Tests.of(of_level.sum(axis=1), calibration, slips.sum(), least)
+    slopes_of_slips = np.linalg.norm(by[:, slips], axis=0)
+    ways = by[:, slips] / slopes_of_slips  # (N m, S) unit vectors
+    along = ((by.T @ ways) ** 2).max(axis=1, initial=0.0)  # seen by the best of them
+    changes_of_slips = white @ ways
+    p_value, p_slip = tests.p_values(of_level @ white**2, changes_of_slips**2)
+    size = tests.smallest(seen, along)
     if tolerance is None:
         tolerance = _tolerance(calibration, commands)
     change = _changes(calibration, calibration.commands, tolerance)
     judged = free & np.isfinite(change)
     hidden = judged & (size > change)
-    power = test.power(change[judged, None] ** 2 * seen[judged]).mean()
+    squares = change[judged] ** 2
+    power = tests.power(squares[:, None] * seen[judged], squares * along[judged]).mean()
+    slipped = ""
+    if p_slip < _ALARMS:
+        most = int(np.abs(changes_of_slips).argmax())
+        at, by_size = np.flatnonzero(slips)[most], slopes_of_slips[most]
+        slipped_by = f"{changes_of_slips[most] / by_size:.2g}"
+        slipped = f"{names[at]} by {slipped_by} {calibration.model.units[at]}"
     if p_value < _ALARMS:
         says = "does not hold"
     else:
@@ -154,6 +171,7 @@ def check(
         unseen=tuple(names[i] for i in np.flatnonzero(hidden)),
         tolerance=tolerance,
         unit=calibration.measured_unit,
+        slipped=slipped,
     )
 
 
@@ -290,6 +308,7 @@ class _Test:
     counts: NDArray[np.intp]  # (G,) readings of each level
     dof: float  # of the noise of a level
     least: float = 1.0  # mean square of a reading without a change; 1 in the test
+    alarms: float = _ALARMS  # share of false alarms
 
     def p_value(self, squares: Array) -> float:
         """Chance of sums (G,) of squared readings at least this large, unchanged."""
@@ -306,7 +325,7 @@ class _Test:
         """
         from scipy import special
 
-        alarms = -np.expm1(np.log1p(-_ALARMS) / len(self.counts))  # of each level
+        alarms = -np.expm1(np.log1p(-self.alarms) / len(self.counts))  # of each level
         limit = special.fdtri(self.counts, self.dof, 1.0 - alarms) / self.least
         ratio = np.ones(1)
         if self.dof < _KNOWN:
@@ -345,6 +364,54 @@ class _Test:
             low, high = np.where(short, middle, low), np.where(short, high, middle)
         with np.errstate(divide="ignore"):
             return np.asarray(np.sqrt(high[of_share.ravel()] / total)[:, 0])
+
+
+@dataclasses.dataclass(frozen=True)
+class _Tests:
+    """A test of all readings, and one of each slip, the largest of which counts."""
+
+    whole: _Test
+    slip: _Test
+    count: int  # of slips, S
+
+    @classmethod
+    def of(
+        cls, counts: NDArray[np.intp], calibration: Fit, slips: int, least: float = 1.0
+    ) -> _Tests:
+        """Each kind has half of the false alarms; where nothing slips, one has all."""
+        half = -np.expm1(np.log1p(-_ALARMS) / 2.0)
+        dof, one = calibration.noise_dof or _KNOWN, np.ones(1, dtype=np.intp)
+        of_each = -np.expm1(np.log1p(-half) / max(1, slips))
+        return cls(
+            _Test(counts, dof, least, half if slips else _ALARMS),
+            _Test(one, dof, least, of_each),
+            int(slips),
+        )
+
+    def p_values(self, squares: Array, of_slips: Array) -> tuple[float, float]:
+        """Of sums (G,) and of the squares along the slips (S,): of both, of a slip."""
+        whole = self.whole.p_value(squares)
+        if not self.count:
+            return whole, 1.0
+        of_one = self.slip.p_value(of_slips.max(keepdims=True))
+        of_any = 1.0 - (1.0 - of_one) ** self.count
+        return tuple(1.0 - (1.0 - p) ** 2 for p in (min(whole, of_any), of_any))
+
+    def power(self, shifts: Array, along: Array) -> Array:
+        """(...,) at least, of noncentralities (..., G) in all, (...,) along a slip."""
+        whole = self.whole.power(shifts)
+        return (
+            np.maximum(whole, self.slip.power(along[..., None]))
+            if self.count
+            else whole
+        )
+
+    def smallest(self, seen: Array, along: Array) -> Array:
+        """(p,) changes that are seen with the power asked for, by either."""
+        whole = self.whole.smallest(seen)
+        if not self.count:
+            return whole
+        return np.minimum(whole, self.slip.smallest(along[:, None]))
 
 
 def verification(
@@ -389,13 +456,14 @@ def verification(
     change = _changes(calibration, where, tolerance)
     judged = (calibration.free[: len(change)] > 0.0) & np.isfinite(change)
     shifts = seen[:, judged] * change[judged, None] ** 2  # of one posture
-    counts, dof = of_level.sum(axis=1), calibration.noise_dof or _KNOWN
+    counts = of_level.sum(axis=1)
+    slips = np.isin(calibration.names, calibration.model.slips)[judged]
 
     def value(rows: list[int]) -> Array:
         """(M,) of the rows and each candidate."""
         shift = shifts[rows].sum(axis=0) + shifts
-        test = _Test(counts * (len(rows) + 1), dof)
-        return np.asarray(test.power(shift).mean(axis=-1))
+        tests = _Tests.of(counts * (len(rows) + 1), calibration, slips.sum())
+        return np.asarray(tests.power(shift, slips * shift.sum(axis=-1)).mean(axis=-1))
 
     chosen: list[int] = []
     for _ in range(k):

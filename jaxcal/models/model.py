@@ -279,6 +279,11 @@ class Model(abc.ABC):
         return ()
 
     @property
+    def slips(self) -> tuple[str, ...]:
+        """Names of the parameters that change alone when something slips."""
+        return ()
+
+    @property
     def relative(self) -> bool:
         """Whether readings are relative to the commands, as the turns of a pose."""
         return False

@@ -958,6 +958,12 @@ class SerialChain(Arm, Model):
         return self.sensor.names
 
     @property
+    def slips(self) -> tuple[str, ...]:
+        """The joints' zeros."""
+        zeros = zip(self.joints, range(1, len(self.joints) + 1), strict=True)
+        return tuple(f"{'theta' if kind == 'R' else 'd'}{i}" for kind, i in zeros)
+
+    @property
     def relative(self) -> bool:
         """The turns of a pose are from the nominal orientation at the command."""
         return isinstance(self.sensor, Pose)

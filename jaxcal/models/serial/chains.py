@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -408,11 +408,21 @@ class Chains(Model):
 
     @property
     def placed(self) -> tuple[str, ...]:
+        return self._of_arms(lambda arm: arm.placed)
+
+    @property
+    def slips(self) -> tuple[str, ...]:
+        return self._of_arms(lambda arm: arm.slips)
+
+    def _of_arms(
+        self, some: Callable[[SerialChain], tuple[str, ...]]
+    ) -> tuple[str, ...]:
+        """Names here of some of each chain's parameters, those shared once."""
         names = (
             name
             for arm, named in zip(self.chains, self._named, strict=True)
             for name, own in zip(named, arm.names, strict=True)
-            if own in arm.sensor.names
+            if own in some(arm)
         )
         return tuple(dict.fromkeys(names))
 
