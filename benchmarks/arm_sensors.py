@@ -12,8 +12,8 @@ error elsewhere with and without harmonics of the joints. ``trial``: the simulat
 fitted as a real one was. ``chance``: of a linear WAM whose misfit and sizes the choice
 knows exactly, how many random choices are better on one arm. ``servos``: what contacts
 of a servo arm determine, by where the sockets stand. ``checks``: what a few chosen
-postures and random ones can tell of a drift. ``slips``: how many slips of a joint six
-readings show, and could show at best. ``contacts``: of real arms, trained on one
+postures and random ones can tell of a drift. ``slips``: how many slips of a joint 6 and
+24 readings show, and could show at best. ``contacts``: of real arms, trained on one
 place and judged at the others: 12 and 16 contacts that are random or chosen, and all;
 likewise with stiff joints, stated tolerances and noise (of the choice and the fit); and
 what is expected of those chosen, and at best (chosen for the very postures they are
@@ -73,6 +73,13 @@ ALONE: dict[str, Sensor] = {
     "camera": Board("camera", np.eye(4)),
     "board": Board("board", np.eye(4)),
 }
+CAMERA = (1280.0, 960.0, 900.0, 900.0, 640.0, 480.0)  # pixels
+CORNERS = Board(
+    "camera",
+    np.block([[np.eye(3), np.array([[-0.55], [0.1], [0.0]])], [np.eye(4)[3:]]]),
+    [[0.03 * x, 0.03 * y, 0.0] for x in range(6) for y in range(5)],
+    CAMERA[2:],
+)
 PAIRS = [("position", "socket"), ("position", "gravity"), ("socket", "gravity"),
          ("plane", "distance")]  # fmt: skip
 
@@ -538,22 +545,22 @@ def _nearest(plain: Any, found: Any, postures: Array) -> SerialChain:
 
 
 def slips(draws: int) -> None:
-    """How many slips of a joint by 0.05 degrees six chosen readings show.
+    """How many slips of a joint by 0.05 degrees 6 and 24 chosen readings show.
 
-    Beside it the power of the best test that knows which joint may have slipped, of
-    this calibration and of one without any error; and how many checks of an arm that
-    did not slip say that it holds.
+    Beside it the power of the best test of the six that knows which joint may have
+    slipped, of this calibration and of one without any error; and how many checks of
+    an arm that did not slip say that it holds.
     """
-    print("| sensor | seen | at best | of an exact arm | unchanged: holds |")
-    print("| --- | --- | --- | --- | --- |")
-    for name in ("position", "pose", "socket", "camera"):
-        rows = [_slipped(ALONE[name], seed) for seed in range(draws)]
-        seen, best, exact, holds = np.mean(rows, axis=0)
-        print(f"| {name} | {seen:.2f} | {best:.2f} | {exact:.2f} | {holds:.2f} |")
+    print("| sensor | 6 | 24 | at best | of an exact arm | unchanged: holds |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for name in ("position", "pose", "socket", "camera", "corners"):
+        rows = [_slipped(ALONE.get(name, CORNERS), seed) for seed in range(draws)]
+        means = " | ".join(f"{mean:.2f}" for mean in np.mean(rows, axis=0))
+        print(f"| {name} | {means} |", flush=True)
 
 
-def _slipped(sensor: Sensor, seed: int) -> tuple[float, float, float, float]:
-    """Shares of the joints' slips: seen, to be seen at best, of an exact arm; holds."""
+def _slipped(sensor: Sensor, seed: int) -> tuple[float, ...]:
+    """Shares of the joints' slips: seen by 6, 24, at best, of an exact arm; holds."""
     rng = np.random.default_rng(seed)
     model = arm(6, sensor)
     bent = model.with_misfit()
@@ -563,9 +570,9 @@ def _slipped(sensor: Sensor, seed: int) -> tuple[float, float, float, float]:
     free &= np.isfinite(std)
     truth[: len(std)][free] += 0.5 * std[free] * rng.normal(size=free.sum())
     truth[len(std) :] = 0.015 * rng.normal(size=bent.waves.size)  # degrees
-    near = NEAR.get(sensor.kind)
+    near, camera = NEAR.get(sensor.kind), CAMERA if sensor is CORNERS else None
     made = bent.calibrated(truth, sensor)  # which touches what the arm touches
-    offered = rng.permutation(made.postures(60, seed=seed, near=near))
+    offered = rng.permutation(made.postures(60, seed=seed, near=near, camera=camera))
     noise = np.asarray(model.default_noise().std) * np.ones(model.num_outputs)
 
     def read(rows: Array, theta: Array) -> Array:
@@ -575,24 +582,27 @@ def _slipped(sensor: Sensor, seed: int) -> tuple[float, float, float, float]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         found = jaxcal.identify(used, read(used, truth), model=model)
-    at = offered[24:][found.verification(offered[24:], 6)]
-    holds = found.check(at, read(at, truth)).says == "holds"
-    slopes, covariance = found.linear(at)
+    rest = offered[24:]
+    few, many = (rest[found.verification(rest, count)] for count in (6, 24))
+    holds = found.check(few, read(few, truth)).says == "holds"
+    slopes, covariance = found.linear(few)
     rows = slopes.reshape(6 * q, -1)
     of_noise = np.diag(np.tile(np.asarray(found.noise_std) ** 2, 6))
-    seen, best, exact = [], [], []
+    shares = []
     for i in range(model.num_joints):
         joint = model.names.index(f"theta{i + 1}")
         if model.names[joint] in prior.fixed:
             continue
         slipped = truth.copy()
         slipped[joint] += 0.05
-        seen.append(found.check(at, read(at, slipped)).says == "does not hold")
+        told = [found.check(at, read(at, slipped)).says for at in (few, many)]
+        shares.append([float(said == "does not hold") for said in told])
         shift = 0.05 * rows[:, joint]
-        for powers, spread in ((best, rows @ covariance @ rows.T), (exact, 0.0)):
+        for spread in (rows @ covariance @ rows.T, 0.0):
             far = np.sqrt(shift @ np.linalg.solve(of_noise + spread, shift))
-            powers.append(stats.norm.sf(1.96 - far) + stats.norm.cdf(-1.96 - far))
-    return float(np.mean(seen)), np.mean(best), np.mean(exact), float(holds)
+            power = stats.norm.sf(1.96 - far) + stats.norm.cdf(-1.96 - far)
+            shares[-1].append(float(power))
+    return *np.mean(shares, axis=0), float(holds)
 
 
 def intervals(draws: int) -> None:

@@ -194,18 +194,14 @@ def load(path: str) -> Views:
     return dataclasses.replace(views, poses=views.posed(camera))
 
 
-def choose(
-    views: Views, rule: str, seed: int = 0, count: int = K
-) -> NDArray[np.int64]:
+def choose(views: Views, rule: str, seed: int = 0, count: int = K) -> NDArray[np.int64]:
     """(count,) views, by the rough camera.
 
     The poses of other views are fitted too, so I is the variance of what they show
     beyond their own poses; of a model it is that of pixels where poses are known.
     """
     if rule == "random":
-        return np.random.default_rng(seed).choice(
-            len(views.seen), count, replace=False
-        )
+        return np.random.default_rng(seed).choice(len(views.seen), count, replace=False)
     if rule == "chosen (I, poses known)":
         return jaxcal.select(
             views.commands,

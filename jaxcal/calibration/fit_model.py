@@ -84,11 +84,6 @@ def fit_model(
     noise, used = noise or Noise(), _used(weights)
     spread = _command_noise(noise, commands, measured.shape[1])
     exact = not spread.any()
-    if not exact and model.relative:
-        raise ValueError(
-            "command_std must not be given with a Pose: the orientations are "
-            "compared with those of the commands given; raise the std of the noise"
-        )
     model = model.prepared(commands[used], measured[used])
     if not exact and model.error_groups() is not None:
         noise, exact = _with_play(model, noise, commands, spread), True

@@ -68,6 +68,11 @@ class ArmOptions:
 
     def read(self, path: str, table: Table | None, places: Any = None) -> SerialChain:
         """The arm in this file; things that it touches are given or in the table."""
+        if "," in (self.tip or ""):
+            raise ValueError(
+                f"--tip must be one link, got {self.tip}: two chains in one model "
+                "(Chains) are in Python, docs/arms.md, Several chains"
+            )
         kind = SENSORS[self.sensor]
         given: dict[str, Any] = {}
         if issubclass(kind, Landmarks):

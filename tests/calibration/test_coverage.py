@@ -20,6 +20,9 @@ from jaxcal.models import (
 from ..models.arms import UR5_TABLE
 
 SCARA = [(325, 0, 300, 0), (225, 180, 0, 0), (0, 0, 100, 0), (0, 0, 50, 0)]
+SEVEN = [(0, -90, 340, 0), (0, 90, 0, 0), (0, 90, 400, 0), (0, -90, 0, 0)]
+SEVEN += [(0, -90, 400, 0), (0, 90, 0, 0), (0, 0, 126, 0)]
+ALONG_X = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
 NEAR = [[400.0, 100.0, 300.0], [400.0, 150.0, 300.0]]
 SENSORS = {
     "position": Position(),
@@ -38,11 +41,24 @@ def _arm(kind, sensor):
         return SerialChain.from_dh(
             SCARA, joints="RRPR", tool=(30, 0, 50), sensor=sensor, limits=limits
         )
+    if kind == "seven axes":
+        return SerialChain.from_dh(SEVEN, tool=(20, 0, 50), sensor=sensor)
+    if kind == "rail":
+        table = [(0, -90, 0, 0), *np.array(UR5_TABLE)[:, :4]]
+        limits = [(0, 1500)] + [(-150, 150)] * 6
+        return SerialChain.from_dh(
+            table,
+            joints="PRRRRRR",
+            base=ALONG_X,
+            tool=(0, 0, 31),
+            sensor=sensor,
+            limits=limits,
+        )
     return SerialChain.from_dh(UR5_TABLE, tool=(0, 0, 31), sensor=sensor)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["ur5", "scara"])
+@pytest.mark.parametrize("kind", ["ur5", "scara", "seven axes", "rail"])
 @pytest.mark.parametrize("name", SENSORS)
 def test_intervals_hold_the_truth_and_predictions_err_as_stated(name, kind):
     """Errors of .25, 1 and 4 times the tolerances, with and without harmonics."""
@@ -62,7 +78,9 @@ def test_intervals_hold_the_truth_and_predictions_err_as_stated(name, kind):
             truth = arm.nominal + free * std * rng.normal(size=len(std))
             waves = 0.03 * (seed % 2) * rng.normal(size=bent.waves.size)
             whole = np.append(truth, waves)
-            low, high = np.clip(arm.limits, -150.0, 150.0).T
+            low, high = arm.limits.clip(
+                -150.0, [[1500.0 if k == "P" else 150.0] for k in arm.joints]
+            ).T
             joints = rng.uniform(low, high, (count + 60, arm.num_joints))
             given = np.zeros((len(joints), len(sensor.inputs)))
             if name == "board":

@@ -56,6 +56,7 @@ def test_contacts_become_a_calibrated_file(files, capsys):
     [
         (["--out", "a.urdf"], "which look like radians"),
         (["--radians", "--tip", "thumb"], "tip link must be one of"),
+        (["--tip", "left,right"], "--tip must be one link, got left,right: two chains"),
         (["--radians", "--play", "-1"], "play must not be negative"),
         (["--radians", "--distance", "0,1,0.05"], "distances must be rows"),
         (["--radians", "--sensor", "plane", "--distance", "0,1,2,3"], "is of --sensor"),

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from jaxcal.models import Chains, Position, SerialChain, Socket, from_dict
+from jaxcal.models import Chains, Pose, Position, SerialChain, Socket, from_dict
 from jaxcal.models.serial.urdf import joints_of
 
 from .arms import differences
@@ -132,6 +132,24 @@ def test_derivatives_are_those_of_the_readings(robot):
         np.testing.assert_allclose(one[:, :joints], moved, atol=2e-4)
 
 
+def test_joints_yield_but_those_that_carry_both_arms(tmp_path):
+    touched = Socket(1, [[0.3, 0.2, 0.5]])
+    sensors = dict.fromkeys(("left_hand", "right_hand"), touched)
+    model = Chains.from_urdf(urdf(tmp_path / "robot.urdf"), sensors, base="base")
+    yielding = [name for name in model.names if "compliance" in name]
+    wanted = [
+        f"{tip}: compliance{i}"
+        for tip in ("left_hand", "right_hand")
+        for i in range(3, 8)
+    ]
+    assert sorted(yielding) == wanted
+    rng = np.random.default_rng(1)
+    commands = postures(model, 4, 1)
+    theta = model.nominal + rng.normal(0, 1e-3, len(model.names))
+    by_theta = differences(lambda t: model.predict(commands, t), theta)
+    np.testing.assert_allclose(model.jacobian(commands, theta), by_theta, atol=2e-4)
+
+
 @pytest.mark.slow
 def test_two_arms_on_a_torso_are_found_together_and_written_in_one_file(tmp_path):
     nominal, truth = tmp_path / "robot.urdf", tmp_path / "truth.urdf"
@@ -241,3 +259,17 @@ def test_a_file_keeps_which_sensor_is_one(robot):
     assert again.names == robot.names and again.stands == robot.stands
     commands = postures(robot, 4, 2)
     np.testing.assert_array_equal(again.predict(commands), robot.predict(commands))
+
+
+@pytest.mark.slow
+def test_blanks_beside_fewer_readings_do_not_count_as_exact(tmp_path):
+    """Positions of one hand, poses of the other: three of nine readings are blanks."""
+    sensors = {"left_hand": Position(), "right_hand": Pose()}
+    model = Chains.from_urdf(urdf(tmp_path / "robot.urdf"), sensors, base="base")
+    rng = np.random.default_rng(0)
+    commands = postures(model, 60, 0)
+    measured = model.predict(commands) + rng.normal(0, 1, (60, 6))
+    measured[commands[:, len(model.joint_names)] == 0, 3:] = 0.0
+    found = jaxcal.identify(commands, measured, model=model)
+    assert found.dof < 30 * 3 + 30 * 6
+    np.testing.assert_allclose(found.noise_std, 1.0, rtol=0.15)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal.models import Noise, Position, SerialChain, Socket
+from jaxcal.models import Noise, Pose, Position, SerialChain, Socket
 
 from .arms import differences
 
@@ -108,3 +108,33 @@ def test_play_on_one_side_is_an_error_of_the_zeros():
         return np.abs(found.residuals).mean()
 
     assert error(before) < 0.1 * error(last)
+
+
+@pytest.mark.slow
+def test_poses_of_an_arm_with_play_are_as_uncertain_as_stated():
+    """Orientations are compared with those of the joints as told, not as they rest."""
+    inside, ratios = [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        model = servo_arm(Pose())
+        truth, plan = made(rng, model), rng.uniform(-80, 80, (30, 5))
+        resting = plan + rng.uniform(-PLAY / 2, PLAY / 2, plan.shape)
+        at = model.predict(resting, truth)
+        turned = model.rotation_vectors(plan, model.rotations(resting, at[:, 3:]))
+        measured = np.hstack([at[:, :3], turned])
+        measured += np.asarray(model.default_noise().std) * rng.normal(size=(30, 6))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            found = jaxcal.identify(
+                plan, measured, model=model, noise=model.noise_with_play(PLAY)
+            )
+        low, high = found.confidence_intervals().T
+        free = found.free[: len(truth)] > 0.0
+        inside.append(((low <= truth) & (truth <= high))[free].mean())
+        there = rng.uniform(-80, 80, (100, 5))
+        off = found.predict(there) - model.predict(there, truth)
+        std = found.predict_std(there)
+        ratios.append(np.sqrt((std**2).mean(axis=0) / (off**2).mean(axis=0)).mean())
+        assert found.verdict.good
+    assert 0.92 < np.mean(inside) < 0.99
+    assert 0.8 < np.median(ratios) < 2.0

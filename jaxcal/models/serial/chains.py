@@ -88,7 +88,8 @@ class Chains(Model):
     ) -> Self:
         """The chains of a URDF file from one base to several tips.
 
-        Joints are stiff here: what a torso yields by depends on all that it carries.
+        Joints that chains share are stiff: what a torso yields by depends on all that
+        it carries. The others yield as those of an arm alone do.
 
         Args:
             path: the file.
@@ -97,23 +98,19 @@ class Chains(Model):
             base, locked, limits: as of ``SerialChain.from_urdf``; each chain takes
                 the joints that it has.
         """
-        arms = {}
-        for tip, sensor in sensors.items():
-            arm = SerialChain.from_urdf(
-                path, base=base, tip=tip, sensor=sensor, locked=locked, compliance=()
+
+        def chain(tip: str, **options: Any) -> SerialChain:
+            return SerialChain.from_urdf(
+                path, base=base, tip=tip, sensor=sensors[tip], locked=locked, **options
             )
+
+        arms = {tip: chain(tip) for tip in sensors}
+        stiff = cls.of(arms)._shared
+        for (tip, arm), shared in zip(arms.items(), stiff, strict=True):
             own = {n: v for n, v in (limits or {}).items() if n in arm.joint_names}
-            if own:
-                arm = SerialChain.from_urdf(
-                    path,
-                    base=base,
-                    tip=tip,
-                    sensor=sensor,
-                    locked=locked,
-                    limits=own,
-                    compliance=(),
-                )
-            arms[tip] = arm
+            yielding = tuple(i for i in arm.compliance if i > shared)
+            if own or yielding != arm.compliance:
+                arms[tip] = chain(tip, limits=own or None, compliance=yielding)
         return cls.of(arms)
 
     # -- what the chains share ---------------------------------------------------------
