@@ -158,7 +158,8 @@ def check(
         most = int(np.abs(changes_of_slips).argmax())
         at, by_size = np.flatnonzero(slips)[most], slopes_of_slips[most]
         slipped_by = f"{changes_of_slips[most] / by_size:.2g}"
-        slipped = f"{names[at]} by {slipped_by} {calibration.model.units[at]}"
+        units = calibration.model.units_for("", calibration.measured_unit)
+        slipped = f"{names[at]} by {slipped_by} {units[at]}"
     if p_value < _ALARMS:
         says = "does not hold"
     else:
@@ -389,13 +390,13 @@ class _Tests:
         )
 
     def p_values(self, squares: Array, of_slips: Array) -> tuple[float, float]:
-        """Of sums (G,) and of the squares along the slips (S,): of both, of a slip."""
+        """Chances of both kinds and of slips alone, by sums (G,), squares (S,)."""
         whole = self.whole.p_value(squares)
         if not self.count:
             return whole, 1.0
         of_one = self.slip.p_value(of_slips.max(keepdims=True))
         of_any = 1.0 - (1.0 - of_one) ** self.count
-        return tuple(1.0 - (1.0 - p) ** 2 for p in (min(whole, of_any), of_any))
+        return 1.0 - (1.0 - min(whole, of_any)) ** 2, 1.0 - (1.0 - of_any) ** 2
 
     def power(self, shifts: Array, along: Array) -> Array:
         """(...,) at least, of noncentralities (..., G) in all, (...,) along a slip."""
