@@ -82,7 +82,7 @@ class Fit:
     @property
     def num_measurements(self) -> int:
         """Measurements of positive weight."""
-        return int((self.loss_weights > 0.0).sum())
+        return int(np.count_nonzero(self.loss_weights > 0.0))
 
     @property
     def noise_known(self) -> bool:

@@ -127,7 +127,7 @@ def fit_model(
         solution = solve(problem)
     if common_noise is None and model.default_noise() is not None:
         problem, solution = _with_levels_apart(problem, solution)
-    fields = _fields(problem, solution, commands, measured, weights, centre)
+    fields = _fields(problem, solution, commands, measured, used, centre)
     if fields["joint_covariance"] is not None:
         fields |= _widened(
             problem, solution, fields, scales, with_misfit, misfit_factor
@@ -385,10 +385,9 @@ def _fields(
     solution: FitSolution,
     commands: Array,
     measured: Array,
-    weights: Array,
+    used: slice | NDArray[np.bool_],
     centre: Array | None,
 ) -> dict[str, Any]:
-    used = _used(weights)
     covariance, null = _covariance(problem, solution)
     freedom = float(solution.freedom.sum())
     noise_std: Array | None = solution.level * np.sqrt(

@@ -178,7 +178,7 @@ class FitSolution:
         q = problem.measured.shape[1]
         self.uncertain = problem.command_std > 0.0
         self.command_root = 1.0 / problem.command_std[self.uncertain]  # 0: unknown
-        self.num_readings = q - int((self.command_root == 0.0).sum())
+        self.num_readings = q - np.count_nonzero(self.command_root == 0.0)
         # From where another search ended, the derivatives are right far enough.
         self.damping, self.grow = 1e-3 if start is None else 1e-10, 2.0
         self.basis: Array | None = None  # (F, r) directions of a linear model
@@ -230,18 +230,20 @@ class FitSolution:
         """(P,) of the parameters."""
         return self.problem.model.parameter_sizes()
 
-    @functools.cached_property
-    def floor(self) -> Array:
+    def _share(self, levels: NDArray[np.intp]) -> None:
+        """Outputs of the same number have one level."""
+        self.shared, self.same = levels, 1.0 * (levels[:, None] == levels)
+        self.floor = self._floor()
+
+    def _floor(self) -> Array:
         """(q,) least level; of contacts, whose readings are zero, in usual noise."""
+        if self.problem.noise_known:
+            return np.zeros(len(self.shared))
         readings = _times(self.problem.white, self.problem.measured)
         largest = np.abs(readings).max(axis=0)
         if not largest.all():
             largest[largest == 0.0] = largest.max() or 1e7
-        return 1e-13 * largest
-
-    def _share(self, levels: NDArray[np.intp]) -> None:
-        """Outputs of the same number have one level."""
-        self.shared, self.same = levels, 1.0 * (levels[:, None] == levels)
+        return np.asarray((self.same * (1e-13 * largest)).max(axis=1))
 
     def _first_level(self) -> Array:
         """(q,) root mean square of the residuals, of the outputs that share a level."""
@@ -249,7 +251,7 @@ class FitSolution:
             return np.ones(len(self.shared))
         square, same = self.white**2, self.same
         mean = same @ square.sum(axis=0) / (len(square) * same.sum(axis=1))
-        return np.maximum(np.sqrt(mean), (same * self.floor).max(axis=1))
+        return np.maximum(np.sqrt(mean), self.floor)
 
     def _take(self, residuals: Array) -> None:
         self.residuals, self.white = residuals, _times(self.problem.white, residuals)
@@ -417,9 +419,9 @@ class FitSolution:
         weight = np.sqrt(self.weights)[:, None]
         rows = (weight[..., None] * rows).reshape(-1, rows.shape[-1])
         right = (weight * right).ravel()
-        free = self.problem.free
-        root = np.sqrt(self.problem.precision[free])
-        if len(self.facts) or root.any():
+        if len(self.facts) or self.informed:
+            free = self.problem.free
+            root = np.sqrt(self.problem.precision[free])
             off = root * (self.problem.mean - self.parameters)[free]
             rows = np.concatenate([rows, np.diag(root), self.fact_rows[:, free]])
             right = np.concatenate([right, off, self.facts])
@@ -507,7 +509,7 @@ class FitSolution:
         square, freedom = same @ square, same @ freedom
         if self.problem.loss is not None:
             square = square / constants(self.problem.loss, self.num_readings)[0]
-        return np.maximum(np.sqrt(square / freedom), (same * self.floor).max(axis=1))
+        return np.maximum(np.sqrt(square / freedom), self.floor)
 
     def _climb(self, distance: Array) -> None:
         """Move the levels towards those of the residuals."""
@@ -564,7 +566,9 @@ class FitSolution:
         right = self._reduce(0.0)[1] if uncertain else self.white / self.level
         if solved is None or self.problem.noise_known:
             self.freedom = self._freedom(readings)
-        self.distance = self._distance(self.white, self.commands)
+        self.distance = (right**2).sum(axis=1)
+        if uncertain:
+            self.distance = self._distance(self.white, self.commands)
         deleted = _deleted(readings, right)
         self.deleted = np.maximum((right * deleted).sum(axis=1), 0.0)
         return self

@@ -69,7 +69,7 @@ class Affine(Model):
         slopes = np.zeros((count, m, m * (n + 1)))
         for i in range(m):
             slopes[:, i, i * n : (i + 1) * n] = commands
-            slopes[:, i, m * n + i] = 1.0
+        slopes[:, :, m * n :] = np.eye(m)
         return slopes
 
     def command_jacobian(

@@ -90,7 +90,7 @@ class Prior:
         free = np.ones(len(names), dtype=np.bool_)
         for name in self.fixed:
             free[names.index(one_of("parameter in fixed", name, names))] = False
-        if not free.any():
+        if self.fixed and not free.any():
             raise ValueError("prior must leave a parameter free, but it fixes them all")
         return ResolvedPrior(mean, std**-2.0, free)
 

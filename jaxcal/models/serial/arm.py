@@ -217,9 +217,10 @@ class Arm:
         self, name: str, key: tuple[Array, ...], find: Callable[[], tuple[Array, ...]]
     ) -> tuple[Array, ...]:
         """What ``find`` gives; the last answer, which a fit asks for again, is kept."""
+        numbers = [array.tobytes() for array in key]
         kept = self.__dict__.get(name)
-        if kept is None or not all(map(np.array_equal, kept[0], key)):
-            kept = tuple(map(np.copy, key)), find()
+        if kept is None or kept[0] != numbers:
+            kept = numbers, find()
             if len(key[0]) < _MANY:
                 self.__dict__[name] = kept
         arrays: tuple[Array, ...] = kept[1]
