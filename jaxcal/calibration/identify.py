@@ -11,7 +11,7 @@ import platform
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -103,60 +103,94 @@ def identify(
         ValueError: naming the argument, the rule and the value; for commands that leave
             a direction unexcited, naming that direction.
     """
-    given, measured, is_recording = recorded(model, commands, measured)
-    if is_recording:
-        input_names = input_names or getattr(model, "inputs", ()) or None
-    given = by_name(model, given)
-    input_names = input_names or names_of(given) or None
-    output_names = output_names or names_of(measured) or None
-    commands = table("commands", given)
-    measured = table("measured", measured, len(commands))
-    n, m = commands.shape[1], measured.shape[1]
-    inputs = axis_names("input_names", input_names, "u", n)
-    outputs = axis_names("output_names", output_names, "y", m)
-    weight = np.ones(len(commands))
-    if weights is not None:
-        weight = array_of("weights", weights, len(commands))
-        require_none(weight < 0.0, weight, "weights must not be negative")
+    readings = _readings(model, commands, measured, weights, input_names, output_names)
+    n, m = len(readings.input_names), len(readings.output_names)
     noise, plain_noise = _noise(noise, noise_std, common_noise, m)
-    for name, unit in (
-        ("command_unit", command_unit),
-        ("measured_unit", measured_unit),
-    ):
-        if not isinstance(unit, str):
-            raise ValueError(f"{name} must be text, got {unit!r}")
-    about: dict[str, Any] = {
-        "input_names": inputs,
-        "output_names": outputs,
-        "command_unit": command_unit,
-        "measured_unit": measured_unit,
-        "provenance": _provenance(commands, measured, weight, notes),
-    }
-    if accuracy is not None:
-        if not array_of("accuracy", accuracy) > 0.0:
-            raise ValueError(f"accuracy must be positive, got {accuracy}")
-        about["provenance"]["accuracy"] = float(accuracy)
+    about = _about(readings, command_unit, measured_unit, notes, accuracy)
     model = _affine(n, m) if model is None else model
-    model = require_fitting(model, commands, measured)
+    model = require_fitting(model, readings.commands, readings.measured)
     plain = prior is None and plain_noise and loss in (None, "gaussian")
     affine = isinstance(model, Affine)
     if plain and (affine or model.affine(model.nominal) is not None):
         loss = "gaussian"
     fields = fit_model(
-        commands,
-        measured,
-        weight,
+        readings.commands,
+        readings.measured,
+        readings.weights,
         model=model,
         prior=prior,
         noise=noise,
         loss=loss or "student",
         common_noise=common_noise,
-        excited=inputs if plain and affine else (),
+        excited=readings.input_names if plain and affine else (),
     )
     calibration = Calibration(**fields, **about)
     if not calibration.verdict.good and not _exact(calibration):
         warnings.warn(str(calibration.verdict), stacklevel=2)
     return calibration
+
+
+class _Readings(NamedTuple):
+    """The measurements of a fit, checked."""
+
+    commands: Array  # (N, n)
+    measured: Array  # (N, m)
+    weights: Array  # (N,)
+    input_names: tuple[str, ...]  # n
+    output_names: tuple[str, ...]  # m
+
+
+def _readings(
+    model: Model | None,
+    commands: Any,
+    measured: Any,
+    weights: ArrayLike | None,
+    input_names: Sequence[str] | None,
+    output_names: Sequence[str] | None,
+) -> _Readings:
+    """The arguments of ``identify`` as tables, of a recording its rests."""
+    commands, measured, is_recording = recorded(model, commands, measured)
+    if is_recording:
+        input_names = input_names or getattr(model, "inputs", ()) or None
+    commands = by_name(model, commands)
+    input_names = input_names or names_of(commands) or None
+    output_names = output_names or names_of(measured) or None
+    told = table("commands", commands)
+    reached = table("measured", measured, len(told))
+    inputs = axis_names("input_names", input_names, "u", told.shape[1])
+    outputs = axis_names("output_names", output_names, "y", reached.shape[1])
+    weight = np.ones(len(told))
+    if weights is not None:
+        weight = array_of("weights", weights, len(told))
+        require_none(weight < 0.0, weight, "weights must not be negative")
+    return _Readings(told, reached, weight, inputs, outputs)
+
+
+def _about(
+    readings: _Readings,
+    command_unit: str,
+    measured_unit: str,
+    notes: Mapping[str, Any] | None,
+    accuracy: float | None,
+) -> dict[str, Any]:
+    """The fields of a ``Calibration`` that say what it is of: names, units, origin."""
+    units = {"command_unit": command_unit, "measured_unit": measured_unit}
+    for name, unit in units.items():
+        if not isinstance(unit, str):
+            raise ValueError(f"{name} must be text, got {unit!r}")
+    provenance = _provenance(
+        readings.commands, readings.measured, readings.weights, notes
+    )
+    if accuracy is not None:
+        if not array_of("accuracy", accuracy) > 0.0:
+            raise ValueError(f"accuracy must be positive, got {accuracy}")
+        provenance["accuracy"] = float(accuracy)
+    return {
+        "input_names": readings.input_names,
+        "output_names": readings.output_names,
+        **units,
+        "provenance": provenance,
+    }
 
 
 # The model of most calibrations, whose names are then made once.

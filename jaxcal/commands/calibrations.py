@@ -127,16 +127,11 @@ def postures(
     if more < 1:
         reason = f"-k must be more than the {k - more} that were reached"
         raise ValueError(f"{reason}, got {k}")
-    targets = None if placed else near
-    if board is not None:
-        seen = arm.sensor
-        if not isinstance(seen, Board) or len(board) != 2:
-            raise ValueError("--board WIDTH,HEIGHT is of --sensor board")
-        arm = arm.measured_with(dataclasses.replace(seen, extent=(board[0], board[1])))
+    arm = _with_board(arm, board)
     offered = arm.postures(
         count,
         seed=seed,
-        near=targets,
+        near=None if placed else near,
         camera=camera,
         distance=away,
         tilt=tilt,
@@ -151,25 +146,52 @@ def postures(
     plan = offered[chosen]
     plan = plan[arm.in_turn(plan)]
     if picture:
-        with needs("plots", "--picture"):
-            from matplotlib.figure import Figure
-
-        from jaxcal import plots
-
-        figure = Figure(figsize=(8, 2.2 * -(-more // 4)), layout="constrained")
-        plots.postures(figure, arm, plan).savefig(picture)
-    turning = [i for i, unit in enumerate(arm.command_units) if unit == "deg"]
-    if one_side is not None:
-        at, width = arm.from_one_side(plan, one_side), plan.shape[1]
-        header = (*header, *(f"from {name}" for name in arm.joint_names))
-        turning += [width + i for i in turning]
-        plan = np.hstack([plan, at])
-    if of_arm.radians:
-        plan[:, turning] = np.radians(plan[:, turning])
-    rows = plan.tolist()
+        _draw(arm, plan, picture)
+    header, rows = _rows_of(arm, plan, one_side, of_arm.radians)
     if not output.written(header, rows):
         cells = [[f"{i + 1}", *(f"{x:.4g}" for x in r)] for i, r in enumerate(rows)]
         print("\n".join(aligned([["", *header], *cells])))
+
+
+def _with_board(arm: SerialChain, size: list[float] | None) -> SerialChain:
+    """The arm whose board is of this width and height, if they are given."""
+    if size is None:
+        return arm
+    if not isinstance(arm.sensor, Board) or len(size) != 2:
+        raise ValueError("--board WIDTH,HEIGHT is of --sensor board")
+    board = dataclasses.replace(arm.sensor, extent=(size[0], size[1]))
+    return arm.measured_with(board)
+
+
+def _draw(arm: SerialChain, plan: Array, path: pathlib.Path) -> None:
+    """A picture of the arm at each posture of the plan."""
+    with needs("plots", "--picture"):
+        from matplotlib.figure import Figure
+
+    from jaxcal import plots
+
+    figure = Figure(figsize=(8, 2.2 * -(-len(plan) // 4)), layout="constrained")
+    plots.postures(figure, arm, plan).savefig(path)
+
+
+def _rows_of(
+    arm: SerialChain, plan: Array, one_side: float | None, radians: bool
+) -> tuple[tuple[str, ...], list[list[float]]]:
+    """The names of the columns of a plan (N, n), and its rows.
+
+    ``one_side``: degrees below each posture where its joints come from, which are then
+    columns too.
+    """
+    header = (*arm.joint_names, *arm.sensor.inputs)
+    turning = [i for i, unit in enumerate(arm.command_units) if unit == "deg"]
+    if one_side is not None:
+        start, width = arm.from_one_side(plan, one_side), plan.shape[1]
+        header = (*header, *(f"from {name}" for name in arm.joint_names))
+        turning += [width + i for i in turning]
+        plan = np.hstack([plan, start])
+    if radians:
+        plan[:, turning] = np.radians(plan[:, turning])
+    return header, plan.tolist()
 
 
 def _worth(design: Design, chosen: NDArray[np.int_], seed: int) -> str:
@@ -285,21 +307,11 @@ def identify(
             raise ValueError(f"{out} is there already; --overwrite writes over it")
     else:
         readings = _readings(of_arm, machine, table, inputs, outputs, weights)
-    given = noise[0] if noise and len(noise) == 1 else noise
-    with_play = None
-    if play is not None:
-        if not isinstance(machine, SerialChain):
-            raise ValueError("--play is of an arm, --model FILE.urdf")
-        with_play = machine.noise_with_play(play)
-        if given is not None:
-            with_play = dataclasses.replace(with_play, std=given)
-            given = None
     calibration = identified(
         readings.commands,
         readings.measured,
         model=machine,
-        noise=with_play,
-        noise_std=given,
+        **_noise(machine, noise, play),
         weights=table.columns([weights])[:, 0] if weights else None,
         input_names=readings.inputs,
         output_names=readings.outputs,
@@ -313,18 +325,7 @@ def identify(
             f"{corrected} is not written, --unproven writes it all the same:\n"
             f"{calibration.verdict}"
         )
-    saved = []
-    if as_urdf:
-        saved = [f"saved {out}, tip link {calibration.to_urdf(out, force=overwrite)}"]
-    elif out:
-        calibration.save(out)
-        saved = [f"saved {out}"]
-    if servos_out:
-        steps = calibration.to_lerobot(
-            servos_out, str(recording.servos), force=overwrite
-        )
-        moved = ", ".join(f"{name} {step:+d}" for name, step in steps.items())
-        saved.append(f"saved {servos_out}, steps: {moved}")
+    saved = _saved(calibration, out, servos_out, str(recording.servos), overwrite)
     good = True
     if report:
         good = calibration.report(
@@ -345,6 +346,37 @@ def identify(
     if report:
         print(f"report {os.path.join(report, 'index.html')}")
     return int(not good)
+
+
+def _noise(machine: Any, stds: list[float] | None, play: float | None) -> Any:
+    """``noise`` and ``noise_std`` of ``identify``, by --noise and --play."""
+    std = stds[0] if stds and len(stds) == 1 else stds
+    if play is None:
+        return {"noise": None, "noise_std": std}
+    if not isinstance(machine, SerialChain):
+        raise ValueError("--play is of an arm, --model FILE.urdf")
+    noise = machine.noise_with_play(play)
+    if std is not None:
+        noise = dataclasses.replace(noise, std=std)
+    return {"noise": noise, "noise_std": None}
+
+
+def _saved(
+    calibration: Calibration, out: str, servos_out: str, servos: str, overwrite: bool
+) -> list[str]:
+    """Write the files that were asked for; a line of each."""
+    lines = []
+    if out.lower().endswith(".urdf"):
+        tip = calibration.to_urdf(out, force=overwrite)
+        lines = [f"saved {out}, tip link {tip}"]
+    elif out:
+        calibration.save(out)
+        lines = [f"saved {out}"]
+    if servos_out:
+        steps = calibration.to_lerobot(servos_out, servos, force=overwrite)
+        moved = ", ".join(f"{name} {step:+d}" for name, step in steps.items())
+        lines.append(f"saved {servos_out}, steps: {moved}")
+    return lines
 
 
 class _Readings(NamedTuple):

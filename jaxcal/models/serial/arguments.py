@@ -2,26 +2,84 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import array_of, in_words, numbers, whole_number
+from jaxcal.checks import array_of, in_words, numbers, one_of, whole_number
+from jaxcal.models.sensors import SENSORS, Position, Sensor
 from jaxcal.models.serial.arm import Load
 
 __all__ = [
+    "joint_kinds",
     "joint_numbers",
+    "limits_of",
     "load",
     "pose_matrix",
-    "require_degrees",
+    "rows_of",
+    "sensor_of",
     "transform",
 ]
 
 Array = NDArray[np.float64]
 
 
-def require_degrees(rows: Array) -> None:
+def rows_of(table: ArrayLike) -> Array:
+    """(n, 5) a, alpha, d, theta, beta of a DH table (n, 4) or (n, 5), in degrees."""
+    rows = numbers("table", table)
+    if rows.ndim != 2 or rows.shape[1] not in (4, 5) or not len(rows):
+        raise ValueError(
+            "table must have shape (n, 4), rows (a, alpha, d, theta), or (n, 5) "
+            f"with beta, got {rows.shape}"
+        )
+    rows = np.column_stack([rows, np.zeros((len(rows), 5 - rows.shape[1]))])
+    _require_degrees(rows)
+    return rows
+
+
+def joint_kinds(joints: str | None, n: int) -> str:
+    """n letters R or P; all R for None."""
+    kinds = "R" * n if joints is None else joints
+    if len(kinds) != n or set(kinds) - set("RP"):
+        raise ValueError(
+            f"joints must be {n} letters R (revolute) or P (prismatic), got {kinds!r}"
+        )
+    return kinds
+
+
+def sensor_of(given: Sensor | Mapping[str, Any] | None) -> Sensor:
+    """A sensor, that of its ``to_dict()``, or ``Position()`` for None."""
+    if given is None:
+        return Position()
+    if isinstance(given, Mapping):
+        kind = one_of("kind of the sensor", given.get("kind"), tuple(SENSORS))
+        given = SENSORS[kind].from_dict(given)
+    if not isinstance(given, Sensor):
+        raise ValueError(
+            f"sensor must be of jaxcal.models, such as Position(), got {given!r}"
+        )
+    return given
+
+
+def limits_of(given: ArrayLike | None, columns: int) -> Array:
+    """(J, 2) least and greatest; None of a pair is not known."""
+    open_ended = np.tile([-np.inf, np.inf], (columns, 1))
+    if given is None:
+        return open_ended
+    limits = array_of("limits", given, columns, 2, finite=False)  # None becomes NaN
+    limits = np.where(np.isnan(limits), open_ended, limits)
+    bad = np.flatnonzero(limits[:, 0] > limits[:, 1])
+    if bad.size:
+        raise ValueError(
+            "limits must be a least and a greatest command, got "
+            f"{in_words(limits[bad[0]])}"
+        )
+    return limits
+
+
+def _require_degrees(rows: Array) -> None:
     """Refuse a table whose right angles are all in radians."""
     alpha = rows[:, 1][rows[:, 1] != 0.0]
     right = np.isclose(np.abs(alpha), np.pi / 2, atol=2e-3)

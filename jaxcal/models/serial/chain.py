@@ -15,12 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import array_of, axis_names, in_words, numbers, one_of
 from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
 from jaxcal.models.recording import Recording
-from jaxcal.models.sensors import SENSORS, Pose, Position, Sensor, Several
+from jaxcal.models.sensors import Pose, Position, Sensor, Several
 from jaxcal.models.serial.arguments import (
+    joint_kinds,
     joint_numbers,
+    limits_of,
     load,
     pose_matrix,
-    require_degrees,
+    rows_of,
+    sensor_of,
     transform,
 )
 from jaxcal.models.serial.arm import Arm
@@ -130,46 +133,26 @@ class SerialChain(Arm, Model):
             source: the URDF file that the arm comes from: its text, the base and tip
                 links and the locked joints.
         """
-        rows = numbers("table", table)
-        if rows.ndim != 2 or rows.shape[1] not in (4, 5) or not len(rows):
-            raise ValueError(
-                "table must have shape (n, 4), rows (a, alpha, d, theta), or (n, 5) "
-                f"with beta, got {rows.shape}"
-            )
+        rows = rows_of(table)
         n = len(rows)
-        rows = np.column_stack([rows, np.zeros((n, 5 - rows.shape[1]))])
-        require_degrees(rows)
-        joints = "R" * n if joints is None else joints
-        if len(joints) != n or set(joints) - set("RP"):
-            raise ValueError(
-                f"joints must be {n} letters R (revolute) or P (prismatic), "
-                f"got {joints!r}"
-            )
+        joints = joint_kinds(joints, n)
         moves = np.eye(n) if drive is None else array_of("drive", drive, n, "J")
         columns = moves.shape[1]
-        names = joint_names or _numbered(columns)
         at_zero = np.zeros(n) if offset is None else array_of("offset", offset, n)
-        sensor = Position() if sensor is None else sensor
-        if isinstance(sensor, Mapping):
-            kind = one_of("kind of the sensor", sensor.get("kind"), tuple(SENSORS))
-            sensor = SENSORS[kind].from_dict(sensor)
-        if not isinstance(sensor, Sensor):
-            raise ValueError(
-                f"sensor must be of jaxcal.models, such as Position(), got {sensor!r}"
-            )
+        sensor = sensor_of(sensor)
         end = transform("tool", tool)
         if compliance is None:
             turning = [i + 1 for i in range(n) if joints[i] == "R"]
             compliance = turning if sensor.compliant else ()
-        number = joint_numbers("compliance", compliance, joints, "R")
+        bending = joint_numbers("compliance", compliance, joints, "R")
         bent = joint_numbers("harmonics", harmonics, joints, "R")
         swings = np.zeros((len(bent), 4)) if waves is None else numbers("waves", waves)
         if swings.size != 4 * len(bent):
             raise ValueError(f"waves must have shape ({len(bent)}, 4)")
-        given = list(loads)
-        if number and not given:
-            given = [(i, 1.0, (0.0, 0.0, 0.0)) for i in range(2, n)]
-            given.append((n, 1.0, end[:3, 3]))
+        if bending and not len(loads):
+            loads = [(i, 1.0, (0.0, 0.0, 0.0)) for i in range(2, n)]
+            loads = [*loads, (n, 1.0, end[:3, 3])]
+        per_torque = np.zeros(len(bending)) if yields is None else yields
         return cls(
             rows,
             one_of("convention", convention, ("standard", "modified")),
@@ -178,20 +161,16 @@ class SerialChain(Arm, Model):
             end,
             sensor,
             joint_numbers("gears", gears, joints),
-            number,
-            array_of(
-                "yields",
-                np.zeros(len(number)) if yields is None else yields,
-                len(number),
-            ),
+            bending,
+            array_of("yields", per_torque, len(bending)),
             bent,
             swings.reshape(-1, 4),
-            tuple(load(each, n) for each in given),
+            tuple(load(one, n) for one in loads),
             tuple(array_of("gravity", gravity, 3).tolist()),
-            axis_names("joint_names", names, "", columns),
+            axis_names("joint_names", joint_names or _numbered(columns), "", columns),
             moves,
             at_zero,
-            _limits(limits, columns),
+            limits_of(limits, columns),
             None if source is None else dict(source),
         )
 
@@ -813,12 +792,14 @@ class SerialChain(Arm, Model):
         )
         first = 5 * len(self.joints)
         last = first + len(self.gears)
-        at = [i - 1 for i in self.gears]
-        moves = self._moves(commands)[:, at]
         if self.harmonics:
             swing, goes = self._swing(commands, parameters)
-            moves = moves * goes[at].T
-        columns[..., first:last] *= moves[:, None]
+        if self.gears:
+            at = [i - 1 for i in self.gears]
+            moves = self._moves(commands)[:, at]
+            if self.harmonics:
+                moves = moves * goes[at].T
+            columns[..., first:last] *= moves[:, None]
         if self.compliance:
             torque = self._torque(commands).T
             columns[..., last : last + len(self.compliance)] *= torque[:, None]
@@ -1028,19 +1009,3 @@ def _far(points: Array, measured: Array, length: float) -> Array:
 def _numbered(columns: int) -> tuple[str, ...]:
     """Names of joints that have none."""
     return tuple(f"joint {i + 1}" for i in range(columns))
-
-
-def _limits(given: ArrayLike | None, columns: int) -> Array:
-    """(J, 2) least and greatest; None of a pair is not known."""
-    open_ended = np.tile([-np.inf, np.inf], (columns, 1))
-    if given is None:
-        return open_ended
-    limits = array_of("limits", given, columns, 2, finite=False)  # None becomes NaN
-    limits = np.where(np.isnan(limits), open_ended, limits)
-    bad = np.flatnonzero(limits[:, 0] > limits[:, 1])
-    if bad.size:
-        raise ValueError(
-            "limits must be a least and a greatest command, got "
-            f"{in_words(limits[bad[0]])}"
-        )
-    return limits
