@@ -200,80 +200,112 @@ def postures(
         )
     arm, targets = _aimed(arm, near)
     rng = np.random.default_rng(seed)
-    low, high = arm.limits.T
-    turns = np.array(arm.command_units) == "deg"
-    if not np.isfinite(arm.limits[~turns]).all():
-        raise ValueError("limits of sliding joints must be known: limits=...")
-    low, high = np.maximum(low, -180.0), np.minimum(high, 180.0)
-    unit = np.where(turns, 1.0, (high - low) / 100.0)
-    kept = np.zeros((0, arm.num_inputs))
-    lost: Counter[str] = Counter()
-    tried = 0
-    num_places = arm.sensor.count if isinstance(arm.sensor, Landmarks) else 1
-    reached = np.zeros(num_places, dtype=int)
-    refused: list[Counter[str]] = [Counter() for _ in reached]
+    collection = _Collection(arm, count, allowed)
+    low, high = collection.low, collection.high
     for batch in range(_ROUNDS):
-        if batch == _VAIN and not reached.all():
+        if batch == _VAIN and not collection.reached.all():
             break
-        size = max(2 * (count - len(kept)), 64)
-        if len(kept):  # more where few were any good: a board is seldom in view
-            size = max(size, min(size * tried // (4 * len(kept)), _BATCH))
-        tried += size
-        starts = rng.uniform(low, high, (size, arm.num_joints))
-        labels = np.zeros((size, len(arm.sensor.inputs)))
-        if isinstance(arm.sensor, Landmarks) and arm.sensor.count > 1:
-            labels[:, 0] = (len(kept) + np.arange(size)) % arm.sensor.count
-        commands = np.hstack([starts, labels])
+        commands, places = collection.starts(rng)
         if view is not None:
-            trial, reason = _pictured(arm, commands, low, high, view, rng)
+            commands, reasons = _pictured(arm, commands, low, high, view, rng)
         else:
-            trial, reason = _reach(arm, commands, low, high, targets)
+            commands, reasons = _reach(arm, commands, low, high, targets)
         if room is not None:
-            reason = [
-                a or b for a, b in zip(reason, room.reasons(arm, trial), strict=True)
-            ]
-        which = (
-            labels[:, 0].astype(int) if num_places > 1 else 0 * starts[:, 0].astype(int)
-        )
-        for row, why, place in zip(trial, reason, which, strict=True):
-            joints = row[: arm.num_joints]
-            if len(kept) == count and reached[place]:
-                continue  # enough; of the other places one posture is looked for
-            if not why:
-                apart = np.abs((kept[:, : arm.num_joints] - joints) / unit)
-                if len(kept) and apart.max(axis=1).min() < _APART:
-                    why = "are next to another one"
-                elif allowed is not None and not allowed(joints.copy()):
-                    why = "are not allowed"
-            if why:
-                lost[why] += 1
-                refused[place][why] += 1
-                continue
-            reached[place] += 1
-            if len(kept) < count:
-                kept = np.vstack([kept, row])
-        if len(kept) == count and reached.all():
+            beside = room.reasons(arm, commands)
+            reasons = [a or b for a, b in zip(reasons, beside, strict=True)]
+        for command, reason, place in zip(commands, reasons, places, strict=True):
+            collection.add(command, reason, place)
+        if collection.complete:
+            kept = collection.kept
             return kept[in_turn(kept, arm.num_joints)]
-    for place in np.flatnonzero(reached == 0)[:1] if num_places > 1 else ():
-        where = ""
-        if arm.sensor.places is not None:
-            where = f" at {in_words(arm.sensor.places[place])}"
-        why = ", ".join(f"{n} {why}" for why, n in refused[place].most_common())
-        raise ValueError(
-            f"{arm.sensor.kind} {place}{where} must be reached by a posture: of "
-            f"{refused[place].total()} postures tried {why}"
+    raise ValueError(collection.shortfall(near))
+
+
+class _Collection:
+    """Postures that can be measured, and what became of the others that were tried."""
+
+    def __init__(
+        self, arm: Chain, count: int, allowed: Callable[[Array], bool] | None
+    ) -> None:
+        self.arm, self.count, self.allowed = arm, count, allowed
+        turns = np.array(arm.command_units) == "deg"
+        if not np.isfinite(arm.limits[~turns]).all():
+            raise ValueError("limits of sliding joints must be known: limits=...")
+        low, high = arm.limits.T
+        self.low, self.high = np.maximum(low, -180.0), np.minimum(high, 180.0)
+        # (J,) two of these are as far as postures must be apart.
+        self.unit = np.where(turns, 1.0, (self.high - self.low) / 100.0)
+        self.kept, self.tried = np.zeros((0, arm.num_inputs)), 0
+        num_places = arm.sensor.count if isinstance(arm.sensor, Landmarks) else 1
+        self.reached = np.zeros(num_places, dtype=int)  # postures at each place
+        self.refused: list[Counter[str]] = [Counter() for _ in self.reached]
+
+    @property
+    def complete(self) -> bool:
+        """As many as were asked for, and one at each place."""
+        return bool(len(self.kept) == self.count and self.reached.all())
+
+    def starts(self, rng: np.random.Generator) -> tuple[Array, NDArray[np.intp]]:
+        """(N, n) random commands to try next, and (N,) the place that each is for."""
+        kept, arm = len(self.kept), self.arm
+        size = max(2 * (self.count - kept), 64)
+        if kept:  # more where few were any good: a board is seldom in view
+            size = max(size, min(size * self.tried // (4 * kept), _BATCH))
+        self.tried += size
+        joints = rng.uniform(self.low, self.high, (size, arm.num_joints))
+        labels = np.zeros((size, len(arm.sensor.inputs)))
+        places = (kept + np.arange(size)) % len(self.reached)
+        if len(self.reached) > 1:
+            labels[:, 0] = places
+        return np.hstack([joints, labels]), places
+
+    def add(self, command: Array, reason: str, place: int) -> None:
+        """Keep a command for a place, unless a ``reason`` against it is given or found:
+        another is near, or it is not allowed."""
+        joints = command[: self.arm.num_joints]
+        if len(self.kept) == self.count and self.reached[place]:
+            return  # enough; of the other places one posture is looked for
+        if not reason:
+            apart = np.abs((self.kept[:, : len(joints)] - joints) / self.unit)
+            if len(self.kept) and apart.max(axis=1).min() < _APART:
+                reason = "are next to another one"
+            elif self.allowed is not None and not self.allowed(joints.copy()):
+                reason = "are not allowed"
+        if reason:
+            self.refused[place][reason] += 1
+            return
+        self.reached[place] += 1
+        if len(self.kept) < self.count:
+            self.kept = np.vstack([self.kept, command])
+
+    def shortfall(self, near: ArrayLike | None) -> str:
+        """What is missing: a place that no posture reaches, or postures."""
+        sensor, missed = self.arm.sensor, np.flatnonzero(self.reached == 0)
+        if len(self.reached) > 1 and len(missed):
+            place = missed[0]
+            where = ""
+            if sensor.places is not None:
+                where = f" at {in_words(sensor.places[place])}"
+            refused = self.refused[place]
+            return (
+                f"{sensor.kind} {place}{where} must be reached by a posture: of "
+                f"{refused.total()} postures tried {_counted(refused)}"
+            )
+        reasons = _counted(sum(self.refused, Counter()))
+        if not len(self.kept):
+            target = "what the sensor reads" if near is None else f"near = {near}"
+            return (
+                f"no posture reaches {target} (of {self.tried} tried {reasons}): is it "
+                "in the unit of the arm's lengths, and in the frame of its base?"
+            )
+        return (
+            f"count must be at most {len(self.kept)} for this arm and sensor, got "
+            f"{self.count}: of {self.tried} postures tried {reasons}"
         )
-    reasons = ", ".join(f"{number} {why}" for why, number in lost.most_common())
-    if not len(kept):
-        target = "what the sensor reads" if near is None else f"near = {near}"
-        raise ValueError(
-            f"no posture reaches {target} (of {tried} tried {reasons}): is it in the "
-            "unit of the arm's lengths, and in the frame of its base?"
-        )
-    raise ValueError(
-        f"count must be at most {len(kept)} for this arm and sensor, got {count}: of "
-        f"{tried} postures tried {reasons}"
-    )
+
+
+def _counted(reasons: Counter[str]) -> str:
+    return ", ".join(f"{number} {reason}" for reason, number in reasons.most_common())
 
 
 class Reachable:

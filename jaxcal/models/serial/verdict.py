@@ -111,82 +111,26 @@ def verdict(calibration: Fit) -> Verdict:
             unit=unit,
         )
     used = np.flatnonzero(calibration.loss_weights > 0.0)
-    commands, residuals = calibration.commands[used], calibration.residuals[used]
-    usual = np.asarray(model.default_noise().std)
-    measured = residuals + calibration.predict(commands)
+    commands, usual = calibration.commands[used], np.asarray(model.default_noise().std)
+    measured = calibration.residuals[used] + calibration.predict(commands)
     errors = _errors(calibration, used, measured, usual)
-    explains, reasons = _scattered(calibration, usual)
-    swapped = _swapped(calibration, model, used, explains)
-    for row, other in swapped.items():
-        reasons.append(f"measurement {row} fits {model.sensor.kind} {other} instead")
-    loose = [row for row in calibration.outliers if row not in swapped]
-    reasons += [outlying(calibration, row) for row in loose]
-    for doubled in np.flatnonzero(calibration.loss_weights == 0.0):
-        same = (commands == calibration.commands[doubled]).all(axis=1)
-        if model.sensor.zeros and same.any():
-            reasons.append(
-                f"measurement {doubled} is {used[same][0]} again, counted once"
-            )
-    right = ~np.isin(used, list(swapped))
-    exchanged = _exchanged(calibration, model)
-    moved = _moved(calibration, model, commands[right], residuals[right], used[right])
-    limit = _LOOSE if len(used) > _SPARSE else 0.0
-    far = (calibration.distance[list(calibration.outliers)] > limit**2).any()
-    contradict = bool(swapped or exchanged or far)
-    if contradict:
-        reasons.insert(0, "some readings contradict the others")
+    explains, scatter = _scattered(calibration, usual)
     mistaken = ""
     if not explains and errors.nominal > _PLAIN * model.length:
         mistaken = mistaken_columns(model, commands, measured)
-    tip, doubtful = _other_tip(calibration, model)
-    other_arm = [] if mistaken else _other_links(calibration, model)
-    other_arm = other_arm or _other_distances(calibration, model)
-    still, unused = _still(model, commands)
-    told = reasons + moved + exchanged + _far(calibration) + tip + other_arm + still
-    if mistaken:  # what the fit made of it is no reason
-        told = [mistaken]
-    doubtful |= bool(contradict or other_arm or unused or mistaken)
-    clean = not (doubtful or (moved and not explains))
+    findings = _findings(calibration, used, scatter, explains, mistaken)
+    clean = not (findings.doubtful or (findings.moved and not explains))
     accuracy = calibration.provenance.get("accuracy")
     if accuracy is not None:
         good = clean and errors.interval[1] <= accuracy
     else:
         enough = explains or errors.interval[1] < _LITTLE * errors.nominal
         good = bool(clean and errors.helps and enough)
-    rows = ", ".join(map(str, sorted({*swapped, *calibration.outliers})))
-    kind = model.sensor.kind
-    steps = (
-        (mistaken, "correct the columns, then identify again"),
-        (exchanged, "look at the sockets' columns"),
-        (
-            contradict,
-            f"look at measurement {rows} (counted from 0): correct it, measure "
-            "it again or leave it out",
-        ),
-        (
-            moved and not explains,
-            f"measure again with the {kind} fixed, or number it as two: one {kind} "
-            "before it moved and another after",
-        ),
-        (
-            doubtful,
-            "clear up what ends in a question or an advice, then identify again",
-        ),
-        (good, models.USE),
-        (
-            accuracy is not None or errors.helps is None,
-            "measure more postures: jaxcal postures --measured chooses them",
-        ),
-        (
-            True,
-            "look at the residuals (report, --report); keep the nominal machine until "
-            "they are explained",
-        ),
-    )
+    more = accuracy is not None or errors.helps is None
     return Verdict(
         good=good,
-        reasons=tuple(told),
-        next_step=next(step for holds, step in steps if holds),
+        reasons=findings.reasons,
+        next_step=models.USE if good else _next_step(model, findings, explains, more),
         unit=unit,
         explains=explains,
         helps=errors.helps,
@@ -197,6 +141,113 @@ def verdict(calibration: Fit) -> Verdict:
         anywhere=_anywhere(calibration, model, commands),
         accuracy=accuracy,
     )
+
+
+class _Findings(NamedTuple):
+    """What speaks against a calibration, and the sentences that say it."""
+
+    reasons: tuple[str, ...]
+    mistaken: bool  # columns of joints are reversed or exchanged
+    exchanged: bool  # so are sockets
+    moved: bool  # a socket or plane seems to have moved
+    contradicting: tuple[int, ...]  # measurements that contradict the others
+    doubtful: bool  # the readings or the description of the arm may be wrong
+
+
+def _findings(
+    calibration: Fit,
+    used: NDArray[np.intp],
+    scatter: list[str],
+    explains: bool,
+    mistaken: str,
+) -> _Findings:
+    """What is wrong, by name.
+
+    Args:
+        calibration: of an arm.
+        used: (N,) rows of the measurements that count.
+        scatter: what was said of the scatter of the readings.
+        explains: the noise explains it.
+        mistaken: what was said of reversed or exchanged columns, if they are.
+    """
+    model, commands = calibration.model, calibration.commands[used]
+    swapped = _swapped(calibration, model, used, explains)
+    exchanged = _exchanged(calibration, model)
+    limit = _LOOSE if len(used) > _SPARSE else 0.0
+    far = (calibration.distance[list(calibration.outliers)] > limit**2).any()
+    contradicting: tuple[int, ...] = ()
+    reasons = scatter + _wrong_rows(calibration, used, swapped)
+    if swapped or exchanged or far:
+        reasons.insert(0, "some readings contradict the others")
+        contradicting = tuple(sorted({*swapped, *calibration.outliers}))
+    right = used[~np.isin(used, list(swapped))]
+    moved = _moved(calibration, model, right)
+    tip, doubtful = _other_tip(calibration, model)
+    other_arm = [] if mistaken else _other_links(calibration, model)
+    other_arm = other_arm or _other_distances(calibration, model)
+    still, unused = _still(model, commands)
+    reasons += moved + exchanged + _far(calibration) + tip + other_arm + still
+    doubtful |= bool(contradicting or exchanged or other_arm or unused or mistaken)
+    return _Findings(
+        # What the fit made of mistaken columns is no reason.
+        (mistaken,) if mistaken else tuple(reasons),
+        bool(mistaken),
+        bool(exchanged),
+        bool(moved),
+        contradicting,
+        doubtful,
+    )
+
+
+def _wrong_rows(
+    calibration: Fit, used: NDArray[np.intp], swapped: dict[int, int]
+) -> list[str]:
+    """Rows of another socket, outliers, and contacts that were written twice."""
+    sensor, commands = calibration.model.sensor, calibration.commands
+    said = [
+        f"measurement {row} fits {sensor.kind} {other} instead"
+        for row, other in swapped.items()
+    ]
+    loose = [row for row in calibration.outliers if row not in swapped]
+    said += [outlying(calibration, row) for row in loose]
+    for doubled in np.flatnonzero(calibration.loss_weights == 0.0):
+        same = (commands[used] == commands[doubled]).all(axis=1)
+        if sensor.zeros and same.any():
+            said.append(f"measurement {doubled} is {used[same][0]} again, counted once")
+    return said
+
+
+def _next_step(model: Chain, findings: _Findings, explains: bool, more: bool) -> str:
+    """What to do about a calibration that is not good.
+
+    ``more`` measurements may make it so.
+    """
+    kind, rows = model.sensor.kind, ", ".join(map(str, findings.contradicting))
+    steps = (
+        (findings.mistaken, "correct the columns, then identify again"),
+        (findings.exchanged, "look at the sockets' columns"),
+        (
+            findings.contradicting,
+            f"look at measurement {rows} (counted from 0): correct it, measure "
+            "it again or leave it out",
+        ),
+        (
+            findings.moved and not explains,
+            f"measure again with the {kind} fixed, or number it as two: one {kind} "
+            "before it moved and another after",
+        ),
+        (
+            findings.doubtful,
+            "clear up what ends in a question or an advice, then identify again",
+        ),
+        (more, "measure more postures: jaxcal postures --measured chooses them"),
+        (
+            True,
+            "look at the residuals (report, --report); keep the nominal machine until "
+            "they are explained",
+        ),
+    )
+    return next(step for holds, step in steps if holds)
 
 
 class _Errors(NamedTuple):
@@ -449,17 +500,11 @@ def _groups(model: Chain, commands: Array) -> list[NDArray[np.intp]]:
     return [np.flatnonzero(which == i) for i in range(model.sensor.count)]
 
 
-def _moved(
-    calibration: Fit,
-    model: Chain,
-    commands: Array,
-    residuals: Array,
-    names: NDArray[np.intp],
-) -> list[str]:
+def _moved(calibration: Fit, model: Chain, used: NDArray[np.intp]) -> list[str]:
     """Sockets and planes whose first and last contacts lie apart."""
     reasons, unit = [], _in(calibration)
-    rng = np.random.default_rng(0)
-    for i, rows in enumerate(_groups(model, commands)):
+    rng, residuals = np.random.default_rng(0), calibration.residuals[used]
+    for i, rows in enumerate(_groups(model, calibration.commands[used])):
         if len(rows) < 2 * _FEW:
             continue
         gain, at, apart, within = _split(residuals[rows])
@@ -469,7 +514,7 @@ def _moved(
             _split(residuals[rng.permutation(rows)])[0] for _ in range(_SHUFFLES)
         ]
         if gain > np.quantile(shuffled, 0.99):
-            first, last = names[rows[:at]], names[rows[at:]]
+            first, last = used[rows[:at]], used[rows[at:]]
             reasons.append(
                 f"{model.sensor.kind} {i} seems to have moved by {apart:.3g}{unit} "
                 f"between measurements {first[-1]} and {last[0]}"
