@@ -242,7 +242,7 @@ class _Collection:
 
     @property
     def complete(self) -> bool:
-        """As many as were asked for, and one at each place."""
+        """All that were asked for are kept, and one at each place."""
         return bool(len(self.kept) == self.count and self.reached.all())
 
     def starts(self, rng: np.random.Generator) -> tuple[Array, NDArray[np.intp]]:
