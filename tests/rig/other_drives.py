@@ -8,7 +8,7 @@ from harness import SESSION, fast_text
 from rig.config import parse_config
 from rig.journal import DeviceRecord
 from rig.simulator.faults import FaultInjector
-from rig.simulator.sensor import Sensor
+from rig.simulator.sensor import SimSensor
 from rig.workbench.commission import steps
 from rig.workbench.commission.operator import Operator
 
@@ -58,7 +58,7 @@ def sensed(places, noise=0.002):
         return MATRIX @ (np.array(places()) * gain) + BIAS + rng.normal(0, noise, 2)
 
     config = parse_config(stage_text('transport = "serial"\ndevice = "x"', "grbl", 0))
-    sensor = Sensor(config.readings, numbers, FaultInjector(), 200.0)
+    sensor = SimSensor(config.readings, numbers, FaultInjector(), 200.0)
     try:
         yield sensor.start(0), gain
     finally:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from rig.config.settings import BusSettings
 from rig.drives.modbus import Bus, BusError
-from rig.readings.stream import MAX_LINE, LineSplitter, Parser
+from rig.readings.stream import MAX_LINE, LineSplitter, StreamParser
 from rig.simulator.server import crc16
 
 IMU = changed(fast_config().imu, max_jump_deg=180.0)
@@ -71,7 +71,7 @@ def judged(line: bytes):
 @pytest.mark.parametrize("count", SIZES)
 def test_mutated_imu_lines(count):
     rng = random.Random(count)
-    parser, splitter = Parser(IMU), LineSplitter()
+    parser, splitter = StreamParser(IMU), LineSplitter()
     accepted = 0
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     splitter.feed(b"\n")
@@ -105,7 +105,7 @@ def test_mutated_imu_lines(count):
     pytest.param(20_000, id="full", marks=pytest.mark.slow)])  # fmt: skip
 def test_random_imu_streams_keep_no_memory(count):
     rng = random.Random(1)
-    parser, splitter = Parser(IMU), LineSplitter()
+    parser, splitter = StreamParser(IMU), LineSplitter()
     for number in range(count):
         data = rng.randbytes(rng.randint(0, 4096))
         if rng.random() < 0.3:
@@ -120,7 +120,7 @@ def test_random_imu_streams_keep_no_memory(count):
     pytest.param(100_000, id="full", marks=pytest.mark.slow)])  # fmt: skip
 def test_mutated_sensor_logger_messages(count):
     rng = random.Random(2)
-    parser = Parser(IMU)
+    parser = StreamParser(IMU)
     for number in range(count):
         q = np.array([rng.gauss(0, 1) for _ in range(4)])
         q /= np.linalg.norm(q)
