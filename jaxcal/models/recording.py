@@ -15,8 +15,9 @@ class Recording:
 
     ``identify`` and ``check`` take it for commands. Joints are found by name; what the
     sensor read is the mean over each rest, of the bag's messages: points or poses
-    (geometry_msgs PointStamped, PoseStamped), accelerations (sensor_msgs Imu), wrenches
-    (WrenchStamped), in metres, radians, newtons; contacts need none.
+    (geometry_msgs PointStamped, PoseStamped; of a board in the camera too), lengths of
+    a wire (sensor_msgs Range, std_msgs Float64), accelerations (sensor_msgs Imu),
+    wrenches (WrenchStamped), in metres, radians, newtons; contacts need none.
 
     Attributes:
         path: rosbag2 folder or MCAP file (extra ``ros``), or the folder of a LeRobot

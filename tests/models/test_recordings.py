@@ -7,9 +7,18 @@ import json
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import jaxcal
-from jaxcal.models import Recording, SerialChain, Servos, Socket, Wrench
+from jaxcal.models import (
+    Board,
+    Distance,
+    Recording,
+    SerialChain,
+    Servos,
+    Socket,
+    Wrench,
+)
 from jaxcal.models.serial.recordings import rests
 
 from .arms import CONTACTS
@@ -85,8 +94,27 @@ def test_a_bag_is_read_by_the_names_of_the_joints(plugin, tmp_path):
         other.at_rest(tmp_path / "bag")
 
 
-def write_bag(folder, joints, forces):
-    """A second at each posture with its wrench, a second of motion between two."""
+def wrench(types, header, value):
+    vector = types["geometry_msgs/msg/Vector3"]
+    both = types["geometry_msgs/msg/Wrench"](vector(*value[:3]), vector(*value[3:]))
+    return types["geometry_msgs/msg/WrenchStamped"](header, both)
+
+
+def pose(types, header, value):
+    turn = Rotation.from_rotvec(value[3:], degrees=True).as_quat()
+    at = types["geometry_msgs/msg/Point"](*value[:3])
+    whole = types["geometry_msgs/msg/Pose"](
+        at, types["geometry_msgs/msg/Quaternion"](*turn)
+    )
+    return types["geometry_msgs/msg/PoseStamped"](header, whole)
+
+
+def distance(types, header, value):
+    return types["sensor_msgs/msg/Range"](header, 0, 0.0, 0.0, 9.0, float(value[0]))
+
+
+def write_bag(folder, joints, forces, made=wrench):
+    """A second at each posture with its reading, a second of motion between two."""
     pytest.importorskip("rosbags")
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
@@ -96,15 +124,14 @@ def write_bag(folder, joints, forces):
     none, stamp = np.zeros(0), types["builtin_interfaces/msg/Time"](0, 0)
     header = types["std_msgs/msg/Header"](stamp, "")
     state = types["sensor_msgs/msg/JointState"]
-    stamped = types["geometry_msgs/msg/WrenchStamped"]
-    vector, wrench = (
-        types["geometry_msgs/msg/Vector3"],
-        types["geometry_msgs/msg/Wrench"],
-    )
+    of_reading = made(types, header, np.zeros(6)).__msgtype__
     with Writer(folder, version=9) as bag:
         states, read = (
-            bag.add_connection(topic, each.__msgtype__, typestore=store)
-            for topic, each in (("/joint_states", state), ("/ft", stamped))
+            bag.add_connection(topic, each, typestore=store)
+            for topic, each in (
+                ("/joint_states", state.__msgtype__),
+                ("/read", of_reading),
+            )
         )
         for i in range(20 * (2 * len(joints) - 1)):
             part, at = divmod(i, 20)
@@ -114,8 +141,7 @@ def write_bag(folder, joints, forces):
             message = state(header, list(PANDA.joint_names), posture, none, none)
             raw = store.serialize_cdr(message, state.__msgtype__)
             bag.write(states, 50_000_000 * i, raw)
-            message = stamped(header, wrench(vector(*force[:3]), vector(*force[3:])))
-            raw = store.serialize_cdr(message, stamped.__msgtype__)
+            raw = store.serialize_cdr(made(types, header, force), of_reading)
             bag.write(read, 50_000_000 * i + 1, raw)
 
 
@@ -148,6 +174,22 @@ def test_a_recording_is_identified_and_checked_as_its_table_is(tmp_path):
     assert not zeros.any()
     with pytest.raises(ValueError, match="measured must be given"):
         jaxcal.identify(joints, model=arm)
+
+
+def test_views_of_a_board_and_lengths_of_a_wire_are_recorded(tmp_path):
+    joints = np.random.default_rng(5).uniform(-60.0, 60.0, (4, 7))
+    joints[:, [3, 5]] += [-65.0, 100.0]
+    seen = np.random.default_rng(6).uniform(-0.4, 0.4, (4, 6)) * [1, 1, 1, 99, 99, 99]
+    seeing = PANDA.measured_with(Board("camera"))
+    write_bag(tmp_path / "board", joints, seen, pose)
+    commands, zeros = seeing.recorded(Recording(tmp_path / "board"))
+    np.testing.assert_allclose(commands, np.hstack([joints, seen]), atol=1e-2)
+    assert zeros.shape == (4, 6) and not zeros.any()
+    write_bag(tmp_path / "wire", joints, np.arange(1.0, 5.0)[:, None], distance)
+    drawn = PANDA.measured_with(Distance(2))
+    commands, lengths = drawn.recorded(Recording(tmp_path / "wire", which=[0, 1, 0, 1]))
+    np.testing.assert_array_equal(commands[:, 7], [0, 1, 0, 1])
+    np.testing.assert_allclose(lengths[:, 0], np.arange(1.0, 5.0), atol=1e-3)
 
 
 MOTORS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import array_of, axis_names, in_words, numbers, one_of
 from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
 from jaxcal.models.recording import Recording
-from jaxcal.models.sensors import Pose, Position, Sensor, Several
+from jaxcal.models.sensors import Board, Pose, Position, Sensor, Several
 from jaxcal.models.serial.arguments import (
     joint_kinds,
     joint_numbers,
@@ -431,23 +431,33 @@ class SerialChain(Arm, Model):
     def recorded(self, recording: Recording) -> tuple[Array, Array | None]:
         """Commands (N, n) and readings (N, q) of a recording, the mean of each rest.
 
-        Readings are zeros of contacts, and None of a sensor whose readings no message
-        holds (a board's, a wire's), or of a LeRobot dataset.
+        Readings are zeros of contacts and of poses of a board, which stand in the
+        commands, and None of a sensor whose readings no message holds (corners'
+        pixels), or of a LeRobot dataset.
 
         Raises:
             ValueError: the arm never stood still; ``which`` has not as many as there
                 were rests; there are no readings.
         """
         sensor = self.sensor
-        of_rows = tuple(sensor.inputs) in ((), (sensor.kind,))
-        if not of_rows:
+        views = isinstance(sensor, Board) and sensor.zeros
+        if not views and tuple(sensor.inputs) not in ((), (sensor.kind,)):
             raise ValueError(
                 f"commands of a {sensor.kind} hold {', '.join(sensor.inputs)}, which "
                 "no recording has: take the postures by at_rest"
             )
-        of_recording = self._rests(recording, sensor.kind)
+        pixels = isinstance(sensor, Board) and not views
+        of_recording = self._rests(recording, "" if pixels else sensor.kind)
         commands, read = of_recording.joints, of_recording.readings
-        if sensor.inputs:
+        if views:
+            from scipy.spatial.transform import Rotation
+
+            if read is None:
+                raise ValueError(f"{recording.path} has no poses of a board")
+            turns = Rotation.from_matrix(read[:, 3:].reshape(-1, 3, 3).swapaxes(1, 2))
+            seen = np.degrees(turns.as_rotvec())
+            commands = np.column_stack([commands, read[:, :3], seen])
+        elif sensor.inputs:
             which = () if recording.which is None else recording.which
             if len(which) != len(commands):
                 raise ValueError(

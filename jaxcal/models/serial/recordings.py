@@ -106,6 +106,11 @@ _MESSAGES: dict[str, dict[str, Callable[[Any], list[float]]]] = {
         "geometry_msgs/msg/PoseStamped": lambda each: _vector(each.pose.position),
     },
     "pose": {"geometry_msgs/msg/PoseStamped": _pose},
+    "board": {"geometry_msgs/msg/PoseStamped": _pose},
+    "distance": {
+        "sensor_msgs/msg/Range": lambda each: [each.range],
+        "std_msgs/msg/Float64": lambda each: [each.data],
+    },
     "gravity": {"sensor_msgs/msg/Imu": lambda each: _vector(each.linear_acceleration)},
     "wrench": {
         "geometry_msgs/msg/WrenchStamped": lambda each: [
