@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from jax.flatten_util import ravel_pytree
 
 import jaxcal.learning
 from jaxcal.learning.config import EpisodesConfig, StreamsConfig
@@ -136,7 +137,11 @@ def test_a_gradient_step_is_that_of_optax(rng, size):
     params = jax.tree.map(jnp.asarray, params)
     grads = jax.tree.map(lambda leaf: size * jnp.sin(leaf), params)
     ours = ppo.TrainState(
-        params, params, ppo.optimiser(config).init(params), None, jnp.int32(0)
+        params,
+        params,
+        ppo.optimiser(config).init(ravel_pytree(params)[0]),
+        None,
+        jnp.int32(0),
     )
     chain = optax.chain(
         optax.clip_by_global_norm(config.max_grad_norm),
@@ -369,7 +374,7 @@ def test_the_averaged_weights_owe_nothing_to_the_initial_ones(rng):
     state = ppo.TrainState(
         params=params,
         average=params,
-        opt_state=ppo.optimiser(config).init(params),
+        opt_state=ppo.optimiser(config).init(ravel_pytree(params)[0]),
         key=jax.random.key(0),
         num_updates=jnp.zeros((), jnp.int32),
     )

@@ -63,8 +63,8 @@ class RowInputs:
     """Inputs of the network for one set: T learned decisions of G episodes."""
 
     features: Any  # leaves (...): candidate features of the set
-    first: Any  # leaves (...): of the first decision, which the episodes share
-    later: Any  # leaves (T - 1, G, ...): of the others; None where T is 1
+    decisions: Any  # leaves (1 + (T - 1) G, ...): of the first decision, which the
+    # episodes share, then of the others, decision by decision
 
 
 # Bytes of the (M, M) arrays of a look-ahead that are held at a time while it plays.
@@ -83,6 +83,11 @@ def _mapped(function: Callable[..., Any], at_once: int, leaves: Any) -> Any:
     if at_once == len(jax.tree.leaves(leaves)[0]):
         return jax.vmap(function)(leaves)
     return jax.lax.map(function, leaves, batch_size=at_once)
+
+
+def _followed(first: jax.Array, others: jax.Array) -> jax.Array:
+    """(1 + T G, ...) from (1, ...) and (T, G, ...)."""
+    return jnp.concatenate([first, others.reshape(-1, *others.shape[2:])])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,12 +120,13 @@ class Postures:
             What was played, rows of decisions (T, G); the keys of the next update;
             metrics: scalars, and ``rewards`` (B G,).
         """
-        keys = jax.vmap(jax.random.split)(jax.random.wrap_key_data(playing))
+        split = jax.vmap(lambda key: jax.random.split(key, 3))
+        keys = split(jax.random.wrap_key_data(playing))  # set, actions, next update
         m = jax.eval_shape(self.task.reset, keys[0, 0]).available.shape[0]
         held = _at_once(self.config.episodes_per_set, m)  # episodes of a row at a time
         rows = _at_once(len(keys), m, held)
         play = functools.partial(self._play, params, held)
-        batch, value, reward, log_det = _mapped(play, rows, keys[:, 0])
+        batch, value, reward, log_det = _mapped(play, rows, keys[:, :2])
         metrics = {
             "rewards": reward.ravel(),
             "reward_mean": reward.mean(),
@@ -130,7 +136,7 @@ class Postures:
         }
         return (
             normalised(self.config, batch),
-            jax.random.key_data(keys[:, 1]),
+            jax.random.key_data(keys[:, 2]),
             metrics,
         )
 
@@ -148,20 +154,26 @@ class Postures:
         """
         memory = encode(self.network, params, seen.features)
         decide = functools.partial(decode, self.network, params, memory)
-        shape = (1, self.config.episodes_per_set)
-        scored = [jnp.broadcast_to(x, (*shape, *x.shape)) for x in decide(seen.first)]
-        if seen.later is not None:
-            later = jax.vmap(jax.vmap(decide))(seen.later)
-            scored = [jnp.concatenate(x) for x in zip(scored, later, strict=True)]
-        logits, value = scored
+        scored = jax.vmap(decide)(seen.decisions)
+        episodes = self.config.episodes_per_set
+
+        def of_each(x: jax.Array) -> jax.Array:
+            """(T, G, ...) from (1 + (T - 1) G, ...)."""
+            first = jnp.broadcast_to(x[:1], (episodes, *x.shape[1:]))
+            whole = jnp.concatenate([first, x[1:]])
+            return whole.reshape(-1, episodes, *x.shape[1:])
+
+        logits, value = map(of_each, scored)
         return logits, value * self.task.value_scale
 
-    def _play(self, params: Any, at_once: int, key: jax.Array) -> tuple[Any, ...]:
-        """A ``Batch`` of one row; its (T, G) values; (G,) rewards, (G,) outcomes."""
+    def _play(self, params: Any, at_once: int, keys: jax.Array) -> tuple[Any, ...]:
+        """A ``Batch`` of one row; its (T, G) values; (G,) rewards, (G,) outcomes.
+
+        ``keys`` (2,) are of the set and of the actions.
+        """
         task, network = self.task, self.network
         learned = task.num_decisions - network.num_unlearned
-        key_set, key_actions = jax.random.split(key)
-        start = task.reset(key_set)
+        start = task.reset(keys[0])
         features = network.candidate_features(start.candidates, start.available)
         memory = encode(network, params, features)
 
@@ -176,9 +188,9 @@ class Postures:
             return decision, *network.lookahead_logits(decision)
 
         def act(
-            state: Any, logits: jax.Array, value: jax.Array, key: jax.Array
+            state: Any, logits: jax.Array, value: jax.Array, noise: jax.Array
         ) -> tuple[Any, Metrics]:
-            action = jax.random.categorical(key, logits).astype(jnp.int32)
+            action = jnp.argmax(logits + noise).astype(jnp.int32)  # of the softmax
             after, reward, _ = task.step(state, action)
             return after, {
                 "action": action,
@@ -189,33 +201,33 @@ class Postures:
             }
 
         def decide(learns: bool, state: Any, now: Any) -> tuple[Any, tuple[Any, ...]]:
-            count, keys = now
+            count, noise = now
             score_at = functools.partial(score, count=count, learns=learns)
             decision, logits, value = _mapped(score_at, at_once, state)
-            state, record = jax.vmap(act)(state, logits, value, keys)
+            state, record = jax.vmap(act)(state, logits, value, noise)
             return state, (decision if learns else None, record)
 
-        shape = (task.num_decisions, self.config.episodes_per_set)
-        keys = jax.random.split(key_actions, shape)
+        shape = task.num_decisions, self.config.episodes_per_set, len(start.available)
+        noise = jax.random.gumbel(keys[1], shape)  # at once: compiled once
         counts = jnp.arange(task.num_decisions)
         # The first decision is the same for every episode.
         first, logits, value = score(start, 0, learned > 0)
         begin = jax.vmap(act, in_axes=(None, None, None, 0))
-        state, record = begin(start, logits, value, keys[0])
+        state, record = begin(start, logits, value, noise[0])
         records = [jax.tree.map(lambda leaf: leaf[None], record)]
-        later = None
-        for begins, ends, learns in ((1, learned, True), (learned, len(keys), False)):
+        decisions = jax.tree.map(lambda leaf: leaf[None], first)
+        for begins, ends, learns in ((1, learned, True), (learned, len(noise), False)):
             if begins < ends:
-                now = counts[begins:ends], keys[begins:ends]
+                now = counts[begins:ends], noise[begins:ends]
                 step = functools.partial(decide, learns)
                 state, (seen, record) = jax.lax.scan(step, state, now)
                 records.append(record)
-                # The last choices, which the look-ahead makes, are not trained on.
-                later = seen if learns else later
+                if learns:  # the last choices, by the look-ahead, are not trained on
+                    decisions = jax.tree.map(_followed, decisions, seen)
         played = jax.tree.map(lambda *x: jnp.concatenate(x), *records)  # leaves (K, G)
         advantage, target = self._advantages_and_targets(played)
         batch = Batch(
-            seen=RowInputs(features, first, later),
+            seen=RowInputs(features, decisions),
             action=played["action"][:learned],
             log_prob=played["log_prob"][:learned],
             advantage=advantage[:learned],

@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxcal.learning.config import TRACED, PPOConfig
@@ -38,6 +39,8 @@ __all__ = [
     "explained_variance",
     "make_train",
     "make_update",
+    "mean_over",
+    "minibatches",
     "normalised",
     "placed",
     "schedule",
@@ -183,7 +186,7 @@ class TrainState:
 
     params: Any  # network parameters
     average: Any  # exponential average of the parameters: the policy
-    opt_state: Any  # of Adam
+    opt_state: Any  # of Adam, whose moments (P,) are of all parameters
     key: jax.Array  # (2,) uint32, data of the PRNG key of the next update
     num_updates: jax.Array  # () int32, updates made
     playing: Any = ()  # leaves (B, ...): what the learner goes on from
@@ -208,7 +211,7 @@ def begin(
     return TrainState(
         params=params,
         average=jax.tree.map(jnp.copy, params),
-        opt_state=optimiser(config).init(params),
+        opt_state=optimiser(config).init(ravel_pytree(params)[0]),
         key=jax.random.key_data(key_updates),
         num_updates=jnp.zeros((), jnp.int32),
         playing=learner.begin(
@@ -243,7 +246,7 @@ def schedule(config: PPOConfig) -> optax.Schedule:
 
 
 def optimiser(config: PPOConfig) -> optax.GradientTransformation:
-    """Adam under the schedule; ``descend`` clips the gradients."""
+    """Adam under the schedule, of all parameters as one vector; ``descend`` clips."""
     return optax.adam(schedule(config), eps=1e-5)
 
 
@@ -252,16 +255,19 @@ def descend(
 ) -> tuple[TrainState, jax.Array]:
     """One gradient step: clipped by the global norm, Adam, averaged weights.
 
+    ``grads`` are a tree as ``state.params``, or one vector of all its leaves.
+
     Returns:
         The next state, and the () norm before clipping.
     """
+    grads = ravel_pytree(grads)[0]
+    norm = jnp.linalg.norm(grads)
     # One factor: optax divides each gradient by the norm, which XLA does not fuse with
     # Adam's moments (that takes 7 to 14 % of an update of the paper's network).
-    norm = jnp.sqrt(sum(jnp.vdot(grad, grad) for grad in jax.tree.leaves(grads)))
     factor = jnp.minimum(1.0, config.max_grad_norm / jnp.maximum(norm, 1e-30))
-    grads = jax.tree.map(lambda grad: grad * factor, grads)
-    changes, opt_state = optimiser(config).update(grads, state.opt_state)
-    params = optax.apply_updates(state.params, changes)
+    changes, opt_state = optimiser(config).update(factor * grads, state.opt_state)
+    as_params = ravel_pytree(state.params)[1]
+    params = optax.apply_updates(state.params, as_params(changes))
     # Exponential average with bias correction: the share of the newest weights is 1 at
     # the first step, so the initial weights do not enter.
     decay, count = config.average_decay, opt_state[0].count
@@ -277,6 +283,40 @@ def placed(tree: Any, mesh: Mesh | None, *axes: str) -> Any:
         return tree
     sharding = NamedSharding(mesh, PartitionSpec(*axes))
     return jax.lax.with_sharding_constraint(tree, sharding)
+
+
+def minibatches(config: PPOConfig, key: jax.Array, blocks: int, rows: int) -> jax.Array:
+    """(steps, blocks, n) indices of rows in each of the blocks, by gradient step; every
+    epoch has an order of its own."""
+    order = jnp.argsort(jax.random.bits(key, (config.num_epochs, blocks, rows)))
+    order = order.reshape(config.num_epochs, blocks, config.num_minibatches, -1)
+    return order.swapaxes(1, 2).reshape(config.steps_per_update, blocks, -1)
+
+
+def mean_over(
+    function: Callable[[Any], Any],
+    rows: Any,
+    index: jax.Array,
+    size: int,
+    mesh: Mesh | None,
+) -> Any:
+    """Mean of a function of rows, computed for ``size`` rows of each block at a time.
+
+    Args:
+        function: rows (blocks * size, ...) -> arrays.
+        rows: leaves (blocks, ...).
+        index: (blocks, n) which rows of each block; n is a multiple of ``size``.
+        size: rows of a block in a call of the function.
+        mesh: whose axis ``sets`` the blocks are spread over.
+    """
+
+    def of_part(part: jax.Array) -> Any:
+        pick = jax.vmap(lambda leaf, number: leaf[number])
+        some = placed(jax.tree.map(lambda leaf: pick(leaf, part), rows), mesh, "sets")
+        return function(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), some))
+
+    parts = index.reshape(len(index), -1, size).swapaxes(0, 1)
+    return jax.tree.map(lambda x: x.mean(0), jax.lax.map(of_part, parts))
 
 
 def make_update(
@@ -314,47 +354,31 @@ def make_update(
 
         rows = placed(jax.tree.map(cut, rows), mesh, "sets")
 
-        def mean(function: Callable[[Any], Any], index: jax.Array) -> Any:
-            """Mean of a function of rows, of each block at ``index`` (blocks, n)."""
-
-            def of_part(part: jax.Array) -> Any:
-                pick = jax.vmap(lambda leaf, number: leaf[number])
-                some = jax.tree.map(lambda leaf: pick(leaf, part), rows)
-                some = placed(some, mesh, "sets")
-                return function(
-                    jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), some)
-                )
-
-            # A slice's arrays stay in a core's cache: faster than all rows at once.
-            number = index.shape[1]
-            size = number if whole else math.gcd(number, ppo.slice_rows)
-            parts = index.reshape(blocks, -1, size).swapaxes(0, 1)
-            return jax.tree.map(lambda x: x.mean(0), jax.lax.map(of_part, parts))
+        # A slice's arrays stay in a core's cache: faster than all rows at once.
+        number = per_block // ppo.num_minibatches
+        size = number if whole else math.gcd(number, ppo.slice_rows)
 
         def step(state: TrainState, index: jax.Array) -> tuple[TrainState, Metrics]:
-            def gradient(some: Any) -> tuple[Any, Metrics]:
+            def gradient(some: Any) -> tuple[jax.Array, Metrics]:
                 of_loss = jax.grad(trained.loss, has_aux=True)
-                return of_loss(state.params, some, state.num_updates)
+                grads, metrics = of_loss(state.params, some, state.num_updates)
+                # One array: many small kernels take XLA long to compile.
+                return ravel_pytree(grads)[0], metrics
 
-            grads, metrics = mean(gradient, index)
+            grads, metrics = mean_over(gradient, rows, index, size, mesh)
             state, norm = descend(ppo, state, grads)
             return state, metrics | {"grad_norm": norm}
 
-        def epoch(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
-            keys = jax.random.split(key, blocks)
-            order = jax.vmap(jax.random.permutation, (0, None))(keys, per_block)
-            parts = order.reshape(blocks, ppo.num_minibatches, -1).swapaxes(0, 1)
-            return jax.lax.scan(step, state, parts)
-
-        keys = jax.random.split(key_epochs, ppo.num_epochs)
-        state, losses = jax.lax.scan(epoch, before, keys)
+        order = minibatches(ppo, key_epochs, blocks, per_block)
+        state, losses = jax.lax.scan(step, before, order)
         losses = jax.tree.map(jnp.mean, losses)
         if "kl" in losses:  # of a minibatch, by the weights that the update ends with
-            some = jnp.arange(per_block // ppo.num_minibatches)
-            losses["kl_after"] = mean(
-                lambda rows: trained.loss(state.params, rows, state.num_updates)[1],
-                jnp.broadcast_to(some, (blocks, len(some))),
-            )["kl"]
+
+            def measure(some: Any) -> Metrics:
+                return trained.loss(state.params, some, state.num_updates)[1]
+
+            index = jnp.broadcast_to(jnp.arange(number), (blocks, number))
+            losses["kl_after"] = mean_over(measure, rows, index, size, mesh)["kl"]
         rate = schedule(ppo)((before.num_updates + 1) * ppo.steps_per_update)
         fine = jnp.isfinite(jnp.stack(jax.tree.leaves(losses))).all()
         after = dataclasses.replace(
@@ -363,7 +387,7 @@ def make_update(
             num_updates=before.num_updates + 1,
             playing=playing,
         )
-        keep = jax.tree.map(lambda new, old: jnp.where(fine, new, old), after, before)
+        keep = jax.lax.cond(fine, lambda: after, lambda: before)
         playing = placed(keep.playing, mesh, "sets")
         metrics = played | losses | {"learning_rate": rate}
         keep, metrics = placed((dataclasses.replace(keep, playing=()), metrics), mesh)

@@ -60,11 +60,11 @@ def given(
 
 def _shape(name: str, key: jax.Array, m: int, n: int) -> jax.Array:
     """(M, n) candidates of one shape, of order one in size."""
-    key_a, key_b, key_c = jax.random.split(key, 3)
     if name == "uniform":
-        return jax.random.uniform(key_a, (m, n))
+        return jax.random.uniform(key, (m, n))
     if name == "gaussian":
-        return jax.random.normal(key_a, (m, n))
+        return jax.random.normal(key, (m, n))
+    key_a, key_b, key_c = jax.random.split(key, 3)
     if name == "sphere":
         points = jax.random.normal(key_a, (m, n))
         return points / jnp.linalg.norm(points, axis=-1, keepdims=True)
@@ -112,13 +112,16 @@ def mixture(
 
     def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         key_which, key_points, key_share, key_mask = jax.random.split(key, 4)
-        points = jnp.stack([_shape(name, key_points, m, n) for name in unique])
-        which = table[jax.random.randint(key_which, (), 0, len(shapes))]
+        clouds = [_shape(name, key_points, m, n).astype(jnp.float32) for name in unique]
+        points = clouds[0]
+        if len(clouds) > 1:
+            which = table[jax.random.randint(key_which, (), 0, len(shapes))]
+            points = jnp.stack(clouds)[which]
         if masked == 0.0:
-            return points[which].astype(jnp.float32), jnp.ones(m, bool)
+            return points, jnp.ones(m, bool)
         share = masked * jax.random.uniform(key_share)
         rank = jax.random.permutation(key_mask, m)
         keep = jnp.maximum((m * (1.0 - share)).astype(int), config.num_selected + 4)
-        return points[which].astype(jnp.float32), rank < keep
+        return points, rank < keep
 
     return draw

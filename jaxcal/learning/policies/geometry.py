@@ -72,25 +72,28 @@ def projected(
         (..., M, p), whose squared lengths are the Schur-complement gains; and (...,)
         the log of the squared volume that the chosen span, 0 where nothing is chosen.
     """
-    rest = [x[..., i] for i in range(x.shape[-1])]
-    basis: list[list[jax.Array]] = []
-    volume = jnp.zeros(chosen.shape[:-2], chosen.dtype)
-    for j in range(chosen.shape[-2]):
-        v = [chosen[..., j, i] for i in range(chosen.shape[-1])]
-        scale = _dot(v, v)
-        for e in basis:
-            along = _dot(v, e)
-            v = [a - along * b for a, b in zip(v, e, strict=True)]
-        square = _dot(v, v)
+    eye = jnp.eye(x.shape[-1], dtype=x.dtype)
+
+    def project(carry: Any, now: Any) -> tuple[Any, None]:
+        projection, volume = carry  # (..., p, p) on what the chosen leave
+        vector, number = now
+        rest = (projection * vector[..., None, :]).sum(-1)
+        square = (rest * rest).sum(-1)
         grown = jnp.log(jnp.maximum(square, 1e-9))
-        volume = volume + jnp.where(j < jnp.asarray(count), grown, 0.0)
-        independent = square > 1e-9 * scale
-        factor = jax.lax.rsqrt(jnp.where(independent, square, 1.0))
-        basis.append([a * jnp.where(independent, factor, 0.0) for a in v])
-        wide = [b[..., None] for b in basis[-1]]
-        along = _dot(rest, wide)
-        rest = [a - along * b for a, b in zip(rest, wide, strict=True)]
-    return jnp.stack(rest, axis=-1), volume
+        volume = volume + jnp.where(number < jnp.asarray(count), grown, 0.0)
+        independent = square > 1e-9 * (vector * vector).sum(-1)
+        factor = jnp.where(independent, 1.0 / jnp.where(independent, square, 1.0), 0.0)
+        along = rest[..., :, None] * rest[..., None, :]
+        return (projection - factor[..., None, None] * along, volume), None
+
+    start = (
+        jnp.broadcast_to(eye, (*chosen.shape[:-2], *eye.shape)),
+        jnp.zeros(chosen.shape[:-2], chosen.dtype),
+    )
+    vectors = jnp.moveaxis(chosen, -2, 0), jnp.arange(chosen.shape[-2])
+    # A loop: written out it takes three times as long to compile.
+    (projection, volume), _ = jax.lax.scan(project, start, vectors)
+    return jnp.einsum("...mp,...pq->...mq", x, projection), volume
 
 
 def _dot(a: list[jax.Array], b: list[jax.Array]) -> jax.Array:
