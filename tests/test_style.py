@@ -13,7 +13,7 @@ WORDS = {"each", "found", "known"}
 # What is left of a budget, and what is a thing's own, have names in these rooms.
 ROOMS = {
     *("adaptive", "calibration", "commands", "evaluation", "information", "learning"),
-    *("rig", "selection"),
+    *("models", "rig", "selection"),
 }
 MORE = {room: {"left", "own"} for room in ROOMS}
 # Where a file may bind one, which parsing tells.

@@ -155,15 +155,15 @@ def _readings(
     commands = by_name(model, commands)
     input_names = input_names or names_of(commands) or None
     output_names = output_names or names_of(measured) or None
-    told = table("commands", commands)
-    reached = table("measured", measured, len(told))
-    inputs = axis_names("input_names", input_names, "u", told.shape[1])
-    outputs = axis_names("output_names", output_names, "y", reached.shape[1])
-    weight = np.ones(len(told))
+    u = table("commands", commands)
+    y = table("measured", measured, len(u))
+    inputs = axis_names("input_names", input_names, "u", u.shape[1])
+    outputs = axis_names("output_names", output_names, "y", y.shape[1])
+    weight = np.ones(len(u))
     if weights is not None:
-        weight = array_of("weights", weights, len(told))
+        weight = array_of("weights", weights, len(u))
         require_none(weight < 0.0, weight, "weights must not be negative")
-    return _Readings(told, reached, weight, inputs, outputs)
+    return _Readings(u, y, weight, inputs, outputs)
 
 
 def _about(

@@ -34,7 +34,7 @@ from jaxcal.information.singular import (
 )
 
 __all__ = [
-    "Whitened",
+    "WhiteBlocks",
     "coarseness",
     "gram",
     "largest_rank",
@@ -57,7 +57,7 @@ _SOME = 256  # candidates, or a few less, of which neighbours are looked at
 _UNTHREADED = 240_000  # multiplications up to which BLAS starts no threads
 
 
-class _Centred(NamedTuple):
+class _CentredBlocks(NamedTuple):
     """Rows of blocks and prior, less what is the same in every block of a set."""
 
     rows: Array  # (S, M q + r, p) ``(B - B @ shift) / scale``
@@ -69,7 +69,7 @@ class _Centred(NamedTuple):
 
 def _centred(
     blocks: Array, usable: Mask | None, root: Array, look: bool = False
-) -> _Centred:
+) -> _CentredBlocks:
     """Blocks (S, M, q, p), zero where not ``usable`` (S, M), and ``root``, centred.
 
     ``look`` whether rows are far from the others.
@@ -132,7 +132,7 @@ def _centred(
         prior = np.broadcast_to(prior, (sets, *prior.shape[-2:]))
         rows = np.concatenate([rows, prior], axis=1)
     far = None if where_far is None else np.asarray(where_far.any(axis=(1, 2)))
-    return _Centred(rows, largest, scale, shift, far)
+    return _CentredBlocks(rows, largest, scale, shift, far)
 
 
 def _far(
@@ -308,7 +308,7 @@ def coarseness(given: object) -> float:
     return 1.0
 
 
-class Whitened(NamedTuple):
+class WhiteBlocks(NamedTuple):
     """Blocks in coordinates where everything together has information I."""
 
     blocks: Array  # (M, q, p), zero where not usable
@@ -338,7 +338,7 @@ def whiten(
     *,
     coarse: float = 1.0,
     computed: bool = False,
-) -> list[Whitened | None]:
+) -> list[WhiteBlocks | None]:
     """Blocks in coordinates where everything measured at once has information I.
 
     With T = prior + sum of the usable ``B_i.T @ B_i`` = R.T R the whitened block is
@@ -388,7 +388,7 @@ def whiten(
     return [
         None
         if singular[n]
-        else Whitened(
+        else WhiteBlocks(
             white[n],
             prior[n],
             back[n],
@@ -460,7 +460,7 @@ def _by_rotations(rows: Array, far: bool) -> tuple[Array, Array, Array]:
     return all_inverse, back, white
 
 
-def _sizes(blocks: Array, centred: _Centred) -> Array:
+def _sizes(blocks: Array, centred: _CentredBlocks) -> Array:
     """(S, p) of what the blocks were computed beside: the largest entries.
 
     A row that is far from the others, as x = 1e7 beside 1, is rounded more than these.

@@ -40,7 +40,7 @@ _EVERY = 2.0  # seconds between writings of runs to the disk
 _TASKS_EACH = 4  # pieces of work for each process, so that none waits long
 
 
-class _Failed(Exception):
+class _RunError(Exception):
     """A run of a program."""
 
 
@@ -79,11 +79,11 @@ class CommandLine:
         )
         if done.returncode:
             last = (done.stderr.strip().splitlines() or [""])[-1]
-            raise _Failed(f"exit code {done.returncode}: {last}"[:200])
+            raise _RunError(f"exit code {done.returncode}: {last}"[:200])
         try:
             return np.array([float(x) for x in done.stdout.replace(",", " ").split()])
         except ValueError as error:
-            raise _Failed(f"standard output: {error}") from None
+            raise _RunError(f"standard output: {error}") from None
 
     def content(self) -> bytes:
         """What its results depend on: the words, and the files that they name."""
@@ -118,7 +118,7 @@ class Runs:
         self.num_outputs: int | None = None  # of the first run
         self._progress = Progress(quiet=quiet)
         self._pool: concurrent.futures.Executor | None = None
-        self._kept = None if cache is None else _Kept(cache, _content(f))
+        self._kept = None if cache is None else _Cache(cache, _content(f))
         if processes > 1 and not isinstance(f, CommandLine):
             try:
                 pickle.dumps(f)
@@ -285,7 +285,7 @@ def _answer(
             with np.errstate(all="ignore"):
                 result = f(given.copy(), parameters.copy())
         except Exception as error:
-            name = "" if isinstance(error, _Failed) else f"{type(error).__name__}: "
+            name = "" if isinstance(error, _RunError) else f"{type(error).__name__}: "
             answers.append(f"{name}{error}".splitlines()[0])
             continue
         answers.append(_readings(result, 1 if batch else 0)[0])
@@ -310,7 +310,7 @@ def _readings(result: Any, rows: int) -> Array:
     return array
 
 
-class _Kept:
+class _Cache:
     """Runs in a file of SQLite; those of another f are other runs."""
 
     def __init__(self, path: str | os.PathLike[str], content: bytes) -> None:

@@ -199,10 +199,10 @@ class Noise:
         white = np.broadcast_to(white, shape)
         if not unknown.shape[-1]:
             return white
-        left, size, _ = np.linalg.svd(white @ unknown)
+        basis, size, _ = np.linalg.svd(white @ unknown)
         eaten = np.zeros((count, num_outputs), dtype=np.bool_)
         eaten[:, : size.shape[-1]] = significant(size)
-        return np.where(eaten[..., None], 0.0, np.matrix_transpose(left) @ white)
+        return np.where(eaten[..., None], 0.0, np.matrix_transpose(basis) @ white)
 
     def reading_std(self, count: int, num_outputs: int) -> Array:
         """(N, q) ``std`` of the readings, 1 where it is not given."""

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import one_of
-from jaxcal.information.blocks import Whitened, triangle
+from jaxcal.information.blocks import WhiteBlocks, triangle
 from jaxcal.information.singular import power_of_two, significant
 
 __all__ = [
@@ -56,7 +56,7 @@ Array = NDArray[np.float64]
 class Coordinates(NamedTuple):
     """The coordinates of one problem, in which everything measured at once says I."""
 
-    white: Whitened
+    white: WhiteBlocks
     names: tuple[str, ...]  # (p,) of the caller's parameters
     readings: int  # that all available candidates give together
     region: Array | None  # (R, q, p) blocks of the criterion's region, in the caller's

@@ -122,13 +122,13 @@ class Board(Sensor):
     def unseen(self, arm: HasNames) -> tuple[str, ...]:
         return BASE
 
-    def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
+    def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
         from scipy.spatial.transform import Rotation
 
         place = np.eye(3) if self.place is None else self.place[:3, :3]
-        turn, axes = turns(own[3:])
+        turn, axes = turns(parameters[3:])
         stand, turn = turn @ place, np.radians(axes)  # of the stand, by its angles
-        count, moved = len(inputs), tip.position - own[:3]
+        count, moved = len(inputs), tip.position - parameters[:3]
         # How the board shifts and turns in the camera, by the tip and by the stand.
         by_tip, by_own = np.zeros((2, count, 6, 6))
         if self.moves == "board":  # its pose in a camera that stands

@@ -35,9 +35,9 @@ class Distance(Landmarks):
     def usual_noise(self, length: float) -> ArrayLike:
         return 5e-4 * length
 
-    def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
+    def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
         which = self.of_rows(inputs)
-        places = own.reshape(-1, 4)[which]
+        places = parameters.reshape(-1, 4)[which]
         apart = tip.position - places[:, :3]
         far = np.linalg.norm(apart, axis=1, keepdims=True)
         unit = apart / np.where(far > 0.0, far, 1.0)

@@ -69,15 +69,15 @@ class Gravity(Sensor):
         ]
         return (*hidden, f"base r{about}")
 
-    def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
+    def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
         up = self.magnitude * np.array(self.up)
         felt = up @ tip.rotation  # (N, 3) in the tip's frame
         count = len(felt)
         by_tip = np.zeros((count, 3, 6))
-        by_tip[:, :, 3:] = own[0] * np.matrix_transpose(tip.rotation) @ hats(up)
+        by_tip[:, :, 3:] = parameters[0] * np.matrix_transpose(tip.rotation) @ hats(up)
         bias = np.broadcast_to(np.eye(3), (count, 3, 3))
         by_own = np.concatenate([felt[..., None], bias], axis=-1)
-        return Reading(own[0] * felt + own[1:], by_tip, by_own)
+        return Reading(parameters[0] * felt + parameters[1:], by_tip, by_own)
 
     def located(
         self, tip: Tip, inputs: Array, measured: Array | None

@@ -56,11 +56,11 @@ class Plane(Landmarks):
     def usual_noise(self, length: float) -> ArrayLike:
         return 1e-4 * length
 
-    def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
+    def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
         which, points = self.of_rows(inputs), tip.position
         normals = self._rows()[which, :3]
         first, second = _across(normals)
-        tilt1, tilt2, offset = own.reshape(-1, 3)[which].T
+        tilt1, tilt2, offset = parameters.reshape(-1, 3)[which].T
         leaning = (
             np.radians(tilt1)[:, None] * first + np.radians(tilt2)[:, None] * second
         )

@@ -29,7 +29,7 @@ class Pose(Sensor):
     def usual_noise(self, length: float) -> ArrayLike:
         return [1e-4 * length] * 3 + [float(np.degrees(1e-4))] * 3
 
-    def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
+    def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
         from scipy.spatial.transform import Rotation
 
         turn = tip.rotation @ np.matrix_transpose(tip.nominal())

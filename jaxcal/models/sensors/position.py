@@ -25,7 +25,7 @@ class Position(Sensor):
     def usual_noise(self, length: float) -> ArrayLike:
         return 1e-4 * length
 
-    def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
+    def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
         count = len(tip.position)
         by_tip = np.broadcast_to(np.eye(3, 6), (count, 3, 6))
         return Reading(tip.position, by_tip, np.zeros((count, 3, 0)))

@@ -133,7 +133,7 @@ class Sensor(abc.ABC):
         return ()
 
     @abc.abstractmethod
-    def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
+    def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
         """Readings at N postures, with columns ``inputs`` (N, e) and parameters."""
 
     def wrapped(self, off: Array, inputs: Array, length: float) -> Array:
@@ -151,12 +151,12 @@ class Sensor(abc.ABC):
         """
         return self, None
 
-    def facts(self, own: Array) -> tuple[Array, Array]:
+    def facts(self, parameters: Array) -> tuple[Array, Array]:
         """What is known of its own parameters besides: (F,) off, (F, s) derivative.
 
         Both in standard deviations: a fact is a reading that needs no posture.
         """
-        return np.zeros(0), np.zeros((0, len(own)))
+        return np.zeros(0), np.zeros((0, len(parameters)))
 
     def stds(self, length: float) -> Array:
         """(q,) standard deviations of the readings."""

@@ -154,16 +154,16 @@ class Several(Sensor):
         turn, axes = turns(angles)
         return shift, turn @ np.asarray(self.mounts)[i - 1, :3, :3], axes
 
-    def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
+    def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
         count, q, first = len(inputs), len(self.outputs), 0
         values = np.zeros((count, q))
-        by_tip, by_own = np.zeros((count, q, 6)), np.zeros((count, q, len(own)))
+        by_tip, by_own = np.zeros((count, q, 6)), np.zeros((count, q, len(parameters)))
         for i, one, rows, columns in self.parts(inputs):
             size = len(one.tool) if i else 0
             last = first + size + len(one.names)
-            mount, width = own[first : first + size], len(one.outputs)
+            mount, width = parameters[first : first + size], len(one.outputs)
             reading = one.read(
-                self._tip(i, tip, rows, mount), columns, own[first + size : last]
+                self._tip(i, tip, rows, mount), columns, parameters[first + size : last]
             )
             scale = one.stds(tip.length)[:, None]
             values[rows, :width] = reading.values / scale[:, 0]
@@ -210,14 +210,14 @@ class Several(Sensor):
                 tool, mounts = new, np.linalg.inv(new) @ mounts
         return dataclasses.replace(self, sensors=tuple(sensors), mounts=mounts), tool
 
-    def facts(self, own: Array) -> tuple[Array, Array]:
+    def facts(self, parameters: Array) -> tuple[Array, Array]:
         first, offs, rows = 0, [], []
         for i, one in enumerate(self.sensors):
             first += len(one.tool) if i else 0
             last = first + len(one.names)
-            off, slopes = one.facts(own[first:last])
+            off, slopes = one.facts(parameters[first:last])
             offs.append(off)
-            rows.append(np.zeros((len(off), len(own))))
+            rows.append(np.zeros((len(off), len(parameters))))
             rows[-1][:, first:last] = slopes
             first = last
         return np.concatenate(offs), np.concatenate(rows)

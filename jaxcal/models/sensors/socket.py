@@ -62,12 +62,12 @@ class Socket(Landmarks):
     def usual_noise(self, length: float) -> ArrayLike:
         return 2e-4 * length
 
-    def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
+    def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
         which = self.of_rows(inputs)
         count = len(which)
         by_tip = np.broadcast_to(np.eye(3, 6), (count, 3, 6))
         by_one = np.broadcast_to(-np.eye(3), (count, 3, 3))
-        values = tip.position - own.reshape(-1, 3)[which]
+        values = tip.position - parameters.reshape(-1, 3)[which]
         return Reading(values, by_tip, self.spread(which, by_one))
 
     def located(
@@ -84,8 +84,8 @@ class Socket(Landmarks):
         ]
         return dataclasses.replace(self, places=np.array(places)), None
 
-    def facts(self, own: Array) -> tuple[Array, Array]:
-        places = own.reshape(-1, 3)
+    def facts(self, parameters: Array) -> tuple[Array, Array]:
+        places = parameters.reshape(-1, 3)
         off = np.zeros(len(self.distances))
         rows = np.zeros((len(self.distances), self.count, 3))
         for k, (first, second, distance, std) in enumerate(self.distances):
@@ -95,4 +95,4 @@ class Socket(Landmarks):
             off[k] = (distance - far) / std
             rows[k, j] = (apart / far if far else np.eye(3)[0]) / std
             rows[k, i] = -rows[k, j]
-        return off, rows.reshape(len(off), own.size)
+        return off, rows.reshape(len(off), parameters.size)

@@ -86,8 +86,8 @@ class Wrench(Sensor):
         """(N, 3) force of one kilogram in the tip's frame."""
         return -self.magnitude * np.array(self.up) @ tip.rotation
 
-    def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
-        mass, lever = own[0], hats(own[1:4])
+    def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
+        mass, lever = parameters[0], hats(parameters[1:4])
         unit, down = self._pull(tip), -self.magnitude * np.array(self.up)
         force = mass * unit
         count = len(force)
@@ -98,7 +98,7 @@ class Wrench(Sensor):
         by_own[:, :3, 0], by_own[:, 3:, 0] = unit, unit @ lever.T
         by_own[:, 3:, 1:4] = -hats(force)
         by_own[:, :, 4:] = np.eye(6)
-        values = np.hstack([force, force @ lever.T]) + own[4:]
+        values = np.hstack([force, force @ lever.T]) + parameters[4:]
         return Reading(values, by_tip, by_own)
 
     def located(

@@ -98,15 +98,15 @@ def urdf_text(chains: Sequence[tuple[Arm, Arm]]) -> tuple[str, list[str]]:
     origins: dict[str, Array] = {}
     more, tips = "", []
     for nominal, calibrated in chains:
-        own = nominal.source or {}
-        if own["text"] != text:
+        file = nominal.source or {}
+        if file["text"] != text:
             raise ValueError("the chains must come from one URDF file")
         corrected, extra = _origins(nominal, calibrated)
         for joint, origin in corrected.items():
             if joint in origins and np.abs(origin - origins[joint]).max() > _AGREE:
                 raise ValueError(f"the chains have joint {joint} in different places")
         origins |= corrected
-        tip = own["tip"]
+        tip = file["tip"]
         if extra is None:
             tips.append(tip)
             continue

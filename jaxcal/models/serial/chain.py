@@ -297,9 +297,11 @@ class SerialChain(Arm, Model):
             ValueError: there are not so many, or a socket is reached by none; the
                 message says what became of the rest.
         """
-        from jaxcal.models.serial.postures import asked, postures
+        from jaxcal.models.serial.postures import postures, view_and_room
 
-        rules = asked(camera, distance, tilt, side, floor, approach, clear, radius)
+        rules = view_and_room(
+            camera, distance, tilt, side, floor, approach, clear, radius
+        )
         return postures(self, count, seed, near, allowed, *rules)
 
     def reachable(
@@ -321,10 +323,12 @@ class SerialChain(Arm, Model):
         Arguments as of ``postures``. Commands that a search tries are moved to where
         the sensor reads: the ball into its socket, the board as the camera sees it.
         """
-        from jaxcal.models.serial.postures import Reachable, asked
+        from jaxcal.models.serial.postures import ReachableSet, view_and_room
 
-        rules = asked(camera, distance, tilt, side, floor, approach, clear, radius)
-        return Reachable(self, near, allowed, *rules)
+        rules = view_and_room(
+            camera, distance, tilt, side, floor, approach, clear, radius
+        )
+        return ReachableSet(self, near, allowed, *rules)
 
     def tip_axis(self, commands: ArrayLike) -> Array:
         """(N, 3) the tip's z axis in the measuring frame, of the nominal arm."""
@@ -1012,8 +1016,8 @@ def _far(points: Array, measured: Array, length: float) -> Array:
     middle, there = points.mean(axis=0), measured.mean(axis=0)
     turn = Rotation.align_vectors(measured - there, points - middle)[0].as_matrix()
     moved[:3, :3], moved[:3, 3] = turn, there - turn @ middle
-    left = np.linalg.norm(points @ turn.T + moved[:3, 3] - measured, axis=1)
-    return moved if np.median(left) < _ALIKE * length else np.eye(4)
+    errors = np.linalg.norm(points @ turn.T + moved[:3, 3] - measured, axis=1)
+    return moved if np.median(errors) < _ALIKE * length else np.eye(4)
 
 
 def _numbered(columns: int) -> tuple[str, ...]:

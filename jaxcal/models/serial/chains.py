@@ -62,7 +62,9 @@ class Chains(Model):
         if len(arms) < 2 or not all(isinstance(arm, SerialChain) for arm in arms):
             raise ValueError("chains must hold two arms or more (SerialChain), by tip")
         sensors = [arm.sensor for arm in arms]
-        stands = [next(i for i, s in enumerate(sensors) if s is own) for own in sensors]
+        stands = [
+            next(i for i, s in enumerate(sensors) if s is other) for other in sensors
+        ]
         model = cls(tips, arms, tuple(stands))
         for k, arm in enumerate(arms):
             for other, before in zip(arms[:k], tips, strict=False):
@@ -107,10 +109,12 @@ class Chains(Model):
         arms = {tip: chain(tip) for tip in sensors}
         stiff = cls.of(arms)._shared
         for (tip, arm), shared in zip(arms.items(), stiff, strict=True):
-            own = {n: v for n, v in (limits or {}).items() if n in arm.joint_names}
+            arm_limits = {
+                n: v for n, v in (limits or {}).items() if n in arm.joint_names
+            }
             yielding = tuple(i for i in arm.compliance if i > shared)
-            if own or yielding != arm.compliance:
-                arms[tip] = chain(tip, limits=own or None, compliance=yielding)
+            if arm_limits or yielding != arm.compliance:
+                arms[tip] = chain(tip, limits=arm_limits or None, compliance=yielding)
         return cls.of(arms)
 
     # -- what the chains share ---------------------------------------------------------
@@ -165,8 +169,8 @@ class Chains(Model):
     def _gather(self, values: Sequence[Any]) -> Any:
         """(p,) from each chain's, the first chain's where they share one."""
         result = np.empty(len(self.names), dtype=np.asarray(values[0]).dtype)
-        for at, own in zip(self.members[::-1], values[::-1], strict=True):
-            result[at] = own
+        for at, of_arm in zip(self.members[::-1], values[::-1], strict=True):
+            result[at] = of_arm
         return result
 
     def _parts(
@@ -228,9 +232,11 @@ class Chains(Model):
         """Readings (N, q) in noise, 0 beyond those of a row's sensor."""
         commands, theta = as_commands(self, commands), as_parameters(self, parameters)
         values = np.zeros((len(commands), self.num_outputs))
-        for k, arm, rows, own in self._parts(commands):
+        for k, arm, rows, arm_commands in self._parts(commands):
             if len(rows):
-                read = arm.predict(own, theta[self.members[k]]) / self._scale(k)
+                read = arm.predict(arm_commands, theta[self.members[k]]) / self._scale(
+                    k
+                )
                 values[rows, : arm.num_outputs] = read
         return values
 
@@ -252,9 +258,9 @@ class Chains(Model):
         commands, theta = as_commands(self, commands), as_parameters(self, parameters)
         width = len(self.names) if by == "jacobian" else self.num_inputs
         slopes = np.zeros((len(commands), self.num_outputs, width))
-        for k, arm, rows, own in self._parts(commands):
+        for k, arm, rows, arm_commands in self._parts(commands):
             if len(rows):
-                of_chain = getattr(arm, by)(own, theta[self.members[k]])
+                of_chain = getattr(arm, by)(arm_commands, theta[self.members[k]])
                 outputs = np.arange(arm.num_outputs)
                 slopes[np.ix_(rows, outputs, at[k])] = (
                     of_chain / self._scale(k)[:, None]
@@ -263,10 +269,10 @@ class Chains(Model):
 
     def wrapped(self, off: Array, commands: Array) -> Array:
         off = off.copy()
-        for k, arm, rows, own in self._parts(commands):
+        for k, arm, rows, arm_commands in self._parts(commands):
             scale, q = self._scale(k), arm.num_outputs
             its = off[..., rows, :q] * scale
-            off[..., rows, :q] = arm.wrapped(its, own) / scale
+            off[..., rows, :q] = arm.wrapped(its, arm_commands) / scale
         return off
 
     def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
@@ -302,10 +308,10 @@ class Chains(Model):
             fixed = set(prior.fixed)
             if self.stands[k] != k:
                 fixed -= set(BASE)
-            for name, own in zip(named, arm.names, strict=True):
-                if own in fixed:
+            for name, short in zip(named, arm.names, strict=True):
+                if short in fixed:
                     held[name] = None
-                elif self.stands[k] == k or own not in BASE or not self._shared[k]:
+                elif self.stands[k] == k or short not in BASE or not self._shared[k]:
                     seen.add(name)
         std = self._gather([np.asarray(prior.std) for prior in priors])
         unseen = tuple(name for name in held if name not in seen)
@@ -363,35 +369,35 @@ class Chains(Model):
         for tip, (given, read) in tables.items():
             k = self.tips.index(one_of("tip", tip, self.tips))
             arm, columns = self.chains[k], self._columns[k]
-            own = array_of(f"commands of {tip}", given, "N", len(columns))
-            commands = np.zeros((len(own), self.num_inputs))
+            arm_commands = array_of(f"commands of {tip}", given, "N", len(columns))
+            commands = np.zeros((len(arm_commands), self.num_inputs))
             commands[:, len(self.joint_names)] = k
-            commands[:, columns] = own
-            measured = np.zeros((len(own), self.num_outputs))
+            commands[:, columns] = arm_commands
+            measured = np.zeros((len(arm_commands), self.num_outputs))
             if read is not None:
                 what, width = f"measured of {tip}", arm.num_outputs
-                values = array_of(what, read, len(own), width)
+                values = array_of(what, read, len(arm_commands), width)
                 measured[:, :width] = values / self._scale(k)
             all_commands.append(commands)
             all_measured.append(measured)
         return np.vstack(all_commands), np.vstack(all_measured)
 
     def require_commands(self, commands: Array) -> None:
-        for _, arm, rows, own in self._parts(commands):
+        for _, arm, rows, arm_commands in self._parts(commands):
             if len(rows):
-                arm.require_commands(own)
+                arm.require_commands(arm_commands)
 
     def prepared(self, commands: Array, measured: Array | None = None) -> Self:
         """These chains with their sensors where commands (and readings) put them."""
         arms = list(self.chains)
-        for k, arm, rows, own in self._parts(commands):
+        for k, arm, rows, arm_commands in self._parts(commands):
             if not len(rows):
                 continue
             if self.stands[k] != k:
                 arm = arm.measured_with(arms[self.stands[k]].sensor)
             q, scale = arm.num_outputs, self._scale(k)
             read = None if measured is None else measured[rows, :q] * scale
-            arms[k] = arm.prepared(own, read)
+            arms[k] = arm.prepared(arm_commands, read)
         for k, owner in enumerate(self.stands):
             if owner != k:
                 arms[k] = arms[k].measured_with(arms[owner].sensor)
@@ -399,8 +405,8 @@ class Chains(Model):
 
     def distinct(self, commands: Array, measured: Array) -> NDArray[np.intp]:
         kept = []
-        for _, arm, rows, own in self._parts(commands):
-            kept.append(rows[arm.distinct(own, measured[rows])])
+        for _, arm, rows, arm_commands in self._parts(commands):
+            kept.append(rows[arm.distinct(arm_commands, measured[rows])])
         return np.sort(np.concatenate(kept))
 
     @property
@@ -418,8 +424,8 @@ class Chains(Model):
         names = (
             name
             for arm, named in zip(self.chains, self._named, strict=True)
-            for name, own in zip(named, arm.names, strict=True)
-            if own in some(arm)
+            for name, short in zip(named, arm.names, strict=True)
+            if short in some(arm)
         )
         return tuple(dict.fromkeys(names))
 
@@ -429,7 +435,10 @@ class Chains(Model):
         """The fields of a calibration that are of one chain, in its own units."""
         k = self.tips.index(one_of("tip", tip, self.tips))
         arm, at, scale = self.chains[k], fit.whole.members[k], self._scale(k)
-        q, (_, _, rows, own) = arm.num_outputs, list(self._parts(fit.commands))[k]
+        q, (_, _, rows, arm_commands) = (
+            arm.num_outputs,
+            list(self._parts(fit.commands))[k],
+        )
         residuals = fit.residuals[rows, :q] * scale
         noise = None if fit.noise_std is None else fit.noise_std[:q] * scale
         square = fit.square
@@ -453,7 +462,7 @@ class Chains(Model):
             "prior_mean": fit.prior_mean[at],
             "prior_precision": fit.prior_precision[at],
             "free": fit.free[at],
-            "commands": own,
+            "commands": arm_commands,
             "estimated_commands": None,
             "residuals": residuals,
             "loss_weights": fit.loss_weights[rows],
@@ -532,8 +541,8 @@ class Chains(Model):
         """The inverse of ``to_dict``."""
         arms: list[SerialChain] = []
         for content, owner in zip(chains, stands, strict=True):
-            own = {key: value for key, value in content.items() if key != "kind"}
-            arm = SerialChain.from_dh(**own)
+            fields = {key: value for key, value in content.items() if key != "kind"}
+            arm = SerialChain.from_dh(**fields)
             if owner < len(arms):
                 arm = arm.measured_with(arms[owner].sensor)
             arms.append(arm)

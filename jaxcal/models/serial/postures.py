@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import array_of, in_words, numbers, whole_number
 from jaxcal.models.sensors import Board, Landmarks, Plane, Several, Socket
 
-__all__ = ["Reachable", "Room", "View", "asked", "in_turn", "postures"]
+__all__ = ["ReachableSet", "Room", "View", "in_turn", "postures", "view_and_room"]
 
 Array = NDArray[np.float64]
 Chain = Any  # a SerialChain, whose module imports this one
@@ -160,7 +160,7 @@ class Room:
         return np.asarray(near.any(axis=1))
 
 
-def asked(
+def view_and_room(
     camera: ArrayLike | None,
     distance: Sequence[float] | None,
     tilt: float,
@@ -308,7 +308,7 @@ def _counted(reasons: Counter[str]) -> str:
     return ", ".join(f"{number} {reason}" for reason, number in reasons.most_common())
 
 
-class Reachable:
+class ReachableSet:
     """Where an arm can be measured, for ``refine``; see ``SerialChain.reachable``."""
 
     def __init__(

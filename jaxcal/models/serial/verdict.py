@@ -549,11 +549,11 @@ def _swapped(
     swaps: dict[int, int] = {}
     if at.size:
         trial = np.repeat(calibration.commands[None, at], sensor.count, axis=0)
-        own = trial[..., model.num_joints].copy()
+        stated = trial[..., model.num_joints].copy()
         trial[..., model.num_joints] = np.arange(sensor.count)[:, None]
         off = np.abs(calibration.predict(trial) / noise).max(axis=-1)
         for other, row in np.argwhere(
-            (off < 4.0) & (own != trial[..., model.num_joints])
+            (off < 4.0) & (stated != trial[..., model.num_joints])
         ):
             swaps[int(at[row])] = int(other)
     if isinstance(sensor, Socket) and not explains:
@@ -563,9 +563,9 @@ def _swapped(
         labels, which = np.unique(sensor.of_rows(columns), return_inverse=True)
         middles = [np.median(points[which == i], axis=0) for i in range(len(labels))]
         apart = np.linalg.norm(points[:, None] - middles, axis=-1)
-        own, nearest = apart[np.arange(len(which)), which], apart.min(axis=1)
-        if np.median(own) < 0.5 * np.median(apart.max(axis=1)):
-            wrong = np.flatnonzero(nearest < 0.8 * own)
+        as_stated, nearest = apart[np.arange(len(which)), which], apart.min(axis=1)
+        if np.median(as_stated) < 0.5 * np.median(apart.max(axis=1)):
+            wrong = np.flatnonzero(nearest < 0.8 * as_stated)
             fits = labels[apart[wrong].argmin(axis=1)]
             swaps |= dict(zip(used[wrong].tolist(), fits.tolist(), strict=True))
     return dict(sorted(swaps.items()))

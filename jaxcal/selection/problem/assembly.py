@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import axis_names, require_none, whole_number
 from jaxcal.information.blocks import (
-    Whitened,
+    WhiteBlocks,
     coarseness,
     largest_rank,
     missing_directions,
@@ -201,7 +201,7 @@ def _checked_problem(
     required: ArrayLike | None,
     max_replicates: int,
     *,
-    white: Whitened | None = None,
+    white: WhiteBlocks | None = None,
     coarse: float = 1.0,
     names: tuple[str, ...] = (),
     times: int = 1,

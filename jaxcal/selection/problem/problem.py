@@ -18,7 +18,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.information.blocks import Whitened, rank_of_blocks
+from jaxcal.information.blocks import WhiteBlocks, rank_of_blocks
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model
 
@@ -39,7 +39,7 @@ class Problem:
     All arrays are the problem's own and cannot be written to.
     """
 
-    white: Whitened  # blocks and prior in coordinates where all of them are I
+    white: WhiteBlocks  # blocks and prior in coordinates where all of them are I
     k: int  # candidates to choose
     available: Mask  # (M,) True where a candidate may be chosen
     required: Indices  # (r,) candidates that must be chosen, r <= k
