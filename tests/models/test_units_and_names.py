@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal import Noise
-from jaxcal.models import Linear, Pose, Sensor, SerialChain
+from jaxcal.models import Linear, Sensor, SerialChain
 
 TABLE = np.array([[0, 90, 400, 0], [500, 0, 0, 0], [0, 90, 0, 0], [0, 0, 450, 0.0]])
 JOINTS = np.random.default_rng(0).uniform(-120, 120, (60, 4))
@@ -33,13 +32,6 @@ def test_measurements_in_another_unit_are_refused() -> None:
         jaxcal.identify(JOINTS, measured / 1000, model=model)
     with pytest.raises(ValueError, match="commands in degrees"):
         jaxcal.identify(np.radians(JOINTS), measured, model=model)
-
-
-def test_a_pose_with_uncertain_commands_is_refused() -> None:
-    model = arm(1.0, Pose())
-    noise = Noise(std=0.1, command_std=0.01)
-    with pytest.raises(ValueError, match="command_std must not be given"):
-        jaxcal.identify(JOINTS, model.predict(JOINTS), model=model, noise=noise)
 
 
 @pytest.mark.parametrize("model", ["affine", SerialChain, np.sin])
