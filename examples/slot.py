@@ -20,7 +20,7 @@ from scipy import special
 
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
-from jaxcal.adaptive.policy.run import train
+from jaxcal.adaptive.policy.training import train
 from jaxcal.adaptive.rules import StateRule
 from jaxcal.adaptive.tasks import Entry
 from jaxcal.evaluation import sequential

@@ -221,7 +221,7 @@ def scan(given: DeviceOptions, *, bus: BusName = "", units: Units = 16) -> int:
             if site.config.bus.transport in scanning.OF_BUS:
                 units_found = list(scanning.scan(site.config.bus, units, _say, maps))
             if units_found:
-                steps.identify(site)
+                steps.show_identity(site)
     return EXIT_OK if units_found else EXIT_FAULT
 
 

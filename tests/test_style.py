@@ -34,7 +34,8 @@ def test_a_docstring_needs_no_neighbour() -> None:
     """Its first words say what comes out, also in an index and in ``help()``."""
     leaning = [
         f"{name}: {sentence}"
-        for name, text in (*sources("jaxcal"), *sources("rig"))
+        for package in ("jaxcal", "rig", "studies", "benchmarks", "examples")
+        for name, text in sources(package)
         for sentence in LEANING.findall(text)
     ]
     assert not leaning

@@ -103,7 +103,7 @@ def ours(batch: int, episodes: int, options: dict[str, Any] | None = None) -> Ru
 def through_brax(
     batch: int, episodes: int, options: dict[str, Any] | None = None
 ) -> Run:
-    """The same environment behind brax's wrappers, as brax's trainers step it."""
+    """Steps of the environment behind brax's wrappers, as brax's trainers step it."""
     config = SelectionConfig()
     env = wrap_fresh(SelectionEnv(config), episode_length=K)
 

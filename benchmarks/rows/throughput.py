@@ -75,7 +75,7 @@ def peak_gigaflops() -> float:
 
 
 def torch_peak_gigaflops() -> float:
-    """The same through PyTorch."""
+    """Peak of a matrix product through PyTorch, in gigaflops."""
     import torch
 
     n = 1600

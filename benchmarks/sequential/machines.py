@@ -22,7 +22,7 @@ import numpy as np
 
 from jaxcal.adaptive.episodes import compare
 from jaxcal.adaptive.fit_ahead import fit
-from jaxcal.adaptive.policy import run
+from jaxcal.adaptive.policy import training
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.rules import SHARES, Gain, StateRule
 from jaxcal.adaptive.tasks import registry
@@ -111,9 +111,13 @@ def rows(name: str, options: Options) -> None:
         )  # fmt: skip
         with tempfile.TemporaryDirectory() as folder:
             begun = time.perf_counter()
-            run.train(config, folder)
+            training.train(config, folder)
             seconds = time.perf_counter() - begun
-            row(f"`policy`, seed {seed}", run.load(folder).decider, f"{seconds:.0f}")
+            row(
+                f"`policy`, seed {seed}",
+                training.load(folder).decider,
+                f"{seconds:.0f}",
+            )
 
 
 if __name__ == "__main__":

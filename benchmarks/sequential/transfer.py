@@ -42,7 +42,7 @@ from benchmarks.sequential.deciders import Rollouts
 from benchmarks.sequential.optimum import solve
 from jaxcal.adaptive.episodes import compare
 from jaxcal.adaptive.grid import GridBelief, GridTask
-from jaxcal.adaptive.policy import run
+from jaxcal.adaptive.policy import training
 from jaxcal.adaptive.rules import Gain, GainRate, best
 from jaxcal.adaptive.tasks.knee import PRICED, STATE_RULE, knee
 from jaxcal.adaptive.tuning import tune
@@ -276,14 +276,14 @@ def main(argv: list[str] | None = None) -> int:
     if options.json is not None:
         require_writable_folder(options.json.parent)
     cache.keep_compiled_programs()
-    trained = run.load(options.checkpoint)
+    trained = training.load(options.checkpoint)
     document: dict[str, Any] = {
         "versions": versions(), "policy": trained.meta, "seed": options.seed,
         "episodes": options.episodes,
     }  # fmt: skip
     policies = {"policy": trained.decider}
     if options.small is not None:
-        policies["trained"] = run.load(options.small).decider
+        policies["trained"] = training.load(options.small).decider
     for part in options.parts:
         if part == "small":
             document[part] = small(policies, options.episodes, options.seed)

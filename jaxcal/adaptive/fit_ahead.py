@@ -28,7 +28,7 @@ from jaxcal.adaptive.rules import SHARES, Shares
 from jaxcal.adaptive.search_kernel import NODE, SUM
 from jaxcal.adaptive.tuning import search
 
-__all__ = ["Fit", "fit", "outside"]
+__all__ = ["AheadFit", "fit", "outside"]
 
 Array = NDArray[np.float32]
 
@@ -47,7 +47,7 @@ _MEASURED = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Fit:
+class AheadFit:
     """A decider for one task, and its information gain there."""
 
     decider: Ahead | Shares
@@ -78,7 +78,7 @@ def fit(
     seconds: float | None = None,
     uses: int | None = None,
     seed: int = 0,
-) -> Fit:
+) -> AheadFit:
     """``ahead`` with the constants that gain most on a task's own sessions.
 
     Args:
@@ -127,7 +127,7 @@ class _Task:
 
 
 @functools.lru_cache(maxsize=16)
-def _fit(of: _Task, seed: int) -> Fit:
+def _fit(of: _Task, seed: int) -> AheadFit:
     seeds = np.random.SeedSequence(seed).generate_state(4)
     chosen = of.play(_plain(SHARES), _LEAST, seeds[0])[1]
     length = max(float((chosen >= 0).sum()) / _LEAST, 1.0)
@@ -169,8 +169,8 @@ def _fit(of: _Task, seed: int) -> Fit:
     rule = of.play(_plain(SHARES), count, seeds[3])[0].sum(axis=1)
     more, error = _paired(nats[best] - rule)
     if more < -2.0 * error:
-        return Fit(SHARES, float(rule.mean()), 0.0, 0.0)
-    return Fit(tried[best], float(nats[best].mean()), float(more), float(error))
+        return AheadFit(SHARES, float(rule.mean()), 0.0, 0.0)
+    return AheadFit(tried[best], float(nats[best].mean()), float(more), float(error))
 
 
 def _plain(rule: Shares) -> Ahead:

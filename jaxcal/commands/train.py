@@ -102,11 +102,11 @@ def _run(arguments: TrainOptions, prog: str) -> int:
         f"{typed_line(prog.replace('train', 'evaluate'))}{task} --checkpoint {out}"
     )
     if arguments.export:
-        from jaxcal.adaptive.policy import run
+        from jaxcal.adaptive.policy import training
         from jaxcal.learning.runtime import weights
         from jaxcal.learning.training import checkpoint
 
-        load: Callable[..., Any] = run.load if arguments.task else checkpoint.load
+        load: Callable[..., Any] = training.load if arguments.task else checkpoint.load
         weights.write(arguments.export, load(out).weights)
         print(f"exported the policy alone to {arguments.export}")
     return 0
@@ -123,7 +123,7 @@ def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) 
     first = devices.is_first()
     validates = first and not (arguments.task or arguments.no_validation)
     if arguments.task:
-        from jaxcal.adaptive.policy import run as trainer
+        from jaxcal.adaptive.policy import training as trainer
 
         schema, unit, columns = trainer.SCHEMA, "decisions", _TASK
         introduction = f"task {config.task}, seed {config.seed}; run folder {out}"
@@ -163,7 +163,7 @@ def _num_runs(arguments: TrainOptions, out: pathlib.Path) -> int:
     seeds = arguments.values.get("num_seeds") or 1
     sweep: Sequence[Any] = arguments.sweep
     if arguments.resume:
-        from jaxcal.adaptive.policy.run import SCHEMA
+        from jaxcal.adaptive.policy.training import SCHEMA
         from jaxcal.learning.training import checkpoint
 
         schema = SCHEMA if arguments.task else checkpoint.SCHEMA
@@ -253,7 +253,7 @@ def _for_brax(
 
 def _task_configuration(arguments: TrainOptions, out: pathlib.Path) -> PolicyConfig:
     """Configuration of a task: from the flags, or from the run to go on with."""
-    from jaxcal.adaptive.policy import run
+    from jaxcal.adaptive.policy import training
     from jaxcal.adaptive.policy.config import PolicyConfig
     from jaxcal.adaptive.tasks import registry
     from jaxcal.commands.train_arguments import TASK_PARTS, given_to
@@ -266,7 +266,7 @@ def _task_configuration(arguments: TrainOptions, out: pathlib.Path) -> PolicyCon
     if arguments.resume:
         more = {"with": arguments.with_} if arguments.with_ else {}
         _refuse_with_resume(given | more | _swept(arguments), out)
-        _, meta = checkpoint.read_meta(out, run.SCHEMA)
+        _, meta = checkpoint.read_meta(out, training.SCHEMA)
         config = PolicyConfig.from_meta(meta)
         if config.task != arguments.task:
             raise ValueError(f"--task must be {config.task}, that of {out}")

@@ -17,7 +17,7 @@ from jaxcal.adaptive.episodes import compare
 from jaxcal.adaptive.fit_ahead import fit, outside
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import AHEAD
-from jaxcal.adaptive.policy import run as policies
+from jaxcal.adaptive.policy import training as policies
 from jaxcal.adaptive.rules import (
     SHARES,
     CostRule,

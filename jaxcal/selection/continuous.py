@@ -874,37 +874,41 @@ class _Ascent:
                 metric = self.gradient(information)
             off = float((metric * (self.prior - information)).sum())
             if certain:
-                corners = np.array(np.meshgrid(*self.box)).reshape(len(self.box), -1).T
-                peaks, differ = corners, 0.0
-                heights = self.leverage(self.blocks(corners), metric)
+                peaks, differ = self._corners(), 0.0
+                heights = self.leverage(self.blocks(peaks), metric)
             else:
                 peaks, heights, differ = self._peaks(metric)
-                of_support = self.leverage(blocks, metric)
-                heights = np.append(heights, of_support)
+                heights = np.append(heights, self.leverage(blocks, metric))
                 peaks = np.concatenate([peaks, support])
-            bound = at + off + self.k * float(heights.max())
-            before = best
+            highest, before = float(heights.max()), best
+            bound = at + off + self.k * highest
             if bound < best:
-                best, error = bound, differ / max(float(heights.max()), 1e-300)
+                best, error = bound, differ / max(highest, 1e-300)
             gap = self._share(phi, best)
             if gap > 1.0 - 1e-9 or self.deadline.passed:
                 break
             if np.isfinite(before) and gap - self._share(phi, before) < _TOLD:
-                slack = self.k * float(heights.max()) + off
-                if slack < 1e-6 * max(abs(at), 1.0):
+                if self.k * highest + off < 1e-6 * max(abs(at), 1.0):
                     break
-            fresh = np.argsort(-heights)[: 2 * self.problem.num_regressors]
-            new = peaks[fresh]
-            far = (np.abs((new[:, None] - support) / self.span).max(axis=2) > 1e-6).all(
-                1
-            )
-            if not far.any():
+            new = self._new_support(peaks, heights, support)
+            if not len(new):
                 break
-            support = np.concatenate([support, new[far]])
-            blocks = np.concatenate([blocks, self.blocks(new[far])])
-            fill = np.full(int(far.sum()), 0.02 / int(far.sum()))
+            support = np.concatenate([support, new])
+            blocks = np.concatenate([blocks, self.blocks(new)])
+            fill = np.full(len(new), 0.02 / len(new))
             weights = np.concatenate([0.98 * weights, fill])
         return max(best, phi), error, certain
+
+    def _corners(self) -> Array:
+        """(2^n, n) of the limits."""
+        return np.array(np.meshgrid(*self.box)).reshape(len(self.box), -1).T
+
+    def _new_support(self, peaks: Array, heights: Array, support: Array) -> Array:
+        """The highest peaks that are not in the support of a weighted design yet."""
+        highest = np.argsort(-heights)[: 2 * self.problem.num_regressors]
+        new = peaks[highest]
+        apart = np.abs((new[:, None] - support) / self.span).max(axis=2)
+        return np.asarray(new[(apart > 1e-6).all(axis=1)])
 
     def _share(self, phi: float, bound: float) -> float:
         reported = self.objective.reported

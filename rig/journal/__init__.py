@@ -14,7 +14,7 @@ from rig.journal.device import (
 )
 from rig.journal.errors import JournalError, Refused
 from rig.journal.lock import BusLock
-from rig.journal.run import (
+from rig.journal.run_folder import (
     JOURNAL,
     Journal,
     Record,

@@ -21,15 +21,15 @@ from rig.journal import (
     new_run_folder,
     read_journal,
 )
-from rig.journal.run import SCHEMA
+from rig.journal.run_folder import SCHEMA
 from rig.simulator import Simulator
+from rig.workbench.command_run import Run, run_safely
 from rig.workbench.commission import steps
 from rig.workbench.commission.operator import Operator
 from rig.workbench.outputs.console import listen
 from rig.workbench.procedures import calibrate, verify
 from rig.workbench.procedures.collect import collect
 from rig.workbench.procedures.goto import goto
-from rig.workbench.run import Run, run_safely
 
 
 class SessionOptions(Protocol):

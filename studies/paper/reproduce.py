@@ -14,7 +14,7 @@ from jaxcal.progress import Progress
 
 if TYPE_CHECKING:
     from studies.paper.exhibits.exhibit import Claim, Exhibit
-    from studies.paper.exhibits.material import Settings
+    from studies.paper.exhibits.study import Settings
 
 _DESCRIPTION = """\
 Make every figure and table of the paper from our own runs, each beside what the paper
@@ -85,7 +85,7 @@ def _make(
 
     from jaxcal.learning.runtime import cache
     from studies.paper.exhibits.claims import claims
-    from studies.paper.exhibits.material import STUDIES, Settings
+    from studies.paper.exhibits.study import STUDIES, Settings
 
     cache.keep_compiled_programs()
     settings = Settings(seed, quick, data, studies or STUDIES)
@@ -107,17 +107,17 @@ def _make(
 
 def _exhibits(settings: Settings, progress: Progress) -> list[Exhibit]:
     """All of them, in the order of the paper."""
-    from studies.paper.exhibits.material import Material
+    from studies.paper.exhibits.study import Study
 
-    material = Material(settings, progress)
+    study = Study(settings, progress)
     # Small inputs that may be wrong come first: a bad file is refused at once.
     for name in ("dataset5", "dataset4"):
-        material.dataset(name)
+        study.dataset(name)
     found: list[Exhibit] = []
     for number, name in enumerate(_PARTS):
-        material.stage = f"part {number + 1} of {len(_PARTS)}, "
+        study.stage = f"part {number + 1} of {len(_PARTS)}, "
         part = importlib.import_module(f"studies.paper.exhibits.{name}")
-        found += part.exhibits(material)
+        found += part.exhibits(study)
     return sorted(found, key=lambda exhibit: _ORDER.index(exhibit.key))
 
 

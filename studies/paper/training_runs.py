@@ -59,7 +59,7 @@ def collect(run: pathlib.Path, out: pathlib.Path) -> dict[str, Any]:
 
 
 def thinned(metrics: dict[str, Array], max_rows: int = MAX_ROWS) -> dict[str, Array]:
-    """The same run in at most ``max_rows`` rows, each the mean of a block of updates.
+    """Metrics in at most ``max_rows`` rows, each the mean of a block of updates.
 
     ``reward_std`` stays that of single episodes: within and between the updates of a
     block. Counts and times are those at the end of the block; what is measured

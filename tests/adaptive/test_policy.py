@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxcal.adaptive.episodes import compare, play
-from jaxcal.adaptive.policy import run
+from jaxcal.adaptive.policy import training
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.policy.network import PolicyDecider, initial
 from jaxcal.adaptive.rules import Gain, Priced, StateRule
@@ -39,7 +39,7 @@ CONFIG = PolicyConfig(
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    return folder, run.train(CONFIG, folder)
+    return folder, training.train(CONFIG, folder)
 
 
 def leaves(state):
@@ -60,8 +60,8 @@ def test_a_policy_begins_as_its_rule():
 @pytest.mark.slow
 def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
     _, whole = finished
-    run.train(CONFIG, tmp_path, num_updates=1)
-    resumed = run.train(CONFIG, tmp_path, resume=True)
+    training.train(CONFIG, tmp_path, num_updates=1)
+    resumed = training.train(CONFIG, tmp_path, resume=True)
     for one, other in zip(leaves(whole), leaves(resumed), strict=True):
         np.testing.assert_array_equal(one, other)
     rows = (tmp_path / "metrics.csv").read_text().splitlines()
@@ -76,26 +76,26 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
 @pytest.mark.slow
 def test_the_run_trains_what_the_pure_function_does_and_tasks_are_arguments(tmp_path):
     one = dataclasses.replace(CONFIG, options=CONFIG.options[:1])
-    state = run.train(one, tmp_path)
+    state = training.train(one, tmp_path)
     train = jax.jit(make_train(one))
-    pure, metrics = train(jax.random.key(0), run.exercises(one)[0])
+    pure, metrics = train(jax.random.key(0), training.exercises(one)[0])
     for a, b in zip(leaves(pure.average), leaves(state.average), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
     assert metrics["reward_mean"].shape == (4,)
-    train(jax.random.key(1), run.exercises(CONFIG)[1])
+    train(jax.random.key(1), training.exercises(CONFIG)[1])
     assert train._cache_size() == 1
 
 
 @pytest.mark.slow
 def test_a_checkpoint_gives_back_the_policy_and_its_configuration(finished, tmp_path):
     folder, state = finished
-    trained = run.load(folder)
+    trained = training.load(folder)
     assert trained.meta["progress"]["updates"] == 4
     assert trained.config == CONFIG
     for one, other in zip(leaves(trained.params), leaves(state.average), strict=True):
         np.testing.assert_array_equal(one, other)
     weights.write(tmp_path / "alone.npz", trained.weights)
-    alone = run.load(tmp_path / "alone.npz")
+    alone = training.load(tmp_path / "alone.npz")
     assert alone.config == CONFIG
     for one, other in zip(leaves(trained.params), leaves(alone.params), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -105,7 +105,7 @@ def test_a_checkpoint_gives_back_the_policy_and_its_configuration(finished, tmp_
 def test_checkpoints_of_another_kind_are_refused(finished):
     folder, _ = finished
     with pytest.raises(CheckpointError, match="must be jaxcal-sequential-policy"):
-        run.load(weights.shipped("default"))
+        training.load(weights.shipped("default"))
     with pytest.raises(CheckpointError, match="must be jaxcal-policy"):
         checkpoint.load(folder)
 
@@ -121,8 +121,8 @@ def test_a_policy_mends_a_rule_that_ignores_trips(tmp_path):
             PPO, num_updates=60, decisions_per_update=1024, num_minibatches=4
         ),
     )
-    run.train(config, tmp_path)
-    deciders = {"rule": config.base, "policy": run.load(tmp_path).decider}
+    training.train(config, tmp_path)
+    deciders = {"rule": config.base, "policy": training.load(tmp_path).decider}
     mean, error = compare(knee(**SMALL), deciders, 2048, seed=7).paired(
         "policy", "rule"
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from jaxcal.adaptive.policy import run
+from jaxcal.adaptive.policy import training
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.weights import CheckpointError, Weights
 from jaxcal.learning.training import checkpoint
@@ -58,9 +58,9 @@ def test_another_format_is_refused(tmp_path, monkeypatch):
         weights.read(path)
 
 
-@pytest.mark.parametrize("load", [checkpoint.load, run.load])
+@pytest.mark.parametrize("load", [checkpoint.load, training.load])
 def test_what_ships_is_one_file_that_jax_reads_too(load):
-    held = weights.read(weights.shipped("knee" if load is run.load else "default"))
+    held = weights.read(weights.shipped("knee" if load is training.load else "default"))
     policy = load()
     assert policy.weights.fingerprint == held.fingerprint
     assert policy.meta == held.meta

@@ -23,7 +23,7 @@ from studies.paper.exhibits.intervals import (
     paired,
     share_interval,
 )
-from studies.paper.exhibits.material import Material, Settings
+from studies.paper.exhibits.study import Settings, Study
 from studies.paper.exhibits.training import exhibits, kept_runs, plateau
 from studies.paper.exhibits.variance import variance_table
 
@@ -146,14 +146,14 @@ def test_recordings_can_be_given(tmp_path: pathlib.Path) -> None:
         )
         rows = [",".join(map(repr, row)) for row in np.hstack([u, y]).tolist()]
         (tmp_path / f"{name}.csv").write_text("\n".join([header, *rows]) + "\n")
-    given = Material(Settings(data=tmp_path))
+    given = Study(Settings(data=tmp_path))
     found = given.parameters("dataset4", "all 50")[:, 0]
     assert found.shape == (100, 12)
     expected = [0.5, 0, 0, 0, 0.6, 0, 0, 0, 0.7, 1, 2, 3]
     np.testing.assert_allclose(found, np.tile(expected, (100, 1)), atol=1e-9)
     assert given.about_overlap("dataset4") == ""  # 5,000 are used as they stand
     assert str(tmp_path) in given.settings.about_recordings
-    assert "500 postures" in Material(Settings()).about_overlap("dataset4")
+    assert "500 postures" in Study(Settings()).about_overlap("dataset4")
 
 
 # -- training --------------------------------------------------------------------------
@@ -190,13 +190,13 @@ def _keep(
 
 
 def _shown(studies: pathlib.Path) -> dict[str, object]:
-    found = exhibits(Material(Settings(studies=studies)))
+    found = exhibits(Study(Settings(studies=studies)))
     return {exhibit.key: exhibit for exhibit in found}
 
 
 @pytest.mark.slow
 def test_no_label_of_figure_2_is_cut_off() -> None:
-    figures = [f for e in exhibits(Material(Settings())) for f in e.figures.items()]
+    figures = [f for e in exhibits(Study(Settings())) for f in e.figures.items()]
     assert [name for name, _ in figures] == ["figure_2_seeds", "figure_2_paper"]
     for name, figure in figures:
         as_bytes(figure, "svg")  # the first drawing of a new figure, as in the report

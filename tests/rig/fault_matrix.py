@@ -55,10 +55,10 @@ from rig.journal import (
 )
 from rig.journal.errors import Refused
 from rig.simulator import Truth, parse_fault
+from rig.workbench.command_run import Run
 from rig.workbench.commission.operator import Operator
-from rig.workbench.commission.steps import Site, go_home, identify
+from rig.workbench.commission.steps import Site, go_home, show_identity
 from rig.workbench.commission.steps import axes as check_the_axes
-from rig.workbench.run import Run
 
 PHASES = ("zeroing", "moving", "settling", "measuring", "saving")
 FAULTS = (
@@ -349,7 +349,7 @@ def _unknown_cell(fault: str, folder: pathlib.Path) -> Outcome:
         record = DeviceRecord(folder / "device.json")
         operator = Operator(yes=True, say=said.append)
         place = Site(served, record, operator, full_speed=True, listeners=(sim.hear,))
-        identify(place)
+        show_identity(place)
         assert go_home(place, here=True) == 0, said
         record.reach(SIGN_CHECKED, served)
         record.reach(STOP_PROVED, served)

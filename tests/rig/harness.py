@@ -26,10 +26,10 @@ from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, STOP_PROVED, DeviceReco
 from rig.journal.lock import BusLock
 from rig.signals import Signals
 from rig.simulator import Truth
+from rig.workbench.command_run import Run, run_safely
 from rig.workbench.outputs import report
 from rig.workbench.outputs.console import listen
 from rig.workbench.procedures.calibrate import calibrate
-from rig.workbench.run import Run, run_safely
 
 AS_OF_A_DEVICE = (
     stop.VERIFY_S,

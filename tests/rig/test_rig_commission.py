@@ -179,7 +179,7 @@ def test_a_count_of_0_after_a_power_cycle_is_not_home(at, name, obeys, monkeypat
         operator = Operator(yes=True, say=told.append)
         place = steps.Site(served, record, operator, full_speed=True,
                             listeners=(sim.hear,))  # fmt: skip
-        steps.identify(place)
+        steps.show_identity(place)
         assert steps.go_home(place, here=True) == 0
         counts = [round(drive.position) for drive in sim.drives]
         assert counts == ([2**30] * 3 if obeys else [0] * 3)

@@ -15,7 +15,7 @@ import pytest
 
 from rig.faults import Refused
 from rig.journal import Journal
-from rig.journal.run import SCHEMA
+from rig.journal.run_folder import SCHEMA
 from rig.signals import PAUSE
 from rig.workbench import live
 from rig.workbench.live.watcher import Watcher

@@ -200,7 +200,7 @@ def stage(request, tmp_path_factory):
     with made, sensed(made.places) as (port, gain):
         config = parse_config(stage_text(bus(made), request.param, port, counts))
         place = place_of(config, folder, said)
-        steps.identify(place)
+        steps.show_identity(place)
         assert steps.go_home(place, here=True) == 0, said
         assert steps.axes(place) == 0, said
         yield types.SimpleNamespace(

@@ -25,7 +25,7 @@ from rig.journal import (
     read_journal,
 )
 from rig.simulator import parse_fault
-from rig.workbench.run import Run
+from rig.workbench.command_run import Run
 
 
 @contextlib.contextmanager

@@ -16,8 +16,8 @@ from harness import (
 
 from rig.journal import read_journal
 from rig.simulator import Truth, parse_fault
+from rig.workbench.command_run import run_safely
 from rig.workbench.procedures.collect import collect
-from rig.workbench.run import run_safely
 
 TURNED = 25.0  # degrees: beyond the envelope of the limits, too
 

@@ -47,7 +47,7 @@ def test_a_calibration_that_is_not_to_be_used_wants_a_word(tmp_path, capsys):
 def test_a_wall_clock_that_is_set_back_exchanges_no_visits(tmp_path, monkeypatch):
     """H: the slip of 1.5 degrees at the end was read as the first visit."""
     wall = [1e9]
-    monkeypatch.setattr("rig.journal.run.time.time", lambda: wall[0])
+    monkeypatch.setattr("rig.journal.run_folder.time.time", lambda: wall[0])
     journal = Journal(tmp_path / "journal.jsonl")
     journal.write("a")
     wall[0] -= 3600.0

@@ -33,11 +33,11 @@ from rig.config import parse_config
 from rig.faults import Refused
 from rig.journal import read_journal
 from rig.simulator import Truth
+from rig.workbench.command_run import run_safely
 from rig.workbench.identification.conclusion import order_residuals
 from rig.workbench.procedures.calibrate import calibrate
 from rig.workbench.procedures.collect import collect
 from rig.workbench.procedures.plan import choose, draw_candidates
-from rig.workbench.run import run_safely
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 

@@ -31,9 +31,9 @@ from rig.journal import lock
 from rig.journal.lock import BusLock, read_armed
 from rig.signals import Signals
 from rig.simulator import parse_fault
+from rig.workbench.command_run import run_safely
 from rig.workbench.outputs.messages import event_lines
 from rig.workbench.procedures.collect import collect
-from rig.workbench.run import run_safely
 
 GENERIC = {'map = "leadshine_pr"': 'map = "generic"', **HASTY}
 

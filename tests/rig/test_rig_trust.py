@@ -42,11 +42,11 @@ from rig.readings.phone import Imu
 from rig.simulator import Truth
 from rig.simulator.faults import FaultInjector
 from rig.simulator.phone import Phone
+from rig.workbench.command_run import run_safely
 from rig.workbench.identification.conclusion import check_matrix
 from rig.workbench.procedures.collect import collect
 from rig.workbench.procedures.goto import unchecked
 from rig.workbench.procedures.verify import load_calibration, verify
-from rig.workbench.run import run_safely
 
 LOST = 1.4  # degrees, as was seen
 

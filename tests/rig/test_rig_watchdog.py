@@ -18,7 +18,7 @@ from rig.core.device import timeouts_left
 from rig.faults import MotionFault
 from rig.journal import read_journal
 from rig.simulator import Truth, parse_fault
-from rig.workbench.run import Run
+from rig.workbench.command_run import Run
 
 WATCHED = {'map = "leadshine_pr"': 'map = "generic"'}
 REGISTER, BEFORE = 0x2B, [0, 60000, 45000]  # what the drives held; 0: no watch

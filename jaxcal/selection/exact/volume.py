@@ -77,21 +77,32 @@ def largest_volumes(
     lengths = np.linalg.norm(vectors[kept], axis=1)
     order = np.argsort(-lengths, kind="stable")
     kept, lengths = kept[order], lengths[order]
-    h = len(kept)
-    points, index = np.empty((q - 1, h, q)), np.empty((q - 1, h), dtype=np.int64)
-    points[0], index[0] = vectors[kept], kept
-    place = np.zeros(q - 1, dtype=np.int64)
-    complete, nodes = descend(
-        points, index, place, subsets, volumes, deadline.remaining_s
-    )
+    nodes, begun = _search(vectors, kept, subsets, volumes, deadline)
     order = np.argsort(-volumes, kind="stable")
     order = order[: max(1, np.count_nonzero(volumes))]
     subsets, volumes = np.sort(subsets[order], axis=1), volumes[order]
     bound = float(volumes[0])
-    if not complete:
-        begun = max(0, int(place[0]) - 1)  # of the vectors that come first
+    if begun is not None:  # of the vectors that come first
         bound = max(bound, float(np.prod(lengths[begun : begun + q])))
-    return Volumes(subsets, unit * volumes, nodes, complete, unit * bound)
+    return Volumes(subsets, unit * volumes, nodes, begun is None, unit * bound)
+
+
+def _search(
+    vectors: Array, order: Indices, subsets: Indices, volumes: Array, deadline: Deadline
+) -> tuple[int, int | None]:
+    """Fill ``subsets`` and ``volumes`` with the largest of vectors, longest first.
+
+    Returns:
+        Nodes, and where the deadline passed first the vector that was begun with.
+    """
+    h, q = len(order), vectors.shape[1]
+    points, index = np.empty((q - 1, h, q)), np.empty((q - 1, h), dtype=np.int64)
+    points[0], index[0] = vectors[order], order
+    place = np.zeros(q - 1, dtype=np.int64)
+    complete, nodes = descend(
+        points, index, place, subsets, volumes, deadline.remaining_s
+    )
+    return nodes, None if complete else max(0, int(place[0]) - 1)
 
 
 def _climbed(vectors: Array) -> Indices:

@@ -30,7 +30,7 @@ from rig.core.proof import RADIANS
 from rig.faults import MotionFault
 from rig.readings.attitude import Array, euler_to_matrix, matrix_to_euler
 from rig.readings.geometry import geometry_of
-from rig.workbench.run import Run
+from rig.workbench.command_run import Run
 
 CLEAR = 4.0  # standard deviations that make a difference a finding
 NEAREST = 0.7  # cosine: an axis within 45 degrees of where it is expected

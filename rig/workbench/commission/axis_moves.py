@@ -10,6 +10,7 @@ from rig.core.motion import move
 from rig.core.proof import FIRST_MOTOR_DEG, slopes, unit_proved
 from rig.faults import MotionFault, Refused
 from rig.journal import SIGN_CHECKED
+from rig.workbench.command_run import Run
 from rig.workbench.commission.axis_check import (
     CLEAR,
     Change,
@@ -27,7 +28,6 @@ from rig.workbench.commission.axis_check import (
     stand_at,
 )
 from rig.workbench.commission.stops import prove_stops
-from rig.workbench.run import Run
 
 REACH_DEG = 3.0  # each way
 FAR_ENOUGH = 1.1  # a move that would be no longer than that is not made

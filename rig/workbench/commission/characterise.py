@@ -21,10 +21,10 @@ from rig.core.device import Device, Posture
 from rig.core.motion import move
 from rig.core.proof import ALLOWED_DEG
 from rig.faults import MotionFault, Refused
+from rig.workbench.command_run import Run
 from rig.workbench.commission.axis_check import Stand, stand_at
 from rig.workbench.commission.axis_moves import ROOM_DEG, SEEN_DEG
 from rig.workbench.commission.breakaway import Breakaway, Estimate
-from rig.workbench.run import Run
 
 LEVEL = 0.95
 PAIRS = 8  # of readings, of the play and of the dead zone

@@ -272,7 +272,7 @@ def go(site: steps.Site, given: SetupOptions) -> int:
     assert site.path is not None
     say(f"device record: {record.path}")
     if record.missing(site.config, IDENTIFIED):
-        steps.identify(site)
+        steps.show_identity(site)
     say("5 imu")
     pin(site, steps.look_at_phone(site))
     if record.missing(site.config, HOMED):

@@ -28,6 +28,7 @@ from rig.journal import (
 from rig.journal.lock import BusLock
 from rig.readings import make_source
 from rig.readings.geometry import geometry_of
+from rig.workbench.command_run import Run, run_safely
 from rig.workbench.commission.axis_check import Change
 from rig.workbench.commission.axis_moves import check_axes
 from rig.workbench.commission.connections import addresses_text, sensor_text, watch
@@ -35,7 +36,6 @@ from rig.workbench.commission.home import can_home, home, identity, unlimited
 from rig.workbench.commission.operator import Operator
 from rig.workbench.outputs.console import listen
 from rig.workbench.rig_toml import edit
-from rig.workbench.run import Run, run_safely
 
 WATCH_S = 5.0
 MOST_JOG_DEG = 10.0  # in one step
@@ -123,7 +123,7 @@ def own_folder(config: RigConfig) -> pathlib.Path:
     return new_run_folder(pathlib.Path(config.output), "simulated")
 
 
-def identify(site: Site) -> None:
+def show_identity(site: Site) -> None:
     """The configured units answer as the configured families: IDENTIFIED."""
     with site.bus("scan") as drives:
         found = identity(drives)
@@ -279,7 +279,7 @@ def _check_axes(site: Site, again: bool = False) -> int:
     site.take(edit(site.path, {change.key: change.new for change in changes}))
     site.say(f"  written; the old file is kept beside {site.path}")
     homed = site.record.state(HOMED) or {}
-    identify(site)
+    show_identity(site)
     # Which also forgets where each named axis was left: it is not what it was.
     site.record.reach(HOMED, site.config, **homed)
     return _check_axes(site, again=True)

@@ -22,7 +22,7 @@ from rig.drives import Drive
 from rig.drives.drive import STILL_COUNTS, Status
 from rig.faults import MotionFault
 from rig.journal import STOP_PROVED
-from rig.workbench.run import Run
+from rig.workbench.command_run import Run
 
 REACH_DEG = 3.0  # either side
 ADD_UP = 3.0  # axes: more move less far

@@ -17,7 +17,7 @@ from rig.workbench.identification import fit_model
 from rig.workbench.identification.drift import estimate_drift, without_drift
 from rig.workbench.identification.fit_affine import (
     held_out_errors,
-    identify,
+    identify_affine,
     pairs,
     uncertainty,
 )
@@ -75,7 +75,9 @@ def conclude(
     }
     if model is not None:
         return fit_model.conclude(config, model, postures, notes, told)
-    held_out, errors = held_out_errors(config, held, postures, identify(config, chosen))
+    held_out, errors = held_out_errors(
+        config, held, postures, identify_affine(config, chosen)
+    )
     zero_share = chosen[0]["samples"] / zero["samples"]
     limits = uncertainty(chosen, held_out, zero_share)
     if not compensated:
@@ -88,7 +90,7 @@ def conclude(
         "verdict": {"good": not reasons, "reasons": reasons},
     }
     noise = np.maximum(1e-9, limits["noise_std_deg"])
-    calibration = identify(config, chosen, noise, notes, zero_share)
+    calibration = identify_affine(config, chosen, noise, notes, zero_share)
     return calibration, {
         **told,
         "A": np.asarray(calibration.matrix).tolist(),

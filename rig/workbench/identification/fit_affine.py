@@ -19,7 +19,7 @@ def pairs(records: list[Record]) -> tuple[Array, Array]:
     return commands, np.array([r["measured_deg"] for r in records], dtype=np.float64)
 
 
-def identify(
+def identify_affine(
     config: RigConfig,
     records: list[Record],
     noise_std: Array | None = None,
@@ -70,7 +70,7 @@ def uncertainty(
     Args:
         chosen: posture records, from which A and b are identified.
         held_out: posture records.
-        zero_share: as of ``identify``.
+        zero_share: as of ``identify_affine``.
 
     Returns:
         noise_std_deg (m,), dof of an axis, basis, and ci95 (m, n + 1), half-widths of

@@ -30,7 +30,7 @@ def outputs(config: RigConfig, records: list[Record]) -> tuple[Array, Array]:
     return commands, np.array(values)
 
 
-def identify(config: RigConfig, model: DeviceModel, records: list[Record]) -> Any:
+def identify_model(config: RigConfig, model: DeviceModel, records: list[Record]) -> Any:
     """The parameters of the model from chosen postures: a ``jaxcal.Calibration``."""
     import jaxcal
 
@@ -77,7 +77,7 @@ def conclude(
         [record for record in postures.values() if record["role"] == role]
         for role in ("select", "held")
     )
-    calibration = identify(config, model, chosen)
+    calibration = identify_model(config, model, chosen)
     errors = held_out_errors(config, model, calibration, held)
     verdict = calibration.verdict
     summary = told | errors | {

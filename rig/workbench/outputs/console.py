@@ -10,10 +10,10 @@ import numpy as np
 from rig.config import RigConfig
 from rig.journal import Record
 from rig.readings.attitude import Array
+from rig.workbench.command_run import Run
 from rig.workbench.outputs.messages import choice_text, event_lines, numbers
 from rig.workbench.outputs.run_state import RunState
 from rig.workbench.outputs.telemetry import telemetry
-from rig.workbench.run import Run
 
 
 def listen(run: Run) -> None:

@@ -13,8 +13,9 @@ from rig.core.session import visit
 from rig.faults import MotionFault
 from rig.journal import SIGN_CHECKED
 from rig.readings.attitude import Array
+from rig.workbench.command_run import Run
 from rig.workbench.identification.conclusion import check_matrix, conclude
-from rig.workbench.identification.fit_affine import identify
+from rig.workbench.identification.fit_affine import identify_affine
 from rig.workbench.outputs.console import plan_lines
 from rig.workbench.outputs.run_state import roles_of
 from rig.workbench.procedures.plan import (
@@ -24,7 +25,6 @@ from rig.workbench.procedures.plan import (
     draw_held_out,
     travel_order,
 )
-from rig.workbench.run import Run
 
 MIDDLE, END = "reference:middle", "reference:end"  # visits of the zero posture
 
@@ -41,7 +41,7 @@ def calibrate(run: Run) -> int:
             chosen = [r for r in run.postures().values() if r["role"] == "select"]
             first = None
             if run.model is None:
-                first = identify(config, chosen)
+                first = identify_affine(config, chosen)
                 _check_gains(run, first.matrix)
             held = _held_out(run, first)
             if held:

@@ -8,11 +8,11 @@ from jaxcal.files import atomic_write
 from rig.core.device import Posture
 from rig.core.session import visit
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE
+from rig.workbench.command_run import Run
 from rig.workbench.identification.fit_affine import pairs
 from rig.workbench.outputs.messages import numbers
 from rig.workbench.procedures.calibrate import END
 from rig.workbench.procedures.plan import draw
-from rig.workbench.run import Run
 
 
 def collect(run: Run, count: int) -> int:

@@ -13,8 +13,8 @@ from rig.core.session import visit
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
 from rig.readings.attitude import Array
 from rig.readings.geometry import Frame, geometry_of
+from rig.workbench.command_run import Run
 from rig.workbench.identification import fit_model
-from rig.workbench.run import Run
 
 
 def goto(run: Run, calibration: Any, to: Sequence[float]) -> int:

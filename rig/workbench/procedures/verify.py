@@ -13,12 +13,12 @@ from rig.config.config import differences
 from rig.core.record_check import ZeroRecord
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
 from rig.model import model_of
+from rig.workbench.command_run import Run
 from rig.workbench.identification import fit_model
 from rig.workbench.identification.fit_affine import held_out_errors, pairs
 from rig.workbench.outputs.messages import error_text, numbers, prediction_text
 from rig.workbench.procedures.calibrate import pair_names, visit_pairs
 from rig.workbench.procedures.plan import draw_held_out
-from rig.workbench.run import Run
 
 _OFFERED = 10  # targets to choose each posture of a check from
 

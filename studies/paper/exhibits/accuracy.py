@@ -28,7 +28,7 @@ from studies.paper.exhibits.intervals import (
     paired,
     share_interval,
 )
-from studies.paper.exhibits.material import Material, commands_deg
+from studies.paper.exhibits.study import Study, commands_deg
 
 Array = NDArray[np.float64]
 
@@ -51,16 +51,16 @@ DRIFT_DEG, OUTLIER_SHARE = SWEEPS["drift"][2], SWEEPS["outliers"][2]
 POSTURES = (4, 5, 6, 8, 10, 12, 16, 20, 25, 30, 40, 50)
 
 
-def exhibits(material: Material) -> list[Exhibit]:
+def exhibits(study: Study) -> list[Exhibit]:
     """Four against fifty, and the number of postures."""
-    return [_four_or_fifty(material), _postures(material)]
+    return [_four_or_fifty(study), _postures(study)]
 
 
-def _four_or_fifty(material: Material) -> Exhibit:
-    settings = material.settings
+def _four_or_fifty(study: Study) -> Exhibit:
+    settings = study.settings
     count = min(settings.size("repeats"), settings.size("episodes"))
-    commands = commands_deg(material.dataset("dataset2"))[:count]
-    chosen = material.result("dataset2", "policy").indices[:count, 0]
+    commands = commands_deg(study.dataset("dataset2"))[:count]
+    chosen = study.result("dataset2", "policy").indices[:count, 0]
     rows: list[tuple[Any, ...]] = []
     numbers: dict[str, Any] = {}
     curves: dict[str, list[dict[str, Any]]] = {name: [] for name in SWEEPS}
@@ -88,7 +88,7 @@ def _four_or_fifty(material: Material) -> Exhibit:
         "four": mean_interval(_mean_variance(pick(z, chosen), z)),
         "fifty": mean_interval(_mean_variance(z, z)),
     }
-    numbers["recorded"] = _recorded(material)
+    numbers["recorded"] = _recorded(study)
     white, drift, gross = (numbers[name]["four_better"] for name in SWEEPS)
     names = ("scenario", "strength", "episode", "rms_four_deg", "rms_fifty_deg")
     return Exhibit.from_texts(
@@ -125,18 +125,18 @@ def _mean_variance(chosen: Array, region: Array) -> Array:
     return np.einsum("eni,eij,enj->en", region, inverse, region).mean(axis=1)
 
 
-def _recorded(material: Material) -> dict[str, Any]:
+def _recorded(study: Study) -> dict[str, Any]:
     """Four of fifty recorded together, predicting every other episode of dataset4."""
-    commands, measured = material.measured("dataset4")
+    commands, measured = study.measured("dataset4")
 
     def across(method: str) -> Array:
         """(E,) rms of each episode's calibration over all other episodes, degrees."""
-        parameters = material.parameters("dataset4", method)
+        parameters = study.parameters("dataset4", method)
         square = rms(predict(parameters, commands[None]) - measured[None]) ** 2
         return np.sqrt((square.sum(axis=1) - np.diag(square)) / (len(square) - 1))
 
     four, fifty = across("policy"), across("all 50")
-    rng, resamples = material.settings.rng(8, 9), material.settings.size("resamples")
+    rng, resamples = study.settings.rng(8, 9), study.settings.size("resamples")
     ratio = paired(four, fifty, rng, resamples).ratio_of_means
     return _means(four, fifty) | {"ratio_of_means": ratio}
 
@@ -173,16 +173,16 @@ def _four_against_fifty(curves: Mapping[str, list[dict[str, Any]]]) -> Figure:
 # -- how many postures -----------------------------------------------------------------
 
 
-def _postures(material: Material) -> Exhibit:
-    settings = material.settings
+def _postures(study: Study) -> Exhibit:
+    settings = study.settings
     count = min(settings.size("repeats"), 200)
-    unit = material.dataset("dataset2").candidates[:count]
-    commands = commands_deg(material.dataset("dataset2"))[:count]
+    unit = study.dataset("dataset2").candidates[:count]
+    commands = commands_deg(study.dataset("dataset2"))[:count]
     z = regressors(commands)
     scenarios = {"white noise": Device(), "drift": Device(drift_std_deg=DRIFT_DEG)}
     rows: list[tuple[Any, ...]] = []
     for step, k in enumerate(POSTURES):
-        material.progress("number of postures", step, len(POSTURES))
+        study.progress("number of postures", step, len(POSTURES))
         draw = settings.rng(9, step)
         order = np.argsort(draw.random(unit.shape[:2]), axis=1)[:, :k]
         restarts = 20 if settings.quick else None

@@ -17,35 +17,35 @@ from jaxcal.paper.twin import ORDERS, RobotConfig, read_out, simulate
 from jaxcal.plots.style import BLACK, COLOURS, boxes, legend_right, panels
 from studies.paper.exhibits.exhibit import Exhibit, by_axis, judge
 from studies.paper.exhibits.intervals import mean_interval, share_interval
-from studies.paper.exhibits.material import Material, commands_deg
+from studies.paper.exhibits.study import Study, commands_deg
 
 Array = NDArray[np.float64]
 
 
-def exhibits(material: Material) -> list[Exhibit]:
+def exhibits(study: Study) -> list[Exhibit]:
     """The robot, Table 1, Figures 1 and 6, the residual under the six Euler orders."""
-    recorded = material.settings.recorded
+    recorded = study.settings.recorded
     return [
-        _robot(material),
-        _table_1(material),
-        _errors(material, "dataset0", "figure_1", "Figure 1", "simulation"),
-        _errors(material, "dataset4", "figure_6", "Figure 6", recorded),
-        _orders(material),
+        _robot(study),
+        _table_1(study),
+        _errors(study, "dataset0", "figure_1", "Figure 1", "simulation"),
+        _errors(study, "dataset4", "figure_6", "Figure 6", recorded),
+        _orders(study),
     ]
 
 
-def _robot(material: Material) -> Exhibit:
+def _robot(study: Study) -> Exhibit:
     """Whether MuJoCo, which drives dataset0, and the closed form read the same."""
     robot = dataset0_robot()
-    commands = commands_deg(material.dataset("dataset3"))[0]
+    commands = commands_deg(study.dataset("dataset3"))[0]
     apart = np.abs(simulate(robot, commands) - read_out(robot, commands))
     numbers = {"postures": len(commands), "largest_difference_deg": apart.max()}
     return Exhibit.from_texts("robot", {}, numbers=numbers)
 
 
-def _errors(material: Material, name: str, key: str, title: str, where: str) -> Exhibit:
+def _errors(study: Study, name: str, key: str, title: str, where: str) -> Exhibit:
     """Input-output errors before calibration, and after it on held-out postures."""
-    commands, measured = material.measured(name)
+    commands, measured = study.measured(name)
     groups, per_group, _ = commands.shape
     # Each group is corrected by the parameters that the group before it identified.
     found = np.roll(least_squares(commands, measured), 1, axis=0)
@@ -66,7 +66,7 @@ def _errors(material: Material, name: str, key: str, title: str, where: str) -> 
         "errors",
         {
             **{"title": title, "where": where, "name": name, "groups": groups},
-            **{"per_group": per_group, "overlap": material.about_overlap(name)},
+            **{"per_group": per_group, "overlap": study.about_overlap(name)},
             "centre": max(map(abs, middle["after"].values())),
             "furthest": max(AXES, key=lambda a: abs(middle["before"][a])),
             "widest": widest,
@@ -121,8 +121,8 @@ def _error_boxes(before: Array, after: Array, title: str) -> Figure:
     return figure
 
 
-def _table_1(material: Material) -> Exhibit:
-    commands, measured = material.measured("dataset0")
+def _table_1(study: Study) -> Exhibit:
+    commands, measured = study.measured("dataset0")
     pooled = identify(commands.reshape(-1, 3), measured.reshape(-1, 3))
     truth = np.concatenate([np.diag(SCALE).ravel(), BIAS_DEG])
     names = Affine(3, 3).names
@@ -161,9 +161,9 @@ def _table_1(material: Material) -> Exhibit:
     )
 
 
-def _orders(material: Material) -> Exhibit:
-    count = 2_000 if material.settings.quick else 10_000
-    commands = RANGES.denormalise(material.settings.rng(6).random((count, 3)))
+def _orders(study: Study) -> Exhibit:
+    count = 2_000 if study.settings.quick else 10_000
+    commands = RANGES.denormalise(study.settings.rng(6).random((count, 3)))
     left = []
     for order in ORDERS:
         read = read_out(RobotConfig(read_out_order=order), commands)

@@ -19,7 +19,7 @@ from jaxcal.plots.style import BLACK, COLOURS, GREY, legend_below, panels
 from studies.paper.exhibits.devices import Device
 from studies.paper.exhibits.exhibit import Exhibit, from_rows
 from studies.paper.exhibits.intervals import share_interval
-from studies.paper.exhibits.material import Material, commands_deg
+from studies.paper.exhibits.study import Study, commands_deg
 
 Array = NDArray[np.float64]
 
@@ -31,14 +31,14 @@ LOOKS = {
 }
 
 
-def exhibits(material: Material) -> list[Exhibit]:
+def exhibits(study: Study) -> list[Exhibit]:
     """Ellipses of pairs of parameters, and how many calibrations lie within."""
-    settings = material.settings
-    evaluation = material.evaluation("dataset3")
+    settings = study.settings
+    evaluation = study.evaluation("dataset3")
     commands = commands_deg(evaluation.dataset)[0]
     draws = evaluation.random_log_det[0]
     middle = int(np.argsort(draws)[len(draws) // 2])
-    random, policy = (material.result("dataset3", m) for m in ("random", "policy"))
+    random, policy = (study.result("dataset3", m) for m in ("random", "policy"))
     four = policy.indices[0, 0]
     sets = (random.indices[0, middle], four, np.arange(len(commands)))
     covariance: dict[str, Any] = {}

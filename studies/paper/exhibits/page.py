@@ -13,7 +13,7 @@ import numpy as np
 from jaxcal import pages
 from jaxcal.extras import versions
 from studies.paper.exhibits.exhibit import Claim, Exhibit, Verdict
-from studies.paper.exhibits.material import Settings
+from studies.paper.exhibits.study import Settings
 
 _TONES: dict[Verdict, tuple[Literal["good", "fair", "bad", "neutral"], str]] = {
     "agrees": ("good", "agree"),

@@ -31,7 +31,7 @@ from jaxcal.selection import exact_batch
 from studies.paper.exhibits.devices import Device, pick, rms
 from studies.paper.exhibits.exhibit import Exhibit, by_axis, from_rows, judge
 from studies.paper.exhibits.intervals import median_interval, paired, share_interval
-from studies.paper.exhibits.material import Material
+from studies.paper.exhibits.study import Study
 
 Array = NDArray[np.float64]
 
@@ -56,13 +56,13 @@ _LOOKS = {
 }
 
 
-def exhibits(material: Material) -> list[Exhibit]:
+def exhibits(study: Study) -> list[Exhibit]:
     """Figure 10 on devices that drift, and on the recordings."""
-    return [_drifting(material), _recorded(material)]
+    return [_drifting(study), _recorded(study)]
 
 
-def _drifting(material: Material) -> Exhibit:
-    settings = material.settings
+def _drifting(study: Study) -> Exhibit:
+    settings = study.settings
     count = min(settings.size("repeats"), 250)
     rng = settings.rng(20)
     unit = rng.random((count * SESSIONS, 50, 3))
@@ -78,7 +78,7 @@ def _drifting(material: Material) -> Exhibit:
         for session in (0, LATER):
             # The eight postures that are predicted are not offered.
             at = (slice(None), session, slice(50 - POINTS))
-            material.progress("recalibration", len(parameters), 2 * len(CHOICES))
+            study.progress("recalibration", len(parameters), 2 * len(CHOICES))
             chosen = _choose(choice, unit[at], rng)
             found = least_squares(
                 pick(commands[at], chosen), pick(measured[at], chosen)
@@ -186,21 +186,21 @@ def _by_age(columns: dict[str, Any]) -> Figure:
 # -- on the recordings -----------------------------------------------------------------
 
 
-def _recorded(material: Material) -> Exhibit:
+def _recorded(study: Study) -> Exhibit:
     """Each calibration predicts eight postures of every other episode."""
     from jaxcal.selection.policy import select_batch
 
-    settings = material.settings
+    settings = study.settings
     rng = settings.rng(22)
-    (u0,), (y0,) = material.measured("dataset5")
-    u1, y1 = material.measured("dataset4")
+    (u0,), (y0,) = study.measured("dataset5")
+    u1, y1 = study.measured("dataset4")
     repeats = settings.size("random_draws")
     picks = np.argsort(rng.random((repeats, len(u0))), axis=1)[:, :4]
-    best = int(np.argmax(material.evaluation("dataset4").reference))
-    policy = np.asarray(select_batch(material.dataset("dataset5").candidates, 4))[0]
+    best = int(np.argmax(study.evaluation("dataset4").reference))
+    policy = np.asarray(select_batch(study.dataset("dataset5").candidates, 4))[0]
     others = np.delete(np.arange(len(u1)), best)
     # Postures that X_* was identified from are not predicted.
-    own = u1[best][material.result("dataset4", "exact").indices[best, 0]]
+    own = u1[best][study.result("dataset4", "exact").indices[best, 0]]
     order = rng.random(u1.shape[:2])
     order[(u1[:, :, None] == own).all(-1).any(-1)] = 2.0
     points = np.argsort(order, axis=1)[others, :POINTS]
@@ -208,13 +208,13 @@ def _recorded(material: Material) -> Exhibit:
     random = least_squares(u0[picks], y0[picks])
     found = {
         "x0_policy": least_squares(u0[policy], y0[policy]),
-        "x_star": material.parameters("dataset4", "exact")[best, 0],
+        "x_star": study.parameters("dataset4", "exact")[best, 0],
     }
     off = {name: predict(p, tested) - seen for name, p in found.items()}
     error = {name: rms(errors) for name, errors in off.items()}
     each = rms(predict(random[:, None], tested[None]) - seen[None])
     error["x0_random"] = np.median(each, axis=0)
-    every = material.parameters("dataset4", "policy")[others]
+    every = study.parameters("dataset4", "policy")[others]
     peers = predict(every, tested[None]) - seen[None]
     peer_error = np.sqrt((peers**2).mean(axis=(-3, -2, -1)))
     ahead = share_interval(peer_error > np.sqrt((error["x_star"] ** 2).mean()))

@@ -17,7 +17,7 @@ from studies.paper.exhibits.intervals import (
     mean_interval,
     share_interval,
 )
-from studies.paper.exhibits.material import Material, Settings
+from studies.paper.exhibits.study import Settings, Study
 
 Array = NDArray[np.float64]
 
@@ -25,22 +25,22 @@ STREAM = {"dataset2": 2, "dataset3": 3, "dataset4": 4}
 _WHERE = {"dataset2": "simulation", "dataset3": "independent simulation"}
 
 
-def exhibits(material: Material) -> list[Exhibit]:
+def exhibits(study: Study) -> list[Exhibit]:
     """Figures 3, 4, 7, 8 and the gap to the optimum."""
     return [
-        _determinants(material, "dataset2", "figure_3", "Figure 3"),
-        _gap(material, "dataset2"),
-        _best(material, "dataset3", "figure_4", "Figure 4"),
-        _determinants(material, "dataset4", "figure_7", "Figure 7"),
-        _best(material, "dataset4", "figure_8", "Figure 8"),
+        _determinants(study, "dataset2", "figure_3", "Figure 3"),
+        _gap(study, "dataset2"),
+        _best(study, "dataset3", "figure_4", "Figure 4"),
+        _determinants(study, "dataset4", "figure_7", "Figure 7"),
+        _best(study, "dataset4", "figure_8", "Figure 8"),
     ]
 
 
-def words_of(material: Material, name: str, title: str) -> dict[str, Any]:
+def words_of(study: Study, name: str, title: str) -> dict[str, Any]:
     """What the texts of the exhibits of one dataset cite."""
-    count, draws = material.evaluation(name).random_log_det.shape
-    where = _WHERE.get(name, material.settings.recorded)
-    overlap = material.about_overlap(name)
+    count, draws = study.evaluation(name).random_log_det.shape
+    where = _WHERE.get(name, study.settings.recorded)
+    overlap = study.about_overlap(name)
     words = {"title": title, "name": name, "where": where, "overlap": overlap}
     return words | {"count": count, "draws": draws}
 
@@ -98,9 +98,9 @@ _SPREADS: dict[str, Any] = {  # of log det S
 }
 
 
-def _determinants(material: Material, name: str, key: str, title: str) -> Exhibit:
-    evaluation = material.evaluation(name)
-    numbers = _comparison(evaluation, material.settings)
+def _determinants(study: Study, name: str, key: str, title: str) -> Exhibit:
+    evaluation = study.evaluation(name)
+    numbers = _comparison(evaluation, study.settings)
     times = numbers["policy"]["times_random"]
     narrower = all(
         numbers[f"policy_over_random_std_{what}"].high < 1.0
@@ -118,7 +118,7 @@ def _determinants(material: Material, name: str, key: str, title: str) -> Exhibi
     }
     return Exhibit.from_texts(
         "determinants",
-        words_of(material, name, title),
+        words_of(study, name, title),
         key=key,
         verdict=judge(times.low > 100.0 and narrower, times.high >= 100.0),
         figures={
@@ -131,12 +131,12 @@ def _determinants(material: Material, name: str, key: str, title: str) -> Exhibi
     )
 
 
-def _gap(material: Material, name: str) -> Exhibit:
-    evaluation = material.evaluation(name)
+def _gap(study: Study, name: str) -> Exhibit:
+    evaluation = study.evaluation(name)
     columns = _by_episode(evaluation)
     numbers: dict[str, Any] = {"proven_share": float(evaluation.proven.mean())}
     for method in ("policy", "greedy"):
-        log_det = material.result(name, method).log_det[:, 0]
+        log_det = study.result(name, method).log_det[:, 0]
         ratio = np.exp(np.minimum(log_det - evaluation.reference, 0.0))
         columns[f"ratio_{method}"] = ratio
         numbers[method] = {
@@ -177,8 +177,8 @@ def _gap_per_episode(columns: dict[str, Array], name: str) -> Figure:
     return figure
 
 
-def _best(material: Material, name: str, key: str, title: str) -> Exhibit:
-    evaluation = material.evaluation(name)
+def _best(study: Study, name: str, key: str, title: str) -> Exhibit:
+    evaluation = study.evaluation(name)
     best = {
         result.method: np.maximum.accumulate(result.log_det, axis=0)
         for result in evaluation.results
@@ -195,7 +195,7 @@ def _best(material: Material, name: str, key: str, title: str) -> Exhibit:
     never = float((random[-1] < first).mean())
     return Exhibit.from_texts(
         "best",
-        words_of(material, name, title),
+        words_of(study, name, title),
         key=key,
         verdict=judge(never > 0.95, True),
         figures={f"{key}_best_so_far": figures.best_so_far(evaluation)},
@@ -205,6 +205,6 @@ def _best(material: Material, name: str, key: str, title: str) -> Exhibit:
             "policy_first_over_random_best": ahead,
             "random_draws_that_never_reach_policys_first": never,
             "final_log_det_s": {m: float(v[-1, 0]) for m, v in best.items()},
-            "comparison": _comparison(evaluation, material.settings),
+            "comparison": _comparison(evaluation, study.settings),
         },
     )

@@ -11,12 +11,12 @@ from jaxcal.information.regression import log_det_information, regression_matrix
 from jaxcal.paper.constants import EPISODES, NUM_CANDIDATES, RANGES
 from studies.paper.exhibits.exhibit import Exhibit, from_rows, judge
 from studies.paper.exhibits.intervals import mean_interval
-from studies.paper.exhibits.material import Material
+from studies.paper.exhibits.study import Study
 
 
-def exhibits(material: Material) -> list[Exhibit]:
+def exhibits(study: Study) -> list[Exhibit]:
     """Table 2, Table 3, the reward's range and the rank of the regression matrix."""
-    return [_table_2(), _table_3(material), _reward(material), _rank(material)]
+    return [_table_2(), _table_3(study), _reward(study), _rank(study)]
 
 
 def _network() -> dict[str, Any]:
@@ -77,7 +77,7 @@ def _table_2() -> Exhibit:
     )
 
 
-def _table_3(material: Material) -> Exhibit:
+def _table_3(study: Study) -> Exhibit:
     paper = {
         "dataset0": ("simulation", 200, 6),
         "dataset1": ("simulation", 200_000, 3),
@@ -92,7 +92,7 @@ def _table_3(material: Material) -> Exhibit:
     for name, (kind, episodes, dim) in paper.items():
         size, width, used = NUM_CANDIDATES, 3, "no; training draws its own sets"
         if name != "dataset1":
-            data = material.dataset(name)
+            data = study.dataset(name)
             size, used = data.num_candidates, f"{data.num_episodes:,}"
             outputs = 0 if data.measured is None else data.num_outputs
             width = data.num_inputs + outputs
@@ -103,20 +103,20 @@ def _table_3(material: Material) -> Exhibit:
     same = all(entry["paper"] == entry["ours"] for entry in numbers.values())
     return Exhibit.from_texts(
         "table_3",
-        {"recordings": material.settings.about_recordings},
+        {"recordings": study.settings.about_recordings},
         verdict=judge(same, True),
         rows=rows,
         numbers=numbers,
     )
 
 
-def _reward(material: Material) -> Exhibit:
+def _reward(study: Study) -> Exhibit:
     corners = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
     sets = np.array(list(itertools.combinations(range(8), 4)))
     with np.errstate(divide="ignore"):
         bound = float(np.max(log_det_information(corners[sets])))
-    reward = material.result("dataset2", "policy").log_det[:, 0] / 10.0
-    best = material.evaluation("dataset2").reference
+    reward = study.result("dataset2", "policy").log_det[:, 0] / 10.0
+    best = study.evaluation("dataset2").reference
     side = float(np.exp((36.0 - best.mean()) / 18.0))
     words = {"count": len(reward), "bound": bound / 10, "side": side}
     return Exhibit.from_texts(
@@ -135,8 +135,8 @@ def _reward(material: Material) -> Exhibit:
     )
 
 
-def _rank(material: Material) -> Exhibit:
-    sets = material.dataset("dataset3").candidates
+def _rank(study: Study) -> Exhibit:
+    sets = study.dataset("dataset3").candidates
     ranks = {
         k: [int(np.linalg.matrix_rank(regression_matrix(c[:k]))) for c in sets]
         for k in (3, 4, 5)

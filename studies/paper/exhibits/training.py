@@ -24,7 +24,7 @@ from jaxcal.evaluation.training_figure import (
 from jaxcal.plots.style import COLOURS, GREY, band, boxes, panels
 from studies.paper.exhibits.exhibit import Exhibit, Verdict, judge
 from studies.paper.exhibits.intervals import mean_interval
-from studies.paper.exhibits.material import Material
+from studies.paper.exhibits.study import Study
 
 Array = NDArray[np.float64]
 
@@ -51,9 +51,9 @@ class Run:
         return bool(self.summary["episodes"] >= self.summary["planned_episodes"])
 
 
-def exhibits(material: Material) -> list[Exhibit]:
+def exhibits(study: Study) -> list[Exhibit]:
     """The seeds of the compact preset, and the paper's network."""
-    studies = material.settings.studies
+    studies = study.settings.studies
     seeds, paper = kept_runs(studies / "compact_seeds"), kept_runs(studies, "paper")
     return [_seeds(seeds, paper), _paper(paper)]
 

@@ -11,17 +11,17 @@ from jaxcal.evaluation import figures
 from jaxcal.models import Affine
 from jaxcal.plots.style import BLACK, COLOURS, GREY
 from studies.paper.exhibits.exhibit import Exhibit, judge
-from studies.paper.exhibits.material import METHODS, Material
 from studies.paper.exhibits.selection import STREAM, words_of
+from studies.paper.exhibits.study import METHODS, Study
 
 Array = NDArray[np.float64]
 
 
-def exhibits(material: Material) -> list[Exhibit]:
+def exhibits(study: Study) -> list[Exhibit]:
     """Figures 5 and 9."""
     return [
-        _variance(material, "dataset3", "figure_5", "Figure 5"),
-        _variance(material, "dataset4", "figure_9", "Figure 9"),
+        _variance(study, "dataset3", "figure_5", "Figure 5"),
+        _variance(study, "dataset4", "figure_9", "Figure 9"),
     ]
 
 
@@ -69,9 +69,9 @@ def variance_table(
     return out
 
 
-def _variance(material: Material, name: str, key: str, title: str) -> Exhibit:
-    settings = material.settings
-    parameters = {m: material.parameters(name, m) for m in (*METHODS, "all 50")}
+def _variance(study: Study, name: str, key: str, title: str) -> Exhibit:
+    settings = study.settings
+    parameters = {m: study.parameters(name, m) for m in (*METHODS, "all 50")}
     table = variance_table(
         parameters, settings.rng(STREAM[name], 1), settings.size("resamples")
     )
@@ -99,7 +99,7 @@ def _variance(material: Material, name: str, key: str, title: str) -> Exhibit:
     words |= {"lower": lower, "fifty": np.median(fifty[0])}
     return Exhibit.from_texts(
         "variance",
-        words_of(material, name, title) | words,
+        words_of(study, name, title) | words,
         key=key,
         verdict=judge(lower and (fifty[1] > 1.0).all(), lower),
         figures={f"{key}_parameter_variance": figure},

@@ -80,7 +80,7 @@ def commands_deg(dataset: Dataset) -> Array:
     return dataset.ranges.denormalise(dataset.candidates)
 
 
-class Material:
+class Study:
     """What the exhibits share; made when first asked for."""
 
     def __init__(self, settings: Settings, progress: Progress | None = None) -> None:
