@@ -92,30 +92,17 @@ def fit_model(
     fitted = with_misfit if model.fits_misfit else model
     scaled = prior is not None or exact  # as far as the prior wants it
     prior = prior or fitted.default_prior()
-    resolved = prior.resolve(fitted)
-    centre, to_centred = None, None
-    if exact and resolved.free.all() and not resolved.precisions.any():
-        centre, to_centred = _centre(fitted, commands[used], weights[used], excited)
-    white, reading_std, levels = _reading_noise(
-        model, noise, weights, measured.shape[1]
-    )
-    if common_noise or not exact:
-        levels = 0 * levels
-    elif common_noise is False:
-        levels = np.arange(len(levels))
-    problem = FitProblem(
-        model=fitted,
-        commands=commands[used] - (0.0 if centre is None else centre),
-        measured=measured[used],
-        white=white[used],
-        reading_std=reading_std[used],
-        mean=resolved.mean if to_centred is None else to_centred @ resolved.mean,
-        precision=resolved.precisions,
-        free=resolved.free,
+    problem, centre = _problem(
+        fitted,
+        commands,
+        measured,
+        weights,
+        prior=prior,
+        noise=noise,
         command_std=spread,
-        noise_known=noise.std is not None or noise.covariance is not None,
-        levels=levels,
-        loss=LOSSES[loss],
+        loss=loss,
+        common_noise=common_noise,
+        excited=excited,
     )
     scales, misfit_factor = None, 1.0
     if prior.by_data and scaled:
@@ -133,6 +120,53 @@ def fit_model(
             problem, solution, fields, scales, with_misfit, misfit_factor
         )
     return fields | {"model": model, "loss": loss}
+
+
+def _problem(
+    model: Model,
+    commands: Array,
+    measured: Array,
+    weights: Array,
+    *,
+    prior: Prior,
+    noise: Noise,
+    command_std: Array,
+    loss: str,
+    common_noise: bool | None,
+    excited: tuple[str, ...],
+) -> tuple[FitProblem, Array | None]:
+    """The problem of the measurements that count.
+
+    Returns:
+        It, and (n,) what its commands are counted from, None: from zero.
+    """
+    used, exact = _used(weights), not command_std.any()
+    resolved = prior.resolve(model)
+    centre, to_centred = None, None
+    if exact and resolved.free.all() and not resolved.precisions.any():
+        centre, to_centred = _centre(model, commands[used], weights[used], excited)
+    white, reading_std, levels = _reading_noise(
+        model, noise, weights, measured.shape[1]
+    )
+    if common_noise or not exact:
+        levels = 0 * levels
+    elif common_noise is False:
+        levels = np.arange(len(levels))
+    problem = FitProblem(
+        model=model,
+        commands=commands[used] - (0.0 if centre is None else centre),
+        measured=measured[used],
+        white=white[used],
+        reading_std=reading_std[used],
+        mean=resolved.mean if to_centred is None else to_centred @ resolved.mean,
+        precision=resolved.precisions,
+        free=resolved.free,
+        command_std=command_std,
+        noise_known=noise.std is not None or noise.covariance is not None,
+        levels=levels,
+        loss=LOSSES[loss],
+    )
+    return problem, centre
 
 
 def _widened(
@@ -474,23 +508,32 @@ def _covariance(
             alone = np.asarray(np.linalg.svd(of_readings, compute_uv=False), np.float64)
         of_rows += int(significant(alone, off=off).sum())
     factor, unseen = np.concatenate(root) / scale, np.concatenate(null) / scale
-    readings = solution.num_readings * len(problem.commands)
-    if len(unseen) and of_rows >= readings:
-        prior = solution.parameters, problem.precision, problem.free
-        words = "; ".join(
-            direction.words
-            for direction in unknown(problem.model, problem.commands, *prior)
-        )
-        raise ValueError(
-            f"measured holds {readings} independent readings, too few for "
-            f"{len(free)} free parameters: {len(unseen)} combinations of them "
-            f"stay unknown{f' ({words})' if words else ''}; measure more, or give a "
-            "prior or fixed parameters"
-        )
+    if len(unseen):
+        _require_readings(problem, solution, of_rows, len(unseen))
     directions = np.zeros((len(unseen), size))
     directions[:, free] = unseen
     covariance = _with_held(size, free, factor.T @ factor)
     return covariance, directions if len(directions) else None
+
+
+def _require_readings(
+    problem: FitProblem, solution: FitSolution, used: int, undetermined: int
+) -> None:
+    """Refuse readings of which all are ``used`` up, with parameters undetermined."""
+    readings = solution.num_readings * len(problem.commands)
+    if used < readings:
+        return
+    prior = solution.parameters, problem.precision, problem.free
+    words = "; ".join(
+        direction.words
+        for direction in unknown(problem.model, problem.commands, *prior)
+    )
+    raise ValueError(
+        f"measured holds {readings} independent readings, too few for "
+        f"{int(problem.free.sum())} free parameters: {undetermined} combinations of "
+        f"them stay unknown{f' ({words})' if words else ''}; measure more, or give a "
+        "prior or fixed parameters"
+    )
 
 
 def _with_held(size: int, free: NDArray[np.intp], covariance: Array) -> Array:

@@ -24,8 +24,9 @@ from jaxcal.calibration.check import Check
 from jaxcal.calibration.fit import Fit
 from jaxcal.csvtable import COMMANDS, MEASURED
 from jaxcal.files import atomic_write
+from jaxcal.models.verdict import left_out
 
-__all__ = ["SCHEMA", "left_out", "moved", "report"]
+__all__ = ["SCHEMA", "moved", "report"]
 
 Array = NDArray[np.float64]
 Calibration = Any  # a jaxcal.Calibration, whose module imports this one
@@ -63,19 +64,6 @@ SCHEMA: dict[str, Any] = {
     },
 }
 """JSON Schema of ``verdict.json``."""
-
-
-def left_out(calibration: Fit) -> Array:
-    """(N, m) residual of each measurement from the fit without it, to first order."""
-    noise = calibration.require_noise("held-out errors")
-    slopes, covariance = calibration.linear(calibration.commands, misfit=False)
-    spread = slopes @ covariance @ np.matrix_transpose(slopes)
-    root = np.diag(1.0 / np.where(noise > 0.0, noise, 1.0))
-    share = np.minimum(calibration.loss_weights, 1.0)[:, None, None]
-    values, vectors = np.linalg.eigh(np.eye(len(noise)) - share * root @ spread @ root)
-    turned = np.matrix_transpose(vectors) / np.maximum(values, 0.02)[..., None]
-    white = vectors @ turned @ root @ calibration.residuals[..., None]
-    return np.asarray(np.linalg.solve(root, white)[..., 0])
 
 
 def leverage(calibration: Fit) -> Array:
@@ -158,25 +146,10 @@ def report(
         OSError: the folder cannot be written, or a file not be read.
         ValueError: ``before`` has other parameters.
     """
-    verdict = calibration.verdict
-    good, reasons, next_step = verdict.good, verdict.lines(), verdict.next_step
-    if check is not None:
-        good, reasons, next_step = check.good, check.reasons, check.next_step
     hashes = {os.fspath(path): _sha256(pathlib.Path(path)) for path in files}
     content = json.dumps(calibration.to_dict(), indent=1, allow_nan=False) + "\n"
     hashes["calibration.json"] = hashlib.sha256(content.encode()).hexdigest()
-    document: dict[str, Any] = {
-        "format": "jaxcal-verdict",
-        "version": 1,
-        "of": "identify" if check is None else "check",
-        "good": good,
-        "exit_code": 0 if good else 1,
-        "reasons": list(reasons),
-        "next_step": next_step,
-        "unit": calibration.measured_unit,
-        "numbers": _numbers(calibration, check),
-        "files": hashes,
-    }
+    document = _document(calibration, check) | {"files": hashes}
     budgets: list[Budget] = []
     if calibration.noise_std is not None:
         budgets = [
@@ -198,7 +171,26 @@ def report(
     for name, text in written.items():
         with atomic_write(place / name) as file:
             file.write(text.encode())
-    return good
+    return bool(document["good"])
+
+
+def _document(calibration: Calibration, check: Check | None) -> dict[str, Any]:
+    """What ``verdict.json`` says of a calibration, or of its check."""
+    verdict = calibration.verdict
+    good, reasons, next_step = verdict.good, verdict.lines(), verdict.next_step
+    if check is not None:
+        good, reasons, next_step = check.good, check.reasons, check.next_step
+    return {
+        "format": "jaxcal-verdict",
+        "version": 1,
+        "of": "identify" if check is None else "check",
+        "good": good,
+        "exit_code": 0 if good else 1,
+        "reasons": list(reasons),
+        "next_step": next_step,
+        "unit": calibration.measured_unit,
+        "numbers": _numbers(calibration, check),
+    }
 
 
 def _of_predictions(

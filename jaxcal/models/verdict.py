@@ -10,9 +10,11 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-__all__ = ["USE", "Verdict", "outlying", "verdict"]
+__all__ = ["USE", "Verdict", "left_out", "outlying", "verdict"]
 
+Array = NDArray[np.float64]
 Fit = Any  # a jaxcal.Calibration, whose package imports this one
 
 UNLIKELY = 1e-4  # p-value of lack of fit under the noise that was given
@@ -39,6 +41,19 @@ class Verdict:
     def __str__(self) -> str:
         word = "good" if self.good else "not good"
         return "\n".join([*self.lines(), f"{word}; next: {self.next_step}"])
+
+
+def left_out(fit: Fit) -> Array:
+    """(N, m) residual of each measurement from the fit without it, to first order."""
+    noise = fit.require_noise("held-out errors")
+    slopes, covariance = fit.linear(fit.commands, misfit=False)
+    spread = slopes @ covariance @ np.matrix_transpose(slopes)
+    root = np.diag(1.0 / np.where(noise > 0.0, noise, 1.0))
+    share = np.minimum(fit.loss_weights, 1.0)[:, None, None]
+    values, vectors = np.linalg.eigh(np.eye(len(noise)) - share * root @ spread @ root)
+    turned = np.matrix_transpose(vectors) / np.maximum(values, 0.02)[..., None]
+    white = vectors @ turned @ root @ fit.residuals[..., None]
+    return np.asarray(np.linalg.solve(root, white)[..., 0])
 
 
 def outlying(fit: Fit, row: int) -> str:

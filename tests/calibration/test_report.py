@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal.calibration.report import SCHEMA, left_out, leverage, moved
+from jaxcal.calibration.report import SCHEMA, leverage, moved
 from jaxcal.commands.main import main
+from jaxcal.models.verdict import left_out
 
 
 def table(path, rng, gain=0.71, rows=9):

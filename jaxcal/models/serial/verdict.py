@@ -17,7 +17,7 @@ from jaxcal.models import verdict as models
 from jaxcal.models.sensors import Landmarks, Pose, Position, Socket
 from jaxcal.models.sensors.sensor import hats
 from jaxcal.models.serial.mistaken import mistaken_columns
-from jaxcal.models.verdict import UNLIKELY, outlying
+from jaxcal.models.verdict import UNLIKELY, left_out, outlying
 
 __all__ = ["Verdict", "verdict"]
 
@@ -276,7 +276,7 @@ def _errors(
 ) -> _Errors:
     """The errors held out and of the nominal arm, of the rows that are used."""
     size, commands = usual / usual[0], calibration.commands[used]
-    held_out = np.linalg.norm(_left_out(calibration, used) / size, axis=1)
+    held_out = np.linalg.norm(left_out(calibration)[used] / size, axis=1)
     arm = calibration.model.located(commands, measured)
     off = measured - arm.predict(commands)
     for rows in _groups(arm, commands):  # a socket's place is no merit of either
@@ -294,20 +294,6 @@ def _in(calibration: Fit) -> str:
         if calibration.measured_unit and of_lengths
         else ""
     )
-
-
-def _left_out(calibration: Fit, used: NDArray[np.intp]) -> Array:
-    """(N, q) residual of each measurement from the fit without it."""
-    noise = np.diag(np.asarray(calibration.noise_std) ** 2)
-    slopes, covariance = calibration.linear(calibration.commands[used], misfit=False)
-    spread = slopes @ covariance @ np.matrix_transpose(slopes)
-    # Of an outlier little was fitted: its weight says how much.
-    share = np.minimum(calibration.loss_weights[used], 1.0)[:, None, None]
-    root = np.linalg.inv(np.sqrt(noise))
-    values, vectors = np.linalg.eigh(np.eye(len(noise)) - share * root @ spread @ root)
-    turned = np.matrix_transpose(vectors) / np.maximum(values, 0.02)[..., None]
-    white = (vectors @ turned @ root @ calibration.residuals[used][..., None])[..., 0]
-    return np.asarray(white @ np.sqrt(noise))
 
 
 def _scattered(calibration: Fit, usual: Array) -> tuple[bool, list[str]]:
