@@ -94,7 +94,7 @@ methods:
 
 tasks:
 {tasks}
-  FILE.py    your own: a file that defines ENTRY (docs/adaptive.md)
+  FILE.py    your own: a file that defines ENTRY (docs/own_task.md)
 
 examples:
   {program} --task knee

@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
-from jaxcal.evaluation.postures import PostureEvaluation as Evaluation
-from jaxcal.evaluation.postures import PostureResult, log_mean
+from jaxcal.evaluation.postures import PostureEvaluation, PostureResult, log_mean
 from jaxcal.evaluation.results import MethodResult
 from jaxcal.models import Affine
 from jaxcal.plots import selection
@@ -56,7 +55,7 @@ _FIXED: dict[str, dict[str, Any]] = {  # the style of random and exact in every 
 }
 
 
-def evaluation_figures(evaluation: Evaluation) -> dict[str, Figure]:
+def evaluation_figures(evaluation: PostureEvaluation) -> dict[str, Figure]:
     """Every figure the evaluation holds data for, by file name without suffix."""
     drawn = [
         first_selection,
@@ -71,7 +70,7 @@ def evaluation_figures(evaluation: Evaluation) -> dict[str, Figure]:
     return {draw.__name__: draw(evaluation) for draw in drawn}
 
 
-def first_selection(evaluation: Evaluation) -> Figure:
+def first_selection(evaluation: PostureEvaluation) -> Figure:
     """Candidates of the first episode and what two methods chose, in up to 3 planes."""
     points = evaluation.dataset.candidates[0]
     if points.shape[1] < 2:
@@ -91,7 +90,7 @@ def first_selection(evaluation: Evaluation) -> Figure:
     return figure
 
 
-def det_per_episode(evaluation: Evaluation) -> Figure:
+def det_per_episode(evaluation: PostureEvaluation) -> Figure:
     """det S in each episode: the main method, the optimum and one random draw."""
     figure, axes = _figure(evaluation, "det S per episode", 3.8)
     total = evaluation.dataset.num_episodes
@@ -117,7 +116,7 @@ def det_per_episode(evaluation: Evaluation) -> Figure:
     return figure
 
 
-def det_means(evaluation: Evaluation) -> Figure:
+def det_means(evaluation: PostureEvaluation) -> Figure:
     """Mean det S by method with its 95 % interval, and how many times random it is."""
     results = _with_random(evaluation)
     height = 0.9 + 0.42 * len(results)
@@ -176,7 +175,7 @@ def _intervals(
     axes.set_ylim(len(names) - 0.5, -0.7)
 
 
-def det_distributions(evaluation: Evaluation) -> Figure:
+def det_distributions(evaluation: PostureEvaluation) -> Figure:
     """Distribution of det S over the selections of each method, on a log scale."""
     names, log_dets, styles = zip(*_with_random(evaluation), strict=True)
     height = 1.1 + 0.42 * len(names)
@@ -191,7 +190,7 @@ def det_distributions(evaluation: Evaluation) -> Figure:
     return figure
 
 
-def gap_to_optimum(evaluation: Evaluation) -> Figure:
+def gap_to_optimum(evaluation: PostureEvaluation) -> Figure:
     """Share of selections that reach at least each fraction of the optimum."""
     figure, axes = _figure(evaluation, "Gap to the optimum", 4.0)
     for name, log_det, style in _with_random(evaluation):
@@ -211,7 +210,7 @@ def gap_to_optimum(evaluation: Evaluation) -> Figure:
     return figure
 
 
-def best_so_far(evaluation: Evaluation) -> Figure:
+def best_so_far(evaluation: PostureEvaluation) -> Figure:
     """Largest det S found up to each episode (paper, Figure 4).
 
     Of several draws an episode the median curve, with a band from 5 to 95 % of them.
@@ -233,7 +232,7 @@ def best_so_far(evaluation: Evaluation) -> Figure:
     return figure
 
 
-def parameter_variance(evaluation: Evaluation) -> Figure:
+def parameter_variance(evaluation: PostureEvaluation) -> Figure:
     """Variance over the episodes of each identified parameter (paper, Figure 5)."""
     dataset = evaluation.dataset
     rows = []
@@ -285,19 +284,21 @@ def variances(
     return figure
 
 
-def _figure(evaluation: Evaluation, title: str, height: float) -> tuple[Figure, Any]:
+def _figure(
+    evaluation: PostureEvaluation, title: str, height: float
+) -> tuple[Figure, Any]:
     """A titled figure of one panel, and its axes; height in inches."""
     figure, axes = _panels((8.0, height))
     axes.set_title(_title(evaluation, title), fontsize=10)
     return figure, axes
 
 
-def _title(evaluation: Evaluation, what: str) -> str:
+def _title(evaluation: PostureEvaluation, what: str) -> str:
     dataset = evaluation.dataset
     return f"{what}: {dataset.name}, {evaluation.k} of {dataset.num_candidates}"
 
 
-def _det_axis(axis: Any, evaluation: Evaluation, text: str = "{}") -> None:
+def _det_axis(axis: Any, evaluation: PostureEvaluation, text: str = "{}") -> None:
     """Name an axis that holds log10 det S and label it with powers of ten.
 
     The logs are drawn rather than a log axis, because det S of many axes in encoder
@@ -309,11 +310,11 @@ def _det_axis(axis: Any, evaluation: Evaluation, text: str = "{}") -> None:
     axis.set_major_formatter(FuncFormatter(lambda x, _: f"$10^{{{x:g}}}$"))
 
 
-def _reference_name(evaluation: Evaluation) -> str:
+def _reference_name(evaluation: PostureEvaluation) -> str:
     return "proven optimum" if evaluation.proven.all() else "optimum or its upper bound"
 
 
-def _label(evaluation: Evaluation, result: PostureResult) -> str:
+def _label(evaluation: PostureEvaluation, result: PostureResult) -> str:
     """The method in words, with its checkpoint where there are several."""
     policies = {r.checkpoint for r in evaluation.results if r.is_policy}
     if not result.is_policy or len(policies) < 2:
@@ -337,7 +338,7 @@ def _line(style: dict[str, Any]) -> dict[str, Any]:
 
 
 def _with_random(
-    evaluation: Evaluation,
+    evaluation: PostureEvaluation,
 ) -> list[tuple[str, Array, dict[str, Any]]]:
     """Name, (E, R) log det S and style of every method; random also when not asked."""
     results = evaluation.results

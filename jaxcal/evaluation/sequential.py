@@ -124,7 +124,7 @@ class DeciderEvaluation(Evaluation):
         )
 
     def summary(self, result: DeciderResult) -> dict[str, Any]:
-        """The numbers of one method, as documented in docs/adaptive.md."""
+        """The numbers of one method, as documented in docs/evaluation.md."""
         numbers = {
             "label": result.label,
             "nats": _moments(result.values[:, 0]),

@@ -120,14 +120,9 @@ def _watch(
     device: Device, starts: list[Status], target: Pulses, connection: int
 ) -> None:
     """Poll until all stand on their targets, or something is wrong."""
-    motion, begun, most_s = device.config.motion, time.monotonic(), 0.0
-    in_turn = device.line.in_turn
+    motion, begun = device.config.motion, time.monotonic()
     here = tuple(start.position for start in starts)
-    for drive, a, b in zip(device.drives, here, target, strict=True):
-        speed, accel = drive.axis.drive_motion
-        needed_s = abs(drive.axis.to_deg(b - a)) / speed + speed / accel
-        most_s = most_s + needed_s if in_turn else max(most_s, needed_s)
-    most_s = DEADLINE_FACTOR * most_s + DEADLINE_SLACK_S
+    most_s = _most_s(device, here, target)
     last = [(position, begun) for position in here]
     seen = [[start] for start in starts]
     while True:
@@ -147,36 +142,14 @@ def _watch(
                     late.append(axis.name)
                 continue
             late.append(axis.name)
-            begin, end, angle = map(axis.to_deg, (start, goal, status.position))
-            low, high = min(begin, end) - FOLLOWING_DEG, max(begin, end) + FOLLOWING_DEG
-            if not low <= angle <= high:
-                raise MotionFault(
-                    f"{axis.name} is at {angle:.3f} {axis.unit_name} on its way from "
-                    f"{begin:.3f} to {end:.3f}, more than {FOLLOWING_DEG:g} off it. "
-                    "Check gearing and direction, and that no other controller moves it"
-                )
+            _require_on_way(axis, start, goal, status)
             if abs(status.position - last[index][0]) > STILL_COUNTS:
                 last[index] = (status.position, status.time)
-                if in_turn:  # who waits for it does not stall
+                if device.line.in_turn:  # who waits for it does not stall
                     last = [(place, status.time) for place, _ in last]
             elif (stood := status.time - last[index][1]) > motion.stall_s:
-                short_by = abs(end - angle)
                 moved = abs(status.position - start) > tolerance
-                if status.done and not status.moving and moved:
-                    raise EndedShort(
-                        f"{axis.name} ended {short_by:.3f} {axis.unit_name} short of "
-                        f"its target, at {angle:.3f}, and its drive says that it is "
-                        "done. Look who stopped it: another controller, an emergency "
-                        "stop that was released, a limit of the drive itself",
-                        axis.name, status.position,
-                    )  # fmt: skip
-                raise MotionFault(
-                    f"{axis.name} does not follow: it stands {short_by:.3f} "
-                    f"{axis.unit_name} from its target for {stood:.2f} s (limit "
-                    "motion.stall_s = "
-                    f"{motion.stall_s:g}). Look for an obstacle, a loose coupling, "
-                    "a drive that is not enabled, or whoever stopped it"
-                )
+                raise _stalled(axis, goal, status, moved, stood, motion.stall_s)
         if not late:
             return
         if time.monotonic() > begun + most_s:
@@ -186,6 +159,54 @@ def _watch(
             )
         _check_attitude(device, connection)
         time.sleep(motion.poll_s)
+
+
+def _most_s(device: Device, here: Pulses, target: Pulses) -> float:
+    """Seconds that a move may take, by the speeds of the drives."""
+    most_s = 0.0
+    for drive, a, b in zip(device.drives, here, target, strict=True):
+        speed, accel = drive.axis.drive_motion
+        needed_s = abs(drive.axis.to_deg(b - a)) / speed + speed / accel
+        most_s = most_s + needed_s if device.line.in_turn else max(most_s, needed_s)
+    return DEADLINE_FACTOR * most_s + DEADLINE_SLACK_S
+
+
+def _require_on_way(axis: Axis, start: int, goal: int, status: Status) -> None:
+    """An axis is between its start and its goal.
+
+    Raises:
+        MotionFault: it is not.
+    """
+    begin, end, angle = map(axis.to_deg, (start, goal, status.position))
+    low, high = min(begin, end) - FOLLOWING_DEG, max(begin, end) + FOLLOWING_DEG
+    if not low <= angle <= high:
+        raise MotionFault(
+            f"{axis.name} is at {angle:.3f} {axis.unit_name} on its way from "
+            f"{begin:.3f} to {end:.3f}, more than {FOLLOWING_DEG:g} off it. "
+            "Check gearing and direction, and that no other controller moves it"
+        )
+
+
+def _stalled(
+    axis: Axis, goal: int, status: Status, moved: bool, stood_s: float, stall_s: float
+) -> MotionFault:
+    """What is wrong with an axis that stands away from its goal."""
+    end, angle = map(axis.to_deg, (goal, status.position))
+    short_by = abs(end - angle)
+    if status.done and not status.moving and moved:
+        return EndedShort(
+            f"{axis.name} ended {short_by:.3f} {axis.unit_name} short of its target, "
+            f"at {angle:.3f}, and its drive says that it is done. Look who stopped it: "
+            "another controller, an emergency stop that was released, a limit of the "
+            "drive itself",
+            axis.name, status.position,
+        )  # fmt: skip
+    return MotionFault(
+        f"{axis.name} does not follow: it stands {short_by:.3f} {axis.unit_name} from "
+        f"its target for {stood_s:.2f} s (limit motion.stall_s = {stall_s:g}). Look "
+        "for an obstacle, a loose coupling, a drive that is not enabled, or whoever "
+        "stopped it"
+    )
 
 
 def _check_speed(device: Device, axis: Axis, seen: list[Status]) -> None:

@@ -154,7 +154,7 @@ def solve_exact(
                     exchange_indices(problem, restarts, seed, deadline.part(0.5))
                 )
                 root_bound = relaxed(problem, start, deadline)
-                by_bound = _found(problem, [start], best, root_bound, 1)
+                by_bound = _solution_of(problem, [start], best, root_bound, 1)
                 assert by_bound.value is not None and by_bound.bound is not None
                 if (
                     problem.criterion.efficiency(by_bound.value, by_bound.bound)
@@ -176,7 +176,7 @@ def solve_exact(
     )  # fmt: skip
     subsets = [_expand(problem, keep, first, each) for each in searched.counts]
     bound = None if searched.proven else searched.bound
-    return _found(problem, subsets, best, bound, searched.nodes)
+    return _solution_of(problem, subsets, best, bound, searched.nodes)
 
 
 def _with_losses(
@@ -292,16 +292,16 @@ def _enumerate(
         np.sort(np.concatenate([problem.required, pool[s]])) for s in volumes.subsets
     ]
     if volumes.complete:
-        return _found(problem, subsets, best, None, volumes.examined)
+        return _solution_of(problem, subsets, best, None, volumes.examined)
     # Out of time: whatever greedy has, if that is better, and the sharper bound.
     greedy = np.sort(greedy_indices(problem))
     # log det(X_s.T X_s) is twice the log of the volume, beside that of ``required``.
     fixed = np.linalg.slogdet(required @ required.T)[1] if len(required) else 0.0
     bound = min(relaxed(problem, greedy), fixed + 2.0 * float(np.log(volumes.bound)))
-    return _found(problem, [*subsets, greedy], best, bound, volumes.examined)
+    return _solution_of(problem, [*subsets, greedy], best, bound, volumes.examined)
 
 
-def _found(
+def _solution_of(
     problem: Problem,
     subsets: list[Indices],
     best: int,
