@@ -60,12 +60,12 @@ class Fit:
     noise_dof: Annotated[float, "", 0.0]  # of the noise estimated, 0 where given
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
+        fields = vars(self)  # of a frozen class
+        for name, value in fields.items():
             if isinstance(value, np.ndarray):
-                value = np.array(value)
-                value.setflags(write=False)
-                object.__setattr__(self, name, value)
-        object.__setattr__(self, "provenance", _copied(self.provenance))
+                fields[name] = value = np.array(value)
+                value.flags.writeable = False
+        fields["provenance"] = _copied(self.provenance)
 
     # -- parameters --------------------------------------------------------------------
 

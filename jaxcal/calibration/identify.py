@@ -36,6 +36,8 @@ __all__ = ["identify"]
 
 Array = NDArray[np.float64]
 
+_LITTLE_ENDIAN = np.dtype("<f8")
+
 
 def identify(
     commands: ArrayLike | Recording | str | os.PathLike[str],
@@ -253,7 +255,7 @@ def _provenance(
     digest = hashlib.sha256()
     for array in (commands, measured, weight):
         digest.update(str(array.shape).encode())
-        digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+        digest.update(np.ascontiguousarray(array, dtype=_LITTLE_ENDIAN).tobytes())
     return {
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "packages": _packages(),

@@ -502,14 +502,15 @@ class FitSolution:
         if freedom.sum() < 1.0:
             return self.level
         square = self.weights @ self.white**2
-        if (self.same @ freedom < 0.5).any():
+        shared = self.same @ freedom
+        if (shared < 0.5).any():
             # What is met exactly has no level of its own, from then on.
             self._share(0 * self.shared)
-        same = self.same
-        square, freedom = same @ square, same @ freedom
+            shared = self.same @ freedom
+        square = self.same @ square
         if self.problem.loss is not None:
             square = square / constants(self.problem.loss, self.num_readings)[0]
-        return np.maximum(np.sqrt(square / freedom), self.floor)
+        return np.maximum(np.sqrt(square / shared), self.floor)
 
     def _climb(self, distance: Array) -> None:
         """Move the levels towards those of the residuals."""
