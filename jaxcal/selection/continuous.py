@@ -41,7 +41,7 @@ from jaxcal.deadline import Deadline
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, as_model
 from jaxcal.models.uncertainty import Noise, Prior
-from jaxcal.selection.criteria import CRITERIA, Criterion, ScenarioCriterion
+from jaxcal.selection.criteria import Criterion, ScenarioCriterion
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.problem import (
     CandidateSet,
@@ -245,15 +245,15 @@ def _range(commands: Array, allowed: Allowed | None) -> Array:
 
 def _same_criterion(selection: Selection) -> Any:
     """The criterion of a selection, asked for again."""
-    if isinstance(selection.problem.criterion, ScenarioCriterion):
-        return selection.problem.criterion
-    name = selection.criterion
-    if name in ("Ds", "As"):
+    criterion = selection.problem.criterion
+    if isinstance(criterion, ScenarioCriterion):
+        return criterion
+    if criterion.by_name:
         raise ValueError(
-            f"criterion {name} must be given again, with its parameters: "
-            f"refine(..., criterion=jaxcal.{name}([...]))"
+            f"criterion {criterion.name} must be given again, with its parameters: "
+            f"refine(..., criterion=jaxcal.{type(criterion).__name__}([...]))"
         )
-    return name
+    return criterion.name
 
 
 def _limits(limits: ArrayLike) -> Array:
@@ -460,9 +460,8 @@ class _Ascent:
         self.smooth = self.worst or self.each.kind == "least"
         self.prior = np.stack([member.prior for member in self.members])
         alone = offer.by_scenario() if len(self.members) > 1 else [offer]
-        of_one = CRITERIA[self.each.name]
         self.block_makers = [
-            blocks_of(one, of_one.by_name, of_one.of_region) for one in alone
+            blocks_of(one, self.each.by_name, self.each.of_region) for one in alone
         ]
         # Commands lie on a surface in the limits, as of an arm that touches something.
         self.surface = hasattr(allowed, "onto")
@@ -955,7 +954,7 @@ class _Ascent:
         pool = offer.candidates[offer.available]
         region = self.region
         given = getattr(getattr(self.asked, "criterion", self.asked), "region", None)
-        if region is None and given is None and CRITERIA[self.each.name].of_region:
+        if region is None and given is None and self.each.of_region:
             region = pool
         scenarios = None
         if len(self.members) > 1:

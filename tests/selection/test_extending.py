@@ -120,3 +120,17 @@ def test_a_solver_of_ones_own_is_asked_by_its_name(monkeypatch) -> None:
         jaxcal.select(
             candidates, 5, "largest", available=available, required=[order[-2]]
         )
+
+
+def test_a_criterion_of_ones_own_is_refined_without_a_row_in_the_table():
+    rng = np.random.default_rng(0)
+    candidates, weights = rng.uniform(-1.0, 1.0, (9, 1)), rng.normal(size=3)
+    design = jaxcal.Design(candidates, jaxcal.models.Polynomial(2, 1, 1))
+    first = design.select(4, C(weights), "exact")
+    better = design.refine(first.indices, criterion=C(weights), starts=1)
+    u = better.commands[:, 0]
+    rows = np.stack([np.ones(4), u, u * u], axis=1)
+    variance = weights @ np.linalg.solve(rows.T @ rows, weights)
+    assert better.value == pytest.approx(variance) and variance <= first.value
+    with pytest.raises(ValueError, match="criterion c must be given again"):
+        design.refine(first)
