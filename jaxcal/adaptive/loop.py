@@ -26,7 +26,12 @@ from jaxcal.adaptive.history import (
 from jaxcal.adaptive.journal import SessionJournal, fingerprint
 from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.rules import Gain
-from jaxcal.adaptive.session import Decider, SequentialTask, Session
+from jaxcal.adaptive.session import (
+    Decider,
+    SequentialTask,
+    Session,
+    jit_by_decider,
+)
 
 __all__ = ["Loop", "Proposal", "SessionResult", "next_measurement", "run"]
 
@@ -253,7 +258,7 @@ def _proposal(
     )  # fmt: skip
 
 
-@jax.jit
+@jit_by_decider
 def _choose(
     task: SequentialTask,
     decider: Decider,

@@ -9,14 +9,45 @@ plays thousands of sessions at once.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
 from flax import struct
 
-__all__ = ["Belief", "Decider", "Options", "SequentialTask", "Session", "pays"]
+__all__ = [
+    "Belief",
+    "Decider",
+    "Options",
+    "SequentialTask",
+    "Session",
+    "jit_by_decider",
+    "pays",
+]
 
 _ROUNDING = 1e-4  # of a cost: sums of float32 may miss the budget by less
+
+
+def jit_by_decider(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``jax.jit`` of f(task, decider, ...), compiled for each class of the two.
+
+    JAX 0.10.1 holds structures of different classes with as many fields for equal, and
+    where their hashes fall together runs what was compiled for the other: ``Gain`` was
+    played by ``Random``. A static argument is compared as it should be.
+    """
+
+    def of_kinds(kinds: tuple[type, type], *arguments: Any) -> Any:
+        return function(*arguments)
+
+    of_kinds.__name__ = function.__name__
+    compiled = jax.jit(of_kinds, static_argnums=0)
+
+    @functools.wraps(function)
+    def call(task: Any, decider: Any, *rest: Any) -> Any:
+        return compiled((type(task), type(decider)), task, decider, *rest)
+
+    return call
 
 
 @struct.dataclass

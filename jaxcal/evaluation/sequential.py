@@ -27,6 +27,7 @@ from jaxcal.adaptive.rules import (
     Random,
     StateRule,
 )
+from jaxcal.adaptive.session import jit_by_decider
 from jaxcal.adaptive.tasks.registry import Entry
 from jaxcal.adaptive.tuning import tune
 from jaxcal.evaluation.results import Evaluation, MethodResult, Summary, finite
@@ -270,7 +271,7 @@ def _decider(method: str, rules: Mapping[str, CostRule]) -> Any:
     return simple[method] if method in simple else rules[method]
 
 
-@jax.jit
+@jit_by_decider
 def _choose(task: Any, decider: Any, belief: Any, session: Any, keys: Any) -> Any:
     def one(belief: Any, session: Any, key: jax.Array) -> jax.Array:
         key_options, key_choice = jax.random.split(key)
