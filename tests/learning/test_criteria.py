@@ -82,6 +82,31 @@ def test_an_episode_is_paid_what_the_choice_is_worth(criterion: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("criterion", OTHERS)
+def test_many_candidates_are_looked_ahead_from_a_shortlist(
+    criterion: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The 512 starts that alone are worth most have what they have among all."""
+    points = np.random.default_rng(1).uniform(size=(1, 1100, 3))
+    active = np.arange(1100)[None] % 7 != 3
+    x, _ = regressors(criterion, jnp.asarray(points, jnp.float32), jnp.asarray(active))
+    inverse = inverse_of(jnp.eye(4)[None] + x[:, :3].mT @ x[:, :3])
+
+    def values() -> list[np.ndarray]:
+        found = lookahead(criterion, x, inverse, jnp.asarray(active), 3)
+        return [np.asarray(value)[0] for value in found]
+
+    few = values()
+    monkeypatch.setattr("jaxcal.learning.policies.criterion.ALL_START", 10**6)
+    whole = values()
+    starts = np.argsort(-whole[0], kind="stable")[:512]
+    np.testing.assert_allclose(few[0], whole[0], rtol=1e-6)
+    for some, every in zip(few[1:], whole[1:], strict=True):
+        np.testing.assert_allclose(some[starts], every[starts], rtol=1e-4, atol=1e-4)
+        assert (np.delete(some, starts) == -30.0).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("criterion", OTHERS)
 def test_the_lookahead_is_greedy_to_the_end(criterion: str) -> None:
     """Against greedy choices in float64, from every start."""
     active = np.arange(12) != 4

@@ -48,7 +48,7 @@ def test_of_many_candidates_those_of_largest_gain_are_looked_ahead_from(
     for mine, theirs in zip(few, values, strict=True):
         np.testing.assert_allclose(mine, theirs, atol=1e-4)
     assert (np.asarray(few[1]) > -30.0).sum() == 512
-    monkeypatch.setattr(geometry, "_ALL_START", 10**6)
+    monkeypatch.setattr(geometry, "ALL_START", 10**6)
     whole = geometry.lookahead(jnp.asarray(y), True, jnp.asarray(active), 3)
     shown = np.asarray(few[2]) > -30.0
     np.testing.assert_allclose(few[2][shown], whole[2][shown], atol=1e-5)

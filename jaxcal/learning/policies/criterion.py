@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jaxcal.learning.criteria import inverse_of, regressors, worth_of_inverse
+from jaxcal.learning.criteria import inverse_of, product, regressors, worth_of_inverse
 from jaxcal.learning.policies.compact import CompactNetwork
 from jaxcal.learning.policies.features import (
     CandidateFeatures,
@@ -16,13 +17,13 @@ from jaxcal.learning.policies.features import (
     picked_of,
     progress_of,
 )
+from jaxcal.learning.policies.geometry import ALL_START, STARTS
 from jaxcal.learning.small_matrices import cholesky, solve_lower
 
 __all__ = ["CriterionNetwork", "lookahead"]
 
 _RIDGE = 1e-3  # of the mean square of a coordinate, which is one
 _UNUSED = -30.0  # gain of a candidate that cannot be chosen
-_MOST = 1024  # candidates; a look-ahead holds some arrays of M squared
 
 
 class CriterionNetwork(CompactNetwork):
@@ -43,11 +44,6 @@ class CriterionNetwork(CompactNetwork):
         self, candidates: jax.Array, usable: jax.Array
     ) -> CandidateFeatures:
         """The geometry of sets; arguments as in ``Network``."""
-        if (m := candidates.shape[-2]) > _MOST:
-            raise ValueError(
-                f"num_candidates must be at most {_MOST:,} with criterion "
-                f"{self.config.criterion}, got {m:,}"
-            )
         x, offset = regressors(self.config.criterion, candidates, usable)
         p = x.shape[-1]
         start = jnp.broadcast_to(
@@ -110,24 +106,30 @@ def lookahead(
 
     Returns:
         Four arrays (..., M) as ``geometry.lookahead`` has them: over the first 1, 2, 3
-        and ``depth`` choices; -30 where not active.
+        and ``depth`` choices; -30 where not active. Of more than 1,024 candidates only
+        the 512 that alone grow it most are looked ahead from: of the others all but
+        the first are -30.
     """
+    m, p = x.shape[-2:]
     before = worth_of_inverse(criterion, inverse)[..., None]
-    shape = (*x.shape[:-1], x.shape[-2])  # (..., S, M), starts and candidates
-    column = jnp.broadcast_to(jnp.arange(shape[-1]), shape)
+    products = (x[..., :, None] * x[..., None, :]).reshape(*x.shape[:-1], p * p)
 
     def gained(inverses: jax.Array) -> jax.Array:
         return worth_of_inverse(criterion, inverses) - before
 
     def gains(inverses: jax.Array) -> jax.Array:
         """(..., S, M) by how much the trace falls where a candidate is chosen next."""
-        back = jnp.einsum("...sij,...mj->...smi", inverses, x)
-        size = 1.0 + (back * x[..., None, :, :]).sum(-1)
-        square = (back * back).sum(-1) / size
+        squares = product(inverses, inverses)
+        size = 1.0 + forms(inverses)
+        square = forms(squares) / size
         if criterion != "E":
             return square
-        twice = jnp.einsum("...sij,...smj->...smi", inverses, back)
-        return 2.0 * (back * twice).sum(-1) / size - square * square
+        return 2.0 * forms(product(squares, inverses)) / size - square * square
+
+    def forms(matrices: jax.Array) -> jax.Array:
+        """(..., S, M) quadratic forms x.T A x of matrices (..., S, p, p)."""
+        flat = matrices.reshape(*matrices.shape[:-2], p * p)
+        return jnp.einsum("...sf,...mf->...sm", flat, products)
 
     def further(d: jax.Array, carry: Any) -> Any:
         inverses, free, values = carry
@@ -144,14 +146,28 @@ def lookahead(
         ]
         return inverses, free, later
 
-    starts = (*x.shape[:-1], *inverse.shape[-2:])
-    inverses = _after(jnp.broadcast_to(inverse[..., None, :, :], starts), x)
-    first = gained(inverses)
-    start = jnp.broadcast_to(jnp.arange(shape[-1])[:, None], shape)
+    every = jnp.broadcast_to(inverse[..., None, :, :], (*x.shape[:-1], p, p))
+    inverses = _after(every, x)
+    first = jnp.where(active, gained(inverses), _UNUSED)
+    starts, begins, reached = jnp.arange(m), active, first
+    if m > ALL_START:
+        starts = jax.lax.top_k(first, STARTS)[1]
+        begins, reached = (
+            jnp.take_along_axis(values, starts, axis=-1) for values in (active, first)
+        )
+        inverses = jnp.take_along_axis(inverses, starts[..., None, None], axis=-3)
+    shape = (*reached.shape, m)
+    column = jnp.broadcast_to(jnp.arange(m), shape)
+    start = jnp.broadcast_to(starts[..., None], shape)
     free = active[..., None, :] & (column != start)
-    carry = (inverses, free, [first] * 3)
+    carry = (inverses, free, [reached] * 3)
     *_, values = jax.lax.fori_loop(1, depth, further, carry)
-    return [jnp.where(active, value, _UNUSED) for value in (first, *values)]
+    values = [jnp.where(begins, value, _UNUSED) for value in values]
+    if m > ALL_START:
+        unused, some = jnp.full_like(first, _UNUSED), jnp.asarray(depth) > 1
+        put = functools.partial(jnp.put_along_axis, axis=-1, inplace=False)
+        values = [jnp.where(some, put(unused, starts, x), first) for x in values]
+    return [first, *values]
 
 
 def _after(inverses: jax.Array, rows: jax.Array) -> jax.Array:

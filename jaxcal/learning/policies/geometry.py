@@ -17,6 +17,8 @@ import jax.numpy as jnp
 from jaxcal.learning.small_matrices import cholesky, solve_lower
 
 __all__ = [
+    "ALL_START",
+    "STARTS",
     "lookahead",
     "normalised_by",
     "projected",
@@ -24,8 +26,8 @@ __all__ = [
 ]
 
 _LOWEST = -30.0  # log-volume of a candidate that is not active
-_ALL_START = 1024  # M up to which all are looked ahead from
-_STARTS = 512  # of more, those of largest gain that are
+ALL_START = 1024  # M up to which all are looked ahead from
+STARTS = 512  # of more, those of largest gain that are
 _TAKEN = -1e9  # gain of a candidate that cannot be chosen
 _LEAST_GAIN = 1e-5  # of whitened vectors; smaller gains are float32 rounding errors
 
@@ -160,8 +162,8 @@ def lookahead(
     # For every start i (axis -2): the gains of all j (axis -1) after its choices.
     starts = jnp.broadcast_to(jnp.arange(m), square.shape)
     picked, reached, begins = y, first, active  # of each start, its newest choice
-    if m > _ALL_START:
-        starts = jax.lax.top_k(jnp.where(active, square, -1.0), _STARTS)[1]
+    if m > ALL_START:
+        starts = jax.lax.top_k(jnp.where(active, square, -1.0), STARTS)[1]
         picked = jnp.take_along_axis(y, starts[..., None], axis=-2)
         reached, begins = (
             jnp.take_along_axis(x, starts, axis=-1) for x in (reached, begins)
@@ -199,7 +201,7 @@ def lookahead(
     # A loop: as many copies of it as choices would take ten times as long to compile.
     *_, values = jax.lax.fori_loop(1, depth, further, carry)
     values = [jnp.where(begins, value, _LOWEST) for value in values[1:]]
-    if m > _ALL_START:
+    if m > ALL_START:
         lowest = jnp.full_like(square, _LOWEST)
         some = jnp.asarray(depth) > 1
         values = [
