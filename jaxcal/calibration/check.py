@@ -44,7 +44,7 @@ class Check:
     unseen: tuple[str, ...]  # parameters whose drift by ``tolerance`` could hide
     tolerance: float  # root mean square of the outputs' change that matters
     unit: str = ""  # of the tolerance, where the calibration has one
-    slipped: str = ""  # what most likely changed alone, and by how much
+    slipped: str = ""  # what alone would explain it, and by how much
 
     @property
     def good(self) -> bool:
@@ -63,7 +63,7 @@ class Check:
             f"seen with {self.power:.0%} on average"
         )
         if self.slipped:
-            text += f"; most likely {self.slipped}"
+            text += f"; a slip of {self.slipped} would explain it"
         if self.unseen and not self.good:
             text += f", and could hide in {', '.join(self.unseen)}"
         return (text,)
@@ -153,9 +153,13 @@ def check(
     hidden = judged & (size > change)
     squares = change[judged] ** 2
     power = tests.power(squares[:, None] * seen[judged], squares * along[judged]).mean()
-    slipped = ""
-    if p_slip < _ALARMS:
+    slipped, explained = "", False
+    if p_slip < _ALARMS and len(white) > 1:
         most = int(np.abs(changes_of_slips).argmax())
+        rest = white @ white - changes_of_slips[most] ** 2
+        others = _Test(np.array([len(white) - 1]), tests.whole.dof)
+        explained = others.p_value(np.array([rest])) >= _ALARMS
+    if explained:
         at, by_size = np.flatnonzero(slips)[most], slopes_of_slips[most]
         slipped_by = f"{changes_of_slips[most] / by_size:.2g}"
         units = calibration.model.units_for("", calibration.measured_unit)

@@ -75,6 +75,21 @@ def test_the_power_that_is_printed_is_that_of_simulated_changes():
     assert low <= sum(seen) <= high
 
 
+def test_a_slip_is_named_with_its_size_where_it_explains_the_readings():
+    joints, still = _new(TRUTH, 6, 11)
+    for name in ("theta2", "theta3", "theta5"):
+        slipped = TRUTH.copy()
+        slipped[ARM.names.index(name)] -= 0.1
+        told = FOUND.check(joints, still + ARM.predict(joints, slipped)
+                           - ARM.predict(joints, TRUTH))  # fmt: skip
+        what, _, size, unit = told.slipped.split()
+        assert (what, unit) == (name, "deg") and abs(float(size) + 0.1) < 0.03
+        assert f"a slip of {told.slipped} would explain it" in str(told)
+    rough = still + np.random.default_rng(0).normal(0.0, 1.0, still.shape)
+    assert FOUND.check(joints, rough).slipped == ""
+    assert FOUND.check(joints, still).slipped == ""
+
+
 def test_what_one_posture_cannot_tell_is_said():
     joints, measured = _new(TRUTH, 1, 3)
     result = FOUND.check(joints, measured, tolerance=0.02)
