@@ -95,7 +95,10 @@ class PPOConfig(abc.ABC):
 
     def require_sweep(self, sweep: Sweep) -> None:
         """Refuse a sweep of what cannot be swept, or of values that break a rule."""
+        swept = [name for name, _ in sweep]
         for name, values in sweep:
+            if swept.count(name) > 1:
+                raise ValueError(f"sweep must have each name once, got {name} twice")
             if name not in TRACED:
                 names = ", ".join(TRACED)
                 raise ValueError(f"sweep must be of {names}, got {name}")

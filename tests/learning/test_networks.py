@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from jaxcal.learning.core import network as networks
+from jaxcal.learning.core.network import Network, initial
 from jaxcal.learning.policies import scorer
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
@@ -282,3 +283,46 @@ def test_the_papers_scores_are_those_of_keys_that_are_written_out(rng):
     np.testing.assert_allclose(
         jax.nn.softmax(logits[0]), jax.nn.softmax(expected), rtol=1e-4, atol=1e-6
     )
+
+
+class _Short(Network):
+    """Logits of fewer candidates than there are."""
+
+    def candidate_features(self, candidates, usable):
+        return candidates
+
+    def decision_features(self, features, chosen, available, count):
+        return features, available
+
+    def encode(self, features):
+        return features
+
+    def decode(self, memory, decision):
+        return memory[..., :3, 0], memory.mean((-1, -2))
+
+
+class _NoValue(_Short):
+    """Logits and no value."""
+
+    def decode(self, memory, decision):
+        return memory[..., 0]
+
+
+class _Unfinished(Network):
+    """A network without methods."""
+
+
+@pytest.mark.parametrize(
+    ("network", "says"),
+    [
+        (
+            _Short(),
+            r"decode of _Short must return logits .*, 5\).*got \(1, 3\), \(1,\)",
+        ),
+        (_NoValue(), r"value .*got \(1, 5\)$"),
+        (_Unfinished(), "must define candidate_features, _Unfinished does not"),
+    ],
+)
+def test_a_network_of_ones_own_that_answers_wrongly_is_named(network, says):
+    with pytest.raises(ValueError, match=says):
+        initial(network, jax.random.key(0), 5, 3, 4)

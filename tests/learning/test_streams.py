@@ -206,6 +206,10 @@ def test_swept_values_are_runs_of_their_own_in_one_program(tmp_path):
             "sweep must be of learning_rate, .* got num_epochs",
         ),
         ((("clip_range", (0.2, -0.1)),), "clip_range must be positive, got -0.1"),
+        (
+            (("discount", (0.9,)), ("discount", (1.0,))),
+            "sweep must have each name once, got discount twice",
+        ),
     ],
 )
 def test_what_cannot_be_swept_is_refused(sweep, says):

@@ -78,15 +78,31 @@ class Network(nn.Module):
 
 
 def initial(network: Network, key: jax.Array, m: int, n: int, k: int) -> Any:
-    """Fresh parameters for M candidates of n inputs and K choices."""
-    return _initial(network, key, m, n, k)
+    """Fresh parameters for M candidates of n inputs and K choices.
+
+    Raises:
+        ValueError: a method is missing, or logits and value have other shapes.
+    """
+    kind = type(network)
+    for name in ("candidate_features", "decision_features", "encode", "decode"):
+        if getattr(kind, name, None) is getattr(Network, name):
+            raise ValueError(f"a Network must define {name}, {kind.__name__} does not")
+    answer, params = _initial(network, key, m, n, k)
+    shapes = [leaf.shape for leaf in jax.tree.leaves(answer)]
+    if shapes != [(1, m), (1,)]:
+        raise ValueError(
+            f"decode of {kind.__name__} must return logits (..., {m}), value (...,): "
+            f"for one set (1, {m}) and (1,), got {', '.join(map(str, shapes))}"
+        )
+    return params
 
 
 # Eager, it would compile two hundred small programs.
 @functools.partial(jax.jit, static_argnums=(0, 2, 3, 4))
 def _initial(network: Network, key: jax.Array, m: int, n: int, k: int) -> Any:
     blank = jnp.zeros((1, m, n)), jnp.ones((1, m), bool), jnp.full((1, k), -1)
-    return network.init(key, *blank)["params"]
+    answer, variables = network.init_with_output(key, *blank)
+    return answer, variables.get("params", {})
 
 
 def encode(network: Network, params: Any, features: Any) -> Any:

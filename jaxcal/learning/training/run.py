@@ -439,5 +439,7 @@ def _table(path: pathlib.Path, done: int, columns: Sequence[str]) -> TextIO:
 def _add(file: TextIO, columns: Sequence[str], row: Mapping[str, float]) -> None:
     """Write a row and flush it; what is not measured, or NaN, is empty."""
     held = {name: value for name, value in row.items() if not np.isnan(value)}
-    csv.DictWriter(file, columns, extrasaction="ignore").writerow(held)
+    csv.DictWriter(file, columns, extrasaction="ignore", lineterminator="\n").writerow(
+        held
+    )
     file.flush()
