@@ -276,6 +276,10 @@ def test_a_column_that_never_changes_is_named():
     joints[:, 2] = 0.0
     with pytest.raises(ValueError, match="panda_joint3 never changes"):
         _fit("panda_1", joints, PLACE[1])
+    joints = PLACE[0].copy()
+    joints[:, 3] = 0.0  # beyond its limits
+    with pytest.raises(ValueError, match=r"panda_joint4 .* never changes in 62 rows"):
+        _fit("panda_1", joints, PLACE[1])
 
 
 def test_degrees_that_were_converted_again_are_named():

@@ -362,6 +362,8 @@ class SerialChain(Arm, Model):
             if ((column >= least) & (column <= most)).all():
                 advice = f"{name} seems reversed, all rows are within them with the "
                 advice += "other sign: negate that column."
+            elif len(column) > 1 and not np.ptp(column):
+                advice = f"it never changes in {len(column)} rows, was it recorded?"
             else:
                 advice = "are the columns in this order: "
                 advice += f"{', '.join(self.joint_names)}?"
