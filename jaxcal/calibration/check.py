@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -117,34 +118,16 @@ def check(
     """
     given, measured, _ = recorded(calibration.model, commands, measured)
     commands, measured = _distinct(calibration, given, measured)
-    noise = calibration.require_noise("check")
-    predicted = calibration.predict(commands)
-    off = calibration.model.wrapped(measured - predicted, commands)
-    _require_unit(calibration, predicted + off, predicted, noise)
-    slopes = np.asarray(calibration.model.jacobian(commands, calibration.parameters))
-    p, names = slopes.shape[-1], calibration.names
-    root, least = _whitening(calibration, commands, noise)
-    white, by = root @ off.ravel(), root @ slopes.reshape(-1, p)
-    placed, levels = np.zeros(p, dtype=np.bool_), _levels(calibration)
-    level = np.tile(levels, len(commands))  # of each reading
-    if placed_anew:
-        if not calibration.model.placed:
-            raise ValueError("placed_anew is of an arm whose sensor stands somewhere")
-        placed = np.isin(names, calibration.model.placed)  # which says nothing now
-        white, by = without(by[:, placed], white, by)
-        level = np.zeros(len(white), dtype=np.intp)
-    if not len(white):
-        raise ValueError("measured must hold a reading beside what was placed anew")
-    of_level = level == np.unique(level)[:, None]
-    free = (calibration.free[:p] > 0.0) & ~placed
-    seen = (of_level @ by**2).T
+    off = _deviations(calibration, commands, measured, placed_anew)
+    names, free = calibration.names, off.free
+    seen = (off.of_level @ off.by**2).T
     slips = free & np.isin(names, calibration.model.slips) & (seen.sum(axis=1) > 0.0)
-    tests = _Tests.of(of_level.sum(axis=1), calibration, slips.sum(), least)
-    slopes_of_slips = np.linalg.norm(by[:, slips], axis=0)
-    ways = by[:, slips] / slopes_of_slips  # (N m, S) unit vectors
-    along = ((by.T @ ways) ** 2).max(axis=1, initial=0.0)  # seen by the best of them
-    changes_of_slips = white @ ways
-    p_value, p_slip = tests.p_values(of_level @ white**2, changes_of_slips**2)
+    tests = _Tests.of(off.of_level.sum(axis=1), calibration, slips.sum(), off.least)
+    slopes_of_slips = np.linalg.norm(off.by[:, slips], axis=0)
+    ways = off.by[:, slips] / slopes_of_slips  # (R, S) unit vectors
+    along = ((off.by.T @ ways) ** 2).max(axis=1, initial=0.0)  # seen by the best
+    changes_of_slips = off.white @ ways
+    p_value, p_slip = tests.p_values(off.of_level @ off.white**2, changes_of_slips**2)
     size = tests.smallest(seen, along)
     if tolerance is None:
         tolerance = _tolerance(calibration, commands)
@@ -153,17 +136,12 @@ def check(
     hidden = judged & (size > change)
     squares = change[judged] ** 2
     power = tests.power(squares[:, None] * seen[judged], squares * along[judged]).mean()
-    slipped, explained = "", False
-    if p_slip < _ALARMS and len(white) > 1:
+    slipped = ""
+    if p_slip < _ALARMS:
         most = int(np.abs(changes_of_slips).argmax())
-        rest = white @ white - changes_of_slips[most] ** 2
-        others = _Test(np.array([len(white) - 1]), tests.whole.dof)
-        explained = others.p_value(np.array([rest])) >= _ALARMS
-    if explained:
-        at, by_size = np.flatnonzero(slips)[most], slopes_of_slips[most]
-        slipped_by = f"{changes_of_slips[most] / by_size:.2g}"
-        units = calibration.model.units_for("", calibration.measured_unit)
-        slipped = f"{names[at]} by {slipped_by} {units[at]}"
+        if _explains(changes_of_slips[most], off.white, tests):
+            slip = changes_of_slips[most] / slopes_of_slips[most]
+            slipped = _slip_in_words(calibration, np.flatnonzero(slips)[most], slip)
     if p_value < _ALARMS:
         says = "does not hold"
     else:
@@ -178,6 +156,54 @@ def check(
         unit=calibration.measured_unit,
         slipped=slipped,
     )
+
+
+def _explains(change: float, white: Array, tests: _Tests) -> bool:
+    """Whether a slip that changes readings (R,) so much leaves nothing unusual."""
+    if len(white) < 2:
+        return False
+    others = _Test(np.array([len(white) - 1]), tests.whole.dof)
+    return others.p_value(np.array([white @ white - change**2])) >= _ALARMS
+
+
+def _slip_in_words(calibration: Fit, parameter: int, slip: float) -> str:
+    units = calibration.model.units_for("", calibration.measured_unit)
+    return f"{calibration.names[parameter]} by {slip:.2g} {units[parameter]}"
+
+
+class _Deviations(NamedTuple):
+    """R readings less their predictions, whitened for the uncertainty of both."""
+
+    white: Array  # (R,)
+    by: Array  # (R, p) their derivatives by the parameters
+    of_level: NDArray[np.bool_]  # (G, R) which of them have one level of noise
+    free: NDArray[np.bool_]  # (p,) parameters that may have drifted
+    least: float  # variance, of 1, without the misfit that they allow for
+
+
+def _deviations(
+    calibration: Fit, commands: Array, measured: Array, placed_anew: bool
+) -> _Deviations:
+    """The deviations of measurements, of which ``check`` has the arguments."""
+    noise = calibration.require_noise("check")
+    predicted = calibration.predict(commands)
+    off = calibration.model.wrapped(measured - predicted, commands)
+    _require_unit(calibration, predicted + off, predicted, noise)
+    slopes = np.asarray(calibration.model.jacobian(commands, calibration.parameters))
+    p, names = slopes.shape[-1], calibration.names
+    root, least = _whitening(calibration, commands, noise)
+    white, by = root @ off.ravel(), root @ slopes.reshape(-1, p)
+    level = np.tile(_levels(calibration), len(commands))  # of each reading
+    free = calibration.free[:p] > 0.0
+    if placed_anew:
+        if not calibration.model.placed:
+            raise ValueError("placed_anew is of an arm whose sensor stands somewhere")
+        placed = np.isin(names, calibration.model.placed)  # which says nothing now
+        white, by = without(by[:, placed], white, by)
+        level, free = np.zeros(len(white), dtype=np.intp), free & ~placed
+    if not len(white):
+        raise ValueError("measured must hold a reading beside what was placed anew")
+    return _Deviations(white, by, level == np.unique(level)[:, None], free, least)
 
 
 def _distinct(

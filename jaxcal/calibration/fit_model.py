@@ -423,23 +423,7 @@ def _fields(
     centre: Array | None,
 ) -> dict[str, Any]:
     covariance, null = _covariance(problem, solution)
-    freedom = float(solution.freedom.sum())
-    noise_std: Array | None = solution.level * np.sqrt(
-        (problem.reading_std**2).sum(axis=0) / len(problem.reading_std)
-    )
-    noise_dof = 0.0
-    if not problem.noise_known:
-        same = solution.level[:, None] == solution.level
-        noise_dof = float((same @ solution.freedom).min())
-        if freedom < 1.0 or noise_dof <= 0.0:
-            noise_std, noise_dof = None, 0.0
-    residuals = np.empty_like(measured)
-    residuals[used] = solution.residuals
-    if isinstance(used, np.ndarray):
-        unused = ~used
-        elsewhere = commands[unused] - (0.0 if centre is None else centre)
-        off = measured[unused] - problem.model.predict(elsewhere, solution.parameters)
-        residuals[unused] = problem.model.wrapped(off, elsewhere)
+    noise_std, noise_dof = _noise_level(problem, solution)
     estimate, mean = solution.parameters, problem.mean
     if centre is not None:
         back = np.asarray(problem.model.centred(-centre))
@@ -461,15 +445,53 @@ def _fields(
         "free": problem.free.astype(np.float64),
         "commands": commands,
         "estimated_commands": estimated,
-        "residuals": residuals,
+        "residuals": _residuals(problem, solution, commands, measured, used, centre),
         "loss_weights": loss_weights,
         "distance": distance,
-        "dof": max(freedom, 0.0),
+        "dof": max(float(solution.freedom.sum()), 0.0),
         "square": float(solution.distance.sum()),
         "num_readings": float(solution.num_readings),
         "noise_std": noise_std,
         "noise_dof": noise_dof,
     }
+
+
+def _noise_level(
+    problem: FitProblem, solution: FitSolution
+) -> tuple[Array | None, float]:
+    """The noise of a reading of weight 1, and its degrees of freedom.
+
+    Returns:
+        (q,) standard deviations, None where nothing tells; 0 where they were given.
+    """
+    mean_square = (problem.reading_std**2).sum(axis=0) / len(problem.reading_std)
+    std = solution.level * np.sqrt(mean_square)
+    if problem.noise_known:
+        return std, 0.0
+    same = solution.level[:, None] == solution.level
+    freedom = float((same @ solution.freedom).min())
+    if solution.freedom.sum() < 1.0 or freedom <= 0.0:
+        return None, 0.0
+    return std, freedom
+
+
+def _residuals(
+    problem: FitProblem,
+    solution: FitSolution,
+    commands: Array,
+    measured: Array,
+    used: slice | NDArray[np.bool_],
+    centre: Array | None,
+) -> Array:
+    """(N, q) of all measurements, also of those that were left out of the fit."""
+    if isinstance(used, slice):
+        return solution.residuals
+    residuals = np.empty_like(measured)
+    residuals[used] = solution.residuals
+    elsewhere = commands[~used] - (0.0 if centre is None else centre)
+    off = measured[~used] - problem.model.predict(elsewhere, solution.parameters)
+    residuals[~used] = problem.model.wrapped(off, elsewhere)
+    return residuals
 
 
 def _covariance(

@@ -42,7 +42,6 @@ RecordPath = Annotated[
     str, "CSV, or - (standard input); of an arm also a bag or a LeRobot dataset"
 ]
 _DRAWS = 10  # random choices that a plan is compared with
-_LENGTHS = ("position", "socket", "plane", "distance")  # sensors that read lengths
 
 
 def postures(
@@ -301,7 +300,7 @@ def identify(
     machine: Any = of_arm.machine(model, table)
     if of_urdf:
         readings = _arm_readings(of_arm, machine, table, inputs, outputs)
-        if machine.sensor.kind in _LENGTHS:  # files of this format are in metres
+        if machine.sensor.lengths:  # files of this format are in metres
             measured_unit = measured_unit or "m"
         if as_urdf and os.path.exists(out) and not overwrite:
             raise ValueError(f"{out} is there already; --overwrite writes over it")
@@ -328,15 +327,8 @@ def identify(
     saved = _saved(calibration, out, servos_out, str(recording.servos), overwrite)
     good = True
     if report:
-        good = calibration.report(
-            report,
-            before=Calibration.load(against) if against else None,
-            sources=[Source.certificate("certificate", certificate)]
-            if certificate is not None
-            else (),
-            at=None if at is None else _commands_for(calibration, read_table(at))[1],
-            files=[path for path in (file, model) if path and os.path.isfile(path)],
-        )
+        files = [path for path in (file, model) if path and os.path.isfile(path)]
+        good = _report(calibration, report, against, certificate, at, files)
     elif against or at or certificate is not None:
         raise ValueError("--against, --certificate and --at are of --report FOLDER")
     if json:
@@ -346,6 +338,27 @@ def identify(
     if report:
         print(f"report {os.path.join(report, 'index.html')}")
     return int(not good)
+
+
+def _report(
+    calibration: Calibration,
+    folder: str,
+    against: str | None,
+    certificate: float | None,
+    at: str | None,
+    files: list[str],
+) -> bool:
+    """Write the page by --against, --certificate and --at; whether it is good."""
+    sources = []
+    if certificate is not None:
+        sources = [Source.certificate("certificate", certificate)]
+    return calibration.report(
+        folder,
+        before=Calibration.load(against) if against else None,
+        sources=sources,
+        at=None if at is None else _commands_for(calibration, read_table(at))[1],
+        files=files,
+    )
 
 
 def _noise(machine: Any, stds: list[float] | None, play: float | None) -> Any:

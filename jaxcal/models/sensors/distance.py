@@ -24,6 +24,7 @@ class Distance(Landmarks):
     """
 
     kind = "distance"
+    lengths = True
     outputs = ("length",)
     axes = ("x", "y", "z", "zero")
     axis_units = ("length",) * 4

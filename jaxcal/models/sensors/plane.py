@@ -26,6 +26,7 @@ class Plane(Landmarks):
     """
 
     kind = "plane"
+    lengths = True
     outputs = ("height",)
     zeros = True
     axes = ("tilt1", "tilt2", "offset")

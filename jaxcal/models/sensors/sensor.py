@@ -89,6 +89,7 @@ class Sensor(abc.ABC):
     kind: ClassVar[str]  # in files and for the command line
     tool: ClassVar[tuple[str, ...]] = ("x", "y", "z")  # what of the tool it sees
     zeros: ClassVar[bool] = False  # what is measured is always zero
+    lengths: ClassVar[bool] = False  # every reading is a length
     compliant: ClassVar[bool] = False  # shown to be better with joints that yield
     local: ClassVar[bool] = False  # of few places: harmonics are fitted if they gain
     misfit: ClassVar[float] = 0.0  # what they leave, by the arm's length, in a choice

@@ -34,6 +34,7 @@ class Socket(Landmarks):
     distances: Sequence[Sequence[float]] = ()
 
     kind = "socket"
+    lengths = True
     outputs = ("off x", "off y", "off z")
     zeros = True
     local = True
