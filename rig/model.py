@@ -20,7 +20,8 @@ from rig.config import ConfigError, RigConfig
 from rig.readings.geometry import RADIAN
 
 if TYPE_CHECKING:
-    from jaxcal.models import Model, Prior
+    from jaxcal.models.model import Model
+    from jaxcal.models.uncertainty import Prior
 
 Array = NDArray[np.float64]
 # A phone tells where up is as a direction: it has neither scale nor bias.
@@ -92,7 +93,9 @@ def model_of(config: RigConfig) -> DeviceModel | None:
 
 
 def _arm(config: RigConfig) -> DeviceModel:
-    from jaxcal.models import Gravity, Position, Prior, SerialChain
+    from jaxcal.models.sensors import Gravity, Position
+    from jaxcal.models.serial import SerialChain
+    from jaxcal.models.uncertainty import Prior
 
     assert config.model is not None and config.model_path is not None
     by_phone, size = config.imu is not None, config.model.magnitude
@@ -126,7 +129,7 @@ def _in_small_letters(names: Sequence[str]) -> list[str]:
 
 def joint_names(urdf: str) -> list[str]:
     """Names of the axes of an arm, from the base outwards; ValueError, OSError."""
-    from jaxcal.models import SerialChain
+    from jaxcal.models.serial import SerialChain
 
     return _in_small_letters(SerialChain.from_urdf(urdf).joint_names)
 

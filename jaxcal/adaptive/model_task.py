@@ -21,7 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.adaptive.host import on_host
 from jaxcal.adaptive.session import Session
 from jaxcal.checks import numbers, table
-from jaxcal.models import FromFunction, FromJax, Noise, Prior
+from jaxcal.models.from_jax import FromJax
+from jaxcal.models.function import FromFunction
 from jaxcal.models.model import (
     Model,
     as_commands,
@@ -30,6 +31,7 @@ from jaxcal.models.model import (
     derivative,
     predict,
 )
+from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["Candidates", "candidates_of"]
 

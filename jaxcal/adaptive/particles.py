@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from jaxcal.adaptive.model_task import Draw, candidates_of
 from jaxcal.adaptive.session import Options, Session, pays
 from jaxcal.checks import in_words, numbers, whole_number
-from jaxcal.models import Noise, Prior
+from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = [
     "ParticleBelief",

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from jaxcal.evaluation.postures import PostureEvaluation, PostureResult, log_mean
 from jaxcal.evaluation.results import MethodResult
-from jaxcal.models import Affine
+from jaxcal.models.affine import Affine
 from jaxcal.plots import selection
 from jaxcal.plots.style import (
     BLACK,

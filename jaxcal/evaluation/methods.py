@@ -21,7 +21,7 @@ from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.parameters import estimate_parameters
 from jaxcal.evaluation.postures import PostureEvaluation, PostureResult
 from jaxcal.information.regression import log_det_gram, log_worth
-from jaxcal.models import Affine
+from jaxcal.models.affine import Affine
 
 __all__ = [
     "BASELINES",

@@ -19,7 +19,7 @@ from jaxcal.evaluation.results import (
     finite,
     moments,
 )
-from jaxcal.models import Affine
+from jaxcal.models.affine import Affine
 
 __all__ = [
     "HIT_TOLERANCE",

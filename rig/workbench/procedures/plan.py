@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.models import Affine
+from jaxcal.models.affine import Affine
 from jaxcal.selection.fastest import Motion, fastest_tour, travel_times
 from rig.config import RigConfig
 from rig.config.axis import Pulses
