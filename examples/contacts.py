@@ -46,7 +46,7 @@ def arm(name: str) -> SerialChain:
 
 
 def load(name: str) -> dict[str, Place]:
-    """Its contacts by the place where the sockets stood."""
+    """Contacts of an arm by the place where the sockets stood."""
     with (common.HERE / "contacts" / f"{name}.csv").open(newline="") as file:
         lines = list(csv.DictReader(file))
     joints = list(lines[0])[2:]

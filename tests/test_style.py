@@ -8,7 +8,10 @@ import re
 from collections.abc import Iterator
 
 ROOT = pathlib.Path(__file__).parents[1]
-LEANING = re.compile(r'"""((?:The same|As|Of|Likewise)\b.*)')
+LEANING = re.compile(
+    r'"""((?:The same|The rest|As|Of|Likewise|Same|Such|It|Its|They|Their|That|Those)'
+    r"\b.*)"
+)
 WORDS = {"each", "found", "known"}
 # What is left of a budget, and what is a thing's own, have names in these rooms.
 ROOMS = {

@@ -58,7 +58,7 @@ class TaskEnv(FunctionalEnv):
         return self._seen(now, key), step.reward, done, step.reward
 
     def network(self, width: int = 64) -> nn.Module:
-        """That of a policy: it begins as the base rule."""
+        """A policy's network, which begins as the base rule."""
         return _TaskNetwork(self.num_actions, width)
 
     def _seen(self, state: State, key: jax.Array) -> _Episode:

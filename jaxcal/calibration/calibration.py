@@ -190,7 +190,7 @@ class Calibration(Fit):
         return steps
 
     def _again(self, model: Any, prior: Prior) -> Calibration:
-        """These readings, fitted by another model of the machine."""
+        """The calibration of the same readings by another model of the machine."""
         fields = fit_model(
             self.commands,
             self.residuals + self.predict(self.commands),

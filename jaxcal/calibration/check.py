@@ -49,7 +49,7 @@ class Check:
 
     @property
     def good(self) -> bool:
-        """It holds."""
+        """Whether the calibration holds."""
         return self.says == "holds"
 
     @property

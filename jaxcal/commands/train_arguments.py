@@ -203,7 +203,7 @@ def read(prog: str, argv: Sequence[str]) -> TrainOptions:
 
 
 def preset_of(arguments: TrainOptions) -> str:
-    """That which was given; else the smallest."""
+    """Name of the preset that was given; else of the smallest."""
     return arguments.preset or "compact"
 
 

@@ -134,7 +134,7 @@ def _rows(shown: Summary) -> list[tuple[str, ...]]:
 
 
 def _checkpoints(shown: Summary) -> list[Any]:
-    """Those of the policies, each once."""
+    """The checkpoints of the policies, without repeats."""
     checkpoints: list[Any] = []
     for row in shown.rows:
         if row.is_policy and row.checkpoint not in checkpoints:

@@ -59,7 +59,7 @@ class Selection:
 
     @property
     def criterion(self) -> str:
-        """Its name in ``CRITERIA``, D, A, I, E, Ds or As; of scenarios "Mean(D)"."""
+        """Name in ``CRITERIA``, D, A, I, E, Ds or As; of scenarios "Mean(D)"."""
         return self.problem.criterion.name
 
     @property
@@ -98,7 +98,7 @@ class Selection:
 
     @cached_property
     def in_scenarios(self) -> ScenarioTable | None:
-        """Its efficiency in each scenario; None where there is one only."""
+        """The efficiency in each scenario; None where there is one only."""
         if not isinstance(self.problem, ScenarioProblem) or not self.problem.told:
             return None
         from jaxcal.selection.in_scenarios import in_scenarios

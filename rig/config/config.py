@@ -154,7 +154,7 @@ class RigConfig(Section):
 
     @property
     def is_arm(self) -> bool:
-        """Its axes are the joints of a URDF."""
+        """Whether the axes are the joints of a URDF."""
         return self.model is not None and bool(self.model.urdf)
 
     @property

@@ -282,7 +282,7 @@ class DriveMap(Section):
 
     @property
     def folder(self) -> pathlib.Path:
-        """That the file of a class is relative to."""
+        """The folder that the file of a class is relative to."""
         return self._folder
 
     @property
@@ -296,22 +296,22 @@ class DriveMap(Section):
 
     @property
     def watches_line(self) -> bool:
-        """It stops by itself where the line is silent, after a time that can be set."""
+        """Whether the drive stops after a silence of the line that can be set."""
         return False
 
     @property
     def mirrors_limits(self) -> bool:
-        """It takes the soft limits too."""
+        """Whether the drive takes the soft limits too."""
         return False
 
     @property
     def homes(self) -> bool:
-        """It has a homing of its own."""
+        """Whether the drive has a homing of its own."""
         return False
 
     @property
     def tells_homed(self) -> bool:
-        """It says whether it is homed."""
+        """Whether the drive says that it is homed."""
         return False
 
     @property

@@ -75,7 +75,7 @@ class Turns(NamedTuple):
         return [float(size) for size in np.linalg.norm(self.deg, axis=0)]
 
     def at(self, config: RigConfig, pulses: Pulses) -> Array:
-        """These columns where the device counts other pulses.
+        """The proof's columns where the device counts other pulses.
 
         In the phone's frame a joint's axis turns with the joints that it carries.
         Numbers are taken to change alike everywhere.

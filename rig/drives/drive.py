@@ -78,7 +78,7 @@ class Drive:
         raise NotImplementedError(_OWN)  # abstract
 
     def position(self) -> int:
-        """Its own count, by its encoder or of the steps it has made."""
+        """The drive's count, by its encoder or of the steps it has made."""
         raise NotImplementedError(_OWN)  # abstract
 
     def move(self, count: int, speed: float, accel: float) -> None:
@@ -147,19 +147,19 @@ class Drive:
         return None
 
     def watch(self) -> int:
-        """Its timeout of the line, as its register holds it, where it has one."""
+        """The line's timeout as the drive's register holds it, where it has one."""
         raise NotImplementedError(_WATCH)  # abstract
 
     def set_watch(self, counts: int) -> None:
-        """Set that register."""
+        """Set the register of the timeout of the line."""
         raise NotImplementedError(_WATCH)  # abstract
 
     def watch_counts(self, seconds: float) -> int:
-        """What that register holds of so many seconds, or of a little more."""
+        """The timeout's register for so many seconds, or for a little more."""
         raise NotImplementedError(_WATCH)  # abstract
 
     def lasting(self, ids: dict[str, int | str]) -> dict[str, int | str]:
-        """Its ids that do not change."""
+        """The ids of a drive that do not change."""
         return ids
 
     def foreign(self, ids: dict[str, int | str]) -> str:

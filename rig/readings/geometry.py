@@ -55,7 +55,7 @@ class Geometry(Protocol):
         """How far one reading is from another."""
 
     def too_far(self, way: float, most: float) -> str:
-        """That it moved further than it may, in words."""
+        """A sentence that what is read moved further than it may."""
 
     def way(self, first: Array, second: Array) -> Array:
         """(3,) or (m,) from one reading to another, as the first one sees it."""

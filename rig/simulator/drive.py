@@ -158,7 +158,7 @@ class SimDrive:
 
     @property
     def travels(self) -> bool:
-        """It is in the middle of a move."""
+        """Whether the drive is in the middle of a move."""
         self.advance()
         return self.moving and not self._stopping and abs(self.velocity) > 0.0
 

@@ -84,7 +84,7 @@ def corners_of(count: int) -> list[tuple[int, ...]]:
 
 
 def corner_name(config: RigConfig, signs: Sequence[int]) -> str:
-    """Such as ``pitch+ yaw- roll+``."""
+    """Name of the corner with these signs, as ``pitch+ yaw- roll+``."""
     named = zip(config.axis_names, signs, strict=True)
     return " ".join(f"{name}{'+' if sign > 0 else '-'}" for name, sign in named)
 

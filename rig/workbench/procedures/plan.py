@@ -119,7 +119,7 @@ def choose(
 def _choose_by_model(
     config: RigConfig, made: DeviceModel, candidates: Array, limit_s: float, **more: Any
 ) -> Choice:
-    """Those whose measurements predict best what any candidate measures (I)."""
+    """The postures that predict best what any candidate measures (I)."""
     import jaxcal
 
     session = config.session
