@@ -68,6 +68,8 @@ def _run(arguments: TrainOptions, prog: str) -> int:
 
     named = pathlib.Path(arguments.task or preset_of(arguments)).stem
     out = pathlib.Path(arguments.out or f"runs/{named}")
+    if arguments.resume and not arguments.task:
+        arguments.task = _task_held(out)
     if arguments.export and not arguments.export.endswith(".npz"):
         raise ValueError(f"--export must be a file NAME.npz, got {arguments.export}")
     if (runs := _num_runs(arguments, out)) > 1:
@@ -86,7 +88,7 @@ def _run(arguments: TrainOptions, prog: str) -> int:
         try:
             done = _train(config, arguments, out, stop)
         except DivergedError as error:
-            print(f"train: {error}", file=sys.stderr)
+            refused(prog, error)
             return 1
     if not devices.is_first():
         return 0
@@ -154,6 +156,29 @@ def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) 
     if first:
         _compare_runs(out, config, trainer.MEASURED, schema)
     return int(np.max(state.num_updates))
+
+
+def _task_held(out: pathlib.Path) -> str | None:
+    """The task that a run is of; None of postures, or where there is no run.
+
+    Raises:
+        ValueError: the task cannot be loaded, a file that has moved, say.
+    """
+    from jaxcal.adaptive.policy.training import SCHEMA
+    from jaxcal.adaptive.tasks import registry
+    from jaxcal.learning.training import checkpoint
+
+    try:
+        task = str(checkpoint.read_meta(out, SCHEMA)[1]["task"])
+    except checkpoint.CheckpointError:
+        return None
+    try:
+        registry.load(task)
+    except ValueError as error:
+        raise ValueError(
+            f"{out} is a run of task {task}: {error}; say where it is by --task FILE"
+        ) from error
+    return task
 
 
 def _num_runs(arguments: TrainOptions, out: pathlib.Path) -> int:
@@ -268,9 +293,11 @@ def _task_configuration(arguments: TrainOptions, out: pathlib.Path) -> PolicyCon
         _refuse_with_resume(given | more | _swept(arguments), out)
         _, meta = checkpoint.read_meta(out, training.SCHEMA)
         config = PolicyConfig.from_meta(meta)
-        if config.task != arguments.task:
+        held, given_task = map(pathlib.Path, (config.task, arguments.task))
+        moved = held.suffix == ".py" and held.name == given_task.name
+        if held != given_task and not moved:
             raise ValueError(f"--task must be {config.task}, that of {out}")
-        return config
+        return dataclasses.replace(config, task=arguments.task)
     _refuse_to_overwrite(out)
     options = entry.train_on
     if arguments.with_:

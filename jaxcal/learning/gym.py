@@ -12,6 +12,7 @@ in the same step; its last observation is in ``infos["final_obs"]``.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, ClassVar
 
 import gymnasium
@@ -61,7 +62,19 @@ class JaxVector(VectorEnv):
         return obs, {"action_mask": mask}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """One step of every environment."""
+        """One step of every environment.
+
+        Args:
+            actions: (num_envs,) whole numbers.
+
+        Raises:
+            ValueError: they are of another shape.
+        """
+        if np.shape(actions) != (self.num_envs,):
+            raise ValueError(
+                f"actions must be one for each environment, ({self.num_envs},), got "
+                f"shape {np.shape(actions)}"
+            )
         self._state, last, reward, done, metric = self._step(
             self._state, jnp.asarray(actions)
         )
@@ -82,8 +95,19 @@ class JaxVector(VectorEnv):
 
 
 def postures(num_envs: int = 1, **sizes: Any) -> JaxVector:
-    """The environment ``jaxcal/Postures-v0``; ``sizes``: fields of
-    ``SelectionConfig``."""
+    """The environment ``jaxcal/Postures-v0``.
+
+    Args:
+        num_envs: how many.
+        sizes: fields of ``SelectionConfig``.
+
+    Raises:
+        ValueError: a name that is none of them, or a value that it refuses.
+    """
+    fields = [field.name for field in dataclasses.fields(SelectionConfig)]
+    for name in sizes:
+        if name not in fields:
+            raise ValueError(f"options must be of {', '.join(fields)}, got {name}")
     return JaxVector(PosturesEnv(SelectionConfig(**sizes)), num_envs)
 
 

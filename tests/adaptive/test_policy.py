@@ -231,6 +231,40 @@ def test_commands_train_resume_and_compare(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
+    ("task", "arguments", "message"),
+    [
+        ("knee", ["--seed", "3"], "takes its configuration from"),  # not another schema
+        ("knee", ["--preset", "paper"], "--task knee does not read --preset"),
+        ("gone.py", [], "does not exist; say where it is by --task FILE"),
+        ("a/own.py", ["--task", "{}/other.py"], "--task must be a/own.py"),
+        ("a/own.py", ["--task", "{}/own.py"], "it begins"),  # the file that moved
+    ],
+)
+def test_a_run_knows_the_task_that_it_goes_on_with(
+    task, arguments, message, tmp_path, capsys, monkeypatch
+):
+    meta = CONFIG.as_meta() | {"task": task, "num_seeds": 1}
+    meta |= {"schema": training.SCHEMA, "version": checkpoint.VERSION}
+    folder = tmp_path / "checkpoint" / "6" / "meta"
+    folder.mkdir(parents=True)
+    (folder / "metadata").write_text(json.dumps(meta))
+    for name in ("own", "other"):
+        text = "from jaxcal.adaptive.tasks.knee import ENTRY"
+        (tmp_path / f"{name}.py").write_text(text)
+
+    def began(config, *_):
+        assert config.task == str(tmp_path / "own.py")
+        raise ValueError("it begins")
+
+    monkeypatch.setattr(train_command, "_train", began)
+    given = [each.format(tmp_path) for each in arguments]
+    again = ["--resume", "--out", str(tmp_path), *given]
+    assert train_command.main(again, "train.py") == 2
+    line = capsys.readouterr().err
+    assert message in line and line.startswith("train.py: ") and line.count("\n") == 1
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--task", "nee"], "task must be one of"),

@@ -33,3 +33,17 @@ def test_make_vec_plays_episodes_that_pay_their_log_det():
     assert not np.array_equal(obs[:, :24].reshape(3, 8, 3), sets)
     again, _ = envs.reset(seed=0)
     np.testing.assert_array_equal(again[:, :24].reshape(3, 8, 3), sets)
+
+
+def test_a_bad_option_and_a_bad_step_are_one_line():
+    from jaxcal.learning.environments.functional import PosturesEnv
+    from jaxcal.learning.gym import JaxVector, postures
+
+    with pytest.raises(
+        ValueError, match=r"^options must be of num_candidates, .* nope"
+    ):
+        postures(nope=3)
+    envs = JaxVector(PosturesEnv(), num_envs=3)
+    for actions in (np.zeros(2, int), 0, np.zeros((3, 1), int)):
+        with pytest.raises(ValueError, match=r"^actions must be .* \(3,\), got shape"):
+            envs.step(actions)
