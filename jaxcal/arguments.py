@@ -111,7 +111,7 @@ def _add(parser: Any, name: str, hint: Any, default: Any, option: bool) -> None:
     ):
         kind, said = parts[0], said if optional else parts[1:]
         may_be_none |= optional
-    text, metavar, *_ = *(each for each in said if isinstance(each, str)), "", ""
+    text, metavar, *_ = *(word for word in said if isinstance(word, str)), "", ""
     parse = next(filter(callable, said), None)
     limits: tuple[float, ...] = next((x for x in said if isinstance(x, tuple)), ())
     choices: Sequence[str] = next((x for x in said if isinstance(x, list)), ())

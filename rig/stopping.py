@@ -132,7 +132,7 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
             raise faults[0]
         for fault in faults:
             _say(str(fault))
-        good = all(each.acknowledged and each.standing for each in results)
+        good = all(result.acknowledged and result.standing for result in results)
         return EXIT_OK if good and not faults else EXIT_FAULT
 
 
@@ -165,7 +165,7 @@ def _targets(path: pathlib.Path, given: bool) -> tuple[list[ArmedBus], str]:
         fault = f"{path} names no bus: {' '.join(str(error).split())}"
         if isinstance(error, FileNotFoundError):
             fault = f"there is no {path}" + " here" * (not given)
-    every = [armed for each in armed_files() if (armed := read_armed(each))]
+    every = [armed for file in armed_files() if (armed := read_armed(file))]
     moving = [armed for armed in every if not armed["standing"]]
     return [ArmedBus(armed["bus"]) for armed in moving or every], fault
 
@@ -268,10 +268,10 @@ def _read(source: dict[str, Any] | pathlib.Path) -> tuple[Any, float, list[Any]]
         return config.bus, config.silence_s, [*config.axes]
     axes = [
         Axis.unmoved(
-            each["name"],
-            each["unit"],
-            parse_map(each["map"], "map", pathlib.Path(each.get("folder", ""))),
+            drive["name"],
+            drive["unit"],
+            parse_map(drive["map"], "map", pathlib.Path(drive.get("folder", ""))),
         )
-        for each in source["drives"]
+        for drive in source["drives"]
     ]
     return BusSettings.model_validate(source["bus"]), source["silence_s"], axes

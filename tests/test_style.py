@@ -22,6 +22,7 @@ MORE = {room: {"left", "own"} for room in ROOMS}
 # Where a file may bind one, which parsing tells.
 PRONOUN = re.compile(
     r"(?m)^ *[\w, (]*\b(each|found|known|left|own)\b(, \w+)*( [+|]?=|:| in) "
+    r"|\bfor [\w, (]*\beach\b"
 )
 LONG = 10  # lines, beyond which a pronoun must be held in the head
 
@@ -50,7 +51,7 @@ def banned_in(name: str) -> set[str]:
 
 
 def bound(function: Function) -> Iterator[str]:
-    """Names that a function binds for longer than one comprehension."""
+    """Names that a function binds for longer than one comprehension, and ``each``."""
     short = {
         id(target)
         for node in ast.walk(function)
@@ -61,7 +62,7 @@ def bound(function: Function) -> Iterator[str]:
         if isinstance(node, ast.arg):
             yield node.arg
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-            if id(node) not in short:
+            if id(node) not in short or node.id == "each":
                 yield node.id
 
 

@@ -443,7 +443,7 @@ def _compare_runs(
     if config.num_runs == 1:
         return
     progress = checkpoint.read_meta(out, schema)[1]["progress"]
-    values = np.array([[each[name] for name in measured] for each in progress["seeds"]])
+    values = np.array([[seed[name] for name in measured] for seed in progress["seeds"]])
     if not len(values):
         return
     runs = config.runs

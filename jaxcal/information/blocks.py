@@ -97,7 +97,7 @@ def _centred(
         scale = power_of_two(largest)
         largest = largest / scale
         blocks, first, ordered = (
-            each / scale[:, None, None] for each in (blocks, first, ordered)
+            array / scale[:, None, None] for array in (blocks, first, ordered)
         )
         root = root / scale[:, None]
     where_far, dense = _far(ordered, largest, same) if look else (None, None)

@@ -59,7 +59,9 @@ def parse(formula: str) -> tuple[dict[str, list[Factor]], set[str]]:
 
     try:
         terms = list(Formula(formula, _ordering="none"))
-        factors = [(str(term), [each.expr for each in term.factors]) for term in terms]
+        factors = [
+            (str(term), [factor.expr for factor in term.factors]) for term in terms
+        ]
     except (FormulaicError, AttributeError, SyntaxError) as error:
         # A formula of two sides has no terms; a message is plain in its first line.
         why = str(error).splitlines()[0] if isinstance(error, FormulaicError) else ""
@@ -69,7 +71,7 @@ def parse(formula: str) -> tuple[dict[str, list[Factor]], set[str]]:
         ) from error
     used: set[str] = set()
     return {
-        term: [_compile(each, used) for each in parts] for term, parts in factors
+        term: [_compile(part, used) for part in parts] for term, parts in factors
     }, used
 
 

@@ -189,8 +189,8 @@ class FromJax(Model):
             return jnp.atleast_1d(self.f(command, parameters))
 
         return tuple(
-            jax.jit(jax.vmap(each, in_axes=(0, None)))
-            for each in (f, jax.jacfwd(f, argnums=1), jax.jacfwd(f, argnums=0))
+            jax.jit(jax.vmap(function, in_axes=(0, None)))
+            for function in (f, jax.jacfwd(f, argnums=1), jax.jacfwd(f, argnums=0))
         )
 
     def _run(

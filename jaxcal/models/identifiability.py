@@ -245,7 +245,7 @@ def _parallel(
         else:
             first.append(int(i))
             classes.append([])
-    return first, [np.array(each) for each in classes if each]
+    return first, [np.array(vectors) for vectors in classes if vectors]
 
 
 def _sparse_null(columns: Array, off: float) -> Array:

@@ -67,7 +67,7 @@ def _word(word: Any) -> Word:
     if type(word) is int and 0 <= word <= 0xFFFF:
         return Word(word)
     name, _, kind = str(word).partition(":")
-    kinds: dict[str, Kind] = {each: each for each in FORMATS}
+    kinds: dict[str, Kind] = {form: form for form in FORMATS}
     if isinstance(word, str) and name in VALUES and kind in kinds:
         return Word(name, kinds[kind])
     raise ValueError(

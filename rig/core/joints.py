@@ -54,9 +54,12 @@ def show(device: Device) -> None:
             except TurnedTooFar as fault:
                 device.record.void(SIGN_CHECKED, str(fault))
                 raise
-        attitudes = [np.array(each["attitude"]) for each in seen]
+        attitudes = [np.array(measurement["attitude"]) for measurement in seen]
         turn = device.geometry.way(*attitudes) / axis.to_deg(far - near)
-        noise = max(max(each["std_deg"]) / each["samples"] ** 0.5 for each in seen)
+        noise = max(
+            max(measurement["std_deg"]) / measurement["samples"] ** 0.5
+            for measurement in seen
+        )
         _compare(device, j, turn, expected[:, j], noise / abs(axis.to_deg(far - near)))
         move(device, Posture("where it began", start))
     device.shown = True

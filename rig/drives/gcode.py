@@ -74,7 +74,7 @@ class TextLine(Line):
         while time.monotonic() < end:
             buffer += self._port.read(max(1, self._port.in_waiting))
             *whole, buffer = re.split(rb"[\r\n]+", buffer)
-            for line in (each.decode("ascii", "replace").strip() for each in whole):
+            for line in (raw.decode("ascii", "replace").strip() for raw in whole):
                 lines.append(line)
                 if ends(line):
                     return lines

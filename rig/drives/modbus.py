@@ -44,7 +44,9 @@ class Rejected(BusError):
         self.code = code
         self.refused = code not in PASSING
         self.out_of_reach = code in OUT_OF_REACH
-        name = next((each.name for each in ExcCodes if each == code), "unknown")
+        name = next(
+            (exception.name for exception in ExcCodes if exception == code), "unknown"
+        )
         name = name.lower().replace("_", " ")
         super().__init__(
             f"unit {unit} answered exception {code} ({name}) at 0x{address:04X}",
@@ -451,7 +453,7 @@ class ModbusDrive(Drive):
         and is retried as reads are.
         """
         once = any(
-            table is each for each in (self.map.move, self.map.home, self.map.stop)
+            table is motion for motion in (self.map.move, self.map.home, self.map.stop)
         )
         tries = 1 if once else 1 + self.line.settings.read_retries
         for tries_left in reversed(range(tries)):

@@ -117,7 +117,7 @@ class DeviceRecord:
         needed = STATES[: STATES.index(through) + 1]
         for number, name in enumerate(needed):
             if (reason := self._fault(name, config)) is not None:
-                commands = dict.fromkeys(COMMANDS[each] for each in needed[number:])
+                commands = dict.fromkeys(COMMANDS[state] for state in needed[number:])
                 words = [f"`jaxcal-rig {command}`" for command in commands]
                 return (
                     f"the device is not {name}: {reason}. Run {', then '.join(words)} "
@@ -136,8 +136,12 @@ class DeviceRecord:
         if name in (IDENTIFIED, HOMED):  # pulses: no gearing, direction or phone in it
             drives = (".unit", ".map")
             then, now = (
-                {key: value for key, value in each.items() if key.endswith(drives)}
-                for each in (then, now)
+                {
+                    key: value
+                    for key, value in fingerprint.items()
+                    if key.endswith(drives)
+                }
+                for fingerprint in (then, now)
             )
         changed = differences(then, now)
         return f"edited since: {'; '.join(changed)}" if changed else None

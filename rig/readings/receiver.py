@@ -140,7 +140,9 @@ class Receiver:
                 else:  # it is still sending: closed at once, it would not see why
                     with contextlib.suppress(OSError):
                         made.send(_answer(403, False))
-                    leaving = [each for each in leaving if each.fileno() >= 0] + [made]
+                    leaving = [
+                        connection for connection in leaving if connection.fileno() >= 0
+                    ] + [made]
                     loop.call_later(LOOK_S * (len(leaving) < BACKLOG), made.close)
 
     def _has_sent(self, task: asyncio.Task[None] | None) -> None:

@@ -106,7 +106,7 @@ def train(
 
     recipe = Recipe(
         config=config,
-        given=tuple((devices.replicate(each, mesh),) for each in given),
+        given=tuple((devices.replicate(exercise, mesh),) for exercise in given),
         schema=SCHEMA,
         columns=("choices",),
         measured=MEASURED,

@@ -131,7 +131,7 @@ def _bag(
     with _opened(path) as bag:
         types = _MESSAGES.get(kind, {})
         given = [c for c in bag.connections if topic in ("", c.topic)]
-        there = [c for each in types for c in given if c.msgtype == each]
+        there = [c for msgtype in types for c in given if c.msgtype == msgtype]
         there = [c for c in there if c.msgtype == there[0].msgtype]
         topics = sorted({c.topic for c in there})
         if types and len(topics) != 1:

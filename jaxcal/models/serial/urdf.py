@@ -158,7 +158,7 @@ def _robot(text: str) -> ElementTree.Element:
         raise ValueError(f"is not a URDF file: {error}") from error
     robot = builder.close()
     # Expanded files may keep the name space, and comments with it.
-    if any(each.tag.startswith("xacro:") for each in robot.iter()):
+    if any(element.tag.startswith("xacro:") for element in robot.iter()):
         raise ValueError(f"it is a {_XACRO}")
     if robot.tag != "robot":
         raise ValueError(f"it must hold a <robot>, got <{robot.tag}>")

@@ -167,14 +167,14 @@ def solve_exact(
     keep, first = _groups(problem, merge=best == 1)
     counts = np.bincount(start, minlength=len(problem.blocks))
     low, high, begun = (
-        np.add.reduceat(each[keep], first)
-        for each in (problem.lower, problem.upper, counts)
+        np.add.reduceat(numbers[keep], first)
+        for numbers in (problem.lower, problem.upper, counts)
     )
     searched = _branched(
         problem, keep[first], low, np.minimum(high, problem.k), begun,
         best=best, deadline=deadline, enough=enough,
     )  # fmt: skip
-    subsets = [_expand(problem, keep, first, each) for each in searched.counts]
+    subsets = [_expand(problem, keep, first, numbers) for numbers in searched.counts]
     bound = None if searched.proven else searched.bound
     return _solution_of(problem, subsets, best, bound, searched.nodes)
 

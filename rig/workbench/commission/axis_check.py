@@ -100,8 +100,8 @@ def rates_of(config: RigConfig, stands: Mapping[str, Stand]) -> Array:
     for j, name in enumerate(config.axis_names):
         parts = ("look", "plus", "back", "minus")
         places = [stands[f"{name}:{part}"] for part in parts]
-        look, plus, back, minus = (way(base, each.attitude) for each in places)
-        at = [each.pulses[j] for each in places]
+        look, plus, back, minus = (way(base, stand.attitude) for stand in places)
+        at = [stand.pulses[j] for stand in places]
         # On the way up and on the way down the play is taken up: no reversal between.
         moved = np.array([at[1] - at[0], at[3] - at[2]])
         rates = np.array([plus - look, minus - back]) / moved[:, None]
@@ -123,13 +123,15 @@ def _inner(
     noisy to tell.
     """
     count, base = rates.shape[1], stands["start"]
-    corners = [stands[corner_name(config, each)] for each in corners_of(count)]
+    corners = [stands[corner_name(config, signs)] for signs in corners_of(count)]
     if not corners:  # of a single axis
         return [0]
-    turned = np.array([turn(base.attitude, each.attitude) for each in corners])
-    ways = np.array([each.pulses - base.pulses for each in corners])
+    turned = np.array([turn(base.attitude, corner.attitude) for corner in corners])
+    ways = np.array([corner.pulses - base.pulses for corner in corners])
     number = len(corners)
-    noise = base.std_deg * np.sqrt(sum(1 / each.samples for each in corners)) / number
+    noise = (
+        base.std_deg * np.sqrt(sum(1 / corner.samples for corner in corners)) / number
+    )
     inner = [0] * count
     for a, b in itertools.combinations(range(count), 2):
         product = ways[:, a] * ways[:, b]  # as large at each

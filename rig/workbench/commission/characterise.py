@@ -106,7 +106,9 @@ class Probe:
         up = [self.stand("up", at - far, at), self.stand("top", at + far)]
         down = [self.stand("down", at), self.stand("bottom", at - far)]
         self._base = self.geometry.mean([up[0].attitude, down[0].attitude])
-        turns = [self.geometry.way(self._base, each.attitude) for each in [*up, *down]]
+        turns = [
+            self.geometry.way(self._base, stand.attitude) for stand in [*up, *down]
+        ]
         deg = (self.way(up[1]) - self.way(up[0]) + self.way(down[0])) / 2.0
         deg -= self.way(down[1]) / 2.0
         rate = (turns[1] - turns[0] + turns[2] - turns[3]) / 2.0 / deg
@@ -121,7 +123,7 @@ class Probe:
         first = self.read(down[0]) - self.read(up[0])
         if first > 0.9 * MOST_DEG:
             raise self.too_much("play", first, MOST_DEG)
-        noise = max(each.std_deg / each.samples**0.5 for each in [*up, *down])
+        noise = max(stand.std_deg / stand.samples**0.5 for stand in [*up, *down])
         sigma = max(noise / self._rate, LEAST_SIGMA_DEG)
         values = [
             self.off(f"down:{number}", at + far, at)

@@ -80,8 +80,8 @@ def scan(
     It holds the lock of the bus until it ends.
     """
     every = [*maps, *(load_map(name) for name in available_maps())]
-    named = {each.name: each for each in every}.values()
-    families = [each for each in named if isinstance(each, RegisterMap)]
+    named = {drive_map.name: drive_map for drive_map in every}.values()
+    families = [drive_map for drive_map in named if isinstance(drive_map, RegisterMap)]
     short = settings.model_copy(
         update={
             "timeout_s": min(settings.timeout_s, SCAN_TIMEOUT_S),
@@ -89,7 +89,7 @@ def scan(
         }
     )
     answers: list[Answer] = []
-    silence_s = max(each.inter_frame_s for each in families)
+    silence_s = max(family.inter_frame_s for family in families)
     with BusLock(settings).acquire("scan"), Bus(short, silence_s) as bus:
         for unit in range(1, units + 1):
             if answer := _ask(bus, unit, families):

@@ -233,11 +233,11 @@ def write_config(
 def _ask_axes(
     answers: list[Answer], given: SetupOptions, operator: Operator
 ) -> list[dict[str, Any]]:
-    usable = {each.unit: each for each in answers if each.families}
+    usable = {answer.unit: answer for answer in answers if answer.families}
     if given.drives:
         usable = {unit: Answer(unit, (given.drives,), {}) for unit in range(1, 7)}
     if len(usable) < len(given.names):
-        unknown = [each.unit for each in answers if not each.families]
+        unknown = [answer.unit for answer in answers if not answer.families]
         raise Refused(
             f"{len(given.names)} drives of a known family are needed, for "
             f"{', '.join(given.names)}; found {len(usable)}"
