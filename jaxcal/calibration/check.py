@@ -44,7 +44,7 @@ class Check:
     drift: dict[str, float]  # smallest change of each parameter seen with power 0.8
     unseen: tuple[str, ...]  # parameters whose drift by ``tolerance`` could hide
     tolerance: float  # root mean square of the outputs' change that matters
-    unit: str = ""  # of the tolerance, where the calibration has one
+    unit: str = ""  # of the tolerance, where the calibration or its sensor has one
     slipped: str = ""  # what alone would explain it, and by how much
 
     @property
@@ -146,6 +146,7 @@ def check(
         says = "does not hold"
     else:
         says = "cannot be told" if hidden.any() else "holds"
+    sensor = getattr(calibration.model, "sensor", None)
     return Check(
         says=says,
         p_value=p_value,
@@ -153,7 +154,7 @@ def check(
         drift={names[i]: float(size[i]) for i in np.flatnonzero(free)},
         unseen=tuple(names[i] for i in np.flatnonzero(hidden)),
         tolerance=tolerance,
-        unit=calibration.measured_unit,
+        unit=calibration.measured_unit or getattr(sensor, "first_unit", ""),
         slipped=slipped,
     )
 

@@ -48,7 +48,9 @@ class ArmOptions:
         "position"
     )
     base: Annotated[str | None, "of an arm, the link that stands still", "LINK"] = None
-    tip: Annotated[str | None, "of an arm, the link that is measured", "LINK"] = None
+    tip: Annotated[list[str] | None, "of an arm, the link that is measured", "LINK"] = (
+        None
+    )
     radians: Annotated[bool, "joint columns are in radians"] = False
     locked: Annotated[
         list[list[Any]] | None,
@@ -68,9 +70,10 @@ class ArmOptions:
 
     def read(self, path: str, table: Table | None, places: Any = None) -> SerialChain:
         """The arm in this file; things that it touches are given or in the table."""
-        if "," in (self.tip or ""):
+        tips = ",".join(self.tip or ())
+        if "," in tips:
             raise ValueError(
-                f"--tip must be one link, got {self.tip}: two chains in one model "
+                f"--tip must be one link, got {tips}: two chains in one model "
                 "(Chains) are in Python, docs/arms.md, Several chains"
             )
         kind = SENSORS[self.sensor]
@@ -103,7 +106,7 @@ class ArmOptions:
         return SerialChain.from_urdf(
             path,
             base=self.base,
-            tip=self.tip,
+            tip=tips or None,
             sensor=sensor,
             locked={name: value for name, (value,) in self.locked or ()},
             limits=dict(self.limits or ()),

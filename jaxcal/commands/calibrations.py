@@ -77,7 +77,9 @@ def postures(
         "least,greatest distance of the camera from the board",
         several(float, "numbers"),
     ] = None,
-    tilt: Annotated[float, "degrees that the board may be turned from the camera"] = 45,
+    tilt: Annotated[
+        float | None, "degrees that the board may be turned from the camera, default 45"
+    ] = None,
     side: Annotated[
         str | None,
         "where the board's z axis points from its printed side",

@@ -30,7 +30,8 @@ def files(tmp_path):
 
 def _run(files, *more):
     urdf, table, _ = files
-    given = ["--model", str(urdf), "--tip", "ball_link", "--sensor", "socket", *more]
+    given = ["--model", str(urdf), "--sensor", "socket", *more]
+    given += [] if "--tip" in more else ["--tip", "ball_link"]
     return main(["identify", str(table), *given])
 
 
@@ -57,6 +58,7 @@ def test_contacts_become_a_calibrated_file(files, capsys):
         (["--out", "a.urdf"], "which look like radians"),
         (["--radians", "--tip", "thumb"], "tip link must be one of"),
         (["--tip", "left,right"], "--tip must be one link, got left,right: two chains"),
+        (["--tip", "left", "--tip", "right"], "must be one link, got left,right"),
         (["--radians", "--play", "-1"], "play must not be negative"),
         (["--radians", "--distance", "0,1,0.05"], "distances must be rows"),
         (["--radians", "--sensor", "plane", "--distance", "0,1,2,3"], "is of --sensor"),
@@ -235,7 +237,7 @@ def test_a_camera_bounds_what_is_planned(files, capsys):
     assert main([*given, "--board", "0.2,0.15"]) == 2
     assert "--board WIDTH,HEIGHT is of --sensor board" in capsys.readouterr().err
     assert main([*given, "--away", "0.3,0.7"]) == 2
-    assert "distance and side need camera=" in capsys.readouterr().err
+    assert "distance needs camera=" in capsys.readouterr().err
 
 
 def test_a_recording_is_identified_and_checked_in_the_shell(files, capsys):

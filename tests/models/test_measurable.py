@@ -121,7 +121,9 @@ def test_wrong_rooms_and_views_are_named():
     near = [[0.4, 0.1, 0.3]]
     for options, why in (
         ({"camera": CAMERA}, "camera is of an arm with sensor=Board"),
-        ({"side": "+z"}, "distance and side need camera="),
+        ({"side": "+z"}, "side needs camera="),
+        ({"tilt": 100.0}, "tilt needs camera=.*got 100"),
+        ({"distance": (0.2, 0.5)}, "distance needs camera="),
         ({"approach": (0, 0, 0)}, "approach must be a direction"),
         ({"clear": [(1, 2, 3)]}, "clear must hold planes"),
     ):

@@ -19,7 +19,7 @@ from jaxcal.models import (
     Socket,
     Wrench,
 )
-from jaxcal.models.serial.recordings import rests
+from jaxcal.models.serial.recordings import rests, rests_of
 
 from .arms import CONTACTS
 
@@ -143,6 +143,18 @@ def write_bag(folder, joints, forces, made=wrench):
             bag.write(states, 50_000_000 * i, raw)
             raw = store.serialize_cdr(made(types, header, force), of_reading)
             bag.write(read, 50_000_000 * i + 1, raw)
+
+
+def test_what_is_no_recording_is_refused_in_one_line(tmp_path):
+    pytest.importorskip("rosbags")
+    (folder := tmp_path / "folder").mkdir()
+    (broken := tmp_path / "broken.mcap").write_text("no bag")
+    for path, message in (
+        (folder, r"folder must be a ROS bag.* or a LeRobot dataset.*got neither$"),
+        (broken, r"broken\.mcap cannot be read as a ROS bag: [^\n]+$"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            rests_of(Recording(path), PANDA.joint_names, np.ones(7, bool))
 
 
 def test_a_recording_is_identified_and_checked_as_its_table_is(tmp_path):

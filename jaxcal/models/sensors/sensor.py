@@ -90,6 +90,7 @@ class Sensor(abc.ABC):
     tool: ClassVar[tuple[str, ...]] = ("x", "y", "z")  # what of the tool it sees
     zeros: ClassVar[bool] = False  # what is measured is always zero
     lengths: ClassVar[bool] = False  # every reading is a length
+    first_unit: ClassVar[str] = ""  # of the first reading, where it is always the same
     compliant: ClassVar[bool] = False  # shown to be better with joints that yield
     local: ClassVar[bool] = False  # of few places: harmonics are fitted if they gain
     misfit: ClassVar[float] = 0.0  # what they leave, by the arm's length, in a choice

@@ -46,6 +46,7 @@ class Several(Sensor):
     mounts: ArrayLike | None = None
 
     kind = "several"
+    first_unit = "times the noise"
 
     def __post_init__(self) -> None:
         given = tuple(self.sensors)

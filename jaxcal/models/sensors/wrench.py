@@ -51,6 +51,7 @@ class Wrench(Sensor):
     kind = "wrench"
     tool = ("rx", "ry", "rz")
     local = True
+    first_unit = "N"
     outputs = tuple(f"{what} {axis}" for what in ("force", "torque") for axis in "xyz")
     names = (
         *("mass", "centre x", "centre y", "centre z"),

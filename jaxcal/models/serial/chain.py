@@ -252,7 +252,7 @@ class SerialChain(Arm, Model):
         allowed: Callable[[NDArray[np.float64]], bool] | None = None,
         camera: ArrayLike | None = None,
         distance: Sequence[float] | None = None,
-        tilt: float = 45.0,
+        tilt: float | None = None,
         side: str | None = None,
         floor: float | None = None,
         approach: ArrayLike | None = None,
@@ -278,7 +278,8 @@ class SerialChain(Arm, Model):
                 with a focal length that is known to a tenth.
             distance: least and greatest, of the board's middle from that camera; such
                 that the board fills 25 to 80 % of the picture when not given.
-            tilt: degrees that the board's face may be turned from the camera.
+            tilt: degrees that the board's face may be turned from the camera; 45 when
+                not given.
             side: "+z", the printed side is where the board's z axis points, or "-z";
                 known of a board that was found from views, else from either side.
             floor: height (z in the measuring frame) that no joint is below.
@@ -311,7 +312,7 @@ class SerialChain(Arm, Model):
         allowed: Callable[[Array], bool] | None = None,
         camera: ArrayLike | None = None,
         distance: Sequence[float] | None = None,
-        tilt: float = 45.0,
+        tilt: float | None = None,
         side: str | None = None,
         floor: float | None = None,
         approach: ArrayLike | None = None,

@@ -27,6 +27,7 @@ _VIEW = np.cos(np.radians(25.0))  # of the board from the camera's axis, and its
 _FOCAL = 1.12  # times: focal lengths are known to a tenth, and arms are off
 _EDGE = 0.02  # of the picture's width, that the board stays away from its edge
 _FILLED = (0.25, 0.8)  # of the picture's width by the board, where no distance is given
+_TILT = 45.0  # degrees, where none is given
 _SIDES = {"+z": 1.0, "-z": -1.0}
 _THICK = 0.04  # radius of an arm's links by its length
 
@@ -45,7 +46,7 @@ class View:
         cls,
         camera: ArrayLike,
         distance: Sequence[float] | None,
-        tilt: float,
+        tilt: float | None,
         side: str | None,
     ) -> View:
         """From (width, height, fx, fy, cx, cy), or a field of view in degrees (2,)."""
@@ -58,6 +59,7 @@ class View:
                 "camera must be (width, height, fx, fy, cx, cy) in pixels or a field "
                 f"of view in degrees (horizontal, vertical), got {in_words(given)}"
             )
+        tilt = _TILT if tilt is None else tilt
         if not 0.0 < numbers("tilt", tilt) < 90.0:
             raise ValueError(f"tilt must be in (0, 90) degrees, got {tilt}")
         if side is not None and side not in _SIDES:
@@ -163,7 +165,7 @@ class Room:
 def view_and_room(
     camera: ArrayLike | None,
     distance: Sequence[float] | None,
-    tilt: float,
+    tilt: float | None,
     side: str | None,
     floor: float | None,
     approach: ArrayLike | None,
@@ -174,8 +176,10 @@ def view_and_room(
     view = room = None
     if camera is not None:
         view = View.of(camera, distance, tilt, side)
-    elif distance is not None or side is not None:
-        raise ValueError("distance and side need camera=")
+    else:
+        for name, value in (("distance", distance), ("tilt", tilt), ("side", side)):
+            if value is not None:
+                raise ValueError(f"{name} needs camera=, of a board; got {value}")
     if floor is not None or approach is not None or len(clear):
         room = Room.of(floor, approach, clear, radius)
     return view, room

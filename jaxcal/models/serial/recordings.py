@@ -164,11 +164,21 @@ def _bag(
 @contextlib.contextmanager
 def _opened(path: pathlib.Path) -> Iterator[Any]:
     with needs("ros", "reading a rosbag"):
-        from rosbags.highlevel import AnyReader
+        from rosbags.highlevel import AnyReader, AnyReaderError
         from rosbags.typesys import Stores, get_typestore
     store = get_typestore(Stores.ROS2_HUMBLE)
-    with AnyReader([path], default_typestore=store) as bag:
-        yield bag
+    path.stat()  # raises where there is none
+    if path.is_dir() and not (path / "metadata.yaml").is_file():
+        raise ValueError(
+            f"{path} must be a ROS bag, a folder with metadata.yaml, or a LeRobot "
+            "dataset, a folder with meta/info.json; got neither"
+        )
+    try:
+        with AnyReader([path], default_typestore=store) as bag:
+            yield bag
+    except AnyReaderError as error:
+        reason = str(error).partition("\n")[0]
+        raise ValueError(f"{path} cannot be read as a ROS bag: {reason}") from error
 
 
 def _dataset(
