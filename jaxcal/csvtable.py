@@ -26,7 +26,7 @@ from jaxcal.checks import axis_letter
 __all__ = [
     "COMMANDS",
     "MEASURED",
-    "Table",
+    "CsvTable",
     "columns_by_name",
     "csv_text",
     "names_of",
@@ -51,7 +51,7 @@ _LEAST_ROWS = 5  # of which a constant step is no chance
 
 
 @dataclasses.dataclass(frozen=True)
-class Table:
+class CsvTable:
     """Rows of numbers under names, and columns of text beside them."""
 
     source: str  # the file's name, for messages
@@ -349,7 +349,7 @@ def of_frame(argument: str, frame: Any, wanted: Sequence[str], prefix: str) -> A
 # -- reading ---------------------------------------------------------------------------
 
 
-def read_table(path: str) -> Table:
+def read_table(path: str) -> CsvTable:
     """Read a CSV file (comma, semicolon or tab; header optional); ``-`` is stdin.
 
     Raises:
@@ -361,7 +361,7 @@ def read_table(path: str) -> Table:
     return parse(path, pathlib.Path(path).read_bytes())
 
 
-def parse(source: str, data: bytes) -> Table:
+def parse(source: str, data: bytes) -> CsvTable:
     """The table in the bytes of a file; ``source`` is its name in errors."""
     if data.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
         raise ValueError(f"{source}: a table must be CSV; save this one as CSV")
@@ -375,7 +375,7 @@ def parse(source: str, data: bytes) -> Table:
     return _from_text(source, text)
 
 
-def _from_text(source: str, text: str) -> Table:
+def _from_text(source: str, text: str) -> CsvTable:
     rows = _rows(source, text)
     if not rows:
         raise ValueError(f"{source}: the table is empty")
@@ -412,7 +412,7 @@ def _from_text(source: str, text: str) -> Table:
     if not columns:
         raise ValueError(f"{source}: no column holds numbers: {', '.join(header)}")
     values = np.array([*columns.values()]).reshape(len(columns), len(rows)).T
-    return Table(source, tuple(columns), values, labels, lines, headed)
+    return CsvTable(source, tuple(columns), values, labels, lines, headed)
 
 
 def _rows(source: str, text: str) -> list[tuple[int, list[str]]]:

@@ -103,8 +103,8 @@ class Calibration(Fit):
     def verdict(self) -> Verdict:
         """Whether it may be used, why not, and what to do next; printed, these lines.
 
-        Of an arm with held-out errors (``jaxcal.models.serial.verdict.Verdict``). The
-        summary, ``report``, the exit codes and the warning of ``identify`` say this.
+        Of an arm with held-out errors (``jaxcal.models.serial.verdict.ArmVerdict``).
+        The summary, ``report``, exit codes and the warning of ``identify`` say this.
         """
         return self.model.verdict(self)
 

@@ -105,7 +105,9 @@ def identify(
         ValueError: naming the argument, the rule and the value; for commands that leave
             a direction unexcited, naming that direction.
     """
-    readings = _readings(model, commands, measured, weights, input_names, output_names)
+    readings = _measurements(
+        model, commands, measured, weights, input_names, output_names
+    )
     n, m = len(readings.input_names), len(readings.output_names)
     noise, plain_noise = _noise(noise, noise_std, common_noise, m)
     about = _about(readings, command_unit, measured_unit, notes, accuracy)
@@ -132,7 +134,7 @@ def identify(
     return calibration
 
 
-class _Readings(NamedTuple):
+class _Measurements(NamedTuple):
     """The measurements of a fit, checked."""
 
     commands: Array  # (N, n)
@@ -142,14 +144,14 @@ class _Readings(NamedTuple):
     output_names: tuple[str, ...]  # m
 
 
-def _readings(
+def _measurements(
     model: Model | None,
     commands: Any,
     measured: Any,
     weights: ArrayLike | None,
     input_names: Sequence[str] | None,
     output_names: Sequence[str] | None,
-) -> _Readings:
+) -> _Measurements:
     """The arguments of ``identify`` as tables, of a recording its rests."""
     commands, measured, is_recording = recorded(model, commands, measured)
     if is_recording:
@@ -165,11 +167,11 @@ def _readings(
     if weights is not None:
         weight = array_of("weights", weights, len(u))
         require_none(weight < 0.0, weight, "weights must not be negative")
-    return _Readings(u, y, weight, inputs, outputs)
+    return _Measurements(u, y, weight, inputs, outputs)
 
 
 def _about(
-    readings: _Readings,
+    readings: _Measurements,
     command_unit: str,
     measured_unit: str,
     notes: Mapping[str, Any] | None,

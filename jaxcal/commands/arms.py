@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arguments import several
-from jaxcal.csvtable import COMMANDS, Table
+from jaxcal.csvtable import COMMANDS, CsvTable
 from jaxcal.models import Model, Recording, SerialChain, from_dict
 from jaxcal.models.linear import input_letters
 from jaxcal.models.model import as_model
@@ -68,7 +68,9 @@ class ArmOptions:
         several(float, "numbers"),
     ] = None
 
-    def read(self, path: str, table: Table | None, places: Any = None) -> SerialChain:
+    def read(
+        self, path: str, table: CsvTable | None, places: Any = None
+    ) -> SerialChain:
         """The arm in this file; things that it touches are given or in the table."""
         tips = ",".join(self.tip or ())
         if "," in tips:
@@ -122,9 +124,9 @@ class ArmOptions:
             return self.read(str(path), None)
         column = np.array(which, dtype=np.float64)[:, None]
         lines = tuple(range(1, 1 + len(column)))
-        return self.read(str(path), Table("", (self.sensor,), column, {}, lines))
+        return self.read(str(path), CsvTable("", (self.sensor,), column, {}, lines))
 
-    def machine(self, path: str | None, table: Table | None) -> Model | None:
+    def machine(self, path: str | None, table: CsvTable | None) -> Model | None:
         """The model in a file, an arm or another; None without one.
 
         Raises:
@@ -142,7 +144,7 @@ class ArmOptions:
     def columns(
         self,
         model: Any,
-        table: Table,
+        table: CsvTable,
         chosen: str | None = None,
         option: str = "--columns",
         but: Sequence[str] = (),
@@ -171,7 +173,7 @@ class ArmOptions:
     def commands(
         self,
         model: Any,
-        table: Table,
+        table: CsvTable,
         columns: Sequence[str],
         used: NDArray[np.bool_] | None = None,
     ) -> Array:
@@ -205,7 +207,7 @@ class RecordingOptions:
         "FILE",
     ] = None
 
-    def table(self, path: str, arm: Any) -> Table | None:
+    def table(self, path: str, arm: Any) -> CsvTable | None:
         """The rests of a recording as a table, degrees; None where it is a table.
 
         Args:
@@ -231,7 +233,7 @@ class RecordingOptions:
             )
         values = np.hstack([commands, read])
         lines = tuple(range(1, len(values) + 1))
-        return Table(path, (*names, *model.sensor.outputs), values, {}, lines)
+        return CsvTable(path, (*names, *model.sensor.outputs), values, {}, lines)
 
 
 def in_degrees(arm: SerialChain, commands: Array) -> Array:

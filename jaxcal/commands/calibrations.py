@@ -28,7 +28,7 @@ from jaxcal.commands.tables import (
     write_json,
     write_rows,
 )
-from jaxcal.csvtable import COMMANDS, MEASURED, Table, read_table
+from jaxcal.csvtable import COMMANDS, MEASURED, CsvTable, read_table
 from jaxcal.extras import needs
 from jaxcal.models import SerialChain
 from jaxcal.models.sensors import SENSORS, Board, Landmarks
@@ -404,7 +404,11 @@ class _Readings(NamedTuple):
 
 
 def _arm_readings(
-    of_arm: ArmOptions, arm: Any, table: Table, inputs: str | None, outputs: str | None
+    of_arm: ArmOptions,
+    arm: Any,
+    table: CsvTable,
+    inputs: str | None,
+    outputs: str | None,
 ) -> _Readings:
     """The columns named as the arm's joints and its sensor's; a contact has none."""
     names = of_arm.columns(arm, table, inputs, "--inputs")
@@ -420,7 +424,7 @@ def _arm_readings(
 def _readings(
     of_arm: ArmOptions,
     machine: Any,
-    table: Table,
+    table: CsvTable,
     inputs: str | None,
     outputs: str | None,
     weights: str | None,
@@ -546,7 +550,7 @@ def command(
 
 def _commands_for(
     calibration: Calibration,
-    table: Table,
+    table: CsvTable,
     chosen: str | None = None,
     option: str = "--columns",
 ) -> tuple[tuple[str, ...], Array]:

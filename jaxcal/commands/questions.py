@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from jaxcal.arguments import several
 from jaxcal.commands.arms import ArmOptions, ModelPath
 from jaxcal.commands.tables import Output, TablePath
-from jaxcal.csvtable import Table, read_table
+from jaxcal.csvtable import CsvTable, read_table
 from jaxcal.information.singular import require_excited
 from jaxcal.models import Affine, Noise
 from jaxcal.selection import Design, Selection, Worst
@@ -47,7 +47,7 @@ class DesignOptions:
     ] = None
     lost: Annotated[int, "1 or 2 rows that may fail: the worst loss counts", "L"] = 0
 
-    def design(self, table: Table, of_arm: ArmOptions) -> Design:
+    def design(self, table: CsvTable, of_arm: ArmOptions) -> Design:
         """The design of the candidates in a table."""
         model, mask = of_arm.machine(self.model, table), table.available()
         names = of_arm.columns(model, table, self.columns)
@@ -247,7 +247,7 @@ def plan(
         print(f"measure rows {', '.join(str(i) for i in result.indices)}")
 
 
-def _rows_of(subset: Table, table: Table) -> NDArray[np.int64]:
+def _rows_of(subset: CsvTable, table: CsvTable) -> NDArray[np.int64]:
     """(k,) rows of the table, by the column ``index`` of what ``select`` wrote.
 
     Raises:
@@ -279,7 +279,7 @@ def _one_or_all(values: list[float]) -> float | list[float]:
     return values[0] if len(values) == 1 else values
 
 
-def _show(selection: Selection, table: Table, output: Output) -> None:
+def _show(selection: Selection, table: CsvTable, output: Output) -> None:
     """The rows chosen, as a table for people, CSV or JSON."""
     names = [*table.labels, *table.names]
     rows: list[list[Any]] = [

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal.checks import axis_letter
-from jaxcal.csvtable import COMMANDS, MEASURED, Table, parse
+from jaxcal.csvtable import COMMANDS, MEASURED, CsvTable, parse
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.files import atomic_write
 
@@ -97,7 +97,7 @@ def read_csv(source: str, data: bytes) -> dict[str, Any]:
     return fields
 
 
-def _columns(table: Table) -> list[str]:
+def _columns(table: CsvTable) -> list[str]:
     """All of them, the labels first."""
     source, header = table.source, table.header
     for name in _LABELS:

@@ -986,7 +986,7 @@ class SerialChain(Arm, Model):
         return goal
 
     def verdict(self, fit: Any) -> Any:
-        """``jaxcal.models.serial.verdict.Verdict`` of a calibration."""
+        """``jaxcal.models.serial.verdict.ArmVerdict`` of a calibration."""
         from jaxcal.models.serial.verdict import verdict
 
         return verdict(fit)

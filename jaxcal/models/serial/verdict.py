@@ -19,7 +19,7 @@ from jaxcal.models.sensors.sensor import hats
 from jaxcal.models.serial.mistaken import mistaken_columns
 from jaxcal.models.verdict import UNLIKELY, left_out, outlying
 
-__all__ = ["Verdict", "verdict"]
+__all__ = ["ArmVerdict", "verdict"]
 
 Array = NDArray[np.float64]
 Chain = Any  # a Chain, whose module imports this one
@@ -47,7 +47,7 @@ _DRAWN = 200  # postures anywhere within the limits
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Verdict(models.Verdict):
+class ArmVerdict(models.Verdict):
     """What the readings say of an arm's calibration.
 
     Good: held-out errors are below the accuracy asked for. Where none was, it is better
@@ -94,7 +94,7 @@ class Verdict(models.Verdict):
         return (*lines, *self.reasons)
 
 
-def verdict(calibration: Fit) -> Verdict:
+def verdict(calibration: Fit) -> ArmVerdict:
     """Does its model explain the readings, does it help, what is wrong.
 
     Held-out errors with an interval beside those of the nominal arm, the scatter
@@ -104,7 +104,7 @@ def verdict(calibration: Fit) -> Verdict:
     """
     model, unit = calibration.model, calibration.measured_unit
     if calibration.noise_std is None:
-        return Verdict(
+        return ArmVerdict(
             good=False,
             reasons=(calibration.no_noise("intervals and no verdict"),),
             next_step="measure more postures, or state noise_std, --noise",
@@ -127,7 +127,7 @@ def verdict(calibration: Fit) -> Verdict:
         enough = explains or errors.interval[1] < _LITTLE * errors.nominal
         good = bool(clean and errors.helps and enough)
     more = accuracy is not None or errors.helps is None
-    return Verdict(
+    return ArmVerdict(
         good=good,
         reasons=findings.reasons,
         next_step=models.USE if good else _next_step(model, findings, explains, more),
