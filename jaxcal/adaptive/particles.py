@@ -378,13 +378,13 @@ class ParticleTask:
         Raises:
             ValueError: naming the argument, the rule and the value.
         """
-        given = candidates_of(model, prior, noise, candidates, cost)
+        at_candidates = candidates_of(model, prior, noise, candidates, cost)
         return ParticleTask.make(
-            given,
+            at_candidates,
             measurements,
             seconds=seconds,
             particles=particles,
-            candidates=len(given.commands),
+            candidates=len(at_candidates.commands),
             contrasts=contrasts,
             moves=moves,
         )

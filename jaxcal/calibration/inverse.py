@@ -266,10 +266,10 @@ class _Search:
 
         low, high = bounds.T
         high = np.maximum(high, low + 1e-12 * self.spread)
-        wanted, names, at = self.wanted[i], self.fit.input_names, np.array([i])
+        desired, names, at = self.wanted[i], self.fit.input_names, np.array([i])
         nearest, least = np.clip(free, low, high), np.inf
         if self.affine:
-            nearest = self._nearest_within(wanted, low, high)
+            nearest = self._nearest_within(desired, low, high)
         for begin in () if self.affine else (free, *self.nearest[i]):
             solution = optimize.least_squares(
                 lambda command: -self.gap(command[None], at)[0],
@@ -289,13 +289,13 @@ class _Search:
         if reached:
             axis = int(beyond.argmax())
             raise ValueError(
-                f"desired {in_words(wanted)} needs {names[axis]} = {free[axis]:.6g}, "
+                f"desired {in_words(desired)} needs {names[axis]} = {free[axis]:.6g}, "
                 f"outside its limits [{bounds[axis, 0]:.6g}, {bounds[axis, 1]:.6g}]"
             )
         close = np.minimum(nearest - low, high - nearest) < 1e-4 * self.spread
         active = [name for name, at in zip(names, close, strict=True) if at]
         raise ValueError(
-            f"desired {in_words(wanted)} is out of reach; the nearest output found is "
+            f"desired {in_words(desired)} is out of reach; the nearest output found is "
             f"{in_words(self.outputs(nearest[None])[0])}"
             + (f", at the limit of {', '.join(active)}" if active else "")
         )

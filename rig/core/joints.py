@@ -45,20 +45,20 @@ def show(device: Device) -> None:
         way = min(max(room, -SHOWN_DEG), SHOWN_DEG)
         # Over the first third its play is taken up.
         near, far = (axis.to_pulses(here + share * way) for share in (1 / 3, 1.0))
-        seen = []
+        measurements = []
         for pulses in (near, far):
             place = tuple(pulses if i == j else p for i, p in enumerate(start))
             posture = Posture(f"show {axis.name}", place)
             try:
-                seen.append(measure(move(device, posture)))
+                measurements.append(measure(move(device, posture)))
             except TurnedTooFar as fault:
                 device.record.void(SIGN_CHECKED, str(fault))
                 raise
-        attitudes = [np.array(measurement["attitude"]) for measurement in seen]
+        attitudes = [np.array(measurement["attitude"]) for measurement in measurements]
         turn = device.geometry.way(*attitudes) / axis.to_deg(far - near)
         noise = max(
             max(measurement["std_deg"]) / measurement["samples"] ** 0.5
-            for measurement in seen
+            for measurement in measurements
         )
         _compare(device, j, turn, expected[:, j], noise / abs(axis.to_deg(far - near)))
         move(device, Posture("where it began", start))

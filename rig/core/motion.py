@@ -124,15 +124,15 @@ def _watch(
     here = tuple(start.position for start in starts)
     most_s = _most_s(device, here, target)
     last = [(position, begun) for position in here]
-    seen = [[start] for start in starts]
+    statuses = [[start] for start in starts]
     while True:
         device.guard(moving=True)
         late = []
         for index, drive in enumerate(device.drives):
             axis, goal, start = drive.axis, target[index], here[index]
             status = drive.sound()
-            seen[index].append(status)
-            _check_speed(device, axis, seen[index])
+            statuses[index].append(status)
+            _check_speed(device, axis, statuses[index])
             tolerance = axis.pulses_within(motion.position_tolerance_deg)
             if abs(status.position - goal) <= tolerance:
                 # A short move ends within the tolerance before it has begun.

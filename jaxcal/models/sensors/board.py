@@ -143,8 +143,8 @@ class Board(Sensor):
         by_tip[:, :3, :3], by_own[:, :3, :3] = sign * eye, -sign * eye
         by_tip[:, 3:, 3:], by_own[:, 3:, 3:] = sign * eye, -sign * (eye @ turn)
         if self.corners is None:
-            seen = Rotation.from_rotvec(inputs[:, 3:], degrees=True).as_matrix()
-            gap = Rotation.from_matrix(board @ np.matrix_transpose(seen))
+            turns_read = Rotation.from_rotvec(inputs[:, 3:], degrees=True).as_matrix()
+            gap = Rotation.from_matrix(board @ np.matrix_transpose(turns_read))
             off = np.asarray(gap.as_rotvec())
             rate = np.degrees(rotation_vector_rate(off))
             for slopes in (by_tip, by_own):

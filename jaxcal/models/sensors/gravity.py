@@ -93,8 +93,8 @@ class Gravity(Sensor):
                 f"gravity readings must be of magnitude {self.magnitude:g} within 20 %,"
                 f" got {size:.4g} in the median: Gravity(magnitude=1) for readings in g"
             )
-        seen = measured / size
-        up = np.einsum("nij,nj->i", tip.rotation, seen) / len(seen)
+        directions = measured / size
+        up = np.einsum("nij,nj->i", tip.rotation, directions) / len(directions)
         if np.linalg.norm(up) > 0.8 and up @ self.up < _ASIDE * np.linalg.norm(up):
             raise ValueError(
                 "gravity readings must point along up, "
@@ -103,12 +103,12 @@ class Gravity(Sensor):
                 "give that as up=, or change their sign where the sensor reads down"
             )
         felt = np.array(self.up) @ tip.rotation
-        left, spread, right = np.linalg.svd(felt.T @ seen)
+        left, spread, right = np.linalg.svd(felt.T @ directions)
         left[:, 2] *= np.linalg.det(left @ right)
         turn = Rotation.from_matrix(left @ right)
         off, other = (
             np.median(np.linalg.norm(felt - one, axis=1))
-            for one in (seen, turn.apply(seen))
+            for one in (directions, turn.apply(directions))
         )
         angle, vector = np.degrees(turn.magnitude()), turn.as_rotvec(degrees=True)
         told = spread[1] > 0.1 * spread[0]  # by more than one direction

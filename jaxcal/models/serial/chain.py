@@ -462,8 +462,8 @@ class SerialChain(Arm, Model):
             if read is None:
                 raise ValueError(f"{recording.path} has no poses of a board")
             turns = Rotation.from_matrix(read[:, 3:].reshape(-1, 3, 3).swapaxes(1, 2))
-            seen = np.degrees(turns.as_rotvec())
-            commands = np.column_stack([commands, read[:, :3], seen])
+            turns_deg = np.degrees(turns.as_rotvec())
+            commands = np.column_stack([commands, read[:, :3], turns_deg])
         elif sensor.inputs:
             which = () if recording.which is None else recording.which
             if len(which) != len(commands):

@@ -74,13 +74,13 @@ def write_datasets(
         OSError: the folder cannot be written, or a recording not be read.
         ValueError: of an argument or a recording.
     """
-    for what, given, optima in (
+    for what, chosen, allowed in (
         ("names", names, NAMES),
         ("formats", formats, ("npz", "csv")),
     ):
-        if unknown := set(given) - set(optima):
+        if unknown := set(chosen) - set(allowed):
             raise ValueError(
-                f"{what} must be of {', '.join(optima)}, got {min(unknown)}"
+                f"{what} must be of {', '.join(allowed)}, got {min(unknown)}"
             )
     report = progress or Progress(quiet=True)
     folder.mkdir(parents=True, exist_ok=True)

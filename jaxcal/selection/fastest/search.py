@@ -224,19 +224,21 @@ class _TourSearch:
         # Whitened. The optimum itself must meet its own value; a bound that is not the
         # optimum asks too much of a subset, never too little.
         assert optimum.bound is not None
-        wanted = optimum.bound / m - scale + problem.num_regressors * np.log(least)
-        wanted -= 1e-12
+        least_log_det = (
+            optimum.bound / m - scale + problem.num_regressors * np.log(least)
+        )
+        least_log_det -= 1e-12
         if above is not None:
-            wanted = max(wanted, above / m - scale + SAME_TIME)
+            least_log_det = max(least_log_det, above / m - scale + SAME_TIME)
         rng = np.random.default_rng(self.seed)
-        chosen, travel = self._local(wanted, rng)
+        chosen, travel = self._local(least_log_det, rng)
         proven, nodes = False, 0
         if self.method == "exact":
-            chosen, proven, nodes = self._exact(wanted, chosen, travel)
+            chosen, proven, nodes = self._exact(least_log_det, chosen, travel)
         elif chosen is not None:
             for _ in range(_KICKS):
-                kicked = self._kicked(chosen, wanted, rng)
-                other, after = self._shortened(kicked, wanted)
+                kicked = self._kicked(chosen, least_log_det, rng)
+                other, after = self._shortened(kicked, least_log_det)
                 if after < travel - SAME_TIME:
                     chosen, travel = other, after
         if chosen is None:

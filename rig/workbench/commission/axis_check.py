@@ -430,27 +430,27 @@ def proposals(
     low, high = SOUND_RATIO
     for drive, joint in enumerate(findings.joints):
         source, axis = config.axes[drive], config.axes[joint]
-        wanted: dict[str, tuple[Any, Any, str]] = {}  # key: old, new, reason
+        edits: dict[str, tuple[Any, Any, str]] = {}  # key: old, new, reason
         for name in OF_DRIVE:
             # A map stands in the file as its name or its path.
             old, new = tables[axis.name].get(name), tables[source.name].get(name)
             reason = f"unit {source.unit} turns {axis.name}"
             if name == "pulses_per_rev" and told[drive] not in (None, new):
                 new, reason = told[drive], f"unit {source.unit} says so itself"
-            wanted[name] = old, new, reason
+            edits[name] = old, new, reason
         rate, pulses = (
             findings.deg_per_pulse[drive],
             told[drive] or source.pulses_per_rev,
         )
         reason = f"positive pulses turn it the {_way(rate)} way"
-        wanted["direction"] = axis.direction, 1 if rate > 0 else -1, reason
+        edits["direction"] = axis.direction, 1 if rate > 0 else -1, reason
         geared = axis.model_copy(update={"pulses_per_rev": pulses})
         ratio = abs(float(rate) * geared.pulses_per_deg)
         if not low <= ratio <= high:
             new = float(f"{axis.reduction / ratio:.{DIGITS}g}")
             reason = f"it turns {ratio:.3g} of what is commanded; sound is {low:g} to "
-            wanted["reduction"] = axis.reduction, new, f"{reason}{high:g}"
-        for name, values in wanted.items():
+            edits["reduction"] = axis.reduction, new, f"{reason}{high:g}"
+        for name, values in edits.items():
             if values[0] != values[1]:
                 changes.append(Change(f"axes.{axis.name}.{name}", *values))
     if findings.turned_deg > MOUNTING_DEG:
@@ -460,9 +460,9 @@ def proposals(
         changes.append(Change("imu.mounting_deg", before, angles.tolist(), reason))
     if findings.order is not None and findings.order != config.joint_order:
         reason = "combined moves show which joint carries which"
-        order, seen = config.mechanism.order, iter(str(findings.order))
+        order, letters = config.mechanism.order, iter(str(findings.order))
         # What no joint turns about keeps its place.
-        new = "".join(next(seen) if at in config.letters else at for at in order)
+        new = "".join(next(letters) if at in config.letters else at for at in order)
         changes.append(Change("mechanism.order", order, new, reason))
     return changes
 

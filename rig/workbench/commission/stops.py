@@ -118,14 +118,14 @@ def _prove(
     names = run.config.axis_names
     going = [names[i] for i, (a, b) in _numbered(low, high) if a != b]
     went_on = [n for n, share in zip(going, gone, strict=True) if share > 1.0 - SHORT]
-    seen = device.attitude(time.monotonic())
+    attitude = device.attitude(time.monotonic())
     after = _look(device, statuses)
     moved = [
         name
         for name, status, then in zip(names, after, at, strict=True)
         if abs(status.position - then) > STILL_COUNTS and status.enabled
     ]
-    turned = device.geometry.apart(seen, device.attitude(time.monotonic()))
+    turned = device.geometry.apart(attitude, device.attitude(time.monotonic()))
     _reset_alarms(run, device, name)
     device.untrack()
     if went_on:

@@ -40,20 +40,20 @@ def estimate_drift(
         return None
     minutes = np.array([visit["time"] - zero["time"] for visit in visits]) / 60.0
     later = [visit["measured_deg"] for visit in visits[1:]]
-    seen = np.array([np.zeros(len(later[0])), *later])
+    angles = np.array([np.zeros(len(later[0])), *later])
     attitudes = np.array([visit["attitude"] for visit in visits])
     turn = geometry.drift(attitudes, minutes)
     rest = [without_drift(visit, turn, zero, geometry) for visit in visits[1:]]
     bend = np.abs([visit["measured_deg"] for visit in rest]).max(axis=0)
     noise = sum(np.square(v["std_deg"]) / v["samples"] for v in (zero, visits[-1]))
     least = np.maximum(SIGNIFICANT * np.sqrt(noise), LEAST * limit_deg)
-    size, end = float(np.abs(seen).max()), np.abs(seen[-1])
+    size, end = float(np.abs(angles).max()), np.abs(angles[-1])
     straight = bool((bend <= np.maximum(least, STRAIGHT * end.max())).all())
     corrected = len(visits) == 3 and straight and bool((end > least).any())
     remaining = float(bend.max()) if corrected else size
     return {
         "minutes": minutes.round(4).tolist(),
-        "angles_deg": seen.tolist(),
+        "angles_deg": angles.tolist(),
         "size_deg": size,
         "turn_deg_per_min": turn.tolist(),
         "corrected": corrected,
