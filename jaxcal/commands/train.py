@@ -13,7 +13,7 @@ import math
 import pathlib
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from jaxcal.arguments import refused, told, typed_line
@@ -76,20 +76,20 @@ def _run(arguments: TrainOptions, prog: str) -> int:
         devices.a_device_for_each_core(runs)
     configuration = _task_configuration if arguments.task else _configuration
     config: Any = devices.on_first(lambda: configuration(arguments, out))
-    stop = _stop_on_signals()
-    if arguments.trainer == "brax":
-        from jaxcal.learning.training import brax_ppo
+    with _stop_on_signals() as stop:
+        if arguments.trainer == "brax":
+            from jaxcal.learning.training import brax_ppo
 
-        brax_ppo.train(config, out, lambda line: print(line, flush=True))
-        done = config.ppo.num_updates
-    else:
-        from jaxcal.learning.training.run import DivergedError
+            brax_ppo.train(config, out, lambda line: print(line, flush=True))
+            done = config.ppo.num_updates
+        else:
+            from jaxcal.learning.training.run import DivergedError
 
-        try:
-            done = _train(config, arguments, out, stop)
-        except DivergedError as error:
-            refused(prog, error)
-            return 1
+            try:
+                done = _train(config, arguments, out, stop)
+            except DivergedError as error:
+                refused(prog, error)
+                return 1
     if not devices.is_first():
         return 0
     task = f" --task {arguments.task}" if arguments.task else ""
@@ -384,7 +384,8 @@ def _introduction(config: TrainConfig, out: pathlib.Path, devices: str) -> str:
     )
 
 
-def _stop_on_signals() -> Stop:
+@contextlib.contextmanager
+def _stop_on_signals() -> Iterator[Stop]:
     """Whether Ctrl-C or SIGTERM asked to save and stop; a second Ctrl-C is at once."""
     asked: list[int] = []
 
@@ -393,9 +394,12 @@ def _stop_on_signals() -> Stop:
         print("\nstopping after this update and saving ...", flush=True)
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, ask)
-    return lambda: bool(asked)
+    before = {n: signal.signal(n, ask) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _begin_table(unit: str, columns: tuple[str, str, str]) -> None:

@@ -472,10 +472,10 @@ def train(*arguments):
 
 @pytest.fixture(autouse=True)
 def signals():
+    """Who calls the command from Python keeps his handlers."""
     before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
     yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
+    assert before == {n: signal.getsignal(n) for n in before}
 
 
 def test_train_command_trains_saves_and_refuses_to_overwrite(tmp_path, capsys):
