@@ -50,7 +50,8 @@ reproduce: $(READY) ## the paper's figures, tables and claims from our own runs,
 # Hundreds of programs are started: what one has compiled the others load.
 test: export PYTHONDONTWRITEBYTECODE =
 # The rig's tests mostly wait for a device and import no JAX: three processes of them run
-# beside the linters and two processes of the others, which compile. Files stay in order:
+# beside the linters and two processes of the others, which compile and give way: a device
+# that is silent for a tenth of a second is a fault. Files stay in order:
 # xdist would put the files of few long tests last. Each process would compile everything
 # that the tests import: one does it before, while mypy runs.
 QUICK_TESTS = $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -m 'not slow' $(ARGS)
@@ -59,7 +60,7 @@ test: $(READY) ## set everything up, lint, and run the quick tests (the ones CI 
 	$(BIN)/python -m pytest --collect-only -qq >/dev/null & imports=$$!; \
 	$(MAKE) --no-print-directory lint || { kill $$rig $$imports; exit 1; }; wait $$imports; \
 	export XLA_FLAGS="$${XLA_FLAGS-$(QUICK_XLA)}"; \
-	$(QUICK_TESTS) -n 2 tests --ignore tests/rig; others=$$?; \
+	nice $(QUICK_TESTS) -n 2 tests --ignore tests/rig; others=$$?; \
 	wait $$rig; rig=$$?; cat $(VENV)/rig-tests.log; exit $$((rig | others))
 
 # A part is a folder of tests/, or `files`, the tests beside them. Each is a run of its own:
@@ -73,7 +74,7 @@ test-all: $(READY) lint ## every test, the slow ones too, hypothesis drawing new
 	$(EVERY_TEST) -n 3 --dist load tests/rig >$(VENV)/rig-tests.log 2>&1 & fi; rig=$$!; \
 	for part in $(filter-out rig,$(sort $(PARTS))); do echo "== $$part"; \
 	if [ $$part = files ]; then tests=`ls tests/test_*.py`; else tests=tests/$$part; fi; \
-	$(EVERY_TEST) -n 2 $$tests || failed="$$failed $$part"; done; \
+	nice $(EVERY_TEST) -n 2 $$tests || failed="$$failed $$part"; done; \
 	if [ "$$rig" ]; then wait $$rig || failed="$$failed rig"; echo "== rig"; cat $(VENV)/rig-tests.log; fi; \
 	[ -z "$$failed" ] || { echo "failed:$$failed"; exit 1; }
 
