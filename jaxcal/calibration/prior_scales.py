@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 
 _LEVEL = 3.0  # factor of one standard deviation of the level, beforehand
 _MOST = 5.0  # of a logarithm
+_LARGEST = 2.5  # of a factor's, 12: beyond it an arm in sockets shrinks until all fit
 _TRIED = np.array([-5.0, -4.0, -3.0, -2.0, -1.2, -0.4, 0.4, 1.2])  # likewise
 _SCORES = 100  # steps of Fisher's scoring, at most
 
@@ -62,10 +63,10 @@ def group_scales(
     least = evidence.at(best)
     for _ in range(_SCORES):
         step = np.linalg.solve(least.curvature, least.slope)
-        trial = np.clip(best - step, -_MOST, _MOST)
+        trial = np.clip(best - step, -_MOST, evidence.most)
         while (after := evidence.at(trial)).value > least.value + 1e-9:
             step *= 0.5
-            trial = np.clip(best - step, -_MOST, _MOST)
+            trial = np.clip(best - step, -_MOST, evidence.most)
         gain, best, least = least.value - after.value, trial, after
         if gain < 1e-4:
             break
@@ -108,6 +109,7 @@ class _Evidence:
         group = np.arange(len(groups.medians))
         self.members = sized == group[:, None]  # (G, s)
         self.middle, self.wide = _thought(groups)
+        self.most = np.append(np.full(len(group), _LARGEST), _MOST)  # (G + 1,)
         self.count, width = len(right), rows.shape[1]
         # All that the readings say is in a triangle; the rest of them is noise alone.
         factor = triangle(np.column_stack([rows, right]))
@@ -219,7 +221,8 @@ def misfit_scale(
             trial = evidence.at(logs)
             curve = trial.curvature[np.ix_(rest, rest)]
             step = np.linalg.solve(curve, trial.slope[rest])
-            logs[rest] = np.clip(logs[rest] - np.clip(step, -1.0, 1.0), -_MOST, _MOST)
+            after = logs[rest] - np.clip(step, -1.0, 1.0)
+            logs[rest] = np.clip(after, -_MOST, evidence.most[rest])
         least[k] = evidence.at(logs).value
     shares = np.exp(-0.5 * (least - least.min()))
     square = float(shares @ np.exp(2.0 * _TRIED) / shares.sum())

@@ -9,7 +9,7 @@ import pytest
 
 import jaxcal
 from jaxcal import Prior
-from jaxcal.models import Affine
+from jaxcal.models import Affine, SerialChain
 
 from ..models.arms import ur5
 
@@ -94,3 +94,49 @@ def test_only_arms_have_sizes():
     prior = dataclasses.replace(Prior(1.0), by_data=True)
     with pytest.raises(ValueError, match=r"Prior\.sized\(\) is of arms"):
         jaxcal.identify(np.eye(4, 3), np.eye(4, 3), model=Affine(3, 3), prior=prior)
+
+
+SIX = [(150, -90, 475, 0), (600, 0, 0, -90), (120, -90, 0, 0), (0, 90, 720, 0)]
+SIX += [(0, -90, 0, 0), (0, 0, 85, 0)]
+LIMITS = [(-165, 165), (-90, 110), (-200, 60), (-180, 180), (-115, 115), (-180, 180)]
+PLACES = np.array([(700.0, 150, 300), (700, 200, 300), (820, 90, 390)])
+
+
+def test_an_arm_in_sockets_does_not_shrink():
+    """Contacts as they are made, errors of twice and four times the tolerances.
+
+    An arm of no size touches any sockets in any posture.
+    """
+    sockets = jaxcal.models.Socket(3)
+    arm = SerialChain.from_dh(SIX, tool=(15, -20, 140), sensor=sockets, limits=LIMITS)
+    tip = arm.measured_with(jaxcal.models.Position())
+    std, inside = np.asarray(tip.default_prior().std), []
+    std = np.where(np.isfinite(std), std, 0.0)
+    for size in (2.0, 4.0):
+        rng = np.random.default_rng(int(size))
+        truth = tip.nominal + size * std * rng.normal(size=len(std))
+        tool = np.char.startswith(tip.names, "tool")
+        truth[tool] = tip.nominal[tool] + 0.1 * std[tool] * rng.normal(size=tool.sum())
+        joints = arm.postures(80, near=PLACES, seed=1)
+        joints, socket = joints[:, :6], joints[:, 6].astype(int)
+        goal = PLACES[socket] + 0.1 * rng.normal(size=(80, 3))
+        for _ in range(30):  # Newton, by differences
+            off = tip.predict(joints, truth) - goal
+            slopes = [
+                (tip.predict(joints + step, truth) - off - goal) / 1e-5
+                for step in 1e-5 * np.eye(6)
+            ]
+            steps = np.linalg.pinv(np.stack(slopes, axis=2), rcond=1e-3)
+            joints = joints - np.clip((steps @ off[..., None])[..., 0], -10.0, 10.0)
+        made = np.abs(tip.predict(joints, truth) - goal).max(axis=1) < 1e-6
+        made &= (
+            (joints > np.array(LIMITS)[:, 0]) & (joints < np.array(LIMITS)[:, 1])
+        ).all(1)
+        assert made.sum() > 40
+        commands = np.column_stack([joints, socket])[made]
+        found = jaxcal.identify(commands, None, model=arm)
+        assert found.verdict.good, str(found.verdict)
+        low, high = found.confidence_intervals()[: len(SIX) * 5].T
+        held = ((low <= truth[:30]) & (truth[:30] <= high))[std[:30] > 0.0]
+        inside.append(held.mean())
+    assert np.mean(inside) > 0.9

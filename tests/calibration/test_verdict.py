@@ -191,7 +191,7 @@ def test_many_contacts_of_the_other_socket_are_named():
 
 
 def test_sockets_as_one_are_told():
-    """Without a known distance, an arm shrunk to nothing fits them exactly."""
+    """Without a known distance only an arm shrunk to nothing fits them exactly."""
     joints = PLACE[0][::4]
     arm = contacts.arm("panda_1").measured_with(Socket())
     with pytest.warns(UserWarning, match="or of several sockets as one"):

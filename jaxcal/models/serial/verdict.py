@@ -317,9 +317,12 @@ def _scattered(calibration: Fit, usual: Array) -> tuple[bool, list[str]]:
         return True, []
     largest = float(noise[(noise / usual).argmax()])
     unit = _in(calibration) if np.ptp(usual) == 0.0 else ""
+    several = isinstance(calibration.model.sensor, Socket) and times > _LOUD
     return False, [
         f"the readings scatter by {largest:.3g}{unit}, {times:.3g} times what this "
         "sensor usually does: their noise, or what no parameter explains"
+        + several
+        * ", or of several sockets as one"
     ]
 
 
