@@ -57,8 +57,8 @@ test: export PYTHONDONTWRITEBYTECODE =
 QUICK_TESTS = $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -m 'not slow' $(ARGS)
 test: $(READY) ## set everything up, lint, and run the quick tests (the ones CI runs)
 	@$(QUICK_TESTS) -n 3 tests/rig >$(VENV)/rig-tests.log 2>&1 & rig=$$!; \
-	$(BIN)/python -m pytest --collect-only -qq >/dev/null & imports=$$!; \
-	$(MAKE) --no-print-directory lint || { kill $$rig $$imports; exit 1; }; wait $$imports; \
+	nice $(BIN)/python -m pytest --collect-only -qq >/dev/null & imports=$$!; \
+	nice $(MAKE) --no-print-directory lint || { kill $$rig $$imports; exit 1; }; wait $$imports; \
 	export XLA_FLAGS="$${XLA_FLAGS-$(QUICK_XLA)}"; \
 	nice $(QUICK_TESTS) -n 2 tests --ignore tests/rig; others=$$?; \
 	wait $$rig; rig=$$?; cat $(VENV)/rig-tests.log; exit $$((rig | others))
