@@ -248,7 +248,7 @@ class Model(abc.ABC):
 
     def blocks(self, commands: ArrayLike) -> Array:
         """(..., N, 1, r) information of each output by itself, with unit noise."""
-        # Where multiplicity is 0 there are none, and no caller asks for them.
+        # No caller asks where multiplicity is 0; a model that has one overrides this.
         raise NotImplementedError("the outputs of this model share no regressor")
 
     def affine(self, parameters: Array) -> tuple[Array, Array] | None:
