@@ -41,7 +41,7 @@ from jaxcal.adaptive.episodes import Episodes
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.particles import ParticleTask
 from jaxcal.adaptive.rules import Gain
-from jaxcal.adaptive.session import Session
+from jaxcal.adaptive.session import Session, jit_by_class
 from jaxcal.files import write_text
 
 
@@ -100,7 +100,7 @@ ROWS = {
 }
 
 
-@jax.jit
+@jit_by_class
 def session(task: Any, key: jax.Array) -> tuple[Episodes, jax.Array, jax.Array]:
     """One session by expected gain; the seconds left; entropy lost, where exact."""
     key_truth, key_begin, key_steps = jax.random.split(key, 3)

@@ -13,6 +13,7 @@ history: its bounds meet. On a grid ``Episodes.entropy_drop`` is exact, without 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from jaxcal.adaptive.episodes import Episodes
 from jaxcal.adaptive.particles import ParticleBelief, ParticleTask, log_mean
+from jaxcal.adaptive.session import jit_by_class
 from jaxcal.checks import whole_number
 
 __all__ = ["Bounds", "sace", "spce"]
@@ -118,7 +120,7 @@ def _observed(task: ParticleTask, episode: Episodes) -> ParticleBelief:
     )
 
 
-@jax.jit(static_argnums=(3, 4))
+@functools.partial(jit_by_class, static_argnums=(3, 4))
 def _spce(
     task: ParticleTask, episodes: Episodes, key: jax.Array, chunk: int, chunks: int
 ) -> tuple[jax.Array, jax.Array]:
@@ -142,7 +144,7 @@ def _spce(
     return jax.lax.map(one, (episodes, keys))
 
 
-@jax.jit(static_argnums=3)
+@functools.partial(jit_by_class, static_argnums=(3,))
 def _sace(
     task: ParticleTask, episodes: Episodes, key: jax.Array, contrasts: int
 ) -> tuple[jax.Array, jax.Array]:

@@ -55,6 +55,7 @@ from jaxcal.adaptive.rules import (
     Shares,
     StateRule,
 )
+from jaxcal.adaptive.session import jit_by_class
 from jaxcal.adaptive.tuning import tune
 from jaxcal.evaluation.sequential import seconds_a_choice
 from jaxcal.files import require_writable_folder, write_text
@@ -125,7 +126,7 @@ def optimum(methods: list[str], options: argparse.Namespace) -> None:
     print(f"{'mean':33}" + "".join(f"{share:12.4f}" for share in means))
 
 
-@jax.jit
+@jit_by_class
 def _nats_of_each(tasks: Any, rule: Any, keys: Any) -> Any:
     return jax.vmap(lambda task, keys: play(task, rule, keys).gain.mean())(tasks, keys)
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxcal.adaptive.session import Decider, SequentialTask, jit_by_decider
+from jaxcal.adaptive.session import Decider, SequentialTask, jit_by_class
 
 __all__ = ["Comparison", "Episodes", "compare", "play"]
 
@@ -56,7 +56,7 @@ def play(task: SequentialTask, decider: Decider, keys: jax.Array) -> Episodes:
     return whole
 
 
-@jit_by_decider
+@jit_by_class
 def _played(task: SequentialTask, decider: Decider, keys: jax.Array) -> Episodes:
     """Sessions played at once."""
     key_truth, key_begin, key_steps = jax.vmap(

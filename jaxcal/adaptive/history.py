@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.particles import ParticleBelief, outcome_shape
-from jaxcal.adaptive.session import SequentialTask, Session
+from jaxcal.adaptive.session import SequentialTask, Session, jit_by_class
 from jaxcal.checks import in_words, numbers, whole_number
 from jaxcal.checks import seconds as checked_seconds
 
@@ -203,7 +203,7 @@ def _answer(belief: Any, design: Any, outcome: Any, where: str) -> jax.Array:
     return answer
 
 
-@jax.jit
+@jit_by_class
 def after(
     task: SequentialTask,
     belief: Any,
@@ -219,7 +219,7 @@ def after(
     )
 
 
-_can_answer = jax.jit(ParticleBelief.can_answer)
+_can_answer = jit_by_class(ParticleBelief.can_answer)
 
 
 def _as_designs(

@@ -30,7 +30,7 @@ from jaxcal.adaptive.session import (
     Decider,
     SequentialTask,
     Session,
-    jit_by_decider,
+    jit_by_class,
 )
 
 __all__ = ["Loop", "Proposal", "SessionResult", "next_measurement", "run"]
@@ -258,7 +258,7 @@ def _proposal(
     )  # fmt: skip
 
 
-@jit_by_decider
+@jit_by_class
 def _choose(
     task: SequentialTask,
     decider: Decider,

@@ -17,7 +17,7 @@ from flax import struct
 from numpy.typing import ArrayLike
 
 from jaxcal.adaptive.model_task import Draw, candidates_of
-from jaxcal.adaptive.session import Options, Session, pays
+from jaxcal.adaptive.session import Options, Session, jit_by_class, pays
 from jaxcal.checks import in_words, numbers, whole_number
 from jaxcal.models.uncertainty import Noise, Prior
 
@@ -504,7 +504,7 @@ def _check(task: ParticleTask) -> None:
         )
 
 
-@jax.jit
+@jit_by_class
 def _tried(task: ParticleTask) -> tuple[jax.Array, ...]:
     """(A,) costs, (A,) outcomes, (A,) their log probabilities, (A,) of all outcomes."""
     model, keys = task.model, jax.random.split(jax.random.key(0), 4)

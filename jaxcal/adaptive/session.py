@@ -10,7 +10,7 @@ plays thousands of sessions at once.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import jax
@@ -22,32 +22,42 @@ __all__ = [
     "Options",
     "SequentialTask",
     "Session",
-    "jit_by_decider",
+    "jit_by_class",
     "pays",
 ]
 
 _ROUNDING = 1e-4  # of a cost: sums of float32 may miss the budget by less
 
 
-def jit_by_decider(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``jax.jit`` of f(task, decider, ...), compiled for each class of the two.
+def jit_by_class(
+    function: Callable[..., Any], *, static_argnums: Sequence[int] = ()
+) -> Callable[..., Any]:
+    """``jax.jit`` of f(*arguments), compiled for each combination of their classes.
 
-    JAX 0.10.1 holds structures of different classes with as many fields for equal, and
-    where their hashes fall together runs what was compiled for the other: ``Gain`` was
-    played by ``Random``. A static argument is compared as it should be.
+    JAX (0.10.1 to 0.12.0 alike) holds dataclasses with as many fields for equal
+    structures, whatever their classes, and where their hashes fall together runs what
+    was compiled for the other: ``Gain`` was played by ``Random``. So the classes of all
+    nodes, a task's model among them, are a static argument, which is compared well.
     """
 
-    def of_kinds(kinds: tuple[type, type], *arguments: Any) -> Any:
+    def of_classes(classes: tuple[Any, ...], *arguments: Any) -> Any:
         return function(*arguments)
 
-    of_kinds.__name__ = function.__name__
-    compiled = jax.jit(of_kinds, static_argnums=0)
+    of_classes.__name__ = function.__name__
+    static = (0, *(number + 1 for number in static_argnums))
+    compiled = jax.jit(of_classes, static_argnums=static)
 
     @functools.wraps(function)
-    def call(task: Any, decider: Any, *rest: Any) -> Any:
-        return compiled((type(task), type(decider)), task, decider, *rest)
+    def call(*arguments: Any) -> Any:
+        return compiled(_classes(jax.tree.structure(arguments)), *arguments)
 
     return call
+
+
+def _classes(structure: jax.tree_util.PyTreeDef) -> tuple[Any, ...]:
+    """The classes of a structure's nodes, nested as the nodes are."""
+    node = structure.node_data()
+    return (node and node[0], *map(_classes, structure.children()))
 
 
 @struct.dataclass

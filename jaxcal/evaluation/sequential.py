@@ -27,7 +27,7 @@ from jaxcal.adaptive.rules import (
     Random,
     StateRule,
 )
-from jaxcal.adaptive.session import jit_by_decider
+from jaxcal.adaptive.session import jit_by_class
 from jaxcal.adaptive.tasks.registry import Entry
 from jaxcal.adaptive.tuning import tune
 from jaxcal.evaluation.results import Evaluation, MethodResult, Summary, finite
@@ -271,7 +271,7 @@ def _decider(method: str, rules: Mapping[str, CostRule]) -> Any:
     return simple[method] if method in simple else rules[method]
 
 
-@jit_by_decider
+@jit_by_class
 def _choose(task: Any, decider: Any, belief: Any, session: Any, keys: Any) -> Any:
     def one(belief: Any, session: Any, key: jax.Array) -> jax.Array:
         key_options, key_choice = jax.random.split(key)
@@ -281,11 +281,16 @@ def _choose(task: Any, decider: Any, belief: Any, session: Any, keys: Any) -> An
     return jax.vmap(one)(belief, session, keys)
 
 
+@jit_by_class
+def _begin(task: Any, keys: jax.Array) -> Any:
+    return jax.vmap(task.begin)(keys)
+
+
 def seconds_a_choice(task: Any, decider: Any, seed: int) -> float:
     """Processor time of a first choice, in a batch; that of all threads counts."""
     count = min(_TIMED, getattr(task, "batch", _TIMED))
     keys = jax.random.split(jax.random.key(seed), count)
-    states = jax.jit(lambda task, keys: jax.vmap(task.begin)(keys))(task, keys)
+    states = _begin(task, keys)
     jax.block_until_ready(_choose(task, decider, *states, keys))
     best = np.inf
     for _ in range(5):

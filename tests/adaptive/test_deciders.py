@@ -1,17 +1,21 @@
 """Every decider on tasks that none of them was written for."""
 
+import pathlib
+
 import jax
 import numpy as np
 import pytest
 from flax import struct
 from scipy import stats
 
+import jaxcal
 from benchmarks.sequential.deciders import Rollouts, TwoStep
 from benchmarks.sequential.sequence import Static
 from jaxcal.adaptive.grid import GridBelief, GridTask
+from jaxcal.adaptive.history import after
 from jaxcal.adaptive.policy.network import PolicyDecider, initial
 from jaxcal.adaptive.rules import Gain, GainRate, Priced, Random, StateRule
-from jaxcal.adaptive.session import jit_by_decider
+from jaxcal.adaptive.session import _classes, jit_by_class
 
 RULE = StateRule(0.1, 1.0, 1.0)
 
@@ -132,16 +136,50 @@ def test_all_deciders_run_unchanged(task):
     assert found["policy"] == found["state"]  # a policy begins as its rule
 
 
+def named(of_class=(), fields=(), **methods):
+    """A pytree of a class of its own, which always has the same name."""
+    kind = type("Named", (), {**methods, "__annotations__": dict.fromkeys(fields, int)})
+    return struct.dataclass(kind)(*of_class)
+
+
+@pytest.mark.parametrize("fields", [(), ("at",)])
+def test_a_compiled_function_is_told_every_class(fields):
+    """Those of a model within a task too, in lists, and where all have a field."""
+    values = [0.0] * len(fields)
+    classes = {
+        _classes(jax.tree.structure(([named(values, fields)], 1))) for _ in range(200)
+    }
+    assert len(classes) == 200
+
+
+def test_what_is_compiled_for_tasks_is_told_their_classes():
+    package = pathlib.Path(jaxcal.__file__).parent
+    files = [*package.glob("adaptive/**/*.py"), *package.glob("evaluation/**/*.py")]
+    plain = [file.name for file in files if "jax.jit(" in file.read_text()]
+    assert len(files) > 30 and plain == ["session.py"]
+    assert not any("@jax.jit" in file.read_text() for file in files)
+
+
+def decide(number):
+    decider = named(__call__=lambda self, at: at + number)
+    return _decided(decider, 0)
+
+
+_decided = jit_by_class(lambda decider, at: decider(at))
+
+
+def update(number):
+    """Its task's model says how long the measurement took."""
+    task = named(
+        [named(cost=lambda self: number)], ["model"],
+        spend=lambda self, session, design, outcome: session + self.model.cost(),
+    )  # fmt: skip
+    belief = named(update=lambda self, task, design, outcome, key: self)
+    return after(task, belief, 0, 0, 0, 0)[1]
+
+
 @pytest.mark.slow
-def test_deciders_without_fields_are_not_mixed_up():
+@pytest.mark.parametrize("compiled", [decide, update])
+def test_classes_of_the_same_structure_are_not_mixed_up(compiled):
     """``jax.jit`` itself ran another class for three to seven of these forty."""
-
-    def decider(number):
-        class Named:
-            def __call__(self, at):
-                return at + number
-
-        return struct.dataclass(Named)()
-
-    chosen = jit_by_decider(lambda task, decider, at: decider(at))
-    assert [int(chosen((), decider(n), 0)) for n in range(40)] == list(range(40))
+    assert [int(compiled(n)) for n in range(40)] == list(range(40))
