@@ -1,11 +1,9 @@
-"""``jaxcal postures``, ``identify``, ``check``, ``predict``, ``command``."""
+"""``jaxcal identify``, ``check``, ``predict``, ``command``."""
 
 from __future__ import annotations
 
 import dataclasses
-import logging
 import os
-import pathlib
 from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple
 
@@ -15,7 +13,6 @@ from numpy.typing import NDArray
 from jaxcal.arguments import several
 from jaxcal.calibration import Calibration, Source
 from jaxcal.calibration import identify as identified
-from jaxcal.checks import aligned
 from jaxcal.commands.arms import (
     ArmOptions,
     ModelPath,
@@ -29,197 +26,15 @@ from jaxcal.commands.tables import (
     write_rows,
 )
 from jaxcal.csvtable import COMMANDS, MEASURED, CsvTable, read_table
-from jaxcal.extras import needs
 from jaxcal.models import SerialChain
-from jaxcal.models.sensors import SENSORS, Board, Landmarks
-from jaxcal.selection import Design
 
-__all__ = ["check", "command", "identify", "postures", "predict"]
+__all__ = ["check", "command", "identify", "predict"]
 
 Array = NDArray[np.float64]
 
 RecordPath = Annotated[
     str, "CSV, or - (standard input); of an arm also a bag or a LeRobot dataset"
 ]
-_DRAWS = 10  # random choices that a plan is compared with
-
-
-def postures(
-    model: Annotated[str, "the arm's .urdf"],
-    *,
-    k: Annotated[int, "postures to measure in all", "K"],
-    of_arm: ArmOptions,
-    near: Annotated[
-        list[list[float]] | None,
-        "where a socket (x,y,z), a plane (normal, offset) or an anchor (x,y,z,zero) "
-        "is, roughly; for other sensors x,y,z,radius around the tip; once for each",
-        several(float, "numbers"),
-    ] = None,
-    measured: Annotated[
-        str | None,
-        "table of postures that were measured already, with columns named as the "
-        "joints and as the sensor's",
-        "FILE",
-    ] = None,
-    camera: Annotated[
-        list[float] | None,
-        "of --sensor board: width,height,fx,fy,cx,cy in pixels, or degrees of view "
-        "horizontal,vertical: the board is in the picture",
-        several(float, "numbers"),
-    ] = None,
-    board: Annotated[
-        list[float] | None,
-        "width,height of the board from the corner that its pose is of",
-        several(float, "numbers"),
-    ] = None,
-    away: Annotated[
-        list[float] | None,
-        "least,greatest distance of the camera from the board",
-        several(float, "numbers"),
-    ] = None,
-    tilt: Annotated[
-        float | None, "degrees that the board may be turned from the camera, default 45"
-    ] = None,
-    side: Annotated[
-        str | None,
-        "where the board's z axis points from its printed side",
-        ["+z", "-z"],
-    ] = None,
-    floor: Annotated[float | None, "height that no joint is below"] = None,
-    approach: Annotated[
-        list[float] | None,
-        "direction in which the tool comes, and the degrees about it: 0,0,-1,60",
-        several(float, "numbers"),
-    ] = None,
-    clear: Annotated[
-        list[list[float]] | None,
-        "a plane (normal, offset) or box (least x,y,z, greatest) that links stay away "
-        "from, as spheres along lines between the joints; once for each",
-        several(float, "numbers"),
-    ] = None,
-    count: Annotated[int, "postures to choose from"] = 300,
-    one_side: Annotated[
-        float | None,
-        "columns `from JOINT`: where to come from, so many degrees below, so that play "
-        "is on one side",
-    ] = None,
-    seed: Annotated[int, "of the random draws of these postures"] = 0,
-    picture: Annotated[
-        pathlib.Path | None, "draw the arm at each posture chosen: .png, .pdf, .svg"
-    ] = None,
-    output: Output,
-) -> None:
-    """Choose the postures to measure, in an order of little travel.
-
-    Postures are made within the joint limits, where the sensor reads, and chosen for
-    the predictions of the calibrated arm. With --measured the rest of the K is chosen
-    beside what was reached, which shows where sockets, planes and boards are, too.
-    Collisions are looked at as far as --floor, --approach and --clear say.
-    """
-    reached = None if measured is None else read_table(measured)
-    placed = issubclass(SENSORS[of_arm.sensor], Landmarks)
-    arm = of_arm.read(model, reached, near if placed else None)
-    header, done = (*arm.joint_names, *arm.sensor.inputs), None
-    if reached is not None:
-        done = of_arm.commands(arm, reached, reached.named(header, COMMANDS))
-        arm.require_commands(done)
-        arm = arm.located(done)
-    more = k - (0 if done is None else len(done))
-    if more < 1:
-        reason = f"-k must be more than the {k - more} that were reached"
-        raise ValueError(f"{reason}, got {k}")
-    arm = _with_board(arm, board)
-    offered = arm.postures(
-        count,
-        seed=seed,
-        near=None if placed else near,
-        camera=camera,
-        distance=away,
-        tilt=tilt,
-        side=side,
-        floor=floor,
-        approach=approach,
-        clear=clear or (),
-    )
-    design = Design(offered, model=arm, measured=done)
-    chosen = design.select(more, method="exchange").indices
-    logging.getLogger("jaxcal").info(_worth(design, chosen, seed))
-    plan = offered[chosen]
-    plan = plan[arm.in_turn(plan)]
-    if picture:
-        _draw(arm, plan, picture)
-    header, rows = _rows_of(arm, plan, one_side, of_arm.radians)
-    if not output.written(header, rows):
-        cells = [[f"{i + 1}", *(f"{x:.4g}" for x in r)] for i, r in enumerate(rows)]
-        print("\n".join(aligned([["", *header], *cells])))
-
-
-def _with_board(arm: SerialChain, size: list[float] | None) -> SerialChain:
-    """The arm whose board is of this width and height, if they are given."""
-    if size is None:
-        return arm
-    if not isinstance(arm.sensor, Board) or len(size) != 2:
-        raise ValueError("--board WIDTH,HEIGHT is of --sensor board")
-    board = dataclasses.replace(arm.sensor, extent=(size[0], size[1]))
-    return arm.measured_with(board)
-
-
-def _draw(arm: SerialChain, plan: Array, path: pathlib.Path) -> None:
-    """A picture of the arm at each posture of the plan."""
-    with needs("plots", "--picture"):
-        from matplotlib.figure import Figure
-
-    from jaxcal import plots
-
-    figure = Figure(figsize=(8, 2.2 * -(-len(plan) // 4)), layout="constrained")
-    plots.postures(figure, arm, plan).savefig(path)
-
-
-def _rows_of(
-    arm: SerialChain, plan: Array, one_side: float | None, radians: bool
-) -> tuple[tuple[str, ...], list[list[float]]]:
-    """The names of the columns of a plan (N, n), and its rows.
-
-    ``one_side``: degrees below each posture where its joints come from, which are then
-    columns too.
-    """
-    header = (*arm.joint_names, *arm.sensor.inputs)
-    turning = [i for i, unit in enumerate(arm.command_units) if unit == "deg"]
-    if one_side is not None:
-        start, width = arm.from_one_side(plan, one_side), plan.shape[1]
-        header = (*header, *(f"from {name}" for name in arm.joint_names))
-        turning += [width + i for i in turning]
-        plan = np.hstack([plan, start])
-    if radians:
-        plan[:, turning] = np.radians(plan[:, turning])
-    return header, plan.tolist()
-
-
-def _worth(design: Design, chosen: NDArray[np.int_], seed: int) -> str:
-    """How many random postures have the same expected error, as a sentence."""
-    rng, offered, k = np.random.default_rng(seed), len(design.available), len(chosen)
-
-    problem = design.problem(k)
-
-    def error(indices: NDArray[np.int_]) -> float:
-        blocks = problem.blocks[indices]
-        gram = problem.prior + np.einsum("kqa,kqb->ab", blocks, blocks)
-        return float(np.sqrt(-problem.criterion.value(gram)))
-
-    def by_random(count: int) -> float:
-        sets = [rng.permutation(offered)[:count] for _ in range(_DRAWS)]
-        return float(np.median([error(rows) for rows in sets]))
-
-    expected, random = error(chosen), by_random(k)
-    same = k
-    while same < offered and by_random(same) > expected:
-        same = min(same + max(1, k // 4), offered)
-    return (
-        f"these {k}: expected error {expected / random:.2f} of that of {k} random "
-        f"ones, and that of about {same}; the gain is less where the arm has errors "
-        "that no parameter explains"
-    )
-
 
 ReportFolder = Annotated[
     str,
@@ -227,15 +42,110 @@ ReportFolder = Annotated[
     "then 1 where it is not good",
     "FOLDER",
 ]
-Earlier = Annotated[
-    str | None, "an earlier calibration.json that the page compares with", "FILE"
-]
-CertificateSize = Annotated[
-    float | None,
-    "expanded uncertainty (k = 2) in the certificate of the reference instrument, in "
-    "the measured unit, for the budget on the page",
-    "U",
-]
+
+
+@dataclasses.dataclass
+class ReportOptions:
+    """The page of a calibration, and what it is compared with."""
+
+    report: ReportFolder = ""
+    against: Annotated[
+        str | None, "an earlier calibration.json that the page compares with", "FILE"
+    ] = None
+    certificate: Annotated[
+        float | None,
+        "expanded uncertainty (k = 2) in the certificate of the reference instrument, "
+        "in the measured unit, for the budget on the page",
+        "U",
+    ] = None
+    at: Annotated[
+        str | None,
+        "table of commands whose predictions get a budget on the page",
+        "FILE",
+    ] = None
+
+    def require(self) -> None:
+        """Refuse options of a page without a page."""
+        if not self.report and self != ReportOptions():
+            raise ValueError("--against, --certificate and --at are of --report FOLDER")
+
+    def written(self, calibration: Calibration, files: Sequence[str | None]) -> bool:
+        """Write the page, if it was asked for; whether nothing on it is bad."""
+        if not self.report:
+            return True
+        sources = []
+        if self.certificate is not None:
+            sources = [Source.certificate("certificate", self.certificate)]
+        at = None
+        if self.at is not None:
+            at = _commands_for(calibration, read_table(self.at))[1]
+        return calibration.report(
+            self.report,
+            before=Calibration.load(self.against) if self.against else None,
+            sources=sources,
+            at=at,
+            files=[path for path in files if path and os.path.isfile(path)],
+        )
+
+
+@dataclasses.dataclass
+class SavedFiles:
+    """What an identification is saved as."""
+
+    out: Annotated[
+        str,
+        "save the calibration (.json), or of an arm the corrected file (.urdf)",
+        "FILE",
+    ] = ""
+    overwrite: Annotated[bool, "write over an .urdf or servos file that is there"] = (
+        False
+    )
+    unproven: Annotated[bool, "write the .urdf of a fit that is not good"] = False
+    servos_out: Annotated[
+        str, "write LeRobot's calibration, of --servos, with the zeros found", "FILE"
+    ] = ""
+
+    @property
+    def as_urdf(self) -> bool:
+        """The arm's own file is written, corrected."""
+        return self.out.lower().endswith(".urdf")
+
+    def require(self, of_urdf: bool, servos: str | None) -> None:
+        """Refuse files that cannot be written, or must not be, before the fit."""
+        if self.servos_out and self.as_urdf:
+            raise ValueError(
+                "one of --servos-out and --out FILE.urdf must be left out: either "
+                "corrects the zeros, both would twice"
+            )
+        if self.servos_out and not servos:
+            raise ValueError("--servos-out needs --servos, the file that it corrects")
+        if self.as_urdf and not of_urdf:
+            raise ValueError("--out FILE.urdf needs --model FILE.urdf")
+        if self.as_urdf and os.path.exists(self.out) and not self.overwrite:
+            raise ValueError(f"{self.out} is there already; --overwrite writes over it")
+
+    def written(self, calibration: Calibration, servos: str | None) -> list[str]:
+        """Write the files that were asked for; a line of each."""
+        corrected = self.out if self.as_urdf else self.servos_out
+        if corrected and not calibration.verdict.good and not self.unproven:
+            raise ValueError(
+                f"{corrected} is not written, --unproven writes it all the same:\n"
+                f"{calibration.verdict}"
+            )
+        lines = []
+        if self.as_urdf:
+            tip = calibration.to_urdf(self.out, force=self.overwrite)
+            lines = [f"saved {self.out}, tip link {tip}"]
+        elif self.out:
+            calibration.save(self.out)
+            lines = [f"saved {self.out}"]
+        if self.servos_out:
+            steps = calibration.to_lerobot(
+                self.servos_out, str(servos), force=self.overwrite
+            )
+            moved = ", ".join(f"{name} {step:+d}" for name, step in steps.items())
+            lines.append(f"saved {self.servos_out}, steps: {moved}")
+        return lines
 
 
 def identify(
@@ -244,6 +154,8 @@ def identify(
     inputs: Annotated[str | None, "columns of commands", "A,B"] = None,
     outputs: Annotated[str | None, "columns of measurements", "C,D"] = None,
     model: ModelPath = None,
+    saved: SavedFiles,
+    page: ReportOptions,
     of_arm: ArmOptions,
     recording: RecordingOptions,
     noise: Annotated[Numbers, "std of a measurement, where it is known", "S"] = None,
@@ -253,29 +165,9 @@ def identify(
     weights: Annotated[str | None, "column of relative weights", "W"] = None,
     command_unit: Annotated[str, "of the commands, stored and printed", "UNIT"] = "",
     measured_unit: Annotated[str, "of the readings, stored and printed", "UNIT"] = "",
-    out: Annotated[
-        str,
-        "save the calibration (.json), or of an arm the corrected file (.urdf)",
-        "FILE",
-    ] = "",
     accuracy: Annotated[
         float | None,
         "of an arm, the held-out error that is enough, in the measured unit",
-    ] = None,
-    overwrite: Annotated[bool, "write over an .urdf or servos file that is there"] = (
-        False
-    ),
-    unproven: Annotated[bool, "write the .urdf of a fit that is not good"] = False,
-    servos_out: Annotated[
-        str, "write LeRobot's calibration, of --servos, with the zeros found", "FILE"
-    ] = "",
-    report: ReportFolder = "",
-    against: Earlier = None,
-    certificate: CertificateSize = None,
-    at: Annotated[
-        str | None,
-        "table of commands whose predictions get a budget on the page",
-        "FILE",
     ] = None,
     json: Annotated[bool, "print JSON"] = False,
 ) -> int:
@@ -286,17 +178,9 @@ def identify(
     named as its joints, in any order, and what its sensor asks for; a bag or a LeRobot
     dataset does in the place of the table, with the postures at which the arm rested.
     """
-    as_urdf = out.lower().endswith(".urdf")
     of_urdf = (model or "").lower().endswith(".urdf")
-    if servos_out and as_urdf:
-        raise ValueError(
-            "one of --servos-out and --out FILE.urdf must be left out: either corrects "
-            "the zeros, both would twice"
-        )
-    if servos_out and not recording.servos:
-        raise ValueError("--servos-out needs --servos, the file that it corrects")
-    if as_urdf and not of_urdf:
-        raise ValueError("--out FILE.urdf needs --model FILE.urdf")
+    saved.require(of_urdf, recording.servos)
+    page.require()
     table = recording.table(file, lambda which: of_arm.of_recording(model, which))
     table = read_table(file) if table is None else table
     machine: Any = of_arm.machine(model, table)
@@ -304,8 +188,6 @@ def identify(
         readings = _arm_readings(of_arm, machine, table, inputs, outputs)
         if machine.sensor.lengths:  # files of this format are in metres
             measured_unit = measured_unit or "m"
-        if as_urdf and os.path.exists(out) and not overwrite:
-            raise ValueError(f"{out} is there already; --overwrite writes over it")
     else:
         readings = _readings(of_arm, machine, table, inputs, outputs, weights)
     calibration = identified(
@@ -320,47 +202,15 @@ def identify(
         measured_unit=measured_unit,
         accuracy=accuracy,
     )
-    corrected = out if as_urdf else servos_out
-    if corrected and not calibration.verdict.good and not unproven:
-        raise ValueError(
-            f"{corrected} is not written, --unproven writes it all the same:\n"
-            f"{calibration.verdict}"
-        )
-    saved = _saved(calibration, out, servos_out, str(recording.servos), overwrite)
-    good = True
-    if report:
-        files = [path for path in (file, model) if path and os.path.isfile(path)]
-        good = _report(calibration, report, against, certificate, at, files)
-    elif against or at or certificate is not None:
-        raise ValueError("--against, --certificate and --at are of --report FOLDER")
+    lines = saved.written(calibration, recording.servos)
+    good = page.written(calibration, (file, model))
     if json:
         write_json("", calibration.to_dict())
         return int(not good)
-    print("\n".join([calibration.summary(), *saved]))
-    if report:
-        print(f"report {os.path.join(report, 'index.html')}")
+    print("\n".join([calibration.summary(), *lines]))
+    if page.report:
+        print(f"report {os.path.join(page.report, 'index.html')}")
     return int(not good)
-
-
-def _report(
-    calibration: Calibration,
-    folder: str,
-    against: str | None,
-    certificate: float | None,
-    at: str | None,
-    files: list[str],
-) -> bool:
-    """Write the page by --against, --certificate and --at; whether it is good."""
-    sources = []
-    if certificate is not None:
-        sources = [Source.certificate("certificate", certificate)]
-    return calibration.report(
-        folder,
-        before=Calibration.load(against) if against else None,
-        sources=sources,
-        at=None if at is None else _commands_for(calibration, read_table(at))[1],
-        files=files,
-    )
 
 
 def _noise(machine: Any, stds: list[float] | None, play: float | None) -> Any:
@@ -374,24 +224,6 @@ def _noise(machine: Any, stds: list[float] | None, play: float | None) -> Any:
     if std is not None:
         noise = dataclasses.replace(noise, std=std)
     return {"noise": noise, "noise_std": None}
-
-
-def _saved(
-    calibration: Calibration, out: str, servos_out: str, servos: str, overwrite: bool
-) -> list[str]:
-    """Write the files that were asked for; a line of each."""
-    lines = []
-    if out.lower().endswith(".urdf"):
-        tip = calibration.to_urdf(out, force=overwrite)
-        lines = [f"saved {out}, tip link {tip}"]
-    elif out:
-        calibration.save(out)
-        lines = [f"saved {out}"]
-    if servos_out:
-        steps = calibration.to_lerobot(servos_out, servos, force=overwrite)
-        moved = ", ".join(f"{name} {step:+d}" for name, step in steps.items())
-        lines.append(f"saved {servos_out}, steps: {moved}")
-    return lines
 
 
 class _Readings(NamedTuple):

@@ -21,7 +21,7 @@ _HERE = {  # command: one line of help, and the module with its flags and functi
     "select": ("choose the few rows of a table worth measuring", "questions"),
     "score": ("judge a choice made elsewhere", "questions"),
     "plan": ("how many measurements a wanted accuracy takes", "questions"),
-    "postures": ("the postures of an arm to measure, in order", "calibrations"),
+    "postures": ("the postures of an arm to measure, in order", "postures"),
     "identify": (
         "fit y = A u + b, or a model, to measurements and save the calibration",
         "calibrations",

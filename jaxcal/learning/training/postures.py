@@ -101,17 +101,7 @@ def train(
     network, k = learners[0].network, config.tasks[0].num_decisions
     last = config.ppo.num_updates if num_updates is None else num_updates
     imitated = min(config.num_imitated, last)
-    if teacher is None and imitated:
-        raise ValueError(
-            f"teacher must be given for the {imitated} updates that imitate, got None"
-        )
-    for task in config.tasks:
-        if task.num_decisions <= network.num_unlearned:
-            raise ValueError(
-                f"num_selected must be at least {network.num_unlearned + 1}, got "
-                f"{task.num_decisions}: the look-ahead makes the last "
-                f"{network.num_unlearned} choices, so nothing is left to learn"
-            )
+    _require_lessons(config, network, teacher, imitated)
 
     def lesson(index: int) -> imitation.Lesson:
         assert teacher is not None  # checked above
@@ -142,3 +132,23 @@ def train(
     with contextlib.closing(imitation.Lessons(lesson, imitated)) as lessons:
         require_room(recipe, mesh)
         return run(recipe, folder, mesh=mesh, num_updates=last, **rest)
+
+
+def _require_lessons(
+    config: TrainConfig,
+    network: Network,
+    teacher: imitation.Teacher | None,
+    imitated: int,
+) -> None:
+    """Refuse a training in which nobody teaches, or nothing is left to learn."""
+    if teacher is None and imitated:
+        raise ValueError(
+            f"teacher must be given for the {imitated} updates that imitate, got None"
+        )
+    for task in config.tasks:
+        if task.num_decisions <= network.num_unlearned:
+            raise ValueError(
+                f"num_selected must be at least {network.num_unlearned + 1}, got "
+                f"{task.num_decisions}: the look-ahead makes the last "
+                f"{network.num_unlearned} choices, so nothing is left to learn"
+            )

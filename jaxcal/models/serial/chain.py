@@ -146,12 +146,8 @@ class SerialChain(Arm, Model):
             compliance = turning if sensor.compliant else ()
         bending = joint_numbers("compliance", compliance, joints, "R")
         bent = joint_numbers("harmonics", harmonics, joints, "R")
-        swings = np.zeros((len(bent), 4)) if waves is None else numbers("waves", waves)
-        if swings.size != 4 * len(bent):
-            raise ValueError(f"waves must have shape ({len(bent)}, 4)")
         if bending and not len(loads):
-            loads = [(i, 1.0, (0.0, 0.0, 0.0)) for i in range(2, n)]
-            loads = [*loads, (n, 1.0, end[:3, 3])]
+            loads = _usual_loads(n, end)
         per_torque = np.zeros(len(bending)) if yields is None else yields
         return cls(
             rows,
@@ -164,7 +160,7 @@ class SerialChain(Arm, Model):
             bending,
             array_of("yields", per_torque, len(bending)),
             bent,
-            swings.reshape(-1, 4),
+            _waves(waves, len(bent)),
             tuple(load(one, n) for one in loads),
             tuple(array_of("gravity", gravity, 3).tolist()),
             axis_names("joint_names", joint_names or _numbered(columns), "", columns),
@@ -1026,3 +1022,19 @@ def _far(points: Array, measured: Array, length: float) -> Array:
 def _numbered(columns: int) -> tuple[str, ...]:
     """Names of joints that have none."""
     return tuple(f"joint {i + 1}" for i in range(columns))
+
+
+def _waves(waves: ArrayLike | None, count: int) -> Array:
+    """(count, 4) degrees by sin and cos of the angle and of twice it; 0 for None."""
+    if waves is None:
+        return np.zeros((count, 4))
+    swings = numbers("waves", waves)
+    if swings.size != 4 * count:
+        raise ValueError(f"waves must have shape ({count}, 4)")
+    return swings.reshape(-1, 4)
+
+
+def _usual_loads(n: int, tool: Array) -> list[tuple[int, float, ArrayLike]]:
+    """A weight of one at the end of every link but the first, the last at the tool."""
+    links = [(i, 1.0, (0.0, 0.0, 0.0)) for i in range(2, n)]
+    return [*links, (n, 1.0, tool[:3, 3])]
