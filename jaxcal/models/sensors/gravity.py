@@ -23,10 +23,10 @@ _TURNED = 27.0  # degrees on the tool, from which the fit does not find them
 class Gravity(Sensor):
     """Acceleration x, y, z in the tip's frame at rest: up, as accelerometers read it.
 
-    Lengths, and a turn about the vertical, are not shown and held. So are the turns of
-    the axes, alpha and beta: a joint's zero cannot be told from its neighbours', which
-    are known better. The scale of the sensor is known to 2 %, its bias to 5 %; noise
-    0.1 % of ``magnitude``.
+    Lengths, and a turn about the vertical, are not shown and held. A joint's zero
+    cannot be told from the turns of the next axes, alpha and beta: the prior shares
+    the error out, and their intervals say so. The scale of the sensor is known to 2 %,
+    its bias to 5 %; noise 0.1 % of ``magnitude``.
 
     Attributes:
         magnitude: what a level sensor reads, 9.81 for m/s^2 or 1 for g.
@@ -65,7 +65,7 @@ class Gravity(Sensor):
         hidden = [
             name
             for name, unit in zip(arm.names, arm.units, strict=True)
-            if unit == "length" or name.startswith(("alpha", "beta"))
+            if unit == "length"
         ]
         return (*hidden, f"base r{about}")
 

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 
 _FEW = 4  # postures that show how the sensor is mounted
 _SPREAD = 0.1  # of the largest: forces along more than a line, and off a plane
+_MASS, _CENTRE = 0.5, 0.1  # of a load: of its mass, of the arm's length
 _TURNED = 0.45  # radians on the tool, from which the fit does not find them
 
 
@@ -29,11 +30,12 @@ class Wrench(Sensor):
     zero``: the load pulls on the sensor. A sensor that reads what holds the load has
     the other sign; negate its readings. The zeros are those of the electronics.
 
-    The arm itself is held, weights are too coarse to calibrate it. How the sensor is
+    Lengths, and a turn about the vertical, are not shown and held. How the sensor is
     turned on the tool (``tool rx``, ``ry``, ``rz``, found without a guess from four
     readings) and which way is down (``base rx``, ``ry``) are known as those of any
-    tool and base. Torques are in newtons times the arm's unit of length. Noise 0.1 N,
-    and as much at 5 % of the arm's length.
+    tool and base. A load that no posture tells from the zeros, as on a SCARA, is known
+    to half its mass and a tenth of the arm's length. Torques are in newtons times the
+    arm's unit of length. Noise 0.1 N, and as much at 5 % of the arm's length.
 
     Attributes:
         mass: of the load with what of the sensor moves with it, kg, roughly; a choice
@@ -74,14 +76,20 @@ class Wrench(Sensor):
     def nominal(self) -> Array:
         return np.array([self.mass, *self.centre, *[0.0] * 6])
 
+    def prior_std(self, length: float) -> Array:
+        return np.array([_MASS * self.mass, *[_CENTRE * length] * 3, *[np.inf] * 6])
+
     def usual_noise(self, length: float) -> ArrayLike:
         return [0.1] * 3 + [0.1 * 0.05 * length] * 3
 
     def unseen(self, arm: HasNames) -> tuple[str, ...]:
         about = "xyz"[int(np.abs(self.up).argmax())]
-        seen = {f"base r{axis}" for axis in "xyz" if axis != about}
-        seen |= {*self.names, *(f"tool {axis}" for axis in self.tool)}
-        return tuple(name for name in arm.names if name not in seen)
+        hidden = [
+            name
+            for name, unit in zip(arm.names, arm.units, strict=True)
+            if unit == "length" and name not in self.names
+        ]
+        return (*hidden, f"base r{about}")
 
     def _pull(self, tip: Tip) -> Array:
         """(N, 3) force of one kilogram in the tip's frame."""
@@ -124,7 +132,9 @@ class Wrench(Sensor):
         pull = self._pull(tip)
         pull = pull - pull.mean(axis=0)
         left, spread, right = np.linalg.svd(pull.T @ force)
-        if spread[1] < _SPREAD * spread[0]:
+        turned = np.linalg.svd(pull, compute_uv=False) / np.sqrt(len(pull))
+        alike = turned[1] < _SPREAD * self.magnitude  # as on a SCARA, always upright
+        if alike or spread[1] < _SPREAD * spread[0]:
             return self, None
         turn, handed = left @ right, np.linalg.det(left @ right)
         if handed < 0.0 and spread[2] > _SPREAD * spread[0]:
