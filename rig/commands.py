@@ -40,7 +40,11 @@ ConfigPath = Annotated[Path, "default: rig.toml here"]
 Faults = Annotated[list[str], "inject KIND[@PHASE][,count=N]...; list: names them"]
 Postures = Annotated[int, "postures"]
 Units = Annotated[int, "ids 1 to N are asked", (1, 247)]
-BusName = Annotated[str, "rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT"]
+BusName = Annotated[
+    str,
+    "rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT; of other drives than "
+    "Modbus serial:DEVICE,BAUD or can:CHANNEL",
+]
 
 
 @dataclasses.dataclass
@@ -436,11 +440,13 @@ def stop(*, config: ConfigPath | None = None) -> int:
 def check(file: ConfigPath | None = None, *, config: ConfigPath | None = None) -> int:
     """check a configuration and list every fault"""
     from rig.config import load_config
+    from rig.drives import make_drives
     from rig.model import model_of
 
     path = config or file or FILE
     loaded = load_config(path)
     model_of(loaded)
+    make_drives(loaded.bus, loaded.axes)
     print(f"{path}: valid")
     for axis in loaded.axes:
         print(
@@ -476,14 +482,14 @@ def refit(
     then, start = recorded(run)
     if start["mode"] != "calibrate":
         raise Refused(f"{run} is a {start['mode']} run; refit takes a calibration")
-    wanted = {
+    values = {
         "mechanism.order": order,
         "imu.order": imu_order,
         "imu.signs": signs,
         "imu.mounting_deg": mounting,
         "readings.factors": factors,
     }
-    return identify_anew(run, records_of(run), then, wanted, print)
+    return identify_anew(run, records_of(run), then, values, print)
 
 
 def report(run: RunPath) -> int:

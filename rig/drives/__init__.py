@@ -14,7 +14,7 @@ from typing import Any
 from rig.config.axis import Axis
 from rig.config.maps import DriveMap
 from rig.config.settings import BusSettings
-from rig.drives.drive import Drive
+from rig.drives.drive import WRITTEN, Drive
 from rig.drives.line import Line
 from rig.faults import Refused
 
@@ -42,8 +42,7 @@ def kind_of(drive_map: DriveMap) -> type[Drive]:
         else:
             module = importlib.import_module(place)
         drive_type = getattr(module, name)
-        if not issubclass(drive_type, Drive):
-            raise TypeError(f"{name} is no subclass of rig.drives.Drive")
+        _require_drive(drive_type)
     except Exception as error:  # whatever the import of foreign code raises
         raise Refused(
             f"the map {drive_map.name} names drive = {drive_map.drive!r}, which cannot "
@@ -51,6 +50,23 @@ def kind_of(drive_map: DriveMap) -> type[Drive]:
             f"{', '.join(KINDS)}, FILE.py:CLASS or MODULE:CLASS"
         ) from None
     return drive_type
+
+
+def _require_drive(drive_type: Any) -> None:
+    """TypeError where it is no class of a drive that can move and stop."""
+    name = getattr(drive_type, "__name__", repr(drive_type))
+    if not isinstance(drive_type, type) or not issubclass(drive_type, Drive):
+        raise TypeError(f"{name} is no subclass of rig.drives.Drive")
+    line_type = getattr(drive_type, "line_type", None)
+    if not isinstance(line_type, type) or not issubclass(line_type, Line):
+        raise TypeError(f"{name}.line_type must be a subclass of rig.drives.Line")
+    for kind, base, methods in (
+        (drive_type, Drive, WRITTEN),
+        (line_type, Line, ("connect", "close")),
+    ):
+        for method in methods:
+            if getattr(kind, method) is getattr(base, method):
+                raise TypeError(f"{kind.__name__} must define {method}")
 
 
 def make_drives(
@@ -73,10 +89,10 @@ def make_drives(
         raise Refused(f"the drives of one device share a line: got {', '.join(kinds)}")
     line_type = lines.pop()
     if settings.transport not in line_type.transports:
-        wanted = ", ".join(line_type.transports)
+        transports = ", ".join(line_type.transports)
         raise Refused(
-            f"bus.transport: must be {wanted} for drives of kind {', '.join(kinds)}, "
-            f"got {settings.transport!r}"
+            f"bus.transport: must be {transports} for drives of kind "
+            f"{', '.join(kinds)}, got {settings.transport!r}"
         )
     line = line_type(settings, silence_s, emit)
     return line, [kinds[axis.map.drive](line, axis) for axis in axes]

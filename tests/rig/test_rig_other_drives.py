@@ -13,6 +13,7 @@ from harness import changed, session
 from other_drives import MATRIX, place_of, sensed, stage_text
 
 import jaxcal
+from rig.__main__ import main
 from rig.config import parse_config
 from rig.drives import make_drives
 from rig.drives.line import BusError, Refusal
@@ -170,6 +171,16 @@ def test_a_class_of_ones_own_is_a_drive(tmp_path):
     config = parse_config(text, tmp_path)
     with pytest.raises(Refused, match=r"mine\.py:Yours.*cannot be loaded"):
         make_drives(config.bus, config.axes)
+
+
+@pytest.mark.parametrize("method", ["def stop", "def close", "line_type"])
+def test_what_a_class_lacks_is_named_before_anything_moves(tmp_path, capsys, method):
+    (tmp_path / "mine.py").write_text(OWN.replace(method, method + "_"))
+    (tmp_path / "mine.toml").write_text(MAP)
+    (tmp_path / "rig.toml").write_text(stage_text(SERIAL.format("x"), "mine.toml", 1))
+    assert main(["check", str(tmp_path / "rig.toml")]) == 2
+    told = capsys.readouterr().err
+    assert f" {method.split()[-1]}" in told.replace("Mine.", " ") and "mine.py" in told
 
 
 def test_drives_of_two_lines_and_of_another_bus_are_refused():

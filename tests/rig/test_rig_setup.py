@@ -5,11 +5,13 @@ import json
 import os
 import pathlib
 import re
+import types
 
 import numpy as np
 import pytest
 from commission import QUICK, device, quick_text, set_up
 from harness import ARM, fast_text, no_figures
+from other_drives import stage_text
 
 from rig.__main__ import main
 from rig.config import load_config, parse_config
@@ -240,3 +242,17 @@ def test_a_simulated_check_of_the_axes_corrects_no_file(at, capsys):
     assert main(["axes", *given]) == 1
     assert "axes.roll.direction = -1 (is 1)" in capsys.readouterr().out
     assert (at / "rig.toml").read_text() == fast_text()
+
+
+def test_limits_of_a_translation_are_asked_for_in_its_unit_and_written(tmp_path):
+    path, said = tmp_path / "rig.toml", []
+    path.write_text(stage_text('transport = "serial"\ndevice = "x"', "grbl", 1))
+    answers = iter(["-15", "", "", "20"])
+    ask = Operator(read=lambda prompt: said.append(prompt) or next(answers))
+    site = types.SimpleNamespace(
+        path=path, config=load_config(path), operator=ask, take=lambda config: None
+    )
+    setup._ask_limits(site)
+    x, y = load_config(path).axes
+    assert (x.min_deg, y.max_deg) == (-15.0, 20.0)
+    assert "lowest place that is safe, mm from home" in said[0]

@@ -63,8 +63,8 @@ def home(run: Run, device: Device, config: RigConfig, here: bool) -> None:
 def _set_zero(run: Run, device: Device, drive: Drive) -> None:
     if not drive.can_set_zero:
         run.say(
-            f"  {drive.axis.name}: the map {drive.axis.map.name} has no register for "
-            f"it; home is at its count of {drive.status().position}"
+            f"  {drive.axis.name}: drives of the map {drive.axis.map.name} take no "
+            f"count; home is at its count of {drive.status().position}"
         )
         return
     if drive.counts_from_home:

@@ -149,7 +149,7 @@ def setting(text: str) -> tuple[str, Any]:
         return key, value
 
 
-def simulated(simulator: Simulator, given: SetupOptions) -> SetupOptions:
+def simulated(simulator: Simulator, options: SetupOptions) -> SetupOptions:
     """What an operator would answer of a simulated device, and its phone started."""
     bus = simulator.start().bus
     where = f"{bus.transport}:{bus.host}:{bus.port}"
@@ -164,23 +164,23 @@ def simulated(simulator: Simulator, given: SetupOptions) -> SetupOptions:
         for name in ("reduction", "speed_deg_s", "accel_deg_s2"):
             values[f"axes.{axis.name}.{name}"] = getattr(axis, name)
     return dataclasses.replace(
-        given, bus=where, imu=f"{imu.format}:{port}", values=values | given.values
+        options, bus=where, imu=f"{imu.format}:{port}", values=values | options.values
     )
 
 
-def begin(path: pathlib.Path, given: SetupOptions, operator: Operator) -> RigConfig:
+def begin(path: pathlib.Path, options: SetupOptions, operator: Operator) -> RigConfig:
     """The configuration of a file, which is written where there is none."""
     operator.confirm(SAFETY, "setup")
     if not path.exists():
-        return write_config(path, given, operator)
-    if given.values:
+        return write_config(path, options, operator)
+    if options.values:
         raise Refused(f"{path} exists: edit it, or leave out --set")
     operator.say(f"{path} exists and is used; delete it to begin anew")
     return load_config(path)
 
 
 def write_config(
-    path: pathlib.Path, given: SetupOptions, operator: Operator
+    path: pathlib.Path, options: SetupOptions, operator: Operator
 ) -> RigConfig:
     """Ask for bus, axes and phone, and write a new rig.toml."""
     say = operator.say
@@ -190,40 +190,40 @@ def write_config(
         say(f"  {line}")
     default = f"rtu:{lines[0].partition(':')[0]},115200,N,8,1" if lines else ""
     question = "bus, as rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT"
-    bus = parse_bus(given.bus or operator.ask(question, default))
+    bus = parse_bus(options.bus or operator.ask(question, default))
     answers: list[Answer] = []
-    if given.drives:
-        say(f"2 scan: none of drives named by --drives {given.drives}")
+    if options.drives:
+        say(f"2 scan: left out, --drives {options.drives} says what they are")
     else:
-        say(f"2 scan: units 1 to {given.units} on {bus.where}; reads only")
-        answers = scan(bus, given.units, lambda text: say(f"  {text}"))
+        say(f"2 scan: units 1 to {options.units} on {bus.where}; reads only")
+        answers = scan(bus, options.units, lambda text: say(f"  {text}"))
     say("3 axes: which unit drives which joint. Step 8 checks it by moving them")
-    axes = _ask_axes(answers, given, operator)
+    axes = _ask_axes(answers, options, operator)
     source: dict[str, Any]
-    if given.readings:
+    if options.readings:
         say("4 sensor")
-        kinds = set(given.axes.values())
-        source = {"names": given.names, "sensor": sensor_of(given.readings)}
+        kinds = set(options.axes.values())
+        source = {"names": options.names, "sensor": sensor_of(options.readings)}
         source["unit"] = operator.ask(
             "unit of the readings", "mm" if "mm" in kinds else "deg"
         )
-        if given.model:
+        if options.model:
             source |= {"names": ("x", "y", "z"), "unit": "m"}
     else:
         say("4 phone")
-        form, _, port = (given.imu or "").partition(":")
+        form, _, port = (options.imu or "").partition(":")
         form = form or operator.choose(
             f"app of the phone ({', '.join(FORMATS)})", FORMATS, FORMATS[0]
         )
         port = port or operator.ask("TCP port that the phone sends to", "2055")
         source = {"form": form, "port": int(port)}
-    values = dict(given.values)
-    for name in given.names:
+    values = dict(options.values)
+    for name in options.names:
         key = f"axes.{name}.reduction"
         if key not in values:
             question = f"{name}: motor turns for one turn of the joint (gearbox)"
             values[key] = operator.number(question, 1.0)
-    text = set_values(new_text(bus, axes, **source, model=given.model), values)
+    text = set_values(new_text(bus, axes, **source, model=options.model), values)
     config = parse_config(text, path.parent, str(path))
     operator.confirm(f"setup writes {path}", "write")
     write_text(path, text)
@@ -231,22 +231,22 @@ def write_config(
 
 
 def _ask_axes(
-    answers: list[Answer], given: SetupOptions, operator: Operator
+    answers: list[Answer], options: SetupOptions, operator: Operator
 ) -> list[dict[str, Any]]:
     usable = {answer.unit: answer for answer in answers if answer.families}
-    if given.drives:
-        usable = {unit: Answer(unit, (given.drives,), {}) for unit in range(1, 7)}
-    if len(usable) < len(given.names):
+    if options.drives:
+        usable = {unit: Answer(unit, (options.drives,), {}) for unit in range(1, 7)}
+    if len(usable) < len(options.names):
         unknown = [answer.unit for answer in answers if not answer.families]
         raise Refused(
-            f"{len(given.names)} drives of a known family are needed, for "
-            f"{', '.join(given.names)}; found {len(usable)}"
+            f"{len(options.names)} drives of a known family are needed, for "
+            f"{', '.join(options.names)}; found {len(usable)}"
             + (f"; units {unknown} answer, of no known family" if unknown else "")
             + ". Check power, wiring, termination, the line format, and that every "
             "drive has a unit id of its own; another family needs a map (docs/rig.md)"
         )
     free, axes = sorted(usable), []
-    for name, kind in given.axes.items():
+    for name, kind in options.axes.items():
         choices = [str(unit) for unit in free]
         unit = int(operator.choose(f"unit of {name}", choices, choices[0]))
         free.remove(unit)
@@ -266,7 +266,7 @@ def _ask_axes(
     return axes
 
 
-def go(site: steps.Site, given: SetupOptions) -> int:
+def go(site: steps.Site, options: SetupOptions) -> int:
     """All steps from IDENTIFIED on; those that stand already are left out."""
     operator, say, record = site.operator, site.say, site.record
     assert site.path is not None
@@ -291,7 +291,7 @@ def go(site: steps.Site, given: SetupOptions) -> int:
                 "home here (the device stands in its zero posture), or drive (each "
                 "drive runs its own homing)"
             )
-            how = operator.choose(question, ["here", "drive"], given.home)
+            how = operator.choose(question, ["here", "drive"], options.home)
         if code := steps.go_home(site, how == "here"):
             return code
         say("7 limits")
@@ -326,8 +326,11 @@ def _ask_limits(site: steps.Site) -> None:
     for axis in site.config.axes:
         for end, name in (("lowest", "min_deg"), ("highest", "max_deg")):
             now = getattr(axis, name)
-            question = f"{axis.name}: {end} angle that is safe, deg from home"
+            what = "place" if axis.kind == "translation" else "angle"
+            question = (
+                f"{axis.name}: {end} {what} that is safe, {axis.unit_name} from home"
+            )
             if (number := site.operator.number(question, now)) != now:
-                values[f"axes.{axis.name}.{name}"] = number
+                values[f"axes.{axis.name}.{axis.key_of(name)}"] = number
     if values:
         site.take(edit(site.path, values))
