@@ -76,6 +76,12 @@ class DesignOptions:
         return design
 
 
+def _of_parameters(word: str) -> str:
+    """The letters of criteria that are made of the parameters of interest."""
+    letters = [name for name, kind in CRITERIA.items() if kind.of_parameters]
+    return f" {word} ".join(letters)
+
+
 @dataclasses.dataclass
 class CriterionOptions:
     """By which criterion."""
@@ -84,7 +90,7 @@ class CriterionOptions:
         str | None, "default D for affine models, else I", [*CRITERIA]
     ] = None
     parameters: Annotated[
-        Names, "with Ds and As: the parameters of interest", "A,B"
+        Names, f"with {_of_parameters('and')}: the parameters of interest", "A,B"
     ] = None
     worst: Annotated[bool, "with --scenarios: the worst counts, not the mean"] = False
 
@@ -93,14 +99,16 @@ class CriterionOptions:
         if self.worst and scenarios is None:
             raise ValueError("--worst must come with --scenarios N")
         name, parameters = self.criterion, self.parameters
-        if (name in ("Ds", "As")) != (parameters is not None):
+        kind = None if name is None else CRITERIA[name]
+        if (kind is not None and kind.of_parameters) != (parameters is not None):
             raise ValueError(
-                "--parameters, those of interest, must be given with --criterion Ds or "
-                f"As, and with no other, got {parameters!r} with {name!r}"
+                "--parameters, those of interest, must be given with --criterion "
+                f"{_of_parameters('or')}, and with no other, got {parameters!r} with "
+                f"{name!r}"
             )
         criterion: Any = name
-        if name is not None and parameters is not None:
-            criterion = CRITERIA[name](parameters)  # type: ignore[call-arg]  # both do
+        if kind is not None and parameters is not None:
+            criterion = kind(parameters)  # type: ignore[call-arg]  # of_parameters
         return Worst(criterion) if self.worst else criterion
 
 
@@ -154,12 +162,12 @@ def select(
     kept as labels. Without --k the fewest rows that identify the model are chosen.
     """
     table = read_table(file)
-    given = {name: x for name, x in vars(of_method).items() if x is not None}
+    options = {name: x for name, x in vars(of_method).items() if x is not None}
     design, criterion = (
         of_design.design(table, of_arm),
         of_criterion.by(of_design.scenarios),
     )
-    selection = design.select(k, criterion, method, **given)
+    selection = design.select(k, criterion, method, **options)
     if not between:
         _show(selection, table, output)
         return
@@ -264,12 +272,14 @@ def _rows_of(subset: CsvTable, table: CsvTable) -> NDArray[np.int64]:
     shared = [name for name in table.names if name in subset.names and name != "index"]
     if not subset.headed or not shared:
         return rows
-    given, held = subset.columns(shared), table.columns(shared)[rows]
-    for row, place in np.argwhere(~np.isclose(given, held, rtol=1e-9, atol=0.0)):
+    in_subset, in_table = subset.columns(shared), table.columns(shared)[rows]
+    for row, place in np.argwhere(
+        ~np.isclose(in_subset, in_table, rtol=1e-9, atol=0.0)
+    ):
         raise ValueError(
             f"{subset.source}: line {subset.lines[row]}, column {shared[place]!r} is "
-            f"{given[row, place]:g}, row {rows[row]} of {table.source} has "
-            f"{held[row, place]:g}: it is not a choice from this table"
+            f"{in_subset[row, place]:g}, row {rows[row]} of {table.source} has "
+            f"{in_table[row, place]:g}: it is not a choice from this table"
         )
     return rows
 

@@ -83,6 +83,7 @@ class Criterion:
     by_name: ClassVar[bool] = (
         False  # it tells the parameters apart, ``Coordinates.names``
     )
+    of_parameters: ClassVar[bool] = False  # made of some of them: ``Ds(parameters)``
     region: ArrayLike | None = None  # commands or blocks where; the candidates if None
 
     root: Array  # C (s, p), of full row rank; square for "least"
@@ -256,7 +257,7 @@ class _SubsetCriterion(Criterion):
         parameters: their names or indices, at least one.
     """
 
-    by_name = True
+    by_name = of_parameters = True
 
     def __init__(self, parameters: Sequence[str | int]) -> None:
         self.parameters = parameters

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import itertools
+import json
 
 import numpy as np
 import pytest
 
 import jaxcal
 from jaxcal.checks import numbers
-from jaxcal.selection.criteria import CRITERIA, Coordinates, Criterion
+from jaxcal.commands import main
+from jaxcal.selection.criteria import CRITERIA, Coordinates, Criterion, positions
 from jaxcal.selection.problem import Problem, Solution
 from jaxcal.selection.solvers import SOLVERS
 
@@ -27,6 +29,19 @@ class C(Criterion):
         if self.weights.shape != (len(at.names),):
             raise ValueError(f"weights must be ({len(at.names)},)")
         return self.weights[None] @ at.basis
+
+
+class Cs(Criterion):
+    """Variance of the sum of the parameters of interest."""
+
+    name, kind, says = "Cs", "trace", "variance"
+    by_name = of_parameters = True
+
+    def __init__(self, parameters) -> None:
+        self.parameters = parameters
+
+    def rows(self, at: Coordinates) -> np.ndarray:
+        return at.basis[positions(self.parameters, at.names)].sum(0, keepdims=True)
 
 
 class L(C):
@@ -82,6 +97,28 @@ def test_a_criterion_by_name_sees_every_parameter_of_the_affine_model(monkeypatc
     assert found.value == pytest.approx(best)
     with pytest.raises(ValueError, match=r"weights must be \(6,\)"):
         jaxcal.select(candidates, 4, criterion=C(weights[:3]))
+
+
+def test_a_criterion_of_ones_own_takes_parameters_on_the_command_line(
+    monkeypatch, tmp_path, capsys
+):
+    monkeypatch.setitem(CRITERIA, "Cs", Cs)
+    candidates = np.random.default_rng(0).random((8, 2))
+    file = tmp_path / "candidates.csv"
+    np.savetxt(file, candidates, delimiter=",", header="u_a,u_b", comments="")
+    words = ["select", str(file), "-k4", "--method=exact", "--criterion=Cs", "--json"]
+    assert main([*words, "--parameters=a11,a12"]) == 0
+    best = json.loads(capsys.readouterr().out)["value"]
+
+    def variance(chosen) -> float:
+        rows = np.c_[candidates[list(chosen)], np.ones(4)]
+        return float(np.linalg.inv(rows.T @ rows)[:2, :2].sum())
+
+    assert best == pytest.approx(
+        min(map(variance, itertools.combinations(range(8), 4)))
+    )
+    assert main(words) == 2
+    assert "--criterion Ds or As or Cs" in capsys.readouterr().err
 
 
 def test_the_worst_of_some_combinations(monkeypatch) -> None:
