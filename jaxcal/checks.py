@@ -61,10 +61,10 @@ def numbers(name: str, values: ArrayLike, *, finite: bool = True) -> Array:
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
         raise ValueError(f"{name} must not be masked; leave those rows out")
     try:
-        given = np.asarray(values)
-        if given.dtype.kind not in "biufO":
+        raw = np.asarray(values)
+        if raw.dtype.kind not in "biufO":
             raise TypeError
-        array = given.astype(np.float64, order="C")
+        array = raw.astype(np.float64, order="C")
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"{name} must be an array of numbers, got "
@@ -89,8 +89,10 @@ def array_of(
         fits = fits and (want == got or isinstance(want, str))
     if not fits:
         comma = "," if len(shape) == 1 else ""
-        wanted = f"({', '.join(map(str, shape))}{comma})"
-        raise ValueError(f"{name} must have shape {wanted}{rule}, got {array.shape}")
+        shape_text = f"({', '.join(map(str, shape))}{comma})"
+        raise ValueError(
+            f"{name} must have shape {shape_text}{rule}, got {array.shape}"
+        )
     return array
 
 

@@ -124,13 +124,13 @@ class CsvTable:
         """
         count = f"{len(wanted)} columns are needed ({', '.join(wanted)})"
         if chosen is not None:
-            given = split_names(chosen)
-            self._require_known(given, prefix)
-            taken = tuple(columns_by_name(given, self.header, prefix, unit))
+            chosen_names = split_names(chosen)
+            self._require_known(chosen_names, prefix)
+            taken = tuple(columns_by_name(chosen_names, self.header, prefix, unit))
             if len(taken) != len(wanted):
                 raise ValueError(
                     f"{self.source}: {count}, {option} names {len(taken)}: "
-                    f"{', '.join(given)}"
+                    f"{', '.join(chosen_names)}"
                 )
             by_name = columns_by_name(wanted, taken, prefix, unit)
             if None not in by_name:
@@ -179,9 +179,9 @@ class CsvTable:
         are those in ``but``; where the values of another do, it is refused.
         """
         if chosen is not None:
-            given = split_names(chosen)
-            self._require_known(given, COMMANDS)
-            return tuple(columns_by_name(given, self.header, COMMANDS))
+            chosen_names = split_names(chosen)
+            self._require_known(chosen_names, COMMANDS)
+            return tuple(columns_by_name(chosen_names, self.header, COMMANDS))
         marked = [name for name in self.names if name.startswith(COMMANDS)]
         others = [
             name
@@ -219,9 +219,9 @@ class CsvTable:
     def outputs(self, chosen: str | None, option: str = "--outputs") -> tuple[str, ...]:
         """Columns of measurements: those chosen, else ``y_...``."""
         if chosen is not None:
-            given = split_names(chosen)
-            self._require_known(given, MEASURED)
-            return tuple(columns_by_name(given, self.header, MEASURED))
+            chosen_names = split_names(chosen)
+            self._require_known(chosen_names, MEASURED)
+            return tuple(columns_by_name(chosen_names, self.header, MEASURED))
         marked = tuple(name for name in self.names if name.startswith(MEASURED))
         if not marked:
             raise ValueError(

@@ -78,13 +78,13 @@ def model_of(config: RigConfig) -> DeviceModel | None:
     key = "model.urdf" if config.is_arm else "model.factory"
     try:
         made = _arm(config) if config.is_arm else _made(config)
-        commands, wanted = len(config.axes), len(config.output_names)
+        commands, outputs = len(config.axes), len(config.output_names)
         takes = made.model.num_inputs
         gives = len(made.predict(np.zeros(takes)))  # a function says it by its answer
-        if (takes, gives) != (commands, wanted):
+        if (takes, gives) != (commands, outputs):
             raise ValueError(
                 f"it takes {takes} commands and predicts {gives} readings; the device "
-                f"has {commands} axes and measures {wanted}"
+                f"has {commands} axes and measures {outputs}"
             )
     except Exception as error:  # whatever a file of Python raises
         where = config.model.urdf or config.model.factory

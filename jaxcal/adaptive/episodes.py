@@ -103,9 +103,9 @@ def _played(task: SequentialTask, decider: Decider, keys: jax.Array) -> Episodes
         ended = jax.vmap(task.over)(carry[1])
         return jax.lax.cond(ended.all(), nothing, going, carry)
 
-    (belief, _), seen = jax.lax.scan(step, (prior, begun), steps)
+    (belief, _), record = jax.lax.scan(step, (prior, begun), steps)
     designs, outcomes, gains, alive = jax.tree.map(
-        lambda leaf: jnp.moveaxis(leaf, 0, 1), seen
+        lambda leaf: jnp.moveaxis(leaf, 0, 1), record
     )
     return Episodes(
         truth=truth,

@@ -228,12 +228,12 @@ def _as_designs(
     """A design in the structure, the shapes and the types of the task's options."""
     leaves, structure = jax.tree.flatten(_like(task, belief, session))
     try:
-        given = structure.flatten_up_to(design)  # type: ignore[attr-defined]  # jaxlib
+        design_leaves = structure.flatten_up_to(design)  # type: ignore[attr-defined]  # jaxlib
     except ValueError:
         raise ValueError(
             f"{where} must have the structure {structure}, got {design!r}"
         ) from None
-    arrays = [numbers(where, values) for values in given]
+    arrays = [numbers(where, values) for values in design_leaves]
     for array, leaf in zip(arrays, leaves, strict=True):
         if array.shape != leaf.shape[1:]:
             raise ValueError(
@@ -262,19 +262,21 @@ def _index(table: NDArray[np.float64], design: Any, where: str) -> int:
         if not 0 <= index < len(table):
             raise ValueError(f"{where} must lie in [0, {len(table)}), got {index}")
         return index
-    given = np.atleast_1d(numbers(where, design))
-    if given.shape != table.shape[1:]:
+    coordinates = np.atleast_1d(numbers(where, design))
+    if coordinates.shape != table.shape[1:]:
         raise ValueError(
             f"{where} must be an index or have {table.shape[1]} coordinates, "
             f"got {design!r}"
         )
     span = np.ptp(table, axis=0)
-    off = np.abs(table - given) / np.where(span > 0.0, span, np.abs(table).max() or 1.0)
+    off = np.abs(table - coordinates) / np.where(
+        span > 0.0, span, np.abs(table).max() or 1.0
+    )
     nearest = int(off.max(axis=1).argmin())
     if off[nearest].max() > _NEAR:
         raise ValueError(
-            f"{where} must be one of the task's, got {in_words(given)}; the nearest "
-            f"is {nearest}, {in_words(table[nearest])}"
+            f"{where} must be one of the task's, got {in_words(coordinates)}; the "
+            f"nearest is {nearest}, {in_words(table[nearest])}"
         )
     return nearest
 

@@ -287,8 +287,8 @@ def _parts(calibration: Fit, slopes: Array) -> dict[str, tuple[Array, float]]:
 
 def _gain(calibration: Fit, width: int) -> Array:
     """(P, N, m) how far the parameters move with each reading, to first order."""
-    given = calibration.estimated_commands
-    at = calibration.commands if given is None else given
+    estimated = calibration.estimated_commands
+    at = calibration.commands if estimated is None else estimated
     slopes = calibration.linear(at)[0][..., :width]
     free = calibration.free[:width] > 0.0
     slopes = slopes * free

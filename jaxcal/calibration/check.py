@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -120,22 +121,24 @@ def check(
     commands, measured = _distinct(calibration, given, measured)
     off = _deviations(calibration, commands, measured, placed_anew)
     names, free = calibration.names, off.free
-    seen = (off.of_level @ off.by**2).T
-    slips = free & np.isin(names, calibration.model.slips) & (seen.sum(axis=1) > 0.0)
+    signal = (off.of_level @ off.by**2).T
+    slips = free & np.isin(names, calibration.model.slips) & (signal.sum(axis=1) > 0.0)
     tests = _Tests.of(off.of_level.sum(axis=1), calibration, slips.sum(), off.least)
     slopes_of_slips = np.linalg.norm(off.by[:, slips], axis=0)
     ways = off.by[:, slips] / slopes_of_slips  # (R, S) unit vectors
     along = ((off.by.T @ ways) ** 2).max(axis=1, initial=0.0)  # seen by the best
     changes_of_slips = off.white @ ways
     p_value, p_slip = tests.p_values(off.of_level @ off.white**2, changes_of_slips**2)
-    size = tests.smallest(seen, along)
+    size = tests.smallest(signal, along)
     if tolerance is None:
         tolerance = _tolerance(calibration, commands)
     change = _changes(calibration, calibration.commands, tolerance)
     judged = free & np.isfinite(change)
     hidden = judged & (size > change)
     squares = change[judged] ** 2
-    power = tests.power(squares[:, None] * seen[judged], squares * along[judged]).mean()
+    power = tests.power(
+        squares[:, None] * signal[judged], squares * along[judged]
+    ).mean()
     slipped = ""
     if p_slip < _ALARMS:
         most = int(np.abs(changes_of_slips).argmax())
@@ -481,13 +484,13 @@ def verification(
     white = np.linalg.inv(np.linalg.cholesky(spread)) @ slopes
     levels = _levels(calibration)
     of_level = (levels == np.unique(levels)[:, None]).astype(np.float64)
-    seen = (of_level @ white**2).transpose(0, 2, 1)  # (M, p, G) by a drift of one
+    signal = (of_level @ white**2).transpose(0, 2, 1)  # (M, p, G) by a drift of one
     where = calibration.commands if region is None else table("region", region)
     if tolerance is None:
         tolerance = _tolerance(calibration, where)
     change = _changes(calibration, where, tolerance)
     judged = (calibration.free[: len(change)] > 0.0) & np.isfinite(change)
-    shifts = seen[:, judged] * change[judged, None] ** 2  # of one posture
+    shifts = signal[:, judged] * change[judged, None] ** 2  # of one posture
     counts = of_level.sum(axis=1)
     slips = np.isin(calibration.names, calibration.model.slips)[judged]
 
@@ -497,6 +500,14 @@ def verification(
         tests = _Tests.of(counts * (len(rows) + 1), calibration, slips.sum())
         return np.asarray(tests.power(shift, slips * shift.sum(axis=-1)).mean(axis=-1))
 
+    return np.array(_best_rows(value, k))
+
+
+def _best_rows(value: Callable[[list[int]], Array], k: int) -> list[int]:
+    """k rows by greedy choice, then by swaps.
+
+    ``value`` is (M,), that of some rows together with each of all.
+    """
     chosen: list[int] = []
     for _ in range(k):
         gains = value(chosen)
@@ -512,4 +523,4 @@ def verification(
                 chosen[at] = int(gains.argmax())
         if chosen == before:
             break
-    return np.array(chosen)
+    return chosen

@@ -10,6 +10,7 @@ import json
 import os
 import pathlib
 import typing
+from collections.abc import Mapping
 from typing import Any, NoReturn
 
 import numpy as np
@@ -107,6 +108,23 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
             f"a calibration of version {content.get('version')!r}, this jaxcal reads "
             f"version {VERSION}: identify again from the measurements"
         )
+    values = _checked_values(content)
+    names = content["derived"].get("parameter_names")
+    model = from_dict(content["model"]) if model is None else as_model(model)
+    if list(model.names) != names:
+        raise ValueError(
+            f"model must have the parameters of the file, {names}, got {model.names}"
+        )
+    size = len(values["estimate"])
+    if size not in (len(names), len(model.with_misfit().names)):
+        raise ValueError(f'"estimate" must have shape ({len(names)},)')
+    if (values["noise_std"] is None) != (values["joint_covariance"] is None):
+        raise ValueError('"noise_std" and "joint_covariance" contradict each other')
+    return values | {"model": model}
+
+
+def _checked_values(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Numbers, names and kinds of the file, of the shapes and types that they have."""
     values: dict[str, Any] = {}
     for key in (*_NUMBERS, *_NAMES, *_KINDS):
         if key not in content:
@@ -136,18 +154,7 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
     require(values["loss"] in LOSSES, "loss", f"be {' or '.join(LOSSES)}")
     for key in ("model", "derived"):
         require(isinstance(content.get(key), dict), key, "be an object")
-    names = content["derived"].get("parameter_names")
-    model = from_dict(content["model"]) if model is None else as_model(model)
-    if list(model.names) != names:
-        raise ValueError(
-            f"model must have the parameters of the file, {names}, got {model.names}"
-        )
-    size = len(values["estimate"])
-    if size not in (len(names), len(model.with_misfit().names)):
-        raise ValueError(f'"estimate" must have shape ({len(names)},)')
-    if (values["noise_std"] is None) != (values["joint_covariance"] is None):
-        raise ValueError('"noise_std" and "joint_covariance" contradict each other')
-    return values | {"model": model}
+    return values
 
 
 def _array(key: str, value: Any, shape: str, sizes: dict[str, int]) -> Any:

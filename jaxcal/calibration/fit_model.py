@@ -114,7 +114,7 @@ def fit_model(
         solution = solve(problem)
     if common_noise is None and model.default_noise() is not None:
         problem, solution = _with_levels_apart(problem, solution)
-    fields = _fields(problem, solution, commands, measured, used, centre)
+    fields = _fields(problem, solution, _Observations(commands, measured, used, centre))
     if fields["joint_covariance"] is not None:
         fields |= _widened(
             problem, solution, fields, scales, with_misfit, misfit_factor
@@ -414,14 +414,28 @@ def _information_shares(problem: FitProblem, solution: FitSolution) -> Array:
     return np.asarray(efficiency * np.minimum(1.0, solution.weights / mean))
 
 
+class _Observations(NamedTuple):
+    """All measurements, of which the fit used some."""
+
+    commands: Array  # (N, n)
+    measured: Array  # (N, q)
+    used: slice | NDArray[np.bool_]  # a slice: all
+    centre: Array | None  # (n,) what the fit took from the commands
+
+    @property
+    def left_out(self) -> tuple[Array, Array]:
+        """Commands, centred, and readings of those that the fit did not use."""
+        assert not isinstance(self.used, slice)
+        commands = self.commands[~self.used]
+        if self.centre is not None:
+            commands = commands - self.centre
+        return commands, self.measured[~self.used]
+
+
 def _fields(
-    problem: FitProblem,
-    solution: FitSolution,
-    commands: Array,
-    measured: Array,
-    used: slice | NDArray[np.bool_],
-    centre: Array | None,
+    problem: FitProblem, solution: FitSolution, observations: _Observations
 ) -> dict[str, Any]:
+    commands, _, used, centre = observations
     covariance, null = _covariance(problem, solution)
     noise_std, noise_dof = _noise_level(problem, solution)
     estimate, mean = solution.parameters, problem.mean
@@ -445,7 +459,7 @@ def _fields(
         "free": problem.free.astype(np.float64),
         "commands": commands,
         "estimated_commands": estimated,
-        "residuals": _residuals(problem, solution, commands, measured, used, centre),
+        "residuals": _residuals(problem, solution, observations),
         "loss_weights": loss_weights,
         "distance": distance,
         "dof": max(float(solution.freedom.sum()), 0.0),
@@ -476,21 +490,17 @@ def _noise_level(
 
 
 def _residuals(
-    problem: FitProblem,
-    solution: FitSolution,
-    commands: Array,
-    measured: Array,
-    used: slice | NDArray[np.bool_],
-    centre: Array | None,
+    problem: FitProblem, solution: FitSolution, observations: _Observations
 ) -> Array:
     """(N, q) of all measurements, also of those that were left out of the fit."""
+    used = observations.used
     if isinstance(used, slice):
         return solution.residuals
-    residuals = np.empty_like(measured)
+    residuals = np.empty_like(observations.measured)
     residuals[used] = solution.residuals
-    elsewhere = commands[~used] - (0.0 if centre is None else centre)
-    off = measured[~used] - problem.model.predict(elsewhere, solution.parameters)
-    residuals[~used] = problem.model.wrapped(off, elsewhere)
+    commands, measured = observations.left_out
+    off = measured - problem.model.predict(commands, solution.parameters)
+    residuals[~used] = problem.model.wrapped(off, commands)
     return residuals
 
 

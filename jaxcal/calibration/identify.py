@@ -229,8 +229,10 @@ def _noise(
         noise = None
         if level is not None:
             noise = Noise(std=levels("noise_std", level, num_outputs))
-    given = noise is not None and not (noise.std is None and noise.covariance is None)
-    if common_noise is not None and given:
+    level_known = noise is not None and not (
+        noise.std is None and noise.covariance is None
+    )
+    if common_noise is not None and level_known:
         raise ValueError(
             "common_noise says how to estimate the noise, and noise says what it is: "
             "give one of them"

@@ -67,8 +67,8 @@ def command_for(
     bounds = _limits(limits, fit.input_names)
     begin = None
     if start is not None:
-        given = fit.points("start", start, n)
-        begin = np.broadcast_to(given, (*points.shape[:-1], n)).reshape(-1, n)
+        first = fit.points("start", start, n)
+        begin = np.broadcast_to(first, (*points.shape[:-1], n)).reshape(-1, n)
     search = _Search(fit, points.reshape(-1, m), begin)
     if search.affine:
         begin = search.solved()
@@ -121,8 +121,8 @@ class _Search:
         there = there.reshape(len(wanted), count, -1) - outputs
         there = self.model.wrapped(there, measured_at)
         # Relative outputs spread as what is wanted, seen from where it was measured.
-        seen = np.concatenate(there) if fit.model.relative else outputs
-        self.size = np.where(np.ptp(seen, axis=0) > 0.0, seen.std(axis=0), 1.0)
+        spread = np.concatenate(there) if fit.model.relative else outputs
+        self.size = np.where(np.ptp(spread, axis=0) > 0.0, spread.std(axis=0), 1.0)
         with np.errstate(over="ignore"):
             order = np.argsort(((there / self.size) ** 2).sum(axis=-1), axis=1)
         self.nearest = measured_at[order[:, :_STARTS]]  # (P, starts, n)

@@ -13,7 +13,7 @@ import json
 import os
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -428,31 +428,28 @@ def _residual_sections(calibration: Fit) -> list[pages.Section]:
             for i, row in enumerate(zip(*columns, strict=True))
         ],
     )
-    sections = [
-        pages.Section(
-            "Residuals",
-            [pages.Figure(by_row, "residuals by row"), *by_input, table],
-            "residuals",
-        )
-    ]
+    figures = [pages.Figure(by_row, "residuals by row"), *by_input]
+    sections = [pages.Section("Residuals", [*figures, table], "residuals")]
     nominal = _nominal_errors(calibration)
     if nominal is not None:
-        after = left_out(calibration) if noise_known else residuals
-        lengths = np.column_stack(
-            [np.linalg.norm(errors, axis=1) for errors in (nominal, after)]
-        )
-        labels = ("before", "after, held out" if noise_known else "after")
-        picture = _scatter(rows, lengths, labels, "row", f"error{unit}", zero=True)
-        means = lengths.mean(axis=0)
-        text = f"Mean error {means[0]:.3g} before, {means[1]:.3g} {labels[1]}."
-        sections.append(
-            pages.Section(
-                "Before and after",
-                [pages.Figure(picture, "errors before and after"), text],
-                "before",
-            )
-        )
+        sections.append(_before_and_after(calibration, nominal, unit))
     return sections
+
+
+def _before_and_after(calibration: Fit, nominal: Array, unit: str) -> pages.Section:
+    """The length of each error (N, m), nominal and as fitted, held out if possible."""
+    noise_known = calibration.noise_std is not None
+    after = left_out(calibration) if noise_known else calibration.residuals
+    lengths = np.column_stack(
+        [np.linalg.norm(errors, axis=1) for errors in (nominal, after)]
+    )
+    labels = ("before", "after, held out" if noise_known else "after")
+    rows = np.arange(len(lengths), dtype=float)
+    picture = _scatter(rows, lengths, labels, "row", f"error{unit}", zero=True)
+    means = lengths.mean(axis=0)
+    text = f"Mean error {means[0]:.3g} before, {means[1]:.3g} {labels[1]}."
+    figure = pages.Figure(picture, "errors before and after")
+    return pages.Section("Before and after", [figure, text], "before")
 
 
 def _files_section(calibration: Fit, files: Mapping[str, str]) -> pages.Section:
@@ -490,6 +487,56 @@ def _ticks(low: float, high: float) -> list[float]:
     return [float(step * i) + 0.0 for i in np.arange(first, last + 1.0)]  # no -0
 
 
+class _Axes(NamedTuple):
+    """The ranges of a picture, and where on it a value lies."""
+
+    low: float  # upward
+    high: float
+    first: float  # across
+    last: float
+
+    @classmethod
+    def around(cls, x: Array, columns: Array, from_zero: bool) -> _Axes:
+        """Around dots (N, s) above x (N,), and zero; ``from_zero``: nothing below."""
+        low, high = min(float(np.min(columns)), 0.0), max(float(np.max(columns)), 0.0)
+        if from_zero:
+            low = 0.0
+        room = 0.06 * ((high - low) or 1.0)
+        first, last = float(np.min(x)), float(np.max(x))
+        pad = 0.03 * ((last - first) or 1.0)
+        below = 0.0 if from_zero else room
+        return cls(low - below, high + room, first - pad, last + pad)
+
+    def x(self, value: float) -> float:
+        share = (value - self.first) / (self.last - self.first)
+        return _LEFT + share * (_WIDTH - _LEFT - _RIGHT)
+
+    def y(self, value: float) -> float:
+        share = (value - self.low) / (self.high - self.low)
+        return _HEIGHT - _BOTTOM - share * (_HEIGHT - _TOP - _BOTTOM)
+
+    def drawn(self, across: str, up: str) -> list[str]:
+        """Numbers along both, the line of zero, and what they are called."""
+        parts = []
+        for value in _ticks(self.low, self.high):
+            y = self.y(value)
+            parts.append(f'<text x="{_LEFT - 6:g}" y="{y + 4:.1f}" text-anchor="end">'
+                         f"{value:.3g}</text>")  # fmt: skip
+        below = _HEIGHT - _BOTTOM + 16
+        for value in _ticks(self.first, self.last):
+            parts.append(f'<text x="{self.x(value):.1f}" y="{below:g}" '
+                         f'text-anchor="middle">{value:.3g}</text>')  # fmt: skip
+        middle, end = self.y(0.0), _WIDTH - _RIGHT
+        return [
+            *parts,
+            f'<path d="M{_LEFT:g} {middle:.1f}H{end:g}" stroke="#888" '
+            'stroke-width="1"/>',
+            f'<text x="{_WIDTH / 2:g}" y="{_HEIGHT - 6:g}" text-anchor="middle">'
+            f"{html.escape(across)}</text>",
+            f'<text x="6" y="14">{html.escape(up)}</text>',
+        ]
+
+
 def _scatter(
     x: Array,
     columns: Array,
@@ -500,42 +547,13 @@ def _scatter(
     zero: bool = False,
 ) -> str:
     """An SVG file: the columns (N, s) as dots above x (N,), each with its colour."""
-    low, high = float(np.min(columns)), float(np.max(columns))
-    low, high = min(low, 0.0), max(high, 0.0)
-    if zero:
-        low = 0.0
-    room = 0.06 * ((high - low) or 1.0)
-    low, high = low - (0.0 if zero else room), high + room
-    first, last = float(np.min(x)), float(np.max(x))
-    pad = 0.03 * ((last - first) or 1.0)
-    first, last = first - pad, last + pad
-
-    def at_x(value: float) -> float:
-        share = (value - first) / (last - first)
-        return _LEFT + share * (_WIDTH - _LEFT - _RIGHT)
-
-    def at_y(value: float) -> float:
-        share = (value - low) / (high - low)
-        return _HEIGHT - _BOTTOM - share * (_HEIGHT - _TOP - _BOTTOM)
-
-    grey = 'stroke="#888" stroke-width="1"'
+    axes = _Axes.around(x, columns, zero)
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" '
         f'width="{1.5 * _WIDTH:g}" height="{1.5 * _HEIGHT:g}" '
-        'font-family="sans-serif" font-size="13" fill="#666">'
+        'font-family="sans-serif" font-size="13" fill="#666">',
+        *axes.drawn(across, up),
     ]
-    for value in _ticks(low, high):
-        y = at_y(value)
-        parts.append(f'<text x="{_LEFT - 6:g}" y="{y + 4:.1f}" text-anchor="end">'
-                     f"{value:.3g}</text>")  # fmt: skip
-    for value in _ticks(first, last):
-        parts.append(f'<text x="{at_x(value):.1f}" y="{_HEIGHT - _BOTTOM + 16:g}" '
-                     f'text-anchor="middle">{value:.3g}</text>')  # fmt: skip
-    middle = at_y(0.0)
-    parts.append(f'<path d="M{_LEFT:g} {middle:.1f}H{_WIDTH - _RIGHT:g}" {grey}/>')
-    parts.append(f'<text x="{_WIDTH / 2:g}" y="{_HEIGHT - 6:g}" text-anchor="middle">'
-                 f"{html.escape(across)}</text>")  # fmt: skip
-    parts.append(f'<text x="6" y="14">{html.escape(up)}</text>')
     for i, name in enumerate(names):
         colour = _COLOURS[i % len(_COLOURS)]
         if len(names) <= _NAMED:
@@ -546,7 +564,7 @@ def _scatter(
             )
         dots = zip(x, columns[:, i], strict=True)
         parts += [
-            f'<circle cx="{at_x(u):.1f}" cy="{at_y(v):.1f}" r="3" fill="{colour}" '
+            f'<circle cx="{axes.x(u):.1f}" cy="{axes.y(v):.1f}" r="3" fill="{colour}" '
             'fill-opacity="0.8"/>'
             for u, v in dots
         ]

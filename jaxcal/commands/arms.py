@@ -79,7 +79,7 @@ class ArmOptions:
                 "(Chains) are in Python, docs/arms.md, Several chains"
             )
         kind = SENSORS[self.sensor]
-        given: dict[str, Any] = {}
+        landmarks: dict[str, Any] = {}
         if issubclass(kind, Landmarks):
             if places is not None:
                 if {len(place) for place in places} != {kind.width}:
@@ -87,19 +87,19 @@ class ArmOptions:
                         f"--near must be {kind.width} numbers for --sensor "
                         f"{self.sensor}, got {places}"
                     )
-                given |= {"count": len(places), "places": places}
+                landmarks |= {"count": len(places), "places": places}
             elif table is not None and self.sensor in table.names:
                 column = table.columns([self.sensor])
-                given["count"] = 1 + int(column.max(initial=0.0))
+                landmarks["count"] = 1 + int(column.max(initial=0.0))
         if self.distance:
             if kind is not Socket:
                 raise ValueError("--distance is of --sensor socket")
-            given["distances"] = self.distance
+            landmarks["distances"] = self.distance
             if table is not None and self.sensor not in table.names:
                 raise ValueError(
                     f"{table.source}: --distance needs a column 'socket', from 0"
                 )
-        sensor = kind(**given)
+        sensor = kind(**landmarks)
         for option, count in (("locked", 1), ("limits", 2)):
             for name, values in getattr(self, option) or ():
                 if not name or len(values) != count:

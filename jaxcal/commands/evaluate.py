@@ -209,14 +209,14 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
     Returns:
         The exit code.
     """
-    given = list(sys.argv[1:] if argv is None else argv)
+    words = list(sys.argv[1:] if argv is None else argv)
     command = ["python", prog] if prog.endswith(".py") else prog.split()
-    of_task = any(word.partition("=")[0] == "--task" for word in given)
+    of_task = any(word.partition("=")[0] == "--task" for word in words)
     kept, before = "nothing was written", signal.signal(signal.SIGTERM, _terminate)
     try:
-        made = parser(prog, typed_line(prog), of_task).parse_args(given)
+        made = parser(prog, typed_line(prog), of_task).parse_args(words)
         options = values_of(made)["options"]
-        options.command = [*command, *given]
+        options.command = [*command, *words]
         if not of_task and options.stream is not None:
             kept = "finished parts are kept; the same command goes on"
         with told():
@@ -350,8 +350,8 @@ def _criterion(options: EvaluateOptions) -> str:
         trained = ", ".join(f"{path} {name}" for path, name in criteria.items())
         raise ValueError(f"--checkpoint must be of one criterion, got {trained}")
     criterion = criteria[options.checkpoint[0]]
-    for flag, given in (("--stream", options.stream), ("--report", options.report)):
-        if criterion != "D" and given is not None:
+    for flag, value in (("--stream", options.stream), ("--report", options.report)):
+        if criterion != "D" and value is not None:
             raise ValueError(
                 f"{flag} is of criterion D, the checkpoint of {criterion}: leave it out"
             )
@@ -402,7 +402,7 @@ def _streamed(
         "--indices": options.indices,
         "--time-limit": options.time_limit is not None,
     }
-    for flag in (flag for flag, given in whole.items() if given):
+    for flag in (flag for flag, value in whole.items() if value):
         raise ValueError(f"{flag} needs every episode at once and --stream keeps none")
     if len(options.datasets) > 1:
         raise ValueError(

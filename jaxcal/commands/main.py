@@ -61,11 +61,11 @@ def main(argv: list[str] | None = None) -> int:
         The exit code: 0, 1 where a calibration is not good, 2 where something given
         was wrong, 130 after Ctrl-C.
     """
-    given = sys.argv[1:] if argv is None else argv
-    if given and given[0] in _WHOLE:
-        module = importlib.import_module(f"jaxcal.commands.{given[0]}")
-        return int(module.main(given[1:], prog=f"jaxcal {given[0]}"))
-    arguments = _parser(given).parse_args(given)
+    words = sys.argv[1:] if argv is None else argv
+    if words and words[0] in _WHOLE:
+        module = importlib.import_module(f"jaxcal.commands.{words[0]}")
+        return int(module.main(words[1:], prog=f"jaxcal {words[0]}"))
+    arguments = _parser(words).parse_args(words)
     code = 0
     try:
         with told(), warnings.catch_warnings():
@@ -132,14 +132,14 @@ def doctor(*, json: Annotated[bool, "print JSON"] = False) -> None:
 
 def _required() -> dict[str, str]:
     """Packages, and the smallest extra that brings each; "" of those always there."""
-    wanted: dict[str, list[str]] = {}
+    of_extra: dict[str, list[str]] = {}
     for line in importlib.metadata.requires("jaxcal") or []:
         asked = re.match(r"([\w.-]+)(?:.*extra == ['\"](\w+)['\"])?", line)
         if asked and asked[2] not in _OTHERS and asked[1] != "jaxcal":
-            wanted.setdefault(asked[2] or "", []).append(asked[1])
+            of_extra.setdefault(asked[2] or "", []).append(asked[1])
     extras: dict[str, str] = {}
-    for extra in sorted(wanted, key=lambda name: (name != "", len(wanted[name]))):
-        for package in wanted[extra]:
+    for extra in sorted(of_extra, key=lambda name: (name != "", len(of_extra[name]))):
+        for package in of_extra[extra]:
             extras.setdefault(package, extra)
     return extras
 

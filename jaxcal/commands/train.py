@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
         0 when trained or stopped on request, 1 where the training diverged, 2 when
         something given was wrong, 3 where another process of the job was lost.
     """
-    given = list(sys.argv[1:] if argv is None else argv)
+    words = list(sys.argv[1:] if argv is None else argv)
 
     def alone() -> int:  # this process may be one of several
         cache.keep_compiled_programs()
@@ -53,12 +53,12 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
             with needs("policy", "training"):
                 from jaxcal.commands.train_arguments import read
             with told():
-                return _run(read(prog, given), prog)
+                return _run(read(prog, words), prog)
         except (ValueError, OSError, MissingExtraError) as error:
             return refused(prog, error)
 
     advice = "what is saved stays: start every process again with --resume"
-    return processes.run_job(prog, given, alone, advice)
+    return processes.run_job(prog, words, alone, advice)
 
 
 def _run(arguments: TrainOptions, prog: str) -> int:
@@ -205,7 +205,7 @@ def _configuration(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
     """Configuration of postures: from the flags, or from the run to go on with."""
     from jaxcal.commands.train_arguments import (
         candidates_of,
-        given_to,
+        given_flags,
         preset_of,
         trained_on,
     )
@@ -213,17 +213,17 @@ def _configuration(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
     from jaxcal.learning.training import checkpoint, presets
     from jaxcal.learning.training.config import TrainConfig
 
-    given = given_to(arguments, task=False)
+    flags = given_flags(arguments, task=False)
     path = arguments.candidates
-    criterion = given.get("criterion", "D")
+    criterion = flags.get("criterion", "D")
     if arguments.resume and path:
         criterion = criterion_of(out)
     candidates = candidates_of(path, criterion) if path else None
     config = presets.load(preset_of(arguments))
     if arguments.trainer == "brax":
-        config = _for_brax(config, arguments, given)
+        config = _for_brax(config, arguments, flags)
     if arguments.resume:
-        _refuse_with_resume(given | _swept(arguments), out)
+        _refuse_with_resume(flags | _swept(arguments), out)
         config = TrainConfig.from_meta(checkpoint.read_meta(out)[1])
         held = config.tasks[0].given
         if held != candidates:  # they are compared by their digest
@@ -236,9 +236,9 @@ def _configuration(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
         return config
     _refuse_to_overwrite(out)
     if candidates is None:
-        config = presets.with_values(config, given)
+        config = presets.with_values(config, flags)
     else:
-        config = trained_on(config, candidates, given)
+        config = trained_on(config, candidates, flags)
     config = dataclasses.replace(config, sweep=tuple(arguments.sweep))
     if config.num_runs > 1 and arguments.no_validation:
         raise ValueError(
@@ -281,16 +281,16 @@ def _task_configuration(arguments: TrainOptions, out: pathlib.Path) -> PolicyCon
     from jaxcal.adaptive.policy import training
     from jaxcal.adaptive.policy.config import PolicyConfig
     from jaxcal.adaptive.tasks import registry
-    from jaxcal.commands.train_arguments import TASK_PARTS, given_to
+    from jaxcal.commands.train_arguments import TASK_PARTS, given_flags
     from jaxcal.learning.settings import settings_of
     from jaxcal.learning.training import checkpoint
 
     assert arguments.task is not None  # it is what this function is for
     entry = registry.load(arguments.task)
-    given = given_to(arguments, task=True)
+    flags = given_flags(arguments, task=True)
     if arguments.resume:
         more = {"with": arguments.with_} if arguments.with_ else {}
-        _refuse_with_resume(given | more | _swept(arguments), out)
+        _refuse_with_resume(flags | more | _swept(arguments), out)
         _, meta = checkpoint.read_meta(out, training.SCHEMA)
         config = PolicyConfig.from_meta(meta)
         held, given_task = map(pathlib.Path, (config.task, arguments.task))
@@ -304,9 +304,9 @@ def _task_configuration(arguments: TrainOptions, out: pathlib.Path) -> PolicyCon
         options = (registry.options_from(entry, arguments.with_),)
     ppo, policy = (
         {
-            f.name: given[f.name]
+            f.name: flags[f.name]
             for f in settings_of(TASK_PARTS[part])
-            if f.name in given
+            if f.name in flags
         }
         for part in ("ppo", "policy")
     )
@@ -366,20 +366,20 @@ def _introduction(config: TrainConfig, out: pathlib.Path, devices: str) -> str:
     for name, values in config.sweep:
         seed += f", {name} " + " ".join(f"{value:g}" for value in values)
     env = task.environment
-    given = f" from {task.given.name}" if task.given else ""
+    origin = f" from {task.given.name}" if task.given else ""
     if env.criterion != "D":
         unit = (
             "does not change with their unit: whitened"
             if env.criterion in AFFINE
             else "changes with their unit: as they are"
         )
-        given += (
+        origin += (
             f" by criterion {env.criterion}, which {unit}, with a look-ahead by "
             f"{env.criterion}"
         )
     return (
         f"preset {config.preset}: {config.network.kind} network, {size:,} parameters; "
-        f"choose {env.num_selected} of {env.num_candidates}{given}; "
+        f"choose {env.num_selected} of {env.num_candidates}{origin}; "
         f"{config.ppo.num_episodes:,} episodes, {seed}, on {devices}; run folder {out}"
     )
 

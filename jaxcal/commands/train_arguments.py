@@ -27,7 +27,7 @@ __all__ = [
     "TrainOptions",
     "candidates_of",
     "flag_of",
-    "given_to",
+    "given_flags",
     "preset_of",
     "read",
     "trained_on",
@@ -207,14 +207,14 @@ def preset_of(arguments: TrainOptions) -> str:
     return arguments.preset or "compact"
 
 
-def given_to(arguments: TrainOptions, task: bool) -> dict[str, Any]:
+def given_flags(arguments: TrainOptions, task: bool) -> dict[str, Any]:
     """The fields of a configuration that were given: name to value.
 
     Raises:
         ValueError: a flag is given that a task, or a preset, does not read.
     """
-    given, read = arguments.values, _TASKS if task else _POSTURES
-    unread = {flag_of(name) for name in set(given) - set(read)}
+    flags, read = arguments.values, _TASKS if task else _POSTURES
+    unread = {flag_of(name) for name in set(flags) - set(read)}
     if task:
         unread |= {"--preset"} if arguments.preset else set()
         unread |= {"--candidates"} if arguments.candidates else set()
@@ -228,7 +228,7 @@ def given_to(arguments: TrainOptions, task: bool) -> dict[str, Any]:
         raise ValueError(
             f"{who} does not read {', '.join(sorted(unread))}: leave {it} out"
         )
-    return given
+    return flags
 
 
 def _abouts() -> str:

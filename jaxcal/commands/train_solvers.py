@@ -33,10 +33,12 @@ def fixed_validation(config: TrainConfig) -> Validation:
         states = jax.vmap(task.reset)(
             jax.random.split(jax.random.key(20261121), _VALIDATED)
         )
-        given = np.asarray(states.candidates, np.float64)
+        candidates = np.asarray(states.candidates, np.float64)
         free = np.asarray(states.available)
-        optima = exact_batch(given, env.num_selected, available=free, num_outputs=1)
-        return Validation(given, np.asarray(optima.log_det), env.num_outputs, free)
+        optima = exact_batch(
+            candidates, env.num_selected, available=free, num_outputs=1
+        )
+        return Validation(candidates, np.asarray(optima.log_det), env.num_outputs, free)
     rng = np.random.default_rng([20261121, env.num_candidates, env.num_inputs])
     sets = rng.uniform(size=(_VALIDATED, env.num_candidates, env.num_inputs))
     best = exact_batch(sets, env.num_selected, num_outputs=1).log_det

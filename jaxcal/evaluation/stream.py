@@ -127,19 +127,19 @@ def _open(folder: pathlib.Path, plan: Mapping[str, Any]) -> None:
     if set(plan["methods"]) & set(POLICIES):
         from jaxcal.learning.training.checkpoint import load
 
-        for given in plan["checkpoints"]:
-            weights[given or "default"] = load(given).weights.fingerprint
+        for checkpoint in plan["checkpoints"]:
+            weights[checkpoint or "default"] = load(checkpoint).weights.fingerprint
     head = {"format": "jaxcal-evaluation-stream", "version": 4, "part": PART}
     whole = {**head, **plan, "weights": weights, "versions": versions()}
-    wanted, path = json.loads(json.dumps(whole)), folder / "stream.json"
+    settings, path = json.loads(json.dumps(whole)), folder / "stream.json"
     folder.mkdir(parents=True, exist_ok=True)
     if not path.exists():
-        write_text(path, json.dumps(wanted, indent=1) + "\n")
+        write_text(path, json.dumps(settings, indent=1) + "\n")
     held = _read(path)
-    for name in (name for name in wanted if held.get(name) != wanted[name]):
+    for name in (name for name in settings if held.get(name) != settings[name]):
         raise ValueError(
             f"{folder} holds parts of another evaluation: its {name} is "
-            f"{held.get(name)!r}, not {wanted[name]!r}; name another folder"
+            f"{held.get(name)!r}, not {settings[name]!r}; name another folder"
         )
 
 

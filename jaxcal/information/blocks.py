@@ -103,26 +103,10 @@ def _centred(
     where_far, dense = _far(ordered, largest, same) if look else (None, None)
     shift, constant = None, first[:, 0] * same
     if np.count_nonzero(constant) and np.count_nonzero(same) < same.size:
-        total = np.add.reduce(blocks, axis=1)
-        if masked:
-            assert usable is not None
-            missing = count - usable.sum(axis=1)[:, None, None]
-            total = (total - missing * first[:, 0]) / np.maximum(count - missing, 1)
-        else:
-            total /= count
-        if where_far is not None:
-            total = np.where(where_far, dense, total)
-        centre = total * ~same
-        if q == 1:
-            size = np.vecdot(constant, constant)[..., None]
-            if sets > 1:
-                size[size == 0.0] = 1.0
-            shift = constant.mT / size * centre
-            if sets > 1:
-                centre = constant @ shift  # of sets without constants it is zero
-        else:
-            shift = np.linalg.pinv(constant) @ centre
-            centre = constant @ shift
+        mean = _mean(blocks, first, usable if masked else None)
+        if where_far is not None and dense is not None:
+            mean = np.where(where_far, dense, mean)
+        shift, centre = _shift(constant, mean * ~same)
         blocks = blocks - centre[:, None]
     if masked:
         blocks = np.where(usable[..., None, None], blocks, 0.0)  # type: ignore[index]
@@ -133,6 +117,30 @@ def _centred(
         rows = np.concatenate([rows, prior], axis=1)
     far = None if where_far is None else np.asarray(where_far.any(axis=(1, 2)))
     return _CentredBlocks(rows, largest, scale, shift, far)
+
+
+def _mean(blocks: Array, first: Array, usable: Mask | None) -> Array:
+    """(S, q, p) of the blocks that are usable; the others are equal to ``first``."""
+    total, count = np.add.reduce(blocks, axis=1), blocks.shape[1]
+    if usable is None:
+        total /= count
+        return total
+    missing = count - usable.sum(axis=1)[:, None, None]
+    return np.asarray((total - missing * first[:, 0]) / np.maximum(count - missing, 1))
+
+
+def _shift(constant: Array, centre: Array) -> tuple[Array, Array]:
+    """(S, p, p) with ``constant @ shift`` nearest the centre, and (S, q, p) that."""
+    sets, q, _ = constant.shape
+    if q > 1:
+        shift = np.linalg.pinv(constant) @ centre
+        return shift, constant @ shift
+    size = np.vecdot(constant, constant)[..., None]
+    if sets == 1:
+        return constant.mT / size * centre, centre
+    size[size == 0.0] = 1.0
+    shift = constant.mT / size * centre
+    return shift, constant @ shift  # of sets without constants it is zero
 
 
 def _far(
@@ -300,9 +308,9 @@ def missing_directions(
     return [direction * back for direction in null]
 
 
-def coarseness(given: object) -> float:
+def coarseness(array: object) -> float:
     """How many times coarser than float64 the numbers of an array are."""
-    kind = getattr(given, "dtype", np.asarray(given).dtype)
+    kind = getattr(array, "dtype", np.asarray(array).dtype)
     if isinstance(kind, np.dtype) and kind.kind == "f":
         return max(1.0, float(np.finfo(kind).eps) / _EPS)
     return 1.0

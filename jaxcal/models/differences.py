@@ -190,13 +190,13 @@ class _Ladder:
                 step = _FIRST * self.scale * 2.0**-i
                 if step < least and rungs:
                     break
-                wanted = [o * step for o in stencil.offsets.tolist()]
-                new = [o for o in wanted if o not in values]
+                steps = [o * step for o in stencil.offsets.tolist()]
+                new = [o for o in steps if o not in values]
                 points = np.tile(at, (len(new), 1))
                 points[:, j] += new
                 if new:
                     values |= dict(zip(new, evaluate(points), strict=True))
-                stack = np.array([values[o] for o in wanted])
+                stack = np.array([values[o] for o in steps])
                 slope = combined(stack, stencil.fine, periods) / step
                 if not np.isfinite(slope).all():
                     continue

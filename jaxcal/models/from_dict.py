@@ -36,17 +36,17 @@ def from_dict(data: Mapping[str, Any]) -> Model:
     """
     if not isinstance(data, Mapping):
         raise ValueError(f"a model must be a JSON object with a kind, got {data!r}")
-    given = dict(data)
-    kind = one_of("kind of the model", given.pop("kind", None), tuple(_KINDS))
-    if kind in ("jax", "function") or given.get("features", "") is None:
+    fields = dict(data)
+    kind = one_of("kind of the model", fields.pop("kind", None), tuple(_KINDS))
+    if kind in ("jax", "function") or fields.get("features", "") is None:
         raise ValueError(
             "the model holds a function, which a file cannot: give the model itself, "
             "model=..."
         )
     if kind == "linear":  # a formula names its own
-        given.pop("terms", None)
+        fields.pop("terms", None)
     try:
-        return _KINDS[kind](**given)
+        return _KINDS[kind](**fields)
     except TypeError as error:
         raise ValueError(
             f"a model of kind {kind} must hold values as to_dict writes them: {error}"

@@ -54,8 +54,8 @@ class FromJax(Model):
         if self.nominal.ndim != 1 or not len(self.nominal):
             raise ValueError(f"nominal must have shape (p,), got {self.nominal.shape}")
         p = len(self.nominal)
-        given = tuple(f"t{i + 1}" for i in range(p)) if names is None else names
-        self.names = axis_names("names", given, "t", p)
+        labels = tuple(f"t{i + 1}" for i in range(p)) if names is None else names
+        self.names = axis_names("names", labels, "t", p)
         self._num_inputs: int | None = None
         self._periods = None if periods is None else np.asarray(periods)
         with needs("policy", "FromJax"):

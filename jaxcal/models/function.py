@@ -98,8 +98,8 @@ class FromFunction(Model):
         p = len(self.nominal)
         if not p:
             raise ValueError("nominal must hold at least one parameter, got none")
-        given = tuple(f"t{i + 1}" for i in range(p)) if names is None else names
-        self.names = axis_names("names", given, "t", p)
+        labels = tuple(f"t{i + 1}" for i in range(p)) if names is None else names
+        self.names = axis_names("names", labels, "t", p)
         self.scale = self._scale(scale)
         self._num_inputs: int | None = None
         self._inputs: tuple[str, ...] = ()

@@ -102,16 +102,16 @@ def identifiability(
     model = as_model(model)
     require_kind("noise", noise, Noise)
     require_kind("prior", prior, Prior)
-    given = None if prior is None else prior.resolve(model)
-    mean = model.nominal if given is None else given.mean
+    resolved = None if prior is None else prior.resolve(model)
+    mean = model.nominal if resolved is None else resolved.mean
     commands = commands[answered(model, commands, mean)]
     jacobian = _white(model, derivative(model, commands, mean), commands, mean, noise)
     rows = jacobian.reshape(-1, model.num_parameters)
     asked = np.ones(model.num_parameters, dtype=np.bool_)
     held: Sequence[str] = ()
-    if given is not None:
-        rows = np.vstack([rows, np.sqrt(given.precision)])
-        asked &= given.free
+    if resolved is not None:
+        rows = np.vstack([rows, np.sqrt(resolved.precision)])
+        asked &= resolved.free
     elif parameters is None:
         held = model.default_prior().fixed
         asked &= ~np.isin(model.names, list(held))
@@ -150,17 +150,17 @@ def _null_space(columns: Array, resolution: float) -> tuple[list[Array], Array]:
         These; and the singular values of the columns, each of length 1.
     """
     largest = np.abs(columns).max(axis=0, initial=0.0)
-    seen, p = largest > 0.0, columns.shape[1]
+    nonzero, p = largest > 0.0, columns.shape[1]
     # A triangle of p rows holds all that is needed of the R.
-    columns = triangle(columns / np.where(seen, largest, 1.0))
+    columns = triangle(columns / np.where(nonzero, largest, 1.0))
     lengths = np.linalg.norm(columns, axis=0)
-    unit = columns / np.where(seen, lengths, 1.0)
-    norms = np.where(seen, lengths * largest, 1.0)
+    unit = columns / np.where(nonzero, lengths, 1.0)
+    norms = np.where(nonzero, lengths * largest, 1.0)
     size = np.asarray(np.linalg.svd(unit, compute_uv=False), np.float64)
     if len(size) == p and significant(size, off=resolution).all():
         return [], size
-    first, classes = _parallel(unit, np.flatnonzero(seen), resolution)
-    null = [np.eye(p)[[i]] for i in np.flatnonzero(~seen)]
+    first, classes = _parallel(unit, np.flatnonzero(nonzero), resolution)
+    null = [np.eye(p)[[i]] for i in np.flatnonzero(~nonzero)]
     null += [vectors / norms for vectors in classes]
     for vector in _sparse_null(unit[:, first], resolution):
         full = np.zeros((1, p))

@@ -78,8 +78,10 @@ class Linear(Model):
         else:
             with np.errstate(all="ignore"):
                 count = self._call(np.zeros((1, self.num_inputs))).shape[1]
-            given = tuple(f"f{i + 1}" for i in range(count)) if terms is None else terms
-            self.terms = axis_names("terms", given, "f", count)
+            labels = (
+                tuple(f"f{i + 1}" for i in range(count)) if terms is None else terms
+            )
+            self.terms = axis_names("terms", labels, "f", count)
         if not self.terms:
             raise ValueError(f"features must hold at least one term, got {features!r}")
 

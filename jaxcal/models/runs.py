@@ -280,10 +280,10 @@ def _answer(
             return [*_readings(result, len(commands))]
     answers: list[Answer] = []
     for command in commands:
-        given = command[None] if batch else command
+        argument = command[None] if batch else command
         try:
             with np.errstate(all="ignore"):
-                result = f(given.copy(), parameters.copy())
+                result = f(argument.copy(), parameters.copy())
         except Exception as error:
             name = "" if isinstance(error, _RunError) else f"{type(error).__name__}: "
             answers.append(f"{name}{error}".splitlines()[0])

@@ -61,9 +61,9 @@ class Prior:
     def __post_init__(self) -> None:
         if isinstance(self.fixed, str) or not isinstance(self.fixed, Collection):
             raise ValueError(f"fixed must be a sequence of names, got {self.fixed!r}")
-        given = self.std
-        given = [*given.values()] if isinstance(given, Mapping) else given
-        std = numbers("std of the prior", given, finite=False)
+        stds = self.std
+        stds = [*stds.values()] if isinstance(stds, Mapping) else stds
+        std = numbers("std of the prior", stds, finite=False)
         if not (std > 0.0).all():
             raise ValueError(
                 "std of the prior must be positive (inf: nothing is known; "

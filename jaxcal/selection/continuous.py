@@ -209,15 +209,29 @@ def refine(
     candidates, available = offer.candidates, offer.available
     if offer.model is None or candidates is None:
         raise ValueError("refine needs candidates and a model, not blocks")
+    begun = _commands_of(selection, candidates)
+    if criterion is None and isinstance(selection, Selection):
+        criterion = _same_criterion(selection)
+    box = _limits(_range(candidates[available], allowed) if limits is None else limits)
+    _require_inputs(box, candidates)
+    _require_within(begun, box, allowed)
+    search = _Ascent(
+        offer, box, allowed, len(begun), criterion, region, seed, time_limit
+    )
+    return search.run(begun, whole_number("starts", starts, 1))
+
+
+def _commands_of(selection: Selection | ArrayLike, candidates: Array) -> Array:
+    """(k, n) the chosen of the candidates (M, n)."""
     rows = selection.indices if isinstance(selection, Selection) else selection
     rows = array_of("selection", rows, "k").astype(np.int64)
     outside = (rows < 0) | (rows >= len(candidates))
     require_none(outside, rows, f"selection must lie in [0, {len(candidates)})")
-    if criterion is None and isinstance(selection, Selection):
-        criterion = _same_criterion(selection)
-    box = _limits(_range(candidates[available], allowed) if limits is None else limits)
-    begun = candidates[rows]
-    _require_inputs(box, candidates)
+    return np.asarray(candidates[rows])
+
+
+def _require_within(begun: Array, box: Array, allowed: Allowed | None) -> None:
+    """Refuse commands (k, n) that the search itself could not reach."""
     beyond = (begun < box[:, 0]) | (begun > box[:, 1])
     require_none(beyond, begun, "selection must be within the limits")
     if allowed is not None:
@@ -227,10 +241,6 @@ def refine(
                 "allowed must hold for the commands that are refined, got False for "
                 f"{in_words(begun[bad][0])}"
             )
-    search = _Ascent(
-        offer, box, allowed, len(begun), criterion, region, seed, time_limit
-    )
-    return search.run(begun, whole_number("starts", starts, 1))
 
 
 def _range(commands: Array, allowed: Allowed | None) -> Array:
@@ -443,6 +453,20 @@ class _Ascent:
         problem = problem_of(offer, k, criterion, region)
         self.problem, self.objective = problem, problem.criterion
         self.k = problem.k
+        self._take_scenarios(problem)
+        # Their least is climbed smoothed.
+        self.smooth = self.worst or self.each.kind == "least"
+        self.prior = np.stack([member.prior for member in self.members])
+        alone = offer.by_scenario() if len(self.members) > 1 else [offer]
+        self.block_makers = [
+            blocks_of(one, self.each.by_name, self.each.of_region) for one in alone
+        ]
+        # Commands lie on a surface in the limits, as of an arm that touches something.
+        self.surface = hasattr(allowed, "onto")
+        self.rough = _ROUGH if offer.model.resolution else _STEP
+
+    def _take_scenarios(self, problem: Problem) -> None:
+        """What joins the values of S scenarios; S is 1 where there are none."""
         self.members: tuple[Problem, ...] = (problem,)
         self.weights, self.scale, self.shift = np.ones(1), np.ones(1), np.zeros(1)
         self.each, self.worst = problem.criterion, False
@@ -456,16 +480,6 @@ class _Ascent:
             self.members, self.weights = problem.members, problem.weights
             self.scale, self.shift = problem.terms()
             self.each, self.worst = problem.joined.each, problem.joined.least
-        # Their least is climbed smoothed.
-        self.smooth = self.worst or self.each.kind == "least"
-        self.prior = np.stack([member.prior for member in self.members])
-        alone = offer.by_scenario() if len(self.members) > 1 else [offer]
-        self.block_makers = [
-            blocks_of(one, self.each.by_name, self.each.of_region) for one in alone
-        ]
-        # Commands lie on a surface in the limits, as of an arm that touches something.
-        self.surface = hasattr(allowed, "onto")
-        self.rough = _ROUGH if offer.model.resolution else _STEP
 
     # -- the criterion, of S scenarios; S is 1 where there are none --------------------
 
@@ -953,8 +967,10 @@ class _Ascent:
         assert offer.candidates is not None
         pool = offer.candidates[offer.available]
         region = self.region
-        given = getattr(getattr(self.asked, "criterion", self.asked), "region", None)
-        if region is None and given is None and self.each.of_region:
+        of_criterion = getattr(
+            getattr(self.asked, "criterion", self.asked), "region", None
+        )
+        if region is None and of_criterion is None and self.each.of_region:
             region = pool
         scenarios = None
         if len(self.members) > 1:

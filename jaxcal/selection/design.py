@@ -241,10 +241,10 @@ class Design:
             ValueError: naming the argument, the rule and the value; also where an
                 option is given that the method does not read.
         """
-        given = checked_options(method, options)
+        checked = checked_options(method, options)
         start = time.perf_counter()
         problem = with_optima(self.problem(k, criterion, region))
-        solution = SOLVERS[method](problem, **given)
+        solution = SOLVERS[method](problem, **checked)
         return self._judged(problem, solution, method, start)
 
     def score(

@@ -335,9 +335,7 @@ class RigConfig(Section):
         }
 
     def broken_rules(self) -> Iterator[str]:
-        motion, session = self.motion, self.session
-        slowest = self._slowest_read_s
-        overshoot = motion.approach_overshoot_deg
+        session = self.session
         if self.k >= session.candidates:
             yield f"session.k: must be under candidates ({session.candidates})"
         if self.k <= len(self.axes):
@@ -365,32 +363,38 @@ class RigConfig(Section):
                 "no phone reads the middle one of mechanism.order elsewhere; got "
                 f"{middle.min_deg:g} and {middle.max_deg:g}"
             )
-        for axis, (low, high) in zip(self.axes, self.ranges, strict=True):
-            at, span = f"axes.{axis.name}", f"session.{axis.name}_range_deg"
-            if axis.range_deg or axis.name not in AXIS_NAMES:
-                span = f"{at}.{axis.key_of('range_deg')}"
-            if axis.speed_deg_s > motion.max_speed_deg_s:
-                yield (
-                    f"{at}.{axis.key_of('speed_deg_s')}: must be at most "
-                    "motion.max_speed_deg_s = "
-                    f"{motion.max_speed_deg_s:g}, got {axis.speed_deg_s:g}"
-                )
-            if abs(1.0 / axis.pulses_per_deg) > motion.position_tolerance_deg:
-                yield f"{at}: one pulse is coarser than motion.position_tolerance_deg"
-            if axis.comm_timeout_s is not None and axis.comm_timeout_s <= slowest:
-                least = f"bus.timeout_s x (read_retries + 1) = {slowest:g} s"
-                yield f"{at}.comm_timeout_s: must exceed {least}"
-            if motion.mirror_limits and not axis.map.mirrors_limits:
-                lack = f"the map {axis.map.name} of {axis.name} has no limit registers"
-                yield f"motion.mirror_limits: {lack}"
-            if low >= high:
-                yield f"{span}: must be [low, high], got [{low}, {high}]"
-            elif low - overshoot < axis.min_deg - 1e-9 or high > axis.max_deg + 1e-9:
-                limits = f"[{axis.min_deg}, {axis.max_deg}]"
-                yield (
-                    f"{span}: [{low}, {high}] with an overshoot of {overshoot} leaves "
-                    f"the axis's limits {limits}"
-                )
+        for axis, ends in zip(self.axes, self.ranges, strict=True):
+            yield from self._rules_of_axis(axis, *ends)
+
+    def _rules_of_axis(self, axis: Axis, low: float, high: float) -> Iterator[str]:
+        """Rules of an axis: its speed, pulses, map and the range of its session."""
+        motion, overshoot = self.motion, self.motion.approach_overshoot_deg
+        slowest = self._slowest_read_s
+        at, span = f"axes.{axis.name}", f"session.{axis.name}_range_deg"
+        if axis.range_deg or axis.name not in AXIS_NAMES:
+            span = f"{at}.{axis.key_of('range_deg')}"
+        if axis.speed_deg_s > motion.max_speed_deg_s:
+            yield (
+                f"{at}.{axis.key_of('speed_deg_s')}: must be at most "
+                "motion.max_speed_deg_s = "
+                f"{motion.max_speed_deg_s:g}, got {axis.speed_deg_s:g}"
+            )
+        if abs(1.0 / axis.pulses_per_deg) > motion.position_tolerance_deg:
+            yield f"{at}: one pulse is coarser than motion.position_tolerance_deg"
+        if axis.comm_timeout_s is not None and axis.comm_timeout_s <= slowest:
+            least = f"bus.timeout_s x (read_retries + 1) = {slowest:g} s"
+            yield f"{at}.comm_timeout_s: must exceed {least}"
+        if motion.mirror_limits and not axis.map.mirrors_limits:
+            lack = f"the map {axis.map.name} of {axis.name} has no limit registers"
+            yield f"motion.mirror_limits: {lack}"
+        if low >= high:
+            yield f"{span}: must be [low, high], got [{low}, {high}]"
+        elif low - overshoot < axis.min_deg - 1e-9 or high > axis.max_deg + 1e-9:
+            limits = f"[{axis.min_deg}, {axis.max_deg}]"
+            yield (
+                f"{span}: [{low}, {high}] with an overshoot of {overshoot} leaves "
+                f"the axis's limits {limits}"
+            )
 
     def _rules_of_model(self, model: ModelSettings) -> Iterator[str]:
         if self.session.k is None:
@@ -436,11 +440,13 @@ def parse_config(
 
 def _repeated(data: dict[str, Any]) -> Iterator[str]:
     """Names, units and letters that axes share; told even beside other faults."""
-    given = data.get("axes")
-    axes = [a for a in given if isinstance(a, dict)] if isinstance(given, list) else []
+    tables = data.get("axes")
+    axes = (
+        [a for a in tables if isinstance(a, dict)] if isinstance(tables, list) else []
+    )
     axes = [{"rotates": DEFAULT_ROTATES.get(str(a.get("name"))), **a} for a in axes]
-    if isinstance(given, list) and not 1 <= len(given) <= MOST_AXES:
-        yield f"axes: must be 1 to {MOST_AXES} tables, got {len(given)}"
+    if isinstance(tables, list) and not 1 <= len(tables) <= MOST_AXES:
+        yield f"axes: must be 1 to {MOST_AXES} tables, got {len(tables)}"
     by_letters = "readings" not in data and not (
         isinstance(data.get("model"), dict) and data["model"].get("urdf")
     )

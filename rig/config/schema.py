@@ -207,7 +207,7 @@ def _texts(error: Any, value: Any, root: dict[str, Any]) -> list[str]:
         near = difflib.get_close_matches(error["loc"][-1], keys, 1)
         hint = f"did you mean {near[0]}? " if near else ""
         return [f"{path}: unknown key; {hint}known here: {', '.join(keys)}"]
-    wanted = rule(here, root)
+    needed = rule(here, root)
     if kind == "missing":
-        return [f"{path}: missing; {wanted} is required"]
-    return [f"{path}: must be {wanted}, got {repr(error['input'])[:80]}"]
+        return [f"{path}: missing; {needed} is required"]
+    return [f"{path}: must be {needed}, got {repr(error['input'])[:80]}"]

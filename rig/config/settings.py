@@ -49,9 +49,9 @@ class BusSettings(Section):
         return f"{self.host}:{self.port} ({self.transport})"
 
     def broken_rules(self) -> Iterator[str]:
-        wanted = "host" if self.transport in NETWORK else "device"
-        if not getattr(self, wanted):
-            yield f"{wanted}: missing; transport {self.transport!r} needs one"
+        required = "host" if self.transport in NETWORK else "device"
+        if not getattr(self, required):
+            yield f"{required}: missing; transport {self.transport!r} needs one"
 
 
 def _by_format(hyperimu: Any, other: Any) -> Callable[[dict[str, Any]], Any]:
@@ -189,11 +189,11 @@ class ReadingsSettings(Section):
             if not re.fullmatch("[a-z][a-z0-9_]{0,23}", name):
                 yield f"names: must be small letters, digits and _, got {name!r}"
         modbus = self.transport == "modbus"
-        for key_name, wanted in (
+        for key_name, required in (
             ("registers", modbus), ("columns", False), ("factors", False)
         ):  # fmt: skip
             count = len(getattr(self, key_name))
-            if count != len(self.names) and (count or wanted):
+            if count != len(self.names) and (count or required):
                 yield f"{key_name}: must be {len(self.names)}, as names, got {count}"
         if self.transport == "serial" and not self.device:
             yield "device: missing; transport 'serial' needs one"

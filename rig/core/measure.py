@@ -180,7 +180,7 @@ def _check_position(device: Device, target: Pulses, feedback: list[int]) -> None
 
 def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
     """The joints are where the drives say, roughly, and moved when they moved."""
-    names, seen = device.config.axis_names, device.seen
+    names, last = device.config.axis_names, device.seen
     # What are no angles of joints is compared by how it changes alone.
     apart = measured - commanded if device.geometry.of_joints else np.zeros(1)
     if (np.abs(apart) > DISAGREEMENT_DEG).any():
@@ -190,9 +190,9 @@ def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
             f"the command (limit {DISAGREEMENT_DEG:g}). Check the zero posture, then "
             "run `jaxcal-rig axes`"
         )
-    way = commanded - seen.commanded
+    way = commanded - last.commanded
     asked = np.abs(way)
-    moved = device.moved(measured - seen.measured, seen.commanded + way / 2.0)
+    moved = device.moved(measured - last.measured, last.commanded + way / 2.0)
     if moved is None:
         _check_predicted(device, commanded, measured)
     followed = np.sign(way) * (way if moved is None else moved)
@@ -210,7 +210,7 @@ def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
                 f"the {'IMU' if imu else 'sensor'} saw {followed[index]:.2f}. Look for "
                 f"{hint}"
             )
-    seen.commanded, seen.measured = commanded, measured
+    last.commanded, last.measured = commanded, measured
 
 
 def _check_predicted(device: Device, commanded: Array, measured: Array) -> None:

@@ -134,11 +134,11 @@ class SimDrive:
         if stuck:
             return
         error = self.target - self.position
-        wanted = math.copysign(
+        target = math.copysign(
             min(self._speed, math.sqrt(2.0 * self._accel * abs(error))), error
         )
         most = self._accel * dt
-        self.velocity += max(-most, min(most, wanted - self.velocity))
+        self.velocity += max(-most, min(most, target - self.velocity))
         step = self.velocity * dt
         # The last step ends on the target, however short it is cut by a look at the
         # drive; only a drive sent back while it runs fast passes it.

@@ -56,14 +56,14 @@ class Truth:
         least = min(*shape, len(paper.matrix))
         matrix[:least, :least] = np.array(paper.matrix)[:least, :least]
         bias = [*paper.bias, 1.3, -2.2, 0.7][: shape[0]]
-        given = {
+        fields = {
             "matrix": tuple(map(tuple, matrix.tolist())),
             "bias": tuple(bias),
             "reversed": (False,) * count,
             "swapped": tuple(range(count)),
             "lost_origin_deg": (0.0,) * count,
         }
-        return cls(**given | more)
+        return cls(**fields | more)
 
     @classmethod
     def of(cls, config: RigConfig, **more: Any) -> Truth:

@@ -56,7 +56,7 @@ def say(text: str) -> None:
 
 
 def run_session(
-    given: SessionOptions,
+    options: SessionOptions,
     command: str,
     config: RigConfig,
     start: dict[str, Any],
@@ -65,7 +65,7 @@ def run_session(
     """Run a session under the lock of its bus; returns the exit code.
 
     Args:
-        given: the options of the command.
+        options: the options of the command.
         command: its name, told to whoever finds the bus locked.
         config: of the device.
         start: mode, inputs and simulation, as the journal's first record keeps them.
@@ -76,16 +76,16 @@ def run_session(
     with contextlib.ExitStack() as stack:
         simulator, text = None, config.text
         if not real:
-            simulator = given.simulator(config, start["simulated"])
+            simulator = options.simulator(config, start["simulated"])
             config = stack.enter_context(simulator).start()
         lock, record = BusLock(config.bus), DeviceRecord.load(config.device_path)
-        if not given.dry_run:
+        if not options.dry_run:
             stack.enter_context(lock.acquire(command))
             if real and (lack := record.missing(config)):
                 raise Refused(lack)
         if folder is None:
             folder = new_run_folder(
-                given.out or pathlib.Path(config.output), start["mode"]
+                options.out or pathlib.Path(config.output), start["mode"]
             )
             (folder / "rig.toml").write_text(text, encoding="utf-8")
         if simulator is not None:
@@ -97,19 +97,19 @@ def run_session(
             start["mode"],
             say,
             start={key: start[key] for key in ("simulated", "inputs", "maps_from")},
-            reset_alarms=given.reset_alarms,
+            reset_alarms=options.reset_alarms,
             record=record,
             # With --zero the operator put the device into its zero posture.
-            zero_at=kept_zero.pulses if kept_zero and not given.zero else None,
+            zero_at=kept_zero.pulses if kept_zero and not options.zero else None,
             kept_zero=kept_zero,
-            dry_run=given.dry_run,
+            dry_run=options.dry_run,
         )
         listen(run)
-        run.confirm = functools.partial(_confirm, given, doubts)
+        run.confirm = functools.partial(_confirm, options, doubts)
         if simulator is not None:
             run.simulated = True
             run.listeners.append(simulator.hear)
-        if given.live:
+        if options.live:
             from rig.workbench import live
 
             run.say(live.start(folder))
@@ -140,7 +140,7 @@ def _procedure(
     return lambda run: goto(run, calibration, inputs["to"]), kept, doubts
 
 
-def _confirm(given: SessionOptions, doubts: list[str], session: Run) -> None:
+def _confirm(options: SessionOptions, doubts: list[str], session: Run) -> None:
     """Ask for what --arm, --zero and --use would have confirmed."""
     takes_zero = not session.journal.events("zero") and session.zero_at is None
     questions = {}
@@ -157,7 +157,7 @@ def _confirm(given: SessionOptions, doubts: list[str], session: Run) -> None:
         if takes_zero and session.config.session.zero == "here":
             questions["zero"] = "the device stands in its zero posture"
     for word, text in questions.items():
-        if not getattr(given, word):
+        if not getattr(options, word):
             Operator(say=say, option=f"--{word}").confirm(text, word)
 
 

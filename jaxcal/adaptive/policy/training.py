@@ -92,9 +92,9 @@ def train(
     """
     rows = config.ppo.rows_per_minibatch
     mesh = devices.make_mesh(rows, num_devices, config.num_runs)
-    given = exercises(config)
+    exercises_of_run = exercises(config)
     keys = jax.random.split(jax.random.key(_FRESH), _VALIDATED)
-    task, base = given[0].task, given[0].base
+    task, base = exercises_of_run[0].task, exercises_of_run[0].base
     rules: list[float] = []  # nats of the base rule, once it is played
 
     def validate(average: Any) -> dict[str, float]:
@@ -106,7 +106,9 @@ def train(
 
     recipe = Recipe(
         config=config,
-        given=tuple((devices.replicate(exercise, mesh),) for exercise in given),
+        given=tuple(
+            (devices.replicate(exercise, mesh),) for exercise in exercises_of_run
+        ),
         schema=SCHEMA,
         columns=("choices",),
         measured=MEASURED,

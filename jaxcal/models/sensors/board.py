@@ -217,15 +217,15 @@ class Board(Sensor):
         """Rotations (N, 3, 3) and places (N, 3) of the board (Zhang, 2000)."""
         flat = np.asarray(self.corners)[:, :2]
         focal, centre = np.array(self.camera).reshape(2, 2)
-        seen = (pixels.reshape(len(pixels), -1, 2) - centre) / focal
+        rays = (pixels.reshape(len(pixels), -1, 2) - centre) / focal
         size = np.abs(flat).max()
         one = np.column_stack([flat / size, np.ones(len(flat))])
         zero = np.zeros((len(pixels), *one.shape))
         ones = zero + one
         rows = np.concatenate(
             [
-                np.concatenate([ones, zero, -seen[..., :1] * ones], axis=-1),
-                np.concatenate([zero, ones, -seen[..., 1:] * ones], axis=-1),
+                np.concatenate([ones, zero, -rays[..., :1] * ones], axis=-1),
+                np.concatenate([zero, ones, -rays[..., 1:] * ones], axis=-1),
             ],
             axis=1,
         )

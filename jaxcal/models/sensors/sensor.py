@@ -162,13 +162,13 @@ class Sensor(abc.ABC):
 
     def stds(self, length: float) -> Array:
         """(q,) standard deviations of the readings."""
-        given = self.usual_noise(length) if self.noise is None else self.noise
-        std = numbers("noise of the sensor", given)
+        noise = self.usual_noise(length) if self.noise is None else self.noise
+        std = numbers("noise of the sensor", noise)
         q = len(self.outputs)
         if std.shape not in ((), (q,)) or not (std > 0.0).all():
             raise ValueError(
                 f"noise of the sensor must be one positive number or ({q},), "
-                f"got {given!r}"
+                f"got {noise!r}"
             )
         return np.broadcast_to(std, (q,)).copy()
 

@@ -168,17 +168,17 @@ class Several(Sensor):
             )
             scale = one.stds(tip.length)[:, None]
             values[rows, :width] = reading.values / scale[:, 0]
-            seen = reading.by_tip / scale
+            scaled = reading.by_tip / scale
             by_own[rows, :width, first + size : last] = reading.by_own / scale
             if i:
                 shift, _, axes = self._mount(i, mount)
                 rotation = tip.rotation[rows]
-                moves, turned = seen[..., :3] @ rotation, seen[..., 3:] @ rotation
+                moves, turned = scaled[..., :3] @ rotation, scaled[..., 3:] @ rotation
                 slopes = np.concatenate([moves, np.radians(turned @ axes)], axis=-1)
                 at = [_MOUNTING.index(axis) for axis in one.tool]
                 by_own[rows, :width, first : first + size] = slopes[..., at]
-                seen[..., 3:] -= seen[..., :3] @ hats(rotation @ shift)
-            by_tip[rows, :width] = seen
+                scaled[..., 3:] -= scaled[..., :3] @ hats(rotation @ shift)
+            by_tip[rows, :width] = scaled
             first = last
         return Reading(values, by_tip, by_own)
 

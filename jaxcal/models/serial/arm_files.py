@@ -222,11 +222,11 @@ def _steps(nominal: Arm, calibrated: Arm) -> tuple[list[list[_Part]], list[Array
     turns = [np.linalg.inv(base) @ _product(gaps[0])]
     for row, gap in zip(rows[:-1], gaps[1:-1], strict=True):
         turns.append(np.linalg.inv(row) @ turns[-1] @ _product(gap))
-    wanted = [calibrated.base @ turns[0]]
+    steps = [calibrated.base @ turns[0]]
     for turn, row, after in zip(turns, new, turns[1:], strict=False):
-        wanted.append(np.linalg.inv(turn) @ row @ after)
-    wanted.append(np.linalg.inv(turns[-1]) @ new[-1] @ calibrated.tool)
-    return gaps, wanted
+        steps.append(np.linalg.inv(turn) @ row @ after)
+    steps.append(np.linalg.inv(turns[-1]) @ new[-1] @ calibrated.tool)
+    return gaps, steps
 
 
 def _origins(nominal: Arm, calibrated: Arm) -> tuple[dict[str, Array], Array | None]:

@@ -580,19 +580,19 @@ class SerialChain(Arm, Model):
         turns = np.array([kind == "R" for kind in self.joints])
         limits = np.array(self.limits, dtype=np.float64)
         limits[turns] = np.clip(limits[turns], -180.0, 180.0)
-        seen = np.column_stack([joints.min(axis=0), joints.max(axis=0)])
-        low, high = np.where(np.isfinite(limits), limits, seen).T
+        ranges = np.column_stack([joints.min(axis=0), joints.max(axis=0)])
+        low, high = np.where(np.isfinite(limits), limits, ranges).T
         rng = np.random.default_rng(0)
         postures = rng.uniform(low, high, (_POSTURES, len(low)))
         tips = self.calibrated(parameters).predict(postures)
-        wanted = np.asarray(other.predict(postures))
+        targets = np.asarray(other.predict(postures))
         turn, _ = Rotation.align_vectors(
-            wanted - wanted.mean(axis=0), tips - tips.mean(axis=0)
+            targets - targets.mean(axis=0), tips - tips.mean(axis=0)
         )
         at = [self.names.index(f"base {axis}") for axis in _BASE]
         base = pose_matrix(parameters[at])
         moved = parameters.copy()
-        place = turn.apply(base[:3, 3] - tips.mean(axis=0)) + wanted.mean(axis=0)
+        place = turn.apply(base[:3, 3] - tips.mean(axis=0)) + targets.mean(axis=0)
         turned = (turn * Rotation.from_matrix(base[:3, :3])).as_euler("XYZ", True)
         moved[at] = np.concatenate([place, turned])
         return moved

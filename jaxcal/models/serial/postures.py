@@ -50,14 +50,14 @@ class View:
         side: str | None,
     ) -> View:
         """From (width, height, fx, fy, cx, cy), or a field of view in degrees (2,)."""
-        given = numbers("camera", camera)
-        if given.shape == (2,) and (given > 0.0).all() and (given < 180.0).all():
-            wide = 2.0 * np.tan(np.radians(given) / 2.0)
-            given = np.array([*wide, 1.0, 1.0, *(wide / 2.0)])
-        if given.shape != (6,) or not (given[:4] > 0.0).all():
+        lens = numbers("camera", camera)
+        if lens.shape == (2,) and (lens > 0.0).all() and (lens < 180.0).all():
+            wide = 2.0 * np.tan(np.radians(lens) / 2.0)
+            lens = np.array([*wide, 1.0, 1.0, *(wide / 2.0)])
+        if lens.shape != (6,) or not (lens[:4] > 0.0).all():
             raise ValueError(
                 "camera must be (width, height, fx, fy, cx, cy) in pixels or a field "
-                f"of view in degrees (horizontal, vertical), got {in_words(given)}"
+                f"of view in degrees (horizontal, vertical), got {in_words(lens)}"
             )
         tilt = _TILT if tilt is None else tilt
         if not 0.0 < numbers("tilt", tilt) < 90.0:
@@ -72,7 +72,7 @@ class View:
                     f"distance must be (least, greatest), positive, got {distance}"
                 )
             ends = (low, high)
-        return cls(given, ends, float(tilt), _SIDES.get(side or "", 0.0))
+        return cls(lens, ends, float(tilt), _SIDES.get(side or "", 0.0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -455,14 +455,14 @@ def _in_view(arm: Chain, commands: Array) -> tuple[Array, list[str]]:
     j = arm.num_joints
     posed = arm.measured_with(dataclasses.replace(arm.sensor, corners=None))
     # Of a board seen at zero: its pose in the camera.
-    seen = posed.predict(np.hstack([commands[:, :j], np.zeros((len(commands), 6))]))
+    pose = posed.predict(np.hstack([commands[:, :j], np.zeros((len(commands), 6))]))
     if arm.sensor.corners is None:
-        commands[:, j:] = seen
+        commands[:, j:] = pose
     from scipy.spatial.transform import Rotation
 
-    face = Rotation.from_rotvec(seen[:, 3:], degrees=True).as_matrix()[:, :, 2]
-    far = np.linalg.norm(seen[:, :3], axis=1)
-    ahead = seen[:, 2] / np.where(far > 0.0, far, 1.0) > _VIEW
+    face = Rotation.from_rotvec(pose[:, 3:], degrees=True).as_matrix()[:, :, 2]
+    far = np.linalg.norm(pose[:, :3], axis=1)
+    ahead = pose[:, 2] / np.where(far > 0.0, far, 1.0) > _VIEW
     turned = np.abs(face[:, 2]) > 0.5  # less than 60 degrees from facing it
     reasons = np.where(turned, "", "see the board too much from the side")
     reasons = np.where(ahead, reasons, "do not have the board before the camera")
@@ -503,8 +503,8 @@ def _pictured(
     turn = Rotation.from_rotvec(angle[:, None] * lean) * spin * facing
     shift = centre - turn.apply(np.tile(middle, (count, 1)))
     posed = arm.measured_with(dataclasses.replace(sensor, corners=None))
-    wanted = np.hstack([commands[:, :j], shift, turn.as_rotvec(degrees=True)])
-    commands = np.hstack([_solved(posed, wanted, low, high)[:, :j], commands[:, j:]])
+    goals = np.hstack([commands[:, :j], shift, turn.as_rotvec(degrees=True)])
+    commands = np.hstack([_solved(posed, goals, low, high)[:, :j], commands[:, j:]])
     return _in_picture(arm, commands, view, ends)
 
 
@@ -534,11 +534,11 @@ def _in_picture(
     points, known_side = sensor.outline, view.side or sensor.side
     width, height, fx, fy, cx, cy = view.camera
     posed = arm.measured_with(dataclasses.replace(sensor, corners=None))
-    seen = posed.predict(np.hstack([commands[:, :j], np.zeros((count, 6))]))
+    pose = posed.predict(np.hstack([commands[:, :j], np.zeros((count, 6))]))
     if sensor.corners is None:
-        commands = np.hstack([commands[:, :j], seen])
-    rotation = Rotation.from_rotvec(seen[:, 3:], degrees=True).as_matrix()
-    spots = points @ np.matrix_transpose(rotation) + seen[:, None, :3]
+        commands = np.hstack([commands[:, :j], pose])
+    rotation = Rotation.from_rotvec(pose[:, 3:], degrees=True).as_matrix()
+    spots = points @ np.matrix_transpose(rotation) + pose[:, None, :3]
     deep = np.maximum(spots[..., 2], 1e-9)
     u = _FOCAL * fx * spots[..., 0] / deep
     v = _FOCAL * fy * spots[..., 1] / deep

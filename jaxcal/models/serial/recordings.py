@@ -53,14 +53,14 @@ def rests_of(
             it says how the joints jitter.
         MissingExtraError: what reads it is not installed.
     """
-    given = {name: recording.names.get(name, name) for name in names}
+    columns = {name: recording.names.get(name, name) for name in names}
     path = pathlib.Path(recording.path)
     if (path / "meta" / "info.json").is_file():
-        parts, messages = _dataset(path, [*given.values()], recording.servos), None
+        parts, messages = _dataset(path, [*columns.values()], recording.servos), None
     else:
         if recording.servos is not None:
             raise ValueError(f"servos are of a LeRobot dataset, {path} is none")
-        times, joints, messages = _bag(path, [*given.values()], kind, recording.topic)
+        times, joints, messages = _bag(path, [*columns.values()], kind, recording.topic)
         parts = [(times, np.where(turning, np.degrees(joints), joints))]
     tables, spans = [], []
     for times, joints in parts:
@@ -127,11 +127,11 @@ def _bag(
     """Times (T,) and joints (T, J) in radians, metres; times and values of messages."""
     times, rows = [], []
     at, values = [], []
-    seen: set[str] = set()
+    joints_met: set[str] = set()
     with _opened(path) as bag:
         types = _MESSAGES.get(kind, {})
-        given = [c for c in bag.connections if topic in ("", c.topic)]
-        there = [c for msgtype in types for c in given if c.msgtype == msgtype]
+        connections = [c for c in bag.connections if topic in ("", c.topic)]
+        there = [c for msgtype in types for c in connections if c.msgtype == msgtype]
         there = [c for c in there if c.msgtype == there[0].msgtype]
         topics = sorted({c.topic for c in there})
         if types and len(topics) != 1:
@@ -148,14 +148,14 @@ def _bag(
                 values.append(types[connection.msgtype](message))
                 continue
             joints = dict(zip(message.name, message.position, strict=False))
-            seen |= joints.keys()
+            joints_met |= joints.keys()
             if joints.keys() >= set(names):
                 times.append(1e-9 * time)
                 rows.append([joints[name] for name in names])
     if not rows:
         raise ValueError(
             f"{path} must hold joint states of {', '.join(names)}, got "
-            f"{', '.join(sorted(seen)) or 'none'}"
+            f"{', '.join(sorted(joints_met)) or 'none'}"
         )
     messages = (np.array(at), np.array(values)) if types else None
     return np.array(times), np.array(rows), messages

@@ -273,14 +273,14 @@ def led(
     None where it stands still. In degrees and metres.
     """
     times, plus, unit = 1.0, 0.0, _unit(joint)
-    seen = [joint.name]
+    followed = [joint.name]
     while joint.name not in locked:
         if not joint.kind:
             return None, 0.0, plus / unit
         if joint.mimic is None:
             return joint.name, times * _unit(joint) / unit, plus / unit
         leader, by, more = joint.mimic
-        if leader not in joints or leader in seen:
+        if leader not in joints or leader in followed:
             raise ValueError(
                 f"joint {joint.name} must mimic another joint of the file, "
                 f"got {leader!r}"
@@ -288,7 +288,7 @@ def led(
         plus += times * more
         times *= by
         joint = joints[leader]
-        seen.append(leader)
+        followed.append(leader)
     return None, 0.0, (plus + times * locked[joint.name] * _unit(joint)) / unit
 
 

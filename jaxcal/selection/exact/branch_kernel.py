@@ -609,8 +609,8 @@ class Search:
         for o in range(self.opened):
             i = self.open[o]
             inside: cython.bint = fractional > 0 and low[i] < c[i] and c[i] < high[i]
-            wanted: cython.bint = self.wish[i] > 0.0 and self.wish[i] >= least
-            if inside or (wanted and size < room):
+            wished: cython.bint = self.wish[i] > 0.0 and self.wish[i] >= least
+            if inside or (wished and size < room):
                 self.which[size] = i
                 size += 1
         return size

@@ -149,18 +149,12 @@ def solve_exact(
         free = problem.k - len(problem.required)
         cheap = math.comb(len(pool), free) <= _CHEAP
         if best == 1 or cheap:
-            if enough and not cheap:  # the relaxation may do without
-                start = np.sort(
-                    exchange_indices(problem, restarts, seed, deadline.part(0.5))
-                )
-                root_bound = relaxed(problem, start, deadline)
-                by_bound = _solution_of(problem, [start], best, root_bound, 1)
-                assert by_bound.value is not None and by_bound.bound is not None
-                if (
-                    problem.criterion.efficiency(by_bound.value, by_bound.bound)
-                    >= enough
-                ):
-                    return by_bound
+            if enough and not cheap:
+                relaxation = _by_relaxation(problem, best, deadline, restarts, seed)
+                value, bound = relaxation.value, relaxation.bound
+                assert value is not None and bound is not None
+                if problem.criterion.efficiency(value, bound) >= enough:
+                    return relaxation
             return _enumerate(problem, pool, best, deadline)
     # Half of the time: a bound takes time as well.
     start = exchange_indices(problem, restarts, seed, deadline.part(0.5))
@@ -177,6 +171,15 @@ def solve_exact(
     subsets = [_expand(problem, keep, first, numbers) for numbers in searched.counts]
     bound = None if searched.proven else searched.bound
     return _solution_of(problem, subsets, best, bound, searched.nodes)
+
+
+def _by_relaxation(
+    problem: Problem, best: int, deadline: Deadline, restarts: int, seed: int
+) -> Solution:
+    """The exchange's selection, with the bound of the relaxation at the root."""
+    start = np.sort(exchange_indices(problem, restarts, seed, deadline.part(0.5)))
+    bound = relaxed(problem, start, deadline)
+    return _solution_of(problem, [start], best, bound, 1)
 
 
 def _with_losses(

@@ -30,13 +30,13 @@ class Motion:
 
     def __post_init__(self) -> None:
         for name in ("speed", "acceleration"):
-            given = numbers(name, getattr(self, name))
-            if given.ndim > 1 or not given.size or (given <= 0.0).any():
+            values = numbers(name, getattr(self, name))
+            if values.ndim > 1 or not values.size or (values <= 0.0).any():
                 raise ValueError(
                     f"{name} must be positive numbers, one or one an axis, "
                     f"got {getattr(self, name)!r}"
                 )
-            object.__setattr__(self, name, tuple(np.atleast_1d(given).tolist()))
+            object.__setattr__(self, name, tuple(np.atleast_1d(values).tolist()))
         settle = numbers("settle", self.settle)
         if settle.ndim or settle < 0.0:
             raise ValueError(f"settle must be at least 0 seconds, got {self.settle!r}")

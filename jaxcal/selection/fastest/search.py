@@ -164,6 +164,32 @@ def _pool(problem: Problem) -> Indices:
     return np.concatenate([problem.required, free[np.argsort(-leverage)]])
 
 
+def _require_travel(offer: CandidateSet, motion: Motion) -> Array:
+    """(M, n) commands between which the device travels; refuses what has no run."""
+    if offer.scenarios is not None or offer.uncertain:
+        raise ValueError(
+            "scenarios, lost and reliability must be left out with fastest and pareto"
+        )
+    if offer.candidates is None:
+        raise ValueError(
+            "commands must be given with blocks, Design.from_blocks(..., "
+            "commands=), for travel between them"
+        )
+    if not isinstance(motion, Motion):
+        raise ValueError(f"motion must be a Motion, got {motion!r}")
+    return offer.candidates
+
+
+def _method_for(k: int, method: str | None) -> str:
+    """The method, checked; when not given, exact where k is small."""
+    if method is None:
+        method = "exact" if k <= _EXACT_BY_DEFAULT else "heuristic"
+    one_of("method", method, _METHODS)
+    if method == "exact" and k > _MOST_EXACT:
+        raise ValueError(f"k must be at most {_MOST_EXACT} with exact, got {k}")
+    return method
+
+
 class _TourSearch:
     """One problem, cut down to the candidates that may be chosen: the pool."""
 
@@ -177,27 +203,9 @@ class _TourSearch:
         time_limit: float,
         seed: int | np.random.Generator,
     ) -> None:
-        if offer.scenarios is not None or offer.uncertain:
-            raise ValueError(
-                "scenarios, lost and reliability must be left out with fastest and "
-                "pareto"
-            )
-        problem, points = problem_of(offer, k, "D"), offer.candidates
-        if points is None:
-            raise ValueError(
-                "commands must be given with blocks, Design.from_blocks(..., "
-                "commands=), for travel between them"
-            )
-        if not isinstance(motion, Motion):
-            raise ValueError(f"motion must be a Motion, got {motion!r}")
-        self.problem, self.k = problem, problem.k
-        if method is None:
-            method = "exact" if self.k <= _EXACT_BY_DEFAULT else "heuristic"
-        self.method = one_of("method", method, _METHODS)
-        if method == "exact" and self.k > _MOST_EXACT:
-            raise ValueError(
-                f"k must be at most {_MOST_EXACT} with exact, got {self.k}"
-            )
+        points = _require_travel(offer, motion)
+        self.problem = problem = problem_of(offer, k, "D")
+        self.k, self.method = problem.k, _method_for(problem.k, method)
         self.seed, self.pool = checked_seed(seed), _pool(problem)
         # Held in every search; one is always left to choose: where all k are required
         # the pool is just those.

@@ -120,14 +120,14 @@ class CompactScorer:
         x *= np.sqrt(usable.sum(axis=1))[:, None, None]
         batch, p, _ = x.shape
         none = np.zeros((batch, 0), np.int64)
-        seen = self._described(x, none, usable, p, p)
+        description = self._described(x, none, usable, p, p)
         scalars = np.empty((batch, 2), np.float32)
         scalars[:, 0] = np.log(usable.sum(axis=1) / 50.0) / 3.0
         scalars[:, 1] = p / 4.0 - 1.0
-        h = self._dense("embed", seen.features, scalars)
-        h *= seen.active[..., None]
+        h = self._dense("embed", description.features, scalars)
+        h *= description.active[..., None]
         for name in self._encoder:
-            h = self._round(name, h, seen)
+            h = self._round(name, h, description)
         return Memory(x, h)
 
     def part(self, memory: Memory, sets: Indices) -> Memory:
@@ -148,9 +148,11 @@ class CompactScorer:
         remaining = k - count
         exact = remaining <= self._unlearned
         only = exact and best_only
-        seen = self._described(x, chosen[:, :count].copy(), free, k, remaining, only)
+        description = self._described(
+            x, chosen[:, :count].copy(), free, k, remaining, only
+        )
         if exact:
-            return np.where(free, _SHARP * seen.ahead, -np.inf)
+            return np.where(free, _SHARP * description.ahead, -np.inf)
         episode = np.arange(len(h))[:, None]
         mean = h[episode, chosen[:, :count]].sum(axis=1) / np.float32(max(count, 1))
         progress = [
@@ -163,16 +165,18 @@ class CompactScorer:
         progress += [min(remaining / p, 3.0), k > p]
         scalars = np.tile(np.array(progress, np.float32), (len(h), 1))
         state = np.concatenate([mean, scalars], axis=1)
-        g = self._dense("join", np.concatenate([h, seen.features], axis=2), state)
-        g *= seen.active[..., None]
+        g = self._dense(
+            "join", np.concatenate([h, description.features], axis=2), state
+        )
+        g *= description.active[..., None]
         for name in self._decoder:
-            g = self._round(name, g, seen)
+            g = self._round(name, g, description)
         g = self._normalised("final_norm", g)
         learned = np.einsum("emw,wo->emo", g, self._weights["actor.kernel"])
-        rule = _RULE * seen.ahead
+        rule = _RULE * description.ahead
         if self._close_up:
             for scale in CLOSE:
-                rule += np.exp(scale * seen.ahead)
+                rule += np.exp(scale * description.ahead)
         scores = learned[..., 0] + float(self._weights["trust"]) * rule
         return np.where(free, scores, -np.inf)
 

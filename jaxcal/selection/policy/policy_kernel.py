@@ -47,7 +47,7 @@ def describe(x, chosen, active, k, depth, best_only, features, moments, ahead):
     p, m = x.shape[1:]
     vectors: cython.double[:, :, ::1] = np.ascontiguousarray(x)
     made: cython.Py_ssize_t[:, :] = chosen
-    seen: cython.uchar[:, ::1] = np.ascontiguousarray(active).view(np.uint8)
+    active_bytes: cython.uchar[:, ::1] = np.ascontiguousarray(active).view(np.uint8)
     shown: cython.float[:, :, ::1] = features
     second: cython.float[:, :, ::1] = moments
     behind: cython.double[:, ::1] = ahead
@@ -62,12 +62,14 @@ def describe(x, chosen, active, k, depth, best_only, features, moments, ahead):
     b: cython.Py_ssize_t
     with cython.nogil:
         for b in range(vectors.shape[0]):
-            _conditional(vectors[b], made[b], seen[b], all_of, y, work[0])
-            _look_ahead(y, seen[b], spanned, far, only, None, values, work, weights)
+            _conditional(vectors[b], made[b], active_bytes[b], all_of, y, work[0])
+            _look_ahead(
+                y, active_bytes[b], spanned, far, only, None, values, work, weights
+            )
             _behind_best(values)
             behind[b] = values[3]
             if not only:
-                _features(y, seen[b], values, shown[b], second[b])
+                _features(y, active_bytes[b], values, shown[b], second[b])
 
 
 def _behind_best(values):
@@ -179,7 +181,7 @@ def look_ahead(y, active, spanned, depth, best_only, factors, values):
             where skipped.
     """
     vectors: cython.double[:, ::1] = y
-    seen: cython.uchar[::1] = active.view(np.uint8)
+    active_bytes: cython.uchar[::1] = active.view(np.uint8)
     tolls: cython.double[:, ::1] = factors
     to: cython.double[:, ::1] = values
     work: cython.double[:, ::1] = np.empty((len(y) + depth + 2, len(active)))
@@ -188,7 +190,7 @@ def look_ahead(y, active, spanned, depth, best_only, factors, values):
     ahead: cython.Py_ssize_t = depth
     only: cython.bint = best_only
     with cython.nogil:
-        _look_ahead(vectors, seen, grows, ahead, only, tolls, to, work, factor)
+        _look_ahead(vectors, active_bytes, grows, ahead, only, tolls, to, work, factor)
 
 
 def _look_ahead(y, active, spanned, depth, best_only, factors, values, work, weights):

@@ -231,10 +231,10 @@ def _labels(
             return rows, axes
     if names is None:
         return None, axes
-    given, count = tuple(names), len(candidates)
-    if len(given) != count or not all(isinstance(name, str) for name in given):
+    labels, count = tuple(names), len(candidates)
+    if len(labels) != count or not all(isinstance(name, str) for name in labels):
         raise ValueError(
-            f"names must be {count} texts, one for each candidate, got {len(given)} of "
-            f"{', '.join(sorted({type(name).__name__ for name in given}))}"
+            f"names must be {count} texts, one for each candidate, got {len(labels)} "
+            f"of {', '.join(sorted({type(name).__name__ for name in labels}))}"
         )
-    return given, axes
+    return labels, axes

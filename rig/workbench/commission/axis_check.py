@@ -137,13 +137,13 @@ def _inner(
         product = ways[:, a] * ways[:, b]  # as large at each
         normal = np.cross(rates[:, a], rates[:, b])
         scale = np.linalg.norm(normal)
-        seen = np.sign(product) @ turned @ normal / scale / number
+        share = np.sign(product) @ turned @ normal / scale / number
         whole = np.radians(np.abs(product).mean() * scale) / 2
         if CLEAR * noise > whole / 2:
             return None
-        if not whole / 2 < abs(seen) < 2 * whole:
+        if not whole / 2 < abs(share) < 2 * whole:
             return []
-        inner[a if seen > 0 else b] += 1
+        inner[a if share > 0 else b] += 1
     return inner if sorted(inner) == [*range(count)] else []
 
 
@@ -308,14 +308,14 @@ def _placed(
             "joint's, so the phone is not placed as imu.mounting_deg says. Correct "
             "that roughly, then run `jaxcal-rig axes` again"
         )
-    wanted, turned = expected[:, joints] * signs, told @ axes
+    goal, turned = expected[:, joints] * signs, told @ axes
     if len(joints) == 1:  # the least turn that fits it
-        across = np.cross(turned[:, 0], wanted[:, 0])
+        across = np.cross(turned[:, 0], goal[:, 0])
         sine = np.linalg.norm(across)
-        angle = np.arctan2(sine, turned[:, 0] @ wanted[:, 0])
+        angle = np.arctan2(sine, turned[:, 0] @ goal[:, 0])
         correction = Rotation.from_rotvec(across * (angle / max(sine, 1e-12)))
     else:
-        correction, _ = Rotation.align_vectors(wanted.T, turned.T)
+        correction, _ = Rotation.align_vectors(goal.T, turned.T)
     return joints, signs, correction.as_matrix() @ told
 
 
@@ -364,10 +364,10 @@ def require_unit(
     """
     unit = config.phone.unit
     other, factor = ("rad", RADIANS) if unit == "deg" else ("deg", 1.0 / RADIANS)
-    seen, (low, high) = _seen(config, ratios), NEAR_UNIT
+    shown, (low, high) = _seen(config, ratios), NEAR_UNIT
     if all(low <= ratio * factor <= high for ratio in ratios):
         raise MotionFault(
-            f'{seen}, about {1 / factor:.3g}: rig.toml says imu.unit = "{unit}", and '
+            f'{shown}, about {1 / factor:.3g}: rig.toml says imu.unit = "{unit}", and '
             f'the phone sends {other}. Set imu.unit = "{other}", then run `jaxcal-rig '
             "axes` again"
         )
@@ -375,7 +375,7 @@ def require_unit(
     sound = sum(low <= ratio <= high for ratio in ratios)
     if not proved and sound < min(2, len(ratios)):
         raise MotionFault(
-            f"{seen}, and none of its angles is over 6.3: either imu.unit or the "
+            f"{shown}, and none of its angles is over 6.3: either imu.unit or the "
             f"gearings are wrong. {BY_PLATE}"
         )
 

@@ -124,9 +124,9 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
         tour.prove_unit()
     corner: list[int] = []  # pulses of each axis
     for j, axis in enumerate(config.axes):
-        far, seen = tour.measure_axis(j)
+        far, turned = tour.measure_axis(j)
         most = min(CORNER_DEG, room[j]) / abs(axis.to_deg(far))
-        corner.append(round(far * min(REACH_DEG / seen, most)))
+        corner.append(round(far * min(REACH_DEG / turned, most)))
     clear = CLEAR * tour.base.std_deg / CORNER_STD_DEG
     clear = int(np.ceil(clear**2 / max(1, len(corners))))
     samples = min(max(clear, config.settle.samples), 8 * config.settle.samples)
@@ -179,10 +179,10 @@ class _Tour:
         """Move an axis further and further; pulses of the last two places."""
         config, geometry = self.run.config, self.device.geometry
         reach = self.device.proof.renew(j, unit)
-        wanted, counts = config.axes[j].to_pulses(REACH_DEG), [0]
-        way = int(np.sign(wanted))
+        furthest, counts = config.axes[j].to_pulses(REACH_DEG), [0]
+        way = int(np.sign(furthest))
         while True:
-            count = reach.pulses(wanted, REACH_DEG * geometry.scale)
+            count = reach.pulses(furthest, REACH_DEG * geometry.scale)
             if count <= FAR_ENOUGH * counts[-1]:
                 return way * counts[-2], way * counts[-1]
             name = f"{config.axis_names[j]}:plus"
@@ -200,10 +200,10 @@ class _Tour:
         ratios = []
         for j, axis in enumerate(config.axes):
             _, far = self.grow(j, False, 4 * config.settle.samples)
-            seen = self.turned(self.stands[f"{axis.name}:plus"])
+            turned = self.turned(self.stands[f"{axis.name}:plus"])
             told = self.device.drives[j].pulses_per_rev() or axis.pulses_per_rev
             geared = told / axis.pulses_per_rev
-            ratios.append(geared * seen / abs(axis.to_deg(far)))
+            ratios.append(geared * turned / abs(axis.to_deg(far)))
             self.visit(f"{axis.name}:back", {j: 0})
         require_unit(config, ratios)
 
@@ -212,13 +212,13 @@ class _Tour:
         axis, geometry = self.run.config.axes[j], self.device.geometry
         look, far = self.grow(j, True)
         plus = self.stands[f"{axis.name}:plus"]
-        seen = self.turned(plus)
+        turned = self.turned(plus)
         commanded = abs(axis.to_deg(far))
         least = SEEN_SIGMA * self.base.std_deg / plus.samples**0.5
-        if seen < max(SEEN_DEG * geometry.scale, least):
+        if turned < max(SEEN_DEG * geometry.scale, least):
             raise MotionFault(
                 f"unit {axis.unit} turned its motor by {commanded:g} {axis.unit_name} "
-                f"of {axis.name}, and {geometry.told} {seen:.3g}. Look for a loose "
+                f"of {axis.name}, and {geometry.told} {turned:.3g}. Look for a loose "
                 "coupling, a stream that does not change, or a reduction that is far "
                 "too small"
             )
@@ -231,6 +231,6 @@ class _Tour:
         move(self.device, Posture(axis.name, self.start))
         self.run.say(
             f"  {axis.name}: {commanded:.2f} {axis.unit_name} commanded, "
-            f"{geometry.told} {seen:.3g}"
+            f"{geometry.told} {turned:.3g}"
         )
-        return far, seen
+        return far, turned

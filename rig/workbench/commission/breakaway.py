@@ -60,9 +60,9 @@ class Breakaway:
         """
         past = self.steps[:, None] - self.centres > limit_deg
         risks = self.weights @ past.T  # (2, S)
-        seen = self.weights @ self.moved.T
+        chances = self.weights @ self.moved.T
         unsure = self.weights @ _entropy(self.moved).T
-        gains = _entropy(seen) - unsure
+        gains = _entropy(chances) - unsure
         safe = risks <= max(risk, risks.min() + 1e-6)
         direction, number = np.unravel_index(
             np.where(safe, gains, -np.inf).argmax(), gains.shape

@@ -63,10 +63,10 @@ def parse_bus(text: str) -> BusSettings:
         kinds += "can:CHANNEL[,BAUD] or rtu:DEVICE"
         must = f"must be {kinds}[,BAUD[,PARITY[,BITS[,STOPBITS]]]]"
         raise ConfigError("--bus", [f"{must}, got {text!r}"])
-    given = [f"transport = {json.dumps(transport)}"]
+    lines = [f"transport = {json.dumps(transport)}"]
     for name, word in zip(names, words, strict=False):
-        given.append(f"{name} = {word if word.isdecimal() else json.dumps(word)}")
-    return parse(BusSettings, "\n".join(given), "--bus")
+        lines.append(f"{name} = {word if word.isdecimal() else json.dumps(word)}")
+    return parse(BusSettings, "\n".join(lines), "--bus")
 
 
 def scan(

@@ -117,13 +117,41 @@ def _prove(
     gone = _shares(device, low, high, at)
     names = run.config.axis_names
     going = [names[i] for i, (a, b) in _numbered(low, high) if a != b]
-    went_on = [n for n, share in zip(going, gone, strict=True) if share > 1.0 - SHORT]
+    _require_stopped(run, device, name, statuses, dict(zip(going, gone, strict=True)))
+    after_deg = {
+        axis.name: round(axis.to_deg(b - a), 3)
+        for axis, a, b in zip(run.config.axes, places, at, strict=True)
+        if axis.name in going
+    }
+    run.say(
+        f"  {name}: stood after "
+        + ", ".join(f"{axis} {abs(deg):.2f}" for axis, deg in after_deg.items())
+        + f" {run.config.axis_unit}, and {stop.stand_s(device.drives):g} s later"
+    )
+    return after_deg
+
+
+def _require_stopped(
+    run: Run,
+    device: Device,
+    name: str,
+    statuses: list[Status],
+    shares: dict[str, float],
+) -> None:
+    """Refuse a stop after which an axis went on, or moved again; alarms are reset.
+
+    Args:
+        name: of the stop.
+        statuses: of the drives as they stood.
+        shares: of the way that each axis that moved had gone by then.
+    """
+    went_on = [axis for axis, share in shares.items() if share > 1.0 - SHORT]
     attitude = device.attitude(time.monotonic())
     after = _look(device, statuses)
     moved = [
-        name
-        for name, status, then in zip(names, after, at, strict=True)
-        if abs(status.position - then) > STILL_COUNTS and status.enabled
+        axis
+        for axis, now, then in zip(run.config.axis_names, after, statuses, strict=True)
+        if abs(now.position - then.position) > STILL_COUNTS and now.enabled
     ]
     turned = device.geometry.apart(attitude, device.attitude(time.monotonic()))
     _reset_alarms(run, device, name)
@@ -140,17 +168,6 @@ def _prove(
             f"({device.geometry.told} {turned:.2f} {device.geometry.unit}). Set the "
             "drive so that it does not go on by itself after a stop"
         )
-    after_deg = {
-        axis.name: round(axis.to_deg(b - a), 3)
-        for axis, a, b in zip(run.config.axes, places, at, strict=True)
-        if axis.name in going
-    }
-    run.say(
-        f"  {name}: stood after "
-        + ", ".join(f"{axis} {abs(deg):.2f}" for axis, deg in after_deg.items())
-        + f" {run.config.axis_unit}, and {stop.stand_s(device.drives):g} s later"
-    )
-    return after_deg
 
 
 def _go(device: Device, low: Pulses, high: Pulses) -> list[int]:

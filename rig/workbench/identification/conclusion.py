@@ -78,19 +78,11 @@ def conclude(
     held_out, errors = held_out_errors(
         config, held, postures, identify_affine(config, chosen)
     )
-    zero_share = chosen[0]["samples"] / zero["samples"]
-    limits = uncertainty(chosen, held_out, zero_share)
     if not compensated:
         errors.pop("after", None)
-    judged = {**errors, "drift": drift}
-    reasons = recalibrate(judged, config.session.verify_limit_deg)
-    notes |= {
-        "mechanism_order": config.mechanism.order,
-        "noise_from": limits["basis"],
-        "verdict": {"good": not reasons, "reasons": reasons},
-    }
-    noise = np.maximum(1e-9, limits["noise_std_deg"])
-    calibration = identify_affine(config, chosen, noise, notes, zero_share)
+    calibration, limits = _judged_affine(
+        config, zero, chosen, held_out, {**errors, "drift": drift}, notes
+    )
     return calibration, {
         **told,
         "A": np.asarray(calibration.matrix).tolist(),
@@ -99,6 +91,30 @@ def conclude(
         "orders": order_residuals(config, zero, chosen + held_out),
         **errors,
     }
+
+
+def _judged_affine(
+    config: RigConfig,
+    zero: Record,
+    chosen: list[Record],
+    held_out: list[Record],
+    errors: dict[str, Any],
+    notes: dict[str, Any],
+) -> tuple[Any, dict[str, Any]]:
+    """The affine calibration of the chosen postures, its verdict in ``notes``.
+
+    With the uncertainty that the held-out postures show.
+    """
+    zero_share = chosen[0]["samples"] / zero["samples"]
+    limits = uncertainty(chosen, held_out, zero_share)
+    reasons = recalibrate(errors, config.session.verify_limit_deg)
+    notes |= {
+        "mechanism_order": config.mechanism.order,
+        "noise_from": limits["basis"],
+        "verdict": {"good": not reasons, "reasons": reasons},
+    }
+    noise = np.maximum(1e-9, limits["noise_std_deg"])
+    return identify_affine(config, chosen, noise, notes, zero_share), limits
 
 
 def order_residuals(

@@ -43,24 +43,13 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
     Raises:
         Refused: it holds none, or A does not determine a command.
     """
-    import jaxcal
-
     if model := records[0]["config"].get("model"):
         use = "calibrated.urdf in its folder" if model["urdf"] else "calibration.json"
         raise Refused(
             f"{folder}: the inverse map is that of an affine device, this one has a "
             f"[model]. Use {use}"
         )
-    path = folder / "calibration.json"
-    try:
-        calibration: Any = jaxcal.Calibration.load(path)
-        matrix = _inverse(np.asarray(calibration.matrix, dtype=np.float64))
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise Refused(
-            f"{folder}: no calibration to export: {error}. Give the run of a "
-            "`jaxcal-rig calibrate` that has ended, or its refit"
-        ) from None
+    calibration, matrix, summary = _calibrated(folder)
     config = records[0]["config"]  # of the run, also where it was refitted
     names, outputs = names_of(config)
     axis_unit, output_unit = units_of(config)
@@ -95,6 +84,22 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
         "output_unit": output_unit,
     }
     return inverse | {"checksum": checksum(inverse)}
+
+
+def _calibrated(folder: pathlib.Path) -> tuple[Any, Array, dict[str, Any]]:
+    """The calibration in a run's folder, its inverse matrix and its summary."""
+    import jaxcal
+
+    try:
+        calibration: Any = jaxcal.Calibration.load(folder / "calibration.json")
+        matrix = _inverse(np.asarray(calibration.matrix, dtype=np.float64))
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise Refused(
+            f"{folder}: no calibration to export: {error}. Give the run of a "
+            "`jaxcal-rig calibrate` that has ended, or its refit"
+        ) from None
+    return calibration, matrix, summary
 
 
 def _inverse(matrix: Array) -> Array:

@@ -65,9 +65,9 @@ def _last_move(record: Record) -> str:
         begin, end = record["from_deg"][i], record["to_deg"][i]
         if begin != end:
             drive = record["drives_deg"][i]
-            seen = "its drive does not answer" if drive is None else f"now {drive:.2f}"
-            seen += f", measured {measured[name]:.2f}" if name in measured else ""
-            ways.append(f"{name} from {begin:.2f} to {end:.2f} {units[i]} ({seen})")
+            place = "its drive does not answer" if drive is None else f"now {drive:.2f}"
+            place += f", measured {measured[name]:.2f}" if name in measured else ""
+            ways.append(f"{name} from {begin:.2f} to {end:.2f} {units[i]} ({place})")
     others = [f"{name} {at:.3g}" for name, at in measured.items() if name not in names]
     told = f"; measured {', '.join(others)}" if others else ""
     return f"moved last, to {record['label']}: {'; '.join(ways) or 'no axis'}{told}"

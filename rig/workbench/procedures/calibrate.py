@@ -141,11 +141,11 @@ def _held_out(run: Run, calibration: Any) -> list[Any]:
     stale = [n for n in run.postures() if n.startswith(("before:", "after:", "held:"))]
     if stale:
         run.emit("void", sync=True, names=stale)
-    wanted = run.config.session.verify_postures
-    targets = draw_held_out(run.config, calibration, wanted)
-    if len(targets) < wanted:
+    count = run.config.session.verify_postures
+    targets = draw_held_out(run.config, calibration, count)
+    if len(targets) < count:
         run.say(
-            f"  note: only {len(targets)} of {wanted} held-out targets can be reached "
+            f"  note: only {len(targets)} of {count} held-out targets can be reached "
             "compensated within the ranges"
         )
     return run.emit("held_out", sync=True, pairs=targets)["pairs"]

@@ -86,10 +86,10 @@ def unchecked(
     where it was left there, its count says nothing. That of ``told`` axes does, whose
     home is at a count of its own.
     """
-    seen = [] if frame is None else geometry_of(config).unseen(frame.zero)
+    unseen = [] if frame is None else geometry_of(config).unseen(frame.zero)
     return [
         axis.name
         for axis in config.axes
-        if axis.name in seen
+        if axis.name in unseen
         and not (axis.map.tells_homed or axis.map.absolute_encoder or axis.name in told)
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -83,20 +84,10 @@ def choose(
             available=available, required=list(required) or None, **more,
         )  # fmt: skip
 
-    exact = chosen = select("exact", time_limit=limit)
-    note, more = "", {}
-    if config.method == "auto":
-        more = {"least_efficiency": session.min_efficiency, "time_limit": limit}
+    exact, chosen, note = select("exact", time_limit=limit), None, ""
     if config.method != "exact" and not replanning:
-        try:
-            chosen = select(config.method, **more)
-            note = getattr(chosen, "reason", "")
-        except Exception as error:
-            if config.method not in ("policy", "auto"):
-                raise
-            # A missing or foreign checkpoint must not keep a rig from being calibrated.
-            reason = " ".join(str(error).split())[:200]
-            note = f"no policy could be used ({reason}); exact is used instead"
+        chosen, note = _by_its_method(config, select, limit)
+    chosen = chosen or exact
     best = max(exact.log_det, chosen.log_det)
     efficiency = math.exp((chosen.log_det - best) / parameters)
     if efficiency < session.min_efficiency:
@@ -114,6 +105,25 @@ def choose(
         method=str(chosen.method),
         note=note,
     )
+
+
+def _by_its_method(
+    config: RigConfig, select: Callable[..., Any], limit_s: float
+) -> tuple[Any, str]:
+    """What the configured method selects, and a note; None where it has no policy."""
+    more: dict[str, Any] = {}
+    if config.method == "auto":
+        least = config.session.min_efficiency
+        more = {"least_efficiency": least, "time_limit": limit_s}
+    try:
+        chosen = select(config.method, **more)
+    except Exception as error:
+        if config.method not in ("policy", "auto"):
+            raise
+        # A missing or foreign checkpoint must not keep a rig from being calibrated.
+        reason = " ".join(str(error).split())[:200]
+        return None, f"no policy could be used ({reason}); exact is used instead"
+    return chosen, getattr(chosen, "reason", "")
 
 
 def _choose_by_model(
