@@ -176,7 +176,7 @@ class Calibration(Fit):
         prior = plain.default_prior()
         held = tuple(name for name in plain.names if name not in fitted)
         fixed = tuple(dict.fromkeys((*prior.fixed, *held)))
-        again = self._again(plain, dataclasses.replace(prior, fixed=fixed))
+        again = self.again(plain, dataclasses.replace(prior, fixed=fixed))
         steps: dict[str, int] = plain.write_servos(
             path, again.parameters, servos, names or {}, force=force
         )
@@ -189,7 +189,7 @@ class Calibration(Fit):
             )
         return steps
 
-    def _again(self, model: Any, prior: Prior) -> Calibration:
+    def again(self, model: Any, prior: Prior | None) -> Calibration:
         """The calibration of the same readings by another model of the machine."""
         fields = fit_model(
             self.commands,
@@ -245,7 +245,7 @@ class Calibration(Fit):
 
     def _without_harmonics(self, plain: Model) -> Array:
         """(p,) fitted again for the ``plain`` model, with a warning how far off."""
-        again = self._again(plain, plain.default_prior())
+        again = self.again(plain, plain.default_prior())
         moved = self.predict(self.commands) - again.predict(self.commands)
         unit = f" {self.measured_unit}" if self.measured_unit else ""
         effect = (

@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 _LEVEL = 3.0  # factor of one standard deviation of the level, beforehand
 _MOST = 5.0  # of a logarithm
 _LARGEST = 2.5  # of a factor's, 12: beyond it an arm in sockets shrinks until all fit
+_FIRST = 1.6  # likewise, 5, of a rough fit's: an arm that has shrunk stays so
 _TRIED = np.array([-5.0, -4.0, -3.0, -2.0, -1.2, -0.4, 0.4, 1.2])  # likewise
 _SCORES = 100  # steps of Fisher's scoring, at most
 
@@ -58,6 +59,8 @@ def group_scales(
     assert of_model is not None
     groups, num_groups = of_model.members, len(of_model.medians)
     evidence = _Evidence(problem, solution, of_model)
+    if start is None:
+        evidence.most[:-1] = _FIRST
     # A level that is known floats too: misfit beyond it is no size of the errors.
     best = evidence.middle if start is None else start.logs
     least = evidence.at(best)

@@ -33,11 +33,12 @@ _FEW = 4  # contacts: fewer that lie apart are outliers, not a socket that was m
 _LOOSE = 7.0  # standard deviations: no scatter, a reading of something else
 _SPARSE = 12  # measurements: so few have no outlier that is scatter
 _LITTLE = 1.0 / 3.0  # of the nominal error: so little left is worth having anyway
-_SURE = 4.0  # standard deviations: a tip that is found so well is there
-_APART = 4.0  # standard deviations between a distance and what contacts say of it
+_APART = 3.5  # standard deviations between a distance and what contacts say of it
 _ALONE = 1e-4  # of what is known of a distance: nothing but that it was given
-_SHORT = 1e-3  # of the arm's length: what no parameter explains may be so much
+_SHORT = 5e-4  # of the arm's length: what no parameter explains moves a distance so
+_WRONG = 1e-3  # likewise; a distance that is off by more was measured wrongly
 _STILL = 8  # measurements in which a joint that is used has moved
+_VAGUE = 3.0  # times the nominal error: contacts leave the arm's size open
 _TIP = 0.004  # of the arm's length: tools are built nearer to their description
 _LINK = 0.02  # likewise; without a known distance an arm may shrink to fit contacts
 _ZERO = 10.0  # degrees: no zero of a joint is set so badly
@@ -119,6 +120,8 @@ def verdict(calibration: Fit) -> ArmVerdict:
     if not explains and errors.nominal > _PLAIN * model.length:
         mistaken = mistaken_columns(model, commands, measured)
     findings = _findings(calibration, used, scatter, explains, mistaken)
+    anywhere = _anywhere(calibration, model, commands)
+    findings = _of_no_size(findings, calibration, anywhere, errors.nominal)
     clean = not (findings.doubtful or (findings.moved and not explains))
     accuracy = calibration.provenance.get("accuracy")
     if accuracy is not None:
@@ -138,7 +141,7 @@ def verdict(calibration: Fit) -> ArmVerdict:
         held_out=errors.held_out,
         interval=errors.interval,
         nominal=errors.nominal,
-        anywhere=_anywhere(calibration, model, commands),
+        anywhere=anywhere,
         accuracy=accuracy,
     )
 
@@ -184,10 +187,11 @@ def _findings(
     moved = _moved(calibration, model, right)
     tip, doubtful = _other_tip(calibration, model)
     other_arm = [] if mistaken else _other_links(calibration, model)
-    other_arm = other_arm or _other_distances(calibration, model)
+    apart, wrong = ([], False) if other_arm else _other_distances(calibration, model)
     still, unused = _still(model, commands)
-    reasons += moved + exchanged + _far(calibration) + tip + other_arm + still
-    doubtful |= bool(contradicting or exchanged or other_arm or unused or mistaken)
+    reasons += moved + exchanged + _far(calibration) + tip + other_arm + apart + still
+    doubtful |= wrong or unused
+    doubtful |= bool(contradicting or exchanged or other_arm or mistaken)
     return _Findings(
         # What the fit made of mistaken columns is no reason.
         (mistaken,) if mistaken else tuple(reasons),
@@ -197,6 +201,25 @@ def _findings(
         contradicting,
         doubtful,
     )
+
+
+def _of_no_size(
+    findings: _Findings, calibration: Fit, anywhere: float, nominal: float
+) -> _Findings:
+    """Findings with that contacts without a known distance leave the arm's size open.
+
+    An arm a tenth smaller, its sockets nearer together, touches them as well.
+    """
+    sensor, unit = calibration.model.sensor, _in(calibration)
+    sized = not isinstance(sensor, Socket) or len(sensor.distances)
+    if sized or not anywhere > _VAGUE * nominal:
+        return findings
+    reason = (
+        f"contacts without a known distance leave the arm's size open: elsewhere its "
+        f"tip is known to {anywhere:.3g}{unit}, the nominal one is {nominal:.3g} off "
+        "here. Give the distance between two sockets (distances=, --distance)"
+    )
+    return findings._replace(reasons=(*findings.reasons, reason), doubtful=True)
 
 
 def _wrong_rows(
@@ -342,9 +365,8 @@ def _far(calibration: Fit) -> list[str]:
 def _other_tip(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
     """A tip far from where the arm's description has it, and whether that is in doubt.
 
-    It is not where the readings show it to a quarter of that, within what the prior
-    allowed: then the description is wrong, or it is of another tool, and the
-    calibration has the tip where it is.
+    It is where it is farther than the prior allowed. Else the description is wrong, or
+    is of another tool, and what the readings leave unknown of it is in the intervals.
     """
     if not model.sensor.zeros:
         return [], False
@@ -363,33 +385,75 @@ def _other_tip(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
     return [
         f"the tip is {far:.3g}{_in(calibration)} from where the arm's description has "
         f"it (tool {by}), known to {std:.2g}: is it another tip?"
-    ], bool(far < _SURE * std or far > allowed)
+    ], bool(far > allowed)
 
 
-def _other_distances(calibration: Fit, model: Chain) -> list[str]:
-    """Distances that were given and that the contacts contradict."""
+def _other_distances(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
+    """Distances that were given and that the contacts contradict; by much or not.
+
+    One that seems so, to first order, is freed: the readings are fitted without it.
+    """
     distances = getattr(model.sensor, "distances", ())
     if not len(distances):
-        return []
+        return [], False
     off, rows = model.facts(calibration.parameters)
-    spread = rows @ np.asarray(calibration.covariance)
+    spread = rows @ _at_these_sizes(calibration, rows)
     share = np.minimum((spread * rows).sum(axis=1), 1.0 - 1e-9)
-    said, unit = [], _in(calibration)
-    for (first, second, distance, std), residual, h in zip(
-        distances, off, share, strict=True
-    ):
-        free = distance - std * residual / (
-            1.0 - h
-        )  # fitted without it, to first order
-        sure = abs(residual) > _APART * np.sqrt(1.0 - h) and h < 1.0 - _ALONE
-        if not sure or abs(free - distance) < _SHORT * model.length:
+    change = np.array(distances)[:, 3] * np.abs(off) / (1.0 - share)
+    doubtful = np.abs(off) > _APART * np.sqrt(1.0 - share)
+    doubtful &= (share < 1.0 - _ALONE) & (change > _SHORT * model.length)
+    said, most, unit = [], 0.0, _in(calibration)
+    for k in np.flatnonzero(doubtful).tolist():
+        first, second, distance, std = distances[k]
+        free, free_std = _freed(calibration, model, k)
+        change[k] = abs(free - distance)
+        sure = change[k] > _APART * np.hypot(free_std, std)
+        if not sure or change[k] < _SHORT * model.length:
             continue
+        most = max(most, change[k])
         said.append(
             f"sockets {first:.0f} and {second:.0f} are given as {distance:g}{unit} "
             f"apart, but the contacts and the arm's lengths say {free:.4g} +- "
-            f"{std * np.sqrt(h / (1.0 - h)):.2g}: measure that distance again"
+            f"{free_std:.2g}: measure that distance again"
         )
-    return said
+    return said, most > _WRONG * model.length
+
+
+def _freed(calibration: Fit, model: Chain, row: int) -> tuple[float, float]:
+    """A given distance as the readings have it without it, and its deviation."""
+    sensor = model.sensor
+    rest = [one for k, one in enumerate(sensor.distances) if k != row]
+    free = model.measured_with(dataclasses.replace(sensor, distances=rest))
+    fit = calibration.again(free, None)
+    off, rows = model.facts(fit.parameters[: len(model.names)])
+    p = rows.shape[1]
+    _, _, distance, std = sensor.distances[row]
+    variance = rows[row] @ np.asarray(fit.covariance)[:p, :p] @ rows[row]
+    return distance - std * off[row], std * float(np.sqrt(variance))
+
+
+def _at_these_sizes(calibration: Fit, facts: Array) -> Array:
+    """(p, p) covariance of the parameters, the sizes of the arm's errors held.
+
+    That of the calibration counts what is not known of the sizes, and is no longer what
+    the readings and ``facts`` (F, p) add up to.
+    """
+    used = np.flatnonzero(calibration.loss_weights > 0.0)
+    theta = calibration.parameters
+    slopes = np.asarray(calibration.model.jacobian(calibration.commands[used], theta))
+    weight = np.sqrt(np.minimum(calibration.loss_weights[used], 1.0))[:, None, None]
+    rows = weight * slopes / np.asarray(calibration.noise_std)[:, None]
+    rows = np.vstack([rows.reshape(-1, len(theta)), facts])
+    free = np.flatnonzero(calibration.free[: len(theta)])
+    precision = calibration.prior_precision[free]
+    information = rows[:, free].T @ rows[:, free] + np.diag(precision)
+    scale = 1.0 / np.sqrt(information.diagonal() + 1e-300)
+    inverse = np.linalg.pinv(
+        scale[:, None] * information * scale, 1e-13, hermitian=True
+    )
+    covariance = np.zeros((len(theta), len(theta)))
+    covariance[np.ix_(free, free)] = scale[:, None] * inverse * scale
+    return covariance
 
 
 def _still(model: Chain, commands: Array) -> tuple[list[str], bool]:
