@@ -98,8 +98,8 @@ def _cut(arm, links):
 def test_links_stay_clear_of_boxes():
     arm = ur5(sensor=Socket(1))
     box = (-300.0, -150.0, 300.0, 300.0, 150.0, 700.0)
-    for clear in ((), (box,)):
-        found = arm.postures(40, near=NEAR[:1], clear=clear, radius=40.0)
+    for clear in ({}, {"clear": (box,), "radius": 40.0}):
+        found = arm.postures(40, near=NEAR[:1], **clear)
         points = arm.skeleton(found)
         share = np.linspace(0.0, 1.0, 50)[:, None]
         upper = points[:, 2, None] + share * (points[:, 3] - points[:, 2])[:, None]
@@ -126,6 +126,9 @@ def test_wrong_rooms_and_views_are_named():
         ({"distance": (0.2, 0.5)}, "distance needs camera="),
         ({"approach": (0, 0, 0)}, "approach must be a direction"),
         ({"clear": [(1, 2, 3)]}, "clear must hold planes"),
+        ({"radius": 0.1}, "radius needs clear="),
+        ({"radius": 0.0, "clear": [(0, 0, 1, 0)]}, "radius must be positive"),
+        ({"floor": 0.45}, r"below floor = 0.45, got socket 0 at \(0.4, 0.1, 0.3\)"),
     ):
         with pytest.raises(ValueError, match=why):
             touching.postures(5, near=near, **options)

@@ -278,14 +278,16 @@ class SerialChain(Arm, Model):
                 not given.
             side: "+z", the printed side is where the board's z axis points, or "-z";
                 known of a board that was found from views, else from either side.
-            floor: height (z in the measuring frame) that no joint is below.
+            floor: height (z in the measuring frame) that no joint is below; sockets
+                neither, by more than 1 % of the arm's length.
             approach: direction (x, y, z) in which the tool comes, from the last joint
                 to the tip, and the degrees about it that are allowed (60).
             clear: planes (normal, offset) whose other side, and boxes (least x, y, z,
                 greatest), that the arm does not touch: spheres along straight lines
                 between the joints, no shapes of the links. The first link and the tip
                 are not looked at, nor is the arm against itself.
-            radius: of the spheres; 4 % of the arm's length when not given.
+            radius: of the spheres that keep clear; 4 % of the arm's length when not
+                given.
 
         Returns:
             (count, n) commands with the sensor's columns, in an order of little travel.

@@ -29,6 +29,7 @@ _EDGE = 0.02  # of the picture's width, that the board stays away from its edge
 _FILLED = (0.25, 0.8)  # of the picture's width by the board, where no distance is given
 _TILT = 45.0  # degrees, where none is given
 _SIDES = {"+z": 1.0, "-z": -1.0}
+_SUNK = 0.01  # of the arm's length: a socket let into a table is no deeper
 _THICK = 0.04  # radius of an arm's links by its length
 
 
@@ -120,6 +121,17 @@ class Room:
         height = None if floor is None else float(numbers("floor", floor))
         return cls(height, cone, planes, boxes, radius)
 
+    def require_sockets(self, arm: Chain) -> None:
+        """Refuse sockets that are below the floor."""
+        places = arm.sensor.places if isinstance(arm.sensor, Socket) else None
+        if self.floor is None or places is None:
+            return
+        for i in np.flatnonzero(places[:, 2] < self.floor - _SUNK * arm.length)[:1]:
+            raise ValueError(
+                f"sockets must not be below floor = {self.floor:g}, got socket {i} at "
+                f"{in_words(places[i])}: is the floor as high in the frame of the base?"
+            )
+
     def reasons(self, arm: Chain, commands: Array) -> Array:
         """(N,) why a posture is not possible, "" where it is."""
         points = arm.skeleton(commands)
@@ -180,6 +192,10 @@ def view_and_room(
         for name, value in (("distance", distance), ("tilt", tilt), ("side", side)):
             if value is not None:
                 raise ValueError(f"{name} needs camera=, of a board; got {value}")
+    if radius is not None and not len(clear):
+        raise ValueError(f"radius needs clear=, planes or boxes; got {radius}")
+    if radius is not None and not numbers("radius", radius) > 0.0:
+        raise ValueError(f"radius must be positive, got {radius}")
     if floor is not None or approach is not None or len(clear):
         room = Room.of(floor, approach, clear, radius)
     return view, room
@@ -203,6 +219,8 @@ def postures(
             "postures are of one sensor at a time: arm.measured_with(sensor).postures()"
         )
     arm, targets = _aimed(arm, near)
+    if room is not None:
+        room.require_sockets(arm)
     rng = np.random.default_rng(seed)
     collection = _Collection(arm, count, allowed)
     low, high = collection.low, collection.high
@@ -331,6 +349,8 @@ class ReachableSet:
         if view is not None and not isinstance(arm.sensor, Board):
             raise ValueError("camera is of an arm with sensor=Board(...)")
         self._arm, self._targets = _aimed(arm, near)
+        if room is not None:
+            room.require_sockets(self._arm)
         self._allowed, self._view, self._room = allowed, view, room
         self._ends = None if view is None else _distances(arm.sensor, view)
 
