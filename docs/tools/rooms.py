@@ -11,6 +11,7 @@ ROOMS = {
         "jaxcal/models/serial",
         "jaxcal/models/sensors",
         "jaxcal/commands/arms.py",
+        "jaxcal/commands/postures.py",
     ),
     "closed loop": ("jaxcal/adaptive",),
     "rig": ("rig",),

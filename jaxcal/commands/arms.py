@@ -19,7 +19,7 @@ from jaxcal.csvtable import COMMANDS, CsvTable
 from jaxcal.models import Model, Recording, SerialChain, from_dict
 from jaxcal.models.linear import input_letters
 from jaxcal.models.model import as_model
-from jaxcal.models.sensors import SENSORS, Landmarks, Socket
+from jaxcal.models.sensors import SENSORS, Landmarks, Sensor, Socket
 
 __all__ = ["ArmOptions", "ModelPath", "RecordingOptions", "in_degrees"]
 
@@ -78,6 +78,23 @@ class ArmOptions:
                 f"--tip must be one link, got {tips}: two chains in one model "
                 "(Chains) are in Python, docs/arms.md, Several chains"
             )
+        sensor = self._sensor(table, places)
+        for option, count in (("locked", 1), ("limits", 2)):
+            for name, values in getattr(self, option) or ():
+                if not name or len(values) != count:
+                    numbers = "LOW,HIGH" if count == 2 else "VALUE"
+                    raise ValueError(f"--{option} must be JOINT={numbers}")
+        return SerialChain.from_urdf(
+            path,
+            base=self.base,
+            tip=tips or None,
+            sensor=sensor,
+            locked={name: value for name, (value,) in self.locked or ()},
+            limits=dict(self.limits or ()),
+        )
+
+    def _sensor(self, table: CsvTable | None, places: Any) -> Sensor:
+        """The sensor, with as many landmarks as are given or in the table."""
         kind = SENSORS[self.sensor]
         landmarks: dict[str, Any] = {}
         if issubclass(kind, Landmarks):
@@ -99,20 +116,7 @@ class ArmOptions:
                 raise ValueError(
                     f"{table.source}: --distance needs a column 'socket', from 0"
                 )
-        sensor = kind(**landmarks)
-        for option, count in (("locked", 1), ("limits", 2)):
-            for name, values in getattr(self, option) or ():
-                if not name or len(values) != count:
-                    numbers = "LOW,HIGH" if count == 2 else "VALUE"
-                    raise ValueError(f"--{option} must be JOINT={numbers}")
-        return SerialChain.from_urdf(
-            path,
-            base=self.base,
-            tip=tips or None,
-            sensor=sensor,
-            locked={name: value for name, (value,) in self.locked or ()},
-            limits=dict(self.limits or ()),
-        )
+        return kind(**landmarks)
 
     def of_recording(self, path: str | None, which: Sequence[int] | None) -> Any:
         """The arm of a recording whose rests are of ``which`` sockets."""

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from jaxcal.adaptive.rules import StateRule
     from jaxcal.adaptive.tasks.registry import Entry
     from jaxcal.commands.train_arguments import TrainOptions
+    from jaxcal.learning.environments.task import GivenCandidates
     from jaxcal.learning.training.config import TrainConfig
     from jaxcal.learning.training.run import Report
 
@@ -104,14 +105,19 @@ def _run(arguments: TrainOptions, prog: str) -> int:
         f"{typed_line(prog.replace('train', 'evaluate'))}{task} --checkpoint {out}"
     )
     if arguments.export:
-        from jaxcal.adaptive.policy import training
-        from jaxcal.learning.runtime import weights
-        from jaxcal.learning.training import checkpoint
-
-        load: Callable[..., Any] = training.load if arguments.task else checkpoint.load
-        weights.write(arguments.export, load(out).weights)
-        print(f"exported the policy alone to {arguments.export}")
+        _export(out, arguments.export, of_task=bool(arguments.task))
     return 0
+
+
+def _export(run: pathlib.Path, path: str, of_task: bool) -> None:
+    """Write the weights of a run's policy alone, without what a training needs."""
+    from jaxcal.adaptive.policy import training
+    from jaxcal.learning.runtime import weights
+    from jaxcal.learning.training import checkpoint
+
+    load: Callable[..., Any] = training.load if of_task else checkpoint.load
+    weights.write(path, load(run).weights)
+    print(f"exported the policy alone to {path}")
 
 
 def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) -> int:
@@ -210,8 +216,7 @@ def _configuration(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
         trained_on,
     )
     from jaxcal.learning.runtime.weights import criterion_of
-    from jaxcal.learning.training import checkpoint, presets
-    from jaxcal.learning.training.config import TrainConfig
+    from jaxcal.learning.training import presets
 
     flags = given_flags(arguments, task=False)
     path = arguments.candidates
@@ -224,16 +229,7 @@ def _configuration(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
         config = _for_brax(config, arguments, flags)
     if arguments.resume:
         _refuse_with_resume(flags | _swept(arguments), out)
-        config = TrainConfig.from_meta(checkpoint.read_meta(out)[1])
-        held = config.tasks[0].given
-        if held != candidates:  # they are compared by their digest
-            what = f"{held.name} (SHA-256 {held.sha256[:12]})" if held else "no file"
-            rule = "give the same file" if held else "leave it out"
-            raise ValueError(f"--candidates: the run was trained on {what}; {rule}")
-        if candidates is not None:
-            task = dataclasses.replace(config.tasks[0], given=candidates)
-            config = dataclasses.replace(config, tasks=(task,))
-        return config
+        return _configuration_of(out, candidates)
     _refuse_to_overwrite(out)
     if candidates is None:
         config = presets.with_values(config, flags)
@@ -246,6 +242,25 @@ def _configuration(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
             "--no-validation out"
         )
     require_writable_folder(out)
+    return config
+
+
+def _configuration_of(
+    out: pathlib.Path, candidates: GivenCandidates | None
+) -> TrainConfig:
+    """The configuration of a run to go on with, on the same candidates."""
+    from jaxcal.learning.training import checkpoint
+    from jaxcal.learning.training.config import TrainConfig
+
+    config = TrainConfig.from_meta(checkpoint.read_meta(out)[1])
+    held = config.tasks[0].given
+    if held != candidates:  # they are compared by their digest
+        what = f"{held.name} (SHA-256 {held.sha256[:12]})" if held else "no file"
+        rule = "give the same file" if held else "leave it out"
+        raise ValueError(f"--candidates: the run was trained on {what}; {rule}")
+    if candidates is not None:
+        task = dataclasses.replace(config.tasks[0], given=candidates)
+        config = dataclasses.replace(config, tasks=(task,))
     return config
 
 

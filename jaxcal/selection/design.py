@@ -322,19 +322,7 @@ class Design:
         log_det = solution.log_det
         if value is None or log_det is None:
             value, log_det = (float(pair[0]) for pair in values(problem, indices[None]))
-        if np.isneginf(log_det):
-            name = "indices" if method == "score" else "method"
-            whose = "" if method == "score" else f", which {method!r} returned"
-            raise ValueError(
-                f"{name} must give an invertible information matrix, but that of "
-                f"{indices.tolist()}{whose} is singular{self._why_singular(indices)}"
-            )
-        least = problem.criterion.kind == "least"
-        if not np.isfinite(value) or (least and not value > 0.0):
-            raise ValueError(
-                f"criterion {problem.criterion.name} must be a number in double "
-                f"precision, got {value} in these units; give the commands in others"
-            )
+        self._require_numbers(problem, indices, value, log_det, method)
         return Selection(
             indices=indices,
             value=value,
@@ -353,6 +341,29 @@ class Design:
             names=self.names,
             axes=self.axes,
         )
+
+    def _require_numbers(
+        self,
+        problem: Problem,
+        indices: Indices,
+        value: float,
+        log_det: float,
+        method: str,
+    ) -> None:
+        """Refuse a selection that is singular, or whose value no double holds."""
+        if np.isneginf(log_det):
+            name = "indices" if method == "score" else "method"
+            whose = "" if method == "score" else f", which {method!r} returned"
+            raise ValueError(
+                f"{name} must give an invertible information matrix, but that of "
+                f"{indices.tolist()}{whose} is singular{self._why_singular(indices)}"
+            )
+        least = problem.criterion.kind == "least"
+        if not np.isfinite(value) or (least and not value > 0.0):
+            raise ValueError(
+                f"criterion {problem.criterion.name} must be a number in double "
+                f"precision, got {value} in these units; give the commands in others"
+            )
 
     def _why_singular(self, indices: Indices) -> str:
         """What choosing among these candidates alone would be refused for."""

@@ -246,7 +246,7 @@ def test_a_recording_is_identified_and_checked_in_the_shell(files, capsys):
     own = arm.names.index("mass")
     theta = arm.nominal.copy()
     theta[own : own + 5] = [1.4, 0.01, 0.02, 0.05, 3.0]
-    joints = np.random.default_rng(3).uniform(-60.0, 60.0, (6, 7))
+    joints = np.random.default_rng(3).uniform(-60.0, 60.0, (8, 7))
     joints[:, [3, 5]] += [-65.0, 100.0]
     read = arm.predict(joints, theta)
     read += 0.02 * np.random.default_rng(0).normal(size=read.shape)
@@ -261,9 +261,9 @@ def test_a_recording_is_identified_and_checked_in_the_shell(files, capsys):
     for more, message in (
         (["--radians"], "recordings say their unit"),
         (["--topic", "/none"], "got none of topic /none"),
-        (["--sensor", "socket", "--which", "0x3,1"], "of 6 rests which socket each"),
+        (["--sensor", "socket", "--which", "0x3,1"], "of 8 rests which socket each"),
         (
-            ["--sensor", "socket", "--which", "0x3,1x3", "--distance", "0,1,.05,.0001"],
+            ["--sensor", "socket", "--which", "0x4,1x4", "--distance", "0,1,.05,.0001"],
             "contacts of socket",
         ),
         (["--servos", "so101.json"], "servos are of a LeRobot dataset"),

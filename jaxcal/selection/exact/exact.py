@@ -96,24 +96,26 @@ def solve_auto(
     started: dict[str, Any] = {"seed": seed, "restarts": restarts}
     if solution.reason:  # rounding
         return dataclasses.replace(solution, method="exact", **started)
-    letter = problem.criterion.name
-    name = f"{'an' if letter[0] in 'AEI' else 'a'} {letter}-efficiency"
-    if isinstance(problem.criterion, ScenarioCriterion):
-        name = "an efficiency"
-    proven_share = problem.criterion.efficiency(solution.value, solution.bound)
+    share = problem.criterion.efficiency(solution.value, solution.bound)
     method, reason = "exact", "the exact search proved this optimum"
-    if not solution.proven and proven_share >= least_efficiency:
-        method = "exchange"
+    if not solution.proven:
+        at_least = f"{_efficiency_in_words(problem)} of at least {share:.6f}"
+        wanted = f"{least_efficiency:g} was asked for"
         reason = (
-            f"the bound proves {name} of at least {proven_share:.6f}, and "
-            f"{least_efficiency:g} was asked for"
+            f"the exact search ran out of time after {limit:g} s with {at_least} "
+            f"proven; {wanted}"
         )
-    elif not solution.proven:
-        reason = (
-            f"the exact search ran out of time after {limit:g} s with {name} "
-            f"of at least {proven_share:.6f} proven; {least_efficiency:g} was asked for"
-        )
+        if share >= least_efficiency:
+            method, reason = "exchange", f"the bound proves {at_least}, and {wanted}"
     return dataclasses.replace(solution, method=method, reason=reason, **started)
+
+
+def _efficiency_in_words(problem: Problem) -> str:
+    """An efficiency by its criterion, "a D-efficiency"; of scenarios without it."""
+    if isinstance(problem.criterion, ScenarioCriterion):
+        return "an efficiency"
+    letter = problem.criterion.name
+    return f"{'an' if letter[0] in 'AEI' else 'a'} {letter}-efficiency"
 
 
 def _starts(problem: Problem) -> int:
@@ -317,8 +319,8 @@ def _solution_of(
     """
     chosen, criterion = np.array(subsets), problem.criterion
     value, log_det = values(problem, chosen)
-    better = max if criterion.larger_is_better else min
-    order = np.argsort(-value if better is max else value, kind="stable")[:best]
+    order = np.argsort(-value if criterion.larger_is_better else value, kind="stable")
+    order = order[:best]
     order = order[np.isfinite(log_det[order])]
     if not order.size:
         raise ValueError(
@@ -326,18 +328,7 @@ def _solution_of(
             f"{chosen[0].tolist()}, is singular"
         )
     subsets, worth = list(chosen[order]), value[order].tolist()
-    bound, proven, reason = worth[0], phi is None, ""
-    if phi is not None:
-        bound = better(bound, float(criterion.reported(phi)))
-    unsure = problem.uncertainty(subsets[0])
-    if unsure > TOLERATED:
-        bound = criterion.bettered(bound, unsure)
-        if proven:
-            reason = (
-                "not proven in double precision: the search is complete, but rounding "
-                f"may change the variances by a share of {unsure:.1g}"
-            )
-        proven = False
+    bound, proven, reason = _proof(problem, subsets[0], worth[0], phi)
     return Solution(
         indices=subsets[0],
         value=worth[0],
@@ -348,6 +339,29 @@ def _solution_of(
         alternatives=tuple(zip(subsets, worth, strict=True)),
         reason=reason,
     )
+
+
+def _proof(
+    problem: Problem, indices: Indices, value: float, phi: float | None
+) -> tuple[float, bool, str]:
+    """Bound of a reported value, whether it is proven, and why not where phi is None.
+
+    ``phi`` is a bound from above that a search did not reach.
+    """
+    criterion, bound = problem.criterion, value
+    if phi is not None:
+        better = max if criterion.larger_is_better else min
+        bound = better(bound, float(criterion.reported(phi)))
+    unsure = problem.uncertainty(indices)
+    if unsure <= TOLERATED:
+        return bound, phi is None, ""
+    reason = ""
+    if phi is None:
+        reason = (
+            "not proven in double precision: the search is complete, but rounding "
+            f"may change the variances by a share of {unsure:.1g}"
+        )
+    return criterion.bettered(bound, unsure), False, reason
 
 
 def _groups(problem: Problem, merge: bool) -> tuple[Indices, Indices]:
