@@ -324,7 +324,7 @@ CONFIG = TrainConfig(
     network=NetworkConfig(width=8, encoder_rounds=1),
     ppo=EpisodesConfig(
         num_episodes=64 * 8, episodes_per_update=64, episodes_per_set=4,
-        num_minibatches=2, learning_rate=5e-5, final_learning_rate=5e-5,
+        num_minibatches=2, learning_rate=2e-5, final_learning_rate=2e-5,
     ),
     seed=3,
     tasks=(Task(SelectionConfig(6, 3, 1, 1, reward_gain=True)),),  # as the flags
