@@ -120,12 +120,6 @@ def check_equal(out: dict[str, object]) -> None:
     assert out["rewards"] < 2e-5
 
 
-@pytest.mark.slow
-def test_eight_devices_do_what_one_does() -> None:
-    out = python(BEGIN, TINY, COMPARE, flags=f"{EIGHT} {QUICK}")
-    check_equal(out)
-
-
 def test_a_mesh_takes_the_devices_asked_for_and_names_what_does_not_divide() -> None:
     out = python(
         BEGIN,
@@ -155,12 +149,11 @@ def test_a_mesh_takes_the_devices_asked_for_and_names_what_does_not_divide() -> 
 
 
 @pytest.mark.slow
-def test_eight_devices_play_what_uncompiled_code_plays() -> None:
+def test_eight_devices_do_what_one_does_and_uncompiled_code_plays() -> None:
     # jaxlib 0.10.2 compiles one reduction wrongly on the CPU; a partitioned program is
     # another program, so it is compared with the plain one too.
-    check_equal(python(BEGIN, TINY, COMPARE))
-    # Of several minibatches each device draws its own, so losses differ as seeds do.
     out = python(BEGIN, TINY, COMPARE, PLAY)
+    check_equal(out)
     assert out["same actions"] == 1.0
     assert out["log_prob"] < 1e-5 and out["advantage"] < 1e-3
     assert out["sets"] == 16 and out["shards"] == [2] and out["on"] == 8
@@ -174,7 +167,7 @@ def test_the_papers_sixteen_episodes_are_shared_by_eight_devices() -> None:
     network = build(dataclasses.replace(preset.network, width=16))
     task, config = preset.tasks[0], preset.ppo
     """
-    check_equal(python(BEGIN, paper, COMPARE))
+    check_equal(python(BEGIN, paper, COMPARE, flags=f"{EIGHT} {QUICK}"))
 
 
 @pytest.mark.slow
