@@ -46,7 +46,7 @@ reproduce: $(READY) ## the paper's figures, tables and claims from our own runs,
 	$(BIN)/python -m studies.paper $(ARGS)
 
 # Most of a first run is XLA compiling: without its optimiser that takes a third of the
-# time. In `make test-all` the parts of QUICKLY compile so, the others as users do.
+# time. In `make test-all` adaptive and learning compile so, the others as users do.
 # Hundreds of programs are started: what one has compiled the others load.
 test: export PYTHONDONTWRITEBYTECODE =
 # The rig's tests mostly wait for a device and import no JAX: three processes of them run
@@ -63,19 +63,20 @@ test: $(READY) ## set everything up, lint, and run the quick tests (the ones CI 
 	nice $(QUICK_TESTS) -n 2 tests --ignore tests/rig; others=$$?; \
 	wait $$rig; rig=$$?; cat $(VENV)/rig-tests.log; exit $$((rig | others))
 
-# A part is a folder of tests/, or `files`, the tests beside them. Each is a run of its own:
-# what one process has compiled it keeps, and the whole suite is too much for one. The rig's
-# part, which mostly waits, runs beside the others.
-QUICKLY = adaptive learning
-PARTS ?= $(notdir $(patsubst %/,%,$(dir $(wildcard tests/*/test_*.py)))) files
-EVERY_TEST = $(BIN)/python -m pytest --hypothesis-profile=new --dist loadfile --no-loadscope-reorder \
+# A part is a folder of tests/, `files`, the tests beside them, or `trainings`, those of
+# adaptive and learning that need the speed of an optimised program. Each is a run of its
+# own: what one process has compiled it keeps, and the whole suite is too much for one. The
+# rig's part, which mostly waits, runs beside the others.
+PARTS ?= $(notdir $(patsubst %/,%,$(dir $(wildcard tests/*/test_*.py)))) files trainings
+EVERY_TEST = $(BIN)/python -m pytest --hypothesis-profile=new -m 'not trains' --dist loadfile --no-loadscope-reorder \
 	--durations=5 --durations-min=60 $(ARGS)
 test-all: $(READY) lint ## every test, the slow ones too, hypothesis drawing new examples (some folders: PARTS="rig docs")
 	@failed=; if [ "$(filter rig,$(PARTS))" ]; then \
 	$(EVERY_TEST) -n 3 --dist load tests/rig >$(VENV)/rig-tests.log 2>&1 & fi; rig=$$!; \
 	for part in $(filter-out rig,$(sort $(PARTS))); do echo "== $$part"; \
-	if [ $$part = files ]; then tests=`ls tests/test_*.py`; else tests=tests/$$part; fi; \
-	case " $(QUICKLY) " in *" $$part "*) flags="$${XLA_FLAGS-$(QUICK_XLA)}";; *) flags="$$XLA_FLAGS";; esac; \
+	flags="$$XLA_FLAGS"; case $$part in files) tests=`ls tests/test_*.py`;; \
+	trainings) tests="-m trains tests/adaptive tests/learning";; *) tests=tests/$$part;; esac; \
+	case $$part in adaptive|learning) flags="$${XLA_FLAGS-$(QUICK_XLA)}";; esac; \
 	XLA_FLAGS="$$flags" nice $(EVERY_TEST) -n 2 $$tests || failed="$$failed $$part"; done; \
 	if [ "$$rig" ]; then wait $$rig || failed="$$failed rig"; echo "== rig"; cat $(VENV)/rig-tests.log; fi; \
 	[ -z "$$failed" ] || { echo "failed:$$failed"; exit 1; }

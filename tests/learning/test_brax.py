@@ -51,6 +51,7 @@ def test_reset_after_done_draws_new_candidates_and_nothing_is_truncated():
 
 
 @pytest.mark.slow
+@pytest.mark.trains
 def test_a_script_of_a_brax_user_trains_postures_and_a_task():
     """As the example has it; random postures reach -1.9, the optimum is -0.35."""
     import brax_ppo
@@ -63,6 +64,7 @@ def test_a_script_of_a_brax_user_trains_postures_and_a_task():
 
 
 @pytest.mark.slow
+@pytest.mark.trains
 def test_braxs_own_ppo_trains_it(tmp_path):
     from jaxcal.learning.training import brax_ppo
 

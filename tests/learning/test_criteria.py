@@ -152,6 +152,7 @@ def test_the_lookahead_is_greedy_to_the_end(criterion: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.trains
 @pytest.mark.parametrize("criterion", OTHERS)
 def test_a_short_training_is_above_greedy(
     criterion: str, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
