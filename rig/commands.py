@@ -204,7 +204,7 @@ def setup(
 
 def ports() -> int:
     """list serial ports"""
-    from rig.workbench.commission.connections import serial_lines
+    from rig.workbench.commission.scan import serial_lines
 
     print(*(serial_lines() or ["no serial port on this computer"]), sep="\n")
     return EXIT_OK
@@ -213,11 +213,12 @@ def ports() -> int:
 def scan(given: DeviceOptions, *, bus: BusName = "", units: Units = 16) -> int:
     """which units answer, and of which family; reads only"""
     from rig.workbench.commission import scan as scanning
-    from rig.workbench.commission import steps
 
     if bus and not given.simulate:
         units_found = scanning.scan(scanning.parse_bus(bus), units, _say)
     else:
+        from rig.workbench.commission import steps
+
         with _place(given) as site:
             maps = tuple(axis.map for axis in site.config.axes)
             # Units of other lines than Modbus are those of rig.toml.
@@ -441,11 +442,13 @@ def check(file: ConfigPath | None = None, *, config: ConfigPath | None = None) -
     """check a configuration and list every fault"""
     from rig.config import load_config
     from rig.drives import make_drives
-    from rig.model import model_of
 
     path = config or file or FILE
     loaded = load_config(path)
-    model_of(loaded)
+    if loaded.model is not None:
+        from rig.model import model_of  # scipy: half of the time of this command
+
+        model_of(loaded)
     make_drives(loaded.bus, loaded.axes)
     print(f"{path}: valid")
     for axis in loaded.axes:

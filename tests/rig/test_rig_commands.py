@@ -149,22 +149,22 @@ def test_identify_prints_every_drive(capsys):
     assert said.count("pulses_per_rev = 10000") == 3
 
 
-def test_help_and_stop_load_no_heavy_module(tmp_path):
+def test_help_stop_check_and_ports_load_no_heavy_module(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(fast_text({"port = 5020": "port = 1"}))
     program = (
-        "import sys\n"
+        "import contextlib, sys\n"
         "from rig.__main__ import main\n"
-        "try:\n"
-        "    main({})\n"
-        "except SystemExit:\n"
-        "    pass\n"
+        "for arguments in {}:\n"
+        "    with contextlib.suppress(SystemExit):\n"
+        "        main(arguments)\n"
         "heavy = set('jax matplotlib scipy flax'.split()) & set(sys.modules)\n"
         "sys.exit(' '.join(heavy) or 0)\n"
     )
-    for arguments in (["--help"], ["stop", "--config", str(path)]):
+    reads = [["--help"], ["check", str(path)], ["ports"]]
+    for commands in (reads, [["stop", "--config", str(path)]]):
         subprocess.run(
-            [sys.executable, "-c", program.format(arguments)], check=True,
+            [sys.executable, "-c", program.format(commands)], check=True,
             capture_output=True, cwd=tmp_path,
         )  # fmt: skip
 

@@ -78,18 +78,6 @@ def watch(
         )
 
 
-def serial_lines() -> list[str]:
-    """One line for each serial port: device, and what its adapter calls itself."""
-    from serial.tools import list_ports  # type: ignore[import-untyped]  # no stubs
-
-    lines = []
-    for port in sorted(list_ports.comports()):
-        usb = f", USB {port.vid:04x}:{port.pid:04x}" if port.vid is not None else ""
-        maker = f", {port.manufacturer}" if port.manufacturer else ""
-        lines.append(f"{port.device}: {port.description}{maker}{usb}")
-    return lines
-
-
 def own_address() -> str:
     """IPv4 address under which a phone can reach this computer; empty without one."""
     # Connecting UDP sends nothing; it tells the address packets leave from.

@@ -1,4 +1,4 @@
-"""Which units answer on a bus, and of which drive family each is. Reads only."""
+"""Serial ports; which units answer on a bus, of which drive family. Reads only."""
 
 from __future__ import annotations
 
@@ -67,6 +67,18 @@ def parse_bus(text: str) -> BusSettings:
     for name, word in zip(names, words, strict=False):
         lines.append(f"{name} = {word if word.isdecimal() else json.dumps(word)}")
     return parse(BusSettings, "\n".join(lines), "--bus")
+
+
+def serial_lines() -> list[str]:
+    """One line for each serial port: device, and what its adapter calls itself."""
+    from serial.tools import list_ports  # type: ignore[import-untyped]  # no stubs
+
+    lines = []
+    for port in sorted(list_ports.comports()):
+        usb = f", USB {port.vid:04x}:{port.pid:04x}" if port.vid is not None else ""
+        maker = f", {port.manufacturer}" if port.manufacturer else ""
+        lines.append(f"{port.device}: {port.description}{maker}{usb}")
+    return lines
 
 
 def scan(

@@ -16,10 +16,9 @@ from rig.faults import EXIT_OK, Refused
 from rig.journal import HOMED, IDENTIFIED, STOP_PROVED, ZEROED
 from rig.model import joint_names
 from rig.workbench.commission import steps
-from rig.workbench.commission.connections import serial_lines
 from rig.workbench.commission.home import can_home
 from rig.workbench.commission.operator import Operator
-from rig.workbench.commission.scan import Answer, parse_bus, scan
+from rig.workbench.commission.scan import Answer, parse_bus, scan, serial_lines
 from rig.workbench.rig_toml import edit, new_text, set_values
 
 if TYPE_CHECKING:
