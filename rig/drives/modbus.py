@@ -254,7 +254,8 @@ class Bus(Line):
             more["count"] = asked
         else:
             more |= {"value": asked[0]} if function == 6 else {"values": asked}
-        time.sleep(max(0.0, self._quiet_until - time.monotonic()))
+        if (silent_s := self._quiet_until - time.monotonic()) > 0.0:
+            time.sleep(silent_s)  # sleep(0) takes .1 ms as well
         try:
             # Connecting, where it is lost, may take as long as configured.
             self._client.comm_params.timeout_connect = self.settings.timeout_s
