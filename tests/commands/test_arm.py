@@ -249,7 +249,8 @@ def test_a_recording_is_identified_and_checked_in_the_shell(files, capsys):
     joints = np.random.default_rng(3).uniform(-60.0, 60.0, (8, 7))
     joints[:, [3, 5]] += [-65.0, 100.0]
     read = arm.predict(joints, theta)
-    read += 0.02 * np.random.default_rng(0).normal(size=read.shape)
+    usual = np.asarray(arm.default_noise().std)
+    read += usual * np.random.default_rng(0).normal(size=read.shape)
     write_bag(folder / "bag", joints, read)
     saved = str(folder / "tool.json")
     given = ["identify", str(folder / "bag"), "--model", str(urdf), "--tip",
