@@ -26,6 +26,8 @@ _KNOWN = 1e9  # degrees of freedom of noise that was given
 _DRIFT = 10.0  # standard deviations of the prior: no parameter drifts by more
 _RATIOS = 16  # quantiles of how far noise that was estimated is off
 _HALVINGS = 26  # of a search for the smallest change
+_MANY = 1000.0  # rows that nobody measures to check
+_BLIND = 0.01  # of a parameter's effect, what is left of it where it cannot be seen
 _SWEEPS = 20  # of swaps, at most
 _UNITS = {  # factors between units that are mistaken for each other
     1000.0: "metres for millimetres",
@@ -47,6 +49,8 @@ class Check:
     tolerance: float  # root mean square of the outputs' change that matters
     unit: str = ""  # of the tolerance, where the calibration or its sensor has one
     slipped: str = ""  # what alone would explain it, and by how much
+    enough: int = 0  # rows like these by which it could be told, about; 0 if not so
+    blind: tuple[str, ...] = ()  # parameters that nothing placed anew shows
 
     @property
     def good(self) -> bool:
@@ -68,6 +72,9 @@ class Check:
             text += f"; a slip of {self.slipped} would explain it"
         if self.unseen and not self.good:
             text += f", and could hide in {', '.join(self.unseen)}"
+        if self.blind:
+            names = ", ".join(self.blind)
+            text += f"; {names} cannot be told from where things were placed anew"
         return (text,)
 
     @property
@@ -80,7 +87,10 @@ class Check:
                 "measure one of these rows again to rule out a wrong reading, then "
                 "calibrate again (identify)"
             )
-        return "measure more: calibration.verification(candidates, k) says where"
+        text = "measure more"
+        if self.enough:
+            text += f", about {self.enough} rows like these in all"
+        return f"{text}: calibration.verification(candidates, k) says where"
 
     def __str__(self) -> str:
         return f"{self.reasons[0]}; next: {self.next_step}"
@@ -139,6 +149,8 @@ def check(
     power = tests.power(
         squares[:, None] * signal[judged], squares * along[judged]
     ).mean()
+    # What is seen grows with the root of the rows.
+    enough = len(commands) * float((size[hidden] / change[hidden]).max(initial=0)) ** 2
     slipped = ""
     if p_slip < _ALARMS:
         most = int(np.abs(changes_of_slips).argmax())
@@ -159,6 +171,8 @@ def check(
         tolerance=tolerance,
         unit=calibration.measured_unit or getattr(sensor, "first_unit", ""),
         slipped=slipped,
+        enough=int(np.ceil(enough)) if enough < _MANY else 0,
+        blind=tuple(names[i] for i in np.flatnonzero(off.blind)),
     )
 
 
@@ -181,7 +195,8 @@ class _Deviations(NamedTuple):
     white: Array  # (R,)
     by: Array  # (R, p) their derivatives by the parameters
     of_level: NDArray[np.bool_]  # (G, R) which of them have one level of noise
-    free: NDArray[np.bool_]  # (p,) parameters that may have drifted
+    free: NDArray[np.bool_]  # (p,) parameters that may have drifted and are judged
+    blind: NDArray[np.bool_]  # (p,) those that what was placed anew takes up
     least: float  # variance, of 1, without the misfit that they allow for
 
 
@@ -198,16 +213,21 @@ def _deviations(
     root, least = _whitening(calibration, commands, noise)
     white, by = root @ off.ravel(), root @ slopes.reshape(-1, p)
     level = np.tile(_levels(calibration), len(commands))  # of each reading
-    free = calibration.free[:p] > 0.0
+    free, blind = calibration.free[:p] > 0.0, np.zeros(p, dtype=np.bool_)
     if placed_anew:
         if not calibration.model.placed:
             raise ValueError("placed_anew is of an arm whose sensor stands somewhere")
         placed = np.isin(names, calibration.model.placed)  # which says nothing now
+        before = np.linalg.norm(by, axis=0)
         white, by = without(by[:, placed], white, by)
         level, free = np.zeros(len(white), dtype=np.intp), free & ~placed
+        blind = free & (np.linalg.norm(by, axis=0) < _BLIND * before)
+        free &= ~blind
     if not len(white):
         raise ValueError("measured must hold a reading beside what was placed anew")
-    return _Deviations(white, by, level == np.unique(level)[:, None], free, least)
+    return _Deviations(
+        white, by, level == np.unique(level)[:, None], free, blind, least
+    )
 
 
 def _distinct(

@@ -247,3 +247,20 @@ def test_false_alarms_are_five_in_a_hundred_whatever_the_degrees_of_freedom(coun
         )
     low, high = stats.binom.interval(0.999, 1000, 0.05)
     assert low <= alarms <= high
+
+
+def test_contacts_of_sockets_placed_anew_hold_where_enough_of_them_say_so():
+    """A shift and a turn about the vertical of the whole arm are the sockets' too."""
+    commands = np.column_stack(contacts.load("kuka_14")["left_back"])
+    commands = commands[np.random.default_rng(2).permutation(len(commands))]
+    zeros = np.zeros((len(commands), 3))
+    arm = contacts.arm("kuka_14")
+    found = jaxcal.identify(commands[:24], zeros[:24], model=arm)
+    told = found.check(commands[50:56], zeros[50:56], placed_anew=True)
+    assert told.says == "cannot be told"
+    assert {"d1", "theta1"} <= set(told.blind) and "theta2" not in told.blind
+    assert "cannot be told from where things were placed anew" in str(told)
+    assert f"about {told.enough} rows like these in all" in told.next_step
+    assert 6 < told.enough <= 36
+    rows = commands[24:][: told.enough], zeros[24:][: told.enough]
+    assert found.check(*rows, placed_anew=True).says == "holds"
