@@ -29,7 +29,7 @@ from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.compact import CompactNetwork
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
-from jaxcal.learning.training import checkpoint, presets, room
+from jaxcal.learning.training import checkpoint, presets, room, run
 from jaxcal.learning.training import postures as training
 from jaxcal.learning.training.checkpoint import CheckpointError
 from jaxcal.learning.training.config import TrainConfig
@@ -629,6 +629,28 @@ def test_ctrl_c_saves_and_resume_goes_on(tmp_path, capsys, monkeypatch):
     monkeypatch.undo()
     assert train("--out", out, "--resume", "--no-validation") == 0
     assert checkpoint.load(out).meta["progress"]["updates"] == 6
+
+
+def test_an_update_is_compiled_by_options_that_change_only_rounding(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=0")
+    assert run._compiler_options() == {}
+    monkeypatch.delenv("XLA_FLAGS")
+    options = run._compiler_options()
+    assert options == {"xla_backend_optimization_level": 2}
+    passed: dict = {}
+    with monkeypatch.context() as patch:
+        patch.setattr(jax, "jit", lambda function, **rest: passed.update(rest))
+        updates.__wrapped__(CONFIG.ppo, CONFIG.learners[0])
+    assert passed["compiler_options"] == options
+
+    def sums(x: jax.Array) -> jax.Array:
+        return (x - x.mean(-1, keepdims=True)) @ x.T / (x * x).sum()
+
+    rows = np.random.default_rng(0).normal(size=(3, 5000)).astype(np.float32)
+    exact = sums(rows.astype(np.float64))
+    for chosen in ({}, options):
+        found = jax.jit(sums, compiler_options=chosen)(rows)
+        np.testing.assert_allclose(found, exact, atol=1e-6)
 
 
 @pytest.mark.slow

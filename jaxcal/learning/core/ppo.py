@@ -319,6 +319,14 @@ def mean_over(
     return jax.tree.map(lambda x: x.mean(0), jax.lax.map(of_part, parts))
 
 
+@struct.dataclass
+class _Measured:
+    """Numbers as one array: many small kernels take XLA long to compile."""
+
+    vector: jax.Array  # (..., N), of which the last have names
+    names: tuple[str, ...] = struct.field(pytree_node=False)
+
+
 def make_update(
     config: PPOConfig, learner: Learner, mesh: Mesh | None = None
 ) -> Callable[..., tuple[TrainState, Metrics]]:
@@ -358,27 +366,30 @@ def make_update(
         number = per_block // ppo.num_minibatches
         size = number if whole else math.gcd(number, ppo.slice_rows)
 
-        def step(state: TrainState, index: jax.Array) -> tuple[TrainState, Metrics]:
-            def gradient(some: Any) -> tuple[jax.Array, Metrics]:
+        def step(state: TrainState, index: jax.Array) -> tuple[TrainState, _Measured]:
+            def gradient(some: Any) -> _Measured:
                 of_loss = jax.grad(trained.loss, has_aux=True)
                 grads, metrics = of_loss(state.params, some, state.num_updates)
-                # One array: many small kernels take XLA long to compile.
-                return ravel_pytree(grads)[0], metrics
+                vector = ravel_pytree((grads, metrics))[0]
+                return _Measured(vector, tuple(sorted(metrics)))
 
-            grads, metrics = mean_over(gradient, rows, index, size, mesh)
+            total = mean_over(gradient, rows, index, size, mesh)
+            some = len(total.names)
+            grads, metrics = total.vector[:-some], total.vector[-some:]
             state, norm = descend(ppo, state, grads)
-            return state, metrics | {"grad_norm": norm}
+            names = *total.names, "grad_norm"
+            return state, _Measured(jnp.append(metrics, norm), names)
 
         order = minibatches(ppo, key_epochs, blocks, per_block)
-        state, losses = jax.lax.scan(step, before, order)
-        losses = jax.tree.map(jnp.mean, losses)
+        state, steps = jax.lax.scan(step, before, order)
+        losses = dict(zip(steps.names, steps.vector.mean(0), strict=True))
         if "kl" in losses:  # of a minibatch, by the weights that the update ends with
 
-            def measure(some: Any) -> Metrics:
-                return trained.loss(state.params, some, state.num_updates)[1]
+            def measure(some: Any) -> jax.Array:
+                return trained.loss(state.params, some, state.num_updates)[1]["kl"]
 
             index = jnp.broadcast_to(jnp.arange(number), (blocks, number))
-            losses["kl_after"] = mean_over(measure, rows, index, size, mesh)["kl"]
+            losses["kl_after"] = mean_over(measure, rows, index, size, mesh)
         rate = schedule(ppo)((before.num_updates + 1) * ppo.steps_per_update)
         fine = jnp.isfinite(jnp.stack(jax.tree.leaves(losses))).all()
         after = dataclasses.replace(

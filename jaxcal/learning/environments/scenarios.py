@@ -111,6 +111,9 @@ def mixture(
     table = jnp.asarray([unique.index(name) for name in shapes])
 
     def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        if len(unique) == 1 and masked == 0.0:  # nothing else is random
+            points = _shape(unique[0], key, m, n).astype(jnp.float32)
+            return points, jnp.ones(m, bool)
         key_which, key_points, key_share, key_mask = jax.random.split(key, 4)
         clouds = [_shape(name, key_points, m, n).astype(jnp.float32) for name in unique]
         points = clouds[0]

@@ -6,10 +6,12 @@ every epoch. Shapes: M candidates, n inputs, p = n + 1, K choices; leading axes 
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcal.learning.policies import geometry
 
@@ -196,9 +198,10 @@ def described(
 def _second_moments(x: jax.Array) -> jax.Array:
     """(..., M, p) -> (..., M, p (p + 1) / 2) with phi(x) . phi(y) = (x . y)^2."""
     p = x.shape[-1]
-    products = [
-        x[..., i] * x[..., j] * (1.0 if i == j else 2.0**0.5)
-        for i in range(p)
-        for j in range(i, p)
-    ]
-    return jnp.stack(products, axis=-1)
+    first, second = np.triu_indices(p)
+    # Products of columns picked by two small matrix products: written one by one, each
+    # would be a kernel of its own.
+    eye = np.eye(p, dtype=x.dtype)
+    scale = np.where(first == second, 1.0, 2.0**0.5).astype(x.dtype)
+    picked = functools.partial(jnp.matmul, x, precision=jax.lax.Precision.HIGHEST)
+    return picked(eye[:, first]) * picked(eye[:, second] * scale)

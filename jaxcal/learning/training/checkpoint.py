@@ -201,15 +201,16 @@ def read_meta(
         except (OSError, ValueError) as error:
             raise _unreadable(path, "read: its meta is damaged", error) from error
     held = meta.get("schema") if isinstance(meta, dict) else None
+    # Of another version first: a run of a task is then not called one of postures.
+    if str(held).startswith("jaxcal-") and meta.get("version") != VERSION:
+        raise CheckpointError(
+            f"checkpoint {path} has version {meta.get('version')!r}; this jaxcal reads "
+            f"version {VERSION}"
+        )
     if held != schema:
         raise CheckpointError(
             f"checkpoint {path} is not a jaxcal policy of this kind: its schema must "
             f"be {schema}, got {held}"
-        )
-    if meta.get("version") != VERSION:
-        raise CheckpointError(
-            f"checkpoint {path} has version {meta.get('version')!r}; this jaxcal reads "
-            f"version {VERSION}"
         )
     return path, meta
 
@@ -293,7 +294,7 @@ def restore(
         raise CheckpointError(
             f"checkpoint {path} holds a policy but no training state to resume from"
         )
-    what = "resumed: its training state is damaged or of another configuration"
+    what = "resumed: its training state is damaged or of an earlier jaxcal"
     average = _read(path / "policy", fresh.average, what)
     rest = _read(path / "state", _rest(fresh), what)
 

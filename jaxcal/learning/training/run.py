@@ -152,6 +152,8 @@ def updates(
             at_once = None if jax.default_backend() == "cpu" else seeds
             all_seeds = functools.partial(jax.lax.map, update, batch_size=at_once)
 
+        all_seeds = jax.jit(all_seeds)  # traced once, for the shapes and for the loop
+
         def step(number: jax.Array, carry: Any) -> Any:
             state, kept = carry
             state, metrics = all_seeds(state)
