@@ -1,5 +1,6 @@
 """Several chains in one model, against the file's frames multiplied out."""
 
+import dataclasses
 import json
 import warnings
 
@@ -11,7 +12,7 @@ import jaxcal
 from jaxcal.models import Chains, Pose, Position, SerialChain, Socket, from_dict
 from jaxcal.models.serial.urdf import joints_of
 
-from .arms import differences
+from .arms import differences, ur5
 
 TORSO = [("yaw", "base", "waist", (0, 0, 0.3), (0, 0, 0), "0 0 1")]
 TORSO += [("pitch", "waist", "chest", (0, 0, 0.2), (0, 0, 0), "0 1 0")]
@@ -273,3 +274,23 @@ def test_blanks_beside_fewer_readings_do_not_count_as_exact(tmp_path):
     found = jaxcal.identify(commands, measured, model=model)
     assert found.dof < 30 * 3 + 30 * 6
     np.testing.assert_allclose(found.noise_std, 1.0, rtol=0.15)
+
+
+def test_hands_may_touch_sockets_that_the_other_does_not():
+    """The distance between sockets 0 and 2, each touched by another arm."""
+    places = np.array([(-400.0, 200.0, 100.0), (-400.0, 250.0, 100.0), (400, 200, 200)])
+    apart = float(np.linalg.norm(places[2] - places[0]))
+    sensor = Socket(3, places, distances=[(0, 2, apart, 0.1)])
+    arm = ur5(sensor=sensor)
+    beside = ur5(sensor=sensor, base=(50.0, 0.0, 0.0))
+    beside = dataclasses.replace(beside, joint_names=tuple("abcdef"))
+    pair = Chains.of({"one": arm, "other": beside})
+    given = {}
+    for name, chain, without in (("one", arm, 2.0), ("other", beside, 0.0)):
+        contacts = chain.postures(20, near=places)
+        given[name] = contacts[contacts[:, 6] != without], None
+    commands, measured = pair.together(given)
+    prepared = pair.prepared(commands, measured)  # as identify begins
+    assert [one.sensor.distances for one in prepared.chains] == [sensor.distances] * 2
+    with pytest.raises(ValueError, match="contacts of socket 2, whose distance"):
+        arm.prepared(given["one"][0], np.zeros((len(given["one"][0]), 3)))

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import array_of, one_of
 from jaxcal.models import verdict as models
 from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
-from jaxcal.models.sensors import Sensor
+from jaxcal.models.sensors import Sensor, Socket
 from jaxcal.models.sensors.sensor import BASE, label
 from jaxcal.models.serial.chain import SerialChain
 from jaxcal.models.uncertainty import Noise, Prior
@@ -397,7 +397,7 @@ class Chains(Model):
                 arm = arm.measured_with(arms[self.stands[k]].sensor)
             q, scale = arm.num_outputs, self._scale(k)
             read = None if measured is None else measured[rows, :q] * scale
-            arms[k] = arm.prepared(arm_commands, read)
+            arms[k] = _prepared(arm, arm_commands, read)
         for k, owner in enumerate(self.stands):
             if owner != k:
                 arms[k] = arms[k].measured_with(arms[owner].sensor)
@@ -586,3 +586,16 @@ def _alike(one: SerialChain, other: SerialChain, i: int) -> bool:
     kind = one.joints[i] == other.joints[i]
     moves = one.drive[i][one.drive[i] != 0.0], other.drive[i][other.drive[i] != 0.0]
     return bool(link and kind and names[0] == names[1] and np.array_equal(*moves))
+
+
+def _prepared(arm: SerialChain, commands: Array, measured: Array | None) -> SerialChain:
+    """The arm where its readings put it; other arms may touch sockets it does not."""
+    sensor = arm.sensor
+    if not isinstance(sensor, Socket):
+        return arm.prepared(commands, measured)
+    touched = set(sensor.of_rows(commands[:, arm.num_joints :]).tolist())
+    within = [row for row in sensor.distances if touched.issuperset(row[:2])]
+    arm = arm.measured_with(dataclasses.replace(sensor, distances=within))
+    arm = arm.prepared(commands, measured)
+    places = getattr(arm.sensor, "places", None)
+    return arm.measured_with(dataclasses.replace(sensor, places=places))

@@ -402,6 +402,7 @@ def _other_distances(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
     change = np.array(distances)[:, 3] * np.abs(off) / (1.0 - share)
     doubtful = np.abs(off) > _APART * np.sqrt(1.0 - share)
     doubtful &= (share < 1.0 - _ALONE) & (change > _SHORT * model.length)
+    doubtful &= _touched(calibration, model)
     said, most, unit = [], 0.0, _in(calibration)
     for k in np.flatnonzero(doubtful).tolist():
         first, second, distance, std = distances[k]
@@ -422,7 +423,9 @@ def _other_distances(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
 def _freed(calibration: Fit, model: Chain, row: int) -> tuple[float, float]:
     """A given distance as the readings have it without it, and its deviation."""
     sensor = model.sensor
-    rest = [one for k, one in enumerate(sensor.distances) if k != row]
+    touched = _touched(calibration, model)
+    touched[row] = False
+    rest = [one for one, kept in zip(sensor.distances, touched, strict=True) if kept]
     free = model.measured_with(dataclasses.replace(sensor, distances=rest))
     fit = calibration.again(free, None)
     off, rows = model.facts(fit.parameters[: len(model.names)])
@@ -430,6 +433,13 @@ def _freed(calibration: Fit, model: Chain, row: int) -> tuple[float, float]:
     _, _, distance, std = sensor.distances[row]
     variance = rows[row] @ np.asarray(fit.covariance)[:p, :p] @ rows[row]
     return distance - std * off[row], std * float(np.sqrt(variance))
+
+
+def _touched(calibration: Fit, model: Chain) -> NDArray[np.bool_]:
+    """(D,) distances both of whose sockets have contacts of this arm."""
+    labels = model.sensor.of_rows(calibration.commands[:, model.num_joints :])
+    pairs = np.array(model.sensor.distances)[:, :2]
+    return np.asarray(np.isin(pairs, labels).all(axis=1))
 
 
 def _at_these_sizes(calibration: Fit, facts: Array) -> Array:
