@@ -905,7 +905,7 @@ class _Ascent:
                     break
             new = self._new_support(peaks, heights, support)
             if not len(new):
-                break
+                continue  # to better weights of the same support
             support = np.concatenate([support, new])
             blocks = np.concatenate([blocks, self.blocks(new)])
             fill = np.full(len(new), 0.02 / len(new))

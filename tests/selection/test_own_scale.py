@@ -106,13 +106,12 @@ def test_units_of_commands_and_noise_change_only_units(seed, unit, std, name):
 def test_units_of_parameters_and_prior_change_only_units(seed, units, std):
     rng = np.random.default_rng(seed)
     blocks, root = rng.normal(size=(9, 2, 3)), rng.normal(size=(1, 3))
-    plain = jaxcal.Design.from_blocks(blocks, prior=root.T @ root)
+    plain = jaxcal.Design.from_blocks(blocks, prior=root.T @ root, max_replicates=2)
     scale = np.array(units)
     prior = (root * scale).T @ (root * scale) / std**2
     other = jaxcal.Design.from_blocks(
         blocks * scale, prior=prior, noise=Noise(std=std), max_replicates=2
     )
-    plain.max_replicates = 2
     found, same = other.select(2, "D", "exact"), plain.select(2, "D", "exact")
     expected = same.value + 2.0 * np.log(scale / std).sum()
     assert found.value == pytest.approx(expected, abs=1e-8)
