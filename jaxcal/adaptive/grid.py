@@ -134,7 +134,7 @@ class GridTask:
     extra: jax.Array  # (A, Y) seconds that an outcome costs
     uses: jax.Array  # (A, Y) int32 that an outcome takes of a countable resource
     most_extra: jax.Array  # (A,) largest ``extra`` of an outcome that is possible
-    most_uses: jax.Array  # (A,) int32 likewise
+    most_uses: jax.Array  # (A,) int32 largest ``uses`` of an outcome that is possible
     seconds: jax.Array  # (2,) budget of a session, uniform between the two
     num_uses: jax.Array  # (E,) int32 equally likely budgets
     place: jax.Array  # () int32 at the start

@@ -81,7 +81,7 @@ def next_measurement(
             what ``fit_ahead.fit`` finds for the task and this budget, in some seconds
             at the first call.
         seconds: budget of the whole session; the task's when not given.
-        uses: budget of the countable resource, likewise.
+        uses: budget of the countable resource; the task's when not given.
         seed: of random draws; the same arguments give the same proposal.
 
     Raises:

@@ -101,15 +101,16 @@ class Calibration(Fit):
 
     @functools.cached_property
     def verdict(self) -> Verdict:
-        """Whether it may be used, why not, and what to do next; printed, these lines.
+        """Whether the calibration may be used, why not, and what to do next.
 
-        Of an arm with held-out errors (``jaxcal.models.serial.verdict.ArmVerdict``).
-        The summary, ``report``, exit codes and the warning of ``identify`` say this.
+        Printed, it is these lines; of an arm with held-out errors
+        (``jaxcal.models.serial.verdict.ArmVerdict``). The summary, ``report``, exit
+        codes and the warning of ``identify`` say this.
         """
         return self.model.verdict(self)
 
     def of(self, tip: str) -> Calibration:
-        """What was found of one of several chains, as if it had been alone.
+        """The calibration of one of several chains, as if it were the only one.
 
         Its readings are in its own unit, and its verdict, file and checks are those of
         an arm; see ``jaxcal.models.Chains``.
@@ -136,13 +137,13 @@ class Calibration(Fit):
         return self.model.write("urdf", path, self._for_file(), force=force)
 
     def to_dh(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """The DH table as CSV, likewise."""
+        """Write the DH table as CSV, corrected as ``to_urdf`` says."""
         self.model.write("dh", path, self._for_file(), force=force)
 
     def to_ur_kinematics(
         self, path: str | os.PathLike[str], *, force: bool = False
     ) -> None:
-        """Universal Robots' kinematics file, likewise."""
+        """Write Universal Robots' kinematics file, corrected as ``to_urdf`` says."""
         self.model.write("ur", path, self._for_file(), force=force)
 
     def to_lerobot(

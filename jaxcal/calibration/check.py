@@ -79,7 +79,7 @@ class Check:
 
     @property
     def next_step(self) -> str:
-        """What to do about it."""
+        """What to do next, in a sentence."""
         if self.good:
             return "go on using it"
         if self.says == "does not hold":

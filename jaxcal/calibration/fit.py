@@ -119,7 +119,8 @@ class Fit:
 
     @property
     def standard_errors(self) -> Array | None:
-        """(p,); infinite where nothing determines the parameter; None as above."""
+        """(p,); infinite where nothing determines the parameter; None where the noise
+        is unknown."""
         covariance = self.covariance
         if covariance is None:
             return None

@@ -4,9 +4,9 @@ Rows of residuals, whitened: the readings, the prior (one row for each parameter
 where commands are uncertain, the commands. Those are unknowns of their own measurement
 and are eliminated there by an orthogonal projection. A model that is linear in its
 parameters is searched along orthogonal directions, so one step is enough whatever its
-units. A loss is iteratively
-reweighted least squares. A level of noise that was not given is estimated beside the
-parameters, from the residuals and the degrees of freedom that they really have.
+units. A loss is iteratively reweighted least squares. A level of noise that was not
+given is estimated beside the parameters, from the residuals and the degrees of freedom
+that they really have.
 
 Sources: Marquardt, 1963, with the damping of Nielsen, 1999; Lange, Little and Taylor,
 1989 (losses); Foerstner, 1979, and MacKay, 1992 (levels of noise and prior).
@@ -214,7 +214,7 @@ class FitSolution:
         self._linearise()
 
     def _continue(self, start: FitSolution) -> None:
-        """Where another search ended, of the same model and measurements."""
+        """Go on from where another search of the same measurements ended."""
         self.parameters, self.commands = start.parameters, start.commands
         self.residuals, self.white = start.residuals, start.white
         self.weights, self.level = start.weights, start.level
@@ -231,7 +231,7 @@ class FitSolution:
         return self.problem.model.parameter_sizes()
 
     def _share(self, levels: NDArray[np.intp]) -> None:
-        """Outputs of the same number have one level."""
+        """Let outputs of the same number in ``levels`` (q,) share one level."""
         self.shared, self.same = levels, 1.0 * (levels[:, None] == levels)
         self.floor = self._floor()
 

@@ -29,9 +29,10 @@ Array = NDArray[np.float64]
 
 _LEVEL = 3.0  # factor of one standard deviation of the level, beforehand
 _MOST = 5.0  # of a logarithm
-_LARGEST = 2.5  # of a factor's, 12: beyond it an arm in sockets shrinks until all fit
-_FIRST = 1.6  # likewise, 5, of a rough fit's: an arm that has shrunk stays so
-_TRIED = np.array([-5.0, -4.0, -3.0, -2.0, -1.2, -0.4, 0.4, 1.2])  # likewise
+_LARGEST = 2.5  # of a factor, 12: beyond it an arm in sockets shrinks until all fit
+_FIRST = 1.6  # of a factor in a rough fit, 5: an arm that has shrunk stays so
+# Logarithms of misfit's factor.
+_TRIED = np.array([-5.0, -4.0, -3.0, -2.0, -1.2, -0.4, 0.4, 1.2])
 _SCORES = 100  # steps of Fisher's scoring, at most
 
 

@@ -105,7 +105,7 @@ examples:
 
 @dataclasses.dataclass(kw_only=True)
 class Outputs:
-    """What is written."""
+    """Files that an evaluation writes, and whether it shows its progress."""
 
     json: Annotated[Path | None, "write every number"] = None
     report: Annotated[Path | None, "write figures and index.html", "DIR"] = None
@@ -125,7 +125,7 @@ class Outputs:
             require_writable_folder(self.report)
 
     def write_json(self, document: str) -> None:
-        """Where it was asked for."""
+        """Write ``document`` to the file of --json, if one was given."""
         if self.json is not None:
             self.json.parent.mkdir(parents=True, exist_ok=True)
             write_text(self.json, document)
@@ -134,7 +134,7 @@ class Outputs:
 
 @dataclasses.dataclass(kw_only=True)
 class TaskOptions(Outputs):
-    """What is played."""
+    """Options of ``--task``: what is played, and by which deciders."""
 
     task: Annotated[str, "see below"]
     with_: Annotated[tuple[str, ...], "options of the task", "OPTION=VALUE"] = ()
@@ -155,7 +155,7 @@ class TaskOptions(Outputs):
 
 @dataclasses.dataclass(kw_only=True)
 class EvaluateOptions(Outputs):
-    """What is evaluated."""
+    """Options of an evaluation of postures: methods, policies and datasets."""
 
     checkpoint: Annotated[
         tuple[str, ...], "trained policies; the shipped one", "DIR"

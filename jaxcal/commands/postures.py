@@ -69,7 +69,7 @@ class BoardView:
 
 
 @dataclasses.dataclass
-class Room:
+class RoomOptions:
     """What the arm stays away from."""
 
     floor: Annotated[float | None, "height that no joint is below"] = None
@@ -91,7 +91,7 @@ def postures(
     *,
     k: Annotated[int, "postures to measure in all", "K"],
     view: BoardView,
-    room: Room,
+    room: RoomOptions,
     of_arm: ArmOptions,
     near: Annotated[
         list[list[float]] | None,

@@ -87,7 +87,7 @@ def _read_npz(data: bytes) -> dict[str, Any]:
 def _member(archive: np.lib.npyio.NpzFile, key: str) -> NDArray[Any]:
     try:
         member: NDArray[Any] = archive[key]
-    except Exception as error:  # as above
+    except Exception as error:  # of many kinds, where bytes are damaged
         if isinstance(error, ValueError) and "pickle" in str(error):
             raise ValueError(
                 f'key "{key}" must be an array of numbers; objects (ragged episodes, '

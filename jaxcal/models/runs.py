@@ -86,7 +86,7 @@ class CommandLine:
             raise _RunError(f"standard output: {error}") from None
 
     def content(self) -> bytes:
-        """What its results depend on: the words, and the files that they name."""
+        """Bytes that differ where results may: the words, and the files they name."""
         parts = [*self.words]
         for word in self.words:
             path = pathlib.Path(shutil.which(word) or word)
@@ -352,7 +352,7 @@ class _Cache:
         return found
 
     def write(self, job: Job, rows: list[int], answers: list[Answer | None]) -> None:
-        """What succeeded; a failure may be another one tomorrow."""
+        """Keep the answers of ``rows``; not failures, which may not be so again."""
         commands, parameters = job
         keys = self._keys(commands[rows], parameters)
         self._waiting += [

@@ -47,7 +47,8 @@ class Prior:
     Attributes:
         std: standard deviation in the parameters' units: one number, (p,), or a mapping
             from name to number. ``inf`` and names that are left out: nothing is known.
-        mean: likewise; the model's nominal value where it is left out.
+        mean: one number, (p,), or a mapping from name to number; the model's nominal
+            value where it is left out.
         fixed: names of parameters held at the mean, out of the identification.
         by_data: of an arm, the sizes of the errors are taken from the readings; see
             ``sized``.

@@ -3,9 +3,9 @@
 A criterion phi is a concave function of the information M of all k commands; over
 scenarios, their mean or least is one of the S informations together. With G its
 gradient at M, the slope of phi by one command u is that of ``d(u) = trace(B G B.T)``, B
-the block there. So all commands climb together, from
-several starts; then single ones are moved to where d is largest, and those that must
-stay where ``allowed`` says move by trial.
+the block there. So all commands climb together, from several starts; then single ones
+are moved to where d is largest, and those that must stay where ``allowed`` says move by
+trial.
 
 How good: with M0 and G0 of any weighted design, no k commands are better than
 

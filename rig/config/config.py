@@ -51,7 +51,7 @@ UNMEASURED = (
     "settle.timeout_s", "session.verify_limit_deg",
     "session.reference_tolerance_deg", "session.max_unreachable",
 )  # fmt: skip
-UNMEASURED_OF_AXES = (".comm_timeout_s",)  # likewise, of each axis
+UNMEASURED_OF_AXES = (".comm_timeout_s",)  # of each axis, may change as well
 
 
 def names_of(described: dict[str, Any]) -> tuple[list[str], list[str]]:
@@ -64,7 +64,8 @@ def names_of(described: dict[str, Any]) -> tuple[list[str], list[str]]:
 
 
 def units_of(described: dict[str, Any]) -> tuple[str, str]:
-    """Units of the commands and of what is measured, likewise."""
+    """Units of the commands, and of what is measured, of a configuration as a journal
+    keeps it."""
     kinds = [axis.get("kind", "rotation") for axis in described.get("axes", ())]
     units = dict.fromkeys("mm" if kind == "translation" else "deg" for kind in kinds)
     readings = described.get("readings") or {"unit": "deg"}

@@ -42,7 +42,7 @@ NOISE_DEG = 0.1  # of the phone, just after a move
 ALLOWED_DEG = 9.0  # that the phone may turn from where an unproved device began
 TOO_FAR = 2.0  # times what checked axes are moved, and MARGIN_DEG: more is a fault
 MARGIN_DEG = 1.0
-SAME = 4 / 3, 0.3  # likewise where it is known what `axes` saw, of one axis alone
+SAME = 4 / 3, 0.3  # factor and margin of one axis alone, where `axes` saw its turn
 SEEN_SHARE = 0.1  # of a checked axis's move must be seen, or the moves do not grow
 BLIND = (
     "Nothing was seen of it: look for a loose coupling, a stream that does not "
@@ -99,9 +99,9 @@ def slopes(predict: Callable[[Array], Array], at_deg: Array) -> Array:
 def unit_proved(imu: ImuSettings | ReadingsSettings, attitude: Array) -> bool:
     """Whether a phone's (3, 3) attitude can only have come in the configured unit.
 
-    Of numbers it is whatever it is called. A quaternion has none. A number over 2 pi is
-    no angle in radians. Degrees that are
-    read as radians turn 57.3 times too far, which the first move shows.
+    Numbers of a sensor have the unit that they are given, quaternions have none: both
+    are proved. A number over 2 pi is no angle in radians. Degrees that are read as
+    radians turn 57.3 times too far, which the first move shows.
     """
     if (
         isinstance(imu, ReadingsSettings)

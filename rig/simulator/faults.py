@@ -26,7 +26,7 @@ KINDS = {
     "halted": "another controller quick-stops a drive that moves",
     "sto": "the power stage is off for `seconds` (1.05), without an alarm",
     "stop_ignored": "the drive acknowledges its stop and goes on",
-    "unit_stop_ignored": "likewise, but a broadcast stops it",
+    "unit_stop_ignored": "the drive goes on after its own stop; a broadcast stops it",
     "watch_ignored": "the drive does not act on its communication timeout",
     "stop_resumes": "`seconds` (1) after a stop the drive goes on to its target",
     "fast_drive": "the drive moves `factor` (20) times as fast as told",

@@ -123,7 +123,7 @@ class Several(Sensor):
         return 1.0
 
     def unseen(self, arm: HasNames) -> tuple[str, ...]:
-        """What none of them sees."""
+        """Names of the parameters that no sensor sees."""
         hidden = [set(one.unseen(arm)) for one in self.sensors]
         return tuple(name for name in arm.names if all(name in h for h in hidden))
 

@@ -264,7 +264,7 @@ class Arm:
         return Tip(frame, lambda: self._nominal_rotations(commands), self.length)
 
     def _reading(self, commands: Array, parameters: Array) -> Reading:
-        """What the sensor reads."""
+        """Readings of the sensor, and their derivatives by the tip."""
 
         def find() -> Reading:
             tip = self._tip_at(commands, self._chain(commands, parameters)[0])

@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 _UR = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 _TAG = re.compile(rb"""(?:[^>"']+|"[^"]*"|'[^']*')*>""")
 _SAME = 1e-13  # metres and radians: no correction
-_AGREE = 1e-9  # likewise: the same correction
+_AGREE = 1e-9  # metres and radians: the same correction
 
 
 class _Part(NamedTuple):

@@ -42,12 +42,12 @@ class LossProblem(Problem):
 
     @property
     def rank_one(self) -> bool:
-        """What holds where nothing is lost only."""
+        """False: the kernels of one reading per candidate count no losses."""
         return False
 
     @property
     def simplex(self) -> bool:
-        """What holds where nothing is lost only."""
+        """False: the search for the largest simplex counts no losses."""
         return False
 
     @property

@@ -44,12 +44,12 @@ class ScenarioProblem(Problem):
 
     @property
     def rank_one(self) -> bool:
-        """What holds of one scenario only."""
+        """False: the kernels of one reading per candidate take one scenario."""
         return False
 
     @property
     def simplex(self) -> bool:
-        """What holds of one scenario only."""
+        """False: the search for the largest simplex takes one scenario."""
         return False
 
     def of_size(self, k: int) -> Self:
@@ -100,7 +100,7 @@ class ScenarioProblem(Problem):
 
 
 def fields_of(problem: Problem) -> dict[str, Any]:
-    """What every problem has."""
+    """The fields of a ``Problem`` by name, without those of its subclass."""
     return {f.name: getattr(problem, f.name) for f in dataclasses.fields(Problem)}
 
 

@@ -41,7 +41,7 @@ LETTERS = ("X", "Y", "Z")
 MOUNTING_DEG = 3.0
 # Measured against commanded: what A may take up, and what only a wrong gearing does.
 SOUND_RATIO = (0.4, 1.5)
-# The same where the phone sends radians for degrees, and those are allowed for.
+# Measured against commanded, once radians and degrees are exchanged.
 NEAR_UNIT = (0.3, 2.0)
 UNPROVED_FACTOR = 2.0  # by which a gearing is corrected on the phone's word alone
 BY_PLATE = (
@@ -350,8 +350,7 @@ def require_unit(
 
     Two gearings of the file that agree with the phone prove it (of a single axis the
     one): both would have to be wrong by 57.3. A gearing is corrected only where the
-    unit is proved, so that no
-    phone's radians are taken for a gearbox.
+    unit is proved, so that no phone's radians are taken for a gearbox.
 
     Args:
         config: names the unit.

@@ -61,10 +61,9 @@ def uncertainty(
     """Noise of one recorded mean, and 95 % half-widths of A and b, axis by axis.
 
     One posture more than axes leaves no residual, so the noise is that of a fit of all
-    postures,
-    those held out too: it holds play, slow noise and drift. The parameters' errors are
-    part of those residuals, which makes Student's t a little too wide. Without
-    held-out postures only the scatter of single readings is known, which is too
+    postures, those held out too: it holds play, slow noise and drift. The parameters'
+    errors are part of those residuals, which makes Student's t a little too wide.
+    Without held-out postures only the scatter of single readings is known, which is too
     optimistic where they are correlated; ``basis`` says which it was.
 
     Args:

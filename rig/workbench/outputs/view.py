@@ -68,7 +68,7 @@ def headline(state: RunState, running: bool) -> tuple[str, str]:
 
 
 def progress(state: RunState) -> str:
-    """How far it is."""
+    """Postures done of those planned, and the time that is left, in words."""
     if not state.planned:
         return ""
     left = f", about {state.left_s():.0f} s left" if state.left_s() else ""
