@@ -1,4 +1,4 @@
-"""Is each sensor's calibration of an arm as uncertain as it says? Eight tables more.
+"""Is each sensor's calibration of an arm as uncertain as it says? Ten tables more.
 
     python -m benchmarks.arm_sensors [draws] [NAMES OF TABLES]
 
@@ -510,7 +510,7 @@ def files(draws: int) -> None:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)
                 written = found._for_file()[np.isin(found.names, plain.names)]
-                again = found._again(plain, plain.default_prior())
+                again = found.again(plain, plain.default_prior())
             low, high = np.clip(plain.limits, -180.0, 180.0).T
             anywhere = np.random.default_rng(0).uniform(low, high, (500, len(low)))
             arms = [found.arm, plain.calibrated(written), again.arm]

@@ -120,12 +120,14 @@ def check(
             outputs may drift, in the unit of the first (an output of another noise
             counts in noise). When not given three times the standard deviation of these
             measurements: the noise and what the calibration does not know.
-        placed_anew: of an arm, what its sensor reads (sockets, planes, anchors) stands
-            elsewhere than at the calibration.
+        placed_anew: of an arm, what its sensor reads (sockets, planes, anchors, a
+            board) stands elsewhere than at the calibration. What cannot be told from
+            that, as the first joint's zero, is named (``blind``) and not judged.
 
     Returns:
         "holds", "does not hold", or "cannot be told": a drift of one parameter by more
-        than the tolerance would be seen with less than 80 % probability.
+        than the tolerance would be seen with less than 80 % probability; the next step
+        says about how many rows would tell (``enough``).
     """
     given, measured, _ = recorded(calibration.model, commands, measured)
     commands, measured = _distinct(calibration, given, measured)

@@ -285,28 +285,30 @@ def check(
         "T",
     ] = None,
     placed_anew: Annotated[
-        bool, "of an arm: its sockets, planes or anchors stand elsewhere now"
+        bool, "of an arm: its sockets, planes, anchors or board stand elsewhere now"
     ] = False,
+    radians: Annotated[bool, "of an arm: joint columns are in radians"] = False,
     report: ReportFolder = "",
     json: Annotated[bool, "print JSON"] = False,
 ) -> int:
     """Whether a calibration still holds, by a few new readings.
 
-    The table has the calibration's columns; of an arm a recording does. Exit code 0:
-    it holds; 1: it does not, or that cannot be told from these readings; 2: bad input.
+    The table has the calibration's columns, of contacts no readings; of an arm a
+    recording does. Exit code 0: it holds; 1: it does not, or that cannot be told from
+    these readings; 2: bad input.
     """
     calibrated = Calibration.load(calibration)
     table = recording.table(file, lambda which: calibrated.model)
+    if table is not None and radians:
+        raise ValueError("--radians is of tables, recordings say their unit")
     table = read_table(file) if table is None else table
     inputs, commands = _commands_for(calibrated, table, option="")
-    unit = calibrated.measured_unit
-    outputs = table.named(calibrated.output_names, MEASURED, option="", unit=unit)
-    if both := sorted({*inputs} & {*outputs}):
-        raise ValueError(
-            f"{file}: columns of commands and of readings must differ, both would be "
-            f"{', '.join(both)}; begin their names with {COMMANDS} and {MEASURED}"
-        )
-    measured = table.columns(outputs)
+    if radians:
+        commands = _in_degrees(calibrated, commands)
+    if getattr(getattr(calibrated.model, "sensor", None), "zeros", False):
+        measured = np.zeros((len(commands), calibrated.num_outputs))
+    else:
+        measured = _readings_for(calibrated, table, inputs)
     result = calibrated.check(
         commands, measured, tolerance=tolerance, placed_anew=placed_anew
     )
@@ -339,9 +341,7 @@ def predict(
     table = read_table(file)
     _, commands = _commands_for(calibrated, table, columns)
     if radians:
-        if not isinstance(calibrated.model, SerialChain):
-            raise ValueError("--radians is of arms")
-        commands = in_degrees(calibrated.model, commands)
+        commands = _in_degrees(calibrated, commands)
     calibrated.model.require_commands(commands)
     names, values = calibrated.output_names, calibrated.predict(commands)
     if std:
@@ -395,6 +395,32 @@ def _commands_for(
         unit=calibration.command_unit,
     )
     return names, table.columns(names)
+
+
+def _in_degrees(calibration: Calibration, commands: Array) -> Array:
+    """Commands (N, n) of an arm whose joint columns are in radians."""
+    if not isinstance(calibration.model, SerialChain):
+        raise ValueError("--radians is of arms")
+    return in_degrees(calibration.model, commands)
+
+
+def _readings_for(
+    calibration: Calibration, table: CsvTable, inputs: Sequence[str]
+) -> Array:
+    """(N, m) the readings of a calibration in a table, beside columns ``inputs``."""
+    outputs = table.named(
+        calibration.output_names,
+        MEASURED,
+        option="",
+        unit=calibration.measured_unit,
+    )
+    if both := sorted({*inputs} & {*outputs}):
+        raise ValueError(
+            f"{table.source}: columns of commands and of readings must differ, both "
+            f"would be {', '.join(both)}; begin their names with {COMMANDS} and "
+            f"{MEASURED}"
+        )
+    return table.columns(outputs)
 
 
 def _emit(output: Output, names: Sequence[str], values: Array) -> None:

@@ -123,8 +123,12 @@ def test_predictions_take_the_columns_of_the_fit(files, capsys):
     assert main(["predict", saved, str(files[1]), "--radians"]) == 0
     off = np.loadtxt(capsys.readouterr().out.splitlines()[1:], delimiter=",")
     assert np.abs(off).max() < 0.002  # of contacts: zeros
-    assert main(["predict", saved, str(files[1])]) == 2
-    assert "which look like radians" in capsys.readouterr().err
+    for command in ("predict", "check"):
+        assert main([command, saved, str(files[1])]) == 2
+        assert "which look like radians" in capsys.readouterr().err
+    # Contacts have no columns of readings.
+    assert main(["check", saved, str(files[1]), "--radians"]) in (0, 1)
+    assert "does not hold" not in capsys.readouterr().out
 
 
 def test_joints_are_locked_and_have_other_limits(files, capsys):
@@ -259,6 +263,8 @@ def test_a_recording_is_identified_and_checked_in_the_shell(files, capsys):
     assert "mass" in capsys.readouterr().out
     assert main(["check", saved, str(folder / "bag")]) == 0
     assert "holds" in capsys.readouterr().out
+    assert main(["check", saved, str(folder / "bag"), "--radians"]) == 2
+    assert "recordings say their unit" in capsys.readouterr().err
     for more, message in (
         (["--radians"], "recordings say their unit"),
         (["--topic", "/none"], "got none of topic /none"),

@@ -259,8 +259,8 @@ class SerialChain(Arm, Model):
 
         Within the limits (180 degrees where a file has none), two degrees apart at
         least, with the ball in the socket, the probe on the plane or the board in view
-        (from either side: which one is printed is not known): inverse kinematics from
-        random starts, so a redundant arm's self-motions are among them.
+        (without ``camera`` from either side): inverse kinematics from random starts, so
+        a redundant arm's self-motions are among them.
 
         Args:
             count: how many.
@@ -907,8 +907,8 @@ class SerialChain(Arm, Model):
     def default_prior(self) -> Prior:
         """Loose knowledge of any arm, by the length of its links; see the constants.
 
-        What the sensor cannot see is held; of contacts and positions the scales of
-        the groups are taken from the readings (``Prior.sized``).
+        What the sensor cannot see is held; the scales of the groups are taken from the
+        readings (``Prior.sized``).
         """
         length = self.length or np.inf  # axes of unknown stroke alone
         joint = [_LENGTH * length, _TWIST, _LENGTH * length, _ZERO, _TWIST]

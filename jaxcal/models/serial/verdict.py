@@ -53,7 +53,8 @@ class ArmVerdict(models.Verdict):
 
     Good: held-out errors are below the accuracy asked for. Where none was, it is better
     than the nominal machine, and the noise explains the scatter or what is left is a
-    third of the nominal error. In either case no reading contradicts the others.
+    third of the nominal error. In either case no reading contradicts the others or the
+    arm's description, and contacts do not leave its size open.
     """
 
     # None where there are too few measurements to tell.
@@ -100,8 +101,8 @@ def verdict(calibration: Fit) -> ArmVerdict:
 
     Held-out errors with an interval beside those of the nominal arm, the scatter
     against the sensor's usual noise, and by name: outliers, contacts of another socket,
-    a socket that was moved, joints reversed or exchanged, parameters far from what was
-    known.
+    a socket that was moved, a distance that contacts contradict, joints reversed or
+    exchanged, parameters far from what was known.
     """
     model, unit = calibration.model, calibration.measured_unit
     if calibration.noise_std is None:
