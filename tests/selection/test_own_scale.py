@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import pathlib
-import shutil
-import subprocess
-import sys
 import time
 
 import exactly
@@ -18,8 +13,6 @@ from hypothesis import strategies as st
 import jaxcal
 from jaxcal import Noise
 from jaxcal.models import Polynomial
-
-EXTREMES = pathlib.Path(__file__).parent / "extremes.py"
 
 
 def asked(name):
@@ -165,24 +158,6 @@ def test_what_double_precision_cannot_hold_is_refused_by_name(name):
     with pytest.raises(ValueError, match=f"criterion {name} must be a number in doub"):
         jaxcal.select(u, criterion=name)
     assert jaxcal.select(u).proven
-
-
-@pytest.mark.slow  # two minutes
-def test_no_kernel_writes_outside_its_arrays():
-    tool = shutil.which("valgrind")
-    if tool is None:
-        pytest.skip("valgrind is not there")
-    done = subprocess.run(
-        [tool, "--undef-value-errors=no", "--quiet",
-         sys.executable, str(EXTREMES)],
-        env={**os.environ, "PYTHONMALLOC": "malloc", "OPENBLAS_NUM_THREADS": "1"},
-        capture_output=True, text=True, timeout=1800, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-3000:]
-    # Of the dynamic loader it says what is not so.
-    wrong = [part for part in done.stderr.split("== \n") if "kernel.cpython" in part]
-    assert not wrong, wrong[0]
-    assert done.stdout.endswith("end\n")
 
 
 def test_what_is_left_without_each_measurement_is_told(rng):
