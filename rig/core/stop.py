@@ -139,9 +139,9 @@ def stay(drives: list[Drive], results: list[UnitStop], seconds: float) -> list[s
         for drive, result in standing:
             with contextlib.suppress(Exception), drive.line.urgent():
                 drive.hold(result.position or 0)
-        again, standing_on = _restarted(standing, time.monotonic() + seconds)
+        again, stood = _restarted(standing, time.monotonic() + seconds)
         if not again:
-            for result in standing_on:
+            for result in stood:
                 result.stayed = True
             break
         words += [f"{result.axis} went on by itself after its stop" for result in again]
@@ -153,21 +153,21 @@ def stay(drives: list[Drive], results: list[UnitStop], seconds: float) -> list[s
 def _restarted(pairs: Pairs, end: float) -> tuple[list[UnitStop], list[UnitStop]]:
     """Drives that stood and move again before a time; and, where none does, those that
     were seen to stand at its end."""
-    standing_on: list[UnitStop] = []
+    stood: list[UnitStop] = []
     while time.monotonic() < end:
         time.sleep(LOOK_S)
         moved: list[UnitStop] = []
-        standing_on = []
+        stood = []
         for drive, result in pairs:
             with contextlib.suppress(Exception), drive.line.urgent():
                 status = drive.steady()
                 powered = status.enabled and not status.fault
                 way = abs(status.position - (result.position or 0))
                 went_on = powered and (status.moving or way > STILL_COUNTS)
-                (moved if went_on else standing_on).append(result)
+                (moved if went_on else stood).append(result)
         if moved:
             return moved, []
-    return [], standing_on
+    return [], stood
 
 
 def stand_s(drives: list[Drive]) -> float:

@@ -14,7 +14,7 @@ from typing import Any
 from rig.config.axis import Axis
 from rig.config.maps import DriveMap
 from rig.config.settings import BusSettings
-from rig.drives.drive import WRITTEN, Drive
+from rig.drives.drive import ABSTRACT, Drive
 from rig.drives.line import Line
 from rig.faults import Refused
 
@@ -61,7 +61,7 @@ def _require_drive(drive_type: Any) -> None:
     if not isinstance(line_type, type) or not issubclass(line_type, Line):
         raise TypeError(f"{name}.line_type must be a subclass of rig.drives.Line")
     for kind, base, methods in (
-        (drive_type, Drive, WRITTEN),
+        (drive_type, Drive, ABSTRACT),
         (line_type, Line, ("connect", "close")),
     ):
         for method in methods:

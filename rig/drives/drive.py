@@ -23,7 +23,8 @@ STILL_COUNTS = 2  # between two readings of a position that flickers by one coun
 LOOKS = 4  # for two readings that agree
 HOME = 2**30  # a count that no drive shows when it is switched on
 
-WRITTEN = ("ids", "arm", "position", "move", "standing", "stop", "alarm")  # by a kind
+# Methods that every kind of drive defines.
+ABSTRACT = ("ids", "arm", "position", "move", "standing", "stop", "alarm")
 _OWN = "every kind of drive defines this itself; Drive only declares it"
 _WATCH = "a drive that watches its line defines this itself"
 
