@@ -28,7 +28,7 @@ _DRAWS = 10  # random choices that a plan is compared with
 
 
 @dataclasses.dataclass
-class BoardView:
+class ViewOptions:
     """A board, and how a camera sees it."""
 
     camera: Annotated[
@@ -56,7 +56,7 @@ class BoardView:
         ["+z", "-z"],
     ] = None
 
-    def of(self, arm: SerialChain) -> SerialChain:
+    def with_board(self, arm: SerialChain) -> SerialChain:
         """The arm whose board is of this width and height, if they are given."""
         if self.board is None:
             return arm
@@ -90,7 +90,7 @@ def postures(
     model: Annotated[str, "the arm's .urdf"],
     *,
     k: Annotated[int, "postures to measure in all", "K"],
-    view: BoardView,
+    view: ViewOptions,
     room: RoomOptions,
     of_arm: ArmOptions,
     near: Annotated[
@@ -136,7 +136,7 @@ def postures(
     if more < 1:
         reason = f"-k must be more than the {k - more} that were reached"
         raise ValueError(f"{reason}, got {k}")
-    arm = view.of(arm)
+    arm = view.with_board(arm)
     offered = arm.postures(
         count,
         seed=seed,
