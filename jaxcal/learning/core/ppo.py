@@ -374,8 +374,8 @@ def make_update(
                 return _Measured(vector, tuple(sorted(metrics)))
 
             total = mean_over(gradient, rows, index, size, mesh)
-            some = len(total.names)
-            grads, metrics = total.vector[:-some], total.vector[-some:]
+            named = total.vector.size - len(total.names)
+            grads, metrics = total.vector[:named], total.vector[named:]
             state, norm = descend(ppo, state, grads)
             names = *total.names, "grad_norm"
             return state, _Measured(jnp.append(metrics, norm), names)
