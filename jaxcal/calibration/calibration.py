@@ -191,7 +191,12 @@ class Calibration(Fit):
         return steps
 
     def again(self, model: Any, prior: Prior | None) -> Calibration:
-        """The calibration of the same readings by another model of the machine."""
+        """The calibration of the same readings by another model of the machine.
+
+        Args:
+            model: it, of the same commands and readings.
+            prior: of its parameters; that which ``identify`` takes when None.
+        """
         fields = fit_model(
             self.commands,
             self.residuals + self.predict(self.commands),

@@ -35,7 +35,7 @@ _SPARSE = 12  # measurements: so few have no outlier that is scatter
 _LITTLE = 1.0 / 3.0  # of the nominal error: so little left is worth having anyway
 _APART = 3.5  # standard deviations between a distance and what contacts say of it
 _ALONE = 1e-4  # of what is known of a distance: nothing but that it was given
-_SHORT = 5e-4  # of the arm's length: what no parameter explains moves a distance so
+_SHORT = 5e-4  # of the arm's length: what no parameter explains moves distances by less
 _WRONG = 1e-3  # of the arm's length: a distance further off was measured wrongly
 _STILL = 8  # measurements in which a joint that is used has moved
 _VAGUE = 3.0  # times the nominal error: contacts leave the arm's size open
@@ -207,13 +207,13 @@ def _findings(
 def _of_no_size(
     findings: _Findings, calibration: Fit, anywhere: float, nominal: float
 ) -> _Findings:
-    """Findings with that contacts without a known distance leave the arm's size open.
+    """The findings, and that contacts leave the arm's size open, where they do.
 
     An arm a tenth smaller, its sockets nearer together, touches them as well.
     """
     sensor, unit = calibration.model.sensor, _in(calibration)
     sized = not isinstance(sensor, Socket) or len(sensor.distances)
-    if sized or not anywhere > _VAGUE * nominal:
+    if findings.mistaken or sized or not anywhere > _VAGUE * nominal:
         return findings
     reason = (
         f"contacts without a known distance leave the arm's size open: elsewhere its "
@@ -366,8 +366,8 @@ def _far(calibration: Fit) -> list[str]:
 def _other_tip(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
     """A tip far from where the arm's description has it, and whether that is in doubt.
 
-    It is where it is farther than the prior allowed. Else the description is wrong, or
-    is of another tool, and what the readings leave unknown of it is in the intervals.
+    In doubt is one that is farther off than the prior allowed. Else the description is
+    wrong, or of another tool, and what the readings leave unknown is in the intervals.
     """
     if not model.sensor.zeros:
         return [], False
@@ -429,10 +429,11 @@ def _freed(calibration: Fit, model: Chain, row: int) -> tuple[float, float]:
     rest = [one for one, kept in zip(sensor.distances, touched, strict=True) if kept]
     free = model.measured_with(dataclasses.replace(sensor, distances=rest))
     fit = calibration.again(free, None)
-    off, rows = model.facts(fit.parameters[: len(model.names)])
-    p = rows.shape[1]
+    off, rows = model.facts(fit.parameters)
     _, _, distance, std = sensor.distances[row]
-    variance = rows[row] @ np.asarray(fit.covariance)[:p, :p] @ rows[row]
+    if fit.covariance is None:  # too few readings to tell the noise without it
+        return distance, np.inf
+    variance = rows[row] @ fit.covariance @ rows[row]
     return distance - std * off[row], std * float(np.sqrt(variance))
 
 
