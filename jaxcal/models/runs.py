@@ -209,11 +209,14 @@ class Runs:
                 yield (j, rows), _answer(self.f, self.batch, commands[rows], parameters)
             return
         try:
-            broken = []
-            futures = {
-                self._submit(jobs[j][0][rows], jobs[j][1]): (j, rows)
-                for j, rows in pieces
-            }
+            broken, futures = [], {}
+            for j, rows in pieces:
+                try:
+                    future = self._submit(jobs[j][0][rows], jobs[j][1])
+                except BrokenProcessPool:  # by a run of an earlier piece
+                    broken.append((j, rows))
+                else:
+                    futures[future] = (j, rows)
             for future in concurrent.futures.as_completed(futures):
                 try:
                     yield futures[future], future.result()

@@ -1,7 +1,9 @@
 """FromFunction: derivatives against those by hand and by JAX, runs, failures, files."""
 
+import concurrent.futures
 import importlib
 import sys
+from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 import pytest
@@ -116,6 +118,27 @@ def test_processes_agree_and_a_run_that_ends_one_is_named(tmp_path, monkeypatch)
     parallel.close()
     with pytest.raises(ValueError, match="f must be a function at the top of a module"):
         model(lambda u, t: decay(u, t), processes=2)
+
+
+@pytest.mark.slow
+def test_a_run_may_end_its_process_before_all_are_handed_over(tmp_path, monkeypatch):
+    (tmp_path / "ends_its_process.py").write_text(ENDS)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    f = importlib.import_module("ends_its_process").f
+    submit = ProcessPoolExecutor.submit
+
+    def waited_for(pool, *args):
+        future = submit(pool, *args)
+        concurrent.futures.wait([future])
+        return future
+
+    monkeypatch.setattr(ProcessPoolExecutor, "submit", waited_for)
+    parallel = FromFunction(f, [2.0], processes=2, quiet=True)
+    rows = U[[6, 0, 3, 8]]
+    with pytest.warns(UserWarning, match=r"for 0 \(its process ended\)"):
+        design = jaxcal.Design(rows, parallel)
+    assert design.available.tolist() == [False, True, True, True]
+    parallel.close()
 
 
 CALLS = []
