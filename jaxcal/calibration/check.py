@@ -148,9 +148,8 @@ def check(
     judged = free & np.isfinite(change)
     hidden = judged & (size > change)
     squares = change[judged] ** 2
-    power = tests.power(
-        squares[:, None] * signal[judged], squares * along[judged]
-    ).mean()
+    powers = tests.power(squares[:, None] * signal[judged], squares * along[judged])
+    power = powers.mean() if judged.any() else free.any()  # nothing drifts so far
     # What is seen grows with the root of the rows.
     enough = len(commands) * float((size[hidden] / change[hidden]).max(initial=0)) ** 2
     slipped = ""
@@ -162,7 +161,7 @@ def check(
     if p_value < _ALARMS:
         says = "does not hold"
     else:
-        says = "cannot be told" if hidden.any() else "holds"
+        says = "cannot be told" if hidden.any() or not free.any() else "holds"
     sensor = getattr(calibration.model, "sensor", None)
     return Check(
         says=says,
@@ -220,16 +219,28 @@ def _deviations(
         if not calibration.model.placed:
             raise ValueError("placed_anew is of an arm whose sensor stands somewhere")
         placed = np.isin(names, calibration.model.placed)  # which says nothing now
-        before = np.linalg.norm(by, axis=0)
         white, by = without(by[:, placed], white, by)
         level, free = np.zeros(len(white), dtype=np.intp), free & ~placed
-        blind = free & (np.linalg.norm(by, axis=0) < _BLIND * before)
+        blind = free & _taken_up(calibration, placed)
         free &= ~blind
     if not len(white):
         raise ValueError("measured must hold a reading beside what was placed anew")
     return _Deviations(
         white, by, level == np.unique(level)[:, None], free, blind, least
     )
+
+
+def _taken_up(calibration: Fit, placed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(p,) parameters that do nothing but what moving the ``placed`` (p,) ones does.
+
+    At the calibration's postures: at a few that are alike any parameter would be one.
+    """
+    by = np.asarray(
+        calibration.model.jacobian(calibration.commands, calibration.parameters)
+    )
+    by = (by / np.asarray(calibration.noise_std)[:, None]).reshape(-1, by.shape[-1])
+    remainder = by - by[:, placed] @ np.linalg.lstsq(by[:, placed], by)[0]
+    return np.linalg.norm(remainder, axis=0) < _BLIND * np.linalg.norm(by, axis=0)
 
 
 def _distinct(
