@@ -213,7 +213,7 @@ class Runs:
             for j, rows in pieces:
                 try:
                     future = self._submit(jobs[j][0][rows], jobs[j][1])
-                except BrokenProcessPool:  # by a run of an earlier piece
+                except BrokenProcessPool:  # a run of an earlier piece ended its process
                     broken.append((j, rows))
                 else:
                     futures[future] = (j, rows)

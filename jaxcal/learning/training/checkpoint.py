@@ -294,7 +294,7 @@ def restore(
         raise CheckpointError(
             f"checkpoint {path} holds a policy but no training state to resume from"
         )
-    what = "resumed: its training state is damaged or of an earlier jaxcal"
+    what = "resumed: its training state is damaged or was saved by an earlier jaxcal"
     average = _read(path / "policy", fresh.average, what)
     rest = _read(path / "state", _rest(fresh), what)
 

@@ -140,7 +140,7 @@ def _require_lessons(
     teacher: imitation.Teacher | None,
     imitated: int,
 ) -> None:
-    """Refuse a training in which nobody teaches, or nothing is left to learn."""
+    """Refuse imitation without a teacher, and a task that leaves nothing to learn."""
     if teacher is None and imitated:
         raise ValueError(
             f"teacher must be given for the {imitated} updates that imitate, got None"
