@@ -35,7 +35,6 @@ from jaxcal.information.singular import (
 
 __all__ = [
     "WhiteBlocks",
-    "coarseness",
     "gram",
     "largest_rank",
     "missing_directions",
@@ -297,23 +296,15 @@ def largest_rank(blocks: Array) -> int:
 
 
 def missing_directions(
-    blocks: Array, root: Array, coarse: float = 1.0, computed: bool = False
+    blocks: Array, root: Array, computed: bool = False
 ) -> list[Array]:
     """Directions (p,) that neither blocks (N, q, p) nor the prior say anything of."""
     centred = _centred(blocks[None], None, root)
-    null = null_directions(centred.rows[0], coarse * centred.largest[0], computed)
+    null = null_directions(centred.rows[0], centred.largest[0], computed)
     if centred.scale is None:
         return null
     back = centred.scale[0].min() / centred.scale[0]
     return [direction * back for direction in null]
-
-
-def coarseness(array: object) -> float:
-    """How many times coarser than float64 the numbers of an array are."""
-    kind = getattr(array, "dtype", np.asarray(array).dtype)
-    if isinstance(kind, np.dtype) and kind.kind == "f":
-        return max(1.0, float(np.finfo(kind).eps) / _EPS)
-    return 1.0
 
 
 class WhiteBlocks(NamedTuple):
@@ -340,12 +331,7 @@ class WhiteBlocks(NamedTuple):
 
 
 def whiten(
-    blocks: Array,
-    usable: Mask,
-    root: Array,
-    *,
-    coarse: float = 1.0,
-    computed: bool = False,
+    blocks: Array, usable: Mask, root: Array, *, computed: bool = False
 ) -> list[WhiteBlocks | None]:
     """Blocks in coordinates where everything measured at once has information I.
 
@@ -360,8 +346,6 @@ def whiten(
         blocks: (S, M, q, p) of S sets, zero where not usable.
         usable: (S, M) which count.
         root: (r, p) of the prior precision.
-        coarse: how many times coarser than float64 the numbers are, for the rule of
-            what is singular.
         computed: the blocks are rounded themselves, as a model's derivatives are.
 
     Returns:
@@ -369,7 +353,7 @@ def whiten(
     """
     sets, num, q, p = blocks.shape
     centred = _centred(blocks, usable, root, look=True)
-    rows, largest, scale = centred.rows, coarse * centred.largest, centred.scale
+    rows, largest, scale = centred.rows, centred.largest, centred.scale
     far = centred.far
     inverse, back, log_det, good = _cholesky_factors(rows, largest, far)
     white = _times(rows, inverse)

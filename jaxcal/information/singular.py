@@ -206,7 +206,6 @@ def require_excited(
     names: tuple[str, ...],
     argument: str = "commands",
     which: str = "postures",
-    coarse: float = 1.0,
 ) -> None:
     """Refuse commands (N, n) that leave a direction unexcited, and name it.
 
@@ -215,12 +214,11 @@ def require_excited(
         names: n names of the axes.
         argument, which: what the message calls the commands: "candidates must vary in
             every direction, but the 5 available ones lie in one plane ...".
-        coarse: how many times coarser than float64 the numbers are.
     """
     count, n = commands.shape
     offset = commands - commands.sum(axis=0) / count if count else commands
     largest = np.abs(commands).max(axis=0, initial=0.0)
-    null = null_directions(offset, coarse * largest)
+    null = null_directions(offset, largest)
     if count >= n + 1 and not null:
         return
     never = directions_in_words("the direction{} never excited: ", null, names)

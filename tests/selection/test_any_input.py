@@ -13,9 +13,12 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from questions import of
 
 import jaxcal
+from jaxcal.selection.batch import exact_batch
 from jaxcal.selection.criteria import CRITERIA
 
 LIMIT = 20.0  # seconds of a call
@@ -344,10 +347,37 @@ def test_blocks_that_say_nothing_are_fine_with_a_prior(worker, name):
     assert answer.efficiency == 1.0
 
 
-def test_float32_candidates_in_a_plane_are_refused():
-    u = np.random.default_rng(1).random((40, 3)).astype(np.float32)
-    u[:, 2] = u[:, 0] + u[:, 1]
+@st.composite
+def float32_tables(draw, dependent):
+    """(M, 3) of float32, near 0 or far from it; the third a sum of two in float32."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    far = draw(st.sampled_from([0.0, 0.1, 30.0, 1e3]))
+    size = 10.0 ** draw(st.integers(-6, 6))
+    u = (size * (far + rng.random((draw(st.integers(5, 100)), 3)))).astype(np.float32)
+    if dependent:
+        a, b = rng.normal(size=2).astype(np.float32)
+        u[:, 2] = a * u[:, 0] + b * u[:, 1]
+    return u
+
+
+@given(float32_tables(dependent=True))
+def test_float32_candidates_in_a_plane_are_refused(u):
     with pytest.raises(ValueError, match="in one plane"):
         jaxcal.select(u, 4)
-    u[:, 2] += np.random.default_rng(2).random(40).astype(np.float32)
-    assert jaxcal.select(u, 4).proven
+    with pytest.raises(ValueError, match="in one plane"):
+        exact_batch(np.stack([u, u]), 4)
+    with pytest.raises(ValueError, match=r"never excited|nothing of the direction"):
+        jaxcal.Design(u, measured=u[:3]).select(4)
+    rows = u[:, None, :]
+    with pytest.raises(ValueError, match="nothing of the direction"):
+        jaxcal.Design.from_blocks(rows, measured=rows[:2]).select(3)
+    with pytest.raises(ValueError, match="nothing of the direction"):
+        jaxcal.Design.from_blocks(np.stack([rows, rows])).select(3)
+    assert len(jaxcal.Design.from_blocks(rows, prior=np.eye(3)).select(3).indices) == 3
+
+
+@given(float32_tables(dependent=False))
+def test_float32_candidates_are_the_numbers_that_they_hold(u):
+    answer, exact = jaxcal.select(u, 4), jaxcal.select(u.astype(np.float64), 4)
+    assert answer.log_det == exact.log_det
+    assert np.array_equal(answer.indices, exact.indices)

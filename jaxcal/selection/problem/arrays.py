@@ -9,12 +9,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, require_finite
 
-__all__ = ["check_available", "filled", "one_array", "usable_numbers"]
+__all__ = [
+    "check_available",
+    "filled",
+    "flatten_rounding",
+    "one_array",
+    "usable_numbers",
+]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _FILLED = ", none of them 0"
+_ROUNDED = 4.0  # units in the last place that short sums of rounded numbers are off by
 _NUMBERS = 2**21  # of 8 bytes; beyond 32 MiB glibc no longer follows
 
 
@@ -52,6 +59,47 @@ def usable_numbers(name: str, array: Array, mask: Mask) -> Array:
         own[hidden] = 0.0
         require_finite(name, own)
     return own
+
+
+def flatten_rounding(
+    given: ArrayLike,
+    usable: Mask,
+    candidates: Array,
+    measured: Array | None = None,
+    *,
+    bias: bool = False,
+) -> None:
+    """Put rows that lie in a plane but for rounding to float32 into it, in place.
+
+    In double precision that rounding would pass for information: of a third column that
+    is the sum of two others in float32 a design would be made, and proven. Numbers
+    given in double precision stay as they are.
+
+    Args:
+        given: the candidates as the caller gave them, whose type tells the rounding.
+        usable: (M,) which of them count.
+        candidates: (M, ..., p) of them in double precision.
+        measured: (N, ..., p) rows known beforehand, in the same plane or in none.
+        bias: a column of ones stands beside them, so the plane need not pass through 0.
+    """
+    kind, p = np.asarray(given).dtype, candidates.shape[-1]
+    if kind.kind != "f" or kind.itemsize >= candidates.itemsize:
+        return
+    rows = candidates[usable].reshape(-1, p)
+    count = len(rows)
+    if measured is not None and measured.shape[1:] == candidates.shape[1:]:
+        rows = np.concatenate([rows, measured.reshape(-1, p)])
+    middle = rows.mean(axis=0) if bias and count else np.zeros(p)
+    largest = np.abs(rows).max(axis=0, initial=0.0)
+    scale = np.where(largest > 0.0, largest, 1.0)
+    left, size, right = np.linalg.svd((rows - middle) / scale, full_matrices=False)
+    rounding = _ROUNDED * np.finfo(kind).eps * np.sqrt(rows.size)
+    if size.min(initial=np.inf) > rounding:
+        return
+    flat = middle + (left * np.where(size > rounding, size, 0.0)) @ right * scale
+    candidates[usable] = flat[:count].reshape(-1, *candidates.shape[1:])
+    if measured is not None and len(flat) > count:
+        measured[...] = flat[count:].reshape(measured.shape)
 
 
 def check_available(available: ArrayLike | None, shape: tuple[int, ...]) -> Mask:

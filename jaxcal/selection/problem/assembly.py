@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import axis_names, require_none, whole_number
 from jaxcal.information.blocks import (
     WhiteBlocks,
-    coarseness,
     largest_rank,
     missing_directions,
     rank_of_blocks,
@@ -39,6 +38,7 @@ from jaxcal.selection.criteria import (
 from jaxcal.selection.problem.arrays import (
     check_available,
     filled,
+    flatten_rounding,
     one_array,
     usable_numbers,
 )
@@ -130,9 +130,8 @@ def _problem_of_one(
     region = None if where is None else blocks.at("region", where, readings=False)
     return _checked_problem(
         raw, root, criterion, k, offer.available, offer.required,
-        offer.max_replicates, coarse=offer.coarse, names=blocks.names,
-        times=blocks.times, region=region, candidates=offer.candidates,
-        model=offer.model,
+        offer.max_replicates, names=blocks.names, times=blocks.times, region=region,
+        candidates=offer.candidates, model=offer.model,
     )  # fmt: skip
 
 
@@ -167,16 +166,18 @@ def make_problems(
     array = filled("candidates", candidates, "B", "M", "n")
     mask = check_available(available, array.shape[:2])
     array = usable_numbers("candidates", array, mask)
+    for usable, commands in zip(mask, array, strict=True):
+        flatten_rounding(candidates, usable, commands, bias=True)
     array.flags.writeable = False  # and so of every set
     m = array.shape[2] if num_outputs is None else num_outputs
     model = Affine(array.shape[2], whole_number("num_outputs", m, 1))
     forced = None if required is None else one_array("required", required)
     if forced is not None and (forced.ndim != 2 or len(forced) != len(array)):
         raise ValueError(f"required must have shape (B, r), got {forced.shape}")
-    raw, coarse = model.blocks(array), coarseness(candidates)
+    raw = model.blocks(array)
     raw.flags.writeable = mask.flags.writeable = False
     root, criterion = np.zeros((0, model.num_inputs + 1)), CRITERIA["D"]()
-    white = whiten(raw, mask, root, coarse=coarse)
+    white = whiten(raw, mask, root)
     k = _check_k(k, raw[0], mask[0], root, regressors=True)  # of no one set
     problems = []
     for b in range(len(array)):
@@ -184,8 +185,7 @@ def make_problems(
             problems.append(_checked_problem(
                 raw[b], root, criterion, k, mask[b],
                 None if forced is None else forced[b], max_replicates,
-                white=white[b], coarse=coarse, times=m, candidates=array[b],
-                model=model,
+                white=white[b], times=m, candidates=array[b], model=model,
             ))  # fmt: skip
         except ValueError as error:
             raise ValueError(f"in set {b}: {error}") from None
@@ -202,7 +202,6 @@ def _checked_problem(
     max_replicates: int,
     *,
     white: WhiteBlocks | None = None,
-    coarse: float = 1.0,
     names: tuple[str, ...] = (),
     times: int = 1,
     region: Array | None = None,
@@ -218,7 +217,6 @@ def _checked_problem(
         k, required, max_replicates: what may be chosen, as asked for.
         available: (M,), checked.
         white: the blocks whitened, where they are already.
-        coarse: how many times coarser than float64 the numbers given are.
         names: (p,) of the parameters; empty where the blocks are [u, 1].
         times: how often log det and trace count.
         region: (R, q, p) blocks that the criterion is about, if it is of a region.
@@ -232,18 +230,16 @@ def _checked_problem(
     cap = whole_number("max_replicates", max_replicates, 1)
     forced = _check_counts(available, k, required, cap)
     computed = bool(names) and model is not None
-    if computed:  # a derivative is as exact as its own numbers
-        coarse = 1.0
     if white is None:
         sets = raw[None], available[None]
-        white = whiten(*sets, root, coarse=coarse, computed=computed)[0]
+        white = whiten(*sets, root, computed=computed)[0]
     if white is None:
         if not names and candidates is not None:
             names = (*axis_names("names", None, "u", candidates.shape[1]), "the bias")
             if not len(root):
                 about = "candidates", "available ones"
-                require_excited(candidates[available], names[:-1], *about, coarse)
-        raise _uninformed(raw[available], root, coarse, computed, names)
+                require_excited(candidates[available], names[:-1], *about)
+        raise _uninformed(raw[available], root, computed, names)
     at = Coordinates(white, names, count, region, times)
     problem = Problem(
         white, k, available, forced, cap, criterion.within(at), times, raw, readings,
@@ -257,10 +253,10 @@ def _checked_problem(
 
 
 def _uninformed(
-    blocks: Array, root: Array, coarse: float, computed: bool, names: tuple[str, ...]
+    blocks: Array, root: Array, computed: bool, names: tuple[str, ...]
 ) -> ValueError:
     """The refusal of blocks (N, q, p): directions that they and the root leave open."""
-    null = missing_directions(blocks, root, coarse, computed)
+    null = missing_directions(blocks, root, computed)
     return ValueError(
         "blocks must inform every parameter, but the available ones"
         + (" and what is known" if len(root) else "")

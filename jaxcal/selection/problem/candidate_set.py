@@ -15,11 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, numbers, require_kind, whole_number
 from jaxcal.csvtable import COMMANDS, names_of, of_frame
-from jaxcal.information.blocks import coarseness
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, answered, as_model, by_name
 from jaxcal.models.uncertainty import Noise, Prior
-from jaxcal.selection.problem.arrays import check_available, filled, usable_numbers
+from jaxcal.selection.problem.arrays import (
+    check_available,
+    filled,
+    flatten_rounding,
+    usable_numbers,
+)
 from jaxcal.selection.problem.losses import checked_reliability
 from jaxcal.selection.problem.scenarios import Scenarios, checked_weights, scenarios_of
 
@@ -50,7 +54,6 @@ class CandidateSet:
     axes: tuple[str, ...] | None = None  # (n,) of the inputs, the caller's own
     scenarios: Scenarios | None = None  # None: the nominal alone
     parameters: Array | None = None  # (p,) of one scenario; None: the nominal's
-    coarse: float = 1.0  # how many times coarser than float64 the numbers given are
 
     def __post_init__(self) -> None:
         require_kind("noise", self.noise, Noise)
@@ -109,9 +112,13 @@ class CandidateSet:
             max_replicates=max_replicates,
             names=labels,
             axes=axes,
-            coarse=coarseness(candidates),
             **losses,
         )
+        if model.multiplicity:  # another's derivatives are computed from the commands
+            assert made.candidates is not None
+            flatten_rounding(
+                candidates, mask, made.candidates, made.measured, bias=True
+            )
         if scenarios is not None:
             made.scenarios = scenarios_of(scenarios, model, prior)
         made._leave_unanswered(model)
@@ -180,7 +187,6 @@ class CandidateSet:
             names=labels,
             axes=axes,
             scenarios=scenarios,
-            coarse=coarseness(blocks),
             **rules,
         )
         seen = made.measured
@@ -189,6 +195,11 @@ class CandidateSet:
                 "measured must have shape (S, N, q, p), blocks of every scenario, got "
                 f"{seen.shape}"
             )
+        for s in range(array.shape[1] if array.ndim == 4 else 0):
+            of_one = None if seen is None else seen[s]
+            flatten_rounding(blocks, mask, array[:, s], of_one)
+        if array.ndim == 3:
+            flatten_rounding(blocks, mask, array, seen)
         return made
 
     @property
