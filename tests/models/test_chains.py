@@ -292,5 +292,15 @@ def test_hands_may_touch_sockets_that_the_other_does_not():
     commands, measured = pair.together(given)
     prepared = pair.prepared(commands, measured)  # as identify begins
     assert [one.sensor.distances for one in prepared.chains] == [sensor.distances] * 2
+    unplaced = Socket(3, distances=sensor.distances)
+    arms = {
+        n: c.measured_with(unplaced)
+        for n, c in zip(pair.tips, pair.chains, strict=True)
+    }
+    for one in Chains.of(arms).prepared(commands, measured).chains:
+        np.testing.assert_allclose(one.sensor.places, places, atol=1e-3)
     with pytest.raises(ValueError, match="contacts of socket 2, whose distance"):
         arm.prepared(given["one"][0], np.zeros((len(given["one"][0]), 3)))
+    which = commands[:, pair.inputs.index("socket")]
+    with pytest.raises(ValueError, match="contacts of socket 2, whose distance"):
+        pair.prepared(commands[which != 2.0], measured[which != 2.0])

@@ -17,6 +17,7 @@ from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
 from jaxcal.models.sensors import Sensor, Socket
 from jaxcal.models.sensors.sensor import BASE, label
 from jaxcal.models.serial.chain import SerialChain
+from jaxcal.models.serial.plausible import require_touched
 from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["Chains", "ChainsVerdict"]
@@ -388,13 +389,17 @@ class Chains(Model):
                 arm.require_commands(arm_commands)
 
     def prepared(self, commands: Array, measured: Array | None = None) -> Self:
-        """These chains with their sensors where commands (and readings) put them."""
-        arms = list(self.chains)
+        """These chains with their sensors where commands (and readings) put them.
+
+        Raises:
+            ValueError: as of ``SerialChain.prepared``; a socket whose distance is given
+                is touched by no chain.
+        """
+        arms = self._with_sockets(commands, measured)
         for k, arm, rows, arm_commands in self._parts(commands):
             if not len(rows):
                 continue
-            if self.stands[k] != k:
-                arm = arm.measured_with(arms[self.stands[k]].sensor)
+            arm = arm.measured_with(arms[self.stands[k]].sensor)
             q, scale = arm.num_outputs, self._scale(k)
             read = None if measured is None else measured[rows, :q] * scale
             arms[k] = _prepared(arm, arm_commands, read)
@@ -402,6 +407,31 @@ class Chains(Model):
             if owner != k:
                 arms[k] = arms[k].measured_with(arms[owner].sensor)
         return dataclasses.replace(self, chains=tuple(arms))
+
+    def _with_sockets(
+        self, commands: Array, measured: Array | None
+    ) -> list[SerialChain]:
+        """The chains, each socket where the first of them that touches it has it."""
+        places: dict[int, Array] = {}  # by the first chain that has the sensor
+        touched: dict[int, set[int]] = {}
+        for k, arm, rows, arm_commands in reversed(list(self._parts(commands))):
+            if not (len(rows) and isinstance(arm.sensor, Socket)):
+                continue
+            which = arm.sensor.of_rows(arm_commands[:, arm.num_joints :])
+            touched.setdefault(self.stands[k], set()).update(which.tolist())
+            if arm.sensor.places is None:
+                middle: Any = arm.located(arm_commands).sensor
+                of_all = places.setdefault(self.stands[k], middle.places)
+                of_all[which] = middle.places[which]
+        arms = list(self.chains)
+        for k, owner in enumerate(self.stands):
+            sensor: Any = arms[k].sensor
+            if owner == k and measured is not None and owner in touched:
+                require_touched(sensor, touched[owner])
+            if owner in places:
+                placed = dataclasses.replace(sensor, places=places[owner])
+                arms[k] = arms[k].measured_with(placed)
+        return arms
 
     def distinct(self, commands: Array, measured: Array) -> NDArray[np.intp]:
         kept = []

@@ -12,7 +12,7 @@ from jaxcal.checks import in_words
 from jaxcal.models.sensors import Pose, Position, Socket
 from jaxcal.models.serial.mistaken import mistaken_columns
 
-__all__ = ["require_readings", "require_sockets", "warn_of_radians"]
+__all__ = ["require_readings", "require_sockets", "require_touched", "warn_of_radians"]
 
 Array = NDArray[np.float64]
 _OTHER_ARM = "a wrong tip, unit, sign or order of columns, or rows of another place?"
@@ -51,12 +51,7 @@ def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
             f"a posture must have the ball in one socket, but row {row} is row "
             f"{first[groups.ravel()[row]]} with another socket: rows of the other file?"
         )
-    named = {int(i) for pair in arm.sensor.distances for i in pair[:2]}
-    for socket in sorted(named - set(which.tolist())):
-        raise ValueError(
-            f"commands must have contacts of socket {socket}, whose distance from "
-            "another is given"
-        )
+    require_touched(arm.sensor, set(which.tolist()))
     if measured.any():  # offsets that were measured, as in a simulation, are of any tip
         return
     points = arm.nominal_tips(joints)
@@ -91,6 +86,16 @@ def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
                 f"the arm as described puts them {distance_seen:.3g} apart: rows of "
                 "another place or another unit?"
             )
+
+
+def require_touched(sensor: Socket, touched: set[int]) -> None:
+    """Refuse a distance of a socket that no contact is of."""
+    named = {int(i) for pair in sensor.distances for i in pair[:2]}
+    for socket in sorted(named - touched):
+        raise ValueError(
+            f"commands must have contacts of socket {socket}, whose distance from "
+            "another is given"
+        )
 
 
 def warn_of_radians(arm: Chain, candidates: Array) -> None:
