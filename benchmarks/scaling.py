@@ -68,7 +68,9 @@ def exchanged(text: str) -> int:
 
     All but a few of them are those of a gradient step.
     """
-    made = re.findall(r"= (.*?) (?:all-|collective-|reduce-scatter)\S*\(", text)
+    # Of one that begins and ends apart, what its end gives.
+    ends = r"= (.*?) (?:all-|collective-|reduce-scatter)[a-z-]*(?<!-start)\("
+    made = re.findall(ends, text)
     shapes = [shape for line in made for shape in re.findall(r"\[([0-9,]*)\]", line)]
     return sum(math.prod(int(n) for n in shape.split(",") if n) for shape in shapes)
 

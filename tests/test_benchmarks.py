@@ -135,6 +135,18 @@ def test_a_quick_run_is_not_judged(quick, said):
     assert ("MISSED" in report.text(shown)) is not quick
 
 
+def test_a_collective_that_begins_and_ends_apart_is_counted_once():
+    from benchmarks.scaling import exchanged
+
+    program = """
+  %sum = (f32[3,4]{1,0}, f32[]) all-reduce(%a, %b), replica_groups={{0,1}}
+  %begun = (f32[5]{0}, f32[10]{0}) all-gather-start(%c), dimensions={0}
+  %all = f32[10]{0} all-gather-done(%begun)
+  %next.1 = f32[7]{0} fusion(%all, %all-reduce.2), kind=kLoop
+"""
+    assert exchanged(program) == 12 + 1 + 10
+
+
 def test_figarohs_relaxation_reaches_the_known_optimum_and_its_weights():
     """The D-optimal measure of a parabola: a third each at both ends and the middle."""
     from benchmarks.peers import figaroh
