@@ -79,11 +79,12 @@ def _centred(
         assert usable is not None
         first = blocks[np.arange(sets), usable.argmax(axis=1)][:, None]
         blocks = np.where(usable[..., None, None], blocks, first)
+    columns = np.ascontiguousarray(blocks.transpose(0, 2, 3, 1))  # reduced in order
     # Some candidates, each column in order: all where they are not many.
-    ordered = np.sort(blocks[:, :: 1 + count // _SOME], axis=1)
-    least, most = ordered[:, 0], ordered[:, -1]  # (S, q, p)
+    ordered = np.sort(columns[..., :: 1 + count // _SOME])
+    least, most = ordered[..., 0], ordered[..., -1]  # (S, q, p)
     if count >= _SOME:
-        least, most = blocks.min(axis=1), blocks.max(axis=1)
+        least, most = columns.min(axis=-1), columns.max(axis=-1)
     same, largest = least == most, np.maximum(most, -least)
     if q > 1:
         same, largest = same.all(axis=1, keepdims=True), largest.max(axis=1)
@@ -95,14 +96,15 @@ def _centred(
     if not (SMALL < min(sizes) and max(sizes) < 1.0 / SMALL):
         scale = power_of_two(largest)
         largest = largest / scale
-        blocks, first, ordered = (
-            array / scale[:, None, None] for array in (blocks, first, ordered)
+        blocks, first = blocks / scale[:, None, None], first / scale[:, None, None]
+        columns, ordered = (
+            array / scale[:, None, :, None] for array in (columns, ordered)
         )
         root = root / scale[:, None]
     where_far, dense = _far(ordered, largest, same) if look else (None, None)
     shift, constant = None, first[:, 0] * same
     if np.count_nonzero(constant) and np.count_nonzero(same) < same.size:
-        mean = _mean(blocks, first, usable if masked else None)
+        mean = _mean(columns, first, usable if masked else None)
         if where_far is not None and dense is not None:
             mean = np.where(where_far, dense, mean)
         shift, centre = _shift(constant, mean * ~same)
@@ -118,9 +120,9 @@ def _centred(
     return _CentredBlocks(rows, largest, scale, shift, far)
 
 
-def _mean(blocks: Array, first: Array, usable: Mask | None) -> Array:
-    """(S, q, p) of the blocks that are usable; the others are equal to ``first``."""
-    total, count = np.add.reduce(blocks, axis=1), blocks.shape[1]
+def _mean(columns: Array, first: Array, usable: Mask | None) -> Array:
+    """(S, q, p) of (S, q, p, M) that are usable; the others are equal to ``first``."""
+    total, count = np.add.reduce(columns, axis=-1), columns.shape[-1]
     if usable is None:
         total /= count
         return total
@@ -145,19 +147,19 @@ def _shift(constant: Array, centre: Array) -> tuple[Array, Array]:
 def _far(
     ordered: Array, largest: Array, same: Mask
 ) -> tuple[Mask | None, Array | None]:
-    """Where entries (S, N, q, p), in order, are far, and where densest, (S, q, p).
+    """Where entries (S, q, p, N), in order, are far, and where densest, (S, q, p).
 
     By the smallest distance between a few neighbours that is not zero; not where all
     are the ``same``. None where no entry is far.
     """
-    few = 1 + ordered.shape[1] // 32
-    apart = ordered[:, few:] - ordered[:, :-few]
-    near = apart * _FAR < largest[:, None, None]
+    few = 1 + ordered.shape[-1] // 32
+    apart = ordered[..., few:] - ordered[..., :-few]
+    near = apart * _FAR < largest[:, None, :, None]
     if np.count_nonzero(near) == apart.size - np.count_nonzero(apart):  # zeros
         return None, None
     near &= apart > 0.0
-    at = np.where(apart > 0.0, apart, np.inf).argmin(axis=1)[:, None]
-    return near.any(axis=1) & ~same, np.take_along_axis(ordered, at, axis=1)[:, 0]
+    at = np.where(apart > 0.0, apart, np.inf).argmin(axis=-1)[..., None]
+    return near.any(axis=-1) & ~same, np.take_along_axis(ordered, at, axis=-1)[..., 0]
 
 
 def _parts(rows: Array) -> Array:

@@ -74,15 +74,17 @@ class _FixedBlocks(Blocks):
             self._values, p = offer.blocks, offer.blocks.shape[2]
             self.names = tuple(f"theta{i + 1}" for i in range(p))
             self.root = _checked_root(offer.prior, p)
+            self._blocks = self._of(self._values)
             return
         assert offer.candidates is not None
         self._values, self.times = offer.candidates, offer.model.multiplicity
         if offer.noise is not None and offer.noise.std is not None:
             self._std = float(offer.noise.std)  # type: ignore[arg-type]  # one number
-        self.names, self.root = (), np.zeros((0, self.of_candidates().shape[2]))
+        self._blocks = self._of(self._values)
+        self.names, self.root = (), np.zeros((0, self._blocks.shape[2]))
 
     def of_candidates(self) -> Array:
-        return self._of(self._values)
+        return self._blocks
 
     def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
         rule = " as blocks have" if self._model is None else _OF_MODEL
