@@ -659,9 +659,7 @@ class Line(Model):
         said = f"a noise of {fit.noise_std[0]:.1g}"
         return Verdict(bool(fit.noise_std[0] < 1.0), (said,), "measure the line again")
 
-    @property
-    def placed(self):
-        return ("a",)
+    placed = ("a",)
 
 
 def test_a_model_of_ones_own_answers_for_itself():
@@ -684,6 +682,9 @@ def test_a_model_of_ones_own_answers_for_itself():
     assert calibration.check(commands, moved).says == "does not hold"
     anew = calibration.check(commands, moved, placed_anew=True, tolerance=9.0)
     assert anew.says == "holds"
+    calibration.model.placed = calibration.names  # and nothing is left to be judged
+    anew = calibration.check(commands, moved, placed_anew=True, tolerance=9.0)
+    assert anew.says == "cannot be told" and anew.power == 0.0
     with pytest.raises(ValueError, match="must be an arm, got Line"):
         calibration.to_urdf("line.urdf")
 

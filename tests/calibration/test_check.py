@@ -8,6 +8,8 @@ import pytest
 from scipy import stats
 
 import jaxcal
+from jaxcal.models import SerialChain
+from jaxcal.models.sensors import Socket
 
 from ..models.arms import ur5
 
@@ -264,3 +266,18 @@ def test_contacts_of_sockets_placed_anew_hold_where_enough_of_them_say_so():
     assert 6 < told.enough <= 36
     rows = commands[24:][: told.enough], zeros[24:][: told.enough]
     assert found.check(*rows, placed_anew=True).says == "holds"
+
+
+def test_alike_postures_say_nothing_of_sockets_placed_anew():
+    """A shift of the socket explains them all: the arm could have drifted anyhow."""
+    table = [(0, 90, 90, 0), (-425, 0, 0, 0), (-390, 0, 0, 0)]
+    arm = SerialChain.from_dh(table, tool=(0, 0, 31), sensor=Socket(1, [(0, 0, 0)]))
+    rng = np.random.default_rng(0)
+    joints = rng.uniform(-120.0, 120.0, (30, 3))
+    measured = arm.predict(joints) + NOISE * rng.normal(size=(30, 3))
+    found = jaxcal.identify(joints, measured, model=arm, noise_std=NOISE)
+    alike = joints[0] + rng.uniform(-0.01, 0.01, (4, 3))
+    told = found.check(alike, arm.predict(alike) + 3.0, placed_anew=True)
+    assert told.says == "cannot be told" and told.power < 0.05
+    assert told.blind == ("d1",)  # along the vertical, as the socket's own z
+    assert {"theta1", "theta2", "theta3", "a2", "a3"} <= set(told.unseen)
