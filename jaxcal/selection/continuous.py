@@ -70,6 +70,7 @@ _SHARP = (10.0, 50.0, 250.0)  # of the least eigenvalue, by one over it
 _CORNERS = 14  # inputs up to which all corners are looked at
 _DRAWS = 200  # batches of points, until enough are allowed
 _TOLD = 1e-4  # efficiency that another round of the bound must gain
+_SETTLED = 1e-6  # of a weight, which would not change in another round
 _MINUTE = 60.0  # seconds where no limit is given
 
 
@@ -875,7 +876,7 @@ class _Ascent:
         weights = np.ones(len(commands)) / len(commands)
         best, error = np.inf, 0.0
         for _ in range(_ROUNDS):
-            weights = self._weights(blocks, weights)
+            begun, weights = weights, self._weights(blocks, weights)
             roots = np.sqrt(self.k * weights)[:, None, None, None]
             information = self.information(roots * blocks)
             at = float(self.phi(information))
@@ -904,12 +905,13 @@ class _Ascent:
                 if self.k * highest + off < 1e-6 * max(abs(at), 1.0):
                     break
             new = self._new_support(peaks, heights, support)
-            if not len(new):
-                continue  # to better weights of the same support
-            support = np.concatenate([support, new])
-            blocks = np.concatenate([blocks, self.blocks(new)])
-            fill = np.full(len(new), 0.02 / len(new))
-            weights = np.concatenate([0.98 * weights, fill])
+            if len(new):
+                support = np.concatenate([support, new])
+                blocks = np.concatenate([blocks, self.blocks(new)])
+                fill = np.full(len(new), 0.02 / len(new))
+                weights = np.concatenate([0.98 * weights, fill])
+            elif np.abs(weights - begun).max() < _SETTLED:
+                break  # nor are these weights to be had better
         return max(best, phi), error, certain
 
     def _corners(self) -> Array:
