@@ -15,6 +15,7 @@ from jaxcal.models import (
     SerialChain,
     Socket,
 )
+from jaxcal.selection import continuous
 
 jnp = pytest.importorskip("jax.numpy")
 
@@ -126,6 +127,21 @@ def test_the_bound_of_e_is_that_of_the_weighted_optimum():
     found = jaxcal.optimise([[-1.0, 1.0]] * 2, 10, model, criterion="E", starts=3)
     assert 2.0 - 1e-6 <= found.bound < 2.02 and found.value <= found.bound
     assert found.value > 1.5
+
+
+def test_the_bound_takes_no_round_twice(monkeypatch):
+    """It took twelve here, ten of them from the same weights of the same support."""
+    rounds, weighted = [], continuous._Ascent._weights
+
+    def noted(ascent, blocks, weights):
+        rounds.append(weights)
+        return weighted(ascent, blocks, weights)
+
+    monkeypatch.setattr(continuous._Ascent, "_weights", noted)
+    jaxcal.optimise([[-1.0, 1.0]] * 3, 6, Affine(3, 1), criterion="I", starts=2)
+    pairs = zip(rounds, rounds[1:], strict=False)
+    steps = [np.abs(a - b).max() for a, b in pairs if len(a) == len(b)]
+    assert min(steps) > 1e-6
 
 
 def test_an_affine_map_is_measured_at_corners_and_that_is_proven():
