@@ -139,7 +139,7 @@ def test_the_bound_takes_no_round_twice(monkeypatch):
 
     monkeypatch.setattr(continuous._Ascent, "_weights", noted)
     jaxcal.optimise([[-1.0, 1.0]] * 3, 6, Affine(3, 1), criterion="I", starts=2)
-    pairs = zip(rounds, rounds[1:], strict=False)
+    pairs = itertools.pairwise(rounds)
     steps = [np.abs(a - b).max() for a, b in pairs if len(a) == len(b)]
     assert min(steps) > 1e-6
 

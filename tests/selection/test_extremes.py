@@ -13,7 +13,7 @@ import pytest
 EXTREMES = pathlib.Path(__file__).parent / "extremes.py"
 
 
-@pytest.mark.slow  # two minutes
+@pytest.mark.slow  # a minute
 def test_no_kernel_writes_outside_its_arrays():
     tool = shutil.which("valgrind")
     if tool is None:
