@@ -322,8 +322,8 @@ def _probabilities(
     likelihood: ArrayLike | Callable[[Array, Array], ArrayLike], at: Array, grid: Array
 ) -> Array:
     """(A, Y, S) probabilities that sum to 1 over the outcomes."""
-    given = likelihood(at, grid) if callable(likelihood) else likelihood
-    table = numbers("likelihood", given)
+    values = likelihood(at, grid) if callable(likelihood) else likelihood
+    table = numbers("likelihood", values)
     if table.ndim != 3 or table.shape[::2] != (len(at), len(grid)):
         raise ValueError(
             f"likelihood must have shape ({len(at)}, Y, {len(grid)}), got {table.shape}"

@@ -75,8 +75,8 @@ _DIMENSIONS = (3, 2, 2, 2, 2, 1, 1, 1, 1, 2, 1, 0, 0, 0, 0)
 
 def _chosen(horizon: int, effort: float, *arrays: Any) -> Any:
     """(...) int32 choices; arrays have leading batch axes that broadcast."""
-    given = [np.asarray(array) for array in arrays]
-    sized = list(zip(given, _DIMENSIONS, strict=True))
+    inputs = [np.asarray(array) for array in arrays]
+    sized = list(zip(inputs, _DIMENSIONS, strict=True))
     batches = [array.shape[: array.ndim - dims] for array, dims in sized]
     batch = np.broadcast_shapes(*batches)
     tasks = np.broadcast_shapes(*batches[:_TABLES])
@@ -90,7 +90,7 @@ def _chosen(horizon: int, effort: float, *arrays: Any) -> Any:
             array[
                 tuple(min(i, n - 1) for i, n in zip(index, array.shape, strict=False))
             ]
-            for array in given[:_TABLES]
+            for array in inputs[:_TABLES]
         ]
         searched = tree(*[*tables, horizon, effort])
         at = tuple(

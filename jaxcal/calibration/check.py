@@ -129,8 +129,8 @@ def check(
         than the tolerance would be seen with less than 80 % probability; the next step
         says about how many rows would tell (``enough``).
     """
-    given, measured, _ = recorded(calibration.model, commands, measured)
-    commands, measured = _distinct(calibration, given, measured)
+    all_commands, measured, _ = recorded(calibration.model, commands, measured)
+    commands, measured = _distinct(calibration, all_commands, measured)
     off = _deviations(calibration, commands, measured, placed_anew)
     names, free = calibration.names, off.free
     signal = (off.of_level @ off.by**2).T

@@ -236,8 +236,8 @@ class Bus(Line):
                 if code:
                     raise Rejected(unit, code, address)
                 if reply.function_code != function:
-                    given = reply.function_code
-                    raise BusError(f"unit {unit}: the reply is of function {given}")
+                    other = reply.function_code
+                    raise BusError(f"unit {unit}: the reply is of function {other}")
             except Rejected:
                 raise  # a refusal is a whole reply
             except BusError:

@@ -245,10 +245,10 @@ class Several(Sensor):
             )
         columns, q = self.inputs, len(self.outputs)
         all_commands, all_measured = [], []
-        for i, (one, (given, read)) in enumerate(
+        for i, (one, (raw_commands, readings)) in enumerate(
             zip(self.sensors, tables, strict=True)
         ):
-            commands = table(f"commands of {one.kind}", given)
+            commands = table(f"commands of {one.kind}", raw_commands)
             joints = commands.shape[1] - len(one.inputs)
             labels = np.zeros((len(commands), len(columns)))
             labels[:, 0] = i
@@ -257,9 +257,9 @@ class Several(Sensor):
             ]
             measured = np.zeros((len(commands), q))
             width = len(one.outputs)
-            if read is not None:
+            if readings is not None:
                 what = f"measured of {one.kind}"
-                values = array_of(what, read, len(commands), width)
+                values = array_of(what, readings, len(commands), width)
                 measured[:, :width] = values / one.stds(length)
             all_commands.append(np.hstack([commands[:, :joints], labels]))
             all_measured.append(measured)

@@ -49,26 +49,26 @@ def joint_kinds(joints: str | None, n: int) -> str:
     return kinds
 
 
-def sensor_of(given: Sensor | Mapping[str, Any] | None) -> Sensor:
+def sensor_of(sensor: Sensor | Mapping[str, Any] | None) -> Sensor:
     """A sensor, that of its ``to_dict()``, or ``Position()`` for None."""
-    if given is None:
+    if sensor is None:
         return Position()
-    if isinstance(given, Mapping):
-        kind = one_of("kind of the sensor", given.get("kind"), tuple(SENSORS))
-        given = SENSORS[kind].from_dict(given)
-    if not isinstance(given, Sensor):
+    if isinstance(sensor, Mapping):
+        kind = one_of("kind of the sensor", sensor.get("kind"), tuple(SENSORS))
+        sensor = SENSORS[kind].from_dict(sensor)
+    if not isinstance(sensor, Sensor):
         raise ValueError(
-            f"sensor must be of jaxcal.models, such as Position(), got {given!r}"
+            f"sensor must be of jaxcal.models, such as Position(), got {sensor!r}"
         )
-    return given
+    return sensor
 
 
-def limits_of(given: ArrayLike | None, columns: int) -> Array:
+def limits_of(pairs: ArrayLike | None, columns: int) -> Array:
     """(J, 2) least and greatest; None of a pair is not known."""
     open_ended = np.tile([-np.inf, np.inf], (columns, 1))
-    if given is None:
+    if pairs is None:
         return open_ended
-    limits = array_of("limits", given, columns, 2, finite=False)  # None becomes NaN
+    limits = array_of("limits", pairs, columns, 2, finite=False)  # None becomes NaN
     limits = np.where(np.isnan(limits), open_ended, limits)
     bad = np.flatnonzero(limits[:, 0] > limits[:, 1])
     if bad.size:

@@ -700,11 +700,11 @@ class SerialChain(Arm, Model):
     def _far(self, commands: Array, measured: Array) -> Array:
         """(4, 4) that takes the arm to where its first tracker sees it, if far off."""
         nominal = self.of_each_sensor(commands, self.predict(commands))
-        for (one, _, told), (_, _, seen) in zip(
+        for (one, _, predicted), (_, _, reached) in zip(
             nominal, self.of_each_sensor(commands, measured), strict=True
         ):
             if isinstance(one.sensor, Position | Pose):
-                moved = _far(told[:, :3], seen[:, :3], self.length)
+                moved = _far(predicted[:, :3], reached[:, :3], self.length)
                 if isinstance(one.sensor, Position):
                     return moved
                 base = moved @ self.base

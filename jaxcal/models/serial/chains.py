@@ -301,7 +301,7 @@ class Chains(Model):
         base is held and the other's is found.
         """
         priors = [arm.default_prior() for arm in self.chains]
-        seen: set[str] = set()
+        observed: set[str] = set()
         held: dict[str, None] = {}
         for k, (arm, named, prior) in enumerate(
             zip(self.chains, self._named, priors, strict=True)
@@ -313,9 +313,9 @@ class Chains(Model):
                 if short in fixed:
                     held[name] = None
                 elif self.stands[k] == k or short not in BASE or not self._shared[k]:
-                    seen.add(name)
+                    observed.add(name)
         std = self._gather([np.asarray(prior.std) for prior in priors])
-        unseen = tuple(name for name in held if name not in seen)
+        unseen = tuple(name for name in held if name not in observed)
         return Prior(std, fixed=unseen, by_data=True)
 
     def parameter_sizes(self) -> Array:
@@ -367,17 +367,19 @@ class Chains(Model):
             Commands (N, n) and readings (N, q) in noise.
         """
         all_commands, all_measured = [], []
-        for tip, (given, read) in tables.items():
+        for tip, (raw_commands, readings) in tables.items():
             k = self.tips.index(one_of("tip", tip, self.tips))
             arm, columns = self.chains[k], self._columns[k]
-            arm_commands = array_of(f"commands of {tip}", given, "N", len(columns))
+            arm_commands = array_of(
+                f"commands of {tip}", raw_commands, "N", len(columns)
+            )
             commands = np.zeros((len(arm_commands), self.num_inputs))
             commands[:, len(self.joint_names)] = k
             commands[:, columns] = arm_commands
             measured = np.zeros((len(arm_commands), self.num_outputs))
-            if read is not None:
+            if readings is not None:
                 what, width = f"measured of {tip}", arm.num_outputs
-                values = array_of(what, read, len(arm_commands), width)
+                values = array_of(what, readings, len(arm_commands), width)
                 measured[:, :width] = values / self._scale(k)
             all_commands.append(commands)
             all_measured.append(measured)

@@ -100,13 +100,13 @@ def solve_auto(
     method, reason = "exact", "the exact search proved this optimum"
     if not solution.proven:
         at_least = f"{_efficiency_in_words(problem)} of at least {share:.6f}"
-        wanted = f"{least_efficiency:g} was asked for"
+        request = f"{least_efficiency:g} was asked for"
         reason = (
             f"the exact search ran out of time after {limit:g} s with {at_least} "
-            f"proven; {wanted}"
+            f"proven; {request}"
         )
         if share >= least_efficiency:
-            method, reason = "exchange", f"the bound proves {at_least}, and {wanted}"
+            method, reason = "exchange", f"the bound proves {at_least}, and {request}"
     return dataclasses.replace(solution, method=method, reason=reason, **started)
 
 
