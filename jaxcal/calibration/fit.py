@@ -100,6 +100,17 @@ class Fit:
         return self.model.names
 
     @property
+    def stated_prior(self) -> Prior | None:
+        """The prior that ``identify`` was given; None: the model's, or a sized one."""
+        if self.provenance.get("prior") != "stated":
+            return None
+        p, names = len(self.names), np.array(self.names)
+        with np.errstate(divide="ignore"):
+            std = self.prior_precision[:p] ** -0.5
+        held = names[self.free[:p] == 0.0].tolist()
+        return Prior(std, mean=self.prior_mean[:p], fixed=held)
+
+    @property
     def covariance(self) -> Array | None:
         """(p, p) of ``parameters``, directions that nothing determines held fixed.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import types
 import warnings
 
 import contacts
@@ -16,8 +17,9 @@ import pytest
 
 import jaxcal
 from jaxcal.commands.main import main
-from jaxcal.models import Socket
+from jaxcal.models import Prior, Socket
 from jaxcal.models.serial.mistaken import mistaken_columns
+from jaxcal.models.serial.verdict import _Findings, _of_no_size
 
 from ..models.arms import ur5, ur5_data
 
@@ -267,6 +269,35 @@ def test_a_distance_that_contacts_contradict_is_named(apart):
     assert not found.verdict.good and abs(free - 0.05) < 0.2 * abs(apart - 0.05) + 5e-4
 
 
+def test_a_distance_is_freed_under_the_prior_that_was_stated():
+    arm = contacts.arm("panda_1").measured_with(
+        Socket(2, distances=[(0, 1, 0.047, 1e-4)])
+    )
+    usual = arm.default_prior()
+    prior = Prior(np.asarray(usual.std) * 0.2, fixed=(*usual.fixed, "theta2"))
+    commands, zeros = np.column_stack(PLACE), np.zeros((62, 3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        said = str(jaxcal.identify(commands, zeros, model=arm, prior=prior).verdict)
+        free = arm.measured_with(Socket(2))
+        places = jaxcal.identify(commands, zeros, model=free, prior=prior).parameters
+    apart = np.linalg.norm(places[-3:] - places[-6:-3])
+    told = float(re.search(r"lengths say (\S+) \+-", said)[1])
+    assert told == pytest.approx(apart, abs=1e-5)
+
+
+def test_a_distance_between_sockets_that_are_not_touched_is_no_size():
+    """As of one of two chains, where the other touches them."""
+    arm = ur5(sensor=Socket(3, distances=[(1, 2, 50.0, 0.1)]))
+    joints = np.zeros((4, 6))
+    for which, doubtful in (((0, 0, 1, 1), True), ((0, 1, 2, 2), False)):
+        fit = types.SimpleNamespace(
+            model=arm, commands=np.column_stack([joints, which]), measured_unit="mm"
+        )
+        none = _Findings((), False, False, False, (), False)
+        assert _of_no_size(none, fit, anywhere=10.0, nominal=1.0).doubtful == doubtful
+
+
 def test_a_column_that_never_changes_is_named():
     joints = PLACE[0].copy()
     joints[:, 6] = 0.0
@@ -324,6 +355,14 @@ def test_too_few_contacts_to_judge_are_said():
     with pytest.warns(UserWarning, match="no intervals and no verdict: 3 measurements"):
         found = _fit("panda_1", PLACE[0][rows], PLACE[1][rows])
     assert not found.verdict.good and found.summary().count("no intervals") == 1
+    usual = float(re.search(r"usual one: (\S+)\)", found.verdict.next_step)[1])
+    commands = np.column_stack([PLACE[0][rows], PLACE[1][rows]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        stated = jaxcal.identify(
+            commands, np.zeros((3, 3)), model=found.model, noise_std=usual
+        )
+    assert stated.confidence_intervals() is not None
 
 
 def _moved(arm, joints, row, off):

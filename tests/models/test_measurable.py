@@ -68,6 +68,24 @@ def test_the_printed_side_is_known_from_views():
     assert ((seen[:, :3, 2] * seen[:, :3, 3]).sum(axis=1) > 0.0).all()
 
 
+def test_corners_outside_the_picture_are_named():
+    wide = Board("camera", PLACE, CORNERS, CAMERA)
+    arm = SerialChain.from_dh(ur5().table, tool=MOUNT, sensor=wide)
+    joints = arm.postures(8, seed=2)  # by the sensor's own camera
+    pixels = arm.predict(joints).reshape(8, -1, 2)
+    assert ((pixels > 0.0) & (pixels < CAMERA[:2])).all()
+    narrow = arm.measured_with(Board("camera", PLACE, CORNERS, CAMERA[2:]))
+    np.testing.assert_array_equal(narrow.predict(joints), arm.predict(joints))
+    arm.prepared(joints, arm.predict(joints))
+    shifted = pixels + [0.0, 1000.0] * (np.arange(8) == 3)[:, None, None]
+    with pytest.raises(ValueError, match="of 1 rows are not: corner 1 of row 3"):
+        arm.prepared(joints, shifted.reshape(8, -1))
+    aside = joints.copy()
+    aside[5, 4] += 180.0  # the camera looks away
+    with pytest.warns(UserWarning, match="1 of 8 candidates .* row 5 first"):
+        arm.prepared(aside)
+
+
 def test_contacts_on_a_table_come_from_above_it():
     arm = ur5(sensor=Socket(2))
     plain = arm.postures(60, near=NEAR)

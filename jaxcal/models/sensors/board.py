@@ -47,7 +47,9 @@ class Board(Sensor):
         moves: "camera" or "board", which is on the tip.
         place: (4, 4) of the other in the measuring frame; found when not given.
         corners: (C, 3) of the board in its own frame, in its plane z = 0.
-        camera: focal lengths and centre in pixels (fx, fy, cx, cy).
+        camera: focal lengths and centre in pixels (fx, fy, cx, cy); with the size of
+            its picture before them, (width, height, fx, fy, cx, cy), corners outside
+            are refused, and postures are planned for that camera.
         side: 1 where the board's z axis points to cameras that see it, -1 where it
             points away; 0 is not known, views tell.
         extent: width and height of the board from the origin of its pose, for postures
@@ -57,7 +59,7 @@ class Board(Sensor):
     moves: str = "camera"
     place: Array | None = None
     corners: Array | None = None
-    camera: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    camera: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     side: float = 0.0
     extent: tuple[float, float] = (0.0, 0.0)
 
@@ -81,13 +83,23 @@ class Board(Sensor):
                 f"{corners.shape}"
             )
         camera = numbers("camera", self.camera)
-        if camera.shape != (4,) or not (camera[:2] > 0.0).all():
+        if camera.shape not in ((4,), (6,)) or not (camera[:-2] > 0.0).all():
             raise ValueError(
-                "camera must be (fx, fy, cx, cy) in pixels where corners are given, "
-                f"got {self.camera!r}"
+                "camera must be (fx, fy, cx, cy) in pixels where corners are given, or "
+                f"(width, height, fx, fy, cx, cy), got {self.camera!r}"
             )
         object.__setattr__(self, "corners", corners)
         object.__setattr__(self, "camera", tuple(camera.tolist()))
+
+    @property
+    def lens(self) -> tuple[Array, Array]:
+        """Focal lengths (2,) and centre (2,) in pixels."""
+        return np.array(self.camera[-4:-2]), np.array(self.camera[-2:])
+
+    @property
+    def picture(self) -> Array | None:
+        """(2,) width and height of the camera's picture, where they are known."""
+        return np.array(self.camera[:2]) if len(self.camera) == 6 else None
 
     @property
     def outline(self) -> Array:
@@ -153,7 +165,7 @@ class Board(Sensor):
             return Reading(values, by_tip, by_own)
         spokes = self.corners @ np.matrix_transpose(board)  # (N, C, 3)
         points = spokes + where[:, None]
-        focal, centre = np.array(self.camera).reshape(2, 2)
+        focal, centre = self.lens
         deep = np.where(points[..., 2:] != 0.0, points[..., 2:], np.nan)
         pixels = focal * points[..., :2] / deep + centre
         rate = np.zeros((*points.shape[:2], 2, 3))
@@ -213,10 +225,17 @@ class Board(Sensor):
         side = float(np.sign(np.median(towards)))
         return dataclasses.replace(self, place=place, side=side), new
 
+    def depths(self, poses: Array) -> Array:
+        """(N, C) of the corners before the camera, from poses (N, 6) of the board."""
+        from scipy.spatial.transform import Rotation
+
+        turn = Rotation.from_rotvec(poses[:, 3:], degrees=True).as_matrix()
+        return np.asarray(turn[:, 2] @ self.outline.T + poses[:, 2:3])
+
     def _poses(self, pixels: Array) -> tuple[Array, Array]:
         """Rotations (N, 3, 3) and places (N, 3) of the board (Zhang, 2000)."""
         flat = np.asarray(self.corners)[:, :2]
-        focal, centre = np.array(self.camera).reshape(2, 2)
+        focal, centre = self.lens
         rays = (pixels.reshape(len(pixels), -1, 2) - centre) / focal
         size = np.abs(flat).max()
         one = np.column_stack([flat / size, np.ones(len(flat))])

@@ -299,7 +299,7 @@ class SerialChain(Arm, Model):
         from jaxcal.models.serial.postures import postures, view_and_room
 
         rules = view_and_room(
-            camera, distance, tilt, side, floor, approach, clear, radius
+            self._camera(camera), distance, tilt, side, floor, approach, clear, radius
         )
         return postures(self, count, seed, near, allowed, *rules)
 
@@ -325,9 +325,14 @@ class SerialChain(Arm, Model):
         from jaxcal.models.serial.postures import ReachableSet, view_and_room
 
         rules = view_and_room(
-            camera, distance, tilt, side, floor, approach, clear, radius
+            self._camera(camera), distance, tilt, side, floor, approach, clear, radius
         )
         return ReachableSet(self, near, allowed, *rules)
+
+    def _camera(self, camera: ArrayLike | None) -> ArrayLike | None:
+        """The camera of postures: the sensor's where its picture is known."""
+        known = getattr(self.sensor, "picture", None) is not None
+        return self.sensor.camera if camera is None and known else camera  # type: ignore[attr-defined]
 
     def tip_axis(self, commands: ArrayLike) -> Array:
         """(N, 3) the tip's z axis in the measuring frame, of the nominal arm."""
@@ -383,6 +388,7 @@ class SerialChain(Arm, Model):
         from jaxcal.models.serial.plausible import (
             require_readings,
             require_sockets,
+            warn_of_picture,
             warn_of_radians,
         )
 
@@ -390,6 +396,7 @@ class SerialChain(Arm, Model):
             arm = self.located(commands)
             arm.require_commands(commands)
             warn_of_radians(arm, commands)
+            warn_of_picture(arm, commands)
             return arm
         for part in self.of_each_sensor(commands, measured):
             require_readings(*part)

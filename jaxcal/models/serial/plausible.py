@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from typing import Any
 
@@ -9,10 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.checks import in_words
-from jaxcal.models.sensors import Pose, Position, Socket
+from jaxcal.models.sensors import Board, Pose, Position, Socket
 from jaxcal.models.serial.mistaken import mistaken_columns
 
-__all__ = ["require_readings", "require_sockets", "require_touched", "warn_of_radians"]
+__all__ = [
+    "require_readings",
+    "require_sockets",
+    "require_touched",
+    "warn_of_picture",
+    "warn_of_radians",
+]
 
 Array = NDArray[np.float64]
 _OTHER_ARM = "a wrong tip, unit, sign or order of columns, or rows of another place?"
@@ -20,11 +27,17 @@ Chain = Any  # a SerialChain, whose module imports this one
 
 _NOMINAL = 0.1  # of its length: no arm is so far off, tip included, before it is fitted
 _APART = 0.2  # of it: what two sockets may seem to be off their distance
+_BEYOND = 0.1  # of a picture: what taking out a lens's distortion moves corners by
 _OTHER_UNIT = 0.01  # of it: so far off and tenfold, a distance is in another unit
 
 
 def require_readings(arm: Chain, commands: Array, measured: Array) -> None:
-    """Refuse millimetres for metres, radians for degrees: an arm is not off tenfold."""
+    """Refuse millimetres for metres, radians for degrees: an arm is not off tenfold.
+
+    Of a camera whose picture is known, corners outside of it.
+    """
+    if isinstance(arm.sensor, Board):
+        _require_in_picture(arm.sensor, measured)
     if not isinstance(arm.sensor, Position | Pose):
         return
     spread = []
@@ -36,6 +49,41 @@ def require_readings(arm: Chain, commands: Array, measured: Array) -> None:
             "measured must be in the unit of the model's lengths and commands in "
             f"degrees: measured positions spread over {spread[0]:g}, those predicted "
             f"over {spread[1]:g}"
+        )
+
+
+def _require_in_picture(board: Board, pixels: Array) -> None:
+    size = board.picture
+    if size is None:
+        return
+    spots = pixels.reshape(len(pixels), -1, 2)
+    outside = np.any(np.abs(spots / size - 0.5) > 0.5 + _BEYOND, axis=2)
+    for row, corner in np.argwhere(outside)[:1]:
+        count = np.count_nonzero(outside.any(axis=1))
+        raise ValueError(
+            f"corners must be in the camera's picture of {size[0]:g} by {size[1]:g} "
+            f"pixels, but those of {count} rows are not: corner {corner + 1} of row "
+            f"{row} is at {in_words(spots[row, corner])}"
+        )
+
+
+def warn_of_picture(arm: Chain, candidates: Array) -> None:
+    """Views from which a camera whose picture is known does not see the whole board."""
+    board = arm.sensor
+    if not isinstance(board, Board) or board.picture is None or board.place is None:
+        return
+    posed = arm.measured_with(dataclasses.replace(board, corners=None))
+    none = np.zeros((len(candidates), len(board.tool)))  # of a board seen at zero
+    depth = board.depths(posed.predict(np.hstack([candidates, none])))
+    spots = arm.predict(candidates).reshape(len(candidates), -1, 2)
+    seen = (spots >= 0.0).all(axis=2) & (spots <= board.picture).all(axis=2)
+    lost = np.flatnonzero(~(seen & (depth > 0.0)).all(axis=1))
+    if lost.size:
+        warnings.warn(
+            f"{lost.size} of {len(candidates)} candidates do not have the whole board "
+            f"in the camera's picture, row {lost[0]} first; arm.postures() makes such "
+            "as have",
+            stacklevel=2,
         )
 
 

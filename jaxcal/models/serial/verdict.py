@@ -106,10 +106,12 @@ def verdict(calibration: Fit) -> ArmVerdict:
     """
     model, unit = calibration.model, calibration.measured_unit
     if calibration.noise_std is None:
+        usual = np.unique(np.asarray(model.default_noise().std))
         return ArmVerdict(
             good=False,
             reasons=(calibration.no_noise("intervals and no verdict"),),
-            next_step="measure more postures, or state noise_std, --noise",
+            next_step="measure more postures, or state noise_std, --noise (this "
+            f"sensor's usual one: {', '.join(f'{std:.2g}' for std in usual)})",
             unit=unit,
         )
     used = np.flatnonzero(calibration.loss_weights > 0.0)
@@ -212,7 +214,9 @@ def _of_no_size(
     An arm a tenth smaller, its sockets nearer together, touches them as well.
     """
     sensor, unit = calibration.model.sensor, _in(calibration)
-    sized = not isinstance(sensor, Socket) or len(sensor.distances)
+    sized = not isinstance(sensor, Socket) or (
+        len(sensor.distances) and _touched(calibration, calibration.model).any()
+    )
     if findings.mistaken or sized or not anywhere > _VAGUE * nominal:
         return findings
     reason = (
@@ -428,7 +432,7 @@ def _freed(calibration: Fit, model: Chain, row: int) -> tuple[float, float]:
     touched[row] = False
     rest = [one for one, kept in zip(sensor.distances, touched, strict=True) if kept]
     free = model.measured_with(dataclasses.replace(sensor, distances=rest))
-    fit = calibration.again(free, None)
+    fit = calibration.again(free, calibration.stated_prior)
     off, rows = model.facts(fit.parameters)
     _, _, distance, std = sensor.distances[row]
     if fit.covariance is None:  # too few readings to tell the noise without it
