@@ -111,8 +111,6 @@ def identify(
     n, m = len(readings.input_names), len(readings.output_names)
     noise, plain_noise = _noise(noise, noise_std, common_noise, m)
     about = _about(readings, command_unit, measured_unit, notes, accuracy)
-    if prior is not None and not prior.by_data:
-        about["provenance"]["prior"] = "stated"
     model = _affine(n, m) if model is None else model
     model = require_fitting(model, readings.commands, readings.measured)
     plain = prior is None and plain_noise and loss in (None, "gaussian")
@@ -130,6 +128,8 @@ def identify(
         common_noise=common_noise,
         excited=readings.input_names if plain and affine else (),
     )
+    if prior is not None and not prior.by_data:
+        about["provenance"]["prior"] = "stated"
     calibration = Calibration(**fields, **about)
     if not calibration.verdict.good and not _exact(calibration):
         warnings.warn(str(calibration.verdict), stacklevel=2)
