@@ -151,36 +151,36 @@ class Budget:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values; infinite ones are None."""
-
-        def plain(values: Array) -> list[Any]:
-            return [float(v) if np.isfinite(v) else None for v in values]
-
         return {
             "confidence": self.confidence,
             "unit": self.unit,
             "sources": [
                 {"name": name, "dof": dof}
                 for name, dof in zip(
-                    self.sources, plain(self.source_dof), strict=True
+                    self.sources, _plain(self.source_dof), strict=True
                 )
             ],
             "results": [
                 {
                     "name": name,
                     "value": float(value),
-                    "contributions": plain(parts),
+                    "contributions": _plain(parts),
                     "combined": combined,
                     "dof": dof,
                     "coverage_factor": float(factor),
                     "expanded": expanded,
                 }
                 for name, value, parts, combined, dof, factor, expanded in zip(
-                    self.names, self.values, self.contributions, plain(self.combined),
-                    plain(self.dof), self.coverage_factor, plain(self.expanded),
+                    self.names, self.values, self.contributions, _plain(self.combined),
+                    _plain(self.dof), self.coverage_factor, _plain(self.expanded),
                     strict=True,
                 )
             ],
         }  # fmt: skip
+
+
+def _plain(values: Array) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in values]
 
 
 def budget(

@@ -98,8 +98,7 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
         model: where the file cannot hold it.
 
     Raises:
-        ValueError: it is no calibration, of another version, or damaged; naming the key
-            and what is wrong with it.
+        ValueError: it is no calibration, of another version, or damaged: which key.
     """
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f'not a calibration: "format" is not "{FORMAT}"')

@@ -221,11 +221,7 @@ def _noise(
         raise ValueError(f"common_noise must be True or False, got {common_noise!r}")
     if noise is not None and noise_std is not None:
         raise ValueError("noise_std is short for noise: give one of them")
-    plain = noise is None or (
-        noise.covariance is None
-        and noise.command_std is None
-        and np.ndim(0.0 if noise.std is None else noise.std) < 2
-    )
+    plain = noise is None or _is_of_levels(noise)
     if plain:
         level = noise_std if noise is None else noise.std
         noise = None
@@ -240,6 +236,13 @@ def _noise(
             "give one of them"
         )
     return noise, plain
+
+
+def _is_of_levels(noise: Noise) -> bool:
+    """Whether each output has one level, known or not, in every reading."""
+    if noise.covariance is not None or noise.command_std is not None:
+        return False
+    return noise.std is None or np.ndim(noise.std) < 2
 
 
 @functools.cache

@@ -405,7 +405,6 @@ def _moved_section(
 
 def _residual_sections(calibration: Fit) -> list[pages.Section]:
     names, residuals = calibration.output_names, calibration.residuals
-    noise_known = calibration.noise_std is not None
     unit = f" ({calibration.measured_unit})" if calibration.measured_unit else ""
     rows = np.arange(len(residuals), dtype=float)
     by_row = _scatter(rows, residuals, names, "row", f"residual{unit}")
@@ -416,24 +415,28 @@ def _residual_sections(calibration: Fit) -> list[pages.Section]:
         )
         for name, u in zip(calibration.input_names, calibration.commands.T, strict=True)
     ]
-    head = ["row", *(f"residual {name}" for name in names), "weight"]
-    columns = [*residuals.T, calibration.loss_weights]
-    if noise_known:
-        head += ["leverage", *(f"held-out {name}" for name in names)]
-        columns += [leverage(calibration), *left_out(calibration).T]
-    table = pages.Table(
-        head,
-        [
-            [str(i), *(f"{value:.3g}" for value in row)]
-            for i, row in enumerate(zip(*columns, strict=True))
-        ],
-    )
     figures = [pages.Figure(by_row, "residuals by row"), *by_input]
+    table = _residual_table(calibration)
     sections = [pages.Section("Residuals", [*figures, table], "residuals")]
     nominal = _nominal_errors(calibration)
     if nominal is not None:
         sections.append(_before_and_after(calibration, nominal, unit))
     return sections
+
+
+def _residual_table(calibration: Fit) -> pages.Table:
+    """A row for each measurement: residuals, weight and, if it has one, leverage."""
+    names = calibration.output_names
+    head = ["row", *(f"residual {name}" for name in names), "weight"]
+    columns = [*calibration.residuals.T, calibration.loss_weights]
+    if calibration.noise_std is not None:
+        head += ["leverage", *(f"held-out {name}" for name in names)]
+        columns += [leverage(calibration), *left_out(calibration).T]
+    rows = [
+        [str(i), *(f"{value:.3g}" for value in row)]
+        for i, row in enumerate(zip(*columns, strict=True))
+    ]
+    return pages.Table(head, rows)
 
 
 def _before_and_after(calibration: Fit, nominal: Array, unit: str) -> pages.Section:
@@ -558,10 +561,7 @@ def _scatter(
         colour = _COLOURS[i % len(_COLOURS)]
         if len(names) <= _NAMED:
             start = 10.0 + i * (_WIDTH - _RIGHT - 10.0) / max(len(names), 3)
-            label = f'<text x="{start + 8:g}" y="34">{html.escape(name)}</text>'
-            parts.append(
-                f'<circle cx="{start:g}" cy="30" r="4" fill="{colour}"/>{label}'
-            )
+            parts.append(_named_dot(start, colour, name))
         dots = zip(x, columns[:, i], strict=True)
         parts += [
             f'<circle cx="{axes.x(u):.1f}" cy="{axes.y(v):.1f}" r="3" fill="{colour}" '
@@ -569,3 +569,9 @@ def _scatter(
             for u, v in dots
         ]
     return "\n".join([*parts, "</svg>\n"])
+
+
+def _named_dot(start: float, colour: str, name: str) -> str:
+    """An entry of the key above a picture."""
+    label = f'<text x="{start + 8:g}" y="34">{html.escape(name)}</text>'
+    return f'<circle cx="{start:g}" cy="30" r="4" fill="{colour}"/>{label}'
