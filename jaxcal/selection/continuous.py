@@ -764,13 +764,20 @@ class _Ascent:
         if free.all() or not free.any():
             return trial[free]
         across = unit[free].mean(axis=0) - unit[~free].mean(axis=0)
+        more = self._beside(command, radius, slope, across)
+        return np.concatenate([trial[free], more])
+
+    def _beside(
+        self, command: Array, radius: float, slope: Array, across: Array
+    ) -> Array:
+        """(T, n) allowed commands along the slope, less its part ``across`` (n,)."""
         size = across @ across
         along = slope - (slope @ across) / (size or 1.0) * across
-        more = command + np.outer(radius * np.array([1.0, 0.3, 0.1]), along) * (
+        trial = command + np.outer(radius * np.array([1.0, 0.3, 0.1]), along) * (
             self.span / (np.linalg.norm(along) or 1.0)
         )
-        more = more.clip(self.box[:, 0], self.box[:, 1])
-        return np.concatenate([trial[free], more[_permitted(self.allowed, more)]])
+        trial = trial.clip(self.box[:, 0], self.box[:, 1])
+        return trial[_permitted(self.allowed, trial)]
 
     def _swapped(self, commands: Array, phi: float) -> tuple[Array, float]:
         """Single commands moved to where d is largest, then all together, again."""

@@ -144,15 +144,19 @@ def pareto(
     while point is not None and len(points) < _MOST_POINTS:
         points.append(point)
         point = search.answer(least, point.log_det)
-    kept = [
+    proven = point is None and all(p.proven for p in points)
+    return ParetoFront(_undominated(points), least, proven)
+
+
+def _undominated(points: list[FastSelection]) -> tuple[FastSelection, ...]:
+    """The points that no other exceeds in efficiency within the same time."""
+    return tuple(
         p
         for p in points
         if not any(
             q.seconds <= p.seconds + SAME_TIME and q.log_det > p.log_det for q in points
         )
-    ]
-    proven = point is None and all(p.proven for p in points)
-    return ParetoFront(tuple(kept), least, proven)
+    )
 
 
 def _pool(problem: Problem) -> Indices:

@@ -91,16 +91,24 @@ def best_design(
         more = _room(problem, previous)
         values = _worst_after(cases, previous, [None], more, how)[0]
         starts.append(np.append(previous, more[int(values.argmin())]))
-    rng = np.random.default_rng([seed, problem.k])
-    room = np.repeat(np.arange(len(problem.blocks)), problem.upper - problem.lower)
-    for _ in range(_RANDOM_STARTS if problem.blocks.shape[1] == 1 else 0):
-        some = rng.permutation(room)[: problem.k - len(problem.required)]
-        starts.append(np.concatenate([problem.required, some]))
+    if problem.blocks.shape[1] == 1:
+        starts += _random_starts(problem, seed)
     for start in starts:
         indices, reached = _exchange(problem, start, cases, how)
         if reached < value * (1.0 - 1e-12):
             best, value = indices, reached
     return np.sort(best)
+
+
+def _random_starts(problem: Problem, seed: int) -> list[Indices]:
+    """(k,) the required candidates with others at random."""
+    rng = np.random.default_rng([seed, problem.k])
+    room = np.repeat(np.arange(len(problem.blocks)), problem.upper - problem.lower)
+    more = problem.k - len(problem.required)
+    return [
+        np.concatenate([problem.required, rng.permutation(room)[:more]])
+        for _ in range(_RANDOM_STARTS)
+    ]
 
 
 def _exchange(

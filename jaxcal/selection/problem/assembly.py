@@ -278,6 +278,13 @@ def _check_counts(
             + (f", each at most {cap} times" if cap > 1 else "")
             + f", got {k}"
         )
+    return _checked_required(required, mask, k)
+
+
+def _checked_required(
+    required: ArrayLike | None, mask: Mask, k: int
+) -> NDArray[np.int64]:
+    """(r,) candidates, at most k, each available and named once."""
     array = np.zeros(0) if required is None else one_array("required", required)
     if not array.size:
         return np.zeros(0, dtype=np.int64)
@@ -305,10 +312,8 @@ def _check_k(
 ) -> int:
     """k, by default the fewest candidates that identify every parameter alone.
 
-    Args:
-        k: as asked for.
-        raw, mask, root: blocks (M, q, p), available (M,), what is known (r, p).
-        regressors: the blocks are [u, 1].
+    Of blocks ``raw`` (M, q, p), which may be regressors [u, 1], with a root (r, p) of
+    what is known.
     """
     p = raw.shape[2]
     usable = raw if raw.shape[1] == 1 and k is not None else raw[mask]
@@ -316,9 +321,7 @@ def _check_k(
     if k is None:
         k = p if regressors else _cover(usable)
     k = whole_number("k", k, 1)
-    prior_rank = 0
-    if len(root):
-        prior_rank = rank_of_blocks(root[None, None], root[:0])[0][0]
+    prior_rank = rank_of_blocks(root[None, None], root[:0])[0][0] if len(root) else 0
     if k * most + prior_rank >= p:
         return k
     if regressors and not prior_rank:
