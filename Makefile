@@ -78,7 +78,6 @@ test-all: $(READY) lint ## every test, the slow ones too, hypothesis drawing new
 	$(RIG_TESTS) -n 2 --dist load >$(VENV)/rig-tests.log 2>&1 & fi; rig=$$!; \
 	for part in $(filter-out rig,$(sort $(PARTS))); do echo "== $$part"; \
 	flags="$$XLA_FLAGS"; case $$part in files) tests="--dist load `ls tests/test_*.py`";; \
-	docs) tests="--dist loadgroup --loadscope-reorder tests/docs";; \
 	trainings) tests="-m trains tests/adaptive tests/learning";; *) tests=tests/$$part;; esac; \
 	case $$part in adaptive|learning) flags="$${XLA_FLAGS-$(QUICK_XLA)}";; esac; \
 	XLA_FLAGS="$$flags" nice -n 19 $(EVERY_TEST) -n 2 $$tests || failed="$$failed $$part"; done; \

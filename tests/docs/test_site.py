@@ -18,7 +18,6 @@ import pytest
 
 ROOT = pathlib.Path(__file__).parents[2]
 BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-SITE = pytest.mark.xdist_group("site")  # built once: a minute
 SIZES = {"desktop": (1280, 900), "phone": (390, 844)}
 
 
@@ -92,7 +91,6 @@ def public(value: type) -> set[str]:
     return {name for name in shown if not name.startswith("_")}
 
 
-@SITE
 @pytest.mark.slow
 def test_every_public_method_and_field_is_on_its_page(site, hooks):
     for module_name in hooks.PUBLIC:
@@ -152,7 +150,6 @@ def brightness(colour: str) -> float:
     return (float(red) + float(green) + float(blue)) / 765.0
 
 
-@SITE
 @pytest.mark.slow
 @pytest.mark.skipif(not (BROWSER and DRIVER), reason="needs chromium and its driver")
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -210,7 +207,6 @@ def test_every_page_and_link(site, browser, scheme, size):
                 )
 
 
-@SITE
 @pytest.mark.slow
 @pytest.mark.skipif(not (BROWSER and DRIVER), reason="needs chromium and its driver")
 def test_the_search_works_without_a_server(site, browser):
