@@ -33,7 +33,7 @@ $(READY): pyproject.toml constraints.txt $(KERNELS)
 	$(BIN)/python -m pip check
 	@touch $@
 
-train: $(READY) ## set everything up and train the compact policy on this machine (one to three minutes)
+train: $(READY) ## set everything up and train the compact policy on this machine (one to two minutes)
 	$(BIN)/python train.py $(ARGS)
 
 checkpoint: $(READY) ## train the policy that ships and put it in checkpoints/default.npz (about 10 minutes)

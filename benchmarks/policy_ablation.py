@@ -256,6 +256,7 @@ def trained(
 ) -> dict[str, Any]:
     """Train one variant from scratch and measure its one greedy pass."""
     values = {
+        "close_up": False,
         **changes,
         "num_selected": sets.k,
         "reward_gain": sets.k > 4,

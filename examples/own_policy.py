@@ -1,7 +1,7 @@
 """Train a policy on postures of one's own machine, save it, and choose with it.
 
 python examples/own_policy.py           # 20,000 episodes
-python examples/own_policy.py --full    # 200,000
+python examples/own_policy.py --full    # 60,000
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def study(full: bool, episodes: int = 0) -> dict[str, np.ndarray]:
         pool = folder / "postures.csv"
         np.savetxt(pool, postures(rng, 2000), delimiter=",", header="pitch,yaw,roll",
                    comments="")  # fmt: skip
-        count = episodes or (200_000 if full else 20_000)
+        count = episodes or (60_000 if full else 20_000)
         flags = ["--candidates", str(pool), "--episodes", str(count)]
         code = train.main([*flags, "--no-validation", "--out", str(folder / "run")])
         if code:

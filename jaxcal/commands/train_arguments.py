@@ -42,12 +42,12 @@ tasks, of sequential measurement:
   FILE.py   your own: a file that defines ENTRY (docs/adaptive.md)
 
 what to try first:
-  {program}                        the compact policy, one to three minutes on a laptop
-  {program} --episodes 20000 --out runs/brief   half a minute, 0.990 of the optimum
+  {program}                        the compact policy, about a minute on a laptop
+  {program} --episodes 20000 --out runs/brief   a quarter of a minute, 0.997
   {program} --num-selected 6 --out runs/six     another number of postures
   {program} --candidates mine.csv --out runs/mine   your own machine's postures
   {program} --criterion A --out runs/a          least variance; I: of predictions; E
-  then --imitation 0.5 --initial-trust 4 --initial-actor 0.05 --close-up, which adds
+  then --imitation 0.5 --initial-trust 4 --initial-actor 0.05, which adds
   most where more than n + 1 postures are chosen. Other numbers rarely need a change.
 
 more examples:

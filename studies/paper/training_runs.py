@@ -32,7 +32,8 @@ _DESCRIPTION = """\
 Keep what the reproduction report draws of training runs, finished or still going:
 metrics.csv, last_rewards.npy and summary.json, in a folder under --out for each.
 
-  python train.py --seed 3 --out runs/compact_seeds/seed_3
+  python train.py --seed 3 --episodes 200000 --no-close-up \\
+      --out runs/compact_seeds/seed_3
   python -m studies.paper.training_runs runs/compact_seeds/* \\
       --out studies/paper/kept/compact_seeds
 """

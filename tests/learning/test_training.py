@@ -536,6 +536,7 @@ def test_brax_saves_what_it_used_and_keeps_what_is_asked_for():
     adapted = brax_ppo.adapted(presets.load("compact"))
     assert (adapted.network.kind, adapted.network.width) == ("paper", 64)
     assert adapted.ppo.learning_rate == 1e-3
+    assert adapted.ppo.num_episodes == 200_000
     asked = presets.with_values(adapted, {"learning_rate": 2e-3, "width": 32})
     assert (asked.ppo.learning_rate, asked.network.width) == (2e-3, 32)
     assert brax_ppo.adapted(presets.load("paper")).network.width == 768
