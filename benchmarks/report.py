@@ -76,7 +76,8 @@ def table(results: dict[str, dict[str, Any]]) -> str:
             "",
             f"`python -m benchmarks --only {row['name']}`, {row['date'][:10]}, "
             f"{where['cores']} cores ({where['processor']}), load average before "
-            f"{where['load_before']}, {row['seconds']:.0f} s{quick}.",
+            f"{where['load_before']}, JAX {where['versions']['jax']}, NumPy "
+            f"{where['versions']['numpy']}, {row['seconds']:.0f} s{quick}.",
             "",
             "| case | who | figure | |",
             "|---|---|---|---|",

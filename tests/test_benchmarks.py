@@ -147,6 +147,19 @@ def test_a_collective_that_begins_and_ends_apart_is_counted_once():
     assert exchanged(program) == 12 + 1 + 10
 
 
+def test_the_table_says_what_versions_a_row_was_made_with():
+    import json
+    import pathlib
+
+    from benchmarks import report
+
+    kept = pathlib.Path(__file__).parents[1] / "docs/benchmarks/results.json"
+    rows = json.loads(kept.read_text())
+    _, *parts = report.table(rows).split("\n## ")
+    for row, part in zip(rows.values(), parts, strict=True):
+        assert f"JAX {row['machine']['versions']['jax']}, NumPy " in part
+
+
 def test_figarohs_relaxation_reaches_the_known_optimum_and_its_weights():
     """The D-optimal measure of a parabola: a third each at both ends and the middle."""
     from benchmarks.peers import figaroh
