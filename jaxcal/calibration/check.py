@@ -135,7 +135,9 @@ def check(
     names, free = calibration.names, off.free
     signal = (off.of_level @ off.by**2).T
     slips = free & np.isin(names, calibration.model.slips) & (signal.sum(axis=1) > 0.0)
-    tests = _Tests.of(off.of_level.sum(axis=1), calibration, slips.sum(), off.least)
+    tests = _Tests.of(
+        off.of_level.sum(axis=1), calibration, int(slips.sum()), off.least
+    )
     slopes_of_slips = np.linalg.norm(off.by[:, slips], axis=0)
     ways = off.by[:, slips] / slopes_of_slips  # (R, S) unit vectors
     along = ((off.by.T @ ways) ** 2).max(axis=1, initial=0.0)  # seen by the best
@@ -530,7 +532,7 @@ def verification(
     def value(rows: list[int]) -> Array:
         """(M,) of the rows and each candidate."""
         shift = shifts[rows].sum(axis=0) + shifts
-        tests = _Tests.of(counts * (len(rows) + 1), calibration, slips.sum())
+        tests = _Tests.of(counts * (len(rows) + 1), calibration, int(slips.sum()))
         return np.asarray(tests.power(shift, slips * shift.sum(axis=-1)).mean(axis=-1))
 
     return np.array(_best_rows(value, k))

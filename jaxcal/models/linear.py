@@ -232,8 +232,8 @@ class Polynomial(Linear):
         powers = range(self.degree + 1)
         choices = np.array([[math.comb(a, k) for k in powers] for a in powers])
         factors = choices[high, low] * centre ** np.maximum(high - low, 0)
-        of_output = np.prod(factors, axis=-1)  # 0 where a power is lower
-        return np.kron(np.eye(self.num_outputs), of_output)
+        of_output: Array = np.prod(factors, axis=-1)  # 0 where a power is lower
+        return np.asarray(np.kron(np.eye(self.num_outputs), of_output))
 
     def affine(self, parameters: Array) -> tuple[Array, Array] | None:
         """A (m, n) and b (m,) of degree 1."""

@@ -85,7 +85,7 @@ def best_design(
         seed: of exchange and of the random starts.
     """
     best = exchange_indices(problem, _D_RESTARTS, seed)
-    value = variances_of(cases, best, how).max()
+    value = float(variances_of(cases, best, how).max())
     starts = [best, greedy_indices(problem)]
     if previous is not None:
         more = _room(problem, previous)

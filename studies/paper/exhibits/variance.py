@@ -95,8 +95,10 @@ def _variance(study: Study, name: str, key: str, title: str) -> Exhibit:
     figure.axes[0].set_title(text, fontsize=10)
     (ratio, low, _), fifty = table["random/policy"], table["all 50/policy"]
     lower = int((low > 1.0).sum())
-    words = {"middle": np.median(ratio), "least": ratio.min(), "most": ratio.max()}
-    words |= {"lower": lower, "fifty": np.median(fifty[0])}
+    words: dict[str, float] = {
+        "middle": np.median(ratio), "least": ratio.min(), "most": ratio.max(),
+        "lower": lower, "fifty": np.median(fifty[0]),
+    }  # fmt: skip
     return Exhibit.from_texts(
         "variance",
         words_of(study, name, title) | words,
