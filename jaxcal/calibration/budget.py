@@ -180,6 +180,7 @@ class Budget:
 
 
 def _plain(values: Array) -> list[float | None]:
+    """Numbers that JSON can hold, None for those that are not finite."""
     return [float(value) if np.isfinite(value) else None for value in values]
 
 

@@ -918,7 +918,7 @@ class _Ascent:
                 fill = np.full(len(new), 0.02 / len(new))
                 weights = np.concatenate([0.98 * weights, fill])
             elif np.abs(weights - begun).max() < _SETTLED:
-                break  # nor are these weights to be had better
+                break  # the weights have converged
         return max(best, phi), error, certain
 
     def _corners(self) -> Array:

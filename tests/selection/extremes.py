@@ -51,7 +51,7 @@ def main() -> None:
 
 
 def scenarios_and_losses() -> None:
-    # Of the exchange three greedy starts and two random ones.
+    # Of the exchange five starts: of each kind one at least.
     short = {"exact": {"time_limit": 0.2}, "exchange": {"restarts": 5}, "greedy": {}}
     rng = np.random.default_rng(1)
     for e in (-300, -155, -12, 0, 12, 155, 300):

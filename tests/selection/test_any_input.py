@@ -376,6 +376,28 @@ def test_float32_candidates_in_a_plane_are_refused(u):
     assert len(jaxcal.Design.from_blocks(rows, prior=np.eye(3)).select(3).indices) == 3
 
 
+def test_float32_is_judged_reading_by_reading_and_where_it_counts():
+    rng = np.random.default_rng(3)
+    whole, part = rng.random((2, 20)).astype(np.float32)
+    pulses = 1e6 * np.stack([whole, whole], axis=1)  # a reading of the sum
+    radians = 0.1 * np.stack([part, -part], axis=1)  # and one of the difference
+    blocks = np.stack([pulses, radians], axis=1)
+    noise = jaxcal.Noise(std=[1e6, 0.1])
+    answer = jaxcal.Design.from_blocks(blocks, noise=noise).select(2)
+    doubles = jaxcal.Design.from_blocks(blocks.astype(np.float64), noise=noise)
+    assert answer.log_det == doubles.select(2).log_det
+    u = rng.random((12, 3)).astype(np.float32)
+    u[:10, 2] = u[:10, 0] + u[:10, 1]
+    u[10] = np.nan
+    available = np.arange(12) < 10
+    with pytest.raises(ValueError, match="in one plane"):
+        jaxcal.select(u, 4, available=available)
+    assert jaxcal.select(u, 4, available=np.arange(12) != 10).proven
+    scenarios = np.stack([u[:10, None], u[:10, None, [1, 0, 2]] ** 2])
+    with pytest.raises(ValueError, match=r"in scenario 0: .*nothing of the direction"):
+        jaxcal.Design.from_blocks(scenarios).select(3)
+
+
 @given(float32_tables(dependent=False))
 def test_float32_candidates_are_the_numbers_that_they_hold(u):
     answer, exact = jaxcal.select(u, 4), jaxcal.select(u.astype(np.float64), 4)

@@ -101,7 +101,7 @@ def best_design(
 
 
 def _random_starts(problem: Problem, seed: int) -> list[Indices]:
-    """(k,) the required candidates with others at random."""
+    """Each (k,): the required candidates with others at random."""
     rng = np.random.default_rng([seed, problem.k])
     room = np.repeat(np.arange(len(problem.blocks)), problem.upper - problem.lower)
     more = problem.k - len(problem.required)

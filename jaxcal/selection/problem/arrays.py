@@ -14,6 +14,7 @@ __all__ = [
     "filled",
     "flatten_rounding",
     "one_array",
+    "rounding_of",
     "usable_numbers",
 ]
 
@@ -61,45 +62,65 @@ def usable_numbers(name: str, array: Array, mask: Mask) -> Array:
     return own
 
 
+def rounding_of(values: ArrayLike) -> float:
+    """Spacing at 1 of numbers that are coarser than double precision, else 0."""
+    kind = np.asarray(values).dtype
+    coarse = kind.kind == "f" and kind.itemsize < np.dtype(np.float64).itemsize
+    return float(np.finfo(kind).eps) if coarse else 0.0
+
+
 def flatten_rounding(
-    given: ArrayLike,
-    usable: Mask,
+    spacing: float,
     candidates: Array,
+    usable: Mask,
     measured: Array | None = None,
     *,
     bias: bool = False,
 ) -> None:
-    """Put rows that lie in a plane but for rounding to float32 into it, in place.
+    """Put blocks that lie in a plane but for rounding to float32 into it, in place.
 
     In double precision that rounding would pass for information: of a third column that
-    is the sum of two others in float32 a design would be made, and proven. Numbers
-    given in double precision stay as they are.
+    is the sum of two others in float32 a design would be made, and proven.
 
     Args:
-        given: the candidates as the caller gave them, whose type tells the rounding.
-        usable: (M,) which of them count.
-        candidates: (M, ..., p) of them in double precision.
-        measured: (N, ..., p) rows known beforehand, in the same plane or in none.
+        spacing: of the numbers that the caller gave, see ``rounding_of``; 0: nothing.
+        candidates: (S, M, q, p) of S sets; readings and columns of any unit.
+        usable: (S, M) which of them count.
+        measured: (S, N, q, p) known beforehand, put into the plane with them.
         bias: a column of ones stands beside them, so the plane need not pass through 0.
     """
-    kind, p = np.asarray(given).dtype, candidates.shape[-1]
-    if kind.kind != "f" or kind.itemsize >= candidates.itemsize:
+    if not spacing:
         return
-    rows = candidates[usable].reshape(-1, p)
-    count = len(rows)
-    if measured is not None and measured.shape[1:] == candidates.shape[1:]:
-        rows = np.concatenate([rows, measured.reshape(-1, p)])
-    middle = rows.mean(axis=0) if bias and count else np.zeros(p)
-    largest = np.abs(rows).max(axis=0, initial=0.0)
-    scale = np.where(largest > 0.0, largest, 1.0)
-    left, size, right = np.linalg.svd((rows - middle) / scale, full_matrices=False)
-    rounding = _ROUNDED * np.finfo(kind).eps * np.sqrt(rows.size)
-    if size.min(initial=np.inf) > rounding:
-        return
-    flat = middle + (left * np.where(size > rounding, size, 0.0)) @ right * scale
-    candidates[usable] = flat[:count].reshape(-1, *candidates.shape[1:])
-    if measured is not None and len(flat) > count:
-        measured[...] = flat[count:].reshape(measured.shape)
+    blocks, counted = candidates, usable
+    if measured is not None and measured.shape[2:] == candidates.shape[2:]:
+        blocks = np.concatenate([candidates, measured], axis=1)
+        always = np.ones(measured.shape[:2], dtype=np.bool_)
+        counted = np.concatenate([usable, always], axis=1)
+    counts = counted[..., None, None]
+    blocks = np.where(counts, blocks, 0.0)
+    scale = _sizes(blocks, (1, 3))
+    scale = scale * _sizes(blocks / scale, (1, 2))
+    unit = blocks / scale
+    middle = np.zeros((len(unit), 1, *unit.shape[2:]))
+    if bias:
+        number = np.maximum(counts.sum(axis=1, keepdims=True), 1)
+        middle = unit.sum(axis=1, keepdims=True) / number
+    rows = np.where(counts, unit - middle, 0.0).reshape(len(unit), -1, unit.shape[3])
+    left, size, right = np.linalg.svd(rows, full_matrices=False)
+    real = size > _ROUNDED * spacing * np.sqrt(rows[0].size)
+    num = candidates.shape[1]
+    for n in np.flatnonzero(~real.all(axis=1)):
+        flat = (left[n] * np.where(real[n], size[n], 0.0)) @ right[n]
+        flat = (flat.reshape(unit.shape[1:]) + middle[n]) * scale[n]
+        candidates[n][usable[n]] = flat[:num][usable[n]]
+        if measured is not None and len(flat) > num:
+            measured[n] = flat[num:]
+
+
+def _sizes(blocks: Array, axes: tuple[int, int]) -> Array:
+    """The largest of each reading or column, 1 where all are zero."""
+    largest = np.abs(blocks).max(axis=axes, initial=0.0, keepdims=True)
+    return np.where(largest > 0.0, largest, 1.0)
 
 
 def check_available(available: ArrayLike | None, shape: tuple[int, ...]) -> Mask:

@@ -40,6 +40,7 @@ from jaxcal.selection.problem.arrays import (
     filled,
     flatten_rounding,
     one_array,
+    rounding_of,
     usable_numbers,
 )
 from jaxcal.selection.problem.blocks import blocks_of
@@ -166,8 +167,7 @@ def make_problems(
     array = filled("candidates", candidates, "B", "M", "n")
     mask = check_available(available, array.shape[:2])
     array = usable_numbers("candidates", array, mask)
-    for usable, commands in zip(mask, array, strict=True):
-        flatten_rounding(candidates, usable, commands, bias=True)
+    flatten_rounding(rounding_of(candidates), array[:, :, None], mask, bias=True)
     array.flags.writeable = False  # and so of every set
     m = array.shape[2] if num_outputs is None else num_outputs
     model = Affine(array.shape[2], whole_number("num_outputs", m, 1))
@@ -228,7 +228,8 @@ def _checked_problem(
         raw = np.asarray(np.linalg.qr(raw, mode="r"))
     k = _check_k(k, raw, available, root, regressors=not names)
     cap = whole_number("max_replicates", max_replicates, 1)
-    forced = _check_counts(available, k, required, cap)
+    _require_enough(available, k, cap)
+    forced = _checked_required(required, available, k)
     computed = bool(names) and model is not None
     if white is None:
         sets = raw[None], available[None]
@@ -265,10 +266,8 @@ def _uninformed(
     )
 
 
-def _check_counts(
-    mask: Mask, k: int, required: ArrayLike | None, cap: int
-) -> NDArray[np.int64]:
-    """The required candidates (r,); enough are available."""
+def _require_enough(mask: Mask, k: int, cap: int) -> None:
+    """Refuse fewer available candidates (M,) than k takes."""
     count = int(np.count_nonzero(mask))
     if not count:
         raise ValueError(f"available must leave at least {k} candidates, got none")
@@ -278,7 +277,6 @@ def _check_counts(
             + (f", each at most {cap} times" if cap > 1 else "")
             + f", got {k}"
         )
-    return _checked_required(required, mask, k)
 
 
 def _checked_required(
@@ -312,8 +310,10 @@ def _check_k(
 ) -> int:
     """k, by default the fewest candidates that identify every parameter alone.
 
-    Of blocks ``raw`` (M, q, p), which may be regressors [u, 1], with a root (r, p) of
-    what is known.
+    Args:
+        k: as asked for.
+        raw, mask, root: blocks (M, q, p), available (M,), what is known (r, p).
+        regressors: the blocks are [u, 1].
     """
     p = raw.shape[2]
     usable = raw if raw.shape[1] == 1 and k is not None else raw[mask]

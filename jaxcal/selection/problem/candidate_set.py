@@ -22,6 +22,7 @@ from jaxcal.selection.problem.arrays import (
     check_available,
     filled,
     flatten_rounding,
+    rounding_of,
     usable_numbers,
 )
 from jaxcal.selection.problem.losses import checked_reliability
@@ -116,8 +117,11 @@ class CandidateSet:
         )
         if model.multiplicity:  # another's derivatives are computed from the commands
             assert made.candidates is not None
+            spacing, known = rounding_of(candidates), None
+            if made.measured is not None and made.measured.ndim == 2:
+                known = made.measured[None, :, None]
             flatten_rounding(
-                candidates, mask, made.candidates, made.measured, bias=True
+                spacing, made.candidates[None, :, None], mask[None], known, bias=True
             )
         if scenarios is not None:
             made.scenarios = scenarios_of(scenarios, model, prior)
@@ -195,11 +199,12 @@ class CandidateSet:
                 "measured must have shape (S, N, q, p), blocks of every scenario, got "
                 f"{seen.shape}"
             )
-        for s in range(array.shape[1] if array.ndim == 4 else 0):
-            of_one = None if seen is None else seen[s]
-            flatten_rounding(blocks, mask, array[:, s], of_one)
-        if array.ndim == 3:
-            flatten_rounding(blocks, mask, array, seen)
+        by_set = np.moveaxis(array, 1, 0) if array.ndim == 4 else array[None]
+        known = seen[None] if seen is not None and array.ndim == 3 else seen
+        if known is not None and known.ndim != 4:
+            known = None
+        usable = np.broadcast_to(mask, by_set.shape[:2])
+        flatten_rounding(rounding_of(blocks), by_set, usable, known)
         return made
 
     @property
