@@ -420,7 +420,7 @@ def _stop_on_signals() -> Iterator[Stop]:
 def _begin_table(unit: str, columns: tuple[str, str, str]) -> None:
     reward, first, second = columns
     print(
-        "compiling the training step (about half a minute; a few seconds where this "
+        "compiling the training step (some 15 s; a few seconds where this "
         "machine has compiled it before) ...\n"
         f"   update {unit:>10}     /s   elapsed      left {reward:>8} {first:>16} "
         f"{second:>16}",

@@ -42,8 +42,8 @@ tasks, of sequential measurement:
   FILE.py   your own: a file that defines ENTRY (docs/adaptive.md)
 
 what to try first:
-  {program}                        the compact policy, about a minute on a laptop
-  {program} --episodes 20000 --out runs/brief   a quarter of a minute, 0.997
+  {program}                        the compact policy, half a minute on one core
+  {program} --episodes 20000 --out runs/brief   quicker, to try things
   {program} --num-selected 6 --out runs/six     another number of postures
   {program} --candidates mine.csv --out runs/mine   your own machine's postures
   {program} --criterion A --out runs/a          least variance; I: of predictions; E

@@ -41,7 +41,7 @@ _FIXED = dict(
 
 def adapted(config: TrainConfig) -> TrainConfig:
     """A preset for brax: the paper's network, a learning rate of at most 1e-3, and at
-    least 200,000 episodes, which the 210 numbers of an observation take."""
+    least 200,000 episodes, since the network begins from nothing."""
     width = config.network.width if config.network.kind == "paper" else 64
     rate = min(config.ppo.learning_rate, 1e-3)  # brax's updates diverge at 2e-3
     episodes = max(config.ppo.num_episodes, 200_000)
