@@ -207,7 +207,10 @@ class Calibration(Fit):
             loss=self.loss,
             common_noise=None,
         )
-        return dataclasses.replace(self, **fields)
+        origin = {k: v for k, v in self.provenance.items() if k != "prior"}
+        if prior is not None and not prior.by_data:
+            origin["prior"] = "stated"
+        return dataclasses.replace(self, **fields, provenance=origin)
 
     def _for_file(self) -> Array:
         """(p,) for a file: fitted without what no file holds, which is zero."""

@@ -35,7 +35,8 @@ class Fit:
     output_names: tuple[str, ...]
     command_unit: str  # "" where not stated
     measured_unit: str
-    provenance: Mapping[str, Any]  # created, packages, data_sha256, notes
+    # created, packages, data_sha256, notes, accuracy; prior "stated" where one was
+    provenance: Mapping[str, Any]
     model: Model
     loss: str  # of jaxcal.calibration.losses
     estimate: Annotated[Array, "P"]
@@ -101,7 +102,7 @@ class Fit:
 
     @property
     def stated_prior(self) -> Prior | None:
-        """The prior that ``identify`` was given; None: the model's, or a sized one."""
+        """The prior that ``identify`` was given, unless sized; None: the model's."""
         if self.provenance.get("prior") != "stated":
             return None
         p, names = len(self.names), np.array(self.names)

@@ -290,9 +290,17 @@ def test_a_distance_between_sockets_that_are_not_touched_is_no_size():
     """As of one of two chains, where the other touches them."""
     arm = ur5(sensor=Socket(3, distances=[(1, 2, 50.0, 0.1)]))
     joints = np.zeros((4, 6))
-    for which, doubtful in (((0, 0, 1, 1), True), ((0, 1, 2, 2), False)):
+    left_out = np.array([1.0, 1.0, 1.0, 0.0])
+    for which, weights, doubtful in (
+        ((0, 0, 1, 1), np.ones(4), True),
+        ((0, 1, 2, 2), np.ones(4), False),
+        ((0, 0, 1, 2), left_out, True),
+    ):
         fit = types.SimpleNamespace(
-            model=arm, commands=np.column_stack([joints, which]), measured_unit="mm"
+            model=arm,
+            commands=np.column_stack([joints, which]),
+            loss_weights=weights,
+            measured_unit="mm",
         )
         none = _Findings((), False, False, False, (), False)
         assert _of_no_size(none, fit, anywhere=10.0, nominal=1.0).doubtful == doubtful

@@ -77,13 +77,30 @@ def test_corners_outside_the_picture_are_named():
     narrow = arm.measured_with(Board("camera", PLACE, CORNERS, CAMERA[2:]))
     np.testing.assert_array_equal(narrow.predict(joints), arm.predict(joints))
     arm.prepared(joints, arm.predict(joints))
-    shifted = pixels + [0.0, 1000.0] * (np.arange(8) == 3)[:, None, None]
-    with pytest.raises(ValueError, match="of 1 rows are not: corner 1 of row 3"):
-        arm.prepared(joints, shifted.reshape(8, -1))
+    arm.prepared(joints, _at_left(pixels, 3, -0.05).reshape(8, -1))
+    with pytest.raises(ValueError, match=r"in 1 of the board's 8 .* its row 3 is at"):
+        arm.prepared(joints, _at_left(pixels, 3, -0.15).reshape(8, -1))
     aside = joints.copy()
     aside[5, 4] += 180.0  # the camera looks away
-    with pytest.warns(UserWarning, match="1 of 8 candidates .* row 5 first"):
+    with pytest.warns(UserWarning, match="1 of 8 candidates .* row 5 of those"):
         arm.prepared(aside)
+
+
+def _at_left(pixels, row, share):
+    """Pixels (N, C, 2) of a row moved until its leftmost is at a share of the width."""
+    moved = pixels.copy()
+    moved[row, :, 0] += share * CAMERA[0] - pixels[row, :, 0].min()
+    return moved
+
+
+def test_a_board_without_corners_takes_a_camera_for_its_postures():
+    posed = Board("camera", PLACE, extent=(200.0, 150.0), camera=CAMERA)
+    arm = SerialChain.from_dh(ur5().table, tool=MOUNT, sensor=posed)
+    candidates = arm.postures(12, seed=2)
+    arm.prepared(candidates)
+    arm.prepared(candidates, arm.predict(candidates) - 80.0)  # poses, no pixels
+    with pytest.raises(ValueError, match=r"camera must be .*, got \(640.0, 480.0\)"):
+        Board("camera", PLACE, camera=(640.0, 480.0))
 
 
 def test_contacts_on_a_table_come_from_above_it():

@@ -48,8 +48,8 @@ class Board(Sensor):
         place: (4, 4) of the other in the measuring frame; found when not given.
         corners: (C, 3) of the board in its own frame, in its plane z = 0.
         camera: focal lengths and centre in pixels (fx, fy, cx, cy); with the size of
-            its picture before them, (width, height, fx, fy, cx, cy), corners outside
-            are refused, and postures are planned for that camera.
+            its picture before them, (width, height, fx, fy, cx, cy), corners more
+            than a tenth outside are refused, and postures are planned for that camera.
         side: 1 where the board's z axis points to cameras that see it, -1 where it
             points away; 0 is not known, views tell.
         extent: width and height of the board from the origin of its pose, for postures
@@ -73,6 +73,16 @@ class Board(Sensor):
         one_of("moves", self.moves, ("camera", "board"))
         if self.place is not None:
             object.__setattr__(self, "place", array_of("place", self.place, 4, 4))
+        camera = numbers("camera", self.camera)
+        known = self.corners is not None or len(self.camera) == 6
+        if camera.shape not in ((4,), (6,)) or (
+            known and not (camera[:-2] > 0.0).all()
+        ):
+            raise ValueError(
+                "camera must be (fx, fy, cx, cy) in pixels where corners are given, or "
+                f"(width, height, fx, fy, cx, cy), got {self.camera!r}"
+            )
+        object.__setattr__(self, "camera", tuple(camera.tolist()))
         if self.corners is None:
             return
         corners = numbers("corners", self.corners)
@@ -82,14 +92,7 @@ class Board(Sensor):
                 "corners must be four or more rows (x, y, 0), got shape "
                 f"{corners.shape}"
             )
-        camera = numbers("camera", self.camera)
-        if camera.shape not in ((4,), (6,)) or not (camera[:-2] > 0.0).all():
-            raise ValueError(
-                "camera must be (fx, fy, cx, cy) in pixels where corners are given, or "
-                f"(width, height, fx, fy, cx, cy), got {self.camera!r}"
-            )
         object.__setattr__(self, "corners", corners)
-        object.__setattr__(self, "camera", tuple(camera.tolist()))
 
     @property
     def lens(self) -> tuple[Array, Array]:
@@ -226,7 +229,7 @@ class Board(Sensor):
         return dataclasses.replace(self, place=place, side=side), new
 
     def depths(self, poses: Array) -> Array:
-        """(N, C) of the corners before the camera, from poses (N, 6) of the board."""
+        """(N, C) depth of the board's points before the camera, at poses (N, 6)."""
         from scipy.spatial.transform import Rotation
 
         turn = Rotation.from_rotvec(poses[:, 3:], degrees=True).as_matrix()

@@ -513,6 +513,8 @@ class Chains(Model):
         of_chains = {tip: fit.of(tip).verdict for tip in self.tips if tip in read}
         bad = [tip for tip, told in of_chains.items() if not told.good]
         step = f"{bad[0]}: {of_chains[bad[0]].next_step}" if bad else models.USE
+        if fit.noise_std is None:
+            step = "measure more postures, or state noise_std=1: readings are in noise"
         reasons = [
             f"{tip}: {line}" for tip, told in of_chains.items() for line in told.lines()
         ]

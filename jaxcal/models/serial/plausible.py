@@ -34,7 +34,7 @@ _OTHER_UNIT = 0.01  # of it: so far off and tenfold, a distance is in another un
 def require_readings(arm: Chain, commands: Array, measured: Array) -> None:
     """Refuse millimetres for metres, radians for degrees: an arm is not off tenfold.
 
-    Of a camera whose picture is known, corners outside of it.
+    Of a camera whose picture is known, corners more than a tenth outside of it.
     """
     if isinstance(arm.sensor, Board):
         _require_in_picture(arm.sensor, measured)
@@ -54,23 +54,28 @@ def require_readings(arm: Chain, commands: Array, measured: Array) -> None:
 
 def _require_in_picture(board: Board, pixels: Array) -> None:
     size = board.picture
-    if size is None:
+    if size is None or board.corners is None:
         return
     spots = pixels.reshape(len(pixels), -1, 2)
     outside = np.any(np.abs(spots / size - 0.5) > 0.5 + _BEYOND, axis=2)
     for row, corner in np.argwhere(outside)[:1]:
         count = np.count_nonzero(outside.any(axis=1))
         raise ValueError(
-            f"corners must be in the camera's picture of {size[0]:g} by {size[1]:g} "
-            f"pixels, but those of {count} rows are not: corner {corner + 1} of row "
-            f"{row} is at {in_words(spots[row, corner])}"
+            f"corners must be within a tenth of the camera's picture of {size[0]:g} by "
+            f"{size[1]:g} pixels, but in {count} of the board's {len(spots)} rows some "
+            f"are not: corner {corner + 1} of its row {row} is at "
+            f"{in_words(spots[row, corner])}. Is it the width before the height, and "
+            "this camera? Of a wide lens give camera=(fx, fy, cx, cy), which is not "
+            "judged"
         )
 
 
 def warn_of_picture(arm: Chain, candidates: Array) -> None:
-    """Views from which a camera whose picture is known does not see the whole board."""
+    """Warn of candidates from which a camera does not have the whole board in view."""
     board = arm.sensor
-    if not isinstance(board, Board) or board.picture is None or board.place is None:
+    if not isinstance(board, Board) or board.corners is None:
+        return
+    if board.picture is None or board.place is None:
         return
     posed = arm.measured_with(dataclasses.replace(board, corners=None))
     none = np.zeros((len(candidates), len(board.tool)))  # of a board seen at zero
@@ -81,8 +86,8 @@ def warn_of_picture(arm: Chain, candidates: Array) -> None:
     if lost.size:
         warnings.warn(
             f"{lost.size} of {len(candidates)} candidates do not have the whole board "
-            f"in the camera's picture, row {lost[0]} first; arm.postures() makes such "
-            "as have",
+            f"in the camera's picture, row {lost[0]} of those available first; use "
+            "arm.postures(), which generates views that do",
             stacklevel=2,
         )
 

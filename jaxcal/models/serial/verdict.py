@@ -106,12 +106,11 @@ def verdict(calibration: Fit) -> ArmVerdict:
     """
     model, unit = calibration.model, calibration.measured_unit
     if calibration.noise_std is None:
-        usual = np.unique(np.asarray(model.default_noise().std))
         return ArmVerdict(
             good=False,
             reasons=(calibration.no_noise("intervals and no verdict"),),
             next_step="measure more postures, or state noise_std, --noise (this "
-            f"sensor's usual one: {', '.join(f'{std:.2g}' for std in usual)})",
+            f"sensor's usual one: {_usual_noise(calibration)})",
             unit=unit,
         )
     used = np.flatnonzero(calibration.loss_weights > 0.0)
@@ -206,6 +205,16 @@ def _findings(
     )
 
 
+def _usual_noise(calibration: Fit) -> str:
+    """That of the sensor, as noise_std takes it: one number, or one of each output."""
+    usual = np.broadcast_to(
+        np.asarray(calibration.model.default_noise().std), (calibration.num_outputs,)
+    )
+    if np.ptp(usual) == 0.0:
+        usual = usual[:1]
+    return ",".join(f"{std:.2g}" for std in usual)
+
+
 def _of_no_size(
     findings: _Findings, calibration: Fit, anywhere: float, nominal: float
 ) -> _Findings:
@@ -222,7 +231,8 @@ def _of_no_size(
     reason = (
         f"contacts without a known distance leave the arm's size open: elsewhere its "
         f"tip is known to {anywhere:.3g}{unit}, the nominal one is {nominal:.3g} off "
-        "here. Give the distance between two sockets (distances=, --distance)"
+        "here. Give the distance between two sockets that it touches (distances=, "
+        "--distance)"
     )
     return findings._replace(reasons=(*findings.reasons, reason), doubtful=True)
 
@@ -443,7 +453,8 @@ def _freed(calibration: Fit, model: Chain, row: int) -> tuple[float, float]:
 
 def _touched(calibration: Fit, model: Chain) -> NDArray[np.bool_]:
     """(D,) distances both of whose sockets have contacts of this arm."""
-    labels = model.sensor.of_rows(calibration.commands[:, model.num_joints :])
+    used = calibration.commands[calibration.loss_weights > 0.0]
+    labels = model.sensor.of_rows(used[:, model.num_joints :])
     pairs = np.array(model.sensor.distances)[:, :2]
     return np.asarray(np.isin(pairs, labels).all(axis=1))
 
