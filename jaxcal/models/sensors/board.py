@@ -74,10 +74,9 @@ class Board(Sensor):
         if self.place is not None:
             object.__setattr__(self, "place", array_of("place", self.place, 4, 4))
         camera = numbers("camera", self.camera)
-        known = self.corners is not None or len(self.camera) == 6
-        if camera.shape not in ((4,), (6,)) or (
-            known and not (camera[:-2] > 0.0).all()
-        ):
+        needed = self.corners is not None or camera.shape == (6,)
+        right = (camera[:-2] > 0.0).all() or not needed
+        if camera.shape not in ((4,), (6,)) or not right:
             raise ValueError(
                 "camera must be (fx, fy, cx, cy) in pixels where corners are given, or "
                 f"(width, height, fx, fy, cx, cy), got {self.camera!r}"

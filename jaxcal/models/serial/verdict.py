@@ -206,7 +206,7 @@ def _findings(
 
 
 def _usual_noise(calibration: Fit) -> str:
-    """That of the sensor, as noise_std takes it: one number, or one of each output."""
+    """The sensor's noise as noise_std takes it: one number, or one of each output."""
     usual = np.broadcast_to(
         np.asarray(calibration.model.default_noise().std), (calibration.num_outputs,)
     )

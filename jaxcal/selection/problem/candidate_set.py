@@ -117,11 +117,11 @@ class CandidateSet:
         )
         if model.multiplicity:  # another's derivatives are computed from the commands
             assert made.candidates is not None
-            spacing, known = rounding_of(candidates), None
+            spacing, rows = rounding_of(candidates), None
             if made.measured is not None and made.measured.ndim == 2:
-                known = made.measured[None, :, None]
+                rows = made.measured[None, :, None]
             flatten_rounding(
-                spacing, made.candidates[None, :, None], mask[None], known, bias=True
+                spacing, made.candidates[None, :, None], mask[None], rows, bias=True
             )
         if scenarios is not None:
             made.scenarios = scenarios_of(scenarios, model, prior)
@@ -200,11 +200,11 @@ class CandidateSet:
                 f"{seen.shape}"
             )
         by_set = np.moveaxis(array, 1, 0) if array.ndim == 4 else array[None]
-        known = seen[None] if seen is not None and array.ndim == 3 else seen
-        if known is not None and known.ndim != 4:
-            known = None
+        rows = seen[None] if seen is not None and array.ndim == 3 else seen
+        if rows is not None and rows.ndim != 4:
+            rows = None
         usable = np.broadcast_to(mask, by_set.shape[:2])
-        flatten_rounding(rounding_of(blocks), by_set, usable, known)
+        flatten_rounding(rounding_of(blocks), by_set, usable, rows)
         return made
 
     @property
