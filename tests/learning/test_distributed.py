@@ -324,7 +324,7 @@ from jaxcal.learning.environments.task import Task
 from jaxcal.learning.training.config import TrainConfig
 
 CONFIG = TrainConfig(
-    network=NetworkConfig(width=8, encoder_rounds=1),
+    network=NetworkConfig(width=8, encoder_rounds=1, close_up=True),
     ppo=EpisodesConfig(
         num_episodes=64 * 8, episodes_per_update=64, episodes_per_set=4,
         num_minibatches=2, learning_rate=2e-5, final_learning_rate=2e-5,
