@@ -73,25 +73,24 @@ class Board(Sensor):
         one_of("moves", self.moves, ("camera", "board"))
         if self.place is not None:
             object.__setattr__(self, "place", array_of("place", self.place, 4, 4))
+        if self.corners is not None:
+            corners = numbers("corners", self.corners)
+            flat = corners.ndim == 2 and corners.shape[1] == 3 and len(corners) > 3
+            if not flat or corners[:, 2].any():
+                raise ValueError(
+                    "corners must be four or more rows (x, y, 0), got shape "
+                    f"{corners.shape}"
+                )
+            object.__setattr__(self, "corners", corners)
         camera = numbers("camera", self.camera)
-        needed = self.corners is not None or camera.shape == (6,)
-        right = (camera[:-2] > 0.0).all() or not needed
-        if camera.shape not in ((4,), (6,)) or not right:
+        used = self.corners is not None or camera.shape == (6,)
+        right = camera.shape in ((4,), (6,))
+        if not right or (used and not (camera[:-2] > 0.0).all()):
             raise ValueError(
                 "camera must be (fx, fy, cx, cy) in pixels where corners are given, or "
                 f"(width, height, fx, fy, cx, cy), got {self.camera!r}"
             )
         object.__setattr__(self, "camera", tuple(camera.tolist()))
-        if self.corners is None:
-            return
-        corners = numbers("corners", self.corners)
-        flat = corners.ndim == 2 and corners.shape[1] == 3 and len(corners) > 3
-        if not flat or corners[:, 2].any():
-            raise ValueError(
-                "corners must be four or more rows (x, y, 0), got shape "
-                f"{corners.shape}"
-            )
-        object.__setattr__(self, "corners", corners)
 
     @property
     def lens(self) -> tuple[Array, Array]:
