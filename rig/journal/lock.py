@@ -34,6 +34,7 @@ FOLDER = pathlib.Path(
     os.environ.get("JAXCAL_RIG_LOCKS", f"/var/tmp/jaxcal-rig-{os.getuid()}")
 )
 PATIENCE_S = 0.2  # a `holder` of another process keeps the flock for an instant
+_ASKERS_S = 2.0  # nobody says that it is held: only such can keep it, one after another
 
 
 class BusLock:
@@ -57,7 +58,12 @@ class BusLock:
             Refused: another process, or this one, holds it; names the holder.
         """
         self._fd = fd = self._open(os.O_RDWR | os.O_CREAT)
-        if not until(PATIENCE_S, lambda: flock(fd, fcntl.LOCK_EX)):
+
+        def taken() -> bool:
+            return flock(fd, fcntl.LOCK_EX)
+
+        free = until(PATIENCE_S, taken)
+        if not (free or (not _content(fd) and until(_ASKERS_S, taken))):
             told = _content(fd)
             self.release()
             raise Refused(
