@@ -213,7 +213,7 @@ class Runs:
             for j, rows in pieces:
                 try:
                     future = self._submit(jobs[j][0][rows], jobs[j][1])
-                except BrokenProcessPool:  # a run of an earlier piece ended its process
+                except BrokenProcessPool:  # an earlier run killed a worker process
                     broken.append((j, rows))
                 else:
                     futures[future] = (j, rows)

@@ -34,7 +34,7 @@ FOLDER = pathlib.Path(
     os.environ.get("JAXCAL_RIG_LOCKS", f"/var/tmp/jaxcal-rig-{os.getuid()}")
 )
 PATIENCE_S = 0.2  # a `holder` of another process keeps the flock for an instant
-_ASKERS_S = 2.0  # nobody says that it is held: only such can keep it, one after another
+_ASKERS_S = 2.0  # the same where several `holder` calls follow one another
 
 
 class BusLock:
