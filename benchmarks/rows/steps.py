@@ -32,7 +32,7 @@ from benchmarks.harness import (
     median_ratio,
     side_by_side,
 )
-from benchmarks.rows import threefry
+from jaxcal.learning.environments import randomness
 from jaxcal.learning.environments import selection as environment
 from jaxcal.learning.environments.brax_env import SelectionEnv, wrap_fresh
 from jaxcal.learning.environments.selection import SelectionConfig
@@ -84,7 +84,7 @@ def ours(batch: int, episodes: int, options: dict[str, Any] | None = None) -> Ru
 
     def episode(carry: Any, key: jax.Array) -> tuple[Any, None]:
         states, seen, total = carry
-        units = jax.random.uniform(key, (K, batch))
+        units = randomness.uniform(key, (K, batch))
         return jax.lax.scan(step, (again(states), seen, total), units)[0], None
 
     @functools.partial(jax.jit, compiler_options=options)
@@ -118,7 +118,7 @@ def through_brax(
     def run(key: jax.Array) -> jax.Array:
         key_reset, key_act = jax.random.split(key)
         state = env.reset(jax.random.split(key_reset, batch))
-        units = jax.random.uniform(key_act, (episodes * K, batch))
+        units = randomness.uniform(key_act, (episodes * K, batch))
         state, total = jax.lax.scan(step, (state, jnp.zeros(batch)), units)[0]
         return state.obs.sum() + total.sum()
 
@@ -178,7 +178,7 @@ def add_floor(row: Row, rate: float) -> None:
 
     def hashes(options: dict[str, Any] | None) -> Callable[[], Any]:
         numbers = jax.jit(
-            lambda key: threefry.uniform(key, count).sum(),
+            lambda key: randomness.uniform(key, (count,)).sum(),
             compiler_options=options,
         )
         return side_by_side(

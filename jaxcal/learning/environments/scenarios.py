@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxcal.learning.environments import randomness
 from jaxcal.learning.environments.selection import CandidateSource, SelectionConfig
 
 __all__ = ["SHAPES", "given", "mixture"]
@@ -61,7 +62,7 @@ def given(
 def _shape(name: str, key: jax.Array, m: int, n: int) -> jax.Array:
     """(M, n) candidates of one shape, of order one in size."""
     if name == "uniform":
-        return jax.random.uniform(key, (m, n))
+        return randomness.uniform(key, (m, n))
     if name == "gaussian":
         return jax.random.normal(key, (m, n))
     key_a, key_b, key_c = jax.random.split(key, 3)

@@ -26,6 +26,7 @@ from flax import struct
 
 from jaxcal.learning.config import CRITERIA
 from jaxcal.learning.criteria import inverse_of, regressors, worth_of_inverse
+from jaxcal.learning.environments import randomness
 from jaxcal.learning.environments.observation import context_features
 from jaxcal.learning.settings import require, setting
 from jaxcal.learning.small_matrices import log_det_gram, picked
@@ -122,7 +123,7 @@ def reset(
     if draw is not None:
         return start(*draw(key_draw), config, key_next)
     m = config.num_candidates
-    candidates = jax.random.uniform(key_draw, (m, config.num_inputs))
+    candidates = randomness.uniform(key_draw, (m, config.num_inputs))
     return start(candidates, jnp.ones(m, bool), config, key_next)
 
 
