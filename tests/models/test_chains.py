@@ -1,6 +1,7 @@
 """Several chains in one model, against the file's frames multiplied out."""
 
 import dataclasses
+import functools
 import json
 import warnings
 
@@ -9,7 +10,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from jaxcal.models import Chains, Pose, Position, SerialChain, Socket, from_dict
+from jaxcal.models import (
+    Board,
+    Chains,
+    Distance,
+    Gravity,
+    Plane,
+    Pose,
+    Position,
+    SerialChain,
+    Several,
+    Socket,
+    from_dict,
+)
 from jaxcal.models.serial.urdf import joints_of
 
 from .arms import differences, ur5
@@ -56,20 +69,23 @@ def urdf(path, rng=None):
     return path
 
 
-def tip_at(path, tip, joints, commands):
-    """(N, 3) of a link by the file's own frames; ``joints`` name the columns."""
+def frames_at(path, tip, joints, commands):
+    """(N, 4, 4) of a link by the file's own frames; ``joints`` name the columns."""
     above = {joint.child: joint for joint in joints_of(path.read_text()).values()}
-    places = []
-    for row in commands:
-        at = dict(zip(joints, row, strict=True))
-        point, link = np.zeros(3), tip
-        while link in above:
-            joint = above[link]
-            turn = Rotation.from_rotvec(joint.axis * at.get(joint.name, 0), True)
-            point = joint.origin[:3, :3] @ turn.apply(point) + joint.origin[:3, 3]
-            link = joint.parent
-        places.append(point)
-    return np.array(places)
+    whole, link = np.tile(np.eye(4), (len(commands), 1, 1)), tip
+    while link in above:
+        joint, one = above[link], np.tile(np.eye(4), (len(commands), 1, 1))
+        if joint.name in joints:
+            angles = np.asarray(commands)[:, joints.index(joint.name), None]
+            turn = Rotation.from_rotvec(joint.axis * angles, True)
+            one[:, :3, :3] = turn.as_matrix()
+        whole, link = joint.origin @ one @ whole, joint.parent
+    return whole
+
+
+def tip_at(path, tip, joints, commands):
+    """(N, 3) of a link by the file's own frames."""
+    return frames_at(path, tip, joints, commands)[:, :3, 3]
 
 
 def tracked(path):
@@ -304,3 +320,179 @@ def test_hands_may_touch_sockets_that_the_other_does_not():
     which = commands[:, pair.inputs.index("socket")]
     with pytest.raises(ValueError, match="contacts of socket 2, whose distance"):
         pair.prepared(commands[which != 2.0], measured[which != 2.0])
+
+
+HANDS = ("left_hand", "right_hand")
+SOCKETS = np.array([(0.28, 0.12, 0.5), (0.3, 0.0, 0.45), (0.28, -0.12, 0.5)])
+PLANE = np.array([0.0, 0.6, 0.8, 0.35])  # normal, distance from the origin
+ANCHORS = np.array([(1.0, 0.5, 0.2, 0.003), (0.8, -0.9, 0.9, -0.002)])
+BOARD = np.eye(4)
+BOARD[:3, :3] = Rotation.from_euler("xyz", (20, -100, 15), True).as_matrix()
+BOARD[:3, 3] = 0.9, 0.1, 0.6
+CAMERA = np.eye(4)  # on a hand
+CAMERA[:3, :3] = Rotation.from_euler("xyz", (40, 30, -70), True).as_matrix()
+CAMERA[:3, 3] = 0.02, -0.03, 0.05
+
+
+def touching(tips, gaps, start):
+    """Joints (M, n) near ``start`` at which ``gaps`` of the tips there are zero."""
+    joints = start.copy()
+    for _ in range(8):
+        off = gaps(tips(joints))
+        by_joint = [gaps(tips(joints + step)) - off for step in np.eye(joints.shape[1])]
+        slopes = np.stack(by_joint, axis=-1)
+        joints -= np.clip((np.linalg.pinv(slopes) @ off[..., None])[..., 0], -20, 20)
+    there = np.abs(gaps(tips(joints))).max(axis=1) < 1e-9
+    return joints[there & (np.abs(joints).max(axis=1) < 85)]
+
+
+def read_by_hand(kind, k, frames, rng):
+    """Commands and readings of a hand's first sensor, by its frames at joints."""
+
+    def tips(joints):
+        return frames(joints)[:, :3, 3]
+
+    start = rng.uniform(-80, 80, (160, 7))
+    if kind == "sockets":  # 0 and 1 by the left hand, 1 and 2 by the right one
+        tables = [
+            (touching(tips, lambda at, p=place: at - p, start[:60]), i)
+            for i, place in enumerate(SOCKETS)
+            if i in (k, k + 1)
+        ]
+        rows = [np.column_stack([q, np.full(len(q), i)]) for q, i in tables]
+        joints = np.vstack(rows)
+        return joints, rng.normal(0, 1e-4, (len(joints), 3))
+    if kind == "plane":
+        joints = touching(tips, lambda at: (at @ PLANE[:3] - PLANE[3])[:, None], start)
+        return joints, rng.normal(0, 5e-5, (len(joints), 1))
+    if kind == "wires":  # the second anchor has two lengths from the left hand
+        which = np.arange(80) % 2 if k else np.arange(80) // 78
+        apart = np.linalg.norm(tips(start[:80]) - ANCHORS[which, :3], axis=1)
+        far = apart - ANCHORS[which, 3] + rng.normal(0, 1e-4, 80)
+        return np.column_stack([start[:80], which]), far[:, None]
+    seen = np.linalg.inv(frames(start[:40]) @ CAMERA) @ BOARD
+    turned = Rotation.from_matrix(seen[:, :3, :3]).as_rotvec(degrees=True)
+    turned += rng.normal(0, 0.01, turned.shape)
+    shift = seen[:, :3, 3] + rng.normal(0, 1e-4, (40, 3))
+    views = np.column_stack([start[:40], shift, turned])
+    return views, np.zeros((40, 6))
+
+
+THINGS = {
+    "sockets": Socket(3, distances=[(0, 2, 0.24, 1e-4)]),
+    "plane": Plane(),
+    "wires": Distance(2, noise=1e-4),
+    "board": Board("camera", noise=(*[1e-4] * 3, *[0.01] * 3)),
+}
+
+
+def sharing(kind, tmp_path):
+    """Two hands with a thing in common and an IMU each; what they read of the truth."""
+    nominal, truth = urdf(tmp_path / "robot.urdf"), tmp_path / "truth.urdf"
+    urdf(truth, np.random.default_rng(1))
+    sensors = {tip: Several((THINGS[kind], Gravity())) for tip in HANDS}
+    robot = Chains.from_urdf(nominal, sensors, base="base")
+    rng, tables = np.random.default_rng(2), {}
+    for k, (tip, arm) in enumerate(zip(HANDS, robot.chains, strict=True)):
+        frames = functools.partial(frames_at, truth, tip, arm.joint_names)
+        of_thing = read_by_hand(kind, k, frames, rng)
+        still = rng.uniform(-80, 80, (20, 7))
+        felt = 9.81 * frames(still)[:, 2, :3] + rng.normal(0, 0.01, (20, 3))
+        tables[tip] = arm.together(of_thing, (still, felt))
+    return robot, *robot.together(tables)
+
+
+@pytest.mark.parametrize("kind", THINGS)
+def test_what_hands_share_in_several_has_one_place(kind, tmp_path):
+    """Found where it is, without a guess, and each camera on its own hand."""
+    robot, commands, measured = sharing(kind, tmp_path)
+    assert all(f"{tip}: bias x" in robot.names for tip in HANDS)
+    own = THINGS[kind].names
+    assert set(own) <= set(robot.names)
+    assert not any(f"{tip}: {name}" in robot.names for tip in HANDS for name in own)
+    arms = robot.prepared(commands, measured).chains
+    for arm in arms:
+        one = arm.sensor.sensors[0]
+        if kind == "board":
+            np.testing.assert_allclose(one.place, BOARD, atol=0.02)
+        else:
+            truth = {"sockets": SOCKETS, "plane": PLANE[None], "wires": ANCHORS}[kind]
+            np.testing.assert_allclose(one.places, truth, atol=0.03)
+    if kind == "board":  # as the nominal hands have them, far from where they began
+        for arm, before in zip(arms, robot.chains, strict=True):
+            hand = np.linalg.inv(before.tool) @ arm.tool
+            np.testing.assert_allclose(hand, CAMERA, atol=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["sockets", "wires"])
+def test_what_hands_share_in_several_shows_one_beside_the_other(kind, tmp_path):
+    """How far the hands are apart, by the frames of the files."""
+    robot, commands, measured = sharing(kind, tmp_path)
+    found = jaxcal.identify(commands, measured, model=robot)
+    apart = {"truth": 0.0, "robot": 0.0, "found": 0.0}
+    for sign, tip, joints in zip((1, -1), HANDS, rng_postures(3), strict=True):
+        names, alone = robot.chains[HANDS.index(tip)].joint_names, found.of(tip)
+        for name in ("truth", "robot"):
+            apart[name] += sign * tip_at(tmp_path / f"{name}.urdf", tip, names, joints)
+        fitted = alone.model.calibrated(alone.parameters)
+        apart["found"] += sign * fitted.predict(joints)
+    far = {name: np.linalg.norm(shift, axis=1) for name, shift in apart.items()}
+    off, before = (np.abs(far[n] - far["truth"]).mean() for n in ("found", "robot"))
+    assert off < 0.3 * before
+
+
+def rng_postures(seed):
+    """(50, 7) joints of either hand, with one torso."""
+    left, right = np.random.default_rng(seed).uniform(-60, 60, (2, 50, 7))
+    right[:, :2] = left[:, :2]
+    return left, right
+
+
+def test_a_distance_in_several_that_no_hand_touches_is_refused(tmp_path):
+    touched = Socket(3, SOCKETS, distances=[(0, 2, 0.24, 1e-4)])
+    sensors = {tip: Several((touched, Gravity())) for tip in HANDS}
+    robot = Chains.from_urdf(urdf(tmp_path / "robot.urdf"), sensors, base="base")
+    joints = np.full((6, 7), 20.0) + np.arange(6)[:, None]
+    joints = np.column_stack([joints, [0, 1] * 3])
+    tables = {
+        tip: arm.together((joints, np.full((6, 3), 1e-3)), (np.zeros((0, 7)), None))
+        for tip, arm in zip(HANDS, robot.chains, strict=True)
+    }
+    with pytest.raises(ValueError, match="contacts of socket 2, whose distance"):
+        robot.prepared(*robot.together(tables))
+
+
+def test_the_base_is_held_of_one_of_the_arms_that_show_where_the_others_stand():
+    """One of a touches the sockets, one of b the plane, c both; d is tracked."""
+    sockets, plane = Socket(2), Plane()
+
+    def held(**sensors):
+        arms = {
+            name: SerialChain.from_dh(
+                [(0, 90, 0.3, 0), (0.4, 0, 0, 0)],
+                sensor=sensor,
+                base=(i, 0, 0),
+                joint_names=[f"{name}1", f"{name}2"],
+            )
+            for i, (name, sensor) in enumerate(sensors.items())
+        }
+        fixed = Chains.of(arms).default_prior().fixed
+        return {name.split(" ", 1)[0] for name in fixed if "base" in name}
+
+    assert held(a=sockets, b=plane) == {"a:", "b:"}
+    assert held(a=sockets, b=plane, c=Several((sockets, plane))) == {"a:"}
+    assert held(a=sockets, d=Several((sockets, Position()))) == set()
+
+
+def test_hands_that_are_tracked_from_elsewhere_keep_one_torso(robot, tmp_path):
+    turn = Rotation.from_euler("zyx", (60, 10, 0), True)
+    commands = postures(robot, 30, 6)
+    scale = robot.chains[0].sensor.stds(robot.chains[0].length)
+    points = read(tmp_path / "robot.urdf", robot, commands) * scale
+    noise = np.random.default_rng(0).normal(0, 1e-4, points.shape)
+    moved = (turn.apply(points) + np.array([3.0, 1.0, 0.0]) + noise) / scale
+    prepared = robot.prepared(commands, moved)
+    assert prepared.names == robot.names
+    off = (prepared.predict(commands) - moved) * scale
+    assert np.abs(off).max() < 0.01

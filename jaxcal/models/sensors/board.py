@@ -48,12 +48,15 @@ class Board(Sensor):
         place: (4, 4) of the other in the measuring frame; found when not given.
         corners: (C, 3) of the board in its own frame, in its plane z = 0.
         camera: focal lengths and centre in pixels (fx, fy, cx, cy); with the size of
-            its picture before them, (width, height, fx, fy, cx, cy), corners more
-            than a tenth outside are refused, and postures are planned for that camera.
+            its picture before them, (width, height, fx, fy, cx, cy), corners outside
+            of it are refused, and postures are planned for that camera.
         side: 1 where the board's z axis points to cameras that see it, -1 where it
             points away; 0 is not known, views tell.
         extent: width and height of the board from the origin of its pose, for postures
             from which all of it is seen; that of ``corners`` where they are given.
+        distortion: (k1, k2, p1, p2) or with k3 of the lens, as OpenCV's, by which a
+            corner that is outside without it is known to be in the picture; none when
+            not given.
     """
 
     moves: str = "camera"
@@ -62,11 +65,14 @@ class Board(Sensor):
     camera: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     side: float = 0.0
     extent: tuple[float, float] = (0.0, 0.0)
+    distortion: tuple[float, ...] = ()
 
     kind = "board"
     tool = ("x", "y", "z", "rx", "ry", "rz")
     names = tuple(f"stand {axis}" for axis in tool)
     units = ("length",) * 3 + ("deg",) * 3
+    stands = True
+    finds_tool = True
     _seen: ClassVar[tuple[str, ...]] = tuple(f"seen {axis}" for axis in tool)
 
     def __post_init__(self) -> None:
@@ -91,6 +97,13 @@ class Board(Sensor):
                 f"(width, height, fx, fy, cx, cy), got {self.camera!r}"
             )
         object.__setattr__(self, "camera", tuple(camera.tolist()))
+        distortion = numbers("distortion", self.distortion)
+        if distortion.shape not in ((0,), (4,), (5,)):
+            raise ValueError(
+                "distortion must be (k1, k2, p1, p2) or with k3, got "
+                f"{self.distortion!r}"
+            )
+        object.__setattr__(self, "distortion", tuple(distortion.tolist()))
 
     @property
     def lens(self) -> tuple[Array, Array]:
@@ -101,6 +114,28 @@ class Board(Sensor):
     def picture(self) -> Array | None:
         """(2,) width and height of the camera's picture, where they are known."""
         return np.array(self.camera[:2]) if len(self.camera) == 6 else None
+
+    def in_picture(self, spots: Array, margin: float = 0.0) -> NDArray[np.bool_]:
+        """(...) whether the camera has pixels (..., 2) without distortion in its
+        picture, or up to ``margin`` pixels outside of it."""
+        focal, centre = self.lens
+        bent, seen = self.bent((spots - centre) / focal)
+        pixels = focal * bent + centre
+        inside = (pixels >= -margin) & (pixels <= np.array(self.picture) + margin)
+        return np.asarray(seen & inside.all(axis=-1))
+
+    def bent(self, rays: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Rays (..., 2), x and y by depth, as the lens bends them; (...) of those that
+        it sees, before its polynomial turns back."""
+        k1, k2, p1, p2, k3 = (*self.distortion, *[0.0] * 5)[:5]
+        x, y = rays[..., 0], rays[..., 1]
+        square = x**2 + y**2
+        stretch = 1.0 + square * (k1 + square * (k2 + square * k3))
+        across = 2.0 * np.stack([p1 * x * y + p2 * x**2, p1 * y**2 + p2 * x * y], -1)
+        aside = across + square[..., None] * np.array([p2, p1])
+        turns = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
+        ends = turns.real[(np.abs(turns.imag) < 1e-9) & (turns.real > 0.0)]
+        return rays * stretch[..., None] + aside, square < ends.min(initial=np.inf)
 
     @property
     def outline(self) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
@@ -19,6 +19,7 @@ __all__ = [
     "HasNames",
     "Landmarks",
     "Reading",
+    "Readings",
     "Sensor",
     "Tip",
     "hats",
@@ -61,6 +62,34 @@ class Tip:
         """(N, 3, 3) from the tip to the measuring frame."""
         return np.ascontiguousarray(self.frame[:3].transpose(2, 1, 0))
 
+    def at(self, rows: NDArray[np.intp]) -> Tip:
+        """At some of the postures."""
+        return Tip(self.frame[:, :, rows], lambda: self.nominal()[rows], self.length)
+
+    @staticmethod
+    def together(tips: Sequence[Tip]) -> Tip:
+        """At the postures of all, which may be of different arms."""
+        frame = np.concatenate([tip.frame for tip in tips], axis=2)
+        return Tip(
+            frame,
+            lambda: np.concatenate([tip.nominal() for tip in tips]),
+            tips[0].length,
+        )
+
+
+class Readings(NamedTuple):
+    """What a sensor measured at N postures."""
+
+    sensor: Sensor
+    tip: Tip  # where it was, of the nominal arm
+    columns: Array  # (N, e) of the commands that are its own
+    measured: Array | None  # (N, q), None of candidates
+
+    def at(self, rows: NDArray[np.intp]) -> Readings:
+        """Some of them."""
+        measured = None if self.measured is None else self.measured[rows]
+        return Readings(self.sensor, self.tip.at(rows), self.columns[rows], measured)
+
 
 class Reading(NamedTuple):
     """What a sensor reads at N postures."""
@@ -93,6 +122,8 @@ class Sensor(abc.ABC):
     first_unit: ClassVar[str] = ""  # of the first reading, where it is always the same
     compliant: ClassVar[bool] = False  # shown to be better with joints that yield
     local: ClassVar[bool] = False  # of few places: harmonics are fitted if they gain
+    stands: ClassVar[bool] = False  # what is read stands at a place that it finds
+    finds_tool: ClassVar[bool] = False  # and where it is on the tool
     misfit: ClassVar[float] = 0.0  # what they leave, by the arm's length, in a choice
     # (q,) of readings that wrap, 360 of an angle in degrees, inf of the others.
     periods: ClassVar[tuple[float, ...] | None] = None
@@ -153,6 +184,36 @@ class Sensor(abc.ABC):
         """
         return self, None
 
+    def of_rows(self, inputs: Array) -> NDArray[np.int64]:
+        """(N,) which of the things that stand around each row is of."""
+        return np.zeros(len(inputs), dtype=np.int64)
+
+    def lacking(self, inputs: Array) -> tuple[int, ...]:
+        """Things of which something is known and none of the rows (N, e) is."""
+        return ()
+
+    # -- the sensors that it consists of: itself, but of Several -----------------------
+
+    @property
+    def members(self) -> tuple[Sensor, ...]:
+        """Sensors with things of their own."""
+        return (self,)
+
+    @property
+    def own_of_members(self) -> tuple[slice, ...]:
+        """Where their own parameters are among the own parameters."""
+        return (slice(0, len(self.names)),)
+
+    def with_members(self, members: Sequence[Sensor]) -> Sensor:
+        """This sensor, of others."""
+        return members[0]
+
+    def of_members(
+        self, tip: Tip, inputs: Array, measured: Array | None
+    ) -> Iterator[Readings]:
+        """What each of them measured."""
+        yield Readings(self, tip, inputs, measured)
+
     def facts(self, parameters: Array) -> tuple[Array, Array]:
         """What is known of its own parameters besides: (F,) off, (F, s) derivative.
 
@@ -202,6 +263,7 @@ class Landmarks(Sensor):
     count: int = 1
     places: Array | None = None
 
+    stands = True
     axes: ClassVar[tuple[str, ...]]  # w names of the parameters of one of them
     axis_units: ClassVar[tuple[str, ...]]
     width: ClassVar[int]  # numbers that say where one stands
@@ -236,7 +298,6 @@ class Landmarks(Sensor):
         return BASE
 
     def of_rows(self, inputs: Array) -> NDArray[np.int64]:
-        """(N,) which one each row is of."""
         if self.count == 1:
             return np.zeros(len(inputs), dtype=np.int64)
         return label(self.kind, inputs[:, 0], self.count)

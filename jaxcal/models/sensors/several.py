@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -13,6 +13,7 @@ from jaxcal.checks import array_of, table
 from jaxcal.models.sensors.sensor import (
     HasNames,
     Reading,
+    Readings,
     Sensor,
     Tip,
     hats,
@@ -139,13 +140,13 @@ class Several(Sensor):
 
     def _tip(self, i: int, tip: Tip, rows: NDArray[np.intp], given: Array) -> Tip:
         """The place of sensor ``i`` at its rows, its mounting as ``given``."""
-        frame, nominal = tip.frame[:, :, rows], lambda: tip.nominal()[rows]
-        if i:
-            shift, turn, _ = self._mount(i, given)
-            turned = np.einsum("jcn,jk->kcn", frame[:3], turn)
-            origin = frame[3] + np.einsum("jcn,j->cn", frame[:3], shift)
-            frame = np.concatenate([turned, origin[None]])
-        return Tip(frame, nominal, tip.length)
+        tip = tip.at(rows)
+        if not i:
+            return tip
+        shift, turn, _ = self._mount(i, given)
+        turned = np.einsum("jcn,jk->kcn", tip.frame[:3], turn)
+        origin = tip.frame[3] + np.einsum("jcn,j->cn", tip.frame[:3], shift)
+        return Tip(np.concatenate([turned, origin[None]]), tip.nominal, tip.length)
 
     def _mount(self, i: int, given: Array) -> tuple[Array, Array, Array]:
         """Shift (3,), rotation (3, 3), and the axes of its turns as columns (3, 3)."""
@@ -196,13 +197,11 @@ class Several(Sensor):
         """Each of them, and where those that find it are on the tool."""
         sensors, mounts = [], np.array(self.mounts)
         tool = None
-        for i, one, rows, columns in self.parts(inputs):
-            read = None
-            if measured is not None:
-                read = measured[rows, : len(one.outputs)] * one.stds(tip.length)
+        for i, (one, at, columns, read) in enumerate(
+            self.of_members(tip, inputs, measured)
+        ):
             placed, new = one, None
-            if len(rows):
-                at = self._tip(i, tip, rows, self._mounting(i))
+            if len(columns):
                 placed, new = one.located(at, columns, read)
             sensors.append(placed)
             if new is not None and i:
@@ -211,16 +210,39 @@ class Several(Sensor):
                 tool, mounts = new, np.linalg.inv(new) @ mounts
         return dataclasses.replace(self, sensors=tuple(sensors), mounts=mounts), tool
 
-    def facts(self, parameters: Array) -> tuple[Array, Array]:
-        first, offs, rows = 0, [], []
+    @property
+    def members(self) -> tuple[Sensor, ...]:
+        return self.sensors
+
+    @property
+    def own_of_members(self) -> tuple[slice, ...]:
+        first, slices = 0, []
         for i, one in enumerate(self.sensors):
             first += len(one.tool) if i else 0
-            last = first + len(one.names)
-            off, slopes = one.facts(parameters[first:last])
+            slices.append(slice(first, first + len(one.names)))
+            first += len(one.names)
+        return tuple(slices)
+
+    def with_members(self, members: Sequence[Sensor]) -> Self:
+        return dataclasses.replace(self, sensors=tuple(members))
+
+    def of_members(
+        self, tip: Tip, inputs: Array, measured: Array | None
+    ) -> Iterator[Readings]:
+        for i, one, rows, columns in self.parts(inputs):
+            read = None
+            if measured is not None:
+                read = measured[rows, : len(one.outputs)] * one.stds(tip.length)
+            at = self._tip(i, tip, rows, self._mounting(i))
+            yield Readings(one, at, columns, read)
+
+    def facts(self, parameters: Array) -> tuple[Array, Array]:
+        offs, rows = [], []
+        for one, at in zip(self.sensors, self.own_of_members, strict=True):
+            off, slopes = one.facts(parameters[at])
             offs.append(off)
             rows.append(np.zeros((len(off), len(parameters))))
-            rows[-1][:, first:last] = slopes
-            first = last
+            rows[-1][:, at] = slopes
         return np.concatenate(offs), np.concatenate(rows)
 
     @classmethod

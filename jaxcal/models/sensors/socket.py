@@ -85,6 +85,10 @@ class Socket(Landmarks):
         ]
         return dataclasses.replace(self, places=np.array(places)), None
 
+    def lacking(self, inputs: Array) -> tuple[int, ...]:
+        named = {int(i) for pair in self.distances for i in pair[:2]}
+        return tuple(sorted(named.difference(self.of_rows(inputs).tolist())))
+
     def facts(self, parameters: Array) -> tuple[Array, Array]:
         places = parameters.reshape(-1, 3)
         off = np.zeros(len(self.distances))

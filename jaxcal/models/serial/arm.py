@@ -260,6 +260,10 @@ class Arm:
         frames, axes, origins = forward(kinds, values, fixed, np.array(ends, np.intp))
         return frames[-1], axes, origins, frames[:-1]
 
+    def nominal_tip(self, commands: Array) -> Tip:
+        """What sensors read of the nominal arm."""
+        return self._tip_at(commands, self._chain(commands, self.nominal)[0])
+
     def _tip_at(self, commands: Array, frame: Array) -> Tip:
         return Tip(frame, lambda: self._nominal_rotations(commands), self.length)
 

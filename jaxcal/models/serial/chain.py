@@ -385,26 +385,36 @@ class SerialChain(Arm, Model):
             ValueError: readings in another unit, of another arm or place, radians for
                 degrees, joints beyond their limits.
         """
-        from jaxcal.models.serial.plausible import (
-            require_readings,
-            require_sockets,
-            warn_of_picture,
-            warn_of_radians,
-        )
+        from jaxcal.models.serial.plausible import require_touched
+
+        self.require_readings(commands, measured)
+        arm = self.located(commands, measured)
+        for part in () if measured is None else arm.of_each_sensor(commands, measured):
+            require_touched(part[0].sensor, part[1][:, self.num_joints :])
+        arm.require_places(commands, measured)
+        return arm
+
+    def require_readings(self, commands: Array, measured: Array | None) -> None:
+        """Refuse what no arm like this one takes or gives; None, candidates."""
+        from jaxcal.models.serial.plausible import require_readings, warn_of_radians
 
         if measured is None:
-            arm = self.located(commands)
-            arm.require_commands(commands)
-            warn_of_radians(arm, commands)
-            warn_of_picture(arm, commands)
-            return arm
+            self.require_commands(commands)
+            warn_of_radians(self, commands)
+            return
         for part in self.of_each_sensor(commands, measured):
             require_readings(*part)
         self.require_commands(commands)
-        arm = self.located(commands, measured)
-        for part in arm.of_each_sensor(commands, measured):
+
+    def require_places(self, commands: Array, measured: Array | None) -> None:
+        """Refuse contacts of other places; warn of views without the board."""
+        from jaxcal.models.serial.plausible import require_sockets, warn_of_picture
+
+        if measured is None:
+            warn_of_picture(self, commands)
+            return
+        for part in self.of_each_sensor(commands, measured):
             require_sockets(*part)
-        return arm
 
     def distinct(self, commands: Array, measured: Array) -> NDArray[np.intp]:
         """(K,) the rows that count: contacts written twice count once."""
@@ -689,32 +699,31 @@ class SerialChain(Arm, Model):
         """
         commands = as_commands(self, commands)
         read = None if measured is None else numbers("measured", measured)
-        frame = self._chain(commands, self.nominal)[0]
+        arm = self.standing_at(self.base_of(commands, read))
         inputs = commands[:, self.num_joints :]
-        moved = np.eye(4)
-        if read is not None:
-            moved = self._far(commands, read)
-            frame = np.einsum("ab,kbn->kan", moved[:3, :3], frame)
-            frame[3] += moved[:3, 3:]
-        sensor, new = self.sensor.located(self._tip_at(commands, frame), inputs, read)
-        if sensor is self.sensor and new is None and (moved == np.eye(4)).all():
-            return self
+        sensor, new = self.sensor.located(arm.nominal_tip(commands), inputs, read)
+        if sensor is self.sensor and new is None:
+            return arm
         tool = self.tool if new is None else self.tool @ new
-        return dataclasses.replace(
-            self, base=moved @ self.base, sensor=sensor, tool=tool
-        )
+        return dataclasses.replace(arm, sensor=sensor, tool=tool)
 
-    def _far(self, commands: Array, measured: Array) -> Array:
-        """(4, 4) that takes the arm to where its first tracker sees it, if far off."""
+    def standing_at(self, base: Array) -> Self:
+        """This arm with another base (4, 4); itself where that is its own."""
+        return self if base is self.base else dataclasses.replace(self, base=base)
+
+    def base_of(self, commands: Array, measured: Array | None) -> Array:
+        """(4, 4) where its first tracker sees the arm if far off, else the base."""
+        if measured is None:
+            return self.base
         nominal = self.of_each_sensor(commands, self.predict(commands))
         for (one, _, predicted), (_, _, reached) in zip(
             nominal, self.of_each_sensor(commands, measured), strict=True
         ):
             if isinstance(one.sensor, Position | Pose):
                 moved = _far(predicted[:, :3], reached[:, :3], self.length)
-                if isinstance(one.sensor, Position):
-                    return moved
                 base = moved @ self.base
+                if isinstance(one.sensor, Position):
+                    return self.base if (moved == np.eye(4)).all() else base
                 shift = np.linalg.norm((base - self.base)[:3, 3])
                 turned = np.trace(moved[:3, :3]) < 1.0 + 2.0 * _ASIDE
                 if turned or shift > _AWAY * self.length:
@@ -725,7 +734,7 @@ class SerialChain(Arm, Model):
                         "rotation_vectors"
                     )
                 break
-        return np.eye(4)
+        return self.base
 
     def of_each_sensor(
         self, commands: Array, measured: Array

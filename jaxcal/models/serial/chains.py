@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Self
@@ -14,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import array_of, one_of
 from jaxcal.models import verdict as models
 from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
-from jaxcal.models.sensors import Sensor, Socket
-from jaxcal.models.sensors.sensor import BASE, label
+from jaxcal.models.sensors import Sensor, Tip
+from jaxcal.models.sensors.sensor import BASE, Readings, label
 from jaxcal.models.serial.chain import SerialChain
 from jaxcal.models.serial.plausible import require_touched
 from jaxcal.models.uncertainty import Noise, Prior
@@ -32,8 +33,9 @@ class Chains(Model):
 
     Chains that begin with the same joints (a torso's) share these joints' columns, and
     the parameters of the links between them. A sensor that is given to several chains
-    as one object stands once: both arms touch the same sockets. All else is each
-    chain's own, named ``left: a3``.
+    as one object, by itself or in ``Several``, is one: both arms touch the same
+    sockets, and what of them has no place is found from the arm that reads it most.
+    All else is each chain's own, named ``left: a3``.
 
     Commands are the columns of all joints, 0 where they are not of the row's chain;
     ``chain``, which says of each row whose tip was read, from 0; and the sensors'
@@ -44,12 +46,13 @@ class Chains(Model):
     Attributes:
         tips: names of the chains, two or more.
         chains: in this order.
-        stands: (C,) the first chain that has the same sensor, itself where none.
+        stands: of each chain the numbers of its sensor's members (itself, but of
+            ``Several``), equal where two chains have one object.
     """
 
     tips: tuple[str, ...]
     chains: tuple[SerialChain, ...]
-    stands: tuple[int, ...]
+    stands: tuple[tuple[int, ...], ...]
 
     @classmethod
     def of(cls, chains: Mapping[str, SerialChain]) -> Self:
@@ -62,11 +65,7 @@ class Chains(Model):
         tips, arms = tuple(chains), tuple(chains.values())
         if len(arms) < 2 or not all(isinstance(arm, SerialChain) for arm in arms):
             raise ValueError("chains must hold two arms or more (SerialChain), by tip")
-        sensors = [arm.sensor for arm in arms]
-        stands = [
-            next(i for i, s in enumerate(sensors) if s is other) for other in sensors
-        ]
-        model = cls(tips, arms, tuple(stands))
+        model = cls(tips, arms, _numbered([arm.sensor.members for arm in arms]))
         for k, arm in enumerate(arms):
             for other, before in zip(arms[:k], tips, strict=False):
                 common = _common(other, arm)
@@ -131,10 +130,9 @@ class Chains(Model):
     @functools.cached_property
     def _named(self) -> list[list[str]]:
         """Names in this model of the parameters of each chain."""
-        whole = len(set(self.stands)) == 1
         named = []
-        for tip, arm, shared, owner in zip(
-            self.tips, self.chains, self._shared, self.stands, strict=True
+        for k, (tip, arm, shared) in enumerate(
+            zip(self.tips, self.chains, self._shared, strict=True)
         ):
             links = [f"{name}{i}" for i in range(1, shared) for name in _COLUMNS]
             common = {*links, *(BASE if shared else ())}
@@ -145,11 +143,51 @@ class Chains(Model):
                 if name in (f"gear{i}", f"compliance{i}")
                 or name.startswith(f"theta{i} ")
             }
-            of_sensor = "" if whole else f"{self.tips[owner]}: "
             prefix = dict.fromkeys(arm.names, f"{tip}: ") | dict.fromkeys(common, "")
-            prefix |= dict.fromkeys(arm.sensor.names, of_sensor)
-            named.append([prefix[name] + name for name in arm.names])
+            of_arm = [prefix[name] + name for name in arm.names]
+            for i, number in enumerate(self.stands[k]):
+                (first, at), *others = self._members[number]
+                if others:
+                    names = self.chains[first].names[self._own(first, at)]
+                    everywhere = len(others) == len(self.chains) - 1
+                    of_first = "" if everywhere else f"{self.tips[first]}: "
+                    of_arm[self._own(k, i)] = [of_first + name for name in names]
+            named.append(of_arm)
         return named
+
+    @functools.cached_property
+    def _members(self) -> list[list[tuple[int, int]]]:
+        """Chains that have each of the sensors, and which member of theirs it is."""
+        owners: dict[int, list[tuple[int, int]]] = {}
+        for k, numbers in enumerate(self.stands):
+            for i, number in enumerate(numbers):
+                owners.setdefault(number, []).append((k, i))
+        return [owners[number] for number in sorted(owners)]
+
+    def _own(self, k: int, i: int) -> slice:
+        """Where a member's own parameters are among those of its chain."""
+        arm = self.chains[k]
+        at = arm.sensor.own_of_members[i]
+        before = len(arm.names) - arm.waves.size - len(arm.sensor.names)
+        return slice(before + at.start, before + at.stop)
+
+    @functools.cached_property
+    def _cells(self) -> list[list[int]]:
+        """Chains that show where each other stands: by joints or things they share."""
+        cells: list[list[int]] = [[k] for k in range(len(self.chains))]
+        linked = [
+            {k for k, _ in owners}
+            for owners in self._members
+            for k, i in owners[:1]
+            if self.chains[k].sensor.members[i].stands
+        ]
+        pairs = itertools.combinations(range(len(self.chains)), 2)
+        linked += [{k, j} for k, j in pairs if _common(self.chains[k], self.chains[j])]
+        for link in linked:
+            joined = [cell for cell in cells if link & set(cell)]
+            cells = [cell for cell in cells if cell not in joined]
+            cells.append(sorted(itertools.chain(*joined)))
+        return cells
 
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
@@ -280,12 +318,14 @@ class Chains(Model):
         theta = as_parameters(self, parameters)
         offs, rows = [np.zeros(0)], [np.zeros((0, len(theta)))]
         for k, (arm, at) in enumerate(zip(self.chains, self.members, strict=True)):
-            if self.stands[k] != k:  # a distance is known once
-                continue
-            off, slopes = arm.facts(theta[at])
-            offs.append(off)
-            rows.append(np.zeros((len(off), len(theta))))
-            rows[-1][:, at] = slopes
+            for i, number in enumerate(self.stands[k]):
+                if self._members[number][0] != (k, i):  # a distance is known once
+                    continue
+                columns = at[self._own(k, i)]
+                off, slopes = arm.sensor.members[i].facts(theta[columns])
+                offs.append(off)
+                rows.append(np.zeros((len(off), len(theta))))
+                rows[-1][:, columns] = slopes
         return np.concatenate(offs), np.concatenate(rows)
 
     # -- what is known before measuring ------------------------------------------------
@@ -297,22 +337,24 @@ class Chains(Model):
     def default_prior(self) -> Prior:
         """Prior of each chain; held is what no chain that has it sees.
 
-        Where two arms with bases of their own touch the same sockets, the first one's
-        base is held and the other's is found.
+        Where arms with bases of their own touch the same sockets, the first one's base
+        is held and the others' are found; of it too what another's sensor shows.
         """
         priors = [arm.default_prior() for arm in self.chains]
+        fixed = [set(prior.fixed) for prior in priors]
+        for cell in self._cells:
+            unseen_of_base = set(BASE).intersection(*(fixed[k] for k in cell))
+            for k in cell:
+                fixed[k] -= set(BASE)
+                if k == cell[0] or _common(self.chains[cell[0]], self.chains[k]):
+                    fixed[k] |= unseen_of_base
         observed: set[str] = set()
         held: dict[str, None] = {}
-        for k, (arm, named, prior) in enumerate(
-            zip(self.chains, self._named, priors, strict=True)
-        ):
-            fixed = set(prior.fixed)
-            if self.stands[k] != k:
-                fixed -= set(BASE)
+        for arm, named, of_arm in zip(self.chains, self._named, fixed, strict=True):
             for name, short in zip(named, arm.names, strict=True):
-                if short in fixed:
+                if short in of_arm:
                     held[name] = None
-                elif self.stands[k] == k or short not in BASE or not self._shared[k]:
+                else:
                     observed.add(name)
         std = self._gather([np.asarray(prior.std) for prior in priors])
         unseen = tuple(name for name in held if name not in observed)
@@ -397,43 +439,89 @@ class Chains(Model):
             ValueError: as of ``SerialChain.prepared``; a socket whose distance is given
                 is touched by no chain.
         """
-        arms = self._with_sockets(commands, measured)
-        for k, arm, rows, arm_commands in self._parts(commands):
-            if not len(rows):
-                continue
-            arm = arm.measured_with(arms[self.stands[k]].sensor)
-            q, scale = arm.num_outputs, self._scale(k)
-            read = None if measured is None else measured[rows, :q] * scale
-            arms[k] = _prepared(arm, arm_commands, read)
-        for k, owner in enumerate(self.stands):
-            if owner != k:
-                arms[k] = arms[k].measured_with(arms[owner].sensor)
+        tables = [
+            (k, arm_commands, self._measured(k, measured, rows))
+            for k, _, rows, arm_commands in self._parts(commands)
+            if len(rows)
+        ]
+        for k, arm_commands, read in tables:
+            self.chains[k].require_readings(arm_commands, read)
+        arms = self._located(tables)
+        if measured is not None:
+            for readings in self._by_member(arms, tables).values():
+                columns = [of_chain.columns for of_chain in readings]
+                require_touched(readings[0].sensor, np.vstack(columns))
+        for k, arm_commands, read in tables:
+            arms[k].require_places(arm_commands, read)
         return dataclasses.replace(self, chains=tuple(arms))
 
-    def _with_sockets(
-        self, commands: Array, measured: Array | None
+    def _measured(
+        self, k: int, measured: Array | None, rows: NDArray[np.intp]
+    ) -> Array | None:
+        """Readings of a chain in its own units."""
+        if measured is None:
+            return None
+        return measured[rows, : self.chains[k].num_outputs] * self._scale(k)
+
+    def _located(
+        self, tables: Sequence[tuple[int, Array, Array | None]]
     ) -> list[SerialChain]:
-        """The chains, each socket where the first of them that touches it has it."""
-        places: dict[int, Array] = {}  # by the first chain that has the sensor
-        touched: dict[int, set[int]] = {}
-        for k, arm, rows, arm_commands in reversed(list(self._parts(commands))):
-            if not (len(rows) and isinstance(arm.sensor, Socket)):
-                continue
-            which = arm.sensor.of_rows(arm_commands[:, arm.num_joints :])
-            touched.setdefault(self.stands[k], set()).update(which.tolist())
-            if arm.sensor.places is None:
-                middle: Any = arm.located(arm_commands).sensor
-                of_all = places.setdefault(self.stands[k], middle.places)
-                of_all[which] = middle.places[which]
+        """The chains, what they share where the one that reads it most has it."""
         arms = list(self.chains)
-        for k, owner in enumerate(self.stands):
-            sensor: Any = arms[k].sensor
-            if owner == k and measured is not None and owner in touched:
-                require_touched(sensor, touched[owner])
-            if owner in places:
-                placed = dataclasses.replace(sensor, places=places[owner])
-                arms[k] = arms[k].measured_with(placed)
-        return arms
+        bases: dict[int, Array] = {}  # by the first chain that stands there
+        for k, arm_commands, read in tables:
+            base = arms[k].base_of(arm_commands, read)
+            if base is not arms[k].base:
+                bases.setdefault(self._stands_as(k), base)
+        for k, arm in enumerate(arms):
+            arms[k] = arm.standing_at(bases.get(self._stands_as(k), arm.base))
+        placed = {
+            number: _placed(readings)
+            for number, readings in self._by_member(arms, tables).items()
+            if readings[0].sensor.stands and len(self._members[number]) > 1
+        }
+        for k, arm_commands, read in tables:
+            arms[k] = self._with(placed, arms[k], k, tools=True)
+            arms[k] = arms[k].located(arm_commands, read)
+        return [self._with(placed, arm, k) for k, arm in enumerate(arms)]
+
+    def _stands_as(self, k: int) -> int:
+        """The first chain that has this one's base."""
+        arms = self.chains
+        return next(j for j in range(k + 1) if j == k or _common(arms[j], arms[k]))
+
+    def _with(
+        self,
+        placed: Mapping[int, Sensor],
+        arm: SerialChain,
+        k: int,
+        *,
+        tools: bool = False,
+    ) -> SerialChain:
+        """An arm with sensors by number; ``tools``, not with what finds its tool."""
+        members = [
+            one if tools and one.finds_tool else placed.get(number, one)
+            for one, number in zip(arm.sensor.members, self.stands[k], strict=True)
+        ]
+        if all(a is b for a, b in zip(members, arm.sensor.members, strict=True)):
+            return arm
+        return arm.measured_with(arm.sensor.with_members(members))
+
+    def _by_member(
+        self,
+        arms: Sequence[SerialChain],
+        tables: Sequence[tuple[int, Array, Array | None]],
+    ) -> dict[int, list[Readings]]:
+        """What each chain read of a sensor, by its number."""
+        by_member: dict[int, list[Readings]] = {}
+        for k, commands, measured in tables:
+            arm = arms[k]
+            tip, inputs = arm.nominal_tip(commands), commands[:, arm.num_joints :]
+            of_members = arm.sensor.of_members(tip, inputs, measured)
+            for number, readings in zip(self.stands[k], of_members, strict=True):
+                if len(readings.columns):
+                    by_member.setdefault(number, []).append(readings)
+        return by_member
 
     def distinct(self, commands: Array, measured: Array) -> NDArray[np.intp]:
         kept = []
@@ -565,22 +653,22 @@ class Chains(Model):
     def to_dict(self) -> dict[str, Any]:
         """What a file holds of the model."""
         arms = [arm.to_dict() for arm in self.chains]
-        stands = list(self.stands)
+        stands = [list(numbers) for numbers in self.stands]
         return {"kind": "chains", "tips": self.tips, "chains": arms, "stands": stands}
 
     @classmethod
     def from_dict(
-        cls, tips: Sequence[str], chains: Sequence[Any], stands: Sequence[int]
+        cls,
+        tips: Sequence[str],
+        chains: Sequence[Any],
+        stands: Sequence[Sequence[int]],
     ) -> Self:
         """The inverse of ``to_dict``."""
-        arms: list[SerialChain] = []
-        for content, owner in zip(chains, stands, strict=True):
-            fields = {key: value for key, value in content.items() if key != "kind"}
-            arm = SerialChain.from_dh(**fields)
-            if owner < len(arms):
-                arm = arm.measured_with(arms[owner].sensor)
-            arms.append(arm)
-        return cls(tuple(tips), tuple(arms), tuple(stands))
+        arms = [
+            SerialChain.from_dh(**{key: arm[key] for key in arm if key != "kind"})
+            for arm in chains
+        ]
+        return cls(tuple(tips), tuple(arms), tuple(map(tuple, stands)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -622,14 +710,33 @@ def _alike(one: SerialChain, other: SerialChain, i: int) -> bool:
     return bool(link and kind and names[0] == names[1] and np.array_equal(*moves))
 
 
-def _prepared(arm: SerialChain, commands: Array, measured: Array | None) -> SerialChain:
-    """The arm where its readings put it; other arms may touch sockets it does not."""
-    sensor = arm.sensor
-    if not isinstance(sensor, Socket):
-        return arm.prepared(commands, measured)
-    touched = set(sensor.of_rows(commands[:, arm.num_joints :]).tolist())
-    within = [row for row in sensor.distances if touched.issuperset(row[:2])]
-    arm = arm.measured_with(dataclasses.replace(sensor, distances=within))
-    arm = arm.prepared(commands, measured)
-    places = getattr(arm.sensor, "places", None)
-    return arm.measured_with(dataclasses.replace(sensor, places=places))
+def _numbered(members: Sequence[Sequence[Sensor]]) -> tuple[tuple[int, ...], ...]:
+    """Numbers of each chain's sensors, one for one object of different chains."""
+    numbers: dict[tuple[int, int], int] = {}
+    return tuple(
+        tuple(
+            numbers.setdefault(
+                (id(one), sum(one is other for other in of_chain[:i])), len(numbers)
+            )
+            for i, one in enumerate(of_chain)
+        )
+        for of_chain in members
+    )
+
+
+def _placed(readings: Sequence[Readings]) -> Sensor:
+    """A sensor with each thing where the arm that reads it most has it."""
+    sensor = readings[0].sensor
+    which = [sensor.of_rows(of_arm.columns) for of_arm in readings]
+    count = 1 + max(int(rows.max()) for rows in which)
+    most = np.argmax([np.bincount(rows, minlength=count) for rows in which], axis=0)
+    kept = [
+        of_arm.at(np.flatnonzero(most[rows] == i))
+        for i, (of_arm, rows) in enumerate(zip(readings, which, strict=True))
+    ]
+    measured = [of_arm.measured for of_arm in kept if of_arm.measured is not None]
+    return sensor.located(
+        Tip.together([of_arm.tip for of_arm in kept]),
+        np.vstack([of_arm.columns for of_arm in kept]),
+        np.vstack(measured) if measured else None,
+    )[0]

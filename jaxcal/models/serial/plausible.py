@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.checks import in_words
-from jaxcal.models.sensors import Board, Pose, Position, Socket
+from jaxcal.models.sensors import Board, Pose, Position, Sensor, Socket
 from jaxcal.models.serial.mistaken import mistaken_columns
 
 __all__ = [
@@ -27,17 +27,17 @@ Chain = Any  # a SerialChain, whose module imports this one
 
 _NOMINAL = 0.1  # of its length: no arm is so far off, tip included, before it is fitted
 _APART = 0.2  # of it: what two sockets may seem to be off their distance
-_BEYOND = 0.1  # of a picture: what taking out a lens's distortion moves corners by
+_EDGE = 4.0  # times the noise of a corner, which is in the picture or next to it
 _OTHER_UNIT = 0.01  # of it: so far off and tenfold, a distance is in another unit
 
 
 def require_readings(arm: Chain, commands: Array, measured: Array) -> None:
     """Refuse millimetres for metres, radians for degrees: an arm is not off tenfold.
 
-    Of a camera whose picture is known, corners more than a tenth outside of it.
+    Of a camera whose picture is known, corners outside of it.
     """
     if isinstance(arm.sensor, Board):
-        _require_in_picture(arm.sensor, measured)
+        _require_in_picture(arm.sensor, measured, arm.length or 1.0)
     if not isinstance(arm.sensor, Position | Pose):
         return
     spread = []
@@ -52,21 +52,21 @@ def require_readings(arm: Chain, commands: Array, measured: Array) -> None:
         )
 
 
-def _require_in_picture(board: Board, pixels: Array) -> None:
+def _require_in_picture(board: Board, pixels: Array, length: float) -> None:
     size = board.picture
     if size is None or board.corners is None:
         return
     spots = pixels.reshape(len(pixels), -1, 2)
-    outside = np.any(np.abs(spots / size - 0.5) > 0.5 + _BEYOND, axis=2)
+    outside = ~board.in_picture(spots, _EDGE * float(board.stds(length).max()))
     for row, corner in np.argwhere(outside)[:1]:
         count = np.count_nonzero(outside.any(axis=1))
         raise ValueError(
-            f"corners must be within a tenth of the camera's picture of {size[0]:g} by "
-            f"{size[1]:g} pixels, but in {count} of the board's {len(spots)} rows some "
-            f"are not: corner {corner + 1} of its row {row} is at "
+            f"corners must be in the camera's picture of {size[0]:g} by {size[1]:g} "
+            f"pixels, but in {count} of the board's {len(spots)} rows some are not: "
+            f"corner {corner + 1} of its row {row} is at "
             f"{in_words(spots[row, corner])}. Is it the width before the height, and "
-            "this camera? Of a wide lens give camera=(fx, fy, cx, cy), which is not "
-            "judged"
+            "this camera? Where a lens's distortion was taken out of them, give it: "
+            "distortion=(k1, k2, p1, p2)"
         )
 
 
@@ -81,8 +81,7 @@ def warn_of_picture(arm: Chain, candidates: Array) -> None:
     none = np.zeros((len(candidates), len(board.tool)))  # of a board seen at zero
     depth = board.depths(posed.predict(np.hstack([candidates, none])))
     spots = arm.predict(candidates).reshape(len(candidates), -1, 2)
-    seen = (spots >= 0.0).all(axis=2) & (spots <= board.picture).all(axis=2)
-    lost = np.flatnonzero(~(seen & (depth > 0.0)).all(axis=1))
+    lost = np.flatnonzero(~(board.in_picture(spots) & (depth > 0.0)).all(axis=1))
     if lost.size:
         warnings.warn(
             f"{lost.size} of {len(candidates)} candidates do not have the whole board "
@@ -104,7 +103,6 @@ def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
             f"a posture must have the ball in one socket, but row {row} is row "
             f"{first[groups.ravel()[row]]} with another socket: rows of the other file?"
         )
-    require_touched(arm.sensor, set(which.tolist()))
     if measured.any():  # offsets that were measured, as in a simulation, are of any tip
         return
     points = arm.nominal_tips(joints)
@@ -130,6 +128,8 @@ def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
                 "rows of another place?"
             )
     for one, other, distance, _ in arm.sensor.distances:
+        if not {int(one), int(other)} <= middles.keys():  # another arm's
+            continue
         distance_seen = float(np.linalg.norm(middles[int(one)] - middles[int(other)]))
         off = abs(distance_seen - distance) / arm.length
         unit = off > _OTHER_UNIT and not 0.1 < distance_seen / distance < 10.0
@@ -141,13 +141,12 @@ def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
             )
 
 
-def require_touched(sensor: Socket, touched: set[int]) -> None:
+def require_touched(sensor: Sensor, inputs: Array) -> None:
     """Refuse a distance of a socket that no contact is of."""
-    named = {int(i) for pair in sensor.distances for i in pair[:2]}
-    for socket in sorted(named - touched):
+    for place in sensor.lacking(inputs):
         raise ValueError(
-            f"commands must have contacts of socket {socket}, whose distance from "
-            "another is given"
+            f"commands must have contacts of {sensor.kind} {place}, whose distance "
+            "from another is given"
         )
 
 

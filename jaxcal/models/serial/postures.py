@@ -559,12 +559,15 @@ def _in_picture(
         commands = np.hstack([commands[:, :j], pose])
     rotation = Rotation.from_rotvec(pose[:, 3:], degrees=True).as_matrix()
     spots = points @ np.matrix_transpose(rotation) + pose[:, None, :3]
-    deep = np.maximum(spots[..., 2], 1e-9)
-    u = _FOCAL * fx * spots[..., 0] / deep
-    v = _FOCAL * fy * spots[..., 1] / deep
+    rays = _FOCAL * spots[..., :2] / np.maximum(spots[..., 2:], 1e-9)
+    inside = spots[..., 2] > 0.0
+    if np.array_equal(view.camera, sensor.camera):  # of which the lens is known
+        rays, seen = sensor.bent(rays)
+        inside &= seen
+    u, v = fx * rays[..., 0], fy * rays[..., 1]
     edge = _EDGE * width
-    inside = (u > edge - cx) & (u < width - edge - cx) & (v > edge - cy)
-    inside &= (v < height - edge - cy) & (spots[..., 2] > 0.0)
+    inside &= (u > edge - cx) & (u < width - edge - cx) & (v > edge - cy)
+    inside &= v < height - edge - cy
     there = spots.mean(axis=1)
     away = np.linalg.norm(there, axis=1)
     face = (rotation[:, :, 2] * -there).sum(axis=1) / np.maximum(away, 1e-9)
