@@ -385,7 +385,7 @@ def _misfit(
     none = np.zeros(count)
     theta = np.concatenate([solution.parameters, none])
     waves = derivative(with_misfit, problem.commands, theta)[..., -count:]
-    white = whiten(problem.white, waves * std) / solution.level[:, None]
+    white = solution.whitened(waves * std) / solution.level[:, None]
     gram = np.einsum(
         "n,nrf,nrw->fw", _information_shares(problem, solution), solution.rows, white
     )

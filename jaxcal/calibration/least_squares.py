@@ -63,6 +63,26 @@ class FitProblem:
     levels: NDArray[np.intp]  # (q,) from 0: outputs of the same number share one
     loss: Loss | None  # None: least squares
 
+    def size(self, theta: Array) -> tuple[Array, Array] | None:
+        """(N, 1) by which readings of zero are as large as at the prior's mean.
+
+        Also the derivative (N, F) of its logarithm; None where all are as they are.
+        """
+        size = self.model.log_size(self.commands, theta)
+        if size is None:
+            return None
+        log, slopes = size
+        zero = ~self.measured.any(axis=1, keepdims=True)
+        ratio = np.exp(np.where(zero, log[:, None] - self._first_size, 0.0))
+        return ratio, zero * slopes[:, self.free]
+
+    @functools.cached_property
+    def _first_size(self) -> Array:
+        """(N, 1)."""
+        size = self.model.log_size(self.commands, self.mean)
+        assert size is not None
+        return size[0][:, None]
+
 
 def solve(
     problem: FitProblem, start: FitSolution | None = None, *, rough: bool = False
@@ -254,7 +274,14 @@ class FitSolution:
         return np.maximum(np.sqrt(mean), self.floor)
 
     def _take(self, residuals: Array) -> None:
-        self.residuals, self.white = residuals, _times(self.problem.white, residuals)
+        self.residuals = residuals
+        self.white = self.whitened(residuals[..., None])[..., 0]
+
+    def whitened(self, rows: Array, theta: Array | None = None) -> Array:
+        """(N, q, F) rows in noise of level 1, those of zeros by the machine's size."""
+        white = whiten(self.problem.white, rows)
+        size = self.problem.size(self.parameters if theta is None else theta)
+        return white if size is None else white / size[0][..., None]
 
     def _predict(self) -> None:
         """Residuals at the present parameters and commands."""
@@ -276,7 +303,9 @@ class FitSolution:
             rows = np.where(without_effect(rows, self.sizes), 0.0, rows)
         if not problem.free.all():
             rows = rows[..., problem.free]
-        self.by_theta = whiten(problem.white, rows)
+        self.by_theta = self.whitened(rows)
+        if (size := problem.size(self.parameters)) is not None:
+            self.by_theta = self.by_theta + self.white[..., None] * size[1][:, None]
         if len(self.command_root):
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
             rows = derivative(problem.model, self.commands, self.parameters, inputs)
@@ -449,7 +478,7 @@ class FitSolution:
             theta[problem.free] += step
             commands = self._moved(step)
             residuals = self._off(commands, theta, finite=False)
-            white = _times(problem.white, residuals)
+            white = self.whitened(residuals[..., None], theta)[..., 0]
             facts, fact_rows = problem.model.facts(theta)
             after = self._cost(white, theta, commands, facts)
             ratio = (cost - after) / gain if np.isfinite(after) else -1.0

@@ -177,6 +177,18 @@ class Model(abc.ABC):
         """The scales that ``Prior.sized()`` takes from the readings; None without."""
         return None
 
+    def log_size(
+        self, commands: Array, parameters: Array
+    ) -> tuple[Array, Array] | None:
+        """Logarithm (N,) of what readings of zero grow with, and derivative (N, p).
+
+        Contacts do not show how large the machine is: were it half as large, with all
+        that it touches, they would be missed by half as much. A fit compares them with
+        its size, or a smaller machine would always fit better. None: readings are as
+        large as they are.
+        """
+        return None
+
     # -- readings that wrap, and a model that can only be run --------------------------
 
     @property

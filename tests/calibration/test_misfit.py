@@ -215,7 +215,13 @@ def test_the_covariance_of_what_may_be_there_is_that_of_a_dense_formula():
         commands, np.zeros((len(commands), 3)), model=arm, **options
     )
     p, free = len(found.names), found.free > 0.0
-    slopes = found.whole.jacobian(commands, found.estimate).reshape(-1, p + 28) / 2e-4
+    slopes = found.whole.jacobian(commands, found.estimate)
+    log, by_size = found.whole.log_size(commands, found.estimate)  # misses are by size
+    off = found.predict(commands)
+    slopes = slopes - off[..., None] * by_size[:, None]
+    start = np.append(found.prior_mean[:p], np.zeros(28))
+    size = np.exp(log - found.whole.log_size(commands, start)[0])
+    slopes = (slopes / size[:, None, None]).reshape(-1, p + 28) / 2e-4
     fitted, waves = slopes[:, :p][:, free[:p]], slopes[:, p:]
     precision = np.diag(found.prior_precision[:p][free[:p]])
     gain = np.linalg.solve(fitted.T @ fitted + precision, fitted.T)

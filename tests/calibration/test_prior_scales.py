@@ -167,6 +167,22 @@ def test_contacts_are_good_exactly_where_the_arm_is_better_elsewhere(size, seed)
         assert found.verdict.good and inside[found.free[:30] > 0.0].mean() > 0.9
 
 
+def test_contacts_prefer_no_smaller_arm():
+    """Its contacts miss by less, being smaller: of an exact arm that said 0.7 %.
+
+    The arm is as described, and a prior that is stated lets it be any size.
+    """
+    arm, commands, *_ = _made(0.0, 0, jaxcal.models.Socket(3))
+    std = np.asarray(arm.default_prior().std).copy()
+    std[np.array(arm.units) == "length"] *= 4.0
+    prior = Prior(std, fixed=arm.default_prior().fixed)
+    found = jaxcal.identify(commands, None, model=arm, prior=prior)
+    places = found.parameters[-9:].reshape(3, 3)
+    apart = [np.linalg.norm(where - np.roll(where, 1, axis=0), axis=1)
+             for where in (places, PLACES)]  # fmt: skip
+    np.testing.assert_allclose(*apart, rtol=2e-3)
+
+
 def test_a_distance_that_was_written_wrongly_is_told_where_it_can_be():
     """50 mm written as 48: arms off by the tolerances say 50 +- .2; as 50: no word."""
     arm, commands, *_ = _made(1.0, 0, jaxcal.models.Socket(2))

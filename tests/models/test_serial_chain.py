@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxcal.models import Pose, Position, SerialChain, from_dict
+from jaxcal.models import Pose, Position, SerialChain, Socket, from_dict
 
 from .arms import UR5_TABLE, differences, ur5, ur5_data
 
@@ -293,3 +293,18 @@ def test_harmonics_are_of_revolute_joints():
         SerialChain.from_dh([(0, 0, 0, 0)], joints="P", harmonics=[1])
     with pytest.raises(ValueError, match=r"waves must have shape \(1, 4\)"):
         ur5(harmonics=[1], waves=[0.1])
+
+
+def test_contacts_are_missed_by_more_by_a_larger_arm_wherever_it_stands():
+    arm = ur5(sensor=Socket(2))
+    commands = np.random.default_rng(0).uniform(-150.0, 150.0, (9, 7))
+    names, length = np.array(arm.names), np.array(arm.units) == "length"
+    theta = arm.nominal + np.where(length, 1.0, 0.3)
+    size, slopes = arm.log_size(commands, theta)
+    larger = arm.log_size(commands, np.where(length, 1.3, 1.0) * theta)[0]
+    np.testing.assert_allclose(larger - size, np.log(1.3))
+    by_lengths = differences(lambda t: arm.log_size(commands, t)[0], theta)
+    np.testing.assert_allclose(slopes[:, length], by_lengths[:, length], atol=1e-9)
+    stands = slopes[:, np.isin(names, ["d1", "base x"])]
+    np.testing.assert_allclose(stands, 0.0, atol=1e-15)
+    assert arm.measured_with(Position()).log_size(commands, theta) is None

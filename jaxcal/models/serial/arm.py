@@ -295,6 +295,45 @@ class Arm:
         by_steps = np.ascontiguousarray(motion.transpose(2, 1, 0))
         return reading.by_tip @ by_steps, reading.by_own
 
+    def log_size(
+        self, commands: Array, parameters: Array
+    ) -> tuple[Array, Array] | None:
+        """Logarithm of how far the joints move the tip (N,), and derivative (N, p).
+
+        Of contacts of turning joints, which touch as well with an arm of any size: the
+        root of the sum of squares, of all postures, of how far the tip is from each
+        axis. It is an arm's size, and none of where it stands. By turns it is held. A
+        slide's way shows the size: None.
+        """
+        sensor = self.sensor
+        if not (sensor.zeros and sensor.lengths and self._revolute.all()):
+            return None
+
+        def find() -> tuple[Array, Array]:
+            frame, axes, origins = self._chain(commands, parameters)
+            about = axes[self._steps_of_joints]
+            levers = frame[3] - origins[self._steps_of_joints]  # (n, 3, N)
+            levers -= about * (about * levers).sum(axis=1, keepdims=True)
+            square = np.vdot(levers, levers)
+            # A shift moves the tip away from the axes before it.
+            shifts, at, joints = self._shifts
+            before = np.concatenate([np.zeros((1, *frame[3].shape)), levers.cumsum(0)])
+            slopes = np.zeros(len(parameters))
+            slopes[shifts] = (before[joints] * axes[at]).sum(axis=(1, 2)) / square
+            return np.array([0.5 * np.log(square)]), slopes
+
+        size, slopes = self._kept("_last_size", (commands, parameters), find)
+        count = len(commands)
+        return size.repeat(count), np.broadcast_to(slopes, (count, len(slopes)))
+
+    @functools.cached_property
+    def _shifts(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+        """Lengths of the chain among the parameters, their steps, joints before."""
+        at = self._steps_of_parameters
+        shifts = np.flatnonzero(self._steps[0][at] < 3)
+        at = at[shifts]
+        return shifts, at, (self._steps_of_joints < at[:, None]).sum(axis=1)
+
     @functools.cached_property
     def _revolute(self) -> NDArray[np.bool_]:
         """(n,)."""

@@ -314,6 +314,21 @@ class Chains(Model):
             off[..., rows, :q] = arm.wrapped(its, arm_commands) / scale
         return off
 
+    def log_size(
+        self, commands: Array, parameters: Array
+    ) -> tuple[Array, Array] | None:
+        sizes, slopes = (
+            np.zeros(len(commands)),
+            np.zeros((len(commands), len(parameters))),
+        )
+        for k, arm, rows, arm_commands in self._parts(commands):
+            size = None
+            if len(rows):
+                size = arm.log_size(arm_commands, parameters[self.members[k]])
+            if size is not None:
+                sizes[rows], slopes[np.ix_(rows, self.members[k])] = size
+        return sizes, slopes
+
     def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
         theta = as_parameters(self, parameters)
         offs, rows = [np.zeros(0)], [np.zeros((0, len(theta)))]

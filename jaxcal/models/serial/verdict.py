@@ -564,6 +564,8 @@ def _exchanged(calibration: Fit, model: Chain) -> list[str]:
     places = calibration.parameters[[model.names.index(name) for name in sensor.names]]
     apart = np.linalg.norm(places.reshape(-1, 1, 3) - sensor.places, axis=-1)
     nearest = apart.argmin(axis=1)
+    if len(np.unique(nearest)) < len(nearest):  # one was moved, or the arm is far off
+        return []
     return [
         f"socket {i} was found where socket {j} was said to be: are their rows "
         "exchanged?"
