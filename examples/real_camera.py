@@ -33,7 +33,13 @@ STD = np.array([500.0, 500.0, 100.0, 100.0, 0.3, 0.3, 0.02, 0.02])  # beforehand
 NOISE = 0.3  # pixels
 K, LEAST = 15, 6  # views chosen; corners of a view that determine its pose
 K_OF_HALF = 8  # of every second view, the others judging
-RULES = ("chosen (I)", "chosen (D)", "chosen (I, poses known)", "random")
+RULES = (
+    "chosen (I)",
+    "chosen (D)",
+    "chosen (I, poses known)",
+    "least left",
+    "random",
+)
 
 
 def project(view, theta, places):
@@ -202,6 +208,8 @@ def choose(views: Views, rule: str, seed: int = 0, count: int = K) -> NDArray[np
     """
     if rule == "random":
         return np.random.default_rng(seed).choice(len(views.seen), count, replace=False)
+    if rule == "least left":
+        return least_left(views, choose(views, "chosen (I)", count=count))
     if rule == "chosen (I, poses known)":
         return jaxcal.select(
             views.commands,
@@ -214,6 +222,34 @@ def choose(views: Views, rule: str, seed: int = 0, count: int = K) -> NDArray[np
         ).indices
     design = jaxcal.Design.from_blocks(views.blocks, prior=np.diag(STD**-2.0))
     return design.select(count, rule.split("(")[1][0], "exchange").indices
+
+
+def least_left(views: Views, start: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(count,) views without which the rest has the least error, by exchange.
+
+    Their scatter about the rough camera counts, and how uncertain the camera of the
+    chosen views is: what is judged, and not the camera.
+    """
+    corners = views.seen.sum(axis=1)
+    scatter = views.distances(views.model.nominal).sum(axis=1) / corners
+    blocks = views.blocks
+    informations = np.matrix_transpose(blocks) @ blocks
+
+    def left(chosen: list[int]) -> float:
+        known = np.diag(STD**-2.0) + informations[chosen].sum(axis=0)
+        unsure = np.einsum("ij,nji->n", np.linalg.inv(known), informations)
+        errors = corners * np.sqrt(scatter**2 + NOISE**2 * unsure / corners)
+        rest = np.setdiff1d(np.arange(len(corners)), chosen)
+        return float(errors[rest].sum() / corners[rest].sum())
+
+    best, before = start.tolist(), np.inf
+    while left(best) < before:
+        before = left(best)
+        for at in range(len(best)):
+            offered = set(range(len(corners))).difference(best)
+            trials = [[*best[:at], i, *best[at + 1 :]] for i in sorted(offered)]
+            best = min([best, *trials], key=left)
+    return np.array(best)
 
 
 def in_other_half(views: Views, rule: str, seed: int) -> float:
@@ -284,9 +320,15 @@ PANELS = 2
 
 def draw(axes, rows: common.Rows) -> None:
     """Both errors, a bar each."""
-    named = [row | {"name": f"{row['camera']}\n{row['rule']}"} for row in rows]
-    common.bars(axes[0], named, "name", "error_px", "error in other views, pixels")
-    common.bars(axes[1], named, "name", "beyond_all_px", "beyond that of all views")
+    names = [f"{row['camera']}, {row['rule']}" for row in rows]
+    for panel, column, title in (
+        (axes[0], "error_px", "error in other views, pixels"),
+        (axes[1], "beyond_all_px", "beyond that of all views"),
+    ):
+        panel.barh(names, [float(row[column]) for row in rows])
+        panel.set_xlabel(title)
+        panel.invert_yaxis()
+    axes[1].set_yticks([])
 
 
 if __name__ == "__main__":

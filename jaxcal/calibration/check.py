@@ -269,20 +269,27 @@ def _whitening(calibration: Fit, commands: Array, noise: Array) -> tuple[Array, 
         that is left where the misfit that they allow for is not there.
     """
 
-    def covariance(misfit: bool) -> Array:
-        slopes, parameters = calibration.linear(commands, misfit=misfit)
-        rows = slopes.reshape(-1, slopes.shape[-1])
-        return np.diag(np.tile(noise**2, len(commands))) + rows @ parameters @ rows.T
+    from scipy.linalg import lapack
 
+    def linear(misfit: bool) -> tuple[Array, Array]:
+        slopes, parameters = calibration.linear(commands, misfit=misfit)
+        return slopes.reshape(-1, slopes.shape[-1]), parameters
+
+    variances = np.tile(noise**2, len(commands))
+    slopes, parameters = linear(True)
     try:
-        root = np.linalg.inv(np.linalg.cholesky(covariance(True)))
+        factor = np.linalg.cholesky(np.diag(variances) + slopes @ parameters @ slopes.T)
     except np.linalg.LinAlgError:
         raise ValueError(
             "the calibration must predict what is checked, but its uncertainty there "
             "is beyond rounding: see calibration.verdict"
         ) from None
+    root = np.asarray(lapack.dtrtri(factor, lower=1)[0])  # rest of factor: zeros
     # Misfit that is allowed for may not be there, and hides a drift all the same.
-    return root, float(np.trace(root @ covariance(False) @ root.T)) / len(root)
+    slopes, parameters = linear(False)
+    by = root @ slopes
+    least = (root**2 @ variances).sum() + ((by @ parameters) * by).sum()
+    return root, float(least) / len(root)
 
 
 def _require_unit(
