@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 from brax.training.agents.ppo import train as ppo
 
+from jaxcal.adaptive import GridTask
 from jaxcal.adaptive.brax_env import SequentialEnv
-from jaxcal.adaptive.tasks.knee import STATE_RULE, knee
 from jaxcal.learning.brax import SelectionEnv, brax_networks, repaired, wrap_fresh
 from jaxcal.learning.environments.selection import SelectionConfig
 
@@ -33,10 +34,23 @@ def postures(steps: int = 200_000) -> list[float]:
     return train(SelectionEnv(SelectionConfig()), 4, steps)
 
 
+def ladder(rungs: int = 24) -> GridTask:
+    """Which rung of a ladder is the highest that holds? A test takes half a second, the
+    way along the ladder 4 s, a rung that breaks 2 s more, and one or two may break."""
+    strength, load = np.arange(rungs) + 0.5, np.arange(1, rungs)
+    way = np.abs(np.append(load, 1)[:, None] - load) / rungs
+    breaks = 0.02 + 0.96 * (load[:, None] > strength)  # one reading in fifty is wrong
+    return GridTask.make(
+        strength, load / rungs, np.stack([1.0 - breaks, breaks], axis=1),
+        travel=0.5 + 4.0 * way, extra=[0.0, 2.0], uses=[0, 1], num_uses=(1, 2),
+        seconds=(4.0, 12.0), horizon=16,
+    )  # fmt: skip
+
+
 def task(steps: int = 100_000) -> list[float]:
-    """Find a small knee; reward in nats."""
-    made = knee(cells=4, sigma=0.05, seconds=(5.0, 9.0))
-    return train(SequentialEnv(made, STATE_RULE, 2), made.horizon, steps)
+    """Sessions on a ladder of one's own; reward in nats."""
+    made = ladder()
+    return train(SequentialEnv(made), made.horizon, steps)
 
 
 if __name__ == "__main__":

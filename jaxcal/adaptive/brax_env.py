@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from jaxcal.adaptive.environment import TaskEnv
-from jaxcal.adaptive.rules import CostRule
+from jaxcal.adaptive.rules import SHARES, Rule
 from jaxcal.learning.environments.brax_env import EpisodeEnv
 
 __all__ = ["SequentialEnv"]
@@ -17,5 +17,5 @@ __all__ = ["SequentialEnv"]
 class SequentialEnv(EpisodeEnv):
     """Sessions of a task; arguments as of ``TaskEnv``."""
 
-    def __init__(self, task: Any, base: CostRule, per_group: int = 8) -> None:
+    def __init__(self, task: Any, base: Rule = SHARES, per_group: int = 6) -> None:
         super().__init__(TaskEnv(task, base, per_group))

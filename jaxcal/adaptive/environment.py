@@ -12,7 +12,7 @@ from flax import struct
 from jaxcal.adaptive.policy.features import NUM_FEATURES, Shortlist
 from jaxcal.adaptive.policy.network import Correction
 from jaxcal.adaptive.policy.sessions import Exercise, Sessions, State
-from jaxcal.adaptive.rules import CostRule
+from jaxcal.adaptive.rules import SHARES, Rule
 from jaxcal.learning.environments.functional import FunctionalEnv
 
 __all__ = ["TaskEnv"]
@@ -31,11 +31,26 @@ class TaskEnv(FunctionalEnv):
     () int32, a place in the shortlist; an invalid one counts as the first. Reward:
     expected information gain of the measurement, nats. End: time or uses are spent, or
     ``task.horizon`` measurements are made.
+
+    Args:
+        task: a ``GridTask`` or a ``ParticleTask``.
+        base: the rule that ranks the options and that the network corrects; the
+            default's constants serve any task, ``tuning.tune(task, StateRule())`` makes
+            those of one.
+        per_group: options of each of the task's groups in the shortlist.
+
+    Raises:
+        ValueError: the rule has no price.
     """
 
     metric = "gain"
 
-    def __init__(self, task: Any, base: CostRule, per_group: int = 8) -> None:
+    def __init__(self, task: Any, base: Rule = SHARES, per_group: int = 6) -> None:
+        if not isinstance(base, Rule):
+            raise ValueError(
+                "base must be a rule with a price, such as rules.Shares or StateRule, "
+                f"got {type(base).__name__}"
+            )
         self._given, self._sessions = Exercise(task, base), Sessions(per_group)
 
     def begin(self, key: jax.Array) -> _Episode:

@@ -18,6 +18,7 @@ __all__ = [
     "GainRate",
     "Priced",
     "Random",
+    "Rule",
     "Shares",
     "StateRule",
     "best",

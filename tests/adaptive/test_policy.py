@@ -13,7 +13,7 @@ from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.policy import training
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.policy.network import PolicyDecider, initial
-from jaxcal.adaptive.rules import Gain, Priced, StateRule
+from jaxcal.adaptive.rules import SHARES, Gain, Priced, StateRule
 from jaxcal.adaptive.tasks import registry
 from jaxcal.adaptive.tasks.knee import STATE_RULE, knee
 from jaxcal.commands import evaluate as evaluate_command
@@ -47,11 +47,12 @@ def leaves(state):
 
 
 @pytest.mark.slow
-def test_a_policy_begins_as_its_rule():
+@pytest.mark.parametrize("rule", [STATE_RULE, SHARES], ids=["state", "shares"])
+def test_a_policy_begins_as_its_rule(rule):
     task = knee(**SMALL)
     keys = jax.random.split(jax.random.key(3), 32)
-    policy = PolicyDecider(initial(jax.random.key(0), 2, 2, 8), STATE_RULE, 2, 8)
-    mine, rules = (play(task, decider, keys) for decider in (policy, STATE_RULE))
+    policy = PolicyDecider(initial(jax.random.key(0), 2, 2, 8), rule, 2, 8)
+    mine, rules = (play(task, decider, keys) for decider in (policy, rule))
     np.testing.assert_array_equal(
         mine.designs * mine.alive, rules.designs * rules.alive
     )

@@ -59,7 +59,7 @@ def test_a_script_of_a_brax_user_trains_postures_and_a_task():
     before, after = brax_ppo.postures(40_000)
     assert before < -1.0 and after > before + 0.5
     before, after = brax_ppo.task(40_000)
-    assert np.isfinite(before) and after > before - 0.1  # begins as the base rule
+    assert before > 0.5 and after > before + 0.03
     assert not hasattr(jax, "device_put_replicated") or jax.__version__ < "0.10"
 
 

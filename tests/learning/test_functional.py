@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxcal.adaptive.environment import TaskEnv
+from jaxcal.adaptive.rules import Gain
 from jaxcal.adaptive.tasks.knee import STATE_RULE, knee
 from jaxcal.learning import PosturesEnv
 from jaxcal.learning.environments.selection import SelectionConfig
@@ -51,6 +52,11 @@ def test_postures_pay_the_log_det_of_what_is_chosen_and_begin_anew():
             assert last["log_det"][episode] == pytest.approx(10 * paid, abs=1e-2)
             assert last["action_mask"][episode].all()  # of the episode that begins
     assert not np.array_equal(kept[0][0], kept[4][0])
+
+
+def test_a_rule_without_a_price_is_refused():
+    with pytest.raises(ValueError, match=r"^base must be a rule with a price.*Gain$"):
+        TaskEnv(knee(cells=4), Gain())
 
 
 @pytest.mark.slow

@@ -9,14 +9,14 @@ from typing import Any
 from jaxcal.adaptive import rules
 from jaxcal.adaptive.policy.network import Correction
 from jaxcal.adaptive.policy.sessions import Sessions
-from jaxcal.adaptive.rules import CostRule
+from jaxcal.adaptive.rules import Rule
 from jaxcal.learning.config import RunConfig, StreamsConfig
 from jaxcal.learning.core.streams import Streams
 from jaxcal.learning.settings import require, setting
 
 __all__ = ["PPO", "PolicyConfig"]
 
-_RULES: tuple[type[CostRule], ...] = (rules.Priced, rules.StateRule)
+_RULES: tuple[type[Rule], ...] = (rules.Priced, rules.Shares, rules.StateRule)
 
 PPO = StreamsConfig(
     num_epochs=4,
@@ -37,7 +37,7 @@ class PolicyConfig(RunConfig):
     """Task, base rule, network and optimisation of a run."""
 
     task: str  # as registered
-    base: CostRule  # the rule that the network corrects; its constants are floats
+    base: Rule  # the rule that the network corrects; its constants are floats
     options: tuple[Mapping[str, Any], ...] = ({},)  # update u trains on u modulo n
     per_group: int = setting(6, "options of a group that the network sees")
     width: int = setting(64, "of the network's layers")

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcal.adaptive.rules import CostRule, groups_of, log_score, shortlist
+from jaxcal.adaptive.rules import Rule, groups_of, log_score, shortlist
 from jaxcal.adaptive.session import Options, Session
 
 __all__ = ["NUM_FEATURES", "Shortlist", "shortlist_of"]
@@ -34,13 +34,13 @@ def shortlist_of(
     session: Session,
     options: Options,
     key: jax.Array,
-    base: CostRule,
+    base: Rule,
     per_group: int,
 ) -> Shortlist:
     """The best ``per_group`` options of each group by the base rule, and features."""
-    gains = belief.gains(task, options, key)
     seconds, uses = task.expected(belief, session, options)
-    score = log_score(gains, base.price(session, seconds, uses))
+    gains, price = base.judged(task, belief, session, options, key)
+    score = log_score(gains, price)
     index, valid = shortlist(task, score, options, per_group)
     groups, number = groups_of(task, len(gains))
     mine = groups[index]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxcal.adaptive.policy.features import NUM_FEATURES, Shortlist, shortlist_of
-from jaxcal.adaptive.rules import CostRule
+from jaxcal.adaptive.rules import Rule
 from jaxcal.adaptive.session import Options, Session
 
 __all__ = ["Correction", "PolicyDecider"]
@@ -54,7 +54,7 @@ class PolicyDecider:
     """A trained network as a decider."""
 
     params: Any
-    base: CostRule
+    base: Rule
     per_group: int = struct.field(pytree_node=False, default=6)
     width: int = struct.field(pytree_node=False, default=64)
     sample: bool = struct.field(pytree_node=False, default=False)

@@ -11,7 +11,7 @@ from flax import struct
 
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.policy.features import Shortlist, shortlist_of
-from jaxcal.adaptive.rules import CostRule
+from jaxcal.adaptive.rules import Rule
 from jaxcal.adaptive.session import Session
 from jaxcal.learning.core.streams import Step
 
@@ -23,7 +23,7 @@ class Exercise:
     """Arrays that a stream takes: a task, and the rule that the policy corrects."""
 
     task: Any
-    base: CostRule
+    base: Rule
 
 
 @struct.dataclass

@@ -6,7 +6,7 @@
 
 A step that ends an episode returns the first observation of a fresh one;
 ``info["action_mask"]`` says what may be chosen next. brax and Gymnasium see the same
-episodes through ``learning.brax`` and ``gymnasium.make_vec("jaxcal/Postures-v0")``.
+episodes through ``learning.brax`` and ``learning.gym``.
 """
 
 from __future__ import annotations
