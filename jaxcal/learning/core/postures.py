@@ -178,14 +178,16 @@ class Postures:
         memory = encode(network, params, features)
 
         def score(
-            state: Any, count: jax.typing.ArrayLike, learns: bool
+            state: Any, count: jax.typing.ArrayLike, learns: Any
         ) -> tuple[Any, jax.Array, jax.Array]:
             decision = network.decision_features(
                 features, state.chosen, state.available, count
             )
-            if learns:
-                return decision, *decode(network, params, memory, decision)
-            return decision, *network.lookahead_logits(decision)
+            by_network = functools.partial(decode, network, params, memory, decision)
+            by_lookahead = functools.partial(network.lookahead_logits, decision)
+            if isinstance(learns, bool):
+                return decision, *(by_network if learns else by_lookahead)()
+            return decision, *jax.lax.cond(learns, by_network, by_lookahead)
 
         def act(
             state: Any, logits: jax.Array, value: jax.Array, noise: jax.Array
@@ -200,31 +202,31 @@ class Postures:
                 "reward": reward,
             }
 
-        def decide(learns: bool, state: Any, now: Any) -> tuple[Any, tuple[Any, ...]]:
+        def decide(state: Any, now: Any) -> tuple[Any, tuple[Any, ...]]:
             count, noise = now
+            learns = (
+                count < learned if 1 < learned < task.num_decisions else learned > 1
+            )
             score_at = functools.partial(score, count=count, learns=learns)
             decision, logits, value = _mapped(score_at, at_once, state)
             state, record = jax.vmap(act)(state, logits, value, noise)
-            return state, (decision if learns else None, record)
+            return state, (decision, record)
 
         shape = task.num_decisions, self.config.episodes_per_set, len(start.available)
         noise = jax.random.gumbel(keys[1], shape)  # at once: compiled once
-        counts = jnp.arange(task.num_decisions)
         # The first decision is the same for every episode.
         first, logits, value = score(start, 0, learned > 0)
         begin = jax.vmap(act, in_axes=(None, None, None, 0))
         state, record = begin(start, logits, value, noise[0])
-        records = [jax.tree.map(lambda leaf: leaf[None], record)]
+        played = jax.tree.map(lambda leaf: leaf[None], record)
         decisions = jax.tree.map(lambda leaf: leaf[None], first)
-        for begins, ends, learns in ((1, learned, True), (learned, len(noise), False)):
-            if begins < ends:
-                now = counts[begins:ends], noise[begins:ends]
-                step = functools.partial(decide, learns)
-                state, (seen, record) = jax.lax.scan(step, state, now)
-                records.append(record)
-                if learns:  # the last choices, by the look-ahead, are not trained on
-                    decisions = jax.tree.map(_followed, decisions, seen)
-        played = jax.tree.map(lambda *x: jnp.concatenate(x), *records)  # leaves (K, G)
+        if len(noise) > 1:
+            # One program for all; the last choices, by the look-ahead, teach nothing.
+            now = jnp.arange(1, len(noise)), noise[1:]
+            state, (seen, record) = jax.lax.scan(decide, state, now)
+            seen = jax.tree.map(lambda leaf: leaf[: max(learned - 1, 0)], seen)
+            decisions = jax.tree.map(_followed, decisions, seen)
+            played = jax.tree.map(lambda *x: jnp.concatenate(x), played, record)
         advantage, target = self._advantages_and_targets(played)
         batch = Batch(
             seen=RowInputs(features, decisions),

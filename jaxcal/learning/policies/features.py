@@ -103,19 +103,23 @@ def decision_features(
     """
     x = features.whitened
     p, total = x.shape[-1], chosen.shape[-1]
+    begins = isinstance(count, int) and count == 0
     count = jnp.asarray(count)
     which, picked = picked_of(x, chosen)
     # A choice multiplies the determinant by |y|^2, or by 1 + |y|^2.
-    if total == p:
-        # Every choice is a new direction: exact projections.
-        y, so_far = geometry.projected(x, picked, count)
+    if total == p and begins:  # the look-ahead of the set is that of the decision
+        vectors, so_far = features.vectors, jnp.zeros(x.shape[:-2], x.dtype)
     else:
-        # The metric of the chosen; until they span the space, with a ridge small
-        # beside what a posture contributes.
-        ridge = jnp.where(count < p, _RIDGE, 0.0)
-        y, so_far = geometry.normalised_by(x, picked, ridge)
-    depth = jnp.minimum(lookahead, total - count)
-    vectors = vector_features(y, total != p, available, depth, close_up)
+        if total == p:
+            # Every choice is a new direction: exact projections.
+            y, so_far = geometry.projected(x, picked, count)
+        else:
+            # The metric of the chosen; until they span the space, with a ridge small
+            # beside what a posture contributes.
+            ridge = jnp.where(count < p, _RIDGE, 0.0)
+            y, so_far = geometry.normalised_by(x, picked, ridge)
+        depth = jnp.minimum(lookahead, total - count)
+        vectors = vector_features(y, total != p, available, depth, close_up)
     return DecisionFeatures(
         vectors,
         chosen=which.sum(-2) / jnp.maximum(count, 1).astype(x.dtype),
