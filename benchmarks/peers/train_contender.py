@@ -98,7 +98,8 @@ def brax(sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
     validation = training.Validation(sets, best, 3)
 
     def watch(step: int, make_policy: Any, params: Any) -> None:
-        if clock.say(validation.measure(network, params[1], 4)[0]):
+        weights = brax_ppo.network_params(params)
+        if clock.say(validation.measure(network, weights, 4)[0]):
             raise Done
 
     with tempfile.TemporaryDirectory() as folder:

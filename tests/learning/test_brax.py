@@ -71,10 +71,17 @@ def test_braxs_own_ppo_trains_it(tmp_path):
     config = brax_ppo.adapted(presets.load("compact"))
     config = presets.with_values(config, {"num_episodes": 20_000})
     lines: list[str] = []
-    brax_ppo.train(config, tmp_path, lines.append, num_evals=3)
+    watched = []  # as a caller of brax reads them while it trains
+
+    def watch(step, make_policy, params):
+        watched.append(brax_ppo.network_params(params))
+
+    more = {"num_evals": 3, "policy_params_fn": watch}
+    brax_ppo.train(config, tmp_path, lines.append, **more)
     values = [float(line.rsplit(" ", 1)[1]) for line in lines if "log det" in line]
     assert values[-1] > values[0] + 3.0  # from random towards the optimum of -1.2
     assert not hasattr(jax, "device_put_replicated") or jax.__version__ < "0.10"
     policy = checkpoint.load(tmp_path)
     assert policy.meta["trainer"] == "brax"
     assert policy.network.config.kind == "paper"
+    jax.tree.map(np.testing.assert_array_equal, watched[-1], policy.params)

@@ -23,7 +23,7 @@ from jaxcal.learning.settings import settings_of
 from jaxcal.learning.training import checkpoint
 from jaxcal.learning.training.config import TrainConfig
 
-__all__ = ["adapted", "require_read", "train"]
+__all__ = ["adapted", "network_params", "require_read", "train"]
 
 _READ = {  # fields of PPOConfig that brax is given: brax's names
     "learning_rate": "learning_rate",
@@ -108,5 +108,10 @@ def train(
             "device": jax.devices()[0].device_kind,
         },
     }
-    policy = params[1]["params"]["network"]
+    policy = network_params(params)
     checkpoint.save(pathlib.Path(folder) / "checkpoint", episodes, policy, meta)
+
+
+def network_params(params: Any) -> Any:
+    """Parameters of jaxcal's network in those that brax's trainer returns."""
+    return params[1]["params"]["network"]
