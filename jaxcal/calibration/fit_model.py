@@ -80,8 +80,8 @@ def fit_model(
     """
     one_of("loss", loss, tuple(LOSSES))
     require_kind("prior", prior, Prior)
-    weights = _distinct_weights(model, commands, measured, weights)
-    noise, used = noise or Noise(), _used(weights)
+    weights, used = _distinct_weights(model, commands, measured, weights)
+    noise = noise or Noise()
     spread = _command_noise(noise, commands, measured.shape[1])
     exact = not spread.any()
     model = model.prepared(commands[used], measured[used])
@@ -97,6 +97,7 @@ def fit_model(
         commands,
         measured,
         weights,
+        used,
         prior=prior,
         noise=noise,
         command_std=spread,
@@ -127,6 +128,7 @@ def _problem(
     commands: Array,
     measured: Array,
     weights: Array,
+    used: slice | NDArray[np.bool_],
     *,
     prior: Prior,
     noise: Noise,
@@ -135,13 +137,12 @@ def _problem(
     common_noise: bool | None,
     excited: tuple[str, ...],
 ) -> tuple[FitProblem, Array | None]:
-    """The problem of the measurements that count.
+    """The problem of the measurements that count, the rows that are ``used``.
 
     Returns:
         It, and (n,) what its commands are counted from, None: from zero.
     """
-    used, exact = _used(weights), not command_std.any()
-    resolved = prior.resolve(model)
+    exact, resolved = not command_std.any(), prior.resolve(model)
     centre, to_centred = None, None
     if exact and resolved.free.all() and not resolved.precisions.any():
         centre, to_centred = _centre(model, commands[used], weights[used], excited)
@@ -194,17 +195,17 @@ def _used(weights: Array) -> slice | NDArray[np.bool_]:
 
 def _distinct_weights(
     model: Model, commands: Array, measured: Array, weights: Array
-) -> Array:
-    """(N,) the weights of the measurements that count, 0 elsewhere."""
-    if not weights.any():
-        raise ValueError("weights must be positive for one measurement at least")
+) -> tuple[Array, slice | NDArray[np.bool_]]:
+    """(N,) the weights of the measurements that count, 0 elsewhere, and their rows."""
     used = _used(weights)
+    if not isinstance(used, slice) and not used.any():
+        raise ValueError("weights must be positive for one measurement at least")
     once = model.distinct(commands[used], measured[used])
     if len(once) == len(weights):
-        return weights
+        return weights, used
     rows, distinct = np.flatnonzero(weights)[once], np.zeros_like(weights)
     distinct[rows] = weights[rows]
-    return distinct
+    return distinct, _used(distinct)
 
 
 class _ScaledFit(NamedTuple):

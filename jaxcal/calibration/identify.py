@@ -261,13 +261,13 @@ def _provenance(
         noted = json.loads(json.dumps(dict(notes), allow_nan=False)) if notes else {}
     except (TypeError, ValueError) as error:
         raise ValueError(f"notes must be what JSON can hold: {error}") from None
-    digest = hashlib.sha256()
-    for array in (commands, measured, weight):
-        digest.update(str(array.shape).encode())
-        digest.update(np.ascontiguousarray(array, dtype=_LITTLE_ENDIAN).tobytes())
+    content = b"".join(
+        str(array.shape).encode() + array.astype(_LITTLE_ENDIAN, copy=False).tobytes()
+        for array in (commands, measured, weight)
+    )
     return {
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "packages": _packages(),
-        "data_sha256": digest.hexdigest(),
+        "data_sha256": hashlib.sha256(content).hexdigest(),
         "notes": noted,
     }

@@ -206,7 +206,8 @@ class FitSolution:
         self._share(problem.levels)
         # The last step of the logarithms of the levels, and how much of one is taken.
         self.climbed, self.trust = np.zeros(q), 1.0
-        self.informed = problem.precision[problem.free].any()
+        self.all_free = bool(problem.free.all())
+        self.informed = bool(np.logical_and(problem.free, problem.precision).any())
         linear = problem.model.linear and not len(self.command_root)
         from_zero = linear and start is None and not self.informed
         if start is None:
@@ -225,7 +226,7 @@ class FitSolution:
         self.parameters, self.commands = problem.mean, problem.commands
         if from_zero:
             self.parameters = np.where(problem.free, 0.0, problem.mean)
-        if from_zero and problem.free.all():
+        if from_zero and self.all_free:
             self._take(problem.measured)
         else:
             self._predict()
@@ -273,6 +274,14 @@ class FitSolution:
         mean = same @ square.sum(axis=0) / (len(square) * same.sum(axis=1))
         return np.maximum(np.sqrt(mean), self.floor)
 
+    def _changed(self, step: Array) -> Array:
+        """(P,) the parameters with a step (F,) of the free ones."""
+        if self.all_free:
+            return self.parameters + step
+        theta = self.parameters.copy()
+        theta[self.problem.free] += step
+        return theta
+
     def _take(self, residuals: Array) -> None:
         self.residuals = residuals
         self.white = self.whitened(residuals[..., None])[..., 0]
@@ -301,7 +310,7 @@ class FitSolution:
         rows = derivative(problem.model, self.commands, self.parameters)
         if not problem.model.linear:  # those of a linear model are exact
             rows = np.where(without_effect(rows, self.sizes), 0.0, rows)
-        if not problem.free.all():
+        if not self.all_free:
             rows = rows[..., problem.free]
         self.by_theta = self.whitened(rows)
         if (size := problem.size(self.parameters)) is not None:
@@ -357,8 +366,7 @@ class FitSolution:
             inverse, self.solved = _factor(rows, self.damping)
             basis = basis / scale @ inverse
         cost, target = float(right @ right), self.solved.T @ right
-        self.parameters = self.parameters.copy()
-        self.parameters[problem.free] += basis @ target
+        self.parameters = self._changed(basis @ target)
         self._predict()
         distance = self._distance(self.white, self.commands)
         gain = float(target @ target)
@@ -474,8 +482,7 @@ class FitSolution:
             step = step / scale if self.basis is None else self.basis @ (step / scale)
             if gain <= self.least + 1e-13 * cost:
                 return True
-            theta = self.parameters.copy()
-            theta[problem.free] += step
+            theta = self._changed(step)
             commands = self._moved(step)
             residuals = self._off(commands, theta, finite=False)
             white = self.whitened(residuals[..., None], theta)[..., 0]
@@ -568,7 +575,7 @@ class FitSolution:
     def _freedom(self, readings: Array) -> Array:
         """(q,) residual degrees of freedom of each output."""
         count, q = self.residuals.shape
-        used = np.einsum("nqf,nqf->q", readings, readings)
+        used = np.vecdot(readings, readings).sum(axis=0)
         if len(self.command_root):
             return np.full(q, (count * self.num_readings - used.sum()) / q)
         freedom = count - used
@@ -655,8 +662,8 @@ def _cholesky(rows: Array, damping: float) -> tuple[Array | None, Array]:
                 np.eye(len(square)) if inverse is None else inverse.T @ inverse
             )
         root, failed = dpotrf(square)
-        size = root.diagonal()
-        if failed or size.min(initial=np.inf) < _CHOLESKY * size.max(initial=0.0):
+        size = root.diagonal().tolist()
+        if failed or (size and min(size) < _CHOLESKY * max(size)):
             return None, rows
         step = dtrtri(root)[0]
         inverse = step if inverse is None else inverse @ step

@@ -402,28 +402,16 @@ def _cholesky_factors(
 
     Of S sets of rows (S, N, p), by Cholesky's factor in units of the columns' lengths.
     """
-    information, p = gram(rows), rows.shape[2]
+    information = gram(rows)
     scale = np.sqrt(information.diagonal(axis1=1, axis2=2))
-    good = np.asarray((scale * _CLEAR > largest).all(axis=1))
+    kernel = compiled.kernel("jaxcal.information.rank_kernel")
+    back, inverse, log_det = kernel.factors(information)
+    unit = (inverse * scale[:, :, None]).reshape(len(rows), -1)
+    good = np.vecdot(unit, unit) <= _LOSS / _EPS  # not where there is none, NaN
+    good &= (scale * _CLEAR > largest).all(axis=1)
     if far is not None:
         good &= ~far
-    if np.count_nonzero(good) < len(good):
-        information[~good], scale[~good] = np.eye(p), 1.0
-    try:
-        lower = np.linalg.cholesky(information)
-    except np.linalg.LinAlgError:
-        lower = np.broadcast_to(np.eye(p), information.shape).copy()
-        for n in np.flatnonzero(good):
-            try:
-                lower[n] = np.linalg.cholesky(information[n])
-            except np.linalg.LinAlgError:
-                good[n] = False
-    inverse = np.linalg.inv(lower / scale[:, :, None])
-    flat = inverse.reshape(-1, p * p)
-    good &= np.vecdot(flat, flat) <= _LOSS / _EPS
-    lengths = lower.diagonal(axis1=1, axis2=2)
-    log_det = 2.0 * np.add.reduce(np.log(lengths), axis=1)
-    return inverse.mT / scale[:, :, None], np.asarray(lower.mT), log_det, good
+    return inverse, back, log_det, good
 
 
 def _by_rotations(rows: Array, far: bool) -> tuple[Array, Array, Array]:

@@ -389,6 +389,8 @@ def as_model(model: Any) -> Model:
     Raises:
         ValueError: it is a class, or lacks a method that has no default.
     """
+    if isinstance(model, Model):
+        return model
     methods = ("predict", "jacobian", "command_jacobian")
     missing = [name for name in methods if not callable(getattr(model, name, None))]
     if missing or isinstance(model, type):
@@ -398,7 +400,7 @@ def as_model(model: Any) -> Model:
             f"jaxcal.models.Model, got {got}"
             + (f" without {missing[0]}" if missing else "")
         )
-    return model if isinstance(model, Model) else _Adapter(model)
+    return _Adapter(model)
 
 
 def as_commands(model: Any, commands: ArrayLike) -> Array:

@@ -93,7 +93,7 @@ class Prior:
             free[names.index(one_of("parameter in fixed", name, names))] = False
         if self.fixed and not free.any():
             raise ValueError("prior must leave a parameter free, but it fixes them all")
-        return ResolvedPrior(mean, std**-2.0, free)
+        return ResolvedPrior(mean, 1.0 / std**2, free)
 
 
 def _by_name(

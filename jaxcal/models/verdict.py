@@ -74,7 +74,7 @@ def verdict(fit: Fit) -> Verdict:
                 "measure more rows, or state noise_std, --noise",
             )
         )
-    if fit.undetermined.any():
+    if fit.unidentified is not None and fit.undetermined.any():
         names = ", ".join(fit.names[i] for i in np.flatnonzero(fit.undetermined))
         findings.append(
             (

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
+import math
 import time
 from collections.abc import Sequence
 from typing import Any, Self
@@ -351,7 +353,7 @@ class Design:
         method: str,
     ) -> None:
         """Refuse a selection that is singular, or whose value no double holds."""
-        if np.isneginf(log_det):
+        if log_det == -math.inf:
             name = "indices" if method == "score" else "method"
             whose = "" if method == "score" else f", which {method!r} returned"
             raise ValueError(
@@ -359,7 +361,7 @@ class Design:
                 f"{indices.tolist()}{whose} is singular{self._why_singular(indices)}"
             )
         least = problem.criterion.kind == "least"
-        if not np.isfinite(value) or (least and not value > 0.0):
+        if not math.isfinite(value) or (least and not value > 0.0):
             raise ValueError(
                 f"criterion {problem.criterion.name} must be a number in double "
                 f"precision, got {value} in these units; give the commands in others"
@@ -395,9 +397,14 @@ def _whole_numbers(indices: ArrayLike) -> Indices:
 
 def _require_allowed(problem: Problem, indices: Indices, method: str) -> None:
     """Refuse what is no selection of this problem: the solver is wrong."""
-    counts = np.bincount(indices, minlength=len(problem.blocks))
-    right = len(indices) == problem.k and len(counts) == len(problem.blocks)
-    if not right or ((counts < problem.lower) | (counts > problem.upper)).any():
+    chosen, count = indices.tolist(), len(problem.available)
+    distinct = set(chosen)
+    right = len(chosen) == problem.k and distinct.issuperset(problem.required.tolist())
+    if len(distinct) < len(chosen):
+        most = max(collections.Counter(chosen).values())
+        right = right and most <= problem.max_replicates
+    right = right and 0 <= min(distinct) and max(distinct) < count
+    if not right or not problem.available[indices].all():
         raise RuntimeError(
             f"method {method!r} must return {problem.k} candidates within lower "
             f"and upper of its problem, got {indices.tolist()}"

@@ -94,3 +94,19 @@ def test_a_prior_alone_is_what_is_left_without_the_only_measurement(rng):
     root = rng.normal(size=(3, 3))
     _, log_det = rank_of_blocks(np.zeros((2, 0, 1, 3)), root)
     np.testing.assert_allclose(log_det, 2.0 * np.linalg.slogdet(root)[1])
+
+
+@pytest.mark.parametrize("p", [1, 4, 39])
+def test_triangles_of_small_matrices_are_numpys(p):
+    from jaxcal.information.rank_kernel import factors
+
+    rows = np.random.default_rng(p).normal(size=(5, 3 * p, p))
+    rows[2, :, 0] = 0.0  # no triangle with an inverse
+    back, inverse, log_det = factors(rows.mT @ rows)
+    assert np.isnan(back[2]).all() and np.isnan(inverse[2]).all()
+    assert np.isnan(log_det[2])
+    for n in (0, 1, 3, 4):
+        square = rows[n].T @ rows[n]
+        np.testing.assert_allclose(back[n], np.linalg.cholesky(square).T, atol=1e-10)
+        np.testing.assert_allclose(inverse[n], np.linalg.inv(back[n]), atol=1e-10)
+        np.testing.assert_allclose(log_det[n], np.linalg.slogdet(square)[1])

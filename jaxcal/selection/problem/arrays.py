@@ -51,15 +51,14 @@ def _keep_freed_pages() -> None:
 
 
 def usable_numbers(name: str, array: Array, mask: Mask) -> Array:
-    """A copy, finite where available; what is not finite elsewhere becomes zero."""
+    """The array, finite where available; what is not elsewhere becomes zero in it."""
     _keep_freed_pages()
-    own = np.array(array, order="C")
-    bad = ~np.isfinite(own)
-    if bad.any():
-        hidden = bad & ~mask.reshape(*mask.shape, *[1] * (own.ndim - mask.ndim))
-        own[hidden] = 0.0
-        require_finite(name, own)
-    return own
+    finite = np.isfinite(array)
+    if not finite.all():
+        hidden = ~finite & ~mask.reshape(*mask.shape, *[1] * (array.ndim - mask.ndim))
+        array[hidden] = 0.0
+        require_finite(name, array)
+    return array
 
 
 def rounding_of(values: ArrayLike) -> float:

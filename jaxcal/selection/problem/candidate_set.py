@@ -61,7 +61,8 @@ class CandidateSet:
         # Copies: the caller's arrays may change before the next question.
         if self.measured is not None:
             self.measured = numbers("measured", self.measured)
-        self.required = copy.deepcopy(self.required)
+        if self.required is not None:
+            self.required = copy.deepcopy(self.required)
         if whole_number("lost", self.lost, 0) > _MOST_LOST:
             raise ValueError(f"lost must be at most {_MOST_LOST}, got {self.lost}")
         if self.reliability is not None:
@@ -115,17 +116,19 @@ class CandidateSet:
             axes=axes,
             **losses,
         )
-        if model.multiplicity:  # another's derivatives are computed from the commands
-            assert made.candidates is not None
+        if scenarios is not None:
+            made.scenarios = scenarios_of(scenarios, model, prior)
+        assert made.candidates is not None
+        if model.multiplicity:  # which answers everywhere, by the commands themselves
             spacing, rows = rounding_of(candidates), None
             if made.measured is not None and made.measured.ndim == 2:
                 rows = made.measured[None, :, None]
             flatten_rounding(
                 spacing, made.candidates[None, :, None], mask[None], rows, bias=True
             )
-        if scenarios is not None:
-            made.scenarios = scenarios_of(scenarios, model, prior)
-        made._leave_unanswered(model)
+        else:
+            made._leave_unanswered(model)
+        made.candidates.flags.writeable = False
         return made
 
     def _leave_unanswered(self, model: Model) -> None:
@@ -145,7 +148,6 @@ class CandidateSet:
             asked = self.candidates[rows]
             kept = answered(model, asked, parameters, rows, self.names)
             self.available[rows[~kept]] = False
-        self.candidates.flags.writeable = False
 
     @classmethod
     def of_blocks(
@@ -171,7 +173,7 @@ class CandidateSet:
         mask = check_available(available, array.shape[-3:-2])
         if array.ndim == 4:
             scenarios = Scenarios(None, checked_weights(weights, len(array)))
-            array = np.moveaxis(array, 1, 0)
+            array = np.ascontiguousarray(np.moveaxis(array, 1, 0))
         elif weights is not None:
             raise ValueError("weights must come with blocks (S, M, q, p) of scenarios")
         array = usable_numbers("blocks", array, mask)
