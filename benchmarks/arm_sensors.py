@@ -742,14 +742,21 @@ def _expected(
 
 
 def distances(_: int) -> None:
-    """How far apart an arm fitted at one place puts the sockets of another: 50 mm."""
+    """How far apart an arm fitted at one place puts the sockets of another: 50 mm.
+
+    The half width is that of scatter that is independent from contact to contact, then
+    of scatter that all contacts of a socket share, as where the arm makes it: it does
+    not average out. Last, what the other place's own contacts say, no distance given.
+    """
     sys.path.insert(0, str(EXAMPLES))
     import contacts as example
 
-    print("| arm, trained on | judged at | distance, mm | 95 % |")
-    print("| --- | --- | --- | --- |")
+    print("| arm, trained on | judged at | distance, mm | 95 % | shared | own |")
+    print("| --- | --- | --- | --- | --- | --- |")
     for name in ("panda_1", "kuka_14"):
         places = example.load(name)
+        freed = example.arm(name).measured_with(Socket(2))
+        own_mm = {where: _apart(freed, place) for where, place in places.items()}
         for trained, place in places.items():
             found = example.identify(name, place, np.arange(len(place[0])))
             own = [found.names.index(each) for each in found.model.sensor.names]
@@ -765,10 +772,31 @@ def distances(_: int) -> None:
                 far = float(np.linalg.norm(apart))
                 first, last = (slopes[at].mean(axis=0) for at in which)
                 by = apart / far @ (last - first)
-                few = sum(1.0 / at.sum() for at in which)
-                std = np.sqrt(by @ covariance @ by + found.noise_std[0] ** 2 * few)
-                half = 1e3 * stats.t.ppf(0.975, found.noise_dof) * np.hypot(std, 1e-4)
-                print(f"| {name}, {trained} | {other} | {1e3 * far:.2f} | {half:.2f} |")
+                std = np.sqrt(by @ covariance @ by + 1e-4**2)
+                noise, t = found.noise_std[0], stats.t.ppf(0.975, found.noise_dof)
+                halves = [
+                    1e3 * t * np.hypot(std, noise * np.sqrt(share))
+                    for share in (sum(1.0 / at.sum() for at in which), len(which))
+                ]
+                print(
+                    f"| {name}, {trained} | {other} | {1e3 * far:.2f} | "
+                    f"{halves[0]:.2f} | {halves[1]:.2f} | {own_mm[other]} |"
+                )
+
+
+def _apart(model: SerialChain, place: tuple[Array, Array]) -> str:
+    """Distance of two sockets in mm by their contacts alone, and its 95 %."""
+    found = jaxcal.identify(np.column_stack(place), model=model)
+    first, second = (
+        [found.names.index(f"socket{i} {axis}") for axis in "xyz"] for i in (0, 1)
+    )
+    by = found.parameters[second] - found.parameters[first]
+    far = float(np.linalg.norm(by))
+    slopes = np.zeros(len(found.names))
+    slopes[second], slopes[first] = by / far, -by / far
+    std = np.sqrt(slopes @ np.asarray(found.covariance) @ slopes)
+    half = stats.t.ppf(0.975, found.noise_dof) * std
+    return f"{1e3 * far:.2f} +- {1e3 * half:.2f}"
 
 
 _ALL = (

@@ -161,6 +161,7 @@ def test_contacts_are_good_exactly_where_the_arm_is_better_elsewhere(size, seed)
     error = _apart(found.arm.predict(rest), points)
     nominal = _apart(arm.nominal_tips(rest), points)
     assert found.verdict.good == (error < nominal), str(found.verdict)
+    assert error < 2.0 * found.verdict.anywhere
     if (size, seed) == (2.0, 0):
         low, high = found.confidence_intervals()[:30].T
         inside = (low <= truth[:30]) & (truth[:30] <= high)
