@@ -1,5 +1,5 @@
-# Everything runs in .venv, made on first use: jaxcal, whose kernels compile meanwhile, and
-# every line of constraints.txt. uv takes half of pip's time for them; where it cannot reach
+# Everything runs in .venv, made on first use: jaxcal and what training needs, then every
+# line of constraints.txt. uv takes half of pip's time for them; where it cannot reach
 # the packages, pip, whose configuration may say where they are, installs them. Python
 # compiles what it imports; compiling everything takes as long again as installing it.
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
@@ -7,8 +7,10 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 VENV ?= .venv
 BENCH ?= .venv-bench
 BIN := $(VENV)/bin
+TRAINS := $(VENV)/.trains
 READY := $(VENV)/.ready
-INSTALL := $(BIN)/python -m pip install --quiet --no-compile --no-deps
+PIP := $(BIN)/python -m pip install --quiet --no-compile
+install = { $(BIN)/uv pip install --quiet --python $(VENV) $(1) || $(PIP) $(1); }
 KERNELS := hatch_build.py $(shell find jaxcal -name '*kernel.py' -o -name '*.pxd')
 
 # XLA's flags for quick compiling, asked of what is installed when a recipe runs. Newer
@@ -24,19 +26,22 @@ QUICK_XLA = $$($(BIN)/python -c 'import importlib.metadata as m; print(\
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
 
-$(READY): pyproject.toml constraints.txt $(KERNELS)
+$(TRAINS): pyproject.toml constraints.txt $(KERNELS)
 	@test -n "$(PYTHON)" || { echo "jaxcal needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 2; }
 	$(PYTHON) -m venv $(VENV)
-	$(INSTALL) -e . & jaxcal=$$!; $(INSTALL) -c constraints.txt uv && \
-	{ $(BIN)/uv pip install --quiet --python $(VENV) --no-deps -r constraints.txt || \
-	$(INSTALL) -r constraints.txt; } && wait $$jaxcal
+	$(PIP) -c constraints.txt uv
+	$(call install,-c constraints.txt -e '.[policy]')
+	@touch $@
+
+$(READY): $(TRAINS)
+	$(call install,--no-deps -r constraints.txt)
 	$(BIN)/python -m pip check
 	@touch $@
 
-train: $(READY) ## set everything up and train the compact policy on this machine (one to two minutes)
+train: $(TRAINS) ## set everything up and train the compact policy on this machine (one to two minutes)
 	$(BIN)/python train.py $(ARGS)
 
-checkpoint: $(READY) ## train the policy that ships and put it in checkpoints/default.npz (about 10 minutes)
+checkpoint: $(TRAINS) ## train the policy that ships and put it in checkpoints/default.npz (about 10 minutes)
 	$(BIN)/python train.py --preset general --export checkpoints/default.npz $(ARGS)
 
 evaluate: $(READY) ## compare every method with the proven optimum on 1,000 unseen candidate sets

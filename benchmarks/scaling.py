@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcal.learning.core import ppo
-from jaxcal.learning.runtime import cache, devices
+from jaxcal.learning.runtime import devices
 from jaxcal.learning.training import presets
 from jaxcal.learning.training.run import updates
 
@@ -84,7 +84,6 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=10, help="0: not timed")
     parser.add_argument("--candidates", type=int, help="of an episode")
     arguments = parser.parse_args()
-    cache.keep_compiled_programs()
     devices.a_device_for_each_core(max(map(int, arguments.seeds.split(","))))
     values = {"num_episodes": 10**8}
     if arguments.candidates:
