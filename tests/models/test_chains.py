@@ -355,7 +355,7 @@ def read_by_hand(kind, k, frames, rng):
     start = rng.uniform(-80, 80, (160, 7))
     if kind == "sockets":  # 0 and 1 by the left hand, 1 and 2 by the right one
         tables = [
-            (touching(tips, lambda at, p=place: at - p, start[:60]), i)
+            (touching(tips, lambda at, p=place: at - p, start[:40]), i)
             for i, place in enumerate(SOCKETS)
             if i in (k, k + 1)
         ]

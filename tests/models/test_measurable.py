@@ -124,6 +124,19 @@ def test_corners_of_a_wide_lens_are_judged_with_its_distortion():
         Board(corners=CORNERS, camera=board.camera, distortion=(0.1,))
 
 
+@pytest.mark.slow
+def test_views_are_planned_for_the_lens():
+    """One that has what is near the corners a third farther out than without it."""
+    lens = Board("camera", PLACE, CORNERS, CAMERA, distortion=(0.6, 0.0, 0.0, 0.0))
+    arm = SerialChain.from_dh(ur5().table, tool=MOUNT, sensor=lens)
+    joints = arm.postures(6, seed=1, distance=(160.0, 230.0))
+    seen = np.linalg.inv(_frames(arm, joints, arm.nominal)) @ PLACE
+    spots = CORNERS @ np.matrix_transpose(seen[:, :3, :3]) + seen[:, None, :3, 3]
+    rays = spots[..., :2] / spots[..., 2:]
+    pixels = 900.0 * rays * (1.0 + 0.6 * (rays**2).sum(axis=-1, keepdims=True))
+    assert (np.abs(pixels) < [640.0, 480.0]).all()
+
+
 def _at_left(pixels, row, share):
     """Pixels (N, C, 2) of a row moved until its leftmost is at a share of the width."""
     moved = pixels.copy()
