@@ -72,9 +72,13 @@ class FitProblem:
         if size is None:
             return None
         log, slopes = size
-        zero = ~self.measured.any(axis=1, keepdims=True)
-        ratio = np.exp(np.where(zero, log[:, None] - self._first_size, 0.0))
-        return ratio, zero * slopes[:, self.free]
+        ratio = np.exp(self._zeros * (log[:, None] - self._first_size))
+        return ratio, self._zeros * slopes[:, self.free]
+
+    @functools.cached_property
+    def _zeros(self) -> Array:
+        """(N, 1) 1 where what was measured is zero, else 0."""
+        return 1.0 - np.asarray(self.measured.any(axis=1, keepdims=True), np.float64)
 
     @functools.cached_property
     def _first_size(self) -> Array:
@@ -185,6 +189,7 @@ class FitSolution:
     num_readings: int  # of a measurement, less its unknown commands
     freedom: Array  # (q,) residual degrees of freedom of each output
     root: Array | None = None  # (F, F) of the covariance, where it is at hand
+    _sized: tuple[Array, tuple[Array, Array] | None] | None = None
 
     def __init__(
         self, problem: FitProblem, start: FitSolution | None, rough: bool
@@ -289,8 +294,14 @@ class FitSolution:
     def whitened(self, rows: Array, theta: Array | None = None) -> Array:
         """(N, q, F) rows in noise of level 1, those of zeros by the machine's size."""
         white = whiten(self.problem.white, rows)
-        size = self.problem.size(self.parameters if theta is None else theta)
+        size = self._size(self.parameters if theta is None else theta)
         return white if size is None else white / size[0][..., None]
+
+    def _size(self, theta: Array) -> tuple[Array, Array] | None:
+        """``FitProblem.size`` of parameters (P,), kept for the last ones."""
+        if self._sized is None or self._sized[0] is not theta:
+            self._sized = theta, self.problem.size(theta)
+        return self._sized[1]
 
     def _predict(self) -> None:
         """Residuals at the present parameters and commands."""
@@ -313,7 +324,7 @@ class FitSolution:
         if not self.all_free:
             rows = rows[..., problem.free]
         self.by_theta = self.whitened(rows)
-        if (size := problem.size(self.parameters)) is not None:
+        if (size := self._size(self.parameters)) is not None:
             self.by_theta = self.by_theta + self.white[..., None] * size[1][:, None]
         if len(self.command_root):
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
