@@ -162,10 +162,10 @@ def solve_exact(
     start = exchange_indices(problem, restarts, seed, deadline.part(0.5))
     keep, first = _groups(problem, merge=best == 1)
     counts = np.bincount(start, minlength=len(problem.blocks))
-    low, high, begun = (
-        np.add.reduceat(numbers[keep], first)
-        for numbers in (problem.lower, problem.upper, counts)
-    )
+    rules = [numbers[keep] for numbers in (problem.lower, problem.upper, counts)]
+    if len(first) < len(keep):
+        rules = [np.add.reduceat(numbers, first) for numbers in rules]
+    low, high, begun = rules
     searched = _branched(
         problem, keep[first], low, np.minimum(high, problem.k), begun,
         best=best, deadline=deadline, enough=enough,
