@@ -169,7 +169,7 @@ def test_contacts_are_good_exactly_where_the_arm_is_better_elsewhere(size, seed)
 
 
 def test_contacts_prefer_no_smaller_arm():
-    """Its contacts miss by less, being smaller: of an exact arm that said 0.7 %.
+    """Its contacts miss by less, being smaller: an exact arm was found 2 % smaller.
 
     The arm is as described, and a prior that is stated lets it be any size.
     """
