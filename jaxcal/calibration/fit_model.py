@@ -153,19 +153,22 @@ def _problem(
         levels = 0 * levels
     elif common_noise is False:
         levels = np.arange(len(levels))
+    counted = commands[used] - (0.0 if centre is None else centre)
+    mean = resolved.mean if to_centred is None else to_centred @ resolved.mean
     problem = FitProblem(
         model=model,
-        commands=commands[used] - (0.0 if centre is None else centre),
+        commands=counted,
         measured=measured[used],
         white=white[used],
         reading_std=reading_std[used],
-        mean=resolved.mean if to_centred is None else to_centred @ resolved.mean,
+        mean=mean,
         precision=resolved.precisions,
         free=resolved.free,
         command_std=command_std,
         noise_known=noise.std is not None or noise.covariance is not None,
         levels=levels,
         loss=LOSSES[loss],
+        log_size=model.log_size(counted, mean),
     )
     return problem, centre
 

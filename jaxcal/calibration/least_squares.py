@@ -62,30 +62,27 @@ class FitProblem:
     noise_known: bool  # the level is 1; else it is estimated
     levels: NDArray[np.intp]  # (q,) from 0: outputs of the same number share one
     loss: Loss | None  # None: least squares
+    log_size: Array | None  # (N,) of the model, at the prior's mean
 
-    def size(self, theta: Array) -> tuple[Array, Array] | None:
+    def size(self, theta: Array) -> Array | None:
         """(N, 1) by which readings of zero are as large as at the prior's mean.
 
-        Also the derivative (N, F) of its logarithm; None where all are as they are.
+        None where all are as they are.
         """
         size = self.model.log_size(self.commands, theta)
-        if size is None:
+        if size is None or self.log_size is None:
             return None
-        log, slopes = size
-        ratio = np.exp(self._zeros * (log[:, None] - self._first_size))
-        return ratio, self._zeros * slopes[:, self.free]
+        return np.exp(self._zeros * (size - self.log_size)[:, None])
+
+    def size_slopes(self, theta: Array) -> Array:
+        """(N, F) derivative of the logarithm of ``size``."""
+        slopes = self.model.log_size_jacobian(self.commands, theta)
+        return self._zeros * (slopes if self.free.all() else slopes[:, self.free])
 
     @functools.cached_property
     def _zeros(self) -> Array:
         """(N, 1) 1 where what was measured is zero, else 0."""
         return 1.0 - np.asarray(self.measured.any(axis=1, keepdims=True), np.float64)
-
-    @functools.cached_property
-    def _first_size(self) -> Array:
-        """(N, 1)."""
-        size = self.model.log_size(self.commands, self.mean)
-        assert size is not None
-        return size[0][:, None]
 
 
 def solve(
@@ -189,7 +186,7 @@ class FitSolution:
     num_readings: int  # of a measurement, less its unknown commands
     freedom: Array  # (q,) residual degrees of freedom of each output
     root: Array | None = None  # (F, F) of the covariance, where it is at hand
-    _sized: tuple[Array, tuple[Array, Array] | None] | None = None
+    _sized: tuple[Array, Array | None] | None = None  # of the last parameters
 
     def __init__(
         self, problem: FitProblem, start: FitSolution | None, rough: bool
@@ -294,14 +291,11 @@ class FitSolution:
     def whitened(self, rows: Array, theta: Array | None = None) -> Array:
         """(N, q, F) rows in noise of level 1, those of zeros by the machine's size."""
         white = whiten(self.problem.white, rows)
-        size = self._size(self.parameters if theta is None else theta)
-        return white if size is None else white / size[0][..., None]
-
-    def _size(self, theta: Array) -> tuple[Array, Array] | None:
-        """``FitProblem.size`` of parameters (P,), kept for the last ones."""
+        theta = self.parameters if theta is None else theta
         if self._sized is None or self._sized[0] is not theta:
             self._sized = theta, self.problem.size(theta)
-        return self._sized[1]
+        size = self._sized[1]
+        return white if size is None else white / size[..., None]
 
     def _predict(self) -> None:
         """Residuals at the present parameters and commands."""
@@ -324,8 +318,9 @@ class FitSolution:
         if not self.all_free:
             rows = rows[..., problem.free]
         self.by_theta = self.whitened(rows)
-        if (size := self._size(self.parameters)) is not None:
-            self.by_theta = self.by_theta + self.white[..., None] * size[1][:, None]
+        if self._sized is not None and self._sized[1] is not None:
+            slopes = problem.size_slopes(self.parameters)
+            self.by_theta += self.white[..., None] * slopes[:, None]
         if len(self.command_root):
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
             rows = derivative(problem.model, self.commands, self.parameters, inputs)

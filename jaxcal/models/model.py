@@ -177,10 +177,8 @@ class Model(abc.ABC):
         """The scales that ``Prior.sized()`` takes from the readings; None without."""
         return None
 
-    def log_size(
-        self, commands: Array, parameters: Array
-    ) -> tuple[Array, Array] | None:
-        """Logarithm (N,) of what readings of zero grow with, and derivative (N, p).
+    def log_size(self, commands: Array, parameters: Array) -> Array | None:
+        """Logarithm (N,) of what readings of zero grow with.
 
         Contacts do not show how large the machine is: were it half as large, with all
         that it touches, they would be missed by half as much. A fit compares them with
@@ -188,6 +186,10 @@ class Model(abc.ABC):
         large as they are.
         """
         return None
+
+    def log_size_jacobian(self, commands: Array, parameters: Array) -> Array:
+        """(N, p) derivative of ``log_size``."""
+        return np.zeros((len(commands), len(self.names)))
 
     # -- readings that wrap, and a model that can only be run --------------------------
 

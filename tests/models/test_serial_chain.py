@@ -300,10 +300,10 @@ def test_contacts_are_missed_by_more_by_a_larger_arm_wherever_it_stands():
     commands = np.random.default_rng(0).uniform(-150.0, 150.0, (9, 7))
     names, length = np.array(arm.names), np.array(arm.units) == "length"
     theta = arm.nominal + np.where(length, 1.0, 0.3)
-    size, slopes = arm.log_size(commands, theta)
-    larger = arm.log_size(commands, np.where(length, 1.3, 1.0) * theta)[0]
-    np.testing.assert_allclose(larger - size, np.log(1.3))
-    by_lengths = differences(lambda t: arm.log_size(commands, t)[0], theta)
+    slopes = arm.log_size_jacobian(commands, theta)
+    larger = arm.log_size(commands, np.where(length, 1.3, 1.0) * theta)
+    np.testing.assert_allclose(larger - arm.log_size(commands, theta), np.log(1.3))
+    by_lengths = differences(lambda t: arm.log_size(commands, t), theta)
     np.testing.assert_allclose(slopes[:, length], by_lengths[:, length], atol=1e-9)
     stands = slopes[:, np.isin(names, ["d1", "base x"])]
     np.testing.assert_allclose(stands, 0.0, atol=1e-15)

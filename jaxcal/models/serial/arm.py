@@ -295,36 +295,48 @@ class Arm:
         by_steps = np.ascontiguousarray(motion.transpose(2, 1, 0))
         return reading.by_tip @ by_steps, reading.by_own
 
-    def log_size(
-        self, commands: Array, parameters: Array
-    ) -> tuple[Array, Array] | None:
-        """Logarithm of how far the joints move the tip (N,), and derivative (N, p).
+    def log_size(self, commands: Array, parameters: Array) -> Array | None:
+        """Logarithm of how far the joints move the tip (N,).
 
         Of contacts of turning joints, which touch as well with an arm of any size: the
         root of the sum of squares, of all postures, of how far the tip is from each
         axis. It is an arm's size, and none of where it stands. By turns it is held. A
         slide's way shows the size: None.
         """
-        sensor = self.sensor
-        if not (sensor.zeros and sensor.lengths and self._revolute.all()):
+        if not self._grows:
             return None
+        _, square = self._levers(commands, parameters)
+        return 0.5 * np.log(square)
+
+    def log_size_jacobian(self, commands: Array, parameters: Array) -> Array:
+        if not self._grows:
+            return np.zeros((len(commands), len(parameters)))
+        levers, square = self._levers(commands, parameters)
+        axes = self._chain(commands, parameters)[1]
+        # A shift moves the tip away from the axes before it.
+        shifts, at, joints = self._shifts
+        before = np.concatenate([np.zeros((1, *levers[0].shape)), levers.cumsum(0)])
+        slopes = np.zeros(len(parameters))
+        slopes[shifts] = np.einsum("skn,skn->s", before[joints], axes[at]) / square[0]
+        return np.broadcast_to(slopes, (len(commands), len(slopes)))
+
+    def _levers(self, commands: Array, parameters: Array) -> tuple[Array, ...]:
+        """(n, 3, N) from the axis of each joint to the tip, (N,) all their squares."""
 
         def find() -> tuple[Array, Array]:
             frame, axes, origins = self._chain(commands, parameters)
             about = axes[self._steps_of_joints]
-            levers = frame[3] - origins[self._steps_of_joints]  # (n, 3, N)
-            levers -= about * (about * levers).sum(axis=1, keepdims=True)
-            square = np.vdot(levers, levers)
-            # A shift moves the tip away from the axes before it.
-            shifts, at, joints = self._shifts
-            before = np.concatenate([np.zeros((1, *frame[3].shape)), levers.cumsum(0)])
-            slopes = np.zeros(len(parameters))
-            slopes[shifts] = (before[joints] * axes[at]).sum(axis=(1, 2)) / square
-            return np.array([0.5 * np.log(square)]), slopes
+            levers = frame[3] - origins[self._steps_of_joints]
+            levers -= about * np.einsum("jkn,jkn->jn", about, levers)[:, None]
+            return levers, np.full(len(commands), np.vdot(levers, levers))
 
-        size, slopes = self._kept("_last_size", (commands, parameters), find)
-        count = len(commands)
-        return size.repeat(count), np.broadcast_to(slopes, (count, len(slopes)))
+        return self._kept("_last_levers", (commands, parameters), find)
+
+    @functools.cached_property
+    def _grows(self) -> bool:
+        """Whether what it reads is zero, and grows with the arm."""
+        sensor = self.sensor
+        return sensor.zeros and sensor.lengths and bool(self._revolute.all())
 
     @functools.cached_property
     def _shifts(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:

@@ -314,20 +314,22 @@ class Chains(Model):
             off[..., rows, :q] = arm.wrapped(its, arm_commands) / scale
         return off
 
-    def log_size(
-        self, commands: Array, parameters: Array
-    ) -> tuple[Array, Array] | None:
-        sizes, slopes = (
-            np.zeros(len(commands)),
-            np.zeros((len(commands), len(parameters))),
-        )
+    def log_size(self, commands: Array, parameters: Array) -> Array | None:
+        sizes = np.zeros(len(commands))
         for k, arm, rows, arm_commands in self._parts(commands):
-            size = None
             if len(rows):
                 size = arm.log_size(arm_commands, parameters[self.members[k]])
-            if size is not None:
-                sizes[rows], slopes[np.ix_(rows, self.members[k])] = size
-        return sizes, slopes
+                sizes[rows] = 0.0 if size is None else size
+        return sizes
+
+    def log_size_jacobian(self, commands: Array, parameters: Array) -> Array:
+        slopes = np.zeros((len(commands), len(parameters)))
+        for k, arm, rows, arm_commands in self._parts(commands):
+            if len(rows):
+                at = self.members[k]
+                of_arm = arm.log_size_jacobian(arm_commands, parameters[at])
+                slopes[np.ix_(rows, at)] = of_arm
+        return slopes
 
     def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
         theta = as_parameters(self, parameters)
