@@ -13,7 +13,6 @@ from jaxcal.calibration.least_squares import (
     FitSolution,
     singular,
     solve,
-    whiten,
 )
 from jaxcal.calibration.losses import LOSSES, constants
 from jaxcal.calibration.prior_scales import (
@@ -168,7 +167,7 @@ def _problem(
         noise_known=noise.std is not None or noise.covariance is not None,
         levels=levels,
         loss=LOSSES[loss],
-        log_size=model.log_size(counted, mean),
+        first_log_size=model.log_size(counted, mean),
     )
     return problem, centre
 
@@ -355,8 +354,9 @@ def _levels_differ(problem: FitProblem, solution: FitSolution) -> bool:
         return False
     from scipy import special
 
-    white = whiten(problem.white, solution.residuals[..., None])[..., 0]
-    variance = solution.weights @ (white / solution.level) ** 2 / solution.freedom
+    variance = (
+        solution.weights @ (solution.white / solution.level) ** 2 / solution.freedom
+    )
     high, low = int(variance.argmax()), int(variance.argmin())
     ratio = variance[high] / max(variance[low], np.finfo(np.float64).tiny)
     chance = special.fdtrc(solution.freedom[high], solution.freedom[low], ratio)

@@ -62,20 +62,20 @@ class FitProblem:
     noise_known: bool  # the level is 1; else it is estimated
     levels: NDArray[np.intp]  # (q,) from 0: outputs of the same number share one
     loss: Loss | None  # None: least squares
-    log_size: Array | None  # (N,) of the model, at the prior's mean
+    first_log_size: Array | None  # (N,) of the model, at the prior's mean
 
-    def size(self, theta: Array) -> Array | None:
+    def growth(self, theta: Array) -> Array | None:
         """(N, 1) by which readings of zero are as large as at the prior's mean.
 
         None where all are as they are.
         """
-        size = self.model.log_size(self.commands, theta)
-        if size is None or self.log_size is None:
+        log = self.model.log_size(self.commands, theta)
+        if log is None or self.first_log_size is None:
             return None
-        return np.exp(self._zeros * (size - self.log_size)[:, None])
+        return np.exp(self._zeros * (log - self.first_log_size)[:, None])
 
-    def size_slopes(self, theta: Array) -> Array:
-        """(N, F) derivative of the logarithm of ``size``."""
+    def growth_slopes(self, theta: Array) -> Array:
+        """(N, F) derivative of the logarithm of ``growth``."""
         slopes = self.model.log_size_jacobian(self.commands, theta)
         return self._zeros * (slopes if self.free.all() else slopes[:, self.free])
 
@@ -186,7 +186,7 @@ class FitSolution:
     num_readings: int  # of a measurement, less its unknown commands
     freedom: Array  # (q,) residual degrees of freedom of each output
     root: Array | None = None  # (F, F) of the covariance, where it is at hand
-    _sized: tuple[Array, Array | None] | None = None  # of the last parameters
+    _grown: tuple[Array, Array | None] | None = None  # of the last parameters
 
     def __init__(
         self, problem: FitProblem, start: FitSolution | None, rough: bool
@@ -292,10 +292,10 @@ class FitSolution:
         """(N, q, F) rows in noise of level 1, those of zeros by the machine's size."""
         white = whiten(self.problem.white, rows)
         theta = self.parameters if theta is None else theta
-        if self._sized is None or self._sized[0] is not theta:
-            self._sized = theta, self.problem.size(theta)
-        size = self._sized[1]
-        return white if size is None else white / size[..., None]
+        if self._grown is None or self._grown[0] is not theta:
+            self._grown = theta, self.problem.growth(theta)
+        growth = self._grown[1]
+        return white if growth is None else white / growth[..., None]
 
     def _predict(self) -> None:
         """Residuals at the present parameters and commands."""
@@ -318,13 +318,13 @@ class FitSolution:
         if not self.all_free:
             rows = rows[..., problem.free]
         self.by_theta = self.whitened(rows)
-        if self._sized is not None and self._sized[1] is not None:
-            slopes = problem.size_slopes(self.parameters)
+        if self._grown is not None and self._grown[1] is not None:
+            slopes = problem.growth_slopes(self.parameters)
             self.by_theta += self.white[..., None] * slopes[:, None]
         if len(self.command_root):
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
             rows = derivative(problem.model, self.commands, self.parameters, inputs)
-            self.by_command = whiten(problem.white, rows[..., self.uncertain])
+            self.by_command = self.whitened(rows[..., self.uncertain])
 
     def _directions(self) -> Array:
         """(F, r) changes of the parameters, those that nothing determines left out.

@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 
 _LEVEL = 3.0  # factor of one standard deviation of the level, beforehand
 _MOST = 5.0  # of a logarithm
+_LARGEST = 2.5  # of a factor, 12: beyond it an arm in sockets shrinks until all fit
+_FIRST = 1.6  # of a factor in a rough fit, 5: an arm that has shrunk stays so
 # Logarithms of misfit's factor.
 _TRIED = np.array([-5.0, -4.0, -3.0, -2.0, -1.2, -0.4, 0.4, 1.2])
 _SCORES = 100  # steps of Fisher's scoring, at most
@@ -58,15 +60,17 @@ def group_scales(
     assert of_model is not None
     groups, num_groups = of_model.members, len(of_model.medians)
     evidence = _Evidence(problem, solution, of_model)
+    if start is None:
+        evidence.most[:-1] = _FIRST
     # A level that is known floats too: misfit beyond it is no size of the errors.
     best = evidence.middle if start is None else start.logs
     least = evidence.at(best)
     for _ in range(_SCORES):
         step = np.linalg.solve(least.curvature, least.slope)
-        trial = np.clip(best - step, -_MOST, _MOST)
+        trial = np.clip(best - step, -_MOST, evidence.most)
         while (after := evidence.at(trial)).value > least.value + 1e-9:
             step *= 0.5
-            trial = np.clip(best - step, -_MOST, _MOST)
+            trial = np.clip(best - step, -_MOST, evidence.most)
         gain, best, least = least.value - after.value, trial, after
         if gain < 1e-4:
             break
@@ -109,6 +113,7 @@ class _Evidence:
         group = np.arange(len(groups.medians))
         self.members = sized == group[:, None]  # (G, s)
         self.middle, self.wide = _thought(groups)
+        self.most = np.append(np.full(len(group), _LARGEST), _MOST)  # (G + 1,)
         self.count, width = len(right), rows.shape[1]
         # All that the readings say is in a triangle; the rest of them is noise alone.
         factor = triangle(np.column_stack([rows, right]))
@@ -221,7 +226,7 @@ def misfit_scale(
             curve = trial.curvature[np.ix_(rest, rest)]
             step = np.linalg.solve(curve, trial.slope[rest])
             after = logs[rest] - np.clip(step, -1.0, 1.0)
-            logs[rest] = np.clip(after, -_MOST, _MOST)
+            logs[rest] = np.clip(after, -_MOST, evidence.most[rest])
         least[k] = evidence.at(logs).value
     shares = np.exp(-0.5 * (least - least.min()))
     square = float(shares @ np.exp(2.0 * _TRIED) / shares.sum())

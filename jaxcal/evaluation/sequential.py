@@ -49,8 +49,8 @@ METHODS = {
     "shares": "EIG per share of time, uses and number left; its constants are fixed",
     "ahead": "shares, over a tree of the next measurements, fitted to the task first",
     "priced": "EIG per price of time and uses, its constants tuned",
-    "state": "the same with prices that follow what is left, tuned",
-    "policy": "the network that corrects the state rule",
+    "state": "EIG per price that follows what is left, tuned",
+    "policy": "the trained network, which corrects a rule",
 }
 _RIVALS = ("state", "ahead", "shares", "priced", "rate", "gain")
 _GENERATIONS = 20  # of tuning

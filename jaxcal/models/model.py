@@ -188,7 +188,7 @@ class Model(abc.ABC):
         return None
 
     def log_size_jacobian(self, commands: Array, parameters: Array) -> Array:
-        """(N, p) derivative of ``log_size``."""
+        """(N, p) derivative of ``log_size``, zero by parameters at which it is held."""
         return np.zeros((len(commands), len(self.names)))
 
     # -- readings that wrap, and a model that can only be run --------------------------

@@ -397,17 +397,19 @@ def _whole_numbers(indices: ArrayLike) -> Indices:
 
 def _require_allowed(problem: Problem, indices: Indices, method: str) -> None:
     """Refuse what is no selection of this problem: the solver is wrong."""
-    chosen, count = indices.tolist(), len(problem.available)
+    chosen, count = indices.ravel().tolist(), len(problem.available)
     distinct = set(chosen)
-    right = len(chosen) == problem.k and distinct.issuperset(problem.required.tolist())
+    right = indices.ndim == 1 and indices.dtype.kind in "iu"
+    right = right and len(chosen) == problem.k
+    right = right and distinct.issuperset(problem.required.tolist())
     if len(distinct) < len(chosen):
         most = max(collections.Counter(chosen).values())
         right = right and most <= problem.max_replicates
     right = right and 0 <= min(distinct) and max(distinct) < count
     if not right or not problem.available[indices].all():
         raise RuntimeError(
-            f"method {method!r} must return {problem.k} candidates within lower "
-            f"and upper of its problem, got {indices.tolist()}"
+            f"method {method!r} must return the numbers of {problem.k} candidates "
+            f"within lower and upper of its problem, got {indices.tolist()}"
         )
 
 

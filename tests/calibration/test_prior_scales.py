@@ -184,6 +184,33 @@ def test_contacts_prefer_no_smaller_arm():
     np.testing.assert_allclose(*apart, rtol=2e-3)
 
 
+@pytest.mark.parametrize("beside", ["gravity", "offsets"])
+def test_an_arm_far_off_is_not_shrunk_into_its_sockets(beside):
+    """At four tolerances, beside an accelerometer, or with the misses measured."""
+    arm, contacts, truth, *_ = _made(4.0, 2, jaxcal.models.Socket(3))
+    rng, gravity = np.random.default_rng(2), jaxcal.models.Gravity()
+    misses = rng.normal(0.0, 0.1 * (beside == "offsets"), (len(contacts), 3))
+    model, commands, measured = arm, contacts, misses
+    if beside == "gravity":
+        felt = arm.measured_with(gravity)
+        theta = felt.nominal.copy()
+        theta[: ARM.table.size] = truth[: ARM.table.size]
+        still = rng.uniform(*np.array(LIMITS).T, (30, 6))
+        read = felt.predict(still, theta) + rng.normal(0.0, 0.01, (30, 3))
+        model = arm.measured_with(
+            jaxcal.models.Several((jaxcal.models.Socket(3), gravity))
+        )
+        commands, measured = model.together((contacts, misses), (still, read))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        found = jaxcal.identify(commands, measured, model=model)
+    at = [i for i, name in enumerate(found.names) if name.startswith("socket")]
+    places = found.parameters[at].reshape(3, 3)
+    apart = [np.linalg.norm(where - np.roll(where, 1, axis=0), axis=1)
+             for where in (places, PLACES)]  # fmt: skip
+    np.testing.assert_allclose(*apart, rtol=0.02)
+
+
 def test_a_distance_that_was_written_wrongly_is_told_where_it_can_be():
     """50 mm written as 48: arms off by the tolerances say 50 +- .2; as 50: no word."""
     arm, commands, *_ = _made(1.0, 0, jaxcal.models.Socket(2))

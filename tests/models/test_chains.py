@@ -496,3 +496,7 @@ def test_hands_that_are_tracked_from_elsewhere_keep_one_torso(robot, tmp_path):
     assert prepared.names == robot.names
     off = (prepared.predict(commands) - moved) * scale
     assert np.abs(off).max() < 0.01
+    second = commands[:, len(robot.joint_names)] == 1.0
+    moved[second] = moved[second] + 2.0 / scale  # another tracker, 2 m away
+    with pytest.raises(ValueError, match="counted from different frames"):
+        robot.prepared(commands, moved)

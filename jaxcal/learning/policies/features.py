@@ -96,7 +96,8 @@ def decision_features(
     Args:
         features: of the set.
         chosen: (..., K) int, of which the first ``count`` are chosen, the rest -1.
-        available: (..., M) bool.
+        available: (..., M) bool; at the number 0 of ``count`` those of the set itself,
+            whose look-ahead is then that of the decision.
         count: () choices made.
         lookahead: most greedy choices to look ahead.
         close_up: as for ``vector_features``.

@@ -54,9 +54,10 @@ class Board(Sensor):
             points away; 0 is not known, views tell.
         extent: width and height of the board from the origin of its pose, for postures
             from which all of it is seen; that of ``corners`` where they are given.
-        distortion: (k1, k2, p1, p2) or with k3 of the lens, as OpenCV's, by which a
-            corner that is outside without it is known to be in the picture; none when
-            not given.
+        distortion: (k1, k2, p1, p2) or with k3 of the lens, as OpenCV's (not of its
+            fisheye), by which a corner that is outside without it is known to be in
+            the picture; none when not given. Corners are read as corrected by it
+            already.
     """
 
     moves: str = "camera"

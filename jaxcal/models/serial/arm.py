@@ -334,9 +334,9 @@ class Arm:
 
     @functools.cached_property
     def _grows(self) -> bool:
-        """Whether what it reads is zero, and grows with the arm."""
-        sensor = self.sensor
-        return sensor.zeros and sensor.lengths and bool(self._revolute.all())
+        """Whether some of what it reads is zero, and grows with the arm."""
+        touches = any(one.zeros and one.lengths for one in self.sensor.members)
+        return touches and bool(self._revolute.all())
 
     @functools.cached_property
     def _shifts(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:

@@ -389,8 +389,10 @@ class SerialChain(Arm, Model):
 
         self.require_readings(commands, measured)
         arm = self.located(commands, measured)
-        for part in () if measured is None else arm.of_each_sensor(commands, measured):
-            require_touched(part[0].sensor, part[1][:, self.num_joints :])
+        if measured is not None:
+            tip, inputs = arm.nominal_tip(commands), commands[:, self.num_joints :]
+            for part in arm.sensor.of_members(tip, inputs, measured):
+                require_touched(part.sensor, part.columns)
         arm.require_places(commands, measured)
         return arm
 

@@ -315,12 +315,14 @@ class Chains(Model):
         return off
 
     def log_size(self, commands: Array, parameters: Array) -> Array | None:
-        sizes = np.zeros(len(commands))
+        sizes, grow = np.zeros(len(commands)), False
         for k, arm, rows, arm_commands in self._parts(commands):
+            size = None
             if len(rows):
                 size = arm.log_size(arm_commands, parameters[self.members[k]])
-                sizes[rows] = 0.0 if size is None else size
-        return sizes
+            if size is not None:
+                sizes[rows], grow = size, True
+        return sizes if grow else None
 
     def log_size_jacobian(self, commands: Array, parameters: Array) -> Array:
         slopes = np.zeros((len(commands), len(parameters)))
@@ -492,14 +494,22 @@ class Chains(Model):
                 bases.setdefault(self._stands_as(k), base)
         for k, arm in enumerate(arms):
             arms[k] = arm.standing_at(bases.get(self._stands_as(k), arm.base))
-        placed = {
-            number: _placed(readings)
-            for number, readings in self._by_member(arms, tables).items()
-            if readings[0].sensor.stands and len(self._members[number]) > 1
-        }
+        placed = {}
+        for number, of_chains in self._by_member(arms, tables).items():
+            readings = [one for one in of_chains if len(one.columns)]
+            shared = len(self._members[number]) > 1
+            if shared and readings and readings[0].sensor.stands:
+                placed[number] = _placed(readings)
         for k, arm_commands, read in tables:
             arms[k] = self._with(placed, arms[k], k, tools=True)
             arms[k] = arms[k].located(arm_commands, read)
+            first = self._stands_as(k)
+            if not np.array_equal(arms[k].base, arms[first].base):
+                raise ValueError(
+                    f"chains {self.tips[first]} and {self.tips[k]} share their base, "
+                    "but their positions are counted from different frames: give both "
+                    "in one, of a tracker that stays"
+                )
         return [self._with(placed, arm, k) for k, arm in enumerate(arms)]
 
     def _stands_as(self, k: int) -> int:
@@ -536,8 +546,7 @@ class Chains(Model):
             tip, inputs = arm.nominal_tip(commands), commands[:, arm.num_joints :]
             of_members = arm.sensor.of_members(tip, inputs, measured)
             for number, readings in zip(self.stands[k], of_members, strict=True):
-                if len(readings.columns):
-                    by_member.setdefault(number, []).append(readings)
+                by_member.setdefault(number, []).append(readings)
         return by_member
 
     def distinct(self, commands: Array, measured: Array) -> NDArray[np.intp]:

@@ -57,6 +57,15 @@ def _require_in_picture(board: Board, pixels: Array, length: float) -> None:
     if size is None or board.corners is None:
         return
     spots = pixels.reshape(len(pixels), -1, 2)
+    focal, centre = board.lens
+    beyond = ~board.bent((spots - centre) / focal)[1]
+    for row, corner in np.argwhere(beyond)[:1]:
+        raise ValueError(
+            "corners must be where the lens of the board's distortion = "
+            f"{board.distortion} has some, but corner {corner + 1} of row {row}, at "
+            f"{in_words(spots[row, corner])}, is where its polynomial turns back. Is "
+            "it of this camera, in OpenCV's order, and are the corners corrected by it?"
+        )
     outside = ~board.in_picture(spots, _EDGE * float(board.stds(length).max()))
     for row, corner in np.argwhere(outside)[:1]:
         count = np.count_nonzero(outside.any(axis=1))

@@ -559,12 +559,12 @@ def _in_picture(
         commands = np.hstack([commands[:, :j], pose])
     rotation = Rotation.from_rotvec(pose[:, 3:], degrees=True).as_matrix()
     spots = points @ np.matrix_transpose(rotation) + pose[:, None, :3]
-    rays = _FOCAL * spots[..., :2] / np.maximum(spots[..., 2:], 1e-9)
+    rays = spots[..., :2] / np.maximum(spots[..., 2:], 1e-9)
     inside = spots[..., 2] > 0.0
     if np.array_equal(view.camera, sensor.camera):  # of which the lens is known
         rays, seen = sensor.bent(rays)
         inside &= seen
-    u, v = fx * rays[..., 0], fy * rays[..., 1]
+    u, v = _FOCAL * fx * rays[..., 0], _FOCAL * fy * rays[..., 1]
     edge = _EDGE * width
     inside &= (u > edge - cx) & (u < width - edge - cx) & (v > edge - cy)
     inside &= v < height - edge - cy

@@ -93,8 +93,7 @@ class _FixedBlocks(Blocks):
 
     def _of(self, values: Array) -> Array:
         if self._model is not None:
-            blocks = self._model.blocks(values)
-            return blocks if self._std == 1.0 else blocks / self._std
+            return self._model.blocks(values) / self._std
         return values if self._noise is None else self._noise.weigh(values)
 
 

@@ -63,6 +63,8 @@ class CandidateSet:
             self.measured = numbers("measured", self.measured)
         if self.required is not None:
             self.required = copy.deepcopy(self.required)
+        if not (self.prior is None or isinstance(self.prior, Prior)):
+            self.prior = copy.deepcopy(self.prior)
         if whole_number("lost", self.lost, 0) > _MOST_LOST:
             raise ValueError(f"lost must be at most {_MOST_LOST}, got {self.lost}")
         if self.reliability is not None:
