@@ -408,8 +408,8 @@ def _require_allowed(problem: Problem, indices: Indices, method: str) -> None:
     right = right and 0 <= min(distinct) and max(distinct) < count
     if not right or not problem.available[indices].all():
         raise RuntimeError(
-            f"method {method!r} must return the numbers of {problem.k} candidates "
-            f"within lower and upper of its problem, got {indices.tolist()}"
+            f"method {method!r} must return {problem.k} candidates within lower "
+            f"and upper of its problem, by number, got {indices.tolist()}"
         )
 
 
