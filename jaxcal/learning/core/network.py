@@ -51,8 +51,9 @@ class Network(nn.Module):
         Args:
             features: from ``candidate_features``.
             chosen: (..., K) int, -1 from ``count`` on.
-            available: (..., M) bool.
-            count: () choices made; traced, so that decisions share a program.
+            available: (..., M) bool; of the first decision as ``usable`` of the set.
+            count: () choices made: the number 0, or traced, so that decisions share a
+                program.
         """
         raise NotImplementedError(_OWN)  # abstract
 
