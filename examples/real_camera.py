@@ -4,9 +4,9 @@
     python examples/real_camera.py --full    # 100, and real_camera.md
 
 The model is that of camera.py: the board's pose in a view is six unknown commands
-(``command_std=inf``), so a view is worth what it adds once its own pose is fitted. The
-error is the mean distance of a corner from where the camera has it, in the views that
-were not chosen, with their poses fitted.
+(``command_std=inf``), so a view is worth what it adds once its own pose is fitted, and
+it counts by its own scatter. The error is the mean distance of a corner from where the
+camera has it, in the views that were not chosen, with their poses fitted.
 """
 
 from __future__ import annotations
@@ -30,16 +30,11 @@ CAMERAS = ("cam0", "cam1")
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")  # as OpenCV's
 NOMINAL = np.array([1280.0, 1280.0, 640.0, 360.0, 0.0, 0.0, 0.0, 0.0])
 STD = np.array([500.0, 500.0, 100.0, 100.0, 0.3, 0.3, 0.02, 0.02])  # beforehand
-NOISE = 0.3  # pixels
+NOISE = 0.3  # pixels, before the views' own scatter is known
+POOLED = 6  # readings of the usual scatter that a view's own is pooled with
 K, LEAST = 15, 6  # views chosen; corners of a view that determine its pose
 K_OF_HALF = 8  # of every second view, the others judging
-RULES = (
-    "chosen (I)",
-    "chosen (D)",
-    "chosen (I, poses known)",
-    "least left",
-    "random",
-)
+RULES = ("chosen (error left)", "chosen (I)", "random")
 
 
 def project(view, theta, places):
@@ -74,6 +69,7 @@ class Views:
     pixels: Array  # (F, 2C), zeros where a corner was not seen
     seen: Array  # (F, C) 1 or 0
     poses: Array  # (F, 6) rough, by that camera
+    scatter: Array  # (F,) of a corner in each direction, pixels
 
     @property
     def commands(self) -> Array:
@@ -82,9 +78,10 @@ class Views:
 
     @property
     def noise(self) -> jaxcal.Noise:
-        """Pixels by their noise, poses by nothing."""
+        """Pixels by the scatter of their view, poses by nothing."""
         unknown = np.where(np.arange(self.commands.shape[1]) < 6, np.inf, 0.0)
-        return jaxcal.Noise(std=NOISE, command_std=unknown)
+        std = np.tile(self.scatter[:, None], self.pixels.shape[1])
+        return jaxcal.Noise(std=std, command_std=unknown)
 
     @property
     def blocks(self) -> Array:
@@ -95,7 +92,9 @@ class Views:
     def fit(
         self, chosen: NDArray[np.int64], loss: str = "gaussian"
     ) -> jaxcal.Calibration:
-        """The camera from these views alone, by least squares."""
+        """The camera from these views alone, by weighted least squares."""
+        offered = np.isin(np.arange(len(self.seen)), chosen)
+        chosen = np.flatnonzero(offered)
         with warnings.catch_warnings():  # of outliers, which least squares keeps
             warnings.simplefilter("ignore", UserWarning)
             return jaxcal.identify(
@@ -103,7 +102,7 @@ class Views:
                 self.pixels[chosen],
                 model=self.model,
                 prior=jaxcal.Prior(STD),
-                noise=self.noise,
+                noise=self.noise.of(offered),
                 loss=loss,
             )
 
@@ -126,11 +125,17 @@ class Views:
         off = self.pixels - self.model.predict(commands, camera)
         return np.linalg.norm(off.reshape(*self.seen.shape, 2), axis=-1)
 
+    def scattered(self, camera: Array) -> Array:
+        """(F,) pixels: RMS of a corner in each direction about this camera, pooled."""
+        squares = (self.distances(camera) ** 2).sum(axis=1)
+        readings = 2.0 * self.seen.sum(axis=1) - 6.0  # beyond the pose
+        usual = np.median(squares / readings)
+        return np.sqrt((squares + POOLED * usual) / (readings + POOLED))
+
     def part(self, rows: slice) -> Views:
         """Some of the views."""
-        return dataclasses.replace(
-            self, pixels=self.pixels[rows], seen=self.seen[rows], poses=self.poses[rows]
-        )
+        parts = (self.pixels, self.seen, self.poses, self.scatter)
+        return Views(self.model, *(values[rows] for values in parts))
 
     def others(self, distances: Array, chosen: NDArray[np.int64]) -> float:
         """Mean over the corners of the views that were not chosen."""
@@ -189,56 +194,54 @@ def load(path: str) -> Views:
 
     # A camera from five views far apart in the picture, then all views' poses from it.
     flat = pixels.reshape(len(frames), -1)
-    views = Views(about(NOMINAL), flat, seen, starts(NOMINAL))
+    usual = np.full(len(frames), NOISE)
+    views = Views(about(NOMINAL), flat, seen, starts(NOMINAL), usual)
     middles = pixels.sum(axis=1) / seen.sum(axis=1, keepdims=True)
     five = [int(seen.sum(axis=1).argmax())]
     while len(five) < 5:
         apart = np.linalg.norm(middles[:, None] - middles[five], axis=-1).min(axis=1)
         five.append(int((apart * (seen.sum(axis=1) >= 0.8 * len(corners))).argmax()))
     camera = np.asarray(views.fit(np.array(five), "student").parameters)
-    views = Views(about(camera), flat, seen, starts(camera))
-    return dataclasses.replace(views, poses=views.posed(camera))
+    views = Views(about(camera), flat, seen, starts(camera), usual)
+    views = dataclasses.replace(views, poses=views.posed(camera))
+    return dataclasses.replace(views, scatter=views.scattered(camera))
 
 
-def choose(views: Views, rule: str, seed: int = 0, count: int = K) -> NDArray[np.int64]:
+def choose(
+    views: Views, rule: str = RULES[0], seed: int = 0, count: int = K
+) -> NDArray[np.int64]:
     """(count,) views, by the rough camera.
 
-    The poses of other views are fitted too, so I is the variance of what they show
-    beyond their own poses; of a model it is that of pixels where poses are known.
+    I is the variance of what the views show beyond their own poses: those of other
+    views are fitted too. It counts all views alike.
     """
     if rule == "random":
         return np.random.default_rng(seed).choice(len(views.seen), count, replace=False)
-    if rule == "least left":
+    if rule == "chosen (error left)":
         return least_left(views, choose(views, "chosen (I)", count=count))
-    if rule == "chosen (I, poses known)":
-        return jaxcal.select(
-            views.commands,
-            count,
-            "exchange",
-            model=views.model,
-            prior=jaxcal.Prior(STD),
-            noise=views.noise,
-            criterion="I",
-        ).indices
-    design = jaxcal.Design.from_blocks(views.blocks, prior=np.diag(STD**-2.0))
-    return design.select(count, rule.split("(")[1][0], "exchange").indices
+    alike = dataclasses.replace(views, scatter=np.full(len(views.seen), NOISE))
+    design = jaxcal.Design.from_blocks(alike.blocks, prior=np.diag(STD**-2.0))
+    return design.select(count, "I", "exchange").indices
 
 
 def least_left(views: Views, start: NDArray[np.int64]) -> NDArray[np.int64]:
     """(count,) views without which the rest has the least error, by exchange.
 
-    Their scatter about the rough camera counts, and how uncertain the camera of the
-    chosen views is: what is judged, and not the camera.
+    The error in a view that is left is its own scatter and, as much as the views that
+    were chosen leave it uncertain, the camera's. The errors of a view's corners are
+    alike, so its corners count as one: the variance of the camera is that of as many
+    times fewer.
     """
     corners = views.seen.sum(axis=1)
     scatter = views.distances(views.model.nominal).sum(axis=1) / corners
     blocks = views.blocks
     informations = np.matrix_transpose(blocks) @ blocks
+    shown = informations * (views.scatter**2 / corners * corners.mean())[:, None, None]
 
     def left(chosen: list[int]) -> float:
         known = np.diag(STD**-2.0) + informations[chosen].sum(axis=0)
-        unsure = np.einsum("ij,nji->n", np.linalg.inv(known), informations)
-        errors = corners * np.sqrt(scatter**2 + NOISE**2 * unsure / corners)
+        unsure = np.einsum("ij,nji->n", np.linalg.inv(known), shown)
+        errors = corners * np.sqrt(scatter**2 + unsure)
         rest = np.setdiff1d(np.arange(len(corners)), chosen)
         return float(errors[rest].sum() / corners[rest].sum())
 
