@@ -17,9 +17,9 @@ import pytest
 
 import jaxcal
 from jaxcal.commands.main import main
-from jaxcal.models import Prior, Socket
+from jaxcal.models import Chains, Gravity, Prior, Several, Socket
 from jaxcal.models.serial.mistaken import mistaken_columns
-from jaxcal.models.serial.verdict import _Findings, _of_no_size
+from jaxcal.models.serial.verdict import _Findings, _of_no_size, _parts
 
 from ..models.arms import ur5, ur5_data
 
@@ -257,7 +257,83 @@ def test_another_tip_within_the_prior_is_named(name, off):
     assert np.linalg.norm(tool) < 2e-4
 
 
-@pytest.mark.parametrize("apart", [0.03, 0.045, 0.048, 0.052, 0.06])
+def _with_gravity(name, arm, joints, sockets, still=False, in_pair=False):
+    """Verdict of contacts beside what an IMU feels of the arm as all of them have it.
+
+    In pair with an arm that has its own tracker.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        truth = _fit(name, *contacts.load(name)["front"]).arm
+    rng, sensor = np.random.default_rng(0), arm.sensor
+    low, high = 0.8 * arm.limits.T
+    poses = rng.uniform(low, high, (30, len(low)))
+    poses[:, -1] *= not still
+    felt = truth.measured_with(Gravity()).predict(poses) + rng.normal(0, 0.01, (30, 3))
+    model = arm.measured_with(Several((sensor, Gravity())))
+    contact = np.column_stack([joints, sockets]), np.zeros((len(joints), 3))
+    commands, measured = model.together(contact, (poses, felt))
+    if in_pair:
+        beside = ur5(joint_names=tuple("abcdef"))
+        turned = rng.uniform(-120, 120, (20, 6))
+        points = beside.predict(turned) + rng.normal(0, 0.05, (20, 3))
+        model = Chains.of({"left": model, "right": beside})
+        tables = {"left": (commands, measured), "right": (turned, points)}
+        commands, measured = model.together(tables)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        verdict = jaxcal.identify(commands, measured, model=model).verdict
+    return verdict.of_chains["left"] if in_pair else verdict
+
+
+@pytest.mark.slow
+def test_what_is_wrong_of_contacts_is_told_beside_other_sensors():
+    arm, (joints, sockets) = contacts.arm("panda_1"), PLACE
+    apart = arm.measured_with(Socket(2, distances=[(0, 1, 0.048, 1e-4)]))
+    places = arm.located(np.column_stack(PLACE)).sensor.places
+    placed = arm.measured_with(Socket(2, places, distances=arm.sensor.distances))
+    other = sockets.copy()
+    other[[3, 40]] = 1.0 - other[[3, 40]]
+    for wrong, said in (
+        ((apart, joints, sockets), "sockets 0 and 1 are given as 0.048 apart, but"),
+        ((placed, joints, 1.0 - sockets), "socket 0 was found where socket 1 was"),
+        ((arm, joints, other), "measurement 3 fits socket 0 instead"),
+    ):
+        verdict = _with_gravity("panda_1", *wrong)
+        assert not verdict.good and said in str(verdict)
+    twice = np.append(joints, joints[:1], axis=0), np.append(sockets, sockets[0])
+    verdict = _with_gravity("panda_1", arm, *twice)
+    assert verdict.good and "measurement 62 is 0 again" in str(verdict)
+    assert 1e-4 < verdict.anywhere < 1e-3  # of the tip, in the arm's unit
+
+
+@pytest.mark.slow
+def test_what_is_wrong_of_contacts_is_told_of_a_chain_with_other_sensors():
+    arm, (joints, sockets) = contacts.arm("panda_1"), PLACE
+    apart = arm.measured_with(Socket(2, distances=[(0, 1, 0.048, 1e-4)]))
+    verdict = _with_gravity("panda_1", apart, joints, sockets, in_pair=True)
+    assert "sockets 0 and 1 are given as 0.048 apart, but" in str(verdict)
+    still = joints * (np.arange(7) != 6)
+    verdict = _with_gravity("panda_1", arm, still, sockets, still=True, in_pair=True)
+    assert "panda_joint7 is 0 in all 92" in str(verdict) and not verdict.good
+    moved = contacts.arm("dinova_1"), *contacts.load("dinova_1")["front"]
+    said = str(_with_gravity("dinova_1", *moved, in_pair=True))
+    assert re.search(
+        r"socket 0 seems to have moved by 0\.01\d+ between .* 6 and 7", said
+    )
+    with pytest.raises(ValueError, match="look like radians"):
+        _with_gravity("panda_1", arm, np.radians(joints), sockets)
+
+
+def test_contacts_beside_gravity_leave_the_size_open():
+    """Of an arm as it is, which its tip elsewhere may not be."""
+    arm = _fit("panda_1", *PLACE).arm.measured_with(Socket(2))
+    rows = np.arange(0, 62, 6)
+    verdict = _with_gravity("panda_1", arm, PLACE[0][rows], PLACE[1][rows])
+    assert not verdict.good and "leave the arm's size open" in str(verdict)
+
+
+@pytest.mark.parametrize("apart", [0.03, 0.048, 0.06])
 def test_a_distance_that_contacts_contradict_is_named(apart):
     arm = contacts.arm("panda_1").measured_with(
         Socket(2, distances=[(0, 1, apart, 1e-4)])
@@ -297,13 +373,12 @@ def test_a_distance_between_sockets_that_are_not_touched_is_no_size():
         ((0, 0, 1, 2), left_out, True),
     ):
         fit = types.SimpleNamespace(
-            model=arm,
-            commands=np.column_stack([joints, which]),
-            loss_weights=weights,
-            measured_unit="mm",
+            model=arm, commands=np.column_stack([joints, which])
         )
-        none = _Findings((), False, False, False, (), False)
-        assert _of_no_size(none, fit, anywhere=10.0, nominal=1.0).doubtful == doubtful
+        parts = _parts(fit, np.flatnonzero(weights))
+        none = _Findings((), False, False, "", (), False)
+        said = _of_no_size(none, parts, " mm", anywhere=10.0, nominal=1.0)
+        assert said.doubtful == doubtful
 
 
 def test_a_column_that_never_changes_is_named():

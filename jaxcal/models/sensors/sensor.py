@@ -84,11 +84,17 @@ class Readings(NamedTuple):
     tip: Tip  # where it was, of the nominal arm
     columns: Array  # (N, e) of the commands that are its own
     measured: Array | None  # (N, q), None of candidates
+    rows: NDArray[np.intp]  # (N,) of all that the arm measured
+    scale: Array  # (q,) its unit in that of the arm's readings
 
     def at(self, rows: NDArray[np.intp]) -> Readings:
         """Some of them."""
-        measured = None if self.measured is None else self.measured[rows]
-        return Readings(self.sensor, self.tip.at(rows), self.columns[rows], measured)
+        return self._replace(
+            tip=self.tip.at(rows),
+            columns=self.columns[rows],
+            measured=None if self.measured is None else self.measured[rows],
+            rows=self.rows[rows],
+        )
 
 
 class Reading(NamedTuple):
@@ -208,11 +214,18 @@ class Sensor(abc.ABC):
         """This sensor, of others."""
         return members[0]
 
+    def parts(
+        self, inputs: Array
+    ) -> Iterator[tuple[int, Sensor, NDArray[np.intp], Array]]:
+        """Each of them and its number, its rows, and its columns there."""
+        yield 0, self, np.arange(len(inputs)), inputs
+
     def of_members(
         self, tip: Tip, inputs: Array, measured: Array | None
     ) -> Iterator[Readings]:
         """What each of them measured."""
-        yield Readings(self, tip, inputs, measured)
+        rows, scale = np.arange(len(inputs)), np.ones(len(self.outputs))
+        yield Readings(self, tip, inputs, measured, rows, scale)
 
     def facts(self, parameters: Array) -> tuple[Array, Array]:
         """What is known of its own parameters besides: (F,) off, (F, s) derivative.

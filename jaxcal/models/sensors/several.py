@@ -131,7 +131,6 @@ class Several(Sensor):
     def parts(
         self, inputs: Array
     ) -> Iterator[tuple[int, Sensor, NDArray[np.intp], Array]]:
-        """Each sensor and its number, its rows, and its columns there."""
         which = label("sensor", inputs[:, 0], len(self.sensors))
         for i, one in enumerate(self.sensors):
             rows = np.flatnonzero(which == i)
@@ -197,12 +196,10 @@ class Several(Sensor):
         """Each of them, and where those that find it are on the tool."""
         sensors, mounts = [], np.array(self.mounts)
         tool = None
-        for i, (one, at, columns, read) in enumerate(
-            self.of_members(tip, inputs, measured)
-        ):
-            placed, new = one, None
-            if len(columns):
-                placed, new = one.located(at, columns, read)
+        for i, part in enumerate(self.of_members(tip, inputs, measured)):
+            placed, new = part.sensor, None
+            if len(part.columns):
+                placed, new = placed.located(part.tip, part.columns, part.measured)
             sensors.append(placed)
             if new is not None and i:
                 mounts[i - 1] = mounts[i - 1] @ new
@@ -230,11 +227,11 @@ class Several(Sensor):
         self, tip: Tip, inputs: Array, measured: Array | None
     ) -> Iterator[Readings]:
         for i, one, rows, columns in self.parts(inputs):
-            read = None
+            read, scale = None, one.stds(tip.length)
             if measured is not None:
-                read = measured[rows, : len(one.outputs)] * one.stds(tip.length)
+                read = measured[rows, : len(one.outputs)] * scale
             at = self._tip(i, tip, rows, self._mounting(i))
-            yield Readings(one, at, columns, read)
+            yield Readings(one, at, columns, read, rows, scale)
 
     def facts(self, parameters: Array) -> tuple[Array, Array]:
         offs, rows = [], []

@@ -344,13 +344,15 @@ class SerialChain(Arm, Model):
         low, high = self.limits.T
         units = np.array(self.command_units)
         joints = commands[:, : self.num_joints]
+        for _, one, rows, _ in self.sensor.parts(commands[:, self.num_joints :]):
+            largest = np.abs(joints[rows][:, units == "deg"]).max(initial=0.0)
+            small = self.num_joints > 2 and 1.0 < largest < 7.0
+            if small and not isinstance(one, Position | Pose):  # readings tell of these
+                raise ValueError(
+                    f"commands must be in degrees, got angles of at most {largest:.3g},"
+                    " which look like radians: np.degrees(commands), --radians"
+                )
         largest = np.abs(joints[:, units == "deg"]).max(initial=0.0)
-        small = self.num_joints > 2 and 1.0 < largest < 7.0
-        if small and self.sensor.kind not in ("position", "pose", "several"):
-            raise ValueError(
-                f"commands must be in degrees, got angles of at most {largest:.3g}, "
-                "which look like radians: np.degrees(commands), --radians"
-            )
         twice = np.degrees(_BEYOND_TURNS)
         if largest > twice and self.num_joints > 2:
             raise ValueError(
@@ -420,9 +422,12 @@ class SerialChain(Arm, Model):
 
     def distinct(self, commands: Array, measured: Array) -> NDArray[np.intp]:
         """(K,) the rows that count: contacts written twice count once."""
-        if not self.sensor.zeros or measured.any():
-            return np.arange(len(commands))
-        return np.sort(np.unique(commands, axis=0, return_index=True)[1])
+        kept = [np.zeros(0, dtype=np.intp)]
+        for _, one, rows, _ in self.sensor.parts(commands[:, self.num_joints :]):
+            if one.zeros and not measured[rows].any():
+                rows = rows[np.unique(commands[rows], axis=0, return_index=True)[1]]
+            kept.append(rows)
+        return np.sort(np.concatenate(kept))
 
     def at_rest(
         self,
@@ -772,6 +777,12 @@ class SerialChain(Arm, Model):
                 kind = joints_of(self.source["text"])[name].kind
             kinds.append(kind)
         return tuple("deg" if kind == "R" else "length" for kind in kinds)
+
+    def own(self, i: int) -> slice:
+        """Where what the sensor's member ``i`` has of its own is among the p."""
+        at = self.sensor.own_of_members[i]
+        before = len(self.names) - self.waves.size - len(self.sensor.names)
+        return slice(before + at.start, before + at.stop)
 
     @property
     def num_parameters(self) -> int:

@@ -148,10 +148,10 @@ class Chains(Model):
             for i, number in enumerate(self.stands[k]):
                 (first, at), *others = self._members[number]
                 if others:
-                    names = self.chains[first].names[self._own(first, at)]
+                    names = self.chains[first].names[self.chains[first].own(at)]
                     everywhere = len(others) == len(self.chains) - 1
                     of_first = "" if everywhere else f"{self.tips[first]}: "
-                    of_arm[self._own(k, i)] = [of_first + name for name in names]
+                    of_arm[arm.own(i)] = [of_first + name for name in names]
             named.append(of_arm)
         return named
 
@@ -163,13 +163,6 @@ class Chains(Model):
             for i, number in enumerate(numbers):
                 owners.setdefault(number, []).append((k, i))
         return [owners[number] for number in sorted(owners)]
-
-    def _own(self, k: int, i: int) -> slice:
-        """Where a member's own parameters are among those of its chain."""
-        arm = self.chains[k]
-        at = arm.sensor.own_of_members[i]
-        before = len(arm.names) - arm.waves.size - len(arm.sensor.names)
-        return slice(before + at.start, before + at.stop)
 
     @functools.cached_property
     def _cells(self) -> list[list[int]]:
@@ -340,7 +333,7 @@ class Chains(Model):
             for i, number in enumerate(self.stands[k]):
                 if self._members[number][0] != (k, i):  # a distance is known once
                     continue
-                columns = at[self._own(k, i)]
+                columns = at[arm.own(i)]
                 off, slopes = arm.sensor.members[i].facts(theta[columns])
                 offs.append(off)
                 rows.append(np.zeros((len(off), len(theta))))

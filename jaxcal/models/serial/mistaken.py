@@ -73,9 +73,12 @@ def _error(arm: Chain, commands: Array, measured: Array) -> float:
     except ValueError:  # no such arm
         return np.inf
     off = measured - at.predict(commands)
-    if isinstance(at.sensor, Landmarks):  # a socket's place is no merit of the arm
-        which = at.sensor.of_rows(commands[:, at.num_joints :])
-        for i in np.unique(which):
-            off[which == i] -= np.median(off[which == i], axis=0)
+    tip, inputs = at.nominal_tip(commands), commands[:, at.num_joints :]
+    for part in at.sensor.of_members(tip, inputs, off):
+        if isinstance(part.sensor, Landmarks):  # its place is no merit of the arm
+            which = part.sensor.of_rows(part.columns)
+            for i in np.unique(which):
+                rows = part.rows[which == i]
+                off[rows] -= np.median(off[rows], axis=0)
     usual = np.asarray(at.default_noise().std)
     return float(np.median(np.linalg.norm(off / (usual / usual[0]), axis=1)))

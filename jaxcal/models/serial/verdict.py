@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from jaxcal.information.singular import depends
 from jaxcal.models import verdict as models
-from jaxcal.models.sensors import Landmarks, Pose, Position, Socket
+from jaxcal.models.sensors import Landmarks, Pose, Position, Sensor, Socket
 from jaxcal.models.sensors.sensor import hats
 from jaxcal.models.serial.mistaken import mistaken_columns
 from jaxcal.models.verdict import UNLIKELY, left_out, outlying
@@ -116,14 +116,16 @@ def verdict(calibration: Fit) -> ArmVerdict:
     used = np.flatnonzero(calibration.loss_weights > 0.0)
     commands, usual = calibration.commands[used], np.asarray(model.default_noise().std)
     measured = calibration.residuals[used] + calibration.predict(commands)
-    errors = _errors(calibration, used, measured, usual)
-    explains, scatter = _scattered(calibration, usual)
+    parts = _parts(calibration, used)
+    errors = _errors(calibration, used, measured, usual, parts)
+    explains, scatter = _scattered(calibration, usual, parts)
     mistaken = ""
-    if not explains and errors.nominal > _PLAIN * model.length:
+    if not explains and max(errors.of_parts) > _PLAIN * model.length:
         mistaken = mistaken_columns(model, commands, measured)
-    findings = _findings(calibration, used, scatter, explains, mistaken)
-    anywhere = _anywhere(calibration, model, commands)
-    findings = _of_no_size(findings, calibration, anywhere, errors.nominal)
+    findings = _findings(calibration, used, parts, scatter, explains, mistaken)
+    at, anywhere = _anywhere(calibration, model, parts)
+    nominal = errors.of_parts[at]
+    findings = _of_no_size(findings, parts, _in(calibration), anywhere, nominal)
     clean = not (findings.doubtful or (findings.moved and not explains))
     accuracy = calibration.provenance.get("accuracy")
     if accuracy is not None:
@@ -148,13 +150,64 @@ def verdict(calibration: Fit) -> ArmVerdict:
     )
 
 
+class _Part(NamedTuple):
+    """What one sensor of an arm read: of ``Several`` each, else the only one."""
+
+    member: int  # number of it
+    sensor: Sensor
+    kind: str  # of it, for a message
+    rows: NDArray[np.intp]  # (K,) measurements that are used
+    columns: Array  # (K, e) of their commands
+    points: Array  # (K, 3) where the arm as described has it
+    own: slice  # of the parameters
+    scale: Array  # (q,) its unit in that of the calibration's readings
+
+    def groups(self) -> list[NDArray[np.intp]]:
+        """Rows of each socket, plane or anchor, in the order of measuring."""
+        if not isinstance(self.sensor, Landmarks):
+            return []
+        which = self.sensor.of_rows(self.columns)
+        return [self.rows[which == i] for i in range(self.sensor.count)]
+
+    def touched(self) -> NDArray[np.bool_]:
+        """(D,) distances both of whose sockets have contacts of this arm."""
+        pairs = np.array(getattr(self.sensor, "distances", ())).reshape(-1, 4)[:, :2]
+        labels = self.sensor.of_rows(self.columns)
+        return np.asarray(np.isin(pairs, labels).all(axis=1))
+
+
+def _parts(calibration: Fit, used: NDArray[np.intp]) -> list[_Part]:
+    """Readings of each sensor that has some."""
+    model, commands = calibration.model, calibration.commands[used]
+    tip, inputs = model.nominal_tip(commands), commands[:, model.num_joints :]
+    kinds = [one.kind for one in model.sensor.members]
+    parts = []
+    for i, read in enumerate(model.sensor.of_members(tip, inputs, None)):
+        twice = kinds.count(read.sensor.kind) > 1
+        kind = f"sensor {i}'s {read.sensor.kind}" if twice else read.sensor.kind
+        if len(read.rows):
+            parts.append(
+                _Part(
+                    i,
+                    read.sensor,
+                    kind,
+                    used[read.rows],
+                    read.columns,
+                    read.tip.position,
+                    model.own(i),
+                    read.scale,
+                )
+            )
+    return parts
+
+
 class _Findings(NamedTuple):
     """What speaks against a calibration, and the sentences that say it."""
 
     reasons: tuple[str, ...]
     mistaken: bool  # columns of joints are reversed or exchanged
     exchanged: bool  # so are sockets
-    moved: bool  # a socket or plane seems to have moved
+    moved: str  # kind of what seems to have moved: socket, plane
     contradicting: tuple[int, ...]  # measurements that contradict the others
     doubtful: bool  # the readings or the description of the arm may be wrong
 
@@ -162,6 +215,7 @@ class _Findings(NamedTuple):
 def _findings(
     calibration: Fit,
     used: NDArray[np.intp],
+    parts: list[_Part],
     scatter: list[str],
     explains: bool,
     mistaken: str,
@@ -171,27 +225,31 @@ def _findings(
     Args:
         calibration: of an arm.
         used: (N,) rows of the measurements that count.
+        parts: of its sensors.
         scatter: what was said of the scatter of the readings.
         explains: the noise explains it.
         mistaken: what was said of reversed or exchanged columns, if they are.
     """
-    model, commands = calibration.model, calibration.commands[used]
-    swapped = _swapped(calibration, model, used, explains)
-    exchanged = _exchanged(calibration, model)
+    model = calibration.model
+    swapped: dict[int, int] = {}
+    for part in parts:
+        swapped |= _swapped(calibration, part, explains)
+    exchanged = [line for part in parts for line in _exchanged(calibration, part)]
     limit = _LOOSE if len(used) > _SPARSE else 0.0
     far = (calibration.distance[list(calibration.outliers)] > limit**2).any()
     contradicting: tuple[int, ...] = ()
-    reasons = scatter + _wrong_rows(calibration, used, swapped)
+    reasons = scatter + _wrong_rows(calibration, used, parts, swapped)
     if swapped or exchanged or far:
         reasons.insert(0, "some readings contradict the others")
         contradicting = tuple(sorted({*swapped, *calibration.outliers}))
-    right = used[~np.isin(used, list(swapped))]
-    moved = _moved(calibration, model, right)
+    moved = {part.kind: _moved(calibration, part, swapped) for part in parts}
+    moved_lines = [line for lines in moved.values() for line in lines]
     tip, doubtful = _other_tip(calibration, model)
-    other_arm = [] if mistaken else _other_links(calibration, model)
-    apart, wrong = ([], False) if other_arm else _other_distances(calibration, model)
-    still, unused = _still(model, commands)
-    reasons += moved + exchanged + _far(calibration) + tip + other_arm + apart + still
+    other_arm = [] if mistaken else _other_links(calibration, parts)
+    apart, wrong = ([], False) if other_arm else _other_distances(calibration, parts)
+    still, unused = _still(model, calibration.commands[used])
+    reasons += moved_lines + exchanged + _far(calibration)
+    reasons += tip + other_arm + apart + still
     doubtful |= wrong or unused
     doubtful |= bool(contradicting or exchanged or other_arm or mistaken)
     return _Findings(
@@ -199,7 +257,7 @@ def _findings(
         (mistaken,) if mistaken else tuple(reasons),
         bool(mistaken),
         bool(exchanged),
-        bool(moved),
+        next((kind for kind, lines in moved.items() if lines), ""),
         contradicting,
         doubtful,
     )
@@ -216,16 +274,18 @@ def _usual_noise(calibration: Fit) -> str:
 
 
 def _of_no_size(
-    findings: _Findings, calibration: Fit, anywhere: float, nominal: float
+    findings: _Findings,
+    parts: list[_Part],
+    unit: str,
+    anywhere: float,
+    nominal: float,
 ) -> _Findings:
     """The findings, and that contacts leave the arm's size open, where they do.
 
     An arm a tenth smaller, its sockets nearer together, touches them as well.
     """
-    sensor, unit = calibration.model.sensor, _in(calibration)
-    sized = not isinstance(sensor, Socket) or (
-        len(sensor.distances) and _touched(calibration, calibration.model).any()
-    )
+    sockets = [part for part in parts if isinstance(part.sensor, Socket)]
+    sized = not sockets or any(part.touched().any() for part in sockets)
     if findings.mistaken or sized or not anywhere > _VAGUE * nominal:
         return findings
     reason = (
@@ -238,19 +298,24 @@ def _of_no_size(
 
 
 def _wrong_rows(
-    calibration: Fit, used: NDArray[np.intp], swapped: dict[int, int]
+    calibration: Fit,
+    used: NDArray[np.intp],
+    parts: list[_Part],
+    swapped: dict[int, int],
 ) -> list[str]:
     """Rows of another socket, outliers, and contacts that were written twice."""
-    sensor, commands = calibration.model.sensor, calibration.commands
+    commands = calibration.commands
+    kinds = {row: part.kind for part in parts for row in part.rows.tolist()}
+    touching = {row: p.sensor.zeros for p in parts for row in p.rows.tolist()}
     said = [
-        f"measurement {row} fits {sensor.kind} {other} instead"
-        for row, other in swapped.items()
+        f"measurement {row} fits {kinds[row]} {other} instead"
+        for row, other in sorted(swapped.items())
     ]
     loose = [row for row in calibration.outliers if row not in swapped]
     said += [outlying(calibration, row) for row in loose]
     for doubled in np.flatnonzero(calibration.loss_weights == 0.0):
         same = (commands[used] == commands[doubled]).all(axis=1)
-        if sensor.zeros and same.any():
+        if same.any() and touching[used[same][0]]:
             said.append(f"measurement {doubled} is {used[same][0]} again, counted once")
     return said
 
@@ -260,7 +325,7 @@ def _next_step(model: Chain, findings: _Findings, explains: bool, more: bool) ->
 
     ``more`` measurements may make it so.
     """
-    kind, rows = model.sensor.kind, ", ".join(map(str, findings.contradicting))
+    kind, rows = findings.moved, ", ".join(map(str, findings.contradicting))
     steps = (
         (findings.mistaken, "correct the columns, then identify again"),
         (findings.exchanged, "look at the sockets' columns"),
@@ -294,6 +359,7 @@ class _Errors(NamedTuple):
     held_out: float
     half_width: float  # of the 95 % interval of ``held_out``
     nominal: float
+    of_parts: list[float]  # ``nominal`` of each sensor, in its own unit
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -310,18 +376,26 @@ class _Errors(NamedTuple):
 
 
 def _errors(
-    calibration: Fit, used: NDArray[np.intp], measured: Array, usual: Array
+    calibration: Fit,
+    used: NDArray[np.intp],
+    measured: Array,
+    usual: Array,
+    parts: list[_Part],
 ) -> _Errors:
     """The errors held out and of the nominal arm, of the rows that are used."""
     size, commands = usual / usual[0], calibration.commands[used]
     held_out = np.linalg.norm(left_out(calibration)[used] / size, axis=1)
     arm = calibration.model.located(commands, measured)
-    off = measured - arm.predict(commands)
-    for rows in _groups(arm, commands):  # a socket's place is no merit of either
-        off[rows] -= off[rows].mean(axis=0) if len(rows) else 0.0
+    off = np.zeros_like(calibration.residuals)
+    off[used] = measured - arm.predict(commands)
+    for part in parts:  # a socket's place is no merit of either
+        for rows in part.groups():
+            off[rows] -= off[rows].mean(axis=0) if len(rows) else 0.0
+    far = np.linalg.norm(off / size, axis=1)
+    of_parts = [float(far[part.rows].mean() * part.scale[0]) for part in parts]
     half_width = 1.96 * held_out.std() / np.sqrt(max(len(held_out) - 1, 1))
-    nominal = np.linalg.norm(off / size, axis=1).mean()
-    return _Errors(float(held_out.mean()), float(half_width), float(nominal))
+    nominal = float(far[used].mean())
+    return _Errors(float(held_out.mean()), float(half_width), nominal, of_parts)
 
 
 def _in(calibration: Fit) -> str:
@@ -334,7 +408,9 @@ def _in(calibration: Fit) -> str:
     )
 
 
-def _scattered(calibration: Fit, usual: Array) -> tuple[bool, list[str]]:
+def _scattered(
+    calibration: Fit, usual: Array, parts: list[_Part]
+) -> tuple[bool, list[str]]:
     """Whether the noise explains the scatter, and why not."""
     if calibration.noise_known:
         fit = calibration.lack_of_fit()
@@ -355,7 +431,8 @@ def _scattered(calibration: Fit, usual: Array) -> tuple[bool, list[str]]:
         return True, []
     largest = float(noise[(noise / usual).argmax()])
     unit = _in(calibration) if np.ptp(usual) == 0.0 else ""
-    several = isinstance(calibration.model.sensor, Socket) and times > _LOUD
+    touches = any(isinstance(part.sensor, Socket) for part in parts)
+    several = touches and times > _LOUD
     return False, [
         f"the readings scatter by {largest:.3g}{unit}, {times:.3g} times what this "
         "sensor usually does: their noise, or what no parameter explains"
@@ -383,7 +460,7 @@ def _other_tip(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
     In doubt is one that is farther off than the prior allowed. Else the description is
     wrong, or of another tool, and what the readings leave unknown is in the intervals.
     """
-    if not model.sensor.zeros:
+    if not model.sensor.members[0].zeros:  # the others' places on the tool are loose
         return [], False
     names = calibration.names
     if "tool rx" in names:  # where a camera or board is on the tip is asked for
@@ -403,60 +480,65 @@ def _other_tip(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
     ], bool(far > allowed)
 
 
-def _other_distances(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
+def _other_distances(calibration: Fit, parts: list[_Part]) -> tuple[list[str], bool]:
     """Distances that were given and that the contacts contradict; by much or not.
 
     One that seems so, to first order, is freed: the readings are fitted without it.
     """
-    distances = getattr(model.sensor, "distances", ())
-    if not len(distances):
-        return [], False
-    off, rows = model.facts(calibration.parameters)
-    spread = rows @ _at_these_sizes(calibration, rows)
-    share = np.minimum((spread * rows).sum(axis=1), 1.0 - 1e-9)
-    change = np.array(distances)[:, 3] * np.abs(off) / (1.0 - share)
-    doubtful = np.abs(off) > _APART * np.sqrt(1.0 - share)
-    doubtful &= (share < 1.0 - _ALONE) & (change > _SHORT * model.length)
-    doubtful &= _touched(calibration, model)
-    said, most, unit = [], 0.0, _in(calibration)
-    for k in np.flatnonzero(doubtful).tolist():
-        first, second, distance, std = distances[k]
-        free, free_std = _freed(calibration, model, k)
-        change[k] = abs(free - distance)
-        sure = change[k] > _APART * np.hypot(free_std, std)
-        if not sure or change[k] < _SHORT * model.length:
+    length, said, most, unit = calibration.model.length, [], 0.0, _in(calibration)
+    for part in parts:
+        distances = getattr(part.sensor, "distances", ())
+        if not len(distances):
             continue
-        most = max(most, change[k])
-        said.append(
-            f"sockets {first:.0f} and {second:.0f} are given as {distance:g}{unit} "
-            f"apart, but the contacts and the arm's lengths say {free:.4g} +- "
-            f"{free_std:.2g}: measure that distance again"
-        )
-    return said, most > _WRONG * model.length
+        off, rows = _facts(calibration, part)
+        _, facts = calibration.model.facts(calibration.parameters)
+        spread = rows @ _at_these_sizes(calibration, facts)
+        share = np.minimum((spread * rows).sum(axis=1), 1.0 - 1e-9)
+        change = np.array(distances)[:, 3] * np.abs(off) / (1.0 - share)
+        doubtful = np.abs(off) > _APART * np.sqrt(1.0 - share)
+        doubtful &= (share < 1.0 - _ALONE) & (change > _SHORT * length)
+        doubtful &= part.touched()
+        for k in np.flatnonzero(doubtful).tolist():
+            first, second, distance, std = distances[k]
+            free, free_std = _freed(calibration, part, k)
+            change[k] = abs(free - distance)
+            sure = change[k] > _APART * np.hypot(free_std, std)
+            if not sure or change[k] < _SHORT * length:
+                continue
+            most = max(most, change[k])
+            said.append(
+                f"{part.kind}s {first:.0f} and {second:.0f} are given as "
+                f"{distance:g}{unit} apart, but the contacts and the arm's lengths say "
+                f"{free:.4g} +- {free_std:.2g}: measure that distance again"
+            )
+    return said, most > _WRONG * length
 
 
-def _freed(calibration: Fit, model: Chain, row: int) -> tuple[float, float]:
+def _facts(calibration: Fit, part: _Part) -> tuple[Array, Array]:
+    """What is known of a sensor's things: (F,) off, (F, p) derivative."""
+    off, own = part.sensor.facts(calibration.parameters[part.own])
+    rows = np.zeros((len(off), len(calibration.names)))
+    rows[:, part.own] = own
+    return off, rows
+
+
+def _freed(calibration: Fit, part: _Part, row: int) -> tuple[float, float]:
     """A given distance as the readings have it without it, and its deviation."""
-    sensor = model.sensor
-    touched = _touched(calibration, model)
+    model, touched = calibration.model, part.touched()
     touched[row] = False
-    rest = [one for one, kept in zip(sensor.distances, touched, strict=True) if kept]
-    free = model.measured_with(dataclasses.replace(sensor, distances=rest))
+    sensor: Any = part.sensor
+    distances = sensor.distances
+    rest = [one for one, kept in zip(distances, touched, strict=True) if kept]
+    members = list(model.sensor.members)
+    members[part.member] = dataclasses.replace(sensor, distances=rest)
+    free = model.measured_with(model.sensor.with_members(members))
     fit = calibration.again(free, calibration.stated_prior)
-    off, rows = model.facts(fit.parameters)
-    _, _, distance, std = sensor.distances[row]
+    _, _, distance, std = distances[row]
     if fit.covariance is None:  # too few readings to tell the noise without it
         return distance, np.inf
+    off, rows = _facts(fit, part)
     variance = rows[row] @ fit.covariance @ rows[row]
     return distance - std * off[row], std * float(np.sqrt(variance))
-
-
-def _touched(calibration: Fit, model: Chain) -> NDArray[np.bool_]:
-    """(D,) distances both of whose sockets have contacts of this arm."""
-    used = calibration.commands[calibration.loss_weights > 0.0]
-    labels = model.sensor.of_rows(used[:, model.num_joints :])
-    pairs = np.array(model.sensor.distances)[:, :2]
-    return np.asarray(np.isin(pairs, labels).all(axis=1))
 
 
 def _at_these_sizes(calibration: Fit, facts: Array) -> Array:
@@ -490,15 +572,16 @@ def _still(model: Chain, commands: Array) -> tuple[list[str], bool]:
         return [], False
     still = np.flatnonzero((joints == joints[0]).all(axis=0))
     said = [
-        f"{model.joint_names[i]} is {joints[0, i]:g} in all {len(joints)} "
+        f"{model.joint_names[i]} is {joints[0, i] + 0.0:g} in all {len(joints)} "
         "measurements: was it recorded? What is said of it is the prior's"
         for i in still
     ]
     return said, bool((joints[0, still] == 0.0).any())
 
 
-def _other_links(calibration: Fit, model: Chain) -> list[str]:
+def _other_links(calibration: Fit, parts: list[_Part]) -> list[str]:
     """Lengths and zeros far from the arm's description, if a prior allowed that."""
+    model = calibration.model
     names, units = np.array(model.names), np.array(model.units)
     off = np.abs(calibration.parameters - model.nominal)
     std = np.asarray(calibration.standard_errors)
@@ -506,7 +589,7 @@ def _other_links(calibration: Fit, model: Chain) -> list[str]:
     lengths = units[: model.table.size] == "length"
     most = np.full(model.table.size, _LINK * model.length)
     reasons = []
-    if not isinstance(model.sensor, Position):
+    if not any(isinstance(part.sensor, Position) for part in parts):
         far = np.flatnonzero(lengths & (sure > most))
         if far.size:
             reasons.append(
@@ -524,25 +607,34 @@ def _other_links(calibration: Fit, model: Chain) -> list[str]:
     return reasons
 
 
-def _anywhere(calibration: Fit, model: Chain, commands: Array) -> float:
+def _anywhere(calibration: Fit, model: Chain, parts: list[_Part]) -> tuple[int, float]:
     """Standard deviation of the tip's position at postures of any kind.
 
     Beside a shift and a turn of the whole arm, which contacts do not show. NaN of
-    sensors that read no position, and where nothing determines it.
+    sensors that read no position, and where nothing determines it. Before it the
+    number of the part whose readings are positions.
     """
-    if not isinstance(model.sensor, Position | Pose | Socket):
-        return np.nan
-    joints, columns = np.split(commands, [model.num_joints], axis=1)
+    for at, part in enumerate(parts):
+        if isinstance(part.sensor, Position | Pose | Socket):
+            return at, _anywhere_of(calibration, model, part)
+    return 0, np.nan
+
+
+def _anywhere_of(calibration: Fit, model: Chain, part: _Part) -> float:
+    """``_anywhere`` of a sensor that reads positions, in its own unit."""
+    commands = calibration.commands[calibration.loss_weights > 0.0]
+    joints = commands[:, : model.num_joints]
+    columns = calibration.commands[part.rows[:1], model.num_joints :]
     turning = np.array(model.command_units) == "deg"
     low, high = np.clip(model.limits, -180.0, 180.0).T
     low = np.where(turning, low, joints.min(axis=0))
     high = np.where(turning, high, joints.max(axis=0))
     drawn = np.random.default_rng(0).uniform(low, high, (_DRAWN, model.num_joints))
     slopes, covariance = calibration.linear(
-        np.hstack([drawn, np.repeat(columns[:1], _DRAWN, axis=0)])
+        np.hstack([drawn, np.repeat(columns, _DRAWN, axis=0)])
     )
-    slopes = slopes[:, :3]
-    slopes[..., [model.names.index(name) for name in model.sensor.names]] = 0.0
+    slopes = slopes[:, :3] * part.scale[:3, None]
+    slopes[..., part.own] = 0.0
     if (
         calibration.unidentified is not None
         and depends(slopes, calibration.unidentified).any()
@@ -556,49 +648,41 @@ def _anywhere(calibration: Fit, model: Chain, commands: Array) -> float:
     return float(np.sqrt(((moves @ covariance) * moves).sum() / _DRAWN))
 
 
-def _exchanged(calibration: Fit, model: Chain) -> list[str]:
+def _exchanged(calibration: Fit, part: _Part) -> list[str]:
     """Sockets that were found where others were said to be."""
-    sensor = model.sensor
+    sensor = part.sensor
     if not isinstance(sensor, Socket) or sensor.places is None:
         return []
-    places = calibration.parameters[[model.names.index(name) for name in sensor.names]]
+    places = calibration.parameters[part.own]
     apart = np.linalg.norm(places.reshape(-1, 1, 3) - sensor.places, axis=-1)
     nearest = apart.argmin(axis=1)
     if len(np.unique(nearest)) < len(nearest):  # one was moved, or the arm is far off
         return []
     return [
-        f"socket {i} was found where socket {j} was said to be: are their rows "
+        f"{part.kind} {i} was found where socket {j} was said to be: are their rows "
         "exchanged?"
         for i, j in enumerate(nearest)
         if i != j and apart[i, j] < 0.5 * apart[i, i]
     ]
 
 
-def _groups(model: Chain, commands: Array) -> list[NDArray[np.intp]]:
-    """Rows of each socket, plane or anchor, in the order of measuring."""
-    if not isinstance(model.sensor, Landmarks):
-        return []
-    which = model.sensor.of_rows(commands[:, model.num_joints :])
-    return [np.flatnonzero(which == i) for i in range(model.sensor.count)]
-
-
-def _moved(calibration: Fit, model: Chain, used: NDArray[np.intp]) -> list[str]:
+def _moved(calibration: Fit, part: _Part, swapped: dict[int, int]) -> list[str]:
     """Sockets and planes whose first and last contacts lie apart."""
-    reasons, unit = [], _in(calibration)
-    rng, residuals = np.random.default_rng(0), calibration.residuals[used]
-    for i, rows in enumerate(_groups(model, calibration.commands[used])):
+    reasons, unit, rng = [], _in(calibration), np.random.default_rng(0)
+    width = len(part.scale)
+    for i, of_one in enumerate(part.groups()):
+        rows = of_one[~np.isin(of_one, list(swapped))]
+        residuals = calibration.residuals[rows, :width] * part.scale
         if len(rows) < 2 * _FEW:
             continue
-        gain, at, apart, within = _split(residuals[rows])
+        gain, at, apart, within = _split(residuals)
         if apart < _MOVED * within:
             continue
-        shuffled = [
-            _split(residuals[rng.permutation(rows)])[0] for _ in range(_SHUFFLES)
-        ]
+        shuffled = [_split(rng.permutation(residuals))[0] for _ in range(_SHUFFLES)]
         if gain > np.quantile(shuffled, 0.99):
-            first, last = used[rows[:at]], used[rows[at:]]
+            first, last = rows[:at], rows[at:]
             reasons.append(
-                f"{model.sensor.kind} {i} seems to have moved by {apart:.3g}{unit} "
+                f"{part.kind} {i} seems to have moved by {apart:.3g}{unit} "
                 f"between measurements {first[-1]} and {last[0]}"
             )
     return reasons
@@ -619,35 +703,31 @@ def _split(values: Array) -> tuple[float, int, float, float]:
     return float(gain[best]), int(at[best]), float(apart[best]), float(within)
 
 
-def _swapped(
-    calibration: Fit, model: Chain, used: NDArray[np.intp], explains: bool
-) -> dict[int, int]:
+def _swapped(calibration: Fit, part: _Part, explains: bool) -> dict[int, int]:
     """Outliers that fit another socket or plane, as if their column were wrong."""
-    sensor = model.sensor
+    model, sensor = calibration.model, part.sensor
     if not (isinstance(sensor, Landmarks) and sensor.zeros and sensor.count > 1):
         return {}
     noise = np.asarray(calibration.noise_std)
-    at = np.array(list(calibration.outliers), dtype=np.intp)
+    at = part.rows[np.isin(part.rows, list(calibration.outliers))]
     swaps: dict[int, int] = {}
     if at.size:
         trial = np.repeat(calibration.commands[None, at], sensor.count, axis=0)
-        stated = trial[..., model.num_joints].copy()
-        trial[..., model.num_joints] = np.arange(sensor.count)[:, None]
+        column = model.num_joints + model.sensor.inputs.index(sensor.inputs[0])
+        stated = trial[..., column].copy()
+        trial[..., column] = np.arange(sensor.count)[:, None]
         off = np.abs(calibration.predict(trial) / noise).max(axis=-1)
-        for other, row in np.argwhere(
-            (off < 4.0) & (stated != trial[..., model.num_joints])
-        ):
+        for other, row in np.argwhere((off < 4.0) & (stated != trial[..., column])):
             swaps[int(at[row])] = int(other)
     if isinstance(sensor, Socket) and not explains:
         # So many that none is an outlier: by the arm as described, where that can tell.
-        joints, columns = np.split(calibration.commands[used], [model.num_joints], 1)
-        points = model.nominal_tips(joints)
-        labels, which = np.unique(sensor.of_rows(columns), return_inverse=True)
+        points = part.points
+        labels, which = np.unique(sensor.of_rows(part.columns), return_inverse=True)
         middles = [np.median(points[which == i], axis=0) for i in range(len(labels))]
         apart = np.linalg.norm(points[:, None] - middles, axis=-1)
         as_stated, nearest = apart[np.arange(len(which)), which], apart.min(axis=1)
         if np.median(as_stated) < 0.5 * np.median(apart.max(axis=1)):
             wrong = np.flatnonzero(nearest < 0.8 * as_stated)
             fits = labels[apart[wrong].argmin(axis=1)]
-            swaps |= dict(zip(used[wrong].tolist(), fits.tolist(), strict=True))
-    return dict(sorted(swaps.items()))
+            swaps |= dict(zip(part.rows[wrong].tolist(), fits.tolist(), strict=True))
+    return swaps
