@@ -42,7 +42,9 @@ _LIMIT = 300  # iterations
 _PATIENCE = 20  # iterations whose gain together decides whether the search creeps
 _MANY = 64  # readings of a measurement from which matrices of them are not made
 _CHOLESKY = 1e-6  # least pivot, of the largest, at which it is as exact as reflections
+_ONCE = 1e-3  # likewise, at which a single one is exact to 1e-8 or so
 _CLEAR = 1e8  # most by which directions differ that are determined without a doubt
+_LITTLE = 1e-6  # of a gain: a step of .001 standard deviations changes no derivative
 _LEAST_DAMPING = 1e-14  # keeps directions that nothing determines where they are
 
 
@@ -185,6 +187,7 @@ class FitSolution:
     deleted: Array  # (N,) squared, from the fit without that measurement, in noise
     num_readings: int  # of a measurement, less its unknown commands
     freedom: Array  # (q,) residual degrees of freedom of each output
+    stale: bool = False  # the parameters have moved a little since the derivatives
     root: Array | None = None  # (F, F) of the covariance, where it is at hand
     _grown: tuple[Array, Array | None] | None = None  # of the last parameters
 
@@ -309,14 +312,15 @@ class FitSolution:
 
     def _linearise(self) -> None:
         """Derivatives at the present parameters, whitened at level 1."""
-        problem = self.problem
+        problem, self.stale = self.problem, False
         if self.basis is not None:  # derivatives stay what they are
             return
         rows = derivative(problem.model, self.commands, self.parameters)
         if not problem.model.linear:  # those of a linear model are exact
-            rows = np.where(without_effect(rows, self.sizes), 0.0, rows)
+            if (idle := without_effect(rows, self.sizes)).any():
+                rows = np.where(idle, 0.0, rows)
         if not self.all_free:
-            rows = rows[..., problem.free]
+            rows = rows.compress(problem.free, axis=-1)
         self.by_theta = self.whitened(rows)
         if self._grown is not None and self._grown[1] is not None:
             slopes = problem.growth_slopes(self.parameters)
@@ -480,7 +484,8 @@ class FitSolution:
         cost = self.cost
         while True:
             rows, right, scale = self._system(self.damping)
-            inverse, across = _factor(rows, self.damping)
+            # Of a model that is not linear the next step makes up for rounding.
+            inverse, across = _factor(rows, self.damping, self.basis is None)
             self.solved = across if self.damping < 1e-9 else None
             step = inverse @ (across.T @ right)
             rest = rows @ step - right
@@ -501,7 +506,10 @@ class FitSolution:
                 self.facts, self.fact_rows = facts, fact_rows
                 shrunk = self.damping * max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3)
                 self.damping, self.grow = max(shrunk, _LEAST_DAMPING), 2.0
-                self._linearise()
+                self.stale = True
+                # The weights of a loss move the parameters by little, many times.
+                if problem.loss is None or gain > _LITTLE:
+                    self._linearise()
                 return False
             if self.damping > 1e9:  # rounding is all that is left, or
                 slope = np.abs(rows.T @ right).max() / np.linalg.norm(right)
@@ -605,6 +613,8 @@ class FitSolution:
 
         ``solved`` are the roots of the hat matrix there, if they are known.
         """
+        if self.stale:
+            self._linearise()
         readings, uncertain = self._leverage(solved), len(self.command_root)
         right = self._reduce(0.0)[1] if uncertain else self.white / self.level
         if solved is None or self.problem.noise_known:
@@ -635,9 +645,12 @@ def _deleted(readings: Array, right: Array) -> Array:
     return np.asarray((right + (readings @ along)[..., 0]) / one)
 
 
-def _factor(rows: Array, damping: float) -> tuple[Array, Array]:
-    """The inverse of R (F, F), and Q (R, F), of the damped rows (R, F)."""
-    inverse, across = _cholesky(rows, damping)
+def _factor(rows: Array, damping: float, once: bool = False) -> tuple[Array, Array]:
+    """The inverse of R (F, F), and Q (R, F), of the damped rows (R, F).
+
+    ``once``: to 1e-8 or so is enough.
+    """
+    inverse, across = _cholesky(rows, damping, once)
     if inverse is not None:
         return inverse, across
     damp = np.sqrt(damping) * np.eye(rows.shape[1])
@@ -653,7 +666,9 @@ def _lapack() -> tuple[Callable[..., Any], Callable[..., Any]]:
     return dpotrf, dtrtri
 
 
-def _cholesky(rows: Array, damping: float) -> tuple[Array | None, Array]:
+def _cholesky(
+    rows: Array, damping: float, once: bool = False
+) -> tuple[Array | None, Array]:
     """The inverse of R, and Q of the damped rows (R, F); None where it is not exact.
 
     Cholesky twice (Yamamoto et al., 2015) is as exact as Householder's reflections
@@ -674,4 +689,6 @@ def _cholesky(rows: Array, damping: float) -> tuple[Array | None, Array]:
         step = dtrtri(root)[0]
         inverse = step if inverse is None else inverse @ step
         turned = rows @ inverse
+        if once and min(size) > _ONCE * max(size):
+            break
     return inverse, turned

@@ -130,7 +130,7 @@ class _EvidenceOfScales:
     """The value for some scales; slope and curvature where they are asked for."""
 
     def __init__(self, evidence: _Evidence, logs: Array) -> None:
-        from scipy.linalg.lapack import dpotrf
+        from scipy.linalg.lapack import dpotrf, dpotrs
 
         self.evidence = evidence
         self.scaled = evidence.rows * np.exp(logs[:-1] @ evidence.members)
@@ -139,9 +139,10 @@ class _EvidenceOfScales:
         self.root, self.failed = dpotrf(self.covariance)
         if self.failed:  # beyond rounding
             log_det = np.linalg.slogdet(self.covariance)[1]
+            self.white = self.inverse @ evidence.right
         else:
             log_det = 2.0 * np.log(self.root.diagonal()).sum()
-        self.white = self.inverse @ evidence.right
+            self.white = dpotrs(self.root, evidence.right)[0]
         alone = (evidence.count - self.top) * 2.0 * logs[-1]
         alone += evidence.rest / self.level
         self.off = (logs - evidence.middle) / evidence.wide

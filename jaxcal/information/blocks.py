@@ -184,6 +184,13 @@ def gram(rows: Array) -> Array:
     """``rows.T @ rows`` (..., p, p)."""
     if rows[..., 0].size * rows.shape[-1] ** 2 <= _UNTHREADED:
         return np.asarray(rows.mT @ rows)
+    if rows.ndim == 2:  # each product symmetric, which takes half of the operations
+        part = max(1, _UNTHREADED // rows.shape[1] ** 2)
+        square = rows[:part].T @ rows[:part]
+        for first in range(part, len(rows), part):
+            some = rows[first : first + part]
+            square += some.T @ some
+        return np.asarray(square)
     parts = _parts(rows)
     return np.asarray((parts.mT @ parts).sum(axis=-3))
 

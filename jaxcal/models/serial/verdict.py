@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.information.singular import depends
+from jaxcal.information.singular import depends, significant
 from jaxcal.models import verdict as models
 from jaxcal.models.sensors import Landmarks, Pose, Position, Sensor, Socket
 from jaxcal.models.sensors.sensor import hats
@@ -644,7 +644,9 @@ def _anywhere_of(calibration: Fit, model: Chain, part: _Part) -> float:
     whole = np.repeat(np.eye(3, 6)[None], _DRAWN, axis=0)
     whole[..., 3:] = hats(points - points.mean(axis=0))
     moves, whole = slopes.reshape(3 * _DRAWN, -1), whole.reshape(-1, 6)
-    moves = moves - whole @ np.linalg.lstsq(whole, moves)[0]
+    basis, size, _ = np.linalg.svd(whole, full_matrices=False)
+    basis = basis[:, significant(size)]
+    moves = moves - basis @ (basis.T @ moves)
     return float(np.sqrt(((moves @ covariance) * moves).sum() / _DRAWN))
 
 
