@@ -424,6 +424,35 @@ def test_what_hands_share_in_several_has_one_place(kind, tmp_path):
             np.testing.assert_allclose(hand, CAMERA, atol=0.02)
 
 
+def test_what_no_hand_reads_often_enough_is_found_from_both(tmp_path):
+    robot, commands, measured = sharing("wires", tmp_path)
+    chain, sensor, which = (commands[:, robot.inputs.index(name)]
+                            for name in ("chain", "sensor", "distance"))  # fmt: skip
+
+    def anchor(count):
+        """The second, of ``count`` lengths by either hand."""
+        rare = (sensor == 0) & (which == 1)
+        kept = np.concatenate(
+            [np.flatnonzero(~rare)]
+            + [np.flatnonzero(rare & (chain == k))[:count] for k in (0, 1)]
+        )
+        prepared = robot.prepared(commands[kept], measured[kept])
+        return prepared.chains[1].sensor.sensors[0].places[1]
+
+    np.testing.assert_allclose(anchor(2), ANCHORS[1], atol=0.03)
+    with pytest.raises(ValueError, match="anchor 1 has 2 lengths, and four"):
+        anchor(1)
+
+
+def test_what_is_refused_of_a_chain_names_it(tmp_path):
+    robot, commands, measured = sharing("board", tmp_path)
+    views = commands[:, robot.inputs.index("sensor")] == 0
+    left = commands[:, robot.inputs.index("chain")] == 0
+    kept = np.flatnonzero(~(views & left) | (np.arange(len(views)) < 2))
+    with pytest.raises(ValueError, match="left_hand: place must be given for 2 views"):
+        robot.prepared(commands[kept], measured[kept])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sockets", "wires"])
 def test_what_hands_share_in_several_shows_one_beside_the_other(kind, tmp_path):

@@ -222,7 +222,10 @@ class Board(Sensor):
         if self.place is not None or (self.corners is not None and measured is None):
             return self, None
         if len(inputs) < 3:
-            raise ValueError(f"place must be given for {len(inputs)} views, 3 find it")
+            raise ValueError(
+                f"place must be given for {len(inputs)} views of a board: 3 of "
+                "every arm that has the camera or the board find it"
+            )
         if self.corners is None or measured is None:
             turn = Rotation.from_rotvec(inputs[:, 3:], degrees=True).as_matrix()
             shift = inputs[:, :3]

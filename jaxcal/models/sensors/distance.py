@@ -28,6 +28,7 @@ class Distance(Landmarks):
     outputs = ("length",)
     axes = ("x", "y", "z", "zero")
     axis_units = ("length",) * 4
+    needed = 4
     width = 4
 
     def prior_std(self, length: float) -> Array:
@@ -62,7 +63,7 @@ class Distance(Landmarks):
         which, places = self.of_rows(inputs), np.zeros((self.count, 4))
         for i in range(self.count):
             points, far = tip.position[which == i], measured[which == i, 0]
-            if len(points) < 4:
+            if len(points) < self.needed:
                 raise ValueError(
                     f"places must be given: anchor {i} has {len(points)} lengths, and "
                     "four are needed to find it"

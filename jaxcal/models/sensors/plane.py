@@ -31,6 +31,7 @@ class Plane(Landmarks):
     zeros = True
     axes = ("tilt1", "tilt2", "offset")
     axis_units = ("deg", "deg", "length")
+    needed = 3
     width = 4
 
     def __post_init__(self) -> None:
@@ -91,7 +92,7 @@ class Plane(Landmarks):
         which, rows = self.of_rows(inputs), self._rows()
         for i in range(self.count):
             points = tip.position[which == i]
-            if len(points) < 3:
+            if len(points) < self.needed:
                 continue
             middle = points.mean(axis=0)
             normal = np.linalg.svd(points - middle)[2][-1]

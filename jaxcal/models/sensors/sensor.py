@@ -130,6 +130,7 @@ class Sensor(abc.ABC):
     local: ClassVar[bool] = False  # of few places: harmonics are fitted if they gain
     stands: ClassVar[bool] = False  # what is read stands at a place that it finds
     finds_tool: ClassVar[bool] = False  # and where it is on the tool
+    needed: ClassVar[int] = 1  # readings that find a place
     misfit: ClassVar[float] = 0.0  # what they leave, by the arm's length, in a choice
     # (q,) of readings that wrap, 360 of an angle in degrees, inf of the others.
     periods: ClassVar[tuple[float, ...] | None] = None

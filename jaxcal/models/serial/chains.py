@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -34,7 +35,8 @@ class Chains(Model):
     Chains that begin with the same joints (a torso's) share these joints' columns, and
     the parameters of the links between them. A sensor that is given to several chains
     as one object, by itself or in ``Several``, is one: both arms touch the same
-    sockets, and what of them has no place is found from the arm that reads it most.
+    sockets, and what of them has no place is found from the arm that reads it most,
+    from all where each reads it too seldom (an anchor with three lengths of either).
     All else is each chain's own, named ``left: a3``.
 
     Commands are the columns of all joints, 0 where they are not of the row's chain;
@@ -440,9 +442,10 @@ class Chains(Model):
         return np.vstack(all_commands), np.vstack(all_measured)
 
     def require_commands(self, commands: Array) -> None:
-        for _, arm, rows, arm_commands in self._parts(commands):
-            if len(rows):
-                arm.require_commands(arm_commands)
+        for k, arm, rows, arm_commands in self._parts(commands):
+            with self._naming(k):
+                if len(rows):
+                    arm.require_commands(arm_commands)
 
     def prepared(self, commands: Array, measured: Array | None = None) -> Self:
         """These chains with their sensors where commands (and readings) put them.
@@ -457,15 +460,25 @@ class Chains(Model):
             if len(rows)
         ]
         for k, arm_commands, read in tables:
-            self.chains[k].require_readings(arm_commands, read)
+            with self._naming(k):
+                self.chains[k].require_readings(arm_commands, read)
         arms = self._located(tables)
         if measured is not None:
             for readings in self._by_member(arms, tables).values():
                 columns = [of_chain.columns for of_chain in readings]
                 require_touched(readings[0].sensor, np.vstack(columns))
         for k, arm_commands, read in tables:
-            arms[k].require_places(arm_commands, read)
+            with self._naming(k):
+                arms[k].require_places(arm_commands, read)
         return dataclasses.replace(self, chains=tuple(arms))
+
+    @contextlib.contextmanager
+    def _naming(self, k: int) -> Iterator[None]:
+        """The chain's name before what is refused of it."""
+        try:
+            yield
+        except ValueError as error:
+            raise ValueError(f"{self.tips[k]}: {error}") from None
 
     def _measured(
         self, k: int, measured: Array | None, rows: NDArray[np.intp]
@@ -495,7 +508,8 @@ class Chains(Model):
                 placed[number] = _placed(readings)
         for k, arm_commands, read in tables:
             arms[k] = self._with(placed, arms[k], k, tools=True)
-            arms[k] = arms[k].located(arm_commands, read)
+            with self._naming(k):
+                arms[k] = arms[k].located(arm_commands, read)
             first = self._stands_as(k)
             if not np.array_equal(arms[k].base, arms[first].base):
                 raise ValueError(
@@ -744,13 +758,17 @@ def _numbered(members: Sequence[Sequence[Sensor]]) -> tuple[tuple[int, ...], ...
 
 
 def _placed(readings: Sequence[Readings]) -> Sensor:
-    """A sensor with each thing where the arm that reads it most has it."""
+    """A sensor with each thing where the arm that reads it most has it, or all arms.
+
+    All where that arm reads it too seldom: bases that are to be found lie apart.
+    """
     sensor = readings[0].sensor
     which = [sensor.of_rows(of_arm.columns) for of_arm in readings]
     count = 1 + max(int(rows.max()) for rows in which)
-    most = np.argmax([np.bincount(rows, minlength=count) for rows in which], axis=0)
+    counts = np.array([np.bincount(rows, minlength=count) for rows in which])
+    most, seldom = counts.argmax(axis=0), counts.max(axis=0) < sensor.needed
     kept = [
-        of_arm.at(np.flatnonzero(most[rows] == i))
+        of_arm.at(np.flatnonzero((most[rows] == i) | seldom[rows]))
         for i, (of_arm, rows) in enumerate(zip(readings, which, strict=True))
     ]
     measured = [of_arm.measured for of_arm in kept if of_arm.measured is not None]
