@@ -424,6 +424,28 @@ def test_what_hands_share_in_several_has_one_place(kind, tmp_path):
             np.testing.assert_allclose(hand, CAMERA, atol=0.02)
 
 
+def test_an_arm_is_found_alike_beside_one_whose_errors_are_larger():
+    """A quarter of the tolerances, or four times: of the first arm all is the same."""
+    names = {"one": tuple("abcdef"), "other": tuple("uvwxyz")}
+    pair = Chains.of({name: ur5(joint_names=joints) for name, joints in names.items()})
+    of_one = []
+    for size in (0.25, 4.0):
+        rng, tables = np.random.default_rng(0), {}
+        for name, arm, times in zip(pair.tips, pair.chains, (1.0, size), strict=True):
+            std = np.asarray(arm.default_prior().std)
+            std[: arm.table.size] *= times
+            truth = arm.nominal + std * rng.normal(size=len(std))
+            joints, noise = rng.uniform(-120, 120, (14, 6)), rng.normal(size=(14, 3))
+            points = arm.predict(joints, truth) + arm.sensor.stds(arm.length) * noise
+            tables[name] = joints, points
+        found = jaxcal.identify(*pair.together(tables), model=pair, noise_std=1.0)
+        of_one.append(found.of("one"))
+    few, many = of_one
+    std = few.standard_errors
+    assert (np.abs(few.parameters - many.parameters) <= 0.05 * std).all()
+    np.testing.assert_allclose(many.standard_errors, std, rtol=0.05)
+
+
 def test_what_no_hand_reads_often_enough_is_found_from_both(tmp_path):
     robot, commands, measured = sharing("wires", tmp_path)
     chain, sensor, which = (commands[:, robot.inputs.index(name)]

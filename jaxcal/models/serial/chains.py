@@ -379,10 +379,28 @@ class Chains(Model):
         return np.asarray(self._gather(sizes))
 
     def error_groups(self) -> ErrorGroups:
-        """Groups as of ``SerialChain``, one scale for all chains."""
-        groups = [arm.error_groups() for arm in self.chains]
-        members = self._gather([group.members for group in groups])
-        return groups[0]._replace(members=members)
+        """Groups as of ``SerialChain``, of each chain; of harmonics one for all, last.
+
+        What chains share is in the first one's.
+        """
+        of_chains = [arm.error_groups() for arm in self.chains]
+        count = len(of_chains[0].medians) - 1
+        last = count * len(of_chains)
+        members = []
+        for k, of_chain in enumerate(of_chains):
+            numbered = of_chain.members + count * k
+            numbered[of_chain.members == count] = last
+            numbered[of_chain.members < 0] = -1
+            members.append(numbered)
+
+        def of_all(one: Array) -> Array:
+            return np.append(np.tile(one[:-1], len(of_chains)), one[-1])
+
+        return ErrorGroups(
+            self._gather(members),
+            of_all(of_chains[0].medians),
+            of_all(of_chains[0].spreads),
+        )
 
     @property
     def misfit_std(self) -> float:
