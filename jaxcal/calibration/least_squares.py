@@ -45,6 +45,7 @@ _CHOLESKY = 1e-6  # least pivot, of the largest, at which it is as exact as refl
 _ONCE = 1e-3  # likewise, at which a single one is exact to 1e-8 or so
 _CLEAR = 1e8  # most by which directions differ that are determined without a doubt
 _LITTLE = 1e-6  # of a gain: a step of .001 standard deviations changes no derivative
+_TOUCHED = 4.0  # times the usual noise: most that is read of what is touched
 _LEAST_DAMPING = 1e-14  # keeps directions that nothing determines where they are
 
 
@@ -67,7 +68,7 @@ class FitProblem:
     first_log_size: Array | None  # (N,) of the model, at the prior's mean
 
     def growth(self, theta: Array) -> Array | None:
-        """(N, 1) by which readings of zero are as large as at the prior's mean.
+        """(N, 1) by which contacts' readings are as large as at the prior's mean.
 
         None where all are as they are.
         """
@@ -83,8 +84,14 @@ class FitProblem:
 
     @functools.cached_property
     def _zeros(self) -> Array:
-        """(N, 1) 1 where what was measured is zero, else 0."""
-        return 1.0 - np.asarray(self.measured.any(axis=1, keepdims=True), np.float64)
+        """(N, 1) 1 where no more was measured than contacts miss by, else 0.
+
+        What is farther off was read at a posture that nothing was touched at.
+        """
+        noise = self.model.default_noise()
+        most = 0.0 if noise is None else _TOUCHED * np.asarray(noise.std)
+        near = np.all(np.abs(self.measured) <= most, axis=1, keepdims=True)
+        return np.asarray(near, dtype=np.float64)
 
 
 def solve(

@@ -178,12 +178,12 @@ class Model(abc.ABC):
         return None
 
     def log_size(self, commands: Array, parameters: Array) -> Array | None:
-        """Logarithm (N,) of what readings of zero grow with.
+        """Logarithm (N,) of what readings grow with that are zero, or near it.
 
         Contacts do not show how large the machine is: were it half as large, with all
-        that it touches, they would be missed by half as much. A fit compares them with
-        its size, or a smaller machine would always fit better. None: readings are as
-        large as they are.
+        that it touches, they would be missed by half as much. A fit compares them (what
+        is below four times ``default_noise``) with its size, or a smaller machine would
+        always fit better. None: readings are as large as they are.
         """
         return None
 

@@ -308,3 +308,18 @@ def test_contacts_are_missed_by_more_by_a_larger_arm_wherever_it_stands():
     stands = slopes[:, np.isin(names, ["d1", "base x"])]
     np.testing.assert_allclose(stands, 0.0, atol=1e-15)
     assert arm.measured_with(Position()).log_size(commands, theta) is None
+    # On a rail that stands still it is the same arm; the rail's way shows the size.
+    rows = [(0, -90, 0, 0), *np.array(UR5_TABLE)[:, :4].tolist()]
+    rail = SerialChain.from_dh(
+        rows, joints="PRRRRRR", tool=(0, 0, 31), sensor=Socket(2)
+    )
+    along = np.column_stack([np.full(9, 700.0), commands])
+    np.testing.assert_allclose(
+        rail.log_size(along, rail.nominal), arm.log_size(commands, arm.nominal)
+    )
+    slopes = rail.log_size_jacobian(along, rail.nominal)
+    by_all = differences(lambda t: rail.log_size(along, t), rail.nominal)
+    length = np.array(rail.units) == "length"
+    np.testing.assert_allclose(slopes[:, length], by_all[:, length], atol=1e-9)
+    along[0, 0] = 710.0
+    assert rail.log_size(along, rail.nominal) is None

@@ -300,16 +300,16 @@ class Arm:
 
         Of contacts of turning joints, which touch as well with an arm of any size: the
         root of the sum of squares, of all postures, of how far the tip is from each
-        axis. It is an arm's size, and none of where it stands. By turns it is held. A
-        slide's way shows the size: None.
+        axis. It is an arm's size, and none of where it stands. By turns it is held. The
+        way of a slide that moves shows the size: None.
         """
-        if not self._grows:
+        if not self._grows(commands):
             return None
         _, square = self._levers(commands, parameters)
         return 0.5 * np.log(square)
 
     def log_size_jacobian(self, commands: Array, parameters: Array) -> Array:
-        if not self._grows:
+        if not self._grows(commands):
             return np.zeros((len(commands), len(parameters)))
         levers, square = self._levers(commands, parameters)
         axes = self._chain(commands, parameters)[1]
@@ -328,15 +328,26 @@ class Arm:
             about = axes[self._steps_of_joints]
             levers = frame[3] - origins[self._steps_of_joints]
             levers -= about * np.einsum("jkn,jkn->jn", about, levers)[:, None]
+            levers[~self._revolute] = 0.0
             return levers, np.full(len(commands), np.vdot(levers, levers))
 
         return self._kept("_last_levers", (commands, parameters), find)
 
-    @functools.cached_property
-    def _grows(self) -> bool:
+    def _grows(self, commands: Array) -> bool:
         """Whether some of what it reads is zero, and grows with the arm."""
-        touches = any(one.zeros and one.lengths for one in self.sensor.members)
-        return touches and bool(self._revolute.all())
+        if not self._touches or self._revolute.all():
+            return self._touches
+        slides = commands[:, self._slides]
+        return bool((slides == slides[:1]).all())
+
+    @functools.cached_property
+    def _touches(self) -> bool:
+        return any(one.zeros and one.lengths for one in self.sensor.members)
+
+    @functools.cached_property
+    def _slides(self) -> NDArray[np.intp]:
+        """Columns of the commands by which joints slide."""
+        return np.flatnonzero(self.drive[~self._revolute].any(axis=0))
 
     @functools.cached_property
     def _shifts(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
