@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import re
 import warnings
 
 import numpy as np
@@ -491,6 +492,26 @@ def test_what_hands_share_in_several_shows_one_beside_the_other(kind, tmp_path):
     far = {name: np.linalg.norm(shift, axis=1) for name, shift in apart.items()}
     off, before = (np.abs(far[n] - far["truth"]).mean() for n in ("found", "robot"))
     assert off < 0.3 * before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("apart", [0.23, 0.24])
+def test_a_distance_from_one_hand_to_the_other_is_judged_by_both(apart, tmp_path):
+    """Sockets 0 and 2 are .24 apart, each touched by one hand, socket 1 by both."""
+    robot, commands, measured = sharing("sockets", tmp_path)
+    sensor = Socket(3, distances=[(0, 2, apart, 1e-4)])
+    number = robot.stands[0][0]
+    given = robot.with_member(number, sensor)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        verdict = jaxcal.identify(commands, measured, model=given).verdict
+    said = [why for why in verdict.reasons if "measure that distance again" in why]
+    assert verdict.good == (apart == 0.24) and len(said) == (apart != 0.24)
+    if said:
+        told = re.search(r"0 and 2 are given as 0.23 .* say (\S+) \+- (\S+):", said[0])
+        free, std = map(float, told.groups())
+        assert abs(free - 0.24) < 3.0 * std < 0.003
+        assert "clear up" in verdict.next_step
 
 
 def rng_postures(seed):

@@ -214,6 +214,12 @@ class SerialChain(Arm, Model):
         """This arm with another sensor."""
         return dataclasses.replace(self, sensor=sensor)
 
+    def with_member(self, i: int, sensor: Sensor) -> Self:
+        """This arm with another sensor in the place of its member ``i``."""
+        members = [*self.sensor.members]
+        members[i] = sensor
+        return self.measured_with(self.sensor.with_members(members))
+
     def with_misfit(self) -> Self:
         """This arm with harmonics of its joints.
 

@@ -644,21 +644,63 @@ class Chains(Model):
             "noise_std": noise,
         }
 
+    def with_member(self, number: int, sensor: Sensor) -> Self:
+        """These chains with another sensor in the place of ``number``."""
+        chains = [self._with({number: sensor}, a, k) for k, a in enumerate(self.chains)]
+        return dataclasses.replace(self, chains=tuple(chains))
+
+    def _shared_parts(self, fit: Any) -> list[Any]:
+        """What chains read of the sensors that they share, of all rows that are used.
+
+        Distances that one chain's contacts judge are left to its own verdict.
+        """
+        from jaxcal.models.serial.verdict import Part
+
+        used = np.flatnonzero(fit.loss_weights > 0.0)
+        tables = [(k, at, None) for k, _, _, at in self._parts(fit.commands[used])]
+        parts = []
+        for number, readings in self._by_member(self.chains, tables).items():
+            if len(readings) < 2:
+                continue
+            k, i = self._members[number][0]
+            part = Part(
+                number,
+                readings[0].sensor,
+                readings[0].sensor.kind,
+                used,
+                np.vstack([of_chain.columns for of_chain in readings]),
+                np.vstack([of_chain.tip.position for of_chain in readings]),
+                self.members[k][self.chains[k].own(i)],
+                readings[0].scale,
+            )
+            alone = [part._replace(columns=r.columns).touched() for r in readings]
+            parts.append(part._replace(judged=np.any(alone, axis=0)))
+        return parts
+
     def verdict(self, fit: Any) -> ChainsVerdict:
-        """Good where every chain that was read is."""
+        """Good where every chain that was read is, and distances that they share."""
+        from jaxcal.models.serial.verdict import CLEAR_UP, other_distances
+
         read = {
             self.tips[k] for k, _, rows, _ in self._parts(fit.commands) if rows.size
         }
         of_chains = {tip: fit.of(tip).verdict for tip in self.tips if tip in read}
         bad = [tip for tip, told in of_chains.items() if not told.good]
         step = f"{bad[0]}: {of_chains[bad[0]].next_step}" if bad else models.USE
+        apart: list[str] = []
+        wrong = False
         if fit.noise_std is None:
             step = "measure more postures, or state noise_std=1: readings are in noise"
+        else:
+            length = min(arm.length for arm in self.chains)
+            apart, wrong = other_distances(fit, self._shared_parts(fit), length)
+            step = CLEAR_UP if wrong else step
         reasons = [
             f"{tip}: {line}" for tip, told in of_chains.items() for line in told.lines()
         ]
         reasons += [f"{tip}: no reading" for tip in self.tips if tip not in read]
-        return ChainsVerdict(not bad, tuple(reasons), step, "", of_chains)
+        good = not (bad or wrong)
+        return ChainsVerdict(good, (*reasons, *apart), step, "", of_chains)
 
     def calibrated(self, parameters: ArrayLike) -> Self:
         """The chains whose nominal is this one with ``parameters``."""

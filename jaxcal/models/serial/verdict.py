@@ -19,11 +19,13 @@ from jaxcal.models.sensors.sensor import hats
 from jaxcal.models.serial.mistaken import mistaken_columns
 from jaxcal.models.verdict import UNLIKELY, left_out, outlying
 
-__all__ = ["ArmVerdict", "verdict"]
+__all__ = ["CLEAR_UP", "ArmVerdict", "Part", "other_distances", "verdict"]
 
 Array = NDArray[np.float64]
 Chain = Any  # a Chain, whose module imports this one
 Fit = Any  # a jaxcal.Calibration, whose package imports this one
+
+CLEAR_UP = "clear up what ends in a question or an advice, then identify again"
 
 _SCATTER = 3.0  # times the sensor's usual noise: the model does not explain that
 _FAR = 4.0  # standard deviations of the prior
@@ -150,8 +152,11 @@ def verdict(calibration: Fit) -> ArmVerdict:
     )
 
 
-class _Part(NamedTuple):
-    """What one sensor of an arm read: of ``Several`` each, else the only one."""
+class Part(NamedTuple):
+    """What one sensor of an arm read: of ``Several`` each, else the only one.
+
+    Or of arms that share it.
+    """
 
     member: int  # number of it
     sensor: Sensor
@@ -159,8 +164,9 @@ class _Part(NamedTuple):
     rows: NDArray[np.intp]  # (K,) measurements that are used
     columns: Array  # (K, e) of their commands
     points: Array  # (K, 3) where the arm as described has it
-    own: slice  # of the parameters
+    own: slice | NDArray[np.intp]  # of the parameters
     scale: Array  # (q,) its unit in that of the calibration's readings
+    judged: NDArray[np.bool_] | None = None  # (D,) distances, of one of the arms alone
 
     def groups(self) -> list[NDArray[np.intp]]:
         """Rows of each socket, plane or anchor, in the order of measuring."""
@@ -176,7 +182,7 @@ class _Part(NamedTuple):
         return np.asarray(np.isin(pairs, labels).all(axis=1))
 
 
-def _parts(calibration: Fit, used: NDArray[np.intp]) -> list[_Part]:
+def _parts(calibration: Fit, used: NDArray[np.intp]) -> list[Part]:
     """Readings of each sensor that has some."""
     model, commands = calibration.model, calibration.commands[used]
     tip, inputs = model.nominal_tip(commands), commands[:, model.num_joints :]
@@ -187,7 +193,7 @@ def _parts(calibration: Fit, used: NDArray[np.intp]) -> list[_Part]:
         kind = f"sensor {i}'s {read.sensor.kind}" if twice else read.sensor.kind
         if len(read.rows):
             parts.append(
-                _Part(
+                Part(
                     i,
                     read.sensor,
                     kind,
@@ -215,7 +221,7 @@ class _Findings(NamedTuple):
 def _findings(
     calibration: Fit,
     used: NDArray[np.intp],
-    parts: list[_Part],
+    parts: list[Part],
     scatter: list[str],
     explains: bool,
     mistaken: str,
@@ -246,7 +252,9 @@ def _findings(
     moved_lines = [line for lines in moved.values() for line in lines]
     tip, doubtful = _other_tip(calibration, model)
     other_arm = [] if mistaken else _other_links(calibration, parts)
-    apart, wrong = ([], False) if other_arm else _other_distances(calibration, parts)
+    apart, wrong = (
+        ([], False) if other_arm else other_distances(calibration, parts, model.length)
+    )
     still, unused = _still(model, calibration.commands[used])
     reasons += moved_lines + exchanged + _far(calibration)
     reasons += tip + other_arm + apart + still
@@ -275,7 +283,7 @@ def _usual_noise(calibration: Fit) -> str:
 
 def _of_no_size(
     findings: _Findings,
-    parts: list[_Part],
+    parts: list[Part],
     unit: str,
     anywhere: float,
     nominal: float,
@@ -300,7 +308,7 @@ def _of_no_size(
 def _wrong_rows(
     calibration: Fit,
     used: NDArray[np.intp],
-    parts: list[_Part],
+    parts: list[Part],
     swapped: dict[int, int],
 ) -> list[str]:
     """Rows of another socket, outliers, and contacts that were written twice."""
@@ -339,10 +347,7 @@ def _next_step(model: Chain, findings: _Findings, explains: bool, more: bool) ->
             f"measure again with the {kind} fixed, or number it as two: one {kind} "
             "before it moved and another after",
         ),
-        (
-            findings.doubtful,
-            "clear up what ends in a question or an advice, then identify again",
-        ),
+        (findings.doubtful, CLEAR_UP),
         (more, "measure more postures: jaxcal postures --measured chooses them"),
         (
             True,
@@ -380,7 +385,7 @@ def _errors(
     used: NDArray[np.intp],
     measured: Array,
     usual: Array,
-    parts: list[_Part],
+    parts: list[Part],
 ) -> _Errors:
     """The errors held out and of the nominal arm, of the rows that are used."""
     size, commands = usual / usual[0], calibration.commands[used]
@@ -409,7 +414,7 @@ def _in(calibration: Fit) -> str:
 
 
 def _scattered(
-    calibration: Fit, usual: Array, parts: list[_Part]
+    calibration: Fit, usual: Array, parts: list[Part]
 ) -> tuple[bool, list[str]]:
     """Whether the noise explains the scatter, and why not."""
     if calibration.noise_known:
@@ -480,12 +485,14 @@ def _other_tip(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
     ], bool(far > allowed)
 
 
-def _other_distances(calibration: Fit, parts: list[_Part]) -> tuple[list[str], bool]:
+def other_distances(
+    calibration: Fit, parts: list[Part], length: float
+) -> tuple[list[str], bool]:
     """Distances that were given and that the contacts contradict; by much or not.
 
     One that seems so, to first order, is freed: the readings are fitted without it.
     """
-    length, said, most, unit = calibration.model.length, [], 0.0, _in(calibration)
+    said, most, unit = [], 0.0, _in(calibration)
     for part in parts:
         distances = getattr(part.sensor, "distances", ())
         if not len(distances):
@@ -498,6 +505,8 @@ def _other_distances(calibration: Fit, parts: list[_Part]) -> tuple[list[str], b
         doubtful = np.abs(off) > _APART * np.sqrt(1.0 - share)
         doubtful &= (share < 1.0 - _ALONE) & (change > _SHORT * length)
         doubtful &= part.touched()
+        if part.judged is not None:
+            doubtful &= ~part.judged
         for k in np.flatnonzero(doubtful).tolist():
             first, second, distance, std = distances[k]
             free, free_std = _freed(calibration, part, k)
@@ -514,7 +523,7 @@ def _other_distances(calibration: Fit, parts: list[_Part]) -> tuple[list[str], b
     return said, most > _WRONG * length
 
 
-def _facts(calibration: Fit, part: _Part) -> tuple[Array, Array]:
+def _facts(calibration: Fit, part: Part) -> tuple[Array, Array]:
     """What is known of a sensor's things: (F,) off, (F, p) derivative."""
     off, own = part.sensor.facts(calibration.parameters[part.own])
     rows = np.zeros((len(off), len(calibration.names)))
@@ -522,16 +531,14 @@ def _facts(calibration: Fit, part: _Part) -> tuple[Array, Array]:
     return off, rows
 
 
-def _freed(calibration: Fit, part: _Part, row: int) -> tuple[float, float]:
+def _freed(calibration: Fit, part: Part, row: int) -> tuple[float, float]:
     """A given distance as the readings have it without it, and its deviation."""
     model, touched = calibration.model, part.touched()
     touched[row] = False
     sensor: Any = part.sensor
     distances = sensor.distances
     rest = [one for one, kept in zip(distances, touched, strict=True) if kept]
-    members = list(model.sensor.members)
-    members[part.member] = dataclasses.replace(sensor, distances=rest)
-    free = model.measured_with(model.sensor.with_members(members))
+    free = model.with_member(part.member, dataclasses.replace(sensor, distances=rest))
     fit = calibration.again(free, calibration.stated_prior)
     _, _, distance, std = distances[row]
     if fit.covariance is None:  # too few readings to tell the noise without it
@@ -579,7 +586,7 @@ def _still(model: Chain, commands: Array) -> tuple[list[str], bool]:
     return said, bool((joints[0, still] == 0.0).any())
 
 
-def _other_links(calibration: Fit, parts: list[_Part]) -> list[str]:
+def _other_links(calibration: Fit, parts: list[Part]) -> list[str]:
     """Lengths and zeros far from the arm's description, if a prior allowed that."""
     model = calibration.model
     names, units = np.array(model.names), np.array(model.units)
@@ -607,7 +614,7 @@ def _other_links(calibration: Fit, parts: list[_Part]) -> list[str]:
     return reasons
 
 
-def _anywhere(calibration: Fit, model: Chain, parts: list[_Part]) -> tuple[int, float]:
+def _anywhere(calibration: Fit, model: Chain, parts: list[Part]) -> tuple[int, float]:
     """Standard deviation of the tip's position at postures of any kind.
 
     Beside a shift and a turn of the whole arm, which contacts do not show. NaN of
@@ -620,7 +627,7 @@ def _anywhere(calibration: Fit, model: Chain, parts: list[_Part]) -> tuple[int, 
     return 0, np.nan
 
 
-def _anywhere_of(calibration: Fit, model: Chain, part: _Part) -> float:
+def _anywhere_of(calibration: Fit, model: Chain, part: Part) -> float:
     """``_anywhere`` of a sensor that reads positions, in its own unit."""
     commands = calibration.commands[calibration.loss_weights > 0.0]
     joints = commands[:, : model.num_joints]
@@ -650,7 +657,7 @@ def _anywhere_of(calibration: Fit, model: Chain, part: _Part) -> float:
     return float(np.sqrt(((moves @ covariance) * moves).sum() / _DRAWN))
 
 
-def _exchanged(calibration: Fit, part: _Part) -> list[str]:
+def _exchanged(calibration: Fit, part: Part) -> list[str]:
     """Sockets that were found where others were said to be."""
     sensor = part.sensor
     if not isinstance(sensor, Socket) or sensor.places is None:
@@ -668,7 +675,7 @@ def _exchanged(calibration: Fit, part: _Part) -> list[str]:
     ]
 
 
-def _moved(calibration: Fit, part: _Part, swapped: dict[int, int]) -> list[str]:
+def _moved(calibration: Fit, part: Part, swapped: dict[int, int]) -> list[str]:
     """Sockets and planes whose first and last contacts lie apart."""
     reasons, unit, rng = [], _in(calibration), np.random.default_rng(0)
     width = len(part.scale)
@@ -705,7 +712,7 @@ def _split(values: Array) -> tuple[float, int, float, float]:
     return float(gain[best]), int(at[best]), float(apart[best]), float(within)
 
 
-def _swapped(calibration: Fit, part: _Part, explains: bool) -> dict[int, int]:
+def _swapped(calibration: Fit, part: Part, explains: bool) -> dict[int, int]:
     """Outliers that fit another socket or plane, as if their column were wrong."""
     model, sensor = calibration.model, part.sensor
     if not (isinstance(sensor, Landmarks) and sensor.zeros and sensor.count > 1):
