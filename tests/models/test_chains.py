@@ -467,13 +467,23 @@ def test_what_no_hand_reads_often_enough_is_found_from_both(tmp_path):
         anchor(1)
 
 
-def test_what_is_refused_of_a_chain_names_it(tmp_path):
+def test_a_camera_with_two_views_is_found_by_the_board_that_another_sees(tmp_path):
     robot, commands, measured = sharing("board", tmp_path)
     views = commands[:, robot.inputs.index("sensor")] == 0
-    left = commands[:, robot.inputs.index("chain")] == 0
-    kept = np.flatnonzero(~(views & left) | (np.arange(len(views)) < 2))
-    with pytest.raises(ValueError, match="left_hand: place must be given for 2 views"):
-        robot.prepared(commands[kept], measured[kept])
+    chain = commands[:, robot.inputs.index("chain")]
+    right = np.flatnonzero(~views | (chain == 1))
+    left = np.flatnonzero(views & (chain == 0))[:2]
+    kept = np.concatenate([left, right])
+    arm = robot.prepared(commands[kept], measured[kept]).chains[0]
+    hand = np.linalg.inv(robot.chains[0].tool) @ arm.tool
+    np.testing.assert_allclose(hand, CAMERA, atol=0.03)
+    np.testing.assert_allclose(arm.sensor.sensors[0].place, BOARD, atol=0.02)
+    few = np.concatenate([left, right[~views[right]], right[views[right]][:2]])
+    with pytest.raises(ValueError, match="3 of one arm that has the camera"):
+        robot.prepared(commands[few], measured[few])
+    commands[chain == 0, :7] = np.radians(commands[chain == 0, :7])
+    with pytest.raises(ValueError, match="left_hand: commands must be in degrees"):
+        robot.prepared(commands, measured)
 
 
 @pytest.mark.slow

@@ -24,6 +24,7 @@ __all__ = ["Board"]
 
 Array = NDArray[np.float64]
 
+_FEW = 3  # views that find where a board stands and its tool
 _WRONG = 0.2  # views so far off, in radians and lengths of the arm, are read wrongly
 
 
@@ -73,7 +74,6 @@ class Board(Sensor):
     names = tuple(f"stand {axis}" for axis in tool)
     units = ("length",) * 3 + ("deg",) * 3
     stands = True
-    finds_tool = True
     _seen: ClassVar[tuple[str, ...]] = tuple(f"seen {axis}" for axis in tool)
 
     def __post_init__(self) -> None:
@@ -221,16 +221,12 @@ class Board(Sensor):
 
         if self.place is not None or (self.corners is not None and measured is None):
             return self, None
-        if len(inputs) < 3:
+        if len(inputs) < _FEW:
             raise ValueError(
-                f"place must be given for {len(inputs)} views of a board: 3 of "
-                "every arm that has the camera or the board find it"
+                f"place must be given for {len(inputs)} views of a board: {_FEW} of "
+                "one arm that has the camera or the board find it"
             )
-        if self.corners is None or measured is None:
-            turn = Rotation.from_rotvec(inputs[:, 3:], degrees=True).as_matrix()
-            shift = inputs[:, :3]
-        else:
-            turn, shift = self._poses(measured)
+        turn, shift = self._views(inputs, measured)
 
         def fit(turn: Array, shift: Array) -> tuple[float, Array, Array]:
             if self.moves == "camera":
@@ -265,6 +261,21 @@ class Board(Sensor):
         side = float(np.sign(np.median(towards)))
         return dataclasses.replace(self, place=place, side=side), new
 
+    @property
+    def standing(self) -> Board:
+        return _Standing(
+            **{f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        )
+
+    def _views(self, inputs: Array, measured: Array | None) -> tuple[Array, Array]:
+        """Rotations (N, 3, 3) and places (N, 3) of the board in the camera."""
+        from scipy.spatial.transform import Rotation
+
+        if self.corners is not None and measured is not None:
+            return self._poses(measured)
+        turn = Rotation.from_rotvec(inputs[:, 3:], degrees=True).as_matrix()
+        return turn, inputs[:, :3]
+
     def depths(self, poses: Array) -> Array:
         """(N, C) depth of the board's points before the camera, at poses (N, 6)."""
         from scipy.spatial.transform import Rotation
@@ -295,6 +306,26 @@ class Board(Sensor):
         turn = np.stack([x, y, np.cross(x, y) / scale[:, None]], axis=-1)
         left, _, right = np.linalg.svd(turn)
         return left @ right, plane[..., 2] / scale[:, None]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Standing(Board):
+    """A board that stands where another arm's views put it: one view shows the tool."""
+
+    def located(
+        self, tip: Tip, inputs: Array, measured: Array | None
+    ) -> tuple[Self, Array | None]:
+        if self.place is None or not 0 < len(inputs) < _FEW:
+            unplaced = dataclasses.replace(self, place=None)
+            return Board.located(unplaced, tip, inputs, measured)
+        turn, shift = self._views(inputs, measured)
+        if self.moves == "camera":
+            turn, shift = _inverse(turn, shift)
+        place, tool, back = self.place, np.eye(4), np.matrix_transpose(tip.rotation)
+        tool[:3, :3] = _nearest((back @ place[:3, :3] @ turn).sum(axis=0))
+        gaps = shift @ place[:3, :3].T + place[:3, 3] - tip.position
+        tool[:3, 3] = (back @ gaps[..., None])[..., 0].mean(axis=0)
+        return self, tool
 
 
 def _hand_and_eye(tip: Tip, turn: Array, shift: Array) -> tuple[float, Array, Array]:

@@ -129,7 +129,6 @@ class Sensor(abc.ABC):
     compliant: ClassVar[bool] = False  # shown to be better with joints that yield
     local: ClassVar[bool] = False  # of few places: harmonics are fitted if they gain
     stands: ClassVar[bool] = False  # what is read stands at a place that it finds
-    finds_tool: ClassVar[bool] = False  # and where it is on the tool
     needed: ClassVar[int] = 1  # readings that find a place
     misfit: ClassVar[float] = 0.0  # what they leave, by the arm's length, in a choice
     # (q,) of readings that wrap, 360 of an angle in degrees, inf of the others.
@@ -190,6 +189,14 @@ class Sensor(abc.ABC):
             It, and where its tool is seen from the nominal one (4, 4), if that is new.
         """
         return self, None
+
+    @property
+    def standing(self) -> Sensor:
+        """This sensor, its place found by other arms: what ``located`` has to find yet.
+
+        Of one that finds its tool too, that: every arm has its own.
+        """
+        return self
 
     def of_rows(self, inputs: Array) -> NDArray[np.int64]:
         """(N,) which of the things that stand around each row is of."""

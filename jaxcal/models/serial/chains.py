@@ -523,9 +523,12 @@ class Chains(Model):
             readings = [one for one in of_chains if len(one.columns)]
             shared = len(self._members[number]) > 1
             if shared and readings and readings[0].sensor.stands:
-                placed[number] = _placed(readings)
+                one = _placed(readings)
+                if one is not readings[0].sensor:  # where it was not given
+                    placed[number] = one
         for k, arm_commands, read in tables:
-            arms[k] = self._with(placed, arms[k], k, tools=True)
+            standing = {number: one.standing for number, one in placed.items()}
+            arms[k] = self._with(standing, arms[k], k)
             with self._naming(k):
                 arms[k] = arms[k].located(arm_commands, read)
             first = self._stands_as(k)
@@ -543,16 +546,11 @@ class Chains(Model):
         return next(j for j in range(k + 1) if j == k or _common(arms[j], arms[k]))
 
     def _with(
-        self,
-        placed: Mapping[int, Sensor],
-        arm: SerialChain,
-        k: int,
-        *,
-        tools: bool = False,
+        self, placed: Mapping[int, Sensor], arm: SerialChain, k: int
     ) -> SerialChain:
-        """An arm with sensors by number; ``tools``, not with what finds its tool."""
+        """An arm with sensors by number."""
         members = [
-            one if tools and one.finds_tool else placed.get(number, one)
+            placed.get(number, one)
             for one, number in zip(arm.sensor.members, self.stands[k], strict=True)
         ]
         if all(a is b for a, b in zip(members, arm.sensor.members, strict=True)):
