@@ -223,3 +223,13 @@ def test_a_distance_that_was_written_wrongly_is_told_where_it_can_be():
         said = "measure that distance again" in str(found.verdict)
         assert said == (apart < 50.0), (apart, str(found.verdict))
         assert found.verdict.good == (apart > 46.0)
+
+
+@pytest.mark.parametrize("apart", [30.0, 48.0])
+def test_a_wrong_distance_is_no_noise_of_its_direction(apart):
+    """Twenty contacts of sockets that lie along y: the ball misses alike all round."""
+    arm, commands, *_ = _made(1.0, 0, jaxcal.models.Socket(2))
+    sockets = jaxcal.models.Socket(2, distances=[(0, 1, apart, 0.1)])
+    rows = np.random.default_rng(0).permutation(len(commands))[:20]
+    with pytest.warns(UserWarning, match="measure that distance again"):
+        jaxcal.identify(commands[rows], None, model=arm.measured_with(sockets))
