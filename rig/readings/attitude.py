@@ -9,6 +9,7 @@ order, and no other; a wrong order leaves degrees of error no calibration remove
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import time
 from collections.abc import Sequence
@@ -34,13 +35,53 @@ class Reading:
 
 
 def euler_to_matrix(angles_deg: ArrayLike, order: str) -> Array:
-    """(..., 3, 3) of (..., 3) degrees in the sequence of ``order``, one of ORDERS."""
-    return Rotation.from_euler(order, angles_deg, degrees=True).as_matrix()
+    """(..., 3, 3) of (..., 3) degrees in the sequence of ``order``, one of ORDERS.
+
+    Written out, as its inverse: scipy's Rotation takes ten times as long for the one
+    attitude of a reading, and a phone sends hundreds in a second.
+    """
+    i, j, k, sign = _sequence(order)
+    turns = np.radians(np.asarray(angles_deg, dtype=np.float64))
+    sine_a, sine_b, sine_c = np.moveaxis(sign * np.sin(turns), -1, 0)
+    cosine_a, cosine_b, cosine_c = np.moveaxis(np.cos(turns), -1, 0)
+    matrix = np.empty((*turns.shape, 3))
+    matrix[..., i, i] = cosine_b * cosine_c
+    matrix[..., i, j] = -cosine_b * sine_c
+    matrix[..., i, k] = sine_b
+    matrix[..., j, i] = cosine_a * sine_c + sine_a * sine_b * cosine_c
+    matrix[..., j, j] = cosine_a * cosine_c - sine_a * sine_b * sine_c
+    matrix[..., j, k] = -sine_a * cosine_b
+    matrix[..., k, i] = sine_a * sine_c - cosine_a * sine_b * cosine_c
+    matrix[..., k, j] = sine_a * cosine_c + cosine_a * sine_b * sine_c
+    matrix[..., k, k] = cosine_a * cosine_b
+    return matrix
 
 
 def matrix_to_euler(matrix: ArrayLike, order: str) -> Array:
-    """(..., 3) degrees; the middle one lies in [-90, 90], the others in +-180."""
-    return Rotation.from_matrix(matrix).as_euler(order, degrees=True)
+    """(..., 3) degrees of rotations (..., 3, 3): the middle one lies in [-90, 90], the
+    others in +-180. Where it is +-90 only the sum or the difference of the others is
+    determined, and any two that give it are returned."""
+    i, j, k, sign = _sequence(order)
+    turned = np.asarray(matrix, dtype=np.float64)
+    first_row, column_i, column_j = turned[..., i, :], turned[..., i], turned[..., j]
+    second = np.arctan2(
+        first_row[..., k], np.hypot(first_row[..., i], first_row[..., j])
+    )
+    third = np.arctan2(-first_row[..., j], first_row[..., i])
+    # The middle axis after the first turn alone: it is one also where second is +-90.
+    sine, cosine = np.sin(third), np.cos(third)
+    first = np.arctan2(
+        column_i[..., k] * sine + column_j[..., k] * cosine,
+        column_i[..., j] * sine + column_j[..., j] * cosine,
+    )
+    return np.degrees(sign * np.stack([first, second, third], axis=-1)) + 0.0  # no -0
+
+
+@functools.cache
+def _sequence(order: str) -> tuple[int, int, int, int]:
+    """Indices of the axes of an order, and 1 where they are right-handed, else -1."""
+    i, j, k = ("XYZ".index(letter) for letter in order)
+    return i, j, k, 1 if (j - i) % 3 == 1 else -1
 
 
 def angle_between_deg(first: ArrayLike, second: ArrayLike) -> float:

@@ -113,6 +113,8 @@ class FaultInjector:
 
     def take(self, kind: str, axis: int | None = None) -> FaultSpec | None:
         """The active fault of a kind that hits this axis; uses one of its count."""
+        if not self._specs:
+            return None
         now = time.monotonic()
         with self._lock:
             for spec in self._specs:

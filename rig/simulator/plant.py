@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rig.config.config import RigConfig
 from rig.model import model_of
@@ -125,5 +124,5 @@ class Plant:
         attitude = euler_to_matrix([heading, 0.0, 0.0], "ZYX") @ turned @ self._mounting
         if self.truth.noise_deg:
             noise = self._rng.normal(0.0, self.truth.noise_deg, 3)
-            attitude = attitude @ Rotation.from_rotvec(noise, degrees=True).as_matrix()
+            attitude = attitude @ euler_to_matrix(noise, "XYZ")
         return attitude

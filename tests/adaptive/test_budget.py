@@ -50,7 +50,7 @@ def spent(of, episodes, number):
     and the number of measurements at its end."""
     seconds = float(episodes.begun.seconds[number])
     uses = int(episodes.begun.uses[number])
-    place, left = int(of.place), []
+    place, left, travel = int(of.place), [], np.asarray(of.travel)
     made = int(np.asarray(episodes.alive[number]).sum())
     assert np.asarray(episodes.alive[number])[:made].all()
     for a, y in zip(
@@ -58,7 +58,7 @@ def spent(of, episodes, number):
         np.asarray(episodes.outcomes[number])[:made].tolist(),
         strict=True,
     ):
-        seconds -= float(of.travel[place, a]) + 0.5 * y
+        seconds -= float(travel[place, a]) + 0.5 * y
         uses -= y
         place = a
         left.append((seconds, uses))
@@ -79,7 +79,7 @@ def test_no_decider_spends_more_than_there_is_and_each_goes_on_while_it_can(name
         assert min(seconds for seconds, _ in left) > -1e-3
         assert min(uses for _, uses in left) >= 0
         seconds, uses = left[-1]
-        cheapest = float(of.travel[place].min()) + 0.5
+        cheapest = float(np.asarray(of.travel)[place].min()) + 0.5
         assert uses == 0 or made == 12 or seconds < cheapest + 1e-3
 
 

@@ -30,9 +30,12 @@ def made(config, m=12, n=3, k=4, seed=0):
     network = build(config)
     params = networks.initial(network, jax.random.key(seed), m, n, k)
     # Every parameter away from its initial zero, so that nothing is hidden by one.
-    noisy = jax.tree.map(lambda leaf: leaf + 0.1 * jnp.cos(jnp.arange(leaf.size)
-                         .reshape(leaf.shape)), params)  # fmt: skip
-    return network, noisy
+
+    def noisy(leaf):
+        added = 0.1 * np.cos(np.arange(leaf.size, dtype=leaf.dtype))
+        return np.asarray(leaf) + added.reshape(leaf.shape)
+
+    return network, jax.tree.map(noisy, params)
 
 
 def score(network, params, points, chosen, k=4, usable=None):

@@ -84,10 +84,10 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
     )
 
 
-def test_updates_compile_once_and_change_every_weight(finished):
+def test_updates_compile_once_and_change_every_weight(finished, tmp_path):
     (learner,) = CONFIG.learners
     assert updates(CONFIG.ppo, learner, None, 16, 0)._cache_size() == 1
-    begun = CONFIG.learners[0].init(jax.random.split(jax.random.key(3))[0])
+    begun = training.train(CONFIG, tmp_path, num_updates=0).params
     moved = jax.tree.map(lambda a, b: (a != b).any(), begun, finished[1].params)
     # The value reads every part of the network, the policy all but the critic.
     assert all(jax.tree.leaves(moved))
@@ -333,7 +333,8 @@ def test_a_task_and_a_network_of_ones_own_are_in_the_checkpoint(tmp_path):
     task = Farthest(SelectionConfig(8, 3, 2, 2))
     network = dataclasses.replace(CONFIG.network, kind=Own)
     config = dataclasses.replace(CONFIG, tasks=(task,), network=network)
-    params = config.learners[0].init(jax.random.key(0))
+    shapes = jax.eval_shape(config.learners[0].init, jax.random.key(0))
+    params = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
     checkpoint.save(tmp_path, 1, params, config.as_meta())
     _, meta = checkpoint.read_meta(tmp_path)
     again = TrainConfig.from_meta(meta)
@@ -457,7 +458,8 @@ def test_learning_finds_the_papers_network_without_importing_the_paper():
 # The update that these flags compile is CONFIG's.
 SHORT = (
     "--episodes=384 --episodes-per-update=64 --episodes-per-set=4 --num-minibatches=2 "
-    "--warmup-updates=1 --width=8 --encoder-rounds=0 --num-candidates=8 --seed=3"
+    "--warmup-updates=1 --width=8 --encoder-rounds=0 --no-close-up "
+    "--num-candidates=8 --seed=3"
 ).split()
 SMALL = [*SHORT, "--num-inputs=2", "--num-outputs=2", "--num-selected=3"]
 

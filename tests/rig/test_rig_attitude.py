@@ -33,6 +33,22 @@ def test_a_chain_of_joints_reads_its_own_angles_in_its_order(order, rng):
             chain = chain @ elementary(letter, degrees)
         np.testing.assert_allclose(euler_to_matrix(angle, order), chain, atol=1e-12)
         np.testing.assert_allclose(matrix_to_euler(chain, order), angle, atol=1e-8)
+    np.testing.assert_array_equal(
+        euler_to_matrix(angles, order)[7], euler_to_matrix(angles[7], order)
+    )
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("middle", [90.0, -90.0, 90.0 - 1e-6])
+def test_angles_give_their_matrix_where_only_a_sum_of_two_is_determined(order, middle):
+    first, third = 25.0, -140.0
+    chain = (elementary(order[0], first) @ elementary(order[1], middle)
+             @ elementary(order[2], third))  # fmt: skip
+    read = matrix_to_euler(np.stack([chain, chain.T]), order)
+    np.testing.assert_allclose(
+        euler_to_matrix(read, order), [chain, chain.T], atol=1e-14
+    )
+    assert read[0, 1] == pytest.approx(middle, abs=1e-5)
 
 
 @pytest.mark.parametrize("order", ORDERS)

@@ -11,7 +11,7 @@ import harness
 import numpy as np
 import pytest
 from commission import device, quick_text, turns
-from harness import fast_config
+from harness import fast_config, no_figures
 
 from rig.__main__ import main
 from rig.config import load_config
@@ -37,7 +37,8 @@ def proved(at, capsys, **options):
             text = text.replace("leadshine_pr", options["config"].axes[0].map.name)
         (at / "rig.toml").write_text(text)
         commission(sim)
-        yield sim
+        with no_figures():
+            yield sim
 
 
 def commission(sim):
