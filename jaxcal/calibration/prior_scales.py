@@ -33,6 +33,7 @@ _LARGEST = 2.5  # of a factor, 12: beyond it an arm in sockets shrinks until all
 _FIRST = 1.6  # of a factor in a rough fit, 5: an arm that has shrunk stays so
 # Logarithms of misfit's factor.
 _TRIED = np.array([-5.0, -4.0, -3.0, -2.0, -1.2, -0.4, 0.4, 1.2])
+_ERRORS = np.exp(np.linspace(0.0, 6.0, 120))  # where their quantile is looked up
 _SCORES = 100  # steps of Fisher's scoring, at most
 
 
@@ -79,13 +80,10 @@ def group_scales(
     if start is None:  # of a rough fit, which begin the next
         return PriorScales(best, factors, groups, np.zeros((num_groups, num_groups)))
     steps = 1e-3 * np.eye(len(best))
-    curves = [
-        evidence.at(best + step).slope - evidence.at(best - step).slope
-        for step in steps
-    ]
+    curves = [evidence.at(best + step).slope - least.slope for step in steps]
     # Half the value's, in units of what was thought, which the readings only sharpen.
     wide = evidence.wide
-    curve = np.array(curves) / 4e-3 * np.outer(wide, wide)
+    curve = np.array(curves) / 2e-3 * np.outer(wide, wide)
     size, axes = np.linalg.eigh(curve)
     axes = wide[:, None] * axes
     inside = (axes / np.maximum(size, 1.0)) @ axes.T
@@ -265,14 +263,13 @@ def covariance_of_scales(
         inverse = np.linalg.inv(square + np.diag(scale**2 * precision * factor)) - none
         return inverse @ right, inverse
 
-    # The logarithm of a size has a long upper tail where few errors show it: its mean
-    # is above the most probable one, by its variance, less where the prior sets it.
     of_model = problem.model.error_groups()
     assert of_model is not None
     variance = np.diagonal(scales.covariance)
-    skew = variance * (1.0 - variance / _thought(of_model)[1][:-1] ** 2)
-    skew = np.where(of_model.medians < 1.0, 0.0, skew)  # of what may not be there
-    wider = np.sqrt(1.0 + 2.0 * skew)
+    there = of_model.medians >= 1.0  # else misfit, which may not be there
+    above, tailed = _moments(variance, _thought(of_model)[1][:-1])
+    skew = np.where(there, above, 0.0)
+    wider = np.sqrt(np.where(there, tailed / variance, 1.0))
     values, axes = np.linalg.eigh(wider[:, None] * scales.covariance * wider)
     nodes = np.sqrt(3.0 * np.maximum(values, 0.0)) * axes  # of Gauss and Hermite
     first, least = at(np.zeros(len(values)))
@@ -286,6 +283,36 @@ def covariance_of_scales(
     result = np.zeros((len(free), len(free)))
     result[np.ix_(free, free)] = scale[:, None] * spread * scale
     return result
+
+
+def _moments(variance: Array, wide: Array) -> tuple[Array, Array]:
+    """(G,) mean, above the most probable value, and variance of logarithms of sizes.
+
+    Where few errors show a size its logarithm has a long upper tail, which ends as what
+    was thought of it does. As many errors as make it so sharp have squares of a chi
+    squared distribution. The mean is such that 1.96 standard deviations of an error of
+    that size hold 95 % of them.
+
+    Args:
+        variance: (G,) one over the curvature of the density, at its top.
+        wide: (G,) a standard deviation of what was thought.
+    """
+    from scipy import special
+
+    logs = np.linspace(-3.0, 4.0, 141) * wide[:, None]
+    square = np.square(logs / wide[:, None])
+    freedom = np.maximum(1.0 / variance - wide**-2.0, 0.0)[:, None] / 2.0
+    density = np.exp(-freedom * (logs + 0.5 * np.exp(-2.0 * logs) - 0.5) - 0.5 * square)
+    density /= density.sum(axis=1, keepdims=True)
+    mean = (density * logs).sum(axis=1)
+    spread = (density * np.square(logs - mean[:, None])).sum(axis=1)
+    # Three nodes of Gauss and Hermite have this mean square.
+    square = (2.0 + np.cosh(2.0 * np.sqrt(3.0 * spread))) / 3.0
+    half = np.empty_like(mean)
+    for k, row in enumerate(density):
+        beyond = row @ special.ndtr(-_ERRORS * np.exp(-logs[k])[:, None])
+        half[k] = np.interp(-0.025, -beyond, _ERRORS)
+    return np.log(half / 1.96) - 0.5 * np.log(square), spread
 
 
 def _reduced(problem: FitProblem, solution: FitSolution) -> tuple[Array, Array]:

@@ -198,5 +198,5 @@ def test_intervals_hold_the_truth_and_predictions_err_as_stated(name, kind):
         most = 0.985 if size > 0.25 else 0.995  # small errors are mostly the prior's
         assert 0.92 - error < mean < most + error, (size, mean, error)
         # Contacts of a SCARA hardly show how large its errors are.
-        most = 3.5 if kind == "scara" and sensor.zeros else 2.0
+        most = 2.5 if kind == "scara" and sensor.zeros else 2.0
         assert 0.8 < ratio < most, (size, ratio)

@@ -10,6 +10,7 @@ import pytest
 
 import jaxcal
 from jaxcal import Prior
+from jaxcal.calibration.prior_scales import _moments
 from jaxcal.models import Affine, SerialChain
 
 from ..models.arms import ur5
@@ -71,6 +72,24 @@ def test_the_factors_maximise_the_marginal_likelihood():
     values = [density(here + step) for step in steps]
     # Twice round the fit moves little; no neighbour is better by more than rounding.
     assert density(here) <= min(values) + 0.05
+
+
+@pytest.mark.parametrize("seen", [0.1, 0.5, 1.0, 2.0, 10.0])
+def test_a_size_that_few_errors_show_is_as_wide_as_its_density(seen):
+    """Brute force: 95 % of an error of which ``seen`` others of its size are known."""
+    wide = np.log(6.0)
+    found = _moments(np.array([1.0 / (2.0 * seen + wide**-2.0)]), np.array([wide]))
+    mean, std = found[0][0], np.sqrt(found[1][0])
+    rng = np.random.default_rng(0)
+    size = np.exp(rng.normal(0.0, wide, 400_000))
+    weight = size**-seen * np.exp(-0.5 * seen / size**2)
+    error = np.abs(size * rng.normal(size=len(size)))
+    order = error.argsort()
+    share = weight[order].cumsum() / weight.sum()
+    quantile = error[order][share.searchsorted(0.95)]
+    at = np.exp(2.0 * (mean + np.sqrt(3.0) * std * np.array([-1.0, 0.0, 1.0])))
+    stated = 1.96 * np.sqrt(at @ [1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0])
+    assert stated == pytest.approx(quantile, rel=0.05)
 
 
 def test_wrong_tolerances_cost_little():
