@@ -33,7 +33,6 @@ __all__ = [
     "FitSolution",
     "singular",
     "solve",
-    "whiten",
 ]
 
 Array = NDArray[np.float64]
@@ -134,7 +133,7 @@ def solve(
     )
 
 
-def whiten(matrices: Array, rows: Array) -> Array:
+def _weighted(matrices: Array, rows: Array) -> Array:
     """(N, q, F) rows times matrices (N, q, q), or their diagonals (N, q)."""
     if matrices.ndim == 2:
         return matrices[..., None] * rows
@@ -142,7 +141,7 @@ def whiten(matrices: Array, rows: Array) -> Array:
 
 
 def _times(matrices: Array, vectors: Array) -> Array:
-    return whiten(matrices, vectors[..., None])[..., 0]
+    return _weighted(matrices, vectors[..., None])[..., 0]
 
 
 def apart(rows: Array) -> list[NDArray[np.intp]]:
@@ -300,7 +299,7 @@ class FitSolution:
 
     def whitened(self, rows: Array, theta: Array | None = None) -> Array:
         """(N, q, F) rows in noise of level 1, those of zeros by the machine's size."""
-        white = whiten(self.problem.white, rows)
+        white = _weighted(self.problem.white, rows)
         theta = self.parameters if theta is None else theta
         if self._grown is None or self._grown[0] is not theta:
             self._grown = theta, self.problem.growth(theta)
