@@ -215,6 +215,8 @@ def choose(
     I is the variance of what the views show beyond their own poses: those of other
     views are fitted too. It counts all views alike.
     """
+    if rule not in RULES:
+        raise ValueError(f"rule must be one of {', '.join(RULES)}, got {rule!r}")
     if rule == "random":
         return np.random.default_rng(seed).choice(len(views.seen), count, replace=False)
     if rule == "chosen (error left)":

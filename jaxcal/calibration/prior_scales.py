@@ -339,4 +339,9 @@ def _reduced(problem: FitProblem, solution: FitSolution) -> tuple[Array, Array]:
     if flat.shape[1]:
         flat = flat / (np.linalg.norm(flat, axis=0) + 1e-300)
         informed, right = without(flat, informed, right)
+    if not len(right):
+        raise ValueError(
+            f"measured holds {len(rows)} readings, all of which unknowns explain of "
+            f"which no prior says anything ({flat.shape[1]}): measure more"
+        )
     return informed, right

@@ -210,6 +210,9 @@ class RecordingOptions:
         "of a LeRobot dataset in -100 to 100, the arm's calibration file",
         "FILE",
     ] = None
+    in_degrees: Annotated[
+        bool, "the dataset is in degrees; --servos is what --servos-out corrects"
+    ] = False
 
     def table(self, path: str, arm: Any) -> CsvTable | None:
         """The rests of a recording as a table, degrees; None where it is a table.
@@ -220,14 +223,21 @@ class RecordingOptions:
         """
         recording = os.path.isdir(path) or path.lower().endswith((".mcap", ".db3"))
         if not recording:
-            if self.which is not None or self.topic:
-                raise ValueError("--which and --topic are of a recording, not a table")
+            if self.which is not None or self.topic or self.in_degrees:
+                raise ValueError(
+                    "--which, --topic and --in-degrees are of a recording, not a table"
+                )
             return None
         model = arm(self.which)
         if not isinstance(model, SerialChain):
             raise ValueError(f"{path}: a recording needs an arm, --model FILE.urdf")
         commands, read = model.recorded(
-            Recording(path, self.which, servos=self.servos, topic=self.topic)
+            Recording(
+                path,
+                self.which,
+                servos=None if self.in_degrees else self.servos,
+                topic=self.topic,
+            )
         )
         names = (*model.joint_names, *model.sensor.inputs)
         if read is None:

@@ -129,8 +129,8 @@ class SavedFiles:
         corrected = self.out if self.as_urdf else self.servos_out
         if corrected and not calibration.verdict.good and not self.unproven:
             raise ValueError(
-                f"{corrected} is not written, --unproven writes it all the same:\n"
-                f"{calibration.verdict}"
+                f"{corrected} is not written: the calibration is not good, as said "
+                "above; --unproven writes it all the same"
             )
         lines = []
         if self.as_urdf:

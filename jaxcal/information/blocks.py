@@ -182,7 +182,7 @@ def _times(rows: Array, matrix: Array) -> Array:
 
 def gram(rows: Array) -> Array:
     """``rows.T @ rows`` (..., p, p)."""
-    if rows[..., 0].size * rows.shape[-1] ** 2 <= _UNTHREADED:
+    if rows.size * rows.shape[-1] <= _UNTHREADED:
         return np.asarray(rows.mT @ rows)
     if rows.ndim == 2:  # each product symmetric, which takes half of the operations
         part = max(1, _UNTHREADED // rows.shape[1] ** 2)

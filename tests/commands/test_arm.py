@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import re
+from unittest import mock
 
 import numpy as np
 import pytest
 
+from jaxcal.commands.arms import RecordingOptions
 from jaxcal.commands.main import main
 from jaxcal.models import Board, Position, SerialChain, Servos, Socket, Wrench
 from jaxcal.selection import select
@@ -296,3 +298,14 @@ def test_zeros_are_written_for_lerobot_in_the_shell(files, capsys):
     assert Servos.load(new).motors["panda_joint1"] == motors["panda_joint1"]
     assert _run(files, *flags, "--out", str(folder / "a.urdf")) == 2
     assert "both would twice" in capsys.readouterr().err
+
+
+def test_a_dataset_in_degrees_keeps_its_servos_for_the_file_that_is_written(files):
+    options = dict(which=[0, 0, 1], servos="so101.json")
+    for in_degrees, read_by in ((False, "so101.json"), (True, None)):
+        arm = mock.create_autospec(SerialChain, instance=True)
+        arm.recorded.return_value = np.zeros((3, 8)), np.zeros((3, 3))
+        arm.joint_names, arm.sensor = tuple("abcdefg"), Socket(2)
+        given = RecordingOptions(**options, in_degrees=in_degrees)
+        given.table(str(files[2]), mock.Mock(return_value=arm))
+        assert arm.recorded.call_args.args[0].servos == read_by

@@ -584,3 +584,18 @@ def test_hands_that_are_tracked_from_elsewhere_keep_one_torso(robot, tmp_path):
     moved[second] = moved[second] + 2.0 / scale  # another tracker, 2 m away
     with pytest.raises(ValueError, match="counted from different frames"):
         robot.prepared(commands, moved)
+
+
+def test_an_arm_that_three_readings_leave_open_is_not_good_beside_another():
+    left, right = (ur5(joint_names=tuple(names)) for names in ("abcdef", "ghijkl"))
+    rng, tables = np.random.default_rng(0), {}
+    for name, arm, count in (("left", left, 3), ("right", right, 20)):
+        joints = rng.uniform(-120.0, 120.0, (count, 6))
+        zeros = np.char.startswith(arm.names, "theta")
+        truth = arm.nominal + 0.3 * zeros * rng.normal(size=len(zeros))
+        noise = 0.05 * rng.normal(size=(count, 3))
+        tables[name] = joints, arm.predict(joints, truth) + noise
+    model = Chains.of({"left": left, "right": right})
+    verdict = jaxcal.identify(*model.together(tables), model=model).verdict
+    assert verdict.of_chains["right"].good and not verdict.good
+    assert "left: so few readings leave the arm open" in str(verdict)

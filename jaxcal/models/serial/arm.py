@@ -24,6 +24,7 @@ Load = tuple[int, float, tuple[float, float, float]]  # link from 1, weight, its
 # row of the table; the tool's three shifts, nominal rotation, three turns. A step is
 # 0, 1, 2, a shift along x, y, z, or 3, 4, 5, a turn about it, or 6 and on, a constant.
 _BASE, _ROW, _TOOL = (0, 1, 2, 3, 4, 5, 6), (0, 3, 2, 5, 4), (0, 1, 2, 7, 3, 4, 5)
+_STILL = 0.02  # of the arm's length: the way of a slide that shows no size
 _MANY = 2_000  # postures: what is found of so many is not kept
 # Where a, alpha, d, theta and beta act among the five steps of a row.
 _ORDER = {"standard": (2, 3, 1, 0, 4), "modified": (0, 1, 4, 3, 2)}
@@ -335,13 +336,13 @@ class Arm:
 
     def _grows(self, commands: Array) -> bool:
         """Whether some of what it reads is zero, and grows with the arm."""
-        if not self._touches or self._revolute.all():
-            return self._touches
-        slides = commands[:, self._slides]
-        return bool((slides == slides[:1]).all())
+        if not self.touches or self._revolute.all():
+            return self.touches
+        ways = np.ptp(commands[:, self._slides], axis=0)
+        return bool((ways < _STILL * self.length).all())
 
     @functools.cached_property
-    def _touches(self) -> bool:
+    def touches(self) -> bool:
         return any(one.zeros and one.lengths for one in self.sensor.members)
 
     @functools.cached_property

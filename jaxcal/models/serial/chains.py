@@ -309,6 +309,10 @@ class Chains(Model):
             off[..., rows, :q] = arm.wrapped(its, arm_commands) / scale
         return off
 
+    @functools.cached_property
+    def touches(self) -> bool:
+        return any(arm.touches for arm in self.chains)
+
     def log_size(self, commands: Array, parameters: Array) -> Array | None:
         sizes, grow = np.zeros(len(commands)), False
         for k, arm, rows, arm_commands in self._parts(commands):
@@ -680,7 +684,9 @@ class Chains(Model):
         from jaxcal.models.serial.verdict import CLEAR_UP, other_distances
 
         read = {
-            self.tips[k] for k, _, rows, _ in self._parts(fit.commands) if rows.size
+            self.tips[k]
+            for k, _, rows, _ in self._parts(fit.commands)
+            if (fit.loss_weights[rows] > 0.0).any()
         }
         of_chains = {tip: fit.of(tip).verdict for tip in self.tips if tip in read}
         bad = [tip for tip, told in of_chains.items() if not told.good]

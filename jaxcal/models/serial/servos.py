@@ -93,7 +93,8 @@ class Servos:
         if most > 100.0 + 1e-3:
             raise ValueError(
                 "values must be in -100 to 100 of each motor's range where servos are "
-                f"given, got {most:g}: leave out servos= where they are degrees"
+                f"given, got {most:g}: where they are degrees leave out servos=, or "
+                "give --in-degrees"
             )
         spans = [self._motor(name) for name in names]
         half = [0.5 * (m["range_max"] - m["range_min"]) for m in spans]

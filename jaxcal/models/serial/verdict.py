@@ -40,7 +40,7 @@ _ALONE = 1e-4  # of what is known of a distance: nothing but that it was given
 _SHORT = 5e-4  # of the arm's length: what no parameter explains moves distances by less
 _WRONG = 1e-3  # of the arm's length: a distance further off was measured wrongly
 _STILL = 8  # measurements in which a joint that is used has moved
-_VAGUE = 3.0  # times the nominal error: contacts leave the arm's size open
+_VAGUE = 3.0  # times the nominal error: the readings leave the arm open
 _TIP = 0.004  # of the arm's length: tools are built nearer to their description
 _LINK = 0.02  # of the arm's length: without a distance an arm shrinks to fit contacts
 _ZERO = 10.0  # degrees: no zero of a joint is set so badly
@@ -288,14 +288,22 @@ def _of_no_size(
     anywhere: float,
     nominal: float,
 ) -> _Findings:
-    """The findings, and that contacts leave the arm's size open, where they do.
+    """The findings, and that the readings leave the arm open, where they do.
 
-    An arm a tenth smaller, its sockets nearer together, touches them as well.
+    Of contacts the size: an arm a tenth smaller, its sockets nearer together, touches
+    them as well.
     """
     sockets = [part for part in parts if isinstance(part.sensor, Socket)]
-    sized = not sockets or any(part.touched().any() for part in sockets)
+    sized = any(part.touched().any() for part in sockets)
     if findings.mistaken or sized or not anywhere > _VAGUE * nominal:
         return findings
+    if not sockets:
+        reason = (
+            f"so few readings leave the arm open: elsewhere its tip is known to "
+            f"{anywhere:.3g}{unit}, the nominal one is {nominal:.3g} off here. Measure "
+            "more postures of it"
+        )
+        return findings._replace(reasons=(*findings.reasons, reason), doubtful=True)
     reason = (
         f"contacts without a known distance leave the arm's size open: elsewhere its "
         f"tip is known to {anywhere:.3g}{unit}, the nominal one is {nominal:.3g} off "
