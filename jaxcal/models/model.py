@@ -177,15 +177,6 @@ class Model(abc.ABC):
         """The scales that ``Prior.sized()`` takes from the readings; None without."""
         return None
 
-    @property
-    def touches(self) -> bool:
-        """Whether contacts are read, alone or beside others.
-
-        They miss alike in every direction, so outputs share one level of noise: with
-        one for each, a wrong distance of two sockets is noise along it.
-        """
-        return False
-
     def log_size(self, commands: Array, parameters: Array) -> Array | None:
         """Logarithm (N,) of what readings grow with that are zero, or near it.
 

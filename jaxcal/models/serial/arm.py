@@ -336,13 +336,13 @@ class Arm:
 
     def _grows(self, commands: Array) -> bool:
         """Whether some of what it reads is zero, and grows with the arm."""
-        if not self.touches or self._revolute.all():
-            return self.touches
+        if not self._touches or self._revolute.all():
+            return self._touches
         ways = np.ptp(commands[:, self._slides], axis=0)
         return bool((ways < _STILL * self.length).all())
 
     @functools.cached_property
-    def touches(self) -> bool:
+    def _touches(self) -> bool:
         return any(one.zeros and one.lengths for one in self.sensor.members)
 
     @functools.cached_property

@@ -309,10 +309,6 @@ class Chains(Model):
             off[..., rows, :q] = arm.wrapped(its, arm_commands) / scale
         return off
 
-    @functools.cached_property
-    def touches(self) -> bool:
-        return any(arm.touches for arm in self.chains)
-
     def log_size(self, commands: Array, parameters: Array) -> Array | None:
         sizes, grow = np.zeros(len(commands)), False
         for k, arm, rows, arm_commands in self._parts(commands):
