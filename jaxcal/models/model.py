@@ -263,7 +263,7 @@ class Model(abc.ABC):
     def blocks(self, commands: ArrayLike) -> Array:
         """(..., N, 1, r) information of each output by itself, with unit noise."""
         # No caller asks where multiplicity is 0; a model that has one overrides this.
-        raise NotImplementedError("the outputs of this model share no regressor")
+        raise NotImplementedError("the outputs share no regressor")  # multiplicity 0
 
     def affine(self, parameters: Array) -> tuple[Array, Array] | None:
         """A (m, n) and b (m,) of a model ``y = A u + b``; None for any other."""

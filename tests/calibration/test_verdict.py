@@ -19,7 +19,7 @@ import jaxcal
 from jaxcal.commands.main import main
 from jaxcal.models import Chains, Gravity, Prior, Several, Socket
 from jaxcal.models.serial.mistaken import mistaken_columns
-from jaxcal.models.serial.verdict import _Findings, _of_no_size, _parts
+from jaxcal.models.serial.verdict import _Findings, _left_open, _parts
 
 from ..models.arms import ur5, ur5_data
 
@@ -377,7 +377,7 @@ def test_a_distance_between_sockets_that_are_not_touched_is_no_size():
         )
         parts = _parts(fit, np.flatnonzero(weights))
         none = _Findings((), False, False, "", (), False)
-        said = _of_no_size(none, parts, " mm", anywhere=10.0, nominal=1.0)
+        said = _left_open(none, parts, " mm", anywhere=10.0, nominal=1.0)
         assert said.doubtful == doubtful
 
 

@@ -127,7 +127,7 @@ def verdict(calibration: Fit) -> ArmVerdict:
     findings = _findings(calibration, used, parts, scatter, explains, mistaken)
     at, anywhere = _anywhere(calibration, model, parts)
     nominal = errors.of_parts[at]
-    findings = _of_no_size(findings, parts, _in(calibration), anywhere, nominal)
+    findings = _left_open(findings, parts, _in(calibration), anywhere, nominal)
     clean = not (findings.doubtful or (findings.moved and not explains))
     accuracy = calibration.provenance.get("accuracy")
     if accuracy is not None:
@@ -281,7 +281,7 @@ def _usual_noise(calibration: Fit) -> str:
     return ",".join(f"{std:.2g}" for std in usual)
 
 
-def _of_no_size(
+def _left_open(
     findings: _Findings,
     parts: list[Part],
     unit: str,
