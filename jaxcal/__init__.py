@@ -11,7 +11,7 @@ import importlib
 import pathlib
 from typing import TYPE_CHECKING, Any
 
-from jaxcal import compiled
+from jaxcal import compiled, moved
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
@@ -57,6 +57,7 @@ __all__ = [
 
 __version__ = "0.2.0"
 
+moved.install_finder()
 _PACKAGE = pathlib.Path(__file__).parent
 if (_PACKAGE.parent / "pyproject.toml").exists():
     compiled.check(_PACKAGE)
@@ -80,7 +81,7 @@ _HOME = {
 }
 
 
-_ROOMS = ("adaptive", "calibration", "candidates", "learning", "models", "selection")
+_ROOMS = ("adaptive", "arms", "calibration", "candidates", "learning", "models", "selection")
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Optional dependencies: one message where an extra is not installed."""
+"""What is installed: extras, what other packages offer, versions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import sys
 import urllib.parse
 from collections.abc import Iterator
 
-__all__ = ["MissingExtraError", "install", "needs", "typed", "versions"]
+__all__ = ["MissingExtraError", "install", "installed", "needs", "typed", "versions"]
 
 _COMPUTE = ("jaxcal", "numpy", "scipy", "jax", "jaxlib", "flax", "optax")
 
@@ -92,6 +92,11 @@ def _as_typed(path: pathlib.Path) -> str:
     with contextlib.suppress(OSError, ValueError):
         return os.fspath(path.relative_to(pathlib.Path.cwd()))
     return os.fspath(path)
+
+
+def installed(group: str) -> dict[str, importlib.metadata.EntryPoint]:
+    """What installed packages offer under an entry-point group, by name."""
+    return {p.name: p for p in importlib.metadata.entry_points(group=group)}
 
 
 def versions() -> dict[str, str]:

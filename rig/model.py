@@ -93,8 +93,8 @@ def model_of(config: RigConfig) -> DeviceModel | None:
 
 
 def _arm(config: RigConfig) -> DeviceModel:
-    from jaxcal.models.sensors import Gravity, Position
-    from jaxcal.models.serial import SerialChain
+    from jaxcal.arms import SerialChain
+    from jaxcal.arms.sensors import Gravity, Position
     from jaxcal.models.uncertainty import Prior
 
     assert config.model is not None and config.model_path is not None
@@ -129,7 +129,7 @@ def _in_small_letters(names: Sequence[str]) -> list[str]:
 
 def joint_names(urdf: str) -> list[str]:
     """Names of the axes of an arm, from the base outwards; ValueError, OSError."""
-    from jaxcal.models.serial import SerialChain
+    from jaxcal.arms import SerialChain
 
     return _in_small_letters(SerialChain.from_urdf(urdf).joint_names)
 

@@ -8,8 +8,8 @@ ROOT = pathlib.Path(__file__).parents[2]
 # The first that a file lies in counts.
 ROOMS = {
     "arms": (
-        "jaxcal/models/serial",
-        "jaxcal/models/sensors",
+        "jaxcal/arms",
+        "jaxcal/arms/sensors",
         "jaxcal/commands/arms.py",
         "jaxcal/commands/postures.py",
     ),

@@ -104,7 +104,7 @@ class Calibration(Fit):
         """Whether the calibration may be used, why not, and what to do next.
 
         Printed, it is these lines; of an arm with held-out errors
-        (``jaxcal.models.serial.verdict.ArmVerdict``). The summary, ``report``, exit
+        (``jaxcal.arms.verdict.ArmVerdict``). The summary, ``report``, exit
         codes and the warning of ``identify`` say this.
         """
         return self.model.verdict(self)

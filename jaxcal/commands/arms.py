@@ -9,17 +9,20 @@ import os
 import pathlib
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arguments import several
+from jaxcal.checks import one_of
 from jaxcal.csvtable import COMMANDS, CsvTable
-from jaxcal.models import Model, Recording, SerialChain, from_dict
+from jaxcal.models import Model, Recording, from_dict
 from jaxcal.models.linear import input_letters
 from jaxcal.models.model import as_model
-from jaxcal.models.sensors import SENSORS, Landmarks, Sensor, Socket
+
+if TYPE_CHECKING:
+    from jaxcal.arms import Sensor, SerialChain
 
 __all__ = ["ArmOptions", "ModelPath", "RecordingOptions", "in_degrees"]
 
@@ -32,9 +35,6 @@ ModelPath = Annotated[
     "FILE",
 ]
 
-_KINDS = [kind for kind in SENSORS if kind != "several"]
-
-
 def _of_joint(text: str) -> list[Any]:
     name, _, values = text.rpartition("=")
     return [name, several(float, "numbers")(values)]
@@ -44,9 +44,12 @@ def _of_joint(text: str) -> list[Any]:
 class ArmOptions:
     """Links of an arm in a URDF file, its sensor, the unit of its columns."""
 
-    sensor: Annotated[str, "of an arm, what its tip is measured with", _KINDS] = (
-        "position"
-    )
+    sensor: Annotated[
+        str,
+        "of an arm, what its tip is measured with: position, pose, socket, plane, "
+        "distance, gravity, wrench or board",
+        "KIND",
+    ] = "position"
     base: Annotated[str | None, "of an arm, the link that stands still", "LINK"] = None
     tip: Annotated[list[str] | None, "of an arm, the link that is measured", "LINK"] = (
         None
@@ -72,6 +75,8 @@ class ArmOptions:
         self, path: str, table: CsvTable | None, places: Any = None
     ) -> SerialChain:
         """The arm in this file; things that it touches are given or in the table."""
+        from jaxcal.arms import SerialChain
+
         tips = ",".join(self.tip or ())
         if "," in tips:
             raise ValueError(
@@ -95,7 +100,10 @@ class ArmOptions:
 
     def _sensor(self, table: CsvTable | None, places: Any) -> Sensor:
         """The sensor, with as many landmarks as are given or in the table."""
-        kind = SENSORS[self.sensor]
+        from jaxcal.arms.sensors import SENSORS, Landmarks, Socket
+
+        kinds = {name: kind for name, kind in SENSORS.items() if name != "several"}
+        kind = kinds[one_of("--sensor", self.sensor, tuple(kinds))]
         landmarks: dict[str, Any] = {}
         if issubclass(kind, Landmarks):
             if places is not None:
@@ -228,6 +236,8 @@ class RecordingOptions:
                     "--which, --topic and --in-degrees are of a recording, not a table"
                 )
             return None
+        from jaxcal.arms import SerialChain
+
         model = arm(self.which)
         if not isinstance(model, SerialChain):
             raise ValueError(f"{path}: a recording needs an arm, --model FILE.urdf")

@@ -26,7 +26,6 @@ from jaxcal.commands.tables import (
     write_rows,
 )
 from jaxcal.csvtable import COMMANDS, MEASURED, CsvTable, read_table
-from jaxcal.models import SerialChain
 
 __all__ = ["check", "command", "identify", "predict"]
 
@@ -218,6 +217,8 @@ def _noise(machine: Any, stds: list[float] | None, play: float | None) -> Any:
     std = stds[0] if stds and len(stds) == 1 else stds
     if play is None:
         return {"noise": None, "noise_std": std}
+    from jaxcal.arms import SerialChain
+
     if not isinstance(machine, SerialChain):
         raise ValueError("--play is of an arm, --model FILE.urdf")
     noise = machine.noise_with_play(play)
@@ -399,6 +400,8 @@ def _commands_for(
 
 def _in_degrees(calibration: Calibration, commands: Array) -> Array:
     """Commands (N, n) of an arm whose joint columns are in radians."""
+    from jaxcal.arms import SerialChain
+
     if not isinstance(calibration.model, SerialChain):
         raise ValueError("--radians is of arms")
     return in_degrees(calibration.model, commands)

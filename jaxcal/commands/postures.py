@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arguments import several
+from jaxcal.arms import SerialChain
+from jaxcal.arms.sensors import SENSORS, Board, Landmarks
 from jaxcal.checks import aligned
 from jaxcal.commands.arms import ArmOptions
 from jaxcal.commands.tables import Output
 from jaxcal.csvtable import COMMANDS, read_table
 from jaxcal.extras import needs
-from jaxcal.models import SerialChain
-from jaxcal.models.sensors import SENSORS, Board, Landmarks
 from jaxcal.selection import Design
 
 __all__ = ["postures"]

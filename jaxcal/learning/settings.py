@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import importlib.metadata
 import importlib.util
 import sys
 import typing
@@ -13,7 +12,6 @@ from typing import Any, NamedTuple
 
 __all__ = [
     "Setting",
-    "installed",
     "named",
     "path_of",
     "require",
@@ -86,8 +84,3 @@ def named(path: str) -> Any:
         raise ValueError(
             f"{path} must be MODULE:NAME or FILE.py:NAME that is there: {error}"
         ) from error
-
-
-def installed(group: str) -> dict[str, importlib.metadata.EntryPoint]:
-    """What installed packages offer under an entry-point group, by name."""
-    return {p.name: p for p in importlib.metadata.entry_points(group=group)}

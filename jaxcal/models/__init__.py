@@ -1,60 +1,56 @@
-"""What a machine does with a command: ``y = f(u; theta)``, its names and derivative."""
+"""What a machine does with a command: ``y = f(u; theta)``, its names and derivative.
+
+Arms and their sensors are ``jaxcal.arms``; their names are here too, and load it.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 from jaxcal.models.affine import Affine
-from jaxcal.models.differences import Differences
 from jaxcal.models.from_dict import from_dict
-from jaxcal.models.from_jax import FromJax
-from jaxcal.models.function import FromFunction
 from jaxcal.models.identifiability import Direction, Identifiability, identifiability
 from jaxcal.models.linear import Linear, Polynomial
 from jaxcal.models.model import Model
 from jaxcal.models.recording import Recording
-from jaxcal.models.sensors import (
-    Board,
-    Distance,
-    Gravity,
-    Plane,
-    Pose,
-    Position,
-    Reading,
-    Sensor,
-    Several,
-    Socket,
-    Tip,
-    Wrench,
-)
-from jaxcal.models.serial import Chains, SerialChain, Servos
 from jaxcal.models.uncertainty import Noise, Prior, ResolvedPrior
+
+if TYPE_CHECKING:
+    from jaxcal.models.differences import Differences
+    from jaxcal.models.from_jax import FromJax
+    from jaxcal.models.function import FromFunction
 
 __all__ = [
     "Affine",
-    "Board",
-    "Chains",
     "Differences",
     "Direction",
-    "Distance",
     "FromFunction",
     "FromJax",
-    "Gravity",
     "Identifiability",
     "Linear",
     "Model",
     "Noise",
-    "Plane",
     "Polynomial",
-    "Pose",
-    "Position",
     "Prior",
-    "Reading",
     "Recording",
     "ResolvedPrior",
-    "Sensor",
-    "SerialChain",
-    "Servos",
-    "Several",
-    "Socket",
-    "Tip",
-    "Wrench",
     "from_dict",
     "identifiability",
 ]
+
+_HOME = {
+    "Differences": "jaxcal.models.differences",
+    "FromFunction": "jaxcal.models.function",
+    "FromJax": "jaxcal.models.from_jax",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name.startswith("__"):  # asked of every module, as by inspect
+        raise AttributeError(name)
+    home = importlib.import_module(_HOME.get(name, "jaxcal.arms"))
+    if name not in home.__all__:
+        raise AttributeError(f"module 'jaxcal.models' has no attribute {name!r}")
+    globals()[name] = value = getattr(home, name)
+    return value

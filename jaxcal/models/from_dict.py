@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, cast
 
 from jaxcal.checks import one_of
+from jaxcal.extras import installed
 from jaxcal.models.affine import Affine
-from jaxcal.models.from_jax import FromJax
-from jaxcal.models.function import FromFunction
 from jaxcal.models.linear import Linear, Polynomial
 from jaxcal.models.model import Model
-from jaxcal.models.serial import Chains, SerialChain
 
 __all__ = ["from_dict"]
 
+_GROUP = "jaxcal.models"  # entry points by which others, as jaxcal.arms, add kinds
 # What makes a model of each kind; its arguments are the keys of the file.
 _KINDS: dict[str, Callable[..., Model]] = {
     "affine": Affine,
-    "chains": Chains.from_dict,
-    "function": FromFunction,
-    "jax": FromJax,
     "linear": Linear,
     "polynomial": Polynomial,
-    "serial_chain": SerialChain.from_dh,
 }
+_UNWRITTEN = ("function", "jax")  # kinds that hold a function
 
 
 def from_dict(data: Mapping[str, Any]) -> Model:
@@ -37,16 +33,20 @@ def from_dict(data: Mapping[str, Any]) -> Model:
     if not isinstance(data, Mapping):
         raise ValueError(f"a model must be a JSON object with a kind, got {data!r}")
     fields = dict(data)
-    kind = one_of("kind of the model", fields.pop("kind", None), tuple(_KINDS))
-    if kind in ("jax", "function") or fields.get("features", "") is None:
+    kind = fields.pop("kind", None)
+    own = (*_KINDS, *_UNWRITTEN)
+    others = {} if kind in own else installed(_GROUP)
+    kind = one_of("kind of the model", kind, (*own, *others))
+    if kind in _UNWRITTEN or fields.get("features", "") is None:
         raise ValueError(
             "the model holds a function, which a file cannot: give the model itself, "
             "model=..."
         )
     if kind == "linear":  # a formula names its own
         fields.pop("terms", None)
+    make = others[kind].load() if kind in others else _KINDS[kind]
     try:
-        return _KINDS[kind](**fields)
+        return cast("Model", make(**fields))
     except TypeError as error:
         raise ValueError(
             f"a model of kind {kind} must hold values as to_dict writes them: {error}"

@@ -8,8 +8,8 @@ import pytest
 from scipy import stats
 
 import jaxcal
+from jaxcal.arms.sensors import Socket
 from jaxcal.models import SerialChain
-from jaxcal.models.sensors import Socket
 
 from ..models.arms import ur5
 

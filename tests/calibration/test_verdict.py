@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 import jaxcal
+from jaxcal.arms.mistaken import mistaken_columns
+from jaxcal.arms.verdict import _Findings, _left_open, _parts
 from jaxcal.commands.main import main
 from jaxcal.models import Chains, Gravity, Prior, Several, Socket
-from jaxcal.models.serial.mistaken import mistaken_columns
-from jaxcal.models.serial.verdict import _Findings, _left_open, _parts
 
 from ..models.arms import ur5, ur5_data
 

@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxcal
+from jaxcal.arms.files.urdf import joints_of
 from jaxcal.models import (
     Board,
     Chains,
@@ -24,7 +25,6 @@ from jaxcal.models import (
     Socket,
     from_dict,
 )
-from jaxcal.models.serial.urdf import joints_of
 
 from .arms import differences, ur5
 

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxcal
+from jaxcal.arms.files.recordings import rests, rests_of
 from jaxcal.models import (
     Board,
     Distance,
@@ -19,7 +20,6 @@ from jaxcal.models import (
     Socket,
     Wrench,
 )
-from jaxcal.models.serial.recordings import rests, rests_of
 
 from .arms import CONTACTS
 

@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxcal
+from jaxcal.arms.sensors import SENSORS, Reading
 from jaxcal.models import (
     Board,
     Distance,
@@ -26,7 +27,6 @@ from jaxcal.models import (
     from_dict,
     identifiability,
 )
-from jaxcal.models.sensors import SENSORS, Reading
 
 from .arms import CONTACTS, UR5_TABLE, differences, ur5
 from .test_serial_chain import _matrix, tool_frame

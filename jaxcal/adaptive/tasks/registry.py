@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from jaxcal.adaptive.rules import Priced, StateRule
-from jaxcal.learning.settings import installed
+from jaxcal.extras import installed
 
 __all__ = ["FREE", "Entry", "load", "names", "options_from"]
 

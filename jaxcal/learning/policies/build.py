@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from jaxcal.extras import installed
 from jaxcal.learning.core.network import Network
 from jaxcal.learning.policies.compact import CompactNetwork
 from jaxcal.learning.policies.criterion import CriterionNetwork
 from jaxcal.learning.policies.networks import GROUP, NetworkConfig
-from jaxcal.learning.settings import installed, named
+from jaxcal.learning.settings import named
 
 __all__ = ["build"]
 

@@ -14,8 +14,9 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from jaxcal.extras import installed
 from jaxcal.learning.config import CRITERIA
-from jaxcal.learning.settings import installed, path_of, require, setting
+from jaxcal.learning.settings import path_of, require, setting
 
 __all__ = ["GROUP", "NetworkConfig"]
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from jaxcal.extras import installed
 from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.environments.scenarios import SHAPES
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.settings import installed, settings_of
+from jaxcal.learning.settings import settings_of
 from jaxcal.learning.training.config import TrainConfig
 
 __all__ = ["PARTS", "field_names", "load", "names", "with_values"]

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.arms.files.servos import Servos
 from jaxcal.checks import in_words
 from jaxcal.extras import needs
 from jaxcal.models.recording import Recording
-from jaxcal.models.serial.servos import Servos
 
 __all__ = ["Rests", "jitter", "rests", "rests_of"]
 

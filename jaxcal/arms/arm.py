@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.arms.chain_kernel import forward
+from jaxcal.arms.sensors import Reading, Sensor, Tip
 from jaxcal.checks import array_of, numbers
 from jaxcal.models.model import as_commands
-from jaxcal.models.sensors import Reading, Sensor, Tip
-from jaxcal.models.serial.kernel import forward
 
 __all__ = ["Arm", "Load"]
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.arms.mistaken import mistaken_columns
+from jaxcal.arms.sensors import Board, Pose, Position, Sensor, Socket
 from jaxcal.checks import in_words
-from jaxcal.models.sensors import Board, Pose, Position, Sensor, Socket
-from jaxcal.models.serial.mistaken import mistaken_columns
 
 __all__ = [
     "require_readings",

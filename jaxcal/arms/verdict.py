@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.arms.mistaken import mistaken_columns
+from jaxcal.arms.sensors import Landmarks, Pose, Position, Sensor, Socket
+from jaxcal.arms.sensors.sensor import hats
 from jaxcal.information.singular import depends, significant
 from jaxcal.models import verdict as models
-from jaxcal.models.sensors import Landmarks, Pose, Position, Sensor, Socket
-from jaxcal.models.sensors.sensor import hats
-from jaxcal.models.serial.mistaken import mistaken_columns
 from jaxcal.models.verdict import UNLIKELY, left_out, outlying
 
 __all__ = ["CLEAR_UP", "ArmVerdict", "Part", "other_distances", "verdict"]

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.arms.sensors import Board, Landmarks, Plane, Several, Socket
 from jaxcal.checks import array_of, in_words, numbers, whole_number
-from jaxcal.models.sensors import Board, Landmarks, Plane, Several, Socket
 
 __all__ = ["ReachableSet", "Room", "View", "in_turn", "postures", "view_and_room"]
 

@@ -9,8 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import array_of, table
-from jaxcal.models.sensors.sensor import (
+from jaxcal.arms.sensors.sensor import (
     HasNames,
     Reading,
     Readings,
@@ -20,6 +19,7 @@ from jaxcal.models.sensors.sensor import (
     label,
     turns,
 )
+from jaxcal.checks import array_of, table
 
 __all__ = ["Several"]
 
@@ -244,7 +244,7 @@ class Several(Sensor):
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Self:
-        from jaxcal.models.sensors import SENSORS  # which names this class
+        from jaxcal.arms.sensors import SENSORS  # which names this class
 
         sensors = [SENSORS[one["kind"]].from_dict(one) for one in content["sensors"]]
         return cls(tuple(sensors), content["mounts"])

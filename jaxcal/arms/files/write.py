@@ -17,9 +17,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.checks import one_of
-from jaxcal.files import atomic_write
-from jaxcal.models.serial.urdf import (
+from jaxcal.arms.files.urdf import (
     Joint,
     joints_of,
     led,
@@ -30,9 +28,11 @@ from jaxcal.models.serial.urdf import (
     turn_of_z,
     walk,
 )
+from jaxcal.checks import one_of
+from jaxcal.files import atomic_write
 
 if TYPE_CHECKING:
-    from jaxcal.models.serial.arm import Arm
+    from jaxcal.arms.arm import Arm
 
 __all__ = ["save", "urdf_text", "written"]
 

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.models.sensors.sensor import Reading, Sensor, Tip, hats
+from jaxcal.arms.sensors.sensor import Reading, Sensor, Tip, hats
 
 __all__ = ["Pose", "rotation_vector_rate"]
 

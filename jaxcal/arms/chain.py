@@ -12,11 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import array_of, axis_names, in_words, numbers, one_of
-from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
-from jaxcal.models.recording import Recording
-from jaxcal.models.sensors import Board, Pose, Position, Sensor, Several
-from jaxcal.models.serial.arguments import (
+from jaxcal.arms.arguments import (
     joint_kinds,
     joint_numbers,
     limits_of,
@@ -26,7 +22,11 @@ from jaxcal.models.serial.arguments import (
     sensor_of,
     transform,
 )
-from jaxcal.models.serial.arm import Arm
+from jaxcal.arms.arm import Arm
+from jaxcal.arms.sensors import Board, Pose, Position, Sensor, Several
+from jaxcal.checks import array_of, axis_names, in_words, numbers, one_of
+from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
+from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["SerialChain"]
@@ -202,7 +202,7 @@ class SerialChain(Arm, Model):
                 ``from_dh``.
         """
         # scipy.spatial and the XML parser take half a second to load.
-        from jaxcal.models.serial.urdf import read_urdf
+        from jaxcal.arms.files.urdf import read_urdf
 
         arm = read_urdf(path, tip, base, locked or {})
         for name, ends in (limits or {}).items():
@@ -302,7 +302,7 @@ class SerialChain(Arm, Model):
             ValueError: there are not so many, or a socket is reached by none; the
                 message says what became of the rest.
         """
-        from jaxcal.models.serial.postures import postures, view_and_room
+        from jaxcal.arms.postures import postures, view_and_room
 
         rules = view_and_room(
             self._camera(camera), distance, tilt, side, floor, approach, clear, radius
@@ -328,7 +328,7 @@ class SerialChain(Arm, Model):
         Arguments as of ``postures``. Commands that a search tries are moved to where
         the sensor reads: the ball into its socket, the board as the camera sees it.
         """
-        from jaxcal.models.serial.postures import ReachableSet, view_and_room
+        from jaxcal.arms.postures import ReachableSet, view_and_room
 
         rules = view_and_room(
             self._camera(camera), distance, tilt, side, floor, approach, clear, radius
@@ -393,7 +393,7 @@ class SerialChain(Arm, Model):
             ValueError: readings in another unit, of another arm or place, radians for
                 degrees, joints beyond their limits.
         """
-        from jaxcal.models.serial.plausible import require_touched
+        from jaxcal.arms.plausible import require_touched
 
         self.require_readings(commands, measured)
         arm = self.located(commands, measured)
@@ -406,7 +406,7 @@ class SerialChain(Arm, Model):
 
     def require_readings(self, commands: Array, measured: Array | None) -> None:
         """Refuse what no arm like this one takes or gives; None, candidates."""
-        from jaxcal.models.serial.plausible import require_readings, warn_of_radians
+        from jaxcal.arms.plausible import require_readings, warn_of_radians
 
         if measured is None:
             self.require_commands(commands)
@@ -418,7 +418,7 @@ class SerialChain(Arm, Model):
 
     def require_places(self, commands: Array, measured: Array | None) -> None:
         """Refuse contacts of other places; warn of views without the board."""
-        from jaxcal.models.serial.plausible import require_sockets, warn_of_picture
+        from jaxcal.arms.plausible import require_sockets, warn_of_picture
 
         if measured is None:
             warn_of_picture(self, commands)
@@ -458,7 +458,7 @@ class SerialChain(Arm, Model):
         return self._rests(recording).joints
 
     def _rests(self, recording: Recording, kind: str = "") -> Any:
-        from jaxcal.models.serial.recordings import rests_of
+        from jaxcal.arms.files.recordings import rests_of
 
         turning = np.array(self.command_units) == "deg"
         return rests_of(recording, self.joint_names, turning, kind)
@@ -531,7 +531,7 @@ class SerialChain(Arm, Model):
         Returns:
             Steps by which the middle of each motor's range moved.
         """
-        from jaxcal.models.serial.servos import Servos
+        from jaxcal.arms.files.servos import Servos
 
         theta = as_parameters(self, parameters)
         rows = (theta - self.nominal)[: self.table.size].reshape(self.table.shape)
@@ -550,7 +550,7 @@ class SerialChain(Arm, Model):
 
     def in_turn(self, commands: ArrayLike) -> NDArray[np.int64]:
         """(N,) the commands' rows in an order of little travel, socket after socket."""
-        from jaxcal.models.serial.postures import in_turn
+        from jaxcal.arms.postures import in_turn
 
         return in_turn(as_commands(self, commands), self.num_joints)
 
@@ -663,7 +663,7 @@ class SerialChain(Arm, Model):
                 others are not; a gear ratio was found, which none can hold.
             FileExistsError: there is a file and ``force`` is not given.
         """
-        from jaxcal.models.serial.arm_files import save, written
+        from jaxcal.arms.files.write import save, written
 
         ratios, yields, waves = self._drives(as_parameters(self, parameters))
         for i in np.flatnonzero(ratios != 1.0):
@@ -778,7 +778,7 @@ class SerialChain(Arm, Model):
             joint = int(np.abs(np.abs(column) - 1.0).argmin())
             kind = self.joints[joint]
             if column[joint] != 1.0 and self.source is not None:
-                from jaxcal.models.serial.urdf import joints_of
+                from jaxcal.arms.files.urdf import joints_of
 
                 kind = joints_of(self.source["text"])[name].kind
             kinds.append(kind)
@@ -1019,8 +1019,8 @@ class SerialChain(Arm, Model):
         return goal
 
     def verdict(self, fit: Any) -> Any:
-        """``jaxcal.models.serial.verdict.ArmVerdict`` of a calibration."""
-        from jaxcal.models.serial.verdict import verdict
+        """``jaxcal.arms.verdict.ArmVerdict`` of a calibration."""
+        from jaxcal.arms.verdict import verdict
 
         return verdict(fit)
 

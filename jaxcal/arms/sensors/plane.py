@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.models.sensors.sensor import Landmarks, Reading, Tip
+from jaxcal.arms.sensors.sensor import Landmarks, Reading, Tip
 
 __all__ = ["Plane"]
 

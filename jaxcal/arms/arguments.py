@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.arms.arm import Load
+from jaxcal.arms.sensors import SENSORS, Position, Sensor
 from jaxcal.checks import array_of, in_words, numbers, one_of, whole_number
-from jaxcal.models.sensors import SENSORS, Position, Sensor
-from jaxcal.models.serial.arm import Load
 
 __all__ = [
     "joint_kinds",

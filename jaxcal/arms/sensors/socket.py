@@ -9,8 +9,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.arms.sensors.sensor import Landmarks, Reading, Tip
 from jaxcal.checks import numbers
-from jaxcal.models.sensors.sensor import Landmarks, Reading, Tip
 
 __all__ = ["Socket"]
 

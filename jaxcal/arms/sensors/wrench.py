@@ -8,8 +8,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.arms.sensors.sensor import HasNames, Reading, Sensor, Tip, hats
 from jaxcal.checks import array_of, in_words, numbers
-from jaxcal.models.sensors.sensor import HasNames, Reading, Sensor, Tip, hats
 
 __all__ = ["Wrench"]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.models.sensors import Landmarks
+from jaxcal.arms.sensors import Landmarks
 
 __all__ = ["mistaken_columns"]
 

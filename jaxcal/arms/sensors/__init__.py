@@ -1,15 +1,15 @@
 """What an arm is measured with: sensors that turn the tip's pose into readings."""
 
-from jaxcal.models.sensors.board import Board
-from jaxcal.models.sensors.distance import Distance
-from jaxcal.models.sensors.gravity import Gravity
-from jaxcal.models.sensors.plane import Plane
-from jaxcal.models.sensors.pose import Pose
-from jaxcal.models.sensors.position import Position
-from jaxcal.models.sensors.sensor import Landmarks, Reading, Sensor, Tip, hats
-from jaxcal.models.sensors.several import Several
-from jaxcal.models.sensors.socket import Socket
-from jaxcal.models.sensors.wrench import Wrench
+from jaxcal.arms.sensors.board import Board
+from jaxcal.arms.sensors.distance import Distance
+from jaxcal.arms.sensors.gravity import Gravity
+from jaxcal.arms.sensors.plane import Plane
+from jaxcal.arms.sensors.pose import Pose
+from jaxcal.arms.sensors.position import Position
+from jaxcal.arms.sensors.sensor import Landmarks, Reading, Sensor, Tip, hats
+from jaxcal.arms.sensors.several import Several
+from jaxcal.arms.sensors.socket import Socket
+from jaxcal.arms.sensors.wrench import Wrench
 
 __all__ = [
     "SENSORS",

@@ -8,9 +8,8 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import array_of, numbers, one_of
-from jaxcal.models.sensors.pose import rotation_vector_rate
-from jaxcal.models.sensors.sensor import (
+from jaxcal.arms.sensors.pose import rotation_vector_rate
+from jaxcal.arms.sensors.sensor import (
     BASE,
     HasNames,
     Reading,
@@ -19,6 +18,7 @@ from jaxcal.models.sensors.sensor import (
     hats,
     turns,
 )
+from jaxcal.checks import array_of, numbers, one_of
 
 __all__ = ["Board"]
 

@@ -13,13 +13,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.arms.chain import SerialChain
+from jaxcal.arms.plausible import require_touched
+from jaxcal.arms.sensors import Sensor, Tip
+from jaxcal.arms.sensors.sensor import BASE, Readings, label
 from jaxcal.checks import array_of, one_of
 from jaxcal.models import verdict as models
 from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
-from jaxcal.models.sensors import Sensor, Tip
-from jaxcal.models.sensors.sensor import BASE, Readings, label
-from jaxcal.models.serial.chain import SerialChain
-from jaxcal.models.serial.plausible import require_touched
 from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["Chains", "ChainsVerdict"]
@@ -652,7 +652,7 @@ class Chains(Model):
 
         Distances that one chain's contacts judge are left to its own verdict.
         """
-        from jaxcal.models.serial.verdict import Part
+        from jaxcal.arms.verdict import Part
 
         used = np.flatnonzero(fit.loss_weights > 0.0)
         tables = [(k, at, None) for k, _, _, at in self._parts(fit.commands[used])]
@@ -677,7 +677,7 @@ class Chains(Model):
 
     def verdict(self, fit: Any) -> ChainsVerdict:
         """Good where every chain that was read is, and distances that they share."""
-        from jaxcal.models.serial.verdict import CLEAR_UP, other_distances
+        from jaxcal.arms.verdict import CLEAR_UP, other_distances
 
         read = {
             self.tips[k]
@@ -731,7 +731,7 @@ class Chains(Model):
         Returns:
             The tip links, with a comma between.
         """
-        from jaxcal.models.serial.arm_files import save, urdf_text
+        from jaxcal.arms.files.write import save, urdf_text
 
         one_of("form", form, ("urdf",))
         theta = as_parameters(self, parameters)

@@ -1,0 +1,1 @@
+"""Files of arms: URDF, UR's and DH tables, recordings, servos."""
