@@ -18,8 +18,8 @@ import pathlib
 
 import numpy as np
 
-from jaxcal import plots
-from jaxcal.plots.style import panels
+from jaxcal.reports import plots
+from jaxcal.reports.plots.style import panels
 from jaxcal.selection import Design, select
 from jaxcal.selection.fastest import Motion, fastest_tour, travel_times
 from jaxcal.selection.fastest.search import ParetoFront

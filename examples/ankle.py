@@ -14,7 +14,7 @@ from typing import Any
 
 import common
 
-from jaxcal import plots
+from jaxcal.reports import plots
 from rig.__main__ import main as rig
 
 AXES = ("pitch", "yaw", "roll")

@@ -18,12 +18,12 @@ import common
 import numpy as np
 from scipy import special
 
+from jaxcal.adaptive import evaluation as sequential
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.policy.training import train
 from jaxcal.adaptive.rules import StateRule
 from jaxcal.adaptive.tasks import Entry
-from jaxcal.evaluation import sequential
 
 METHODS = ("gain", "state", "shares", "ahead")
 
@@ -110,7 +110,7 @@ def _mean(values: np.ndarray) -> tuple[float, float]:
 
 def draw(axes, rows: common.Rows) -> None:
     """Nats less those of ``ahead``, with 95 % intervals; ``gain`` is far below."""
-    from jaxcal.plots.style import COLOURS
+    from jaxcal.reports.plots.style import COLOURS
 
     for row in (row for row in rows if row["method"] != "gain"):
         axes.errorbar(

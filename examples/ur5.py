@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 import jaxcal
 from jaxcal.models import SerialChain
-from jaxcal.plots.style import plain_log
 from jaxcal.progress import Progress
+from jaxcal.reports.plots.style import plain_log
 
 Array = NDArray[np.float64]
 

@@ -81,7 +81,10 @@ _HOME = {
 }
 
 
-_ROOMS = ("adaptive", "arms", "calibration", "candidates", "learning", "models", "selection")
+_ROOMS = (
+    *("adaptive", "arms", "calibration", "candidates", "learning", "models"),
+    *("reports", "selection"),
+)
 
 
 def __getattr__(name: str) -> Any:

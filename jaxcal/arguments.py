@@ -22,11 +22,12 @@ import re
 import sys
 import typing
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Literal, NoReturn, TypeVar
+from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 from jaxcal.extras import typed
 
 __all__ = [
+    "Numbers",
     "Parser",
     "exit_code",
     "number_type",
@@ -232,3 +233,6 @@ def several(kind: Callable[[str], T], what: str) -> Callable[[str], list[T]]:
             ) from None
 
     return parse
+
+
+Numbers = Annotated[list[float] | None, several(float, "numbers")]

@@ -12,6 +12,9 @@ from typing import Any
 __all__ = ["MOVED", "install_finder"]
 
 MOVED = {  # longer names first
+    "jaxcal.calibration.budget": "jaxcal.reports.budget",
+    "jaxcal.calibration.report": "jaxcal.reports.calibration",
+    "jaxcal.evaluation.sequential": "jaxcal.adaptive.evaluation",
     "jaxcal.models.sensors": "jaxcal.arms.sensors",
     "jaxcal.models.serial.kernel": "jaxcal.arms.chain_kernel",
     "jaxcal.models.serial.arm_files": "jaxcal.arms.files.write",
@@ -19,6 +22,8 @@ MOVED = {  # longer names first
     "jaxcal.models.serial.servos": "jaxcal.arms.files.servos",
     "jaxcal.models.serial.urdf": "jaxcal.arms.files.urdf",
     "jaxcal.models.serial": "jaxcal.arms",
+    "jaxcal.pages": "jaxcal.reports.page",
+    "jaxcal.plots": "jaxcal.reports.plots",
 }
 
 

@@ -74,7 +74,7 @@ CASES = {
     ),
     "plots": (
         ("jax", "flax", "brax", "mujoco", "pymodbus"),
-        [(["python", "-c", "import jaxcal.plots, jinja2"], 0, "")],
+        [(["python", "-c", "import jaxcal.reports.plots, jinja2"], 0, "")],
     ),
     "rig": (
         ("jax", "flax", "brax", "mujoco"),

@@ -11,7 +11,7 @@ import sys
 
 import pytest
 
-from jaxcal.pages import (
+from jaxcal.reports.page import (
     Badge,
     Box,
     Code,
@@ -136,7 +136,7 @@ def test_write_page_replaces_the_file_atomically(tmp_path: pathlib.Path):
 
 def test_pages_load_no_drawing_library():
     code = (
-        "import sys, jaxcal.pages as p; p.render(p.Page('t', []));"
+        "import sys, jaxcal.reports.page as p; p.render(p.Page('t', []));"
         "print([m for m in ('matplotlib', 'jax', 'scipy') if m in sys.modules])"
     )
     shown = subprocess.run(

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from jaxcal import plots
 from jaxcal.models import SerialChain, Socket
+from jaxcal.reports import plots
 
 
 def test_an_ellipse_lies_at_its_mahalanobis_distance():

@@ -43,6 +43,7 @@ from benchmarks.sequential.family.structures import HELD_OUT, Limits
 from benchmarks.sequential.optimum import solve
 from benchmarks.sequential.transfer import arrays, shown
 from jaxcal.adaptive.episodes import compare, play
+from jaxcal.adaptive.evaluation import seconds_a_choice
 from jaxcal.adaptive.fit_ahead import fit
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import AHEAD, Ahead
@@ -57,7 +58,6 @@ from jaxcal.adaptive.rules import (
 )
 from jaxcal.adaptive.session import jit_by_class
 from jaxcal.adaptive.tuning import tune
-from jaxcal.evaluation.sequential import seconds_a_choice
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.learning.runtime import cache
 

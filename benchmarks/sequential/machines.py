@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.adaptive.episodes import compare
+from jaxcal.adaptive.evaluation import seconds_a_choice
 from jaxcal.adaptive.fit_ahead import fit
 from jaxcal.adaptive.policy import training
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
@@ -28,7 +29,6 @@ from jaxcal.adaptive.rules import SHARES, Gain, StateRule
 from jaxcal.adaptive.tasks import registry
 from jaxcal.adaptive.tuning import tune
 from jaxcal.arguments import Parser, several, values_of
-from jaxcal.evaluation.sequential import seconds_a_choice
 
 __all__ = ["TASKS", "main"]
 

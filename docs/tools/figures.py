@@ -20,9 +20,9 @@ import common
 
 import jaxcal
 from benchmarks import report
-from jaxcal import plots
 from jaxcal.models import SerialChain
-from jaxcal.plots.style import COLOURS, GREY, as_bytes, panels
+from jaxcal.reports import plots
+from jaxcal.reports.plots.style import COLOURS, GREY, as_bytes, panels
 
 
 def four_of_fifty() -> Figure:

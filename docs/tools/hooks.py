@@ -27,7 +27,7 @@ PUBLIC = (
     "jaxcal.learning",
     "jaxcal.candidates",
     "jaxcal.evaluation",
-    "jaxcal.plots",
+    "jaxcal.reports.plots",
 )
 FIRST = {  # what a page begins with; the rest follows in the order of the alphabet
     "jaxcal": ("select", "Design", "Selection", "identify", "Calibration"),

@@ -1,7 +1,8 @@
 """What the API pages show beside what griffe reads: two habits of this code.
 
-A method that a class takes from a module of its own (``check = check``) is shown as a
-method, and the comment of a dataclass's field is the field's documentation.
+A method that a class takes from a module of its own (``check = check``, or
+``report = late("module:report")``) is shown as a method, and the comment of a
+dataclass's field is the field's documentation.
 """
 
 from __future__ import annotations
@@ -48,12 +49,18 @@ def _assigned(cls: Any, member: Any) -> Any:
     """The method that ``name = function`` or ``name = wrapper(function)`` makes."""
     value = member.value
     wrapped = isinstance(value, griffe.ExprCall)
+    late = wrapped and str(value.function) == "late"
     if wrapped:
         value = value.arguments[0] if len(value.arguments) == 1 else None
-    if not isinstance(value, griffe.ExprName):
+        wrapped = not late
+    if not (late or isinstance(value, griffe.ExprName)):
         return None
     try:
-        found = cls.module[value.name]
+        if late:  # 'module:function'
+            path = str(value).strip("'\"").replace(":", ".")
+            found = cls.modules_collection[path]
+        else:
+            found = cls.module[value.name]
         found = found.final_target if found.is_alias else found
     except (KeyError, griffe.AliasResolutionError, griffe.CyclicAliasError):
         return None

@@ -7,10 +7,20 @@ solution the fields of a calibration; ``least_squares`` is the search, for every
 the summary and the ``file``.
 """
 
-from jaxcal.calibration.budget import Budget, Source
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
 from jaxcal.calibration.calibration import Calibration
 from jaxcal.calibration.check import Check
 from jaxcal.calibration.identify import identify
 from jaxcal.models.verdict import Verdict
 
 __all__ = ["Budget", "Calibration", "Check", "Source", "Verdict", "identify"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in ("Budget", "Source"):
+        raise AttributeError(f"module 'jaxcal.calibration' has no attribute {name!r}")
+    return getattr(importlib.import_module("jaxcal.reports.budget"), name)

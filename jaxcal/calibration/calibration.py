@@ -13,14 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration import file
-from jaxcal.calibration.budget import budget
 from jaxcal.calibration.check import check, verification
 from jaxcal.calibration.file import save, to_dict
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.fit_model import fit_model
 from jaxcal.calibration.inverse import command_for
-from jaxcal.calibration.report import report
 from jaxcal.checks import aligned, in_words
+from jaxcal.late import late
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.models.verdict import Verdict
@@ -42,8 +41,8 @@ class Calibration(Fit):
 
     command_for = command_for
     check = check
-    budget = budget
-    report = report
+    budget = late("jaxcal.reports.budget:budget")
+    report = late("jaxcal.reports.calibration:report")
     verification = verification
     to_dict = to_dict
     save = save

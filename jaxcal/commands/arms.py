@@ -35,6 +35,7 @@ ModelPath = Annotated[
     "FILE",
 ]
 
+
 def _of_joint(text: str) -> list[Any]:
     name, _, values = text.rpartition("=")
     return [name, several(float, "numbers")(values)]

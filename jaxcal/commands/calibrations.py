@@ -10,8 +10,8 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.arguments import several
-from jaxcal.calibration import Calibration, Source
+from jaxcal.arguments import Numbers, several
+from jaxcal.calibration import Calibration
 from jaxcal.calibration import identify as identified
 from jaxcal.commands.arms import (
     ArmOptions,
@@ -19,7 +19,6 @@ from jaxcal.commands.arms import (
     RecordingOptions,
     in_degrees,
 )
-from jaxcal.commands.questions import Numbers
 from jaxcal.commands.tables import (
     Output,
     write_json,
@@ -74,6 +73,8 @@ class ReportOptions:
             return True
         sources = []
         if self.certificate is not None:
+            from jaxcal.reports.budget import Source
+
             sources = [Source.certificate("certificate", self.certificate)]
         at = None
         if self.at is not None:

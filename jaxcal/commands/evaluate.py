@@ -242,8 +242,8 @@ def parser(prog: str, typed: str, of_task: bool = False) -> Parser:
         from jaxcal.learning.runtime import cache
 
         cache.keep_compiled_programs()  # before JAX is loaded
+        from jaxcal.adaptive.evaluation import METHODS
         from jaxcal.adaptive.tasks import registry
-        from jaxcal.evaluation.sequential import METHODS
 
     tasks = {name: registry.load(name).about for name in registry.names()}
     more = _TASK_EPILOG.format(
@@ -284,7 +284,9 @@ def _run(options: EvaluateOptions) -> None:
     progress = Progress(quiet=options.quiet)
     runs = _run_folders(options.run, options.checkpoints)
     whole = evaluated(options, methods, progress)
-    _show(options, whole, "evaluation_figures", progress, runs)
+    _show(
+        options, whole, "jaxcal.evaluation.figures:evaluation_figures", progress, runs
+    )
 
 
 def _show(
@@ -310,7 +312,8 @@ def _show(
     finally:
         progress.clear()
     if options.report is not None:
-        draw = getattr(importlib.import_module("jaxcal.evaluation.figures"), figures)
+        module, _, name = figures.partition(":")
+        draw = getattr(importlib.import_module(module), name)
         count = write_report(options.report, whole, draw, runs, command=options.command)
         drawn = "1 figure" if count == 1 else f"{count} figures"
         print(f"saved: {options.report}/index.html and {drawn}")
@@ -451,15 +454,20 @@ def _run_task(options: TaskOptions) -> None:
 
     options.require_writable()
     progress = Progress(quiet=options.quiet)
-    _show(options, _sessions(options, progress), "decider_figures", progress)
+    _show(
+        options,
+        _sessions(options, progress),
+        "jaxcal.adaptive.figures:decider_figures",
+        progress,
+    )
 
 
 def _sessions(
     options: TaskOptions, progress: Progress
 ) -> Iterator[tuple[Summary, Evaluation]]:
     """The methods on the sessions of the task."""
+    from jaxcal.adaptive import evaluation as sequential
     from jaxcal.adaptive.tasks import registry
-    from jaxcal.evaluation import sequential
 
     entry = registry.load(options.task)
     methods = options.methods or list(entry.methods)

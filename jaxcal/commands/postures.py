@@ -167,7 +167,7 @@ def _draw(arm: SerialChain, plan: Array, path: pathlib.Path) -> None:
     with needs("plots", "--picture"):
         from matplotlib.figure import Figure
 
-    from jaxcal import plots
+    from jaxcal.reports import plots
 
     figure = Figure(figsize=(8, 2.2 * -(-len(plan) // 4)), layout="constrained")
     plots.postures(figure, arm, plan).savefig(path)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.arguments import several
+from jaxcal.arguments import Numbers, several
 from jaxcal.commands.arms import ArmOptions, ModelPath
 from jaxcal.commands.tables import Output, TablePath
 from jaxcal.csvtable import CsvTable, read_table
@@ -17,9 +17,8 @@ from jaxcal.models import Affine, Noise
 from jaxcal.selection import Design, Selection, Worst
 from jaxcal.selection.criteria import CRITERIA
 
-__all__ = ["Numbers", "plan", "score", "select"]
+__all__ = ["plan", "score", "select"]
 
-Numbers = Annotated[list[float] | None, several(float, "numbers")]
 Names = Annotated[list[str] | None, several(str, "names")]
 Rows = Annotated[list[int] | None, several(int, "whole numbers")]
 

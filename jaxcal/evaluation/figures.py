@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import pathlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from jaxcal.evaluation.postures import PostureEvaluation, PostureResult, log_mean
 from jaxcal.evaluation.results import MethodResult
 from jaxcal.models.affine import Affine
-from jaxcal.plots import selection
-from jaxcal.plots.style import (
+from jaxcal.reports.plots import selection
+from jaxcal.reports.plots.style import (
     BLACK,
     COLOURS,
     GREY,
@@ -28,20 +28,18 @@ from jaxcal.plots.style import (
     legend_right,
     numbered,
 )
-from jaxcal.plots.style import panels as _panels
-
-if TYPE_CHECKING:
-    from jaxcal.evaluation.sequential import DeciderEvaluation  # loads JAX
+from jaxcal.reports.plots.style import panels as _panels
 
 __all__ = [
     "best_so_far",
-    "decider_figures",
     "det_distributions",
     "det_means",
     "det_per_episode",
     "evaluation_figures",
     "first_selection",
     "gap_to_optimum",
+    "intervals",
+    "styles_of",
     "variances",
 ]
 
@@ -133,33 +131,13 @@ def det_means(evaluation: PostureEvaluation) -> Figure:
             text = f"{times:,.0f} x random"
             axes.annotate(text, (ends[-1][1], row), fontsize=8, **place)
     names, _, styles = zip(*results, strict=True)
-    _intervals(axes, names, ends, styles)
+    intervals(axes, names, ends, styles)
     axes.margins(x=0.12)
     _det_axis(axes.xaxis, evaluation, "mean {}, with its 95 % interval")
     return figure
 
 
-def decider_figures(evaluation: DeciderEvaluation) -> dict[str, Figure]:
-    """Mean nats by method, and less those of the rival in pairs, 95 % intervals."""
-    results, rival = evaluation.results, evaluation.rival
-    names = [result.method for result in results]
-    size = (9.0, 0.9 + 0.42 * len(names))
-    figure, panels = _panels(size, shape=(1, 2))
-    nats_of = [result.values[:, 0] for result in results]
-    less = [evaluation.less(result)[:, 0] for result in results]
-    for axes, samples in zip(panels, (nats_of, less), strict=True):
-        ends = []
-        for values in samples:
-            half = 1.96 * values.std(ddof=1) / np.sqrt(len(values))
-            ends.append(values.mean() + np.array([-half, 0.0, half]))
-        _intervals(axes, names, ends, _styles(results))
-    panels[0].set_xlabel("information gained in a session (nats)")
-    panels[1].set_xlabel(f"less that of {rival}, in pairs (nats)")
-    panels[1].axvline(0.0, color=GREY, linestyle="--", zorder=0)
-    return {"sequential": figure}
-
-
-def _intervals(
+def intervals(
     axes: Any,
     names: Sequence[str],
     ends: Sequence[Array],
@@ -237,7 +215,7 @@ def parameter_variance(evaluation: PostureEvaluation) -> Figure:
     dataset = evaluation.dataset
     rows = []
     for result, style in zip(
-        evaluation.results, _styles(evaluation.results), strict=True
+        evaluation.results, styles_of(evaluation.results), strict=True
     ):
         random = result.method == "random"
         label = "random, median over draws" if random else _label(evaluation, result)
@@ -323,7 +301,7 @@ def _label(evaluation: PostureEvaluation, result: PostureResult) -> str:
     return f"{result.label}, {pathlib.Path(name).name}"
 
 
-def _styles(results: Sequence[MethodResult]) -> list[dict[str, Any]]:
+def styles_of(results: Sequence[MethodResult]) -> list[dict[str, Any]]:
     """Colour, line and marker of each; random and exact look the same everywhere."""
     number = itertools.count()
     return [_FIXED.get(result.method) or numbered(next(number)) for result in results]
@@ -344,7 +322,7 @@ def _with_random(
     results = evaluation.results
     rows = [
         (_label(evaluation, result), result.log_det, style)
-        for result, style in zip(results, _styles(results), strict=True)
+        for result, style in zip(results, styles_of(results), strict=True)
     ]
     if all(result.method != "random" for result in results):
         rows.append(("random", evaluation.random_log_det, _FIXED["random"]))

@@ -11,7 +11,7 @@ from jaxcal.checks import aligned
 from jaxcal.evaluation.results import Evaluation, Summary
 from jaxcal.extras import versions
 from jaxcal.files import atomic_write
-from jaxcal.pages import Block, Code, Figure, Page, Section, Table, Text, render
+from jaxcal.reports.page import Block, Code, Figure, Page, Section, Table, Text, render
 
 __all__ = ["file_prefixes", "json_document", "text_table", "write_report"]
 
@@ -111,7 +111,7 @@ def _drawn(
     figures: Mapping[str, Any], files: dict[str, bytes], prefix: str = ""
 ) -> list[Block]:
     """Figures of a page; their files are added to those that are given."""
-    from jaxcal.plots.style import as_files
+    from jaxcal.reports.plots.style import as_files
 
     blocks: list[Block] = []
     for name, figure in ((prefix + name, figures[name]) for name in figures):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from jaxcal.csvtable import read_table
-from jaxcal.plots.style import COLOURS, panels
+from jaxcal.reports.plots.style import COLOURS, panels
 
 __all__ = ["last_rewards", "read_metrics", "training_curves", "training_diagnostics"]
 

@@ -34,9 +34,9 @@ def from_dict(data: Mapping[str, Any]) -> Model:
         raise ValueError(f"a model must be a JSON object with a kind, got {data!r}")
     fields = dict(data)
     kind = fields.pop("kind", None)
-    own = (*_KINDS, *_UNWRITTEN)
-    others = {} if kind in own else installed(_GROUP)
-    kind = one_of("kind of the model", kind, (*own, *others))
+    kinds = (*_KINDS, *_UNWRITTEN)
+    others = {} if kind in kinds else installed(_GROUP)
+    kind = one_of("kind of the model", kind, (*kinds, *others))
     if kind in _UNWRITTEN or fields.get("features", "") is None:
         raise ValueError(
             "the model holds a function, which a file cannot: give the model itself, "

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal.calibration.report import SCHEMA, leverage, moved
 from jaxcal.commands.main import main
 from jaxcal.models.verdict import left_out
+from jaxcal.reports.calibration import SCHEMA, leverage, moved
 
 
 def table(path, rng, gain=0.71, rows=9):

@@ -126,7 +126,10 @@ def test_a_negative_value_after_a_blank(folder, monkeypatch, capsys):
 
 @pytest.mark.parametrize(
     ("imported", "missing", "extra"),
-    [("jaxcal.plots", "matplotlib", "plots"), ("jaxcal.adaptive", "jax", "policy")],
+    [
+        ("jaxcal.reports.plots", "matplotlib", "plots"),
+        ("jaxcal.adaptive", "jax", "policy"),
+    ],
 )
 def test_an_import_names_its_extra(imported, missing, extra):
     code = f"import sys; sys.modules[{missing!r}] = None; import {imported}"

@@ -32,7 +32,7 @@ from jaxcal.evaluation.training_figure import training_curves, training_diagnost
 from jaxcal.information.regression import regression_matrix
 from jaxcal.models import Affine
 from jaxcal.paper.datasets.datasets import make_dataset
-from jaxcal.plots import as_bytes
+from jaxcal.reports.plots import as_bytes
 
 BASELINES = ("random", "greedy", "exchange", "exact")
 

@@ -14,7 +14,7 @@ from scipy import stats
 from jaxcal.calibration.identify import identify
 from jaxcal.csvtable import csv_text
 from jaxcal.evaluation.parameters import least_squares, predict
-from jaxcal.plots import as_bytes
+from jaxcal.reports.plots import as_bytes
 from studies.paper.exhibits.devices import Device
 from studies.paper.exhibits.intervals import (
     bootstrap_interval,

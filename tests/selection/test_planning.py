@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from questions import criteria, plan
 
 import jaxcal
-from jaxcal import plots
 from jaxcal.models import Affine, Noise, Polynomial, Prior, SerialChain
+from jaxcal.reports import plots
 
 
 def value_of(candidates, indices, criterion, region=None):

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal.extras import install
-from jaxcal.pages import Code, Figure, Page, Section, Table, Text, write_page
+from jaxcal.reports.page import Code, Figure, Page, Section, Table, Text, write_page
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE
 from rig.journal import JOURNAL, Record, RunFolder, is_written, measured_postures
 from rig.workbench.outputs.messages import (
@@ -153,7 +153,7 @@ def drawn(
     try:
         import matplotlib.figure
 
-        from jaxcal.plots import as_bytes
+        from jaxcal.reports.plots import as_bytes
     except ModuleNotFoundError:
         missing = f"no figure: matplotlib is not installed ({install('plots')})"
         return Text(f"{alt}: {missing}", "note")
@@ -166,7 +166,7 @@ def draw_errors(
     figure: Any, each: dict[str, Any], names: Sequence[str], unit: str
 ) -> None:
     """Errors at held-out targets, raw beside compensated, each on its scale."""
-    from jaxcal import plots
+    from jaxcal.reports import plots
 
     axes = figure.subplots(1, len(each), squeeze=False)[0]
     for axis, (title, values) in zip(axes, each.items(), strict=True):
@@ -178,7 +178,7 @@ def draw_postures(
 ) -> None:
     """Commands of all visits, and of those the calibration is identified from; of more
     than three axes the first three."""
-    from jaxcal import plots
+    from jaxcal.reports import plots
 
     commands = np.array([r["commanded_deg"] for r in records])[:, :3]
     chosen = [i for i, r in enumerate(records) if r.get("role") == "select"]

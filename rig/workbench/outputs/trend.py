@@ -11,7 +11,7 @@ import pathlib
 import numpy as np
 
 from jaxcal.checks import aligned
-from jaxcal.pages import Badge, Block, Page, Section, Table, Text, write_page
+from jaxcal.reports.page import Badge, Block, Page, Section, Table, Text, write_page
 from rig.journal import JournalError, Record, read_journal
 from rig.workbench.outputs.messages import held_out, recalibrate
 from rig.workbench.outputs.report import draw_parameters, drawn

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from jaxcal.evaluation.parameters import least_squares, predict
 from jaxcal.information.regression import regressors
 from jaxcal.paper.constants import NOISE_STD_DEG
-from jaxcal.plots.style import BLACK, band, numbered, panels, plain_log
+from jaxcal.reports.plots.style import BLACK, band, numbered, panels, plain_log
 from jaxcal.selection import exchange_batch
 from studies.paper.exhibits.devices import Device, pick, rms
 from studies.paper.exhibits.exhibit import Exhibit, from_rows, judge

@@ -14,7 +14,7 @@ from jaxcal.models import Affine
 from jaxcal.paper.constants import AXES, BIAS_DEG, NOISE_STD_DEG, RANGES, SCALE
 from jaxcal.paper.datasets import dataset0_robot
 from jaxcal.paper.twin import ORDERS, RobotConfig, read_out, simulate
-from jaxcal.plots.style import BLACK, COLOURS, boxes, legend_right, panels
+from jaxcal.reports.plots.style import BLACK, COLOURS, boxes, legend_right, panels
 from studies.paper.exhibits.exhibit import Exhibit, by_axis, judge
 from studies.paper.exhibits.intervals import mean_interval, share_interval
 from studies.paper.exhibits.study import Study, commands_deg

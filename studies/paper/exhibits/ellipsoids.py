@@ -14,8 +14,8 @@ from jaxcal.evaluation.parameters import least_squares
 from jaxcal.information.regression import regressors
 from jaxcal.models import Affine
 from jaxcal.paper.constants import BIAS_DEG, NOISE_STD_DEG, SCALE
-from jaxcal.plots import ellipsoid
-from jaxcal.plots.style import BLACK, COLOURS, GREY, legend_below, panels
+from jaxcal.reports.plots import ellipsoid
+from jaxcal.reports.plots.style import BLACK, COLOURS, GREY, legend_below, panels
 from studies.paper.exhibits.devices import Device
 from studies.paper.exhibits.exhibit import Exhibit, from_rows
 from studies.paper.exhibits.intervals import share_interval

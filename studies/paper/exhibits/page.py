@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from jaxcal import pages
 from jaxcal.extras import versions
+from jaxcal.reports import page as pages
 from studies.paper.exhibits.exhibit import Claim, Exhibit, Verdict
 from studies.paper.exhibits.study import Settings
 

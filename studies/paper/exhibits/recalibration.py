@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from jaxcal.evaluation.parameters import least_squares, predict
 from jaxcal.paper.constants import AXES, NOISE_STD_DEG, RANGES
-from jaxcal.plots.style import (
+from jaxcal.reports.plots.style import (
     BLACK,
     COLOURS,
     GREY,

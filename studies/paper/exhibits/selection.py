@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from jaxcal.evaluation import figures
 from jaxcal.evaluation.postures import HIT_TOLERANCE, PostureEvaluation
-from jaxcal.plots.style import BLACK, COLOURS, legend_right, panels
+from jaxcal.reports.plots.style import BLACK, COLOURS, legend_right, panels
 from studies.paper.exhibits.exhibit import Columns, Exhibit, judge
 from studies.paper.exhibits.intervals import (
     bootstrap_interval,

@@ -21,7 +21,7 @@ from jaxcal.evaluation.training_figure import (
     read_metrics,
     training_curves,
 )
-from jaxcal.plots.style import COLOURS, GREY, band, boxes, panels
+from jaxcal.reports.plots.style import COLOURS, GREY, band, boxes, panels
 from studies.paper.exhibits.exhibit import Exhibit, Verdict, judge
 from studies.paper.exhibits.intervals import mean_interval
 from studies.paper.exhibits.study import Study

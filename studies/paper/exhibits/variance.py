@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from jaxcal.evaluation import figures
 from jaxcal.models import Affine
-from jaxcal.plots.style import BLACK, COLOURS, GREY
+from jaxcal.reports.plots.style import BLACK, COLOURS, GREY
 from studies.paper.exhibits.exhibit import Exhibit, judge
 from studies.paper.exhibits.selection import STREAM, words_of
 from studies.paper.exhibits.study import METHODS, Study

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.plots.style import COLOURS
+from jaxcal.reports.plots.style import COLOURS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

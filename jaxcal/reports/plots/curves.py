@@ -9,7 +9,14 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
-from jaxcal.plots.style import BLACK, COLOURS, GREY, MARKERS, numbered, plain_axes
+from jaxcal.reports.plots.style import (
+    BLACK,
+    COLOURS,
+    GREY,
+    MARKERS,
+    numbered,
+    plain_axes,
+)
 
 __all__ = ["against_count", "pareto", "plan", "scenarios"]
 

@@ -184,7 +184,7 @@ def _template() -> Any:
         import jinja2
 
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("jaxcal", "templates"),
+        loader=jinja2.PackageLoader("jaxcal.reports", ""),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

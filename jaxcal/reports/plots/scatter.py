@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.plots.style import COLOURS, GREY, plain_axes
+from jaxcal.reports.plots.style import COLOURS, GREY, plain_axes
 
 __all__ = ["ellipsoid", "selection"]
 

@@ -18,13 +18,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal import pages
-from jaxcal.calibration.budget import Budget, Source, budget
 from jaxcal.calibration.check import Check
 from jaxcal.calibration.fit import Fit
 from jaxcal.csvtable import COMMANDS, MEASURED
 from jaxcal.files import atomic_write
 from jaxcal.models.verdict import left_out
+from jaxcal.reports import page as pages
+from jaxcal.reports.budget import Budget, Source, budget
 
 __all__ = ["SCHEMA", "moved", "report"]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.plots.style import BLACK, plain_axes, points
+from jaxcal.reports.plots.style import BLACK, plain_axes, points
 
 __all__ = ["before_after", "residuals"]
 

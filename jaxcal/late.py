@@ -1,0 +1,34 @@
+"""Methods whose module loads when they are first called."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+__all__ = ["late"]
+
+
+class late:
+    """A method that a module further up defines: ``report = late("module:function")``.
+
+    Asked for, of the class or of an object, it is that function.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    @functools.cached_property
+    def function(self) -> Callable[..., Any]:
+        """The function, its module loaded."""
+        module, _, name = self.path.partition(":")
+        function: Callable[..., Any] = getattr(importlib.import_module(module), name)
+        return function
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Callable[..., Any]:
+        method: Callable[..., Any] = self.function.__get__(instance, owner)
+        return method
