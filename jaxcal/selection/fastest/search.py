@@ -170,10 +170,8 @@ def _pool(problem: Problem) -> Indices:
 
 def _require_travel(offer: CandidateSet, motion: Motion) -> Array:
     """(M, n) commands between which the device travels; refuses what has no run."""
-    if offer.scenarios is not None or offer.uncertain:
-        raise ValueError(
-            "scenarios, lost and reliability must be left out with fastest and pareto"
-        )
+    if offer.scenarios is not None:
+        raise ValueError("scenarios must be left out with fastest and pareto")
     if offer.candidates is None:
         raise ValueError(
             "commands must be given with blocks, Design.from_blocks(..., "
