@@ -100,9 +100,6 @@ calls = {
         blocks=blocks, k=9, method="exact", criterion="E", time_limit=300
     ),
     "volumes": lambda: jaxcal.select(sphere, 10, "exact", time_limit=300),
-    "fastest": lambda: jaxcal.Design(rows[:200]).fastest(
-        10, jaxcal.Motion(1, 2), least_efficiency=0.7, method="exact", time_limit=300
-    ),
     "look-ahead": lambda: look_ahead(
         y, active, True, 40, False, None, np.empty((4, 60_000))
     ),

@@ -44,7 +44,6 @@ class DesignOptions:
     scenarios: Annotated[
         int | None, "draws of the model's parameters; the mean over them counts", "N"
     ] = None
-    lost: Annotated[int, "1 or 2 rows that may fail: the worst loss counts", "L"] = 0
 
     def design(self, table: CsvTable, of_arm: ArmOptions) -> Design:
         """The design of the candidates in a table."""
@@ -68,7 +67,6 @@ class DesignOptions:
             required=self.required,
             max_replicates=self.replicates,
             scenarios=self.scenarios,
-            lost=self.lost,
             names=next(iter(table.labels.values()), None),
         )
         design.candidate_set.axes = names

@@ -446,11 +446,6 @@ class _Ascent:
         _require_inputs(box, offer.candidates)
         _require_one_noise(offer.noise or Noise())
         self.asked, self.region = criterion, region
-        if offer.uncertain:
-            raise ValueError(
-                "refine is of measurements that all arrive, got a design with lost or "
-                "reliability"
-            )
         problem = problem_of(offer, k, criterion, region)
         self.problem, self.objective = problem, problem.criterion
         self.k = problem.k

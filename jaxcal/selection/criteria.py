@@ -42,7 +42,6 @@ __all__ = [
     "Criterion",
     "Ds",
     "I",
-    "LossCriterion",
     "Mean",
     "ScenarioCriterion",
     "Worst",
@@ -407,20 +406,6 @@ class Mean(ScenarioCriterion):
     """
 
     word, least = "mean", False
-
-
-class LossCriterion(ScenarioCriterion):
-    """The criterion of what is left where the worst few of the chosen fail."""
-
-    least = True
-
-    def __init__(self, count: int) -> None:
-        super().__init__()
-        self.word = f"{count} lost"
-
-    @property
-    def name(self) -> str:
-        return f"{self.each.name} with {self.word}"
 
 
 class Worst(ScenarioCriterion):

@@ -63,11 +63,6 @@ class Design:
             by as well: a whole number of draws from the prior (seeded), (S, p), or
             ``(parameters, weights)``. A criterion is then ``jaxcal.Mean("D")``, as
             letters alone are, or ``jaxcal.Worst("D")``.
-        lost: measurements, 1 or 2, that may fail: what is best is what the worst such
-            loss leaves. Of several scenarios with ``jaxcal.Worst`` only.
-        reliability: (M,) probabilities that a candidate can be measured; the mean of
-            the criterion over what arrives counts: over every case where at most six
-            may fail, else over 64 draws (seeded).
         names: (M,) names of the candidates, for the answers.
 
     Raises:
@@ -89,14 +84,11 @@ class Design:
         max_replicates: int = 1,
         *,
         scenarios: Any = None,
-        lost: int = 0,
-        reliability: ArrayLike | None = None,
         names: Sequence[str] | None = None,
     ) -> None:
         self.candidate_set = CandidateSet.of_commands(
             candidates, model, prior, noise, measured, available, scenarios=scenarios,
-            names=names, required=required, max_replicates=max_replicates, lost=lost,
-            reliability=reliability,
+            names=names, required=required, max_replicates=max_replicates,
         )  # fmt: skip
 
     @classmethod
@@ -113,8 +105,6 @@ class Design:
         commands: ArrayLike | None = None,
         names: Sequence[str] | None = None,
         weights: ArrayLike | None = None,
-        lost: int = 0,
-        reliability: ArrayLike | None = None,
     ) -> Self:
         """The problem of information blocks, of any model.
 
@@ -126,8 +116,7 @@ class Design:
             noise: of the readings, where it is not of unit variance.
             measured: (N, q, p) blocks that were measured already, of scenarios
                 (S, N, q, p).
-            available, required, max_replicates, names, lost, reliability: as for
-                candidates.
+            available, required, max_replicates, names: as for candidates.
             commands: (M, n) of the candidates, for travel between them and for tables.
             weights: (S,) of the scenarios, of sum 1; equal when not given.
         """
@@ -135,7 +124,6 @@ class Design:
         design.candidate_set = CandidateSet.of_blocks(
             blocks, prior, noise, measured, available, commands=commands, names=names,
             weights=weights, required=required, max_replicates=max_replicates,
-            lost=lost, reliability=reliability,
         )  # fmt: skip
         return design
 
@@ -438,8 +426,6 @@ def select(
     required: ArrayLike | None = None,
     max_replicates: int = 1,
     scenarios: Any = None,
-    lost: int = 0,
-    reliability: ArrayLike | None = None,
     names: Any = None,
     **options: Any,
 ) -> Selection:
@@ -454,7 +440,7 @@ def select(
         blocks: (M, q, p), of scenarios (S, M, q, p), instead of candidates and model,
             as in ``Design.from_blocks``; ``prior`` is then a (p, p) precision.
         model, prior, noise, measured, available, required, max_replicates, scenarios,
-            lost, reliability, names: of the problem, see ``Design``.
+            names: of the problem, see ``Design``.
         criterion, region: what is best, see ``Design.select``.
         options: seed, restarts, time_limit, best, least_efficiency, checkpoint,
             decoding, num: those that the method reads, see ``Design.select``.
@@ -468,7 +454,6 @@ def select(
     rules: dict[str, Any] = {
         "prior": prior, "noise": noise, "measured": measured, "available": available,
         "required": required, "max_replicates": max_replicates, "names": names,
-        "lost": lost, "reliability": reliability,
     }  # fmt: skip
     checked_options(method, options)  # before any work
     if (candidates is None) == (blocks is None):

@@ -99,7 +99,7 @@ class Selection:
     @cached_property
     def in_scenarios(self) -> ScenarioTable | None:
         """The efficiency in each scenario; None where there is one only."""
-        if not isinstance(self.problem, ScenarioProblem) or not self.problem.told:
+        if not isinstance(self.problem, ScenarioProblem):
             return None
         from jaxcal.selection.in_scenarios import in_scenarios
 
@@ -114,14 +114,13 @@ class Selection:
 
     @cached_property
     def left_without(self) -> NDArray[np.float64]:
-        """(k,) det S without each of the chosen, as a share of det S; 0 is singular."""
-        problem, chosen = self.problem, self.indices
-        others = np.tile(chosen, (len(chosen), 1))[~np.eye(len(chosen), dtype=np.bool_)]
-        raw = problem.raw[others.reshape(len(chosen), -1)]
-        if raw.shape[1] == 0 and not len(problem.root):
-            return np.zeros(len(chosen))
-        log_det = rank_of_blocks(raw, problem.root, problem.white.size)[1]
-        return np.asarray(np.exp(problem.multiplicity * log_det - self.log_det))
+        """(k,) det S without each of the chosen, as a share of det S; 0 is singular.
+
+        Of scenarios the least over them.
+        """
+        members = getattr(self.problem, "members", (self.problem,))
+        shares = [_shares_without(member, self.indices) for member in members]
+        return np.asarray(np.min(shares, axis=0))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, text and lists, as a JSON file takes them."""
@@ -224,3 +223,15 @@ class BatchSelection:
     nodes: Indices  # (B,) nodes examined, 0 where not counted
     method: str
     seconds: float  # wall time of the whole batch
+
+
+def _shares_without(
+    problem: Problem, indices: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """(k,) det S without each of the chosen (k,), as a share of det S."""
+    k = len(indices)
+    others = np.tile(indices, (k, 1))[~np.eye(k, dtype=np.bool_)].reshape(k, -1)
+    if k == 1 and not len(problem.root):
+        return np.zeros(1)
+    log_det = rank_of_blocks(problem.raw[others], problem.root, problem.white.size)[1]
+    return np.asarray(np.exp(problem.multiplicity * log_det - problem.log_det(indices)))

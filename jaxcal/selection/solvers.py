@@ -18,7 +18,6 @@ from jaxcal.checks import one_of, seconds, share, whole_number
 from jaxcal.selection.exact import exact
 from jaxcal.selection.exchange import exchange
 from jaxcal.selection.problem import (
-    LossProblem,
     Problem,
     ScenarioProblem,
     Solution,
@@ -40,8 +39,8 @@ _TRIES = 200  # random selections, before the greedy one, where all are singular
 def solve_random(problem: Problem, *, seed: int | np.random.Generator) -> Solution:
     """The baseline of the paper: drawn uniformly, never singular, required first."""
     rng = np.random.default_rng(seed)
-    if isinstance(problem, ScenarioProblem | LossProblem):
-        for _ in range(_TRIES):  # none singular in any scenario, or with any loss
+    if isinstance(problem, ScenarioProblem):
+        for _ in range(_TRIES):  # none singular in any scenario
             indices = random_indices([problem], rng)[0][0]
             if np.isfinite(problem.log_det(indices)):
                 return Solution(indices, seed=seed if isinstance(seed, int) else None)

@@ -112,8 +112,6 @@ def test_contacts_are_chosen_from_a_table(files, capsys):
     assert "--worst must come with --scenarios N" in capsys.readouterr().err
     assert main([*given, *sensor[:-1]]) == 2
     assert "which look like radians" in capsys.readouterr().err
-    assert main([*given, *sensor, "--lost", "3"]) == 2
-    assert "lost must be at most 2" in capsys.readouterr().err
     assert main(["select", str(table), "-k", "4", "--radians"]) == 2
     assert "options of an arm need --model FILE.urdf" in capsys.readouterr().err
 

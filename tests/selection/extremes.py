@@ -64,8 +64,6 @@ def scenarios_and_losses() -> None:
                     ask(lambda m=method, j=joined, d=design: d.select(
                         4, j, m, **short[m]
                     ))  # fmt: skip
-        few = jaxcal.Design.from_blocks(blocks[0, :9], lost=1)
-        ask(lambda d=few: d.select(4, "A", "exact", time_limit=0.2))
 
 
 def arms() -> None:

@@ -259,9 +259,6 @@ def test_bad_input_is_named():
         design.refine([0, 1, 2], allowed=lambda u: False)
     with pytest.raises(ValueError, match="refine needs candidates and a model"):
         jaxcal.Design.from_blocks(np.ones((3, 1, 1))).refine([0])
-    careful = jaxcal.Design(np.random.default_rng(0).random((9, 2)), lost=1)
-    with pytest.raises(ValueError, match="got a design with lost or reliability"):
-        careful.refine([0, 1, 2, 3])
     best = jaxcal.Worst("D", efficiency=True)
     cases = ([[0.0, 1.0]], 2, enzyme())
     with pytest.raises(ValueError, match="criterion must be of values with refine"):

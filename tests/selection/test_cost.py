@@ -51,79 +51,73 @@ def every_run(candidates, k, start, required=(), available=None):
     return np.array(runs)
 
 
-@pytest.mark.slow
-@settings(max_examples=12)
-@given(st.integers(0, 2**31), st.floats(0.5, 1.0), st.booleans(), st.integers(0, 2))
-def test_exact_is_the_least_of_every_subset_and_order(seed, least, started, r):
-    rng = np.random.default_rng(seed)
-    candidates = rng.uniform(-20, 20, (8, 3))
-    start = np.zeros(3) if started else None
-    available = rng.permutation(8) < 7
-    required = np.flatnonzero(available)[:r]
-    runs = every_run(candidates, 4, start, required, available)
-    enough = np.exp((runs[:, 0] - runs[:, 0].max()) / 12) >= least - 1e-12
-    found = select_fastest(
-        candidates,
-        4,
-        motion=MOTION,
-        least_efficiency=least,
-        start=start,
-        available=available,
-        required=required,
-    )
-    assert found.proven
-    assert found.seconds == pytest.approx(runs[enough, 1].min(), abs=1e-8)
-    assert found.seconds == pytest.approx(
-        seconds_of(candidates, found.indices, start), abs=1e-9
-    )
+def excess(found, runs, least, size=12):
+    """How much longer the run is than the fastest of all ``runs`` (N, 2), a share.
+
+    It is of a subset as efficient as asked, in its best order; ``size`` is of the
+    efficiency's root.
+    """
+    own = np.isclose(runs[:, 0], found.log_det, rtol=1e-9)
+    assert found.seconds == pytest.approx(runs[own, 1].min(), abs=1e-8)
     assert found.efficiency >= least - 1e-9
-    assert found.log_det == pytest.approx(
-        jaxcal.log_det_information(candidates[found.indices])
-    )
-    assert set(required.tolist()) <= set(found.indices.tolist())
-    assert available[found.indices].all()
+    assert (found.method, found.proven) == ("heuristic", False)
+    share = np.exp((runs[:, 0] - runs[:, 0].max()) / size)
+    more = found.seconds / runs[share >= least - 1e-12, 1].min() - 1.0
+    assert more >= -1e-9
+    return more
 
 
-@pytest.mark.parametrize("k", [5, 6])
-def test_exact_holds_for_more_postures_than_regressors(rng, k):
-    candidates = rng.uniform(-20, 20, (8, 3))
-    runs = every_run(candidates, k, np.zeros(3))
-    for least in (0.7, 0.9, 0.99):
-        enough = np.exp((runs[:, 0] - runs[:, 0].max()) / 12) >= least - 1e-12
-        found = select_fastest(
-            candidates, k, motion=MOTION, least_efficiency=least, start=np.zeros(3)
-        )
-        assert found.proven
-        assert found.seconds == pytest.approx(runs[enough, 1].min(), abs=1e-8)
+def nearly_always_the_fastest(shares):
+    """Half a percent longer in the mean, and mostly not at all."""
+    assert np.mean(shares) < 0.005
+    assert np.mean(np.array(shares) < 1e-9) > 0.7
 
 
 @pytest.mark.parametrize("started", [False, True])
-def test_the_front_is_that_of_every_subset(rng, started):
+def test_runs_are_nearly_the_fastest_of_every_subset_and_order(rng, started):
+    shares = []
+    for k, r in ((4, 0), (4, 2), (5, 0), (6, 0)):
+        candidates = rng.uniform(-20, 20, (8, 3))
+        start = np.zeros(3) if started else None
+        available = rng.permutation(8) < 7
+        required = np.flatnonzero(available)[:r]
+        runs = every_run(candidates, k, start, required, available)
+        for least in (0.7, 0.9, 0.99):
+            found = select_fastest(
+                candidates, k, motion=MOTION, least_efficiency=least, start=start,
+                available=available, required=required,
+            )  # fmt: skip
+            shares.append(excess(found, runs, least))
+            own = seconds_of(candidates, found.indices, start)
+            assert found.seconds == pytest.approx(own, abs=1e-9)
+            own = jaxcal.log_det_information(candidates[found.indices])
+            assert found.log_det == pytest.approx(own)
+            assert set(required.tolist()) <= set(found.indices.tolist())
+            assert available[found.indices].all()
+    nearly_always_the_fastest(shares)
+
+
+@pytest.mark.parametrize("started", [False, True])
+def test_the_front_is_nearly_that_of_every_subset(rng, started):
+    shares = []
     for _ in range(3):
         candidates = rng.uniform(-20, 20, (9, 3))
         start = np.zeros(3) if started else None
         runs = every_run(candidates, 4, start)
-        runs[:, 0] = np.exp((runs[:, 0] - runs[:, 0].max()) / 12)
-        runs = runs[runs[:, 0] >= 0.6]
-        best = np.array(
-            [
-                run
-                for run in runs
-                if not ((runs[:, 1] <= run[1] + 1e-9) & (runs[:, 0] > run[0])).any()
-            ]
-        )
-        best = best[np.argsort(best[:, 1])]
         front = pareto_front(
             candidates, 4, motion=MOTION, least_efficiency=0.6, start=start
         )
-        assert front.proven
-        got = np.array([(p.efficiency, p.seconds) for p in front.points])
-        np.testing.assert_allclose(got, best, rtol=1e-7)
+        assert (front.method, front.proven) == ("heuristic", False)
+        shares += [excess(p, runs, p.efficiency * (1 - 1e-9)) for p in front.points]
+        efficiencies = [p.efficiency for p in front.points]
+        assert efficiencies == sorted(efficiencies)
+        assert efficiencies[-1] == pytest.approx(1.0)
+    nearly_always_the_fastest(shares)
 
 
 @settings(max_examples=6)
 @given(st.integers(0, 2**31), st.sampled_from([4, 5, 8, 13]))
-def test_the_heuristic_keeps_every_rule_and_is_never_faster_than_exact(seed, k):
+def test_a_run_keeps_every_rule(seed, k):
     rng = np.random.default_rng(seed)
     candidates = rng.uniform(-20, 20, (20, 3))
     found = select_fastest(
@@ -132,7 +126,6 @@ def test_the_heuristic_keeps_every_rule_and_is_never_faster_than_exact(seed, k):
         motion=MOTION,
         least_efficiency=0.9,
         required=[3],
-        method="heuristic",
         seed=seed,
     )
     assert found.efficiency >= 0.9 - 1e-9
@@ -140,11 +133,6 @@ def test_the_heuristic_keeps_every_rule_and_is_never_faster_than_exact(seed, k):
     assert len(set(found.indices.tolist())) == k
     assert 3 in found.indices
     assert found.seconds == pytest.approx(seconds_of(candidates, found.indices, None))
-    if k <= 5:
-        best = select_fastest(
-            candidates, k, motion=MOTION, least_efficiency=0.9, required=[3]
-        )
-        assert best.seconds <= found.seconds + 1e-9
 
 
 @given(st.integers(0, 2**31))
@@ -212,21 +200,6 @@ def test_less_efficiency_never_takes_longer(rng):
     assert seconds == sorted(seconds)
 
 
-def test_out_of_time_is_said(rng):
-    candidates = rng.uniform(-20, 20, (60, 3))
-    found = select_fastest(
-        candidates,
-        10,
-        motion=MOTION,
-        least_efficiency=0.3,
-        method="exact",
-        time_limit=0.2,
-    )
-    assert found.method == "exact"
-    assert not found.proven
-    assert found.efficiency >= 0.3
-
-
 def test_the_figure_holds_every_point(rng):
     front = pareto_front(rng.uniform(-20, 20, (10, 3)), 4, motion=MOTION)
     axes = plots.pareto(Figure().add_subplot(), {"K = 4": front})
@@ -239,23 +212,28 @@ def test_the_figure_holds_every_point(rng):
     ("change", "message"),
     [
         ({"least_efficiency": 0.0}, r"least_efficiency must be in \(0, 1\], got 0"),
-        (
-            {"method": "magic"},
-            "method must be one of exact, heuristic, got 'magic'",
-        ),
-        ({"k": 13, "method": "exact"}, "k must be at most 12 with exact, got 13"),
+        ({"method": "exact"}, "method must be one of heuristic, got 'exact'"),
         ({"motion": 20.0}, "motion must be a Motion, got 20.0"),
         ({"k": 3}, "k must be at least 4"),
         ({"start": np.zeros(2)}, r"start must have shape \(3,\), got \(2,\)"),
         ({"time_limit": -1}, "time_limit must be a number above 0 in seconds, got -1"),
         ({"motion": Motion((1.0, 2.0), (1.0,))}, "motion.speed must hold 1 or 3"),
-        ({"method": "lookahead"}, "method must be one of exact, heuristic"),
     ],
 )
 def test_bad_requests_name_argument_rule_and_value(rng, change, message):
     given = {"k": 4, "motion": MOTION} | change
     with pytest.raises(ValueError, match=message):
         select_fastest(rng.random((20, 3)), given.pop("k"), **given)
+
+
+def test_replicates_and_scenarios_have_no_run(rng):
+    twice = jaxcal.Design(rng.random((9, 3)), max_replicates=2)
+    for ask in (twice.fastest, twice.pareto):
+        with pytest.raises(ValueError, match="max_replicates must be 1 with fastest"):
+            ask(4, MOTION)
+    several = jaxcal.Design.from_blocks(rng.random((2, 9, 1, 3)))
+    with pytest.raises(ValueError, match="scenarios must be left out with fastest"):
+        several.fastest(4, MOTION)
 
 
 @pytest.mark.parametrize(
@@ -298,15 +276,9 @@ def test_blocks_are_visited_as_by_brute_force(seed, least, known):
         orders = itertools.permutations(subset)
         least_seconds = min(seconds_of(candidates, o, None) for o in orders)
         runs.append((np.linalg.slogdet(rows.T @ rows + prior)[1], least_seconds))
-    value, taken = np.array(runs).T
     given = {"blocks": blocks, "prior": prior, "least_efficiency": least}
     found = select_fastest(candidates, 4, motion=MOTION, **given)
-    enough = value >= value.max() + 5 * np.log(least) - 1e-9
-    assert found.proven
-    assert found.seconds == pytest.approx(taken[enough].min(), abs=1e-8)
-    assert found.efficiency >= least - 1e-9
-    near = select_fastest(candidates, 4, motion=MOTION, method="heuristic", **given)
-    assert near.seconds >= found.seconds - 1e-9 and near.efficiency >= least - 1e-9
+    assert excess(found, np.array(runs), least, size=5) < 0.05
 
 
 @pytest.mark.parametrize(
@@ -341,15 +313,9 @@ def test_any_model_is_visited_as_by_brute_force(rng, model, k):
         least_seconds = min(seconds_of(candidates, o, None) for o in orders)
         added = np.einsum("kqa,kqb->ab", some, some)
         runs.append((np.linalg.slogdet(known + added)[1], least_seconds))
-    value, taken = np.array(runs).T
     given = {"model": model, "noise": Noise(0.1), "measured": measured}
     found = select_fastest(candidates, k, motion=MOTION, least_efficiency=0.99, **given)
-    enough = value >= value.max() + len(known) * np.log(0.99) - 1e-9
-    assert found.proven
-    assert found.seconds == pytest.approx(taken[enough].min(), abs=1e-8)
-    assert found.log_det == pytest.approx(
-        value[(taken == taken[enough].min()) & enough].max()
-    )
+    assert excess(found, np.array(runs), 0.99, size=len(known)) < 1e-9
     front = pareto_front(candidates, k, motion=MOTION, least_efficiency=0.99, **given)
     assert front.points[0].seconds == pytest.approx(found.seconds)
 

@@ -95,6 +95,26 @@ def test_exact_is_brute_force(name) -> None:
                 assert bound >= sign * answer.value - 1e-9 * abs(answer.value)
 
 
+def test_the_worst_measurement_that_fails_is_a_scenario() -> None:
+    """Every choice by brute force; candidate i fails in scenario i."""
+    blocks = np.random.default_rng(6).standard_normal((7, 1, 3))
+    fails = blocks * ~np.eye(7, dtype=bool)[:, :, None, None]
+    subsets = list(itertools.combinations(range(7), 5))
+    each = np.array([phi(fails, c, "D", blocks)[list(c)].min() for c in subsets])
+    answer = Design.from_blocks(fails).select(5, Worst("D"), "exact")
+    assert answer.proven and answer.value == pytest.approx(each.max(), rel=1e-9)
+    assert answer.indices.tolist() == list(subsets[each.argmax()])
+
+
+def test_what_is_left_without_each_is_that_of_the_scenario_that_loses_most() -> None:
+    blocks = np.random.default_rng(7).standard_normal((3, 8, 1, 3))
+    answer = Design.from_blocks(blocks).select(5, Mean("D"))
+    chosen = answer.indices.tolist()
+    rest = [phi(blocks, [j for j in chosen if j != i], "D", blocks) for i in chosen]
+    shares = np.exp(np.array(rest) - phi(blocks, chosen, "D", blocks)).min(axis=1)
+    np.testing.assert_allclose(answer.left_without, shares, rtol=1e-9)
+
+
 @pytest.mark.parametrize("name", "DA")
 def test_many_scenarios_are_brute_force_too(name) -> None:
     """Twenty, of which the search looks at the curvature of some at a time."""

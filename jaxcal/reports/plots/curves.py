@@ -45,7 +45,7 @@ def against_count(
 
 
 def pareto(axes: Any, fronts: dict[str, Any]) -> Any:
-    """Time against efficiency; filled markers are proven, hollow ones are not.
+    """Time against efficiency.
 
     Args:
         axes: matplotlib axes.
@@ -64,8 +64,7 @@ def pareto(axes: Any, fronts: dict[str, Any]) -> Any:
             linewidth=1.0,
             marker=MARKERS[i % len(MARKERS)],
             markersize=5,
-            markerfacecolor=colour if front.proven else "white",
-            label=name + ("" if front.proven else " (not proven)"),
+            label=name,
         )
     axes.set_xlabel("D-efficiency against the optimum")
     axes.set_ylabel("time of the run (s): travel and settling")

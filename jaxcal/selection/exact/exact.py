@@ -30,9 +30,7 @@ from jaxcal.selection.exchange.exchange import (
     exchange_indices,
     greedy_indices,
 )
-from jaxcal.selection.exchange.rounds import in_rounds
 from jaxcal.selection.problem import (
-    LossProblem,
     Problem,
     ScenarioProblem,
     Solution,
@@ -50,7 +48,6 @@ _BLOCKS_LIMIT = 2.0  # of auto: what is not proven by then often takes minutes
 
 TOLERATED = 1e-9  # share by which rounding may change what is called proven
 
-_MOST_LOSSES = 500  # that branch and bound looks at together
 _CHEAP = 5_000_000  # subsets: the largest volume is found within milliseconds
 _LARGEST_HULL_DIMENSION = 4  # qhull's facets grow as M^(n // 2)
 
@@ -144,8 +141,6 @@ def solve_exact(
         restarts, seed: of the exchange that starts branch and bound.
         enough: efficiency in (0, 1] at which to stop, unless the proof is cheap.
     """
-    if isinstance(problem, LossProblem):
-        return _with_losses(problem, best, deadline, restarts, seed, enough)
     if problem.simplex:
         pool = _pool(problem, hull=best == 1)
         free = problem.k - len(problem.required)
@@ -184,36 +179,6 @@ def _by_relaxation(
     return _solution_of(problem, [start], best, bound, 1)
 
 
-def _with_losses(
-    problem: LossProblem,
-    best: int,
-    deadline: Deadline,
-    restarts: int,
-    seed: int,
-    enough: float | None,
-) -> Solution:
-    """``solve_exact`` where the worst few of the chosen fail."""
-    if best > 1:  # every loss at once
-        every = problem.losses_of(np.flatnonzero(problem.available))
-        if len(every) > _MOST_LOSSES:
-            raise ValueError(
-                f"best must be 1 with lost of more than {_MOST_LOSSES} candidates or "
-                f"pairs of them, got {len(every)}"
-            )
-        return solve_exact(problem.among(every), best, deadline, restarts, seed, enough)
-
-    def solve_some(some: Problem) -> Solution:
-        return solve_exact(some, 1, deadline.part(0.5), restarts, seed, enough)
-
-    start = greedy_indices(problem.unlost)
-    solution = in_rounds(problem, solve_some, start, deadline, enough)
-    value, log_det = (float(x[0]) for x in values(problem, solution.indices[None]))
-    return dataclasses.replace(
-        solution, value=value, log_det=log_det,
-        alternatives=((solution.indices, value),),
-    )  # fmt: skip
-
-
 def upper_bound(problem: Problem) -> float:
     """The value that no selection betters: the optimum if cheap, or the relaxation's.
 
@@ -226,10 +191,6 @@ def upper_bound(problem: Problem) -> float:
             solution = _enumerate(problem, pool, 1, NEVER)
             assert solution.bound is not None
             return solution.bound
-    if isinstance(problem, LossProblem):
-        start = greedy_indices(problem)
-        some = problem.among(problem.losses_of(start))
-        return float(problem.criterion.reported(relaxed(some, start)))
     bound = relaxed(problem, greedy_indices(problem))
     return float(problem.criterion.reported(bound))
 

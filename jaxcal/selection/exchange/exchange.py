@@ -20,9 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal import compiled
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection.criteria import Criterion
-from jaxcal.selection.exchange.rounds import in_rounds
 from jaxcal.selection.problem import (
-    LossProblem,
     Problem,
     ScenarioProblem,
     Solution,
@@ -60,8 +58,7 @@ _CLIMBS = 2.5e5  # k p^3 of the climbs of E in one call, from each kind of start
 
 def solve(problem: Problem, *, seed: int, restarts: int | None) -> Solution:
     """The solver "exchange"."""
-    if restarts is None and not isinstance(problem, LossProblem):
-        restarts = default_restarts(problem)
+    restarts = restarts or default_restarts(problem)
     indices = exchange_indices(problem, restarts, seed)
     return Solution(indices, seed=seed, restarts=restarts)
 
@@ -79,23 +76,12 @@ def greedy_indices(problem: Problem) -> Indices:
     at most p times and at least once the largest: an incomplete selection has no least
     eigenvalue to raise.
     """
-    if isinstance(problem, LossProblem):
-        return _greedy_with_losses(problem)
     climbs = Climbs(problem, 0)
     for share, swaps in ((climbs.share, 0), (_RANK_FIRST, 0), (climbs.share, 1)):
         chosen, phi = climbs.climbed(problem.required, share, swaps)
         if phi > -np.inf:
             return chosen
     return climbs.best_of(1 + _MENDING)[0]
-
-
-def _greedy_with_losses(problem: LossProblem) -> Indices:
-    """Greedy against the losses of the selection made where nothing is lost."""
-    losses = problem.losses_of(greedy_indices(problem.unlost))
-    chosen = greedy_indices(problem.among(losses))
-    if np.isfinite(problem.log_det(chosen)):
-        return chosen
-    return exchange_indices(problem, 1)
 
 
 def default_restarts(problem: Problem) -> int:
@@ -242,13 +228,6 @@ def exchange_indices(
 
     After ``deadline`` no more swaps are made.
     """
-    if isinstance(problem, LossProblem):
-        start = greedy_indices(problem.unlost)
-
-        def solve_some(some: Problem) -> Solution:
-            return Solution(exchange_indices(some, restarts, seed, deadline))
-
-        return in_rounds(problem, solve_some, start, deadline).indices
     restarts = restarts or default_restarts(problem)
     climbs = Climbs(problem, seed, deadline)
     if problem.criterion.kind == "least":

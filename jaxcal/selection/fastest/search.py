@@ -1,15 +1,9 @@
-"""Which postures, in which order, so that a run takes least time; the trade-off.
+"""Which postures, in which order, so that a run takes little time; the trade-off.
 
-Both searches start from the D-optimum and local optima of the exchange. "heuristic"
-swaps one posture at a time where that keeps the determinant and shortens the tour.
-"exact" is a compiled depth-first search over subsets in the order of the pool; a level
-keeps the best open tours through its postures (Held and Karp), so going one deeper
-costs only the new ones. Two bounds close a branch. Time: travel times are a metric, so
-a tour through more postures takes no less than the best one through those already held.
-Determinant: for any positive definite W, ``log det M <= -log det W + p log(trace(W M) /
-p)``; W is taken as the inverse of what the held postures and the D-optimum's share of
-the rest give, and the trace is completed by the largest gains that are left. Source of
-the bound: Ponte, Fampa and Lee, arXiv 2302.07386.
+A heuristic: local search starts from the D-optimum and local optima of the exchange and
+swaps one posture at a time where that keeps the determinant and shortens the tour;
+random swaps then lead away from a local optimum. The order of the postures found is
+proven up to 12 (Held and Karp), the choice of them is not.
 """
 
 from __future__ import annotations
@@ -29,7 +23,6 @@ from jaxcal.selection.fastest.motion import Motion, travel_times
 from jaxcal.selection.problem import (
     CandidateSet,
     DesignProtocol,
-    Problem,
     problem_of,
 )
 from jaxcal.selection.solvers import checked_seed
@@ -40,9 +33,6 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 SAME_TIME = 1e-9  # seconds: two runs this close take as long
-_METHODS = ("exact", "heuristic")
-_MOST_EXACT = 12  # postures that the exact search accepts
-_EXACT_BY_DEFAULT = 8
 _STARTS = 12  # the D-optimum and local optima of the exchange
 _KICKS = 20  # random changes of the best run found, from which to search again
 _KICK_TRIES = 50  # swaps drawn until one keeps the determinant
@@ -53,7 +43,7 @@ _TRIED = 8  # most promising swaps that are put in their best order
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FastSelection:
-    """The postures in the order to visit, what the run takes, and what is proven."""
+    """The postures in the order to visit, and what the run takes."""
 
     indices: Indices  # (k,) in the order to visit
     seconds: float  # of travel and settling
@@ -61,12 +51,11 @@ class FastSelection:
     log_det: float  # natural log det S, in the candidates' unit
     efficiency: float  # D-efficiency against ``bound``
     least_efficiency: float  # that was asked for
-    proven: bool  # no subset and order with that efficiency takes less time
-    method: str  # as asked for
     bound: float  # log det S of the D-optimum, an upper bound on it where not proven
     bound_proven: bool  # ``bound`` is the optimum
-    nodes: int  # of the exact search
     search_seconds: float  # that finding it took
+    method: str = "heuristic"
+    proven: bool = False  # another subset with that efficiency may take less time
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -75,7 +64,8 @@ class ParetoFront:
 
     points: tuple[FastSelection, ...]  # ascending in time and in efficiency
     least_efficiency: float  # where the front was cut off
-    proven: bool  # every point is, and none is missing
+    method: str = "heuristic"
+    proven: bool = False  # points may be missing, and others be faster
 
 
 def fastest(
@@ -85,11 +75,11 @@ def fastest(
     *,
     least_efficiency: float = 0.95,
     start: ArrayLike | None = None,
-    method: str | None = None,
+    method: str = "heuristic",
     time_limit: float = 60.0,
     seed: int | np.random.Generator = 0,
 ) -> FastSelection:
-    """The subset and the order of least time with a D-efficiency.
+    """The fastest subset and order found with a D-efficiency, by local search.
 
     Args:
         design: what may be measured; ``design.fastest(k, motion)`` asks the same.
@@ -97,18 +87,20 @@ def fastest(
         motion: speeds and accelerations in the candidates' unit, settle time.
         least_efficiency: in (0, 1], against the proven D-optimum.
         start: (n,) where the device stands; it begins at any posture by default.
-        method: "exact" (k up to 12, with a proof unless the time runs out) or
-            "heuristic" (local search); exact up to k = 8 when not given.
-        time_limit: seconds of the exact search and of the D-optimum behind both.
-        seed: of the heuristic's starts, from which exact starts too.
+        method: "heuristic", the only one.
+        time_limit: seconds of the search for the D-optimum.
+        seed: of the starts and of the random swaps.
 
     Returns:
-        The selection; among runs of equal time the one with the largest determinant.
+        The selection, its postures in the order to visit.
+
+    Raises:
+        ValueError: naming the argument, the rule and the value; of scenarios and
+            replicates, which have no such run.
     """
     least = share("least_efficiency", least_efficiency)
-    search = _TourSearch(
-        design.candidate_set, k, motion, start, method, time_limit, seed
-    )
+    one_of("method", method, ("heuristic",))
+    search = _TourSearch(design.candidate_set, k, motion, start, time_limit, seed)
     answer = search.answer(least, None)
     if answer is None:
         raise ValueError(
@@ -124,28 +116,30 @@ def pareto(
     motion: Motion,
     *,
     least_efficiency: float = 0.7,
+    method: str = "heuristic",
     **options: Any,
 ) -> ParetoFront:
     """Time against D-efficiency, from ``least_efficiency`` up to the D-optimum.
 
-    Each point is the fastest run more efficient than the point before it.
+    Each point is the fastest run found that is more efficient than the one before it.
 
     Args:
         design: what may be measured; ``design.pareto(k, motion)`` asks the same.
         k, motion: as in ``fastest``.
         least_efficiency: where to cut the front off, in (0, 1].
-        options: start, method, seed and time_limit (for each point) of ``fastest``.
+        method: "heuristic", the only one.
+        options: start, seed and time_limit of ``fastest``.
     """
     least = share("least_efficiency", least_efficiency)
-    defaults = {"start": None, "method": None, "time_limit": 60.0, "seed": 0}
+    one_of("method", method, ("heuristic",))
+    defaults = {"start": None, "time_limit": 60.0, "seed": 0}
     search = _TourSearch(design.candidate_set, k, motion, **(defaults | options))
     points: list[FastSelection] = []
     point = search.answer(least, None)
     while point is not None and len(points) < _MOST_POINTS:
         points.append(point)
         point = search.answer(least, point.log_det)
-    proven = point is None and all(p.proven for p in points)
-    return ParetoFront(_undominated(points), least, proven)
+    return ParetoFront(_undominated(points), least)
 
 
 def _undominated(points: list[FastSelection]) -> tuple[FastSelection, ...]:
@@ -159,20 +153,14 @@ def _undominated(points: list[FastSelection]) -> tuple[FastSelection, ...]:
     )
 
 
-def _pool(problem: Problem) -> Indices:
-    """Candidates of the search, the required first, then by falling leverage."""
-    if len(problem.required) == problem.k:
-        return problem.required
-    free = np.setdiff1d(np.flatnonzero(problem.available), problem.required)
-    leverage = (problem.blocks[free] ** 2).sum(axis=(1, 2))
-    return np.concatenate([problem.required, free[np.argsort(-leverage)]])
-
-
 def _require_travel(offer: CandidateSet, motion: Motion) -> Array:
     """(M, n) commands between which the device travels; refuses what has no run."""
-    if offer.scenarios is not None or offer.uncertain:
+    if offer.scenarios is not None:
+        raise ValueError("scenarios must be left out with fastest and pareto")
+    if offer.max_replicates != 1:
         raise ValueError(
-            "scenarios, lost and reliability must be left out with fastest and pareto"
+            "max_replicates must be 1 with fastest and pareto, which visit a posture "
+            f"once, got {offer.max_replicates}"
         )
     if offer.candidates is None:
         raise ValueError(
@@ -184,16 +172,6 @@ def _require_travel(offer: CandidateSet, motion: Motion) -> Array:
     return offer.candidates
 
 
-def _method_for(k: int, method: str | None) -> str:
-    """The method, checked; when not given, exact where k is small."""
-    if method is None:
-        method = "exact" if k <= _EXACT_BY_DEFAULT else "heuristic"
-    one_of("method", method, _METHODS)
-    if method == "exact" and k > _MOST_EXACT:
-        raise ValueError(f"k must be at most {_MOST_EXACT} with exact, got {k}")
-    return method
-
-
 class _TourSearch:
     """One problem, cut down to the candidates that may be chosen: the pool."""
 
@@ -203,17 +181,15 @@ class _TourSearch:
         k: int | None,
         motion: Motion,
         start: ArrayLike | None,
-        method: str | None,
         time_limit: float,
         seed: int | np.random.Generator,
     ) -> None:
         points = _require_travel(offer, motion)
         self.problem = problem = problem_of(offer, k, "D")
-        self.k, self.method = problem.k, _method_for(problem.k, method)
-        self.seed, self.pool = checked_seed(seed), _pool(problem)
-        # Held in every search; one is always left to choose: where all k are required
-        # the pool is just those.
-        self.fixed = min(len(problem.required), self.k - 1)
+        self.k, self.seed = problem.k, checked_seed(seed)
+        self.fixed = len(problem.required)  # the first of the pool
+        free = np.setdiff1d(np.flatnonzero(problem.available), problem.required)
+        self.pool = np.concatenate([problem.required, free])
         points = points[self.pool]
         self.blocks = np.ascontiguousarray(problem.blocks[self.pool])
         self.times = travel_times(points, points, motion)
@@ -222,8 +198,7 @@ class _TourSearch:
             where = array_of("start", start, *points.shape[1:])
             self.start = travel_times(where[None], points, motion)[0]
         self.settle = float(motion.settle) * self.k
-        self.limit = seconds("time_limit", time_limit)
-        deadline = Deadline(self.limit)
+        deadline = Deadline(seconds("time_limit", time_limit))
         self.optimum = solve_exact(problem, deadline=deadline)
 
     def answer(self, least: float, above: float | None) -> FastSelection | None:
@@ -244,17 +219,13 @@ class _TourSearch:
             least_log_det = max(least_log_det, above / m - scale + SAME_TIME)
         rng = np.random.default_rng(self.seed)
         chosen, travel = self._local(least_log_det, rng)
-        proven, nodes = False, 0
-        if self.method == "exact":
-            chosen, proven, nodes = self._exact(least_log_det, chosen, travel)
-        elif chosen is not None:
-            for _ in range(_KICKS):
-                kicked = self._kicked(chosen, least_log_det, rng)
-                other, after = self._shortened(kicked, least_log_det)
-                if after < travel - SAME_TIME:
-                    chosen, travel = other, after
         if chosen is None:
             return None
+        for _ in range(_KICKS):
+            kicked = self._kicked(chosen, least_log_det, rng)
+            other, after = self._shortened(kicked, least_log_det)
+            if after < travel - SAME_TIME:
+                chosen, travel = other, after
         tour, travel = self._tour(chosen)
         log_det = problem.log_det(self.pool[tour])
         bound = max(optimum.bound, log_det)
@@ -265,29 +236,10 @@ class _TourSearch:
             log_det=log_det,
             efficiency=problem.criterion.efficiency(log_det, bound),
             least_efficiency=least,
-            proven=proven and optimum.proven,
-            method=self.method,
             bound=bound,
             bound_proven=optimum.proven,
-            nodes=nodes,
             search_seconds=time.perf_counter() - begun,
         )
-
-    def _exact(
-        self, wanted: float, begun: Indices | None, travel: float
-    ) -> tuple[Indices | None, bool, int]:
-        """The compiled search from a run known: subset, is it proven, nodes."""
-        from jaxcal.selection.fastest.tour_kernel import fastest_subset
-
-        chosen = np.zeros(self.k, np.int64) if begun is None else np.sort(begun)
-        best = np.array([travel, -np.inf if begun is None else self._log_det(chosen)])
-        prior = np.array(self.problem.prior)
-        relaxed = self._information(self._positions(self.optimum.indices)) - prior
-        complete, nodes = fastest_subset(
-            self.blocks, prior, self.times, self.start, self.fixed, relaxed, wanted,
-            SAME_TIME, chosen, best, self.limit,
-        )  # fmt: skip
-        return (chosen if np.isfinite(best[0]) else None), complete, nodes
 
     def _local(
         self, wanted: float, rng: np.random.Generator

@@ -1,14 +1,13 @@
-"""Compiled searches: the order of least time, and the fastest subset with its proof."""
+"""The order of least time, compiled: optimal for few postures, else improved."""
 
 from __future__ import annotations
 
 import cython
 import numpy as np
-from cython.cimports.jaxcal.information.linear_algebra import add, copy, dot, factor
 from cython.cimports.jaxcal.watch import Watch, begin, late
-from cython.cimports.libc.math import INFINITY, log
+from cython.cimports.libc.math import INFINITY
 
-__all__ = ["MOST_EXACT", "best_order", "fastest_subset"]
+__all__ = ["MOST_EXACT", "best_order"]
 
 MOST_EXACT = 12  # postures up to which the order is optimal (Held and Karp 1962)
 
@@ -139,124 +138,3 @@ def _improve(times, start, order, seconds):
                     order[j] = a
         seconds -= saved
     return seconds
-
-
-def fastest_subset(
-    blocks: cython.const[cython.double][:, :, ::1],
-    prior: cython.const[cython.double][:, ::1],
-    times: cython.double[:, ::1],
-    start: cython.double[::1],
-    fixed: cython.Py_ssize_t,
-    relaxed: cython.const[cython.double][:, ::1],
-    wanted: cython.double,
-    same: cython.double,
-    chosen: cython.Py_ssize_t[::1],
-    best: cython.double[::1],
-    seconds: cython.double,
-):
-    """Depth-first search for the fastest subset with a determinant.
-
-    Args:
-        blocks: (M, q, p) float64 whitened.
-        prior: (p, p) float64 information beforehand.
-        times: (M, M) float64 seconds, a metric.
-        start: (M,) float64 seconds to each from the start, zero where there is none.
-        fixed: postures in every subset, the first of ``blocks``; fewer than k.
-        relaxed: (p, p) information of a good selection of k, without the prior; any
-            leaves the bound true.
-        wanted: log det a subset must have.
-        same: seconds within which two runs take as long; of these the one with the
-            larger determinant wins.
-        chosen: (k,) int64 the incumbent, written.
-        best: (2,) float64 its seconds and log det, written.
-        seconds: time limit.
-
-    Returns:
-        Whether the search is complete, and its nodes.
-    """
-    m, k, p = blocks.shape[0], chosen.shape[0], blocks.shape[2]
-    tours: cython.double[:, ::1] = np.full((1 << k, k), np.inf)
-    held: cython.Py_ssize_t[::1] = np.zeros(k + 1, np.int64)
-    room: cython.double[:, ::1] = np.empty((4, p * p))
-    gains: cython.double[::1] = np.empty(k)
-    depth: cython.Py_ssize_t
-    nodes: cython.Py_ssize_t = 0
-    watch: Watch = begin(seconds)
-    with cython.nogil:
-        for depth in range(fixed):
-            held[depth] = depth
-            _extend(tours, times, start, held, depth)
-        depth = fixed
-        held[depth] = fixed - 1  # the next one tried is one further
-        while depth >= fixed:
-            held[depth] += 1
-            if held[depth] + (k - depth) > m:
-                depth -= 1
-                continue
-            if late(cython.address(watch)):
-                break
-            nodes += 1
-            least = _extend(tours, times, start, held, depth)
-            if least > best[0] + same:
-                continue
-            bound = _bound(blocks, prior, held, depth + 1, k, relaxed, room, gains)
-            if depth == k - 1:
-                if bound >= wanted and (
-                    least < best[0] - same or bound > best[1] + 1e-12
-                ):
-                    best[0], best[1] = min(least, best[0]), bound
-                    chosen[:] = held[:k]
-                continue
-            if bound < wanted or (least > best[0] - same and bound <= best[1]):
-                continue
-            depth += 1
-            held[depth] = held[depth - 1]
-    return depth < fixed, nodes
-
-
-def _bound(blocks, prior, held, count, k, relaxed, room, gains):
-    """Upper bound on log det of the first ``count`` held with k - count after them.
-
-    It is log det where all k are held, and infinite where it cannot be computed.
-
-    Args:
-        blocks, prior, k, relaxed: see above.
-        room: (4, p p) to work in: the information of the held, what stands in for all
-            k of them, its inverse and its factor.
-        gains: (k,) likewise.
-    """
-    m, q, p = blocks.shape[0], blocks.shape[1], cython.cast(cython.int, blocks.shape[2])
-    more = k - count
-    share = cython.cast(cython.double, more) / k
-    gram = cython.address(room[0, 0])
-    whole, inverse = gram + p * p, gram + 2 * p * p
-    copy(gram, cython.address(prior[0, 0]), p * p)
-    for c in range(count):
-        add(gram, 1.0, cython.address(blocks[held[c], 0, 0]), q, p)
-    for a in range(p):
-        for b in range(p):
-            gram[a * p + b] = gram[max(a, b) * p + min(a, b)]
-            whole[a * p + b] = gram[a * p + b] + share * relaxed[a, b]
-    log_det = factor(whole, inverse, gram + 3 * p * p, p)
-    if not more:
-        return log_det
-    if log_det == -INFINITY:
-        return INFINITY
-    total: cython.double = dot(inverse, gram, p * p)
-    gains[:more] = -1.0  # the largest so far, ascending
-    for j in range(held[count - 1] + 1, m):
-        gain: cython.double = 0.0
-        for r in range(q):
-            row = cython.address(blocks[j, r, 0])
-            for a in range(p):
-                gain += row[a] * dot(inverse + a * p, row, p)
-        if gain <= gains[0]:
-            continue
-        place: cython.Py_ssize_t = 0
-        while place + 1 < more and gains[place + 1] < gain:
-            gains[place] = gains[place + 1]
-            place += 1
-        gains[place] = gain
-    for place in range(more):
-        total += gains[place]
-    return log_det + p * log(total / p)

@@ -168,8 +168,6 @@ def plan(
             ``max_k`` suffices, with the accuracy that can be reached.
     """
     begun, offer = time.perf_counter(), design.candidate_set
-    if offer.uncertain:
-        raise ValueError("lost and reliability must be left out with plan")
     one_of("criterion", criterion, tuple(_SUMMARIES))
     more, start = whole_number("more", more, 0), checked_seed(seed)
     requests = [

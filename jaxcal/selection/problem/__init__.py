@@ -3,7 +3,6 @@
 from jaxcal.selection.problem.assembly import make_problems, problem_of
 from jaxcal.selection.problem.blocks import Blocks, blocks_of, shares_regressor
 from jaxcal.selection.problem.candidate_set import CandidateSet, DesignProtocol
-from jaxcal.selection.problem.losses import Loss, LossProblem
 from jaxcal.selection.problem.problem import Problem, Solution, log_dets, values
 from jaxcal.selection.problem.scenario_problem import ScenarioProblem
 from jaxcal.selection.problem.scenarios import Scenarios
@@ -12,8 +11,6 @@ __all__ = [
     "Blocks",
     "CandidateSet",
     "DesignProtocol",
-    "Loss",
-    "LossProblem",
     "Problem",
     "ScenarioProblem",
     "Scenarios",

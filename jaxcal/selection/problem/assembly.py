@@ -1,8 +1,7 @@
 """The problem of a question to a candidate set, checked and whitened.
 
 ``problem_of`` makes it out of the set's information blocks; scenarios are problems of
-their own, joined, and losses a problem about these. ``make_problems`` makes a batch of
-the affine model's.
+their own, joined. ``make_problems`` makes a batch of the affine model's.
 """
 
 from __future__ import annotations
@@ -45,7 +44,6 @@ from jaxcal.selection.problem.arrays import (
 )
 from jaxcal.selection.problem.blocks import blocks_of
 from jaxcal.selection.problem.candidate_set import CandidateSet
-from jaxcal.selection.problem.losses import with_arrivals, with_losses
 from jaxcal.selection.problem.problem import Problem
 from jaxcal.selection.problem.scenario_problem import joined_problem
 
@@ -74,28 +72,7 @@ def problem_of(
     joined = criterion if isinstance(criterion, ScenarioCriterion) else Mean(criterion)
     default = "I" if offer.model and not offer.model.multiplicity else "D"
     of_one = criterion_of(joined.criterion, region, default)
-    if offer.lost:
-        return _problem_with_losses(offer, k, of_one, joined)
-    problem = _problem_of_scenarios(offer, k, of_one, joined)
-    if offer.reliability is None:
-        return problem
-    return with_arrivals(problem, offer.reliability, joined)
-
-
-def _problem_with_losses(
-    offer: CandidateSet, k: int | None, criterion: Criterion, joined: ScenarioCriterion
-) -> Problem:
-    """The problem where the worst ``offer.lost`` of the chosen fail."""
-    if offer.reliability is not None:
-        raise ValueError("lost and reliability must not be given together")
-    if k is None:
-        k = _problem_of_scenarios(offer, None, criterion, joined).k + offer.lost
-    try:
-        kept = whole_number("k", k, 1) - offer.lost
-        _problem_of_scenarios(offer, kept, criterion, joined)
-    except ValueError as error:
-        raise ValueError(f"of k = {k} with {offer.lost} lost: {error}") from None
-    return with_losses(_problem_of_scenarios(offer, k, criterion, joined), offer.lost)
+    return _problem_of_scenarios(offer, k, of_one, joined)
 
 
 def _problem_of_scenarios(

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import array_of, numbers, require_kind, whole_number
+from jaxcal.checks import array_of, numbers, require_kind
 from jaxcal.csvtable import COMMANDS, names_of, of_frame
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, answered, as_model, by_name
@@ -25,15 +25,12 @@ from jaxcal.selection.problem.arrays import (
     rounding_of,
     usable_numbers,
 )
-from jaxcal.selection.problem.losses import checked_reliability
 from jaxcal.selection.problem.scenarios import Scenarios, checked_weights, scenarios_of
 
 __all__ = ["CandidateSet", "DesignProtocol"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-_MOST_LOST = 2  # measurements whose loss is counted on
 
 
 @dataclasses.dataclass(eq=False, repr=False)
@@ -49,8 +46,6 @@ class CandidateSet:
     measured: Any  # commands (N, n), or blocks (N, q, p), of scenarios (S, N, q, p)
     required: Any  # candidates that must be chosen, as given
     max_replicates: int  # how often one candidate may be chosen
-    lost: int = 0  # of the chosen, how many may fail
-    reliability: Array | None = None  # (M,) probability that a measurement arrives
     names: tuple[str, ...] | None = None  # (M,) of the candidates, the caller's own
     axes: tuple[str, ...] | None = None  # (n,) of the inputs, the caller's own
     scenarios: Scenarios | None = None  # None: the nominal alone
@@ -65,11 +60,6 @@ class CandidateSet:
             self.required = copy.deepcopy(self.required)
         if not (self.prior is None or isinstance(self.prior, Prior)):
             self.prior = copy.deepcopy(self.prior)
-        if whole_number("lost", self.lost, 0) > _MOST_LOST:
-            raise ValueError(f"lost must be at most {_MOST_LOST}, got {self.lost}")
-        if self.reliability is not None:
-            count = len(self.available)
-            self.reliability = checked_reliability(self.reliability, count)
 
     @classmethod
     def of_commands(
@@ -85,9 +75,8 @@ class CandidateSet:
         names: Sequence[str] | None = None,
         required: ArrayLike | None = None,
         max_replicates: int = 1,
-        **losses: Any,
     ) -> CandidateSet:
-        """Commands (M, n) of a model, see ``jaxcal.Design``; ``losses`` are fields."""
+        """Commands (M, n) of a model, see ``jaxcal.Design``."""
         if model is not None:
             model = as_model(model)
         require_kind("prior", prior, Prior)
@@ -116,7 +105,6 @@ class CandidateSet:
             max_replicates=max_replicates,
             names=labels,
             axes=axes,
-            **losses,
         )
         if scenarios is not None:
             made.scenarios = scenarios_of(scenarios, model, prior)
@@ -210,11 +198,6 @@ class CandidateSet:
         usable = np.broadcast_to(mask, by_set.shape[:2])
         flatten_rounding(rounding_of(blocks), by_set, usable, rows)
         return made
-
-    @property
-    def uncertain(self) -> bool:
-        """Whether it counts on measurements that fail."""
-        return self.lost > 0 or self.reliability is not None
 
     def by_scenario(self) -> list[CandidateSet]:
         """The candidates in each scenario alone; where there are none, as they are."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from jaxcal.selection.criteria import ScenarioCriterion
 from jaxcal.selection.problem.problem import Problem, values_of_one
 
-__all__ = ["ScenarioProblem", "fields_of", "joined_problem"]
+__all__ = ["ScenarioProblem", "joined_problem"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -34,7 +34,6 @@ class ScenarioProblem(Problem):
     weights: Array = dataclasses.field(default_factory=lambda: np.zeros(0))  # (S,)
     optima: Array | None = None  # (S,) reported values, of a worst efficiency
     nominal: Problem | None = None  # at the model's nominal, where there is a model
-    told: bool = True  # whether each scenario is worth a line: losses are not
 
     @property
     def joined(self) -> ScenarioCriterion:
@@ -99,11 +98,6 @@ class ScenarioProblem(Problem):
         return self.joined.terms(criteria, self.optima)
 
 
-def fields_of(problem: Problem) -> dict[str, Any]:
-    """The fields of a ``Problem`` by name, without those of its subclass."""
-    return {f.name: getattr(problem, f.name) for f in dataclasses.fields(Problem)}
-
-
 def joined_problem(
     members: Sequence[Problem],
     weights: Array,
@@ -126,7 +120,8 @@ def joined_problem(
         return first
     # The fewest that identify in every scenario, where k was not given.
     members = [one if one.k == k else one.of_size(k) for one in members]
-    fields = fields_of(members[0]) | {"criterion": criterion.within(first.criterion)}
+    fields = {f.name: getattr(members[0], f.name) for f in dataclasses.fields(Problem)}
+    fields["criterion"] = criterion.within(first.criterion)
     weights = np.array(weights)
     weights.flags.writeable = False
     if nominal is not None and nominal.k != k:
