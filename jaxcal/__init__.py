@@ -16,6 +16,7 @@ from jaxcal import compiled, moved
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
     from jaxcal.calibration.identify import identify
+    from jaxcal.designs import Motion, optimise
     from jaxcal.information.regression import (
         log_det_information,
         regression_matrix,
@@ -28,10 +29,8 @@ if TYPE_CHECKING:
         Ds,
         I,
         Mean,
-        Motion,
         Selection,
         Worst,
-        optimise,
         select,
     )
 
@@ -73,16 +72,16 @@ _HOME = {
     "Ds": "jaxcal.selection",
     "I": "jaxcal.selection",
     "Mean": "jaxcal.selection",
-    "Motion": "jaxcal.selection",
+    "Motion": "jaxcal.designs",
     "Selection": "jaxcal.selection",
     "Worst": "jaxcal.selection",
-    "optimise": "jaxcal.selection",
+    "optimise": "jaxcal.designs",
     "select": "jaxcal.selection",
 }
 
 
 _ROOMS = (
-    *("adaptive", "arms", "calibration", "candidates", "learning", "models"),
+    *("adaptive", "arms", "calibration", "candidates", "designs", "learning", "models"),
     *("reports", "selection"),
 )
 

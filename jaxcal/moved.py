@@ -24,11 +24,14 @@ MOVED = {  # longer names first
     "jaxcal.models.serial": "jaxcal.arms",
     "jaxcal.pages": "jaxcal.reports.page",
     "jaxcal.plots": "jaxcal.reports.plots",
+    "jaxcal.selection.continuous": "jaxcal.designs.continuous",
+    "jaxcal.selection.fastest": "jaxcal.designs.travel",
 }
 
 
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Finds a module that has moved; asked last, for what nobody else finds."""
+    """Finds a module that has moved, asked first: a folder that an older checkout left
+    would be an empty package."""
 
     def find_spec(
         self, fullname: str, path: Any = None, target: Any = None
@@ -50,7 +53,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 def _new_name(name: str) -> str | None:
-    for old, new in MOVED.items():
+    for old, new in MOVED.items() if name.startswith("jaxcal.") else ():
         if name == old or name.startswith(f"{old}."):
             return new + name[len(old) :]
     return None
@@ -58,4 +61,4 @@ def _new_name(name: str) -> str | None:
 
 def install_finder() -> None:
     """Let old paths be imported."""
-    sys.meta_path.append(_Finder())
+    sys.meta_path.insert(0, _Finder())

@@ -1,18 +1,23 @@
 """Which few of many candidate postures to measure: one problem, many questions."""
 
-from jaxcal.selection.batch import (
-    exact_batch,
-    exchange_batch,
-    greedy_batch,
-    random_batch,
-)
-from jaxcal.selection.continuous import Refinement, optimise
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from jaxcal.selection.criteria import As, Ds, I, Mean, Worst
 from jaxcal.selection.design import Design, select
-from jaxcal.selection.fastest.motion import Motion
 from jaxcal.selection.problem import Problem, make_problems
 from jaxcal.selection.result import BatchSelection, Selection, Subset
 from jaxcal.selection.solvers import METHODS
+
+if TYPE_CHECKING:
+    from jaxcal.selection.batch import (
+        exact_batch,
+        exchange_batch,
+        greedy_batch,
+        random_batch,
+    )
 
 __all__ = [
     "METHODS",
@@ -22,9 +27,7 @@ __all__ = [
     "Ds",
     "I",
     "Mean",
-    "Motion",
     "Problem",
-    "Refinement",
     "Selection",
     "Subset",
     "Worst",
@@ -32,7 +35,16 @@ __all__ = [
     "exchange_batch",
     "greedy_batch",
     "make_problems",
-    "optimise",
     "random_batch",
     "select",
 ]
+
+_MOVED = ("Motion", "Refinement", "optimise")  # to jaxcal.designs
+
+
+def __getattr__(name: str) -> Any:
+    if name not in (*__all__, *_MOVED):
+        raise AttributeError(f"module 'jaxcal.selection' has no attribute {name!r}")
+    home = "jaxcal.designs" if name in _MOVED else "jaxcal.selection.batch"
+    globals()[name] = value = getattr(importlib.import_module(home), name)
+    return value

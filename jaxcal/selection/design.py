@@ -14,13 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import one_of, require_none, seconds
 from jaxcal.deadline import Deadline
+from jaxcal.late import late
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
-from jaxcal.selection.continuous import refine
 from jaxcal.selection.exact.exact import TIME_LIMIT, solve_exact
-from jaxcal.selection.fastest.search import fastest, pareto
 from jaxcal.selection.in_scenarios import with_optima
-from jaxcal.selection.plan import plan
 from jaxcal.selection.problem import (
     CandidateSet,
     Problem,
@@ -294,10 +292,10 @@ class Design:
             )
         return problem
 
-    plan = plan
-    fastest = fastest
-    pareto = pareto
-    refine = refine
+    plan = late("jaxcal.selection.plan:plan")
+    fastest = late("jaxcal.designs.travel.search:fastest")
+    pareto = late("jaxcal.designs.travel.search:pareto")
+    refine = late("jaxcal.designs.continuous:refine")
 
     def _judged(
         self, problem: Problem, solution: Solution, method: str, start: float

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from jaxcal import As, Design, Ds
+from jaxcal.designs.travel.search import FastSelection, ParetoFront
 from jaxcal.information import criteria as information
 from jaxcal.information.regression import regressors
-from jaxcal.selection.fastest.search import FastSelection, ParetoFront
 from jaxcal.selection.plan import Plan
 from jaxcal.selection.problem import Problem
 from jaxcal.selection.result import Selection

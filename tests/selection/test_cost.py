@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from questions import pareto_front, score, select_fastest
 
 import jaxcal
+from jaxcal.designs.travel import Motion, fastest_tour, travel_times
 from jaxcal.information.regression import log_det_gram
 from jaxcal.models import Noise, Polynomial, SerialChain
 from jaxcal.reports import plots
-from jaxcal.selection.fastest import Motion, fastest_tour, travel_times
 
 MOTION = Motion(speed=(20.0, 10.0, 30.0), acceleration=(50.0, 100.0, 20.0), settle=0.5)
 

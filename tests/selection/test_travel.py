@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from questions import pareto_front, select_fastest
 
 import jaxcal
+from jaxcal.designs.travel import Motion, fastest_tour, travel_times
 from jaxcal.information.regression import log_det_gram
-from jaxcal.selection.fastest import Motion, fastest_tour, travel_times
 
 MOTION = Motion(speed=(20.0, 10.0, 30.0), acceleration=(50.0, 100.0, 20.0), settle=0.5)
 HOME = np.zeros(3)

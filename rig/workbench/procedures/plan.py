@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxcal.designs.travel import Motion, fastest_tour, travel_times
 from jaxcal.models.affine import Affine
-from jaxcal.selection.fastest import Motion, fastest_tour, travel_times
 from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.model import DeviceModel, model_of

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, one_of, seconds, share
 from jaxcal.deadline import Deadline
+from jaxcal.designs.travel.motion import Motion, travel_times
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.exchange.exchange import exchange_indices
-from jaxcal.selection.fastest.motion import Motion, travel_times
 from jaxcal.selection.problem import (
     CandidateSet,
     DesignProtocol,
@@ -343,7 +343,7 @@ class _TourSearch:
 
     def _tour(self, chosen: Indices) -> tuple[Indices, float]:
         """``chosen`` (k,) in the best order found, and its seconds of travel."""
-        from jaxcal.selection.fastest.tour_kernel import best_order
+        from jaxcal.designs.travel.tour_kernel import best_order
 
         order, travel = best_order(
             self.times[np.ix_(chosen, chosen)], self.start[chosen]

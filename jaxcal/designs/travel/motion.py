@@ -113,7 +113,7 @@ def fastest_tour(
             f"{between[i, j]:g} from {i} to {j} and {between[j, i]:g} back"
         )
     begin = np.zeros(k) if start is None else array_of("start", start, k)
-    from jaxcal.selection.fastest.tour_kernel import best_order
+    from jaxcal.designs.travel.tour_kernel import best_order
 
     order, seconds = best_order(between, begin)
     return order, float(seconds)

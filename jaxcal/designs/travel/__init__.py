@@ -3,6 +3,6 @@
 ``run`` has the searches, compiled; nothing here loads them.
 """
 
-from jaxcal.selection.fastest.motion import Motion, fastest_tour, travel_times
+from jaxcal.designs.travel.motion import Motion, fastest_tour, travel_times
 
 __all__ = ["Motion", "fastest_tour", "travel_times"]
