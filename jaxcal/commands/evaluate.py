@@ -265,10 +265,12 @@ def _terminate(number: int, frame: object) -> NoReturn:
 
 
 def _run(options: EvaluateOptions) -> None:
-    from jaxcal.evaluation.methods import POLICIES, methods_by
+    from jaxcal.evaluation.methods import DEFAULT_METHODS, POLICIES, check_methods
     from jaxcal.progress import Progress
 
-    methods = methods_by("D", options.methods)
+    methods = check_methods(
+        DEFAULT_METHODS if options.methods is None else options.methods
+    )
     if options.checkpoint:
         if not set(methods) & set(POLICIES):
             raise ValueError(
@@ -278,7 +280,6 @@ def _run(options: EvaluateOptions) -> None:
         with needs("policy", "--checkpoint"):  # it may need JAX
             from jaxcal.learning.runtime import cache
         cache.keep_compiled_programs()
-        methods = methods_by(_criterion(options), options.methods)
     _check_outputs(options)
     evaluated = _whole if options.stream is None else _streamed
     progress = Progress(quiet=options.quiet)
@@ -336,29 +337,9 @@ def _whole(
             random_draws=options.draws,
             seed=options.seed,
             time_limit=options.time_limit,
-            criterion=_criterion(options),
             progress=progress,
         )
         yield evaluation.summarise(indices=options.indices), evaluation
-
-
-def _criterion(options: EvaluateOptions) -> str:
-    """The criterion that the checkpoints were trained for; D without any."""
-    if not options.checkpoint:
-        return "D"
-    from jaxcal.learning.runtime.weights import criterion_of
-
-    criteria = {path: criterion_of(path) for path in options.checkpoint}
-    if len(set(criteria.values())) > 1:
-        trained = ", ".join(f"{path} {name}" for path, name in criteria.items())
-        raise ValueError(f"--checkpoint must be of one criterion, got {trained}")
-    criterion = criteria[options.checkpoint[0]]
-    for flag, value in (("--stream", options.stream), ("--report", options.report)):
-        if criterion != "D" and value is not None:
-            raise ValueError(
-                f"{flag} is of criterion D, the checkpoint of {criterion}: leave it out"
-            )
-    return criterion
 
 
 def _dataset(name: str, options: EvaluateOptions, progress: Progress) -> Dataset:

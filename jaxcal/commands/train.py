@@ -215,15 +215,11 @@ def _configuration(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
         preset_of,
         trained_on,
     )
-    from jaxcal.learning.runtime.weights import criterion_of
     from jaxcal.learning.training import presets
 
     flags = given_flags(arguments, task=False)
     path = arguments.candidates
-    criterion = flags.get("criterion", "D")
-    if arguments.resume and path:
-        criterion = criterion_of(out)
-    candidates = candidates_of(path, criterion) if path else None
+    candidates = candidates_of(path) if path else None
     config = presets.load(preset_of(arguments))
     if arguments.trainer == "brax":
         config = _for_brax(config, arguments, flags)
@@ -371,8 +367,6 @@ def _introduction(config: TrainConfig, out: pathlib.Path, devices: str) -> str:
     """What will be trained, in one line."""
     import jax
 
-    from jaxcal.learning.config import AFFINE
-
     shapes = jax.eval_shape(config.learners[0].init, jax.random.key(0))
     size = sum(leaf.size for leaf in jax.tree.leaves(shapes))
     task, seed = config.tasks[0], f"seed {config.seed}"
@@ -382,16 +376,6 @@ def _introduction(config: TrainConfig, out: pathlib.Path, devices: str) -> str:
         seed += f", {name} " + " ".join(f"{value:g}" for value in values)
     env = task.environment
     origin = f" from {task.given.name}" if task.given else ""
-    if env.criterion != "D":
-        unit = (
-            "does not change with their unit: whitened"
-            if env.criterion in AFFINE
-            else "changes with their unit: as they are"
-        )
-        origin += (
-            f" by criterion {env.criterion}, which {unit}, with a look-ahead by "
-            f"{env.criterion}"
-        )
     return (
         f"preset {config.preset}: {config.network.kind} network, {size:,} parameters; "
         f"choose {env.num_selected} of {env.num_candidates}{origin}; "

@@ -15,7 +15,7 @@ from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.tasks import registry
 from jaxcal.arguments import Parser, number_type, typed_line, values_of
 from jaxcal.commands.pools import holds_sets, read_pool
-from jaxcal.learning.config import AFFINE, TRACED, StreamsConfig
+from jaxcal.learning.config import TRACED, StreamsConfig
 from jaxcal.learning.environments.task import GivenCandidates
 from jaxcal.learning.runtime import processes
 from jaxcal.learning.settings import Setting, settings_of
@@ -46,7 +46,6 @@ what to try first:
   {program} --episodes 20000 --out runs/brief   quicker, to try things
   {program} --num-selected 6 --out runs/six     another number of postures
   {program} --candidates mine.csv --out runs/mine   your own machine's postures
-  {program} --criterion A --out runs/a          least variance; I: of predictions; E
   then --imitation 0.5 --initial-trust 4 --initial-actor 0.05, which adds
   most where more than n + 1 postures are chosen. Other numbers rarely need a change.
 
@@ -248,11 +247,10 @@ def _tasks() -> str:
 # -- the user's own postures ----------------------------------------------------------
 
 
-def candidates_of(path: str, criterion: str = "D") -> GivenCandidates:
+def candidates_of(path: str) -> GivenCandidates:
     """The user's own candidates, each axis mapped to [0, 1] over the whole file.
 
-    By D and I the best postures do not depend on the unit; float32 and the paper's
-    network do. By A and E they do: candidates stay as they are.
+    The best postures do not depend on the unit; float32 and the paper's network do.
     """
     from jaxcal.evaluation.dataset_files import load_dataset
 
@@ -270,8 +268,6 @@ def candidates_of(path: str, criterion: str = "D") -> GivenCandidates:
             f"{path}: every column must hold numbers that differ, got {low[axis]:g} to "
             f"{high[axis]:g} in input {axis + 1}: leave it out"
         )
-    if criterion not in AFFINE:
-        low, high = np.zeros_like(low), np.ones_like(high)
     return GivenCandidates(
         name=pathlib.Path(path).name,
         values=((values - low) / (high - low)).astype(np.float32),

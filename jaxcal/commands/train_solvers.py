@@ -5,17 +5,13 @@ from __future__ import annotations
 import jax
 import numpy as np
 
-from jaxcal.information.regression import log_worth
-from jaxcal.learning.environments.task import Task
 from jaxcal.learning.training.config import TrainConfig
 from jaxcal.learning.training.postures import Validation
-from jaxcal.models import Affine
-from jaxcal.selection import exact_batch, exchange_batch, select
+from jaxcal.selection import exact_batch, exchange_batch
 
 __all__ = ["fixed_validation", "teacher"]
 
 _VALIDATED = 500  # sets that a training run is measured on
-_BY_OTHERS = 200  # by another criterion than D, whose proofs take longer
 
 
 def fixed_validation(config: TrainConfig) -> Validation:
@@ -23,12 +19,10 @@ def fixed_validation(config: TrainConfig) -> Validation:
 
     Uniform ones, never trained on, that depend on M and n only, so runs with other
     seeds or networks are measured on the same ones. Where the user gave candidates, 500
-    draws of those. By A, I and E 200.
+    draws of those.
     """
     task = config.tasks[0]
     env = task.environment
-    if env.criterion != "D":
-        return _by_criterion(task)
     if task.given is not None:
         states = jax.vmap(task.reset)(
             jax.random.split(jax.random.key(20261121), _VALIDATED)
@@ -43,29 +37,6 @@ def fixed_validation(config: TrainConfig) -> Validation:
     sets = rng.uniform(size=(_VALIDATED, env.num_candidates, env.num_inputs))
     best = exact_batch(sets, env.num_selected, num_outputs=1).log_det
     return Validation(sets, np.asarray(best), env.num_outputs)
-
-
-def _by_criterion(task: Task) -> Validation:
-    """Sets of a task and their optima by its criterion."""
-    env, free = task.environment, None
-    if task.given is None:
-        rng = np.random.default_rng([20261121, env.num_candidates, env.num_inputs])
-        sets = rng.uniform(size=(_BY_OTHERS, env.num_candidates, env.num_inputs))
-    else:
-        keys = jax.random.split(jax.random.key(20261121), _BY_OTHERS)
-        states = jax.vmap(task.reset)(keys)
-        sets = np.asarray(states.candidates, np.float64)
-        free = np.asarray(states.available)
-    model = Affine(env.num_inputs, env.num_outputs)
-    solved = [
-        select(
-            candidates, env.num_selected, "exact", criterion=env.criterion, model=model,
-            available=None if free is None else free[number],
-        ).indices
-        for number, candidates in enumerate(sets)
-    ]  # fmt: skip
-    best = log_worth(env.criterion, sets, np.array(solved)[:, None], free)[:, 0]
-    return Validation(sets, best, env.num_outputs, free, env.criterion)
 
 
 def teacher(

@@ -20,7 +20,7 @@ from jaxcal.deadline import NEVER, Deadline
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.parameters import estimate_parameters
 from jaxcal.evaluation.postures import PostureEvaluation, PostureResult
-from jaxcal.information.regression import log_det_gram, log_worth
+from jaxcal.information.regression import log_det_gram
 from jaxcal.models.affine import Affine
 
 __all__ = [
@@ -32,7 +32,6 @@ __all__ = [
     "check_methods",
     "evaluate",
     "label_of",
-    "methods_by",
     "rows_of",
 ]
 
@@ -98,21 +97,6 @@ def rows_of(
     ]
 
 
-def methods_by(criterion: str, methods: Sequence[str] | None) -> tuple[str, ...]:
-    """``check_methods`` of those asked for, else all that serve a criterion.
-
-    Raises:
-        ValueError: as ``check_methods``, or one that serves D alone.
-    """
-    chosen = check_methods(DEFAULT_METHODS if methods is None else methods)
-    if criterion == "D":
-        return chosen
-    climbs = "policy:exchange"  # by det S
-    if methods is not None and climbs in methods:
-        raise ValueError(f"{climbs} is of criterion D, the policy of {criterion}")
-    return tuple(name for name in chosen if name != climbs)
-
-
 def evaluate(
     dataset: Dataset,
     k: int = 4,
@@ -123,7 +107,6 @@ def evaluate(
     random_draws: int = DEFAULT_RANDOM_DRAWS,
     seed: int = 0,
     time_limit: float | None = None,
-    criterion: str = "D",
     progress: Progress | None = None,
 ) -> PostureEvaluation:
     """Run methods on a dataset and judge them against the proven optimum.
@@ -138,14 +121,13 @@ def evaluate(
         seed: of everything drawn at random.
         time_limit: seconds for the exact solver over the whole dataset; episodes not
             proven by then are judged against an upper bound.
-        criterion: by which methods are judged, and solvers choose: D, A, I or E.
         progress: called as selections are made.
 
     Raises:
         ValueError: naming the dataset and what is wrong with it, k or a method.
         OSError: a checkpoint cannot be read.
     """
-    methods = methods_by(criterion, methods)
+    methods = check_methods(methods)
     for name, value in (("num", num), ("random_draws", random_draws)):
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
@@ -153,7 +135,7 @@ def evaluate(
         selection.make_problems(dataset.candidates, k, available=dataset.available)
     except ValueError as error:
         raise ValueError(f"{dataset.name}: {error}") from None
-    run = _Run(dataset, k, num, seed, progress or (lambda *_: None), criterion)
+    run = _Run(dataset, k, num, seed, progress or (lambda *_: None))
     rows = rows_of(methods, checkpoints)
     policies = {row: run.policy(*row) for row in rows if row[0] in POLICIES}
     random = run.random(random_draws)
@@ -170,7 +152,6 @@ def evaluate(
         reference=reference,
         proven=proven,
         random_log_det=random.log_det,
-        criterion=criterion,
     )
 
 
@@ -183,7 +164,6 @@ class _Run:
     num: int
     seed: int
     progress: Progress
-    criterion: str = "D"
 
     def result(
         self,
@@ -195,7 +175,9 @@ class _Run:
     ) -> PostureResult:
         """Judge (E, R, k) indices, unless their (E, R) log det of Z.T Z is known."""
         if gram is None:
-            gram = np.concatenate([self.worth(c, indices[c]) for c in self.pieces()])
+            sets = self.dataset.candidates
+            values = [log_det_gram_of(sets[c], indices[c]) for c in self.pieces()]
+            gram = np.concatenate(values)
         return PostureResult(
             method=method,
             label=label_of(method, self.num),
@@ -205,14 +187,6 @@ class _Run:
             seconds=seconds / self.dataset.num_episodes,
             parameters=estimate_parameters(self.dataset, indices),
         )
-
-    def worth(self, cut: slice, indices: Indices) -> Array:
-        """(E, R) of (E, R, k) indices: log det of Z.T Z, or what stands for it."""
-        candidates, mask = self.dataset.candidates[cut], self.dataset.available
-        if self.criterion == "D":
-            return log_det_gram_of(candidates, indices)
-        free = None if mask is None else mask[cut]
-        return log_worth(self.criterion, candidates, indices, free)
 
     def selected(
         self, method: str, cut: slice, deadline: Deadline = NEVER
@@ -231,7 +205,6 @@ class _Run:
                     candidates,
                     self.k,
                     method,
-                    criterion=self.criterion,
                     model=Affine(candidates.shape[1], self.dataset.num_outputs),
                     available=None if masks is None else masks[i],
                     **more,
@@ -308,9 +281,9 @@ class _Run:
 
         def choose(cut: slice) -> Indices:
             part = self.part(cut)
-            if self.criterion == "D" and method == "greedy":
+            if method == "greedy":
                 return selection.greedy_batch(**part).indices
-            if self.criterion == "D" and method == "exchange":
+            if method == "exchange":
                 return selection.exchange_batch(**part, seed=self.seed).indices
             return np.array([one.indices for one in self.selected(method, cut)])
 
@@ -322,25 +295,17 @@ class _Run:
         self, time_limit: float | None
     ) -> tuple[PostureResult, Array, NDArray[np.bool_]]:
         """The optimum, its (E,) log det S or an upper bound, and (E,) where proven."""
-        m = self.dataset.num_outputs
-        p = m * (self.dataset.num_inputs + 1)
 
         def choose(cut: slice) -> tuple[NDArray[Any], ...]:
-            """(E, k) indices, (E,) proven, (E,) upper bounds; efficiencies but by D."""
-            if self.criterion == "D":
-                remaining_s = max(deadline.remaining_s, 1e-3)
-                batch = selection.exact_batch(
-                    **self.part(cut),
-                    num_outputs=m,
-                    time_limit=None if deadline is NEVER else remaining_s,
-                )
-                return batch.indices, batch.proven, batch.bound
-            chosen = self.selected("exact", cut, deadline)
-            lists = ([getattr(one, name) for one in chosen]
-                     for name in ("indices", "proven", "efficiency"))  # fmt: skip
-            indices, proven, efficiency = map(np.array, lists)
-            reached = m * self.worth(cut, indices[:, None])[:, 0]
-            return indices, proven, reached - p * np.log(efficiency)
+            """(E, k) indices, (E,) proven, (E,) upper bounds."""
+            batch = selection.exact_batch(
+                **self.part(cut),
+                num_outputs=self.dataset.num_outputs,
+                time_limit=(
+                    None if deadline is NEVER else max(deadline.remaining_s, 1e-3)
+                ),
+            )
+            return batch.indices, batch.proven, batch.bound
 
         deadline = NEVER if time_limit is None else Deadline(time_limit)
         choose(slice(0, 1))  # not timed: it may compile
@@ -359,8 +324,7 @@ class _Run:
             "random", lambda cut: draw_random(rng, **self.part(cut), num=draws)
         )
         picks, gram = map(np.concatenate, zip(*found, strict=True))
-        judged = gram if self.criterion == "D" else None
-        return self.result("random", picks, batch.seconds, gram=judged)
+        return self.result("random", picks, batch.seconds, gram=gram)
 
 
 def draw_random(

@@ -44,7 +44,7 @@ class PostureResult(MethodResult):
 
     @property
     def log_det(self) -> Array:
-        """(E, R) log det S; by another criterion what stands for it."""
+        """(E, R) log det S."""
         return self.values
 
 
@@ -52,8 +52,7 @@ class PostureResult(MethodResult):
 class PostureEvaluation(Evaluation):
     """All methods on one dataset, selection by selection.
 
-    ``reference`` (E,) is log det S* where proven, else an upper bound on it. By another
-    criterion than D ``log_worth`` times the outputs stands for log det S.
+    ``reference`` (E,) is log det S* where proven, else an upper bound on it.
     """
 
     title: ClassVar[str] = "Posture selection against the proven optimum"
@@ -71,7 +70,6 @@ class PostureEvaluation(Evaluation):
     results: tuple[PostureResult, ...]
     proven: NDArray[np.bool_]  # (E,)
     random_log_det: Array  # (E, R) the baseline behind ratio_to_random
-    criterion: str = "D"
 
     def summarise(self, *, indices: bool = False) -> Summary:
         """The numbers of every method.
@@ -83,7 +81,7 @@ class PostureEvaluation(Evaluation):
             for row, result in zip(rows, self.results, strict=True):
                 row.numbers["indices"] = result.indices[:, 0].tolist()
         facts: dict[str, Any] = {"dataset": data.facts(), "k": self.k}
-        facts |= {"seed": self.seed, "criterion": self.criterion}
+        facts |= {"seed": self.seed, "criterion": "D"}
         if data.measured is not None:
             names = Affine(data.num_inputs, data.num_outputs).names
             facts["parameter_names"] = list(names)
@@ -96,28 +94,21 @@ class PostureEvaluation(Evaluation):
         hits = self.proven[:, None] & (behind >= -HIT_TOLERANCE * m)
         behind = np.minimum(behind, 0.0)
         efficiency = np.exp(behind / (m * (self.dataset.num_inputs + 1)))
-        row: dict[str, Any] = {"label": result.label}
-        if self.criterion == "D":
-            with np.errstate(over="ignore"):
-                det = np.exp(result.log_det)
-                times = np.exp(log_mean(result.log_det) - log_mean(self.random_log_det))
-            row |= {
-                "det_s": moments(det),
-                "log_det_s": moments(result.log_det),
-                "ratio_to_exact": float(np.exp(behind).mean()),
-                "hit_rate": float(hits.mean()),
-                "d_efficiency": float(efficiency.mean()),
-                "ratio_to_random": finite(times),
-            }
-        else:
-            row |= {
-                "efficiency": moments(efficiency),
-                "least_efficiency": float(efficiency.min()),
-                "hit_rate": float(hits.mean()),
-            }
-        row["seconds_per_selection"] = result.seconds
-        row["draws_per_episode"] = result.log_det.shape[1]
-        if self.criterion == "D" and result.parameters is not None:
+        with np.errstate(over="ignore"):
+            det = np.exp(result.log_det)
+            times = np.exp(log_mean(result.log_det) - log_mean(self.random_log_det))
+        row: dict[str, Any] = {
+            "label": result.label,
+            "det_s": moments(det),
+            "log_det_s": moments(result.log_det),
+            "ratio_to_exact": float(np.exp(behind).mean()),
+            "hit_rate": float(hits.mean()),
+            "d_efficiency": float(efficiency.mean()),
+            "ratio_to_random": finite(times),
+            "seconds_per_selection": result.seconds,
+            "draws_per_episode": result.log_det.shape[1],
+        }
+        if result.parameters is not None:
             row["parameter_variance"] = self.parameter_variance(result).tolist()
         return row
 
@@ -142,13 +133,12 @@ def summary_of(
         rows: a method each.
         proven: how many of the episodes' optima.
     """
-    data, k, criterion = facts["dataset"], facts["k"], facts["criterion"]
+    data, k = facts["dataset"], facts["k"]
     seed = "" if data["seed"] is None else f", seed {data['seed']}"
     heading = (
         f"{data['name']}{seed}: {data['episodes']:,} episodes, "
         f"{k} of {data['num_candidates']} postures, "
         f"{data['num_inputs']} inputs, {data['num_outputs']} outputs"
-        + ("" if criterion == "D" else f", criterion {criterion}")
     )
     notes = []
     if proven < data["episodes"]:
@@ -163,8 +153,7 @@ def summary_of(
             "equations: no residual, so no estimate of the noise; a larger k leaves one"
         )
     facts = facts | {"proven": proven / data["episodes"], "notes": notes}
-    columns = _BY_D if criterion == "D" else _BY_OTHERS
-    return Summary(data["name"], heading, columns, rows, facts, tuple(notes))
+    return Summary(data["name"], heading, _COLUMNS, rows, facts, tuple(notes))
 
 
 def log_mean(log_values: Array) -> float:
@@ -192,23 +181,13 @@ def _time(seconds: float) -> str:
     return f"{seconds / units[unit]:.3g} {unit}"
 
 
-_METHOD: Column = "method", lambda row: row.numbers["label"]
-_HITS: Column = "hit rate", lambda row: _share(row.numbers["hit_rate"])
-_TIME: Column = "time each", lambda row: _time(row.numbers["seconds_per_selection"])
-_BY_D: tuple[Column, ...] = (
-    _METHOD,
+_COLUMNS: tuple[Column, ...] = (
+    ("method", lambda row: row.numbers["label"]),
     ("mean det S", lambda row: _det(row.numbers["det_s"]["mean"])),
     ("median det S", lambda row: _det(row.numbers["det_s"]["median"])),
     ("det S/det S*", lambda row: _share(row.numbers["ratio_to_exact"])),
-    _HITS,
+    ("hit rate", lambda row: _share(row.numbers["hit_rate"])),
     ("D-eff.", lambda row: _share(row.numbers["d_efficiency"])),
     ("x random", lambda row: _times(row.numbers["ratio_to_random"])),
-    _TIME,
-)
-_BY_OTHERS: tuple[Column, ...] = (
-    _METHOD,
-    ("efficiency", lambda row: _share(row.numbers["efficiency"]["mean"])),
-    ("least", lambda row: _share(row.numbers["least_efficiency"])),
-    _HITS,
-    _TIME,
+    ("time each", lambda row: _time(row.numbers["seconds_per_selection"])),
 )

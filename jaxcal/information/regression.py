@@ -22,7 +22,6 @@ from jaxcal.information.blocks import rank_of_blocks
 __all__ = [
     "log_det_gram",
     "log_det_information",
-    "log_worth",
     "regression_matrix",
     "regressors",
 ]
@@ -120,42 +119,3 @@ def log_det_information(
     m = commands.shape[-1] if num_outputs is None else num_outputs
     value = m * log_det_gram(commands)
     return float(value) if value.ndim == 0 else value
-
-
-def log_worth(
-    criterion: str,
-    commands: ArrayLike,
-    indices: ArrayLike,
-    available: ArrayLike | None = None,
-) -> Array:
-    """What choices are worth by a criterion, as a logarithm: larger is better.
-
-    For D it is log det(Z.T Z); for A and I -p log(trace V / p), for E p log of 1 over
-    the largest eigenvalue of V, where V is the covariance of the p parameters of one
-    output, of I that of the predictions. So e^(difference / p) is the efficiency of one
-    choice against another by each.
-
-    Args:
-        criterion: D, A, I or E.
-        commands: (B, M, n) in any unit.
-        indices: (B, R, k) choices of each set.
-        available: (B, M) bool, over which I takes the mean; all by default.
-
-    Returns:
-        (B, R); -inf where a choice is singular.
-    """
-    rows, chosen = regressors(commands), np.asarray(indices)
-    picked = np.take_along_axis(rows[:, None], chosen[..., None], axis=2)
-    if criterion == "D":
-        return log_det_gram(picked[..., :-1])
-    if criterion == "I":
-        weight = np.ones(rows.shape[:2]) if available is None else np.asarray(available)
-        kept = rows * weight[..., None]
-        moments = kept.transpose(0, 2, 1) @ kept / weight.sum(axis=1)[:, None, None]
-        half = np.linalg.inv(np.linalg.cholesky(moments))
-        picked = picked @ half.transpose(0, 2, 1)[:, None]
-    values, p = np.linalg.svd(picked, compute_uv=False) ** 2, rows.shape[-1]
-    with np.errstate(divide="ignore"):
-        if criterion == "E":
-            return np.asarray(p * np.log(values.min(axis=-1)))
-        return np.asarray(-p * np.log((1.0 / values).mean(axis=-1)))

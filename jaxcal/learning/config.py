@@ -11,8 +11,6 @@ from typing import Any, ClassVar
 from jaxcal.learning.settings import require, setting
 
 __all__ = [
-    "AFFINE",
-    "CRITERIA",
     "TRACED",
     "EpisodesConfig",
     "PPOConfig",
@@ -29,10 +27,6 @@ TRACED = (
 )  # fmt: skip
 """Fields of ``PPOConfig`` that a run may have as arrays, other than its
 configuration's: runs that differ in them are one program."""
-
-CRITERIA = ("D", "A", "I", "E")
-AFFINE = ("D", "I")
-"""Criteria by which no affine map of the commands changes a choice."""
 
 _NOT_NEGATIVE = (
     "final_learning_rate", "warmup_updates", "value_coefficient", "entropy_start",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import jaxcal
 from jaxcal.adaptive.policy import training
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.weights import CheckpointError, Weights
@@ -80,3 +81,31 @@ def test_names_of_arrays_become_a_tree_again():
     found = weights.nested(weights.flat(tree))
     assert found.keys() == tree.keys() and found["a"]["c"].keys() == {"d"}
     np.testing.assert_array_equal(found["a"]["b"], tree["a"]["b"])
+
+
+def test_a_policy_that_an_earlier_version_trained_by_another_criterion_is_refused(
+    tmp_path,
+):
+    """Fields of before: D is read as ever, A refused with its version by every way."""
+    shipped = weights.read(weights.shipped())
+    path, rows = tmp_path / "policy.npz", np.random.default_rng(0).random((12, 3))
+    envs = [task["environment"] for task in shipped.meta["tasks"]]
+    for criterion in "DA":
+        for held in (shipped.network, shipped.meta["network"], *envs):
+            held["criterion"] = criterion
+        weights.write(path, shipped)
+        if criterion == "D":
+            assert len(jaxcal.select(rows, 4, "policy", checkpoint=path).indices) == 4
+            assert checkpoint.load(path).network.config.kind == "compact"
+    version = shipped.meta["versions"]["jaxcal"]
+    words = rf"trained for criterion A by jaxcal {version}; .*docs/learning\.md"
+    with pytest.raises(CheckpointError, match=words):
+        jaxcal.select(rows, 4, "policy", checkpoint=path)
+    with pytest.raises(CheckpointError, match=words):
+        checkpoint.load(path)
+
+
+def test_the_policy_chooses_by_d_alone():
+    rows = np.random.default_rng(0).random((12, 3))
+    with pytest.raises(ValueError, match='"policy" is trained for criterion D, got A'):
+        jaxcal.select(rows, 4, "policy", criterion="A")

@@ -8,8 +8,7 @@
 | end | after ``num_selected`` choices; a pure termination, nothing is truncated |
 | version | 1 |
 
-With ``reward_gain`` the reward is the increase of log det S since the last payment;
-with another ``criterion`` than D, ``learning.criteria`` says what stands for log det S.
+With ``reward_gain`` the reward is the increase of log det S since the last payment.
 Functions take one episode; ``jax.vmap`` makes a batch. ``reset_from`` draws the next
 episode's candidates from the key in the state. Source: paper, Section 2.3 and Table 2;
 docs/environment.md discusses the reward's range.
@@ -24,8 +23,6 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcal.learning.config import CRITERIA
-from jaxcal.learning.criteria import inverse_of, regressors, worth_of_inverse
 from jaxcal.learning.environments import randomness
 from jaxcal.learning.environments.observation import context_features
 from jaxcal.learning.settings import require, setting
@@ -60,7 +57,6 @@ class SelectionConfig:
     reward_gain: bool = setting(
         False, "pay the increase of log det S; on where num_selected > num_inputs + 1"
     )
-    criterion: str = setting("D", "D, A, I or E: what is paid, and what compact sees")
 
     def __post_init__(self) -> None:
         require(self, "at least 1", lambda v: v >= 1, "num_inputs", "num_outputs")
@@ -69,7 +65,6 @@ class SelectionConfig:
             self, f"in [{least}, {end})", lambda v: least <= v < end, "num_selected"
         )
         require(self, "positive", lambda v: v > 0, "reward_scale")
-        require(self, "D, A, I or E", lambda v: v in CRITERIA, "criterion")
 
     @property
     def num_regressors(self) -> int:
@@ -156,7 +151,8 @@ def step(
     done = count >= config.num_selected
     pays = (count % p == 0) | done
 
-    value = config.num_outputs * _worth(state, chosen, config.criterion)
+    log_det = log_det_gram(picked(state.candidates, chosen), chosen >= 0)
+    value = config.num_outputs * log_det
 
     before = state.paid if config.reward_gain else jnp.zeros_like(value)
     reward = jnp.where(pays, config.reward_scale * (value - before), 0.0)
@@ -168,17 +164,6 @@ def step(
         paid=jnp.where(pays, value, state.paid),
     )
     return state, reward, done
-
-
-def _worth(state: SelectionState, chosen: jax.Array, criterion: str) -> jax.Array:
-    """() of the chosen (K,), for one output."""
-    if criterion == "D":
-        return log_det_gram(picked(state.candidates, chosen), chosen >= 0)
-    held = jax.nn.one_hot(chosen, len(state.available), dtype=bool).any(axis=0)
-    x, offset = regressors(criterion, state.candidates, state.available | held)
-    rows = picked(x, chosen) * (chosen >= 0)[:, None]
-    gram = rows.T @ rows
-    return worth_of_inverse(criterion, inverse_of(gram)) + offset
 
 
 def observe(state: SelectionState, config: SelectionConfig) -> jax.Array:

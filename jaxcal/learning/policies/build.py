@@ -8,7 +8,6 @@ from typing import Any
 from jaxcal.extras import installed
 from jaxcal.learning.core.network import Network
 from jaxcal.learning.policies.compact import CompactNetwork
-from jaxcal.learning.policies.criterion import CriterionNetwork
 from jaxcal.learning.policies.networks import GROUP, NetworkConfig
 from jaxcal.learning.settings import named
 
@@ -18,8 +17,7 @@ __all__ = ["build"]
 def build(config: NetworkConfig) -> Network:
     """The network that a configuration names: ``compact``, one's own, a package's."""
     if config.kind == "compact":
-        kinds = CompactNetwork, CriterionNetwork
-        return kinds[config.criterion != "D"](config)
+        return CompactNetwork(config)
     if ":" in config.kind:
         kind = named(config.kind)
         if not (isinstance(kind, type) and issubclass(kind, Network)):

@@ -23,9 +23,6 @@ __all__ = [
     "VectorFeatures",
     "close_up_of",
     "decision_features",
-    "described",
-    "picked_of",
-    "progress_of",
     "vector_features",
 ]
 
@@ -106,7 +103,7 @@ def decision_features(
     p, total = x.shape[-1], chosen.shape[-1]
     begins = isinstance(count, int) and count == 0
     count = jnp.asarray(count)
-    which, picked = picked_of(x, chosen)
+    which, picked = _picked_of(x, chosen)
     # A choice multiplies the determinant by |y|^2, or by 1 + |y|^2.
     if total == p and begins:  # the look-ahead of the set is that of the decision
         vectors, so_far = features.vectors, jnp.zeros(x.shape[:-2], x.dtype)
@@ -125,11 +122,11 @@ def decision_features(
         vectors,
         chosen=which.sum(-2) / jnp.maximum(count, 1).astype(x.dtype),
         reached=features.offset + so_far + vectors.best[..., -1],
-        progress=progress_of(count, total, x, so_far.shape),
+        progress=_progress_of(count, total, x, so_far.shape),
     )
 
 
-def picked_of(x: jax.Array, chosen: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _picked_of(x: jax.Array, chosen: jax.Array) -> tuple[jax.Array, jax.Array]:
     """(..., K, M) one-hot of the chosen and their rows (..., K, p) of x (..., M, p);
     zeros where nothing is chosen yet."""
     which = jax.nn.one_hot(chosen, x.shape[-2], dtype=x.dtype)
@@ -138,7 +135,7 @@ def picked_of(x: jax.Array, chosen: jax.Array) -> tuple[jax.Array, jax.Array]:
     )
 
 
-def progress_of(
+def _progress_of(
     count: jax.typing.ArrayLike, total: int, x: jax.Array, shape: tuple[int, ...]
 ) -> jax.Array:
     """(*shape, 7) ``DecisionFeatures.progress`` after ``count`` of ``total`` choices
@@ -168,21 +165,12 @@ def vector_features(
     ``close_up`` adds the columns that tell near-equal look-aheads apart.
     """
     y = y * active[..., None].astype(y.dtype)
-    ahead = geometry.lookahead(y, spanned, active, depth)
-    return described(y, ahead, active, close_up)
-
-
-def described(
-    y: jax.Array, lookaheads: list[jax.Array], active: jax.Array, close_up: bool
-) -> VectorFeatures:
-    """Features of vectors y (..., M, p) and their four look-aheads (..., M)."""
-    y = y * active[..., None].astype(y.dtype)
     number = jnp.maximum(active.sum(-1).astype(y.dtype), 1.0)
     square = (y * y).sum(-1)
     mean_square = jnp.maximum(square.sum(-1) / number, 1e-8)
     unit = y * jax.lax.rsqrt(mean_square)[..., None, None]
     moments = _second_moments(unit) * jax.lax.rsqrt(number)[..., None, None]
-    ahead = jnp.stack(lookaheads, axis=-1)
+    ahead = jnp.stack(geometry.lookahead(y, spanned, active, depth), axis=-1)
     best = ahead.max(-2)
     ahead = jnp.maximum(ahead - best[..., None, :], -30.0)
     level = jnp.log(jnp.maximum(square, 1e-6) / mean_square[..., None])

@@ -15,7 +15,6 @@ import dataclasses
 from typing import Any
 
 from jaxcal.extras import installed
-from jaxcal.learning.config import CRITERIA
 from jaxcal.learning.settings import path_of, require, setting
 
 __all__ = ["GROUP", "NetworkConfig"]
@@ -39,7 +38,6 @@ class NetworkConfig:
         0.0, "initial weight of the look-ahead; at 4 training begins at its rule"
     )
     initial_actor: float = setting(0.1, "scale of the learned score before learning")
-    criterion: str = setting("D", "D, A, I or E: what is paid, and what compact sees")
 
     def __post_init__(self) -> None:
         kind: Any = self.kind
@@ -53,7 +51,6 @@ class NetworkConfig:
                 f"{self.kind!r}; your own is MODULE:NAME or FILE.py:NAME, or an entry "
                 f"point in the group {GROUP}"
             )
-        require(self, "D, A, I or E", lambda v: v in CRITERIA, "criterion")
         require(self, "at least 1", lambda v: v >= 1, "width", "lookahead")
         rounds = ("encoder_rounds", "decoder_rounds")
         require(self, "0 or more", lambda v: v >= 0, *rounds)

@@ -11,18 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.information.regression import log_worth
 from jaxcal.learning.core import network as networks
 from jaxcal.learning.core.network import Network
 from jaxcal.learning.policies import decoding as decoders
 from jaxcal.learning.small_matrices import log_det_gram
 
-__all__ = ["NetworkScorer", "choose", "criterion_of", "log_det_of", "scores_of"]
-
-
-def criterion_of(network: Network) -> str:
-    """The criterion that a network's configuration names; D where it names none."""
-    return str(getattr(getattr(network, "config", None), "criterion", "D"))
+__all__ = ["NetworkScorer", "choose", "log_det_of", "scores_of"]
 
 
 class NetworkScorer:
@@ -64,10 +58,8 @@ class NetworkScorer:
     def worth(
         self, rows: NDArray[Any], usable: NDArray[np.bool_], tries: NDArray[np.int64]
     ) -> NDArray[Any]:
-        """(B, T) of tries (B, T, K), by the network's criterion."""
-        if (criterion := criterion_of(self._network)) == "D":
-            return decoders.log_dets(rows, tries)
-        return log_worth(criterion, rows[..., :-1], tries, usable)
+        """(B, T) of tries (B, T, K), log det(Z.T Z)."""
+        return decoders.log_dets(rows, tries)
 
 
 @functools.partial(jax.jit, static_argnames="network")

@@ -23,11 +23,11 @@ from jaxcal.files import atomic_write
 __all__ = [
     "CheckpointError",
     "Weights",
-    "criterion_of",
     "flat",
     "locate",
     "nested",
     "read",
+    "require_trained_by_d",
     "shipped",
     "write",
 ]
@@ -158,25 +158,20 @@ def read(path: str | pathlib.Path) -> Weights:
     return weights
 
 
-def criterion_of(checkpoint: str | pathlib.Path) -> str:
-    """The criterion that a policy of postures was trained for: D, A, I or E.
+def require_trained_by_d(path: str | pathlib.Path, meta: dict[str, Any]) -> None:
+    """Refuse a policy that an earlier jaxcal trained by A, I or E.
 
-    Raises:
-        CheckpointError: there is no such checkpoint, or it is damaged.
+    Removes the field ``criterion`` of its network and environments, which is gone.
     """
-    path = locate(checkpoint)
-    try:
-        if path.is_file():
-            meta = read(path).meta
-        else:
-            meta = json.loads((path / "meta" / "metadata").read_text())
-        return str(meta["tasks"][0]["environment"].get("criterion", "D"))
-    except (OSError, KeyError, IndexError, TypeError, ValueError) as error:
-        if isinstance(error, CheckpointError):
-            raise
-        raise CheckpointError(
-            f"checkpoint {path} is not a jaxcal policy of postures, or damaged"
-        ) from error
+    tasks = (task["environment"] for task in meta.get("tasks", ()))
+    for held in (meta.get("network", {}), *tasks):
+        if (criterion := held.pop("criterion", "D")) != "D":
+            version = meta.get("versions", {}).get("jaxcal", "an earlier version")
+            raise CheckpointError(
+                f"checkpoint {path} was trained for criterion {criterion} by jaxcal "
+                f"{version}; this jaxcal reads policies trained for D: train one with "
+                "jaxcal train, or with a reward of your own (docs/learning.md)"
+            )
 
 
 def _damaged(path: str | pathlib.Path, what: str) -> str:

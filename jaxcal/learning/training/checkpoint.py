@@ -212,6 +212,7 @@ def read_meta(
             f"checkpoint {path} is not a jaxcal policy of this kind: its schema must "
             f"be {schema}, got {held}"
         )
+    weights.require_trained_by_d(path, meta)
     return path, meta
 
 

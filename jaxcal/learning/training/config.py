@@ -34,17 +34,6 @@ class TrainConfig(RunConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(self, "in [0, 1]", lambda v: 0.0 <= v <= 1.0, "imitation")
-        by = {task.environment.criterion for task in self.tasks}
-        if self.network.kind == "compact" and by != {self.network.criterion}:
-            raise ValueError(
-                f"network.criterion must be {min(by)}, that of the tasks, got "
-                f"{self.network.criterion}"
-            )
-        if by != {"D"} and self.imitation:
-            raise ValueError(
-                f"imitation must be 0 with criterion {min(by - {'D'})}, got "
-                f"{self.imitation:g}: the solvers that it imitates maximise D"
-            )
 
     @property
     def num_imitated(self) -> int:

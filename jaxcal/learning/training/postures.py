@@ -10,7 +10,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxcal.information.regression import log_worth
 from jaxcal.learning.core.network import Network
 from jaxcal.learning.core.ppo import Learner, TrainState
 from jaxcal.learning.policies import scorer
@@ -30,27 +29,17 @@ class Validation:
     """Fixed candidate sets with their proven optimum."""
 
     candidates: np.ndarray  # (B, M, n)
-    best: np.ndarray  # (B,) ``log_worth`` of the optimum; by D log det(Z.T Z)
+    best: np.ndarray  # (B,) log det(Z.T Z) of the optimum
     num_outputs: int
     available: np.ndarray | None = None  # (B, M) bool; all when None
-    criterion: str = "D"
 
     def measure(self, network: Network, params: Any, k: int) -> tuple[float, float]:
-        """Mean det S / det S* and the share of optima hit, by greedy decoding.
-
-        By another criterion the first is the mean efficiency.
-        """
+        """Mean det S / det S* and the share of optima hit, by greedy decoding."""
         candidates = np.asarray(self.candidates, np.float32)
         free = self.available
         if free is None:
             free = np.ones(candidates.shape[:2], bool)
         indices = scorer.choose(network, params, candidates, free, k=k)
-        if self.criterion != "D":
-            worth = log_worth(
-                self.criterion, self.candidates, indices[:, None], self.available
-            )
-            gap = (worth[:, 0] - self.best) / (candidates.shape[-1] + 1)
-            return float(np.exp(gap).mean()), float((gap > -1e-9).mean())
         gap = np.asarray(scorer.log_det_of(candidates, indices)) - self.best
         # float32 values against a float64 optimum: equal to a few units in the last
         # place counts as hit; evaluate.py compares in float64.

@@ -33,10 +33,6 @@ Indices = NDArray[np.int64]
 class Chooser(Protocol):
     """A policy, ready to choose."""
 
-    @property
-    def criterion(self) -> str:
-        """What it was trained for: D, A, I or E."""
-
     def __call__(
         self, problems: Sequence[Problem], decoding: str, num: int, seed: int
     ) -> Indices:
@@ -65,12 +61,13 @@ def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Chooser:
     """Args: a weights file or a run's step, and what changes when it is replaced."""
     if path.is_file():
         stored = weights.read(path)
+        held = stored.meta | {"network": stored.network}
+        weights.require_trained_by_d(path, held)
     else:
         with needs("policy", f"checkpoint {path}, the folder of a training run,"):
             from jaxcal.learning.training import checkpoint
         stored = checkpoint.load(path.parent).weights
-    network = stored.network
-    if network["kind"] == "compact" and network.get("criterion", "D") == "D":
+    if stored.network["kind"] == "compact":
         from jaxcal.selection.policy.compact import CompactScorer
 
         return CompactScorer(stored.network, stored.arrays)
@@ -82,19 +79,15 @@ class _ThroughJax:
     """A network that reads the candidates' own coordinates, compiled for each shape."""
 
     def __init__(self, path: pathlib.Path) -> None:
-        from jaxcal.learning.policies.scorer import criterion_of
         from jaxcal.learning.training import checkpoint
 
         self._policy = checkpoint.load(path)
-        self.criterion = criterion_of(self._policy.network)
 
     def __call__(
         self, problems: Sequence[Problem], decoding: str, num: int, seed: int
     ) -> Indices:
         from jaxcal.learning.policies import scorer
 
-        # A and E change with the unit: their networks see it.
-        read = _in_unit_range if self.criterion == "D" else _as_given
         m, tries = len(problems[0].available), 1 if decoding == "greedy" else num
         # A power of two, filled up by repeating the last set: few shapes to compile.
         most = max(1, min(_LARGEST_CALL, _CELLS // (m * m * tries)))
@@ -106,7 +99,7 @@ class _ThroughJax:
             indices = scorer.choose(
                 self._policy.network,
                 self._policy.params,
-                np.stack([read(problem) for problem in filled]),
+                np.stack([_in_unit_range(problem) for problem in filled]),
                 np.stack([problem.available for problem in filled]),
                 np.stack([problem.required for problem in filled]),
                 k=problems[0].k,
@@ -116,13 +109,6 @@ class _ThroughJax:
             )
             chosen.append(indices[: len(part)])
         return np.concatenate(chosen)
-
-
-def _as_given(problem: Problem) -> NDArray[np.float32]:
-    """(M, n) candidates, 0 where masked."""
-    assert problem.candidates is not None  # blocks are refused before
-    free = problem.available[:, None]
-    return np.where(free, problem.candidates, 0.0).astype(np.float32)
 
 
 def _in_unit_range(problem: Problem) -> NDArray[np.float32]:

@@ -67,7 +67,7 @@ class CompactScorer:
         arrays: weights by flat name.
     """
 
-    piece_rows, criterion = _ROWS, "D"
+    piece_rows = _ROWS
 
     def __init__(self, config: Mapping[str, Any], arrays: Mapping[str, Array32]):
         self._lookahead: int = config["lookahead"]
