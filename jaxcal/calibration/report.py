@@ -22,9 +22,9 @@ from jaxcal import pages
 from jaxcal.calibration.budget import Budget, Source, budget
 from jaxcal.calibration.check import Check
 from jaxcal.calibration.fit import Fit
-from jaxcal.csvtable import COMMANDS, MEASURED
 from jaxcal.files import atomic_write
 from jaxcal.models.verdict import left_out
+from jaxcal.tables import COMMANDS, MEASURED
 
 __all__ = ["SCHEMA", "moved", "report"]
 

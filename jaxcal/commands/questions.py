@@ -8,18 +8,18 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.arguments import several
+from jaxcal.arguments import levels, several
 from jaxcal.commands.arms import ArmOptions, ModelPath
 from jaxcal.commands.tables import Output, TablePath
-from jaxcal.csvtable import CsvTable, read_table
 from jaxcal.information.singular import require_excited
 from jaxcal.models import Affine, Noise
 from jaxcal.selection import Design, Selection, Worst
 from jaxcal.selection.criteria import CRITERIA
+from jaxcal.tables import Table, read_table
 
 __all__ = ["Numbers", "plan", "score", "select"]
 
-Numbers = Annotated[list[float] | None, several(float, "numbers")]
+Numbers = Annotated[list[float] | None, levels]
 Names = Annotated[list[str] | None, several(str, "names")]
 Rows = Annotated[list[int] | None, several(int, "whole numbers")]
 
@@ -47,7 +47,7 @@ class DesignOptions:
     ] = None
     lost: Annotated[int, "1 or 2 rows that may fail: the worst loss counts", "L"] = 0
 
-    def design(self, table: CsvTable, of_arm: ArmOptions) -> Design:
+    def design(self, table: Table, of_arm: ArmOptions) -> Design:
         """The design of the candidates in a table."""
         model, mask = of_arm.machine(self.model, table), table.available()
         names = of_arm.columns(model, table, self.columns)
@@ -171,10 +171,10 @@ def select(
     if not between:
         _show(selection, table, output)
         return
-    if of_arm.sensor != "position":
+    if of_arm.kind != "position":
         raise ValueError(
             "--between is of sensors that read everywhere, not of --sensor "
-            f"{of_arm.sensor}; in Python: design.refine(..., allowed=arm.reachable())"
+            f"{of_arm.kind}; in Python: design.refine(..., allowed=arm.reachable())"
         )
     refined = design.refine(selection, criterion=criterion)
     names = list(design.axes or ())
@@ -229,7 +229,7 @@ def plan(
         list[float],
         "standard error that a prediction may have; one number or one per output",
         "E",
-        several(float, "numbers"),
+        levels,
     ],
     criterion: Annotated[
         Literal["G", "I"],
@@ -255,7 +255,7 @@ def plan(
         print(f"measure rows {', '.join(str(i) for i in result.indices)}")
 
 
-def _rows_of(subset: CsvTable, table: CsvTable) -> NDArray[np.int64]:
+def _rows_of(subset: Table, table: Table) -> NDArray[np.int64]:
     """(k,) rows of the table, by the column ``index`` of what ``select`` wrote.
 
     Raises:
@@ -289,7 +289,7 @@ def _one_or_all(values: list[float]) -> float | list[float]:
     return values[0] if len(values) == 1 else values
 
 
-def _show(selection: Selection, table: CsvTable, output: Output) -> None:
+def _show(selection: Selection, table: Table, output: Output) -> None:
     """The rows chosen, as a table for people, CSV or JSON."""
     names = [*table.labels, *table.names]
     rows: list[list[Any]] = [
