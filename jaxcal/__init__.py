@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         Worst,
         select,
     )
+    from jaxcal.tables import read_table
 
 __all__ = [
     "As",
@@ -50,6 +51,7 @@ __all__ = [
     "identify",
     "log_det_information",
     "optimise",
+    "read_table",
     "regression_matrix",
     "select",
 ]
@@ -76,6 +78,7 @@ _HOME = {
     "Selection": "jaxcal.selection",
     "Worst": "jaxcal.selection",
     "optimise": "jaxcal.designs",
+    "read_table": "jaxcal.tables",
     "select": "jaxcal.selection",
 }
 

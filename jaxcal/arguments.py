@@ -15,6 +15,7 @@ import argparse
 import contextlib
 import dataclasses
 import inspect
+import io
 import logging
 import math
 import pathlib
@@ -30,6 +31,7 @@ __all__ = [
     "Numbers",
     "Parser",
     "exit_code",
+    "levels",
     "number_type",
     "refused",
     "several",
@@ -153,14 +155,25 @@ def _add(parser: Any, name: str, hint: Any, default: Any, option: bool) -> None:
 
 
 @contextlib.contextmanager
-def told() -> Iterator[None]:
-    """What jaxcal logs inside the block is shown on standard error."""
-    log, shown = logging.getLogger("jaxcal"), logging.StreamHandler()
+def told(at_end: bool = False) -> Iterator[None]:
+    """What jaxcal logs inside the block is shown on standard error.
+
+    Args:
+        at_end: once the block is done, and nothing where it fails: an error is then
+            the only line.
+    """
+    lines = io.StringIO()
+    log, shown = logging.getLogger("jaxcal"), logging.StreamHandler(lines)
+    level = log.level
+    if not at_end:
+        shown.setStream(sys.stderr)
     log.setLevel(logging.INFO)
     log.addHandler(shown)
     try:
         yield
+        sys.stderr.write(lines.getvalue())
     finally:
+        log.setLevel(level)
         log.removeHandler(shown)
 
 
@@ -235,4 +248,15 @@ def several(kind: Callable[[str], T], what: str) -> Callable[[str], list[T]]:
     return parse
 
 
-Numbers = Annotated[list[float] | None, several(float, "numbers")]
+def levels(text: str) -> list[float]:
+    """One number, or one for each output; 1,5 is neither."""
+    if re.fullmatch(r"\s*\d+,\d+\s*", text):
+        whole = text.strip()
+        point, two = whole.replace(",", "."), whole.replace(",", ".0,") + ".0"
+        raise argparse.ArgumentTypeError(
+            f"may be one number or two, got {whole!r}: write {point}, or {two}"
+        )
+    return several(float, "numbers")(text)
+
+
+Numbers = Annotated[list[float] | None, levels]

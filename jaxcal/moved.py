@@ -14,6 +14,7 @@ __all__ = ["MOVED", "install_finder"]
 MOVED = {  # longer names first
     "jaxcal.calibration.budget": "jaxcal.reports.budget",
     "jaxcal.calibration.report": "jaxcal.reports.calibration",
+    "jaxcal.csvtable": "jaxcal.tables",
     "jaxcal.evaluation.sequential": "jaxcal.adaptive.evaluation",
     "jaxcal.models.sensors": "jaxcal.arms.sensors",
     "jaxcal.models.serial.kernel": "jaxcal.arms.chain_kernel",

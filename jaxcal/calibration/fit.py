@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, numbers
-from jaxcal.csvtable import COMMANDS, MEASURED, of_frame
 from jaxcal.information.singular import depends
 from jaxcal.models.identifiability import Identifiability, identifiability
 from jaxcal.models.model import Model, derivative, predict
 from jaxcal.models.uncertainty import Prior
+from jaxcal.tables import COMMANDS, MEASURED, of_frame
 
 __all__ = ["Fit"]
 

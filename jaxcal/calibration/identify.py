@@ -26,11 +26,20 @@ from jaxcal.checks import (
     require_none,
     table,
 )
-from jaxcal.csvtable import names_of
 from jaxcal.models.affine import Affine
-from jaxcal.models.model import Model, by_name, recorded
+from jaxcal.models.model import Model, recorded
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
+from jaxcal.tables import (
+    COMMANDS,
+    MEASURED,
+    columns_by_name,
+    columns_of,
+    inputs_of,
+    names_in,
+    of_frame,
+    outputs_of,
+)
 
 __all__ = ["identify"]
 
@@ -65,10 +74,11 @@ def identify(
     unexcited.
 
     Args:
-        commands: (N, n) what the device was told, in any unit; of an arm also a
-            ``Recording``, or the path of one: a bag, a LeRobot dataset.
+        commands: (N, n) what the device was told, in any unit; an array, or a frame or
+            table, whose columns are read as ``jaxcal.read_table`` decides; of an arm
+            also a ``Recording``, or the path of one: a bag, a LeRobot dataset.
         measured: (N, m) what it reached, in any unit. Contacts need none, nor does a
-            recording that has the readings.
+            recording that has the readings, or a table that has columns y_....
         model: of ``jaxcal.models``, or any object with its methods; affine when not
             given.
         prior: what is known beforehand; ``model.default_prior()`` when not given.
@@ -158,11 +168,11 @@ def _measurements(
     commands, measured, is_recording = recorded(model, commands, measured)
     if is_recording:
         input_names = input_names or getattr(model, "inputs", ()) or None
-    commands = by_name(model, commands)
-    input_names = input_names or names_of(commands) or None
-    output_names = output_names or names_of(measured) or None
-    u = table("commands", commands)
-    y = table("measured", measured, len(u))
+    inputs, outputs = _columns(model, commands, measured)
+    u = table("commands", of_frame("commands", commands, inputs or (), COMMANDS))
+    y = of_frame("measured", measured, outputs or (), MEASURED)
+    y = table("measured", y, len(u))
+    input_names, output_names = input_names or inputs, output_names or outputs
     inputs = axis_names("input_names", input_names, "u", u.shape[1])
     outputs = axis_names("output_names", output_names, "y", y.shape[1])
     weight = np.ones(len(u))
@@ -170,6 +180,21 @@ def _measurements(
         weight = array_of("weights", weights, len(u))
         require_none(weight < 0.0, weight, "weights must not be negative")
     return _Measurements(u, y, weight, inputs, outputs)
+
+
+def _columns(model: Any, commands: Any, measured: Any) -> tuple[Any, Any]:
+    """Names of the columns of commands and of readings; None of what has no names."""
+    wanted = getattr(getattr(model, "sensor", None), "outputs", ())
+    together, outputs = measured is commands, None
+    readings = [*(columns_of("measured", measured) or ())]
+    if any(columns_by_name(wanted, readings, MEASURED)):
+        outputs = names_in("measured", measured, wanted, MEASURED)
+    elif readings:
+        outputs = outputs_of("measured", measured, together)
+    if inputs := getattr(model, "inputs", ()):
+        beside = outputs if together else ()
+        return names_in("commands", commands, inputs, COMMANDS, beside or ()), outputs
+    return inputs_of("commands", commands, outputs if together else ()), outputs
 
 
 def _about(

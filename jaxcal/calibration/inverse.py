@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -21,6 +23,8 @@ __all__ = ["command_for"]
 
 Array = NDArray[np.float64]
 
+_FAR = 0.25  # of the range of what was measured, beyond it
+_NAMED = 3  # targets in a warning
 _STARTS, _STEPS, _REACHED = 6, 60, 1e-9  # of the outputs' spread over the measurements
 
 
@@ -76,9 +80,13 @@ def command_for(
     slack = 1e-9 * search.spread
     low, high = bounds.T
     inside = ((commands >= low - slack) & (commands <= high + slack)).all(axis=1)
+    free = commands.copy()
     for i in np.flatnonzero(~(reached & inside)):
         commands[i] = search.bounded(int(i), commands[i], reached[i], bounds, clip)
     commands = np.clip(commands, low, high)
+    if clip:
+        search.say_clipped(free, commands)
+    search.say_far(commands)
     if not (clip or search.affine):
         search.require_regular(commands)
     search.require_determined(commands)
@@ -126,6 +134,52 @@ class _Search:
         with np.errstate(over="ignore"):
             order = np.argsort(((there / self.size) ** 2).sum(axis=-1), axis=1)
         self.nearest = measured_at[order[:, :_STARTS]]  # (P, starts, n)
+
+    def say_clipped(self, free: Array, commands: Array) -> None:
+        """Warn of the targets (P, n) that the limits keep from being reached."""
+        rows = np.arange(len(commands))
+        lines = []
+        for i in np.flatnonzero(~self._arrived(self.gap(commands, rows))):
+            j = int((np.abs(commands[i] - free[i]) / self.spread).argmax())
+            lines.append(
+                f"target {i + 1}, {self.fit.input_names[j]} = {free[i, j]:.6g} to "
+                f"{commands[i, j]:.6g}"
+            )
+        if lines:
+            more = f"; and {len(lines) - _NAMED} more" if len(lines) > _NAMED else ""
+            listed = "; ".join(lines[:_NAMED]) + more
+            warnings.warn(
+                f"{len(lines)} of {len(commands)} targets are clipped: {listed}",
+                stacklevel=3,
+            )
+
+    def say_far(self, commands: Array) -> None:
+        """Warn of targets that are reached (P, n) far from what was measured."""
+        fit, used = self.fit, self.fit.loss_weights > 0.0
+        sides = [(fit.input_names, commands, fit.commands[used])]
+        if not fit.model.relative:
+            readings = predict(self.model, fit.commands, fit.estimate) + fit.residuals
+            sides.append((fit.output_names, self.wanted, readings[used]))
+        far = np.zeros(len(commands), dtype=np.bool_)
+        most, worst = _FAR, ""
+        for names, values, measured in sides:
+            low, high = measured.min(axis=0), measured.max(axis=0)
+            width = np.where(high > low, high - low, np.inf)
+            beyond = np.maximum(low - values, values - high) / width
+            far |= (beyond > _FAR).any(axis=1)
+            if beyond.max(initial=0.0) > most:
+                i, j = np.unravel_index(beyond.argmax(), beyond.shape)
+                most = beyond[i, j]
+                worst = (
+                    f"target {i + 1} has {names[j]} = {values[i, j]:.6g}, measured "
+                    f"was {low[j]:.6g} to {high[j]:.6g}"
+                )
+        if worst:
+            warnings.warn(
+                f"{far.sum()} of {len(far)} targets are far outside the measurements: "
+                f"{worst}; nothing shows that the calibration holds there",
+                stacklevel=3,
+            )
 
     def outputs(self, commands: Array) -> Array:
         return predict(self.model, commands, self.fit.estimate, finite=False)

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from jaxcal.arguments import several
 from jaxcal.checks import one_of
-from jaxcal.csvtable import COMMANDS, CsvTable
 from jaxcal.models import Model, Recording, from_dict
 from jaxcal.models.linear import input_letters
 from jaxcal.models.model import as_model
+from jaxcal.tables import COMMANDS, Table
 
 if TYPE_CHECKING:
     from jaxcal.arms import Sensor, SerialChain
@@ -46,11 +46,11 @@ class ArmOptions:
     """Links of an arm in a URDF file, its sensor, the unit of its columns."""
 
     sensor: Annotated[
-        str,
-        "of an arm, what its tip is measured with: position, pose, socket, plane, "
-        "distance, gravity, wrench or board",
+        str | None,
+        "of an arm, what its tip is measured with: position (default), pose, socket, "
+        "plane, distance, gravity, wrench or board",
         "KIND",
-    ] = "position"
+    ] = None
     base: Annotated[str | None, "of an arm, the link that stands still", "LINK"] = None
     tip: Annotated[list[str] | None, "of an arm, the link that is measured", "LINK"] = (
         None
@@ -72,9 +72,12 @@ class ArmOptions:
         several(float, "numbers"),
     ] = None
 
-    def read(
-        self, path: str, table: CsvTable | None, places: Any = None
-    ) -> SerialChain:
+    @property
+    def kind(self) -> str:
+        """Of the sensor."""
+        return self.sensor or "position"
+
+    def read(self, path: str, table: Table | None, places: Any = None) -> SerialChain:
         """The arm in this file; things that it touches are given or in the table."""
         from jaxcal.arms import SerialChain
 
@@ -99,29 +102,29 @@ class ArmOptions:
             limits=dict(self.limits or ()),
         )
 
-    def _sensor(self, table: CsvTable | None, places: Any) -> Sensor:
+    def _sensor(self, table: Table | None, places: Any) -> Sensor:
         """The sensor, with as many landmarks as are given or in the table."""
         from jaxcal.arms.sensors import SENSORS, Landmarks, Socket
 
         kinds = {name: kind for name, kind in SENSORS.items() if name != "several"}
-        kind = kinds[one_of("--sensor", self.sensor, tuple(kinds))]
+        kind = kinds[one_of("--sensor", self.kind, tuple(kinds))]
         landmarks: dict[str, Any] = {}
         if issubclass(kind, Landmarks):
             if places is not None:
                 if {len(place) for place in places} != {kind.width}:
                     raise ValueError(
                         f"--near must be {kind.width} numbers for --sensor "
-                        f"{self.sensor}, got {places}"
+                        f"{self.kind}, got {places}"
                     )
                 landmarks |= {"count": len(places), "places": places}
-            elif table is not None and self.sensor in table.names:
-                column = table.columns([self.sensor])
+            elif table is not None and self.kind in table.names:
+                column = table.columns([self.kind])
                 landmarks["count"] = 1 + int(column.max(initial=0.0))
         if self.distance:
             if kind is not Socket:
                 raise ValueError("--distance is of --sensor socket")
             landmarks["distances"] = self.distance
-            if table is not None and self.sensor not in table.names:
+            if table is not None and self.kind not in table.names:
                 raise ValueError(
                     f"{table.source}: --distance needs a column 'socket', from 0"
                 )
@@ -137,9 +140,9 @@ class ArmOptions:
             return self.read(str(path), None)
         column = np.array(which, dtype=np.float64)[:, None]
         lines = tuple(range(1, 1 + len(column)))
-        return self.read(str(path), CsvTable("", (self.sensor,), column, {}, lines))
+        return self.read(str(path), Table("", (self.kind,), column, {}, lines))
 
-    def machine(self, path: str | None, table: CsvTable | None) -> Model | None:
+    def machine(self, path: str | None, table: Table | None) -> Model | None:
         """The model in a file, an arm or another; None without one.
 
         Raises:
@@ -157,7 +160,7 @@ class ArmOptions:
     def columns(
         self,
         model: Any,
-        table: CsvTable,
+        table: Table,
         chosen: str | None = None,
         option: str = "--columns",
         but: Sequence[str] = (),
@@ -181,12 +184,15 @@ class ArmOptions:
             if len(names) == len(inputs):
                 table.say(inputs, names, "in their order")
                 return names
-        return table.named(inputs, COMMANDS, chosen=chosen, option=option)
+        beside = but or getattr(getattr(model, "sensor", None), "outputs", ())
+        return table.named(
+            inputs, COMMANDS, chosen=chosen, option=option, others=beside
+        )
 
     def commands(
         self,
         model: Any,
-        table: CsvTable,
+        table: Table,
         columns: Sequence[str],
         used: NDArray[np.bool_] | None = None,
     ) -> Array:
@@ -223,7 +229,7 @@ class RecordingOptions:
         bool, "the dataset is in degrees; --servos is what --servos-out corrects"
     ] = False
 
-    def table(self, path: str, arm: Any) -> CsvTable | None:
+    def table(self, path: str, arm: Any) -> Table | None:
         """The rests of a recording as a table, degrees; None where it is a table.
 
         Args:
@@ -258,7 +264,7 @@ class RecordingOptions:
             )
         values = np.hstack([commands, read])
         lines = tuple(range(1, len(values) + 1))
-        return CsvTable(path, (*names, *model.sensor.outputs), values, {}, lines)
+        return Table(path, (*names, *model.sensor.outputs), values, {}, lines)
 
 
 def in_degrees(arm: SerialChain, commands: Array) -> Array:

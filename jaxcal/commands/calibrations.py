@@ -24,7 +24,7 @@ from jaxcal.commands.tables import (
     write_json,
     write_rows,
 )
-from jaxcal.csvtable import COMMANDS, MEASURED, CsvTable, read_table
+from jaxcal.tables import COMMANDS, MEASURED, Table, read_table
 
 __all__ = ["check", "command", "identify", "predict"]
 
@@ -185,7 +185,7 @@ def identify(
     table = read_table(file) if table is None else table
     machine: Any = of_arm.machine(model, table)
     if of_urdf:
-        readings = _arm_readings(of_arm, machine, table, inputs, outputs)
+        readings = _arm_readings(of_arm, machine, table, inputs, outputs, weights)
         if machine.sensor.lengths:  # files of this format are in metres
             measured_unit = measured_unit or "m"
     else:
@@ -240,25 +240,30 @@ class _Readings(NamedTuple):
 def _arm_readings(
     of_arm: ArmOptions,
     arm: Any,
-    table: CsvTable,
+    table: Table,
     inputs: str | None,
     outputs: str | None,
+    weights: str | None,
 ) -> _Readings:
     """The columns named as the arm's joints and its sensor's; a contact has none."""
-    names = of_arm.columns(arm, table, inputs, "--inputs")
-    commands, columns = of_arm.commands(arm, table, names), arm.sensor.outputs
-    if arm.sensor.zeros:
-        return _Readings(
-            commands, np.zeros((len(commands), len(columns))), names, columns
-        )
-    columns = table.named(columns, MEASURED, chosen=outputs, option="--outputs")
-    return _Readings(commands, table.columns(columns), names, columns)
+    columns, contacts = arm.sensor.outputs, arm.sensor.zeros
+    if not contacts:
+        columns = table.named(columns, MEASURED, chosen=outputs, option="--outputs")
+    elif outputs:
+        raise ValueError(f"--outputs is of readings, contacts have none, got {outputs}")
+    beside = (*columns, weights or "")
+    names = of_arm.columns(arm, table, inputs, "--inputs", beside)
+    commands = of_arm.commands(arm, table, names)
+    measured = np.zeros((len(table), len(columns)))
+    if not contacts:
+        measured = table.columns(columns)
+    return _Readings(commands, measured, names, columns)
 
 
 def _readings(
     of_arm: ArmOptions,
     machine: Any,
-    table: CsvTable,
+    table: Table,
     inputs: str | None,
     outputs: str | None,
     weights: str | None,
@@ -372,7 +377,13 @@ def command(
     """
     calibrated = Calibration.load(calibration)
     table, unit = read_table(file), calibrated.measured_unit
-    names = table.named(calibrated.output_names, MEASURED, chosen=columns, unit=unit)
+    names = table.named(
+        calibrated.output_names,
+        MEASURED,
+        chosen=columns,
+        unit=unit,
+        others=calibrated.input_names,
+    )
     desired = table.columns(names)
     if clip and not limits:
         raise ValueError("--clip needs --limits")
@@ -384,7 +395,7 @@ def command(
 
 def _commands_for(
     calibration: Calibration,
-    table: CsvTable,
+    table: Table,
     chosen: str | None = None,
     option: str = "--columns",
 ) -> tuple[tuple[str, ...], Array]:
@@ -395,6 +406,7 @@ def _commands_for(
         chosen=chosen,
         option=option,
         unit=calibration.command_unit,
+        others=calibration.output_names,
     )
     return names, table.columns(names)
 
@@ -409,7 +421,7 @@ def _in_degrees(calibration: Calibration, commands: Array) -> Array:
 
 
 def _readings_for(
-    calibration: Calibration, table: CsvTable, inputs: Sequence[str]
+    calibration: Calibration, table: Table, inputs: Sequence[str]
 ) -> Array:
     """(N, m) the readings of a calibration in a table, beside columns ``inputs``."""
     outputs = table.named(

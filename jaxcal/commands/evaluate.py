@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 from jaxcal.arguments import Parser, refused, several, told, typed_line, values_of
+from jaxcal.commands.tables import require_kept
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder, write_text
 
@@ -219,6 +220,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
         options.command = [*command, *words]
         if not of_task and options.stream is not None:
             kept = "finished parts are kept; the same command goes on"
+        require_kept(vars(made))
         with told():
             made.function(options)
     except KeyboardInterrupt as stop:

@@ -13,6 +13,7 @@ from typing import Annotated
 
 from jaxcal.arguments import Parser, refused, told, values_of
 from jaxcal.checks import aligned
+from jaxcal.commands.tables import require_kept, write_json
 from jaxcal.extras import MissingExtraError, install
 
 __all__ = ["COMMANDS", "main"]
@@ -68,13 +69,14 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _parser(words).parse_args(words)
     code = 0
     try:
-        with told(), warnings.catch_warnings():
+        with told(arguments.command != "loop"), warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = lambda warning, *_: print(
                 f"jaxcal {arguments.command}: warning:",
                 "; ".join(str(warning).splitlines()),
                 file=sys.stderr,
             )
+            require_kept(vars(arguments))
             code = arguments.function(**values_of(arguments))
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of a pipe, such as head, has left
@@ -110,8 +112,6 @@ def _parser(given: list[str]) -> Parser:
 
 def doctor(*, json: Annotated[bool, "print JSON"] = False) -> None:
     """Print versions and devices; nothing is changed and no port is opened."""
-    from jaxcal.commands.tables import write_json
-
     versions = {
         "python": f"{platform.python_version()} ({sys.executable})",
         "platform": platform.platform(),

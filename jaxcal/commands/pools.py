@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.csvtable import read_table
+from jaxcal.tables import read_table
 
 __all__ = ["draw_sets", "holds_sets", "read_pool"]
 

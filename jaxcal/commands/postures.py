@@ -16,9 +16,9 @@ from jaxcal.arms.sensors import SENSORS, Board, Landmarks
 from jaxcal.checks import aligned
 from jaxcal.commands.arms import ArmOptions
 from jaxcal.commands.tables import Output
-from jaxcal.csvtable import COMMANDS, read_table
 from jaxcal.extras import needs
 from jaxcal.selection import Design
+from jaxcal.tables import COMMANDS, read_table
 
 __all__ = ["postures"]
 
@@ -125,11 +125,13 @@ def postures(
     Collisions are looked at as far as --floor, --approach and --clear say.
     """
     reached = None if measured is None else read_table(measured)
-    placed = issubclass(SENSORS[of_arm.sensor], Landmarks)
+    placed = issubclass(SENSORS[of_arm.kind], Landmarks)
     arm = of_arm.read(model, reached, near if placed else None)
     header, done = (*arm.joint_names, *arm.sensor.inputs), None
     if reached is not None:
-        done = of_arm.commands(arm, reached, reached.named(header, COMMANDS))
+        done = of_arm.commands(
+            arm, reached, reached.named(header, COMMANDS, others=arm.sensor.outputs)
+        )
         arm.require_commands(done)
         arm = arm.located(done)
     more = k - (0 if done is None else len(done))

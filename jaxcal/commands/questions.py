@@ -8,14 +8,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.arguments import Numbers, several
+from jaxcal.arguments import Numbers, levels, several
 from jaxcal.commands.arms import ArmOptions, ModelPath
 from jaxcal.commands.tables import Output, TablePath
-from jaxcal.csvtable import CsvTable, read_table
 from jaxcal.information.singular import require_excited
 from jaxcal.models import Affine, Noise
 from jaxcal.selection import Design, Selection, Worst
 from jaxcal.selection.criteria import CRITERIA
+from jaxcal.tables import Table, read_table
 
 __all__ = ["plan", "score", "select"]
 
@@ -45,7 +45,7 @@ class DesignOptions:
         int | None, "draws of the model's parameters; the mean over them counts", "N"
     ] = None
 
-    def design(self, table: CsvTable, of_arm: ArmOptions) -> Design:
+    def design(self, table: Table, of_arm: ArmOptions) -> Design:
         """The design of the candidates in a table."""
         model, mask = of_arm.machine(self.model, table), table.available()
         names = of_arm.columns(model, table, self.columns)
@@ -168,10 +168,10 @@ def select(
     if not between:
         _show(selection, table, output)
         return
-    if of_arm.sensor != "position":
+    if of_arm.kind != "position":
         raise ValueError(
             "--between is of sensors that read everywhere, not of --sensor "
-            f"{of_arm.sensor}; in Python: design.refine(..., allowed=arm.reachable())"
+            f"{of_arm.kind}; in Python: design.refine(..., allowed=arm.reachable())"
         )
     refined = design.refine(selection, criterion=criterion)
     names = list(design.axes or ())
@@ -226,7 +226,7 @@ def plan(
         list[float],
         "standard error that a prediction may have; one number or one per output",
         "E",
-        several(float, "numbers"),
+        levels,
     ],
     criterion: Annotated[
         Literal["G", "I"],
@@ -252,7 +252,7 @@ def plan(
         print(f"measure rows {', '.join(str(i) for i in result.indices)}")
 
 
-def _rows_of(subset: CsvTable, table: CsvTable) -> NDArray[np.int64]:
+def _rows_of(subset: Table, table: Table) -> NDArray[np.int64]:
     """(k,) rows of the table, by the column ``index`` of what ``select`` wrote.
 
     Raises:
@@ -286,7 +286,7 @@ def _one_or_all(values: list[float]) -> float | list[float]:
     return values[0] if len(values) == 1 else values
 
 
-def _show(selection: Selection, table: CsvTable, output: Output) -> None:
+def _show(selection: Selection, table: Table, output: Output) -> None:
     """The rows chosen, as a table for people, CSV or JSON."""
     names = [*table.labels, *table.names]
     rows: list[list[Any]] = [

@@ -6,9 +6,10 @@ import csv
 import dataclasses
 import io
 import json
+import os
 import pathlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from jaxcal.files import write_text
 __all__ = [
     "Output",
     "TablePath",
+    "require_kept",
     "write_json",
     "write_rows",
 ]
@@ -55,6 +57,38 @@ class Output:
         else:
             return False
         return True
+
+
+def require_kept(given: Mapping[str, Any]) -> None:
+    """Refuse to write over what is read: an input of these arguments, by any path.
+
+    Raises:
+        ValueError: naming the option and the file.
+    """
+    options = ("out", "servos_out", "picture", "json")
+    written: dict[str, Any] = {name: given.get(name) for name in options}
+    if folder := given.get("report"):
+        for name in ("index.html", "verdict.json", "calibration.json"):
+            written[f"report {name}"] = os.path.join(folder, name)
+    for option, path in written.items():
+        if not isinstance(path, str | pathlib.Path) or given.get("overwrite"):
+            continue
+        for name, value in given.items():
+            values = value if isinstance(value, list | tuple) else [value]
+            if name not in written and any(_same_file(path, x) for x in values):
+                raise ValueError(
+                    f"--{option.replace('_', '-')}: {path} is what is read "
+                    f"({name.replace('_', '-')}); write to another file"
+                )
+
+
+def _same_file(path: Any, value: Any) -> bool:
+    try:
+        if value == "-":
+            return os.path.samestat(os.stat(path), os.fstat(sys.stdin.fileno()))
+        return isinstance(value, str | pathlib.Path) and os.path.samefile(path, value)
+    except (OSError, ValueError):
+        return False
 
 
 def write_rows(out: str, names: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

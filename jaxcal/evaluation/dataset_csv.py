@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from jaxcal.checks import axis_letter
-from jaxcal.csvtable import COMMANDS, MEASURED, CsvTable, parse
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.files import atomic_write
+from jaxcal.tables import COMMANDS, MEASURED, Table, parse
 
 __all__ = ["read_csv", "save_csv"]
 
@@ -92,12 +92,14 @@ def read_csv(source: str, data: bytes) -> dict[str, Any]:
     fields: dict[str, Any] = {"candidates": in_order[..., u]}
     if y:
         fields["measured"] = in_order[..., y]
+    if _MASK in table.labels:  # 0 and 1 alone, as save_csv writes it
+        table.columns([_MASK])
     if (mask := table.available()) is not None:
         fields["available"] = mask[order].reshape(shape)
     return fields
 
 
-def _columns(table: CsvTable) -> list[str]:
+def _columns(table: Table) -> list[str]:
     """All of them, the labels first."""
     source, header = table.source, table.header
     for name in _LABELS:

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from jaxcal.csvtable import read_table
 from jaxcal.reports.plots.style import COLOURS, panels
+from jaxcal.tables import read_table
 
 __all__ = ["last_rewards", "read_metrics", "training_curves", "training_diagnostics"]
 

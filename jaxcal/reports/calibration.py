@@ -20,11 +20,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.check import Check
 from jaxcal.calibration.fit import Fit
-from jaxcal.csvtable import COMMANDS, MEASURED
 from jaxcal.files import atomic_write
 from jaxcal.models.verdict import left_out
 from jaxcal.reports import page as pages
 from jaxcal.reports.budget import Budget, Source, budget
+from jaxcal.tables import COMMANDS, MEASURED
 
 __all__ = ["SCHEMA", "moved", "report"]
 

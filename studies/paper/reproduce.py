@@ -128,8 +128,8 @@ def _files(
     progress: Progress,
 ) -> dict[str, bytes]:
     """Everything to write, by path below the folder; the page last."""
-    from jaxcal.csvtable import csv_text
     from jaxcal.reports.plots.style import as_files
+    from jaxcal.tables import csv_text
     from studies.paper.exhibits.page import json_document, page
 
     figures = {name: f for e in exhibits for name, f in e.figures.items()}

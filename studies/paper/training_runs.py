@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arguments import Parser, exit_code, values_of
-from jaxcal.csvtable import csv_text
 from jaxcal.files import require_writable_folder, write_text
+from jaxcal.tables import csv_text
 
 Array = NDArray[np.float64]
 

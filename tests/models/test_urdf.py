@@ -262,7 +262,7 @@ def test_columns_of_a_table_are_taken_by_the_names_of_the_joints(tmp_path):
     pandas = pytest.importorskip("pandas")
     model = _read(tmp_path, TREE, base="camera", tip="finger")
     frame = pandas.DataFrame({"slide": [0.01], "neck": [10.0], "shoulder": [5.0]})
-    picked = by_name(model, frame).to_numpy()
+    picked = np.asarray(by_name(model, frame))
     np.testing.assert_array_equal(picked, [[10.0, 5.0, 0.01]])
     with pytest.raises(ValueError, match="'neck' is missing"):
         by_name(model, frame.drop(columns="neck"))

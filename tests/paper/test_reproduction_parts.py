@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from jaxcal.calibration.identify import identify
-from jaxcal.csvtable import csv_text
 from jaxcal.evaluation.parameters import least_squares, predict
 from jaxcal.reports.plots import as_bytes
+from jaxcal.tables import csv_text
 from studies.paper.exhibits.devices import Device
 from studies.paper.exhibits.intervals import (
     bootstrap_interval,

@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges
-from jaxcal.csvtable import parse
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.paper.constants import AXES, EPISODES, NUM_CANDIDATES, RANGES
+from jaxcal.tables import parse
 
 __all__ = ["SHIPPED", "read_pool", "recorded_dataset"]
 

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, numbers, require_kind
-from jaxcal.csvtable import COMMANDS, names_of, of_frame
 from jaxcal.models.affine import Affine
-from jaxcal.models.model import Model, answered, as_model, by_name
+from jaxcal.models.model import Model, answered, as_model
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.problem.arrays import (
     check_available,
@@ -26,6 +25,14 @@ from jaxcal.selection.problem.arrays import (
     usable_numbers,
 )
 from jaxcal.selection.problem.scenarios import Scenarios, checked_weights, scenarios_of
+from jaxcal.tables import (
+    COMMANDS,
+    columns_of,
+    inputs_of,
+    names_in,
+    of_frame,
+    table_of_frame,
+)
 
 __all__ = ["CandidateSet", "DesignProtocol"]
 
@@ -80,9 +87,19 @@ class CandidateSet:
         if model is not None:
             model = as_model(model)
         require_kind("prior", prior, Prior)
-        candidates = by_name(model, candidates)
-        if header := names_of(candidates):
-            measured = of_frame("measured", measured, header, COMMANDS)
+        labels, axes = _names_of_rows(candidates, names), None
+        if columns_of("candidates", candidates):
+            wanted, mask = (
+                getattr(model, "inputs", ()),
+                _available(candidates, available),
+            )
+            if wanted:
+                axes = names_in("candidates", candidates, wanted, COMMANDS, ())
+            else:
+                axes = inputs_of("candidates", candidates)
+            candidates = of_frame("candidates", candidates, axes, COMMANDS, mask)
+            measured = of_frame("measured", measured, wanted or axes, COMMANDS)
+            available = mask
         array = filled("candidates", candidates, "M", "n")
         if model is None:
             model = Affine(array.shape[1], array.shape[1])
@@ -92,7 +109,6 @@ class CandidateSet:
                 f"got {array.shape}"
             )
         mask = check_available(available, array.shape[:1])
-        labels, axes = _labels(candidates, names)
         made = cls(
             model=model,
             candidates=usable_numbers("candidates", array, mask),
@@ -171,7 +187,6 @@ class CandidateSet:
             rule = ", one for each block"
             commands = array_of("commands", commands, len(array), "n", rule=rule)
             commands.flags.writeable = False
-        labels, axes = _labels(array, names)
         made = cls(
             model=None,
             candidates=commands,
@@ -180,8 +195,7 @@ class CandidateSet:
             prior=prior,
             noise=noise,
             measured=measured,
-            names=labels,
-            axes=axes,
+            names=_names_of_rows(array, names),
             scenarios=scenarios,
             **rules,
         )
@@ -222,22 +236,36 @@ class DesignProtocol(Protocol):
     candidate_set: CandidateSet
 
 
-def _labels(
+def _available(frame: Any, available: Any) -> Any:
+    """The column ``available`` of a frame, where it has one, else what was given."""
+    column = table_of_frame("candidates", frame).available()
+    if column is None or available is None:
+        return available if column is None else column
+    if not np.array_equal(column, np.asarray(available)):
+        raise ValueError(
+            "available must be that of the candidates' column, or that column be left "
+            "out: they differ"
+        )
+    return column
+
+
+def _names_of_rows(
     candidates: Any, names: Sequence[str] | None
-) -> tuple[tuple[str, ...] | None, tuple[str, ...] | None]:
-    """Names of the candidates and of their axes, from a data frame where it is one."""
-    axes = None
-    if hasattr(candidates, "to_numpy") and hasattr(candidates, "columns"):
-        axes = tuple(str(column) for column in candidates.columns)
-        rows = tuple(str(label) for label in getattr(candidates, "index", ()))
-        if names is None and rows and rows != tuple(map(str, range(len(rows)))):
-            return rows, axes
+) -> tuple[str, ...] | None:
+    """Names of the candidates, of a data frame its index or its column of words."""
+    if names is None and columns_of("candidates", candidates):
+        rows = tuple(map(str, getattr(candidates, "index", ())))
+        if rows and rows != tuple(map(str, range(len(rows)))):
+            return rows
+        names = next(
+            iter(table_of_frame("candidates", candidates).labels.values()), None
+        )
     if names is None:
-        return None, axes
+        return None
     labels, count = tuple(names), len(candidates)
     if len(labels) != count or not all(isinstance(name, str) for name in labels):
         raise ValueError(
             f"names must be {count} texts, one for each candidate, got {len(labels)} "
             f"of {', '.join(sorted({type(name).__name__ for name in labels}))}"
         )
-    return labels, axes
+    return labels

@@ -7,7 +7,7 @@ import io
 import numpy as np
 import pytest
 
-from jaxcal.csvtable import read_table
+from jaxcal.tables import read_table
 
 
 def written(tmp_path, text, name="table.csv"):

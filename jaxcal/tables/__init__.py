@@ -1,0 +1,35 @@
+"""Tables: one reader for files and frames, one decision for each column.
+
+A column that has a name is never read by its place; what is not read, or could be meant
+otherwise, is said in one line.
+"""
+
+from jaxcal.tables.decisions import Decision
+from jaxcal.tables.frames import (
+    columns_of,
+    inputs_of,
+    names_in,
+    of_frame,
+    outputs_of,
+    table_of_frame,
+)
+from jaxcal.tables.names import COMMANDS, MEASURED, columns_by_name
+from jaxcal.tables.table import Table, parse, read_table
+from jaxcal.tables.text import csv_text
+
+__all__ = [
+    "COMMANDS",
+    "MEASURED",
+    "Decision",
+    "Table",
+    "columns_by_name",
+    "columns_of",
+    "csv_text",
+    "inputs_of",
+    "names_in",
+    "of_frame",
+    "outputs_of",
+    "parse",
+    "read_table",
+    "table_of_frame",
+]

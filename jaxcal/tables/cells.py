@@ -1,0 +1,133 @@
+"""Cells of text as numbers, by one decimal mark for the whole table.
+
+Which mark that is, cells decide that can be read in one way only: 1,5 or 0.25 or
+1.234,5. A cell that could be two numbers, 14.036 beside -838, is refused.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+__all__ = ["Ambiguity", "decimal_mark", "is_number", "numbers_of", "truths_of"]
+
+_BLANKS = " \u00a0\u202f\u2009'\u2019"  # between groups of three digits
+_GROUPS = re.compile(rf"([+-]?\d{{1,3}})([{_BLANKS}])(\d{{3}}(?:\2\d{{3}})*)([.,]\d*)?")
+_MARKED = re.compile(r"[+-]?\d*(?:[.,]\d+)+(?:[eE][+-]?\d+)?")
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")  # or three decimals
+_MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "nat", "<na>"}
+_TRUTHS = {"true": 1.0, "yes": 1.0, "false": 0.0, "no": 0.0, "1": 1.0, "0": 0.0}
+_LEAST = 100.0  # a whole number beside 14.036 that makes that one doubtful
+_OTHER = {".": ",", ",": "."}
+
+
+class Ambiguity(ValueError):
+    """A cell that could be two numbers."""
+
+
+def truths_of(cells: Iterable[str], words: Sequence[str] = ()) -> list[float] | None:
+    """1 and 0 for TRUE and FALSE, yes and no; NaN where empty; else None.
+
+    Args:
+        cells: of a column, in any case.
+        words: those that count, all of them when not given.
+    """
+    known = {word: _TRUTHS[word] for word in words or _TRUTHS} | {"": math.nan}
+    numbers = [known.get(cell.casefold()) for cell in cells]
+    return None if None in numbers else numbers  # type: ignore[return-value]  # as said
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell is a number in whatever way it is written."""
+    cell = _plain(cell)
+    return _float(cell) is not None or _MARKED.fullmatch(cell) is not None
+
+
+def decimal_mark(cells: Sequence[str], semicolons: bool) -> tuple[str, bool]:
+    """The decimal mark of a table, and whether a cell decides it.
+
+    Args:
+        cells: all of the table's.
+        semicolons: cells are not separated by commas, so 1,234 has decimals.
+    """
+    if not any("," in cell or cell.count(".") > 1 for cell in cells):
+        return ".", True
+    marked = [*filter(_MARKED.fullmatch, map(_plain, cells))]
+    votes = Counter(filter(None, map(_vote, marked)))
+    if votes["."] or votes[","]:
+        return ("." if votes["."] >= votes[","] else ","), True
+    commas = any("," in cell for cell in marked)
+    return ("," if commas and semicolons else "."), False
+
+
+def _vote(cell: str) -> str | None:
+    """The decimal mark of a number that can be read in one way only."""
+    last = "," if cell.rfind(",") > cell.rfind(".") else "."
+    if "." in cell and "," in cell:
+        return last if cell.count(last) == 1 else None
+    if cell.count(last) > 1:
+        groups = re.fullmatch(rf"[+-]?\d{{1,3}}(\{last}\d{{3}})+", cell)
+        return _OTHER[last] if groups else None
+    return None if _THOUSANDS.fullmatch(cell) else last
+
+
+def numbers_of(
+    cells: Sequence[str], mark: str = ".", decided: bool = True
+) -> list[float | None]:
+    """Each cell as a number, NaN where it is empty, None where it holds none.
+
+    Args:
+        cells: of a column.
+        mark: the decimal one.
+        decided: as ``decimal_mark`` says.
+
+    Raises:
+        Ambiguity: with the place of the first cell that could be two numbers.
+    """
+    numbers = [_number(cell, mark) for cell in cells]
+    doubtful = [
+        i
+        for i, cell in enumerate(cells)
+        if cell[-4:-3] in (".", ",") and _THOUSANDS.fullmatch(_plain(cell))
+    ]
+    if grouped := [i for i in doubtful if mark not in cells[i] and not decided]:
+        raise Ambiguity(grouped[0])
+    if decimals := [i for i in doubtful if mark in cells[i]]:
+        rest = [_plain(cells[i]) for i in {*range(len(cells))} - {*doubtful}]
+        rest = [cell for cell in rest if cell.casefold() not in _MISSING]
+        if all(cell.lstrip("+-").isdecimal() for cell in rest):
+            largest = max((abs(float(cell)) for cell in rest), default=0.0)
+            if _LEAST <= largest < 1000.0:
+                raise Ambiguity(decimals[0])
+    return numbers
+
+
+def _plain(cell: str) -> str:
+    """With an ASCII minus, and without blanks between thousands."""
+    cell = cell.replace("\u2212", "-")
+    if match := _GROUPS.fullmatch(cell):
+        return match[1] + match[3].replace(match[2], "") + (match[4] or "")
+    return cell
+
+
+def _number(cell: str, mark: str) -> float | None:
+    if mark == "." and (number := _float(cell)) is not None:
+        return number
+    if cell.casefold() in _MISSING:
+        return math.nan
+    cell, other = _plain(cell), _OTHER[mark]
+    if other in cell:
+        grouped = rf"[+-]?\d{{1,3}}(\{other}\d{{3}})+(\{mark}\d*)?"
+        if not re.fullmatch(grouped, cell):
+            return None
+        cell = cell.replace(other, "")
+    return _float(cell.replace(mark, "."))
+
+
+def _float(cell: str) -> float | None:
+    try:
+        return None if "_" in cell else float(cell)
+    except ValueError:
+        return None

@@ -1,0 +1,232 @@
+"""What each column of a table is: one rule for files and frames.
+
+Names decide first: u_, y_, available, id and the like; values where names do not.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.tables.cells import truths_of
+from jaxcal.tables.names import COMMANDS, MEASURED
+
+__all__ = ["AVAILABLE", "Decision", "decide", "sentence", "spelt"]
+
+Array = NDArray[np.float64]
+
+AVAILABLE = "available"
+_LEAST_ROWS = 5  # of which a constant step is no chance
+# Columns that number the rows, by their names; runs only where each has its own.
+_NUMBERS = re.compile(
+    r"#|(.*[_ ])?(id|idx|index)|no\.?|nr\.?|row|sample|seq|unnamed: 0|level_0"
+    r"|episode|candidate",
+    re.IGNORECASE,
+)
+_RUNS = re.compile(
+    r"((std|run|standard|random)[ _.]?)?(order|number|no\.?|nr\.?)|run|std|trial"
+    r"|versuch|lauf",
+    re.IGNORECASE,
+)
+_STAMPS = {"stamp", "timestamp", "date", "datetime", "epoch", "datum"}
+_TIMES = {"time", "uhrzeit", "elapsed", "clock"}
+_SECONDS = re.compile(r"t([ _]?[\[(]?(s|ms|us|ns|sec|seconds|min)[\])]?)?", re.I)
+_EPOCH = 1e8  # seconds; no factor of an experiment is so large
+
+
+class Decision(NamedTuple):
+    """What a column is."""
+
+    role: str  # input, output, label, available, time or left out
+    reason: str = ""  # said where it is not ""
+    asks: bool = False  # commands are read only once it is named, or marked
+
+
+def decide(
+    table: Any, outputs: Collection[str] = (), *, fit: bool = False
+) -> dict[str, Decision]:
+    """The decision for each column of a ``Table``, in its order.
+
+    Args:
+        table: has ``header``, ``names``, ``values``, ``labels`` and ``headed``.
+        outputs: columns that are known to be readings, or weights.
+        fit: the table must hold readings.
+    """
+    marked = [x for x in table.header if table.headed and x.startswith(COMMANDS)]
+    decisions = {}
+    for name in table.header:
+        if name in outputs:
+            decision = Decision("output")
+        elif name.strip().casefold() == AVAILABLE and table.headed:
+            decision = Decision("available")
+        elif name.startswith(COMMANDS):
+            decision = Decision("input")
+        elif name in table.labels:
+            truths = truths_of(table.labels[name], ("true", "false"))
+            words = "holds words" if truths is None else "holds TRUE and FALSE"
+            decision = Decision("label", f"it {words}")
+        else:
+            column = table.values[:, table.names.index(name)]
+            decision = _of_numbers(name, column, table.header, marked, outputs, fit)
+        decisions[name] = decision
+    if not any(decision.role == "input" for decision in decisions.values()):
+        for name, decision in decisions.items():  # a course over time, say
+            if decision.role == "time" and not _is_stamp(name):
+                decisions[name] = Decision("input", "it is the only one")
+                break
+    return decisions if marked else decisions | _counting(table, decisions)
+
+
+def _of_numbers(
+    name: str,
+    column: Array,
+    header: Sequence[str],
+    marked: Sequence[str],
+    outputs: Collection[str],
+    fit: bool,
+) -> Decision:
+    """The decision for a column of numbers that is neither named nor begins with u_."""
+    numbers = column[np.isfinite(column)]
+    if name.startswith(MEASURED):
+        return _of_y(name, header, bool(marked), outputs, fit)
+    if not len(numbers):
+        return Decision("left out", "it is empty")
+    if timed := _of_time(name, numbers):
+        if timed.role == "time" or not marked:
+            return timed
+    whole = bool((numbers == np.round(numbers)).all())
+    distinct = len(np.unique(numbers)) == len(column)
+    if whole and (
+        _NUMBERS.fullmatch(name.strip()) or (distinct and _RUNS.fullmatch(name.strip()))
+    ):
+        return Decision("left out", "it counts the rows or tells their time")
+    if marked:
+        reason = f"commands are those that begin with {COMMANDS}"
+        return Decision("left out", reason)
+    return Decision("input")
+
+
+def _of_y(
+    name: str, header: Sequence[str], marked: bool, outputs: Collection[str], fit: bool
+) -> Decision:
+    """An output, or the axis y of x, y and z."""
+    root, names = name[len(MEASURED) :], {other.casefold() for other in header}
+    digits = root.isdecimal() or root in ("x", "y", "z")
+    depth = f"z_{root}".casefold() in names
+    axis = depth or (f"x_{root}".casefold() in names and not digits)
+    if axis and marked:
+        reason = f"it stands beside x_{root}: name what was measured"
+        return Decision("output", reason, asks=True)
+    if marked:
+        return Decision("output")
+    if axis or (outputs and not any(x.startswith(MEASURED) for x in outputs)):
+        return Decision("input", "an axis: no column begins with u_")
+    if outputs:
+        return Decision("left out", "other columns are the outputs")
+    if fit or digits or root in header:
+        return Decision("output", "no column begins with u_")
+    return Decision("input", "no column begins with u_")
+
+
+def _is_stamp(name: str) -> bool:
+    return bool(_STAMPS & _words(name))
+
+
+def _words(name: str) -> set[str]:
+    """Its words, as snake, camel or plain text has them, without a unit."""
+    plain = re.sub(r"[\[(].*", "", name)
+    return {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", plain)}
+
+
+def _of_time(name: str, numbers: Array) -> Decision | None:
+    """When the rows were made, or a factor of the experiment; None: no time by name."""
+    stamp = _is_stamp(name)
+    if not (stamp or _TIMES & _words(name) or _SECONDS.fullmatch(name.strip())):
+        return None
+    rising = len(numbers) > 1 and bool((np.diff(numbers) > 0.0).all())
+    if stamp or rising or numbers.min() > _EPOCH:
+        return Decision("time", "it counts the rows or tells their time")
+    return Decision("input", "a factor: it does not rise from row to row")
+
+
+def _counting(table: Any, decisions: dict[str, Decision]) -> dict[str, Decision]:
+    """Inputs that by their values count the rows, beside inputs that do not."""
+    names = [name for name, decision in decisions.items() if decision.role == "input"]
+    columns = [table.values[:, table.names.index(name)] for name in names]
+    reasons = [_count(column) for column in columns]
+    if None not in reasons:
+        return {}  # all are swept together: a table of one axis, say
+    return {
+        name: Decision("left out", reason, asks=True)
+        for name, reason in zip(names, reasons, strict=True)
+        if reason is not None and not decisions[name].reason
+    }
+
+
+def _count(column: Array) -> str | None:
+    """In which way a column counts the rows; None where it does not."""
+    numbers = column[np.isfinite(column)]
+    steps, count = np.diff(numbers), len(numbers)
+    if count < _LEAST_ROWS or not steps.any():
+        return None
+    mean = float(steps.mean())
+    if (np.abs(steps - mean) <= 0.05 * abs(mean)).all():
+        return (
+            f"goes up by {mean:.4g} from row to row, as a number of the rows or a time "
+            "does"
+        )
+    for first in (0.0, 1.0):
+        if count > _LEAST_ROWS and np.array_equal(
+            np.sort(numbers), np.arange(count) + first
+        ):
+            return (
+                f"holds each number from {first:g} to {count - 1 + first:g} once, as a "
+                "running number does"
+            )
+    return None
+
+
+def sentence(decisions: dict[str, Decision]) -> str:
+    """What was read as what, in one line; "" where names alone say it."""
+    if not any(decision.reason for decision in decisions.values()):
+        return ""
+    parts = []
+    for role in ("input", "output"):
+        if names := [name for name, d in decisions.items() if d.role == role]:
+            reasons = {decisions[n].reason: n for n in names if decisions[n].reason}
+            more = "".join(f" ({name!r}: {why})" for why, name in reasons.items())
+            plural = "s" if len(names) > 1 else ""
+            parts.append(f"{role}{plural} {', '.join(names)}{more}")
+    parts += [
+        f"label {name!r}: {decision.reason}"
+        for name, decision in decisions.items()
+        if decision.role == "label"
+    ]
+    apart: dict[str, list[str]] = {}
+    for name, decision in decisions.items():
+        if decision.role in ("time", "left out") and decision.reason:
+            apart.setdefault(decision.reason, []).append(name)
+    parts += [
+        f"column{'s' if len(names) > 1 else ''} {', '.join(map(repr, names))} "
+        f"{'are' if len(names) > 1 else 'is'} not read: {reason}"
+        for reason, names in apart.items()
+    ]
+    return "; ".join(parts)
+
+
+def spelt(names: Sequence[str], name: str) -> str | None:
+    """The one of the names that is ``name`` but for case and blanks; None: none is.
+
+    Raises:
+        ValueError: two are.
+    """
+    like = [each for each in names if each.strip().casefold() == name]
+    if len(like) > 1:
+        raise ValueError(
+            f"columns {' and '.join(map(repr, like))} could both be {name}"
+        )
+    return like[0] if like else None

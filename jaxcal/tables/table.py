@@ -1,0 +1,453 @@
+"""``Table``: columns of numbers and of words under names, and what each of them is."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pathlib
+import sys
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.checks import axis_letter
+from jaxcal.tables.cells import Ambiguity, decimal_mark, numbers_of, truths_of
+from jaxcal.tables.decisions import AVAILABLE, Decision, decide, sentence, spelt
+from jaxcal.tables.names import COMMANDS, MEASURED, bare, columns_by_name, say
+from jaxcal.tables.names import split_names as split
+from jaxcal.tables.text import decoded, sheet_of
+
+__all__ = ["Table", "parse", "read_table", "table_of"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """Rows of numbers under names, and columns of words beside them."""
+
+    source: str  # the file's name, for messages
+    names: tuple[str, ...]  # of the columns of numbers
+    values: Array  # (N, len(names)), NaN where a cell is empty
+    labels: dict[str, list[str]]  # columns that hold words, each of length N
+    lines: tuple[int, ...]  # of the file, or rows of a frame, one for each row
+    headed: bool = True  # False: there is no header, the names are u_x, u_y, u_z
+    row: str = "line"  # what ``lines`` counts
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    @property
+    def header(self) -> tuple[str, ...]:
+        """Names of all columns, those of numbers first."""
+        return (*self.names, *self.labels)
+
+    @property
+    def decisions(self) -> dict[str, Decision]:
+        """For each column its role and why: input, output, label, available, time or
+        left out; where nothing but the table says it."""
+        return decide(self)
+
+    def columns(self, wanted: Sequence[str], used: Mask | None = None) -> Array:
+        """(N, len(wanted)) the columns of these very names, in that order.
+
+        TRUE and FALSE are 1 and 0.
+
+        Raises:
+            ValueError: there is no such column, or a cell of a row that is ``used``
+                (N,), all when not given, is empty, NaN or infinite.
+        """
+        values = np.empty((len(self), len(wanted)))
+        for place, name in enumerate(wanted):
+            if name in self.names:
+                values[:, place] = self.values[:, self.names.index(name)]
+            elif name in self.labels:
+                cells = self.labels[name]
+                truths = truths_of(cells, ("true", "false"))
+                values[:, place] = truths or _require_numbers(self, name, cells)
+            else:
+                raise ValueError(
+                    f"{self.source}: there is no column {name!r}; columns: "
+                    f"{', '.join(self.header)}"
+                )
+        bad = ~np.isfinite(values)
+        for row, place in np.argwhere(bad if used is None else bad & used[:, None]):
+            raise ValueError(
+                f"{self.source}: {self.row} {self.lines[row]}, column "
+                f"{wanted[place]!r} must hold a number, got {values[row, place]} or an "
+                "empty cell; fill it or leave the row out"
+            )
+        return values
+
+    def named(
+        self,
+        wanted: Sequence[str],
+        prefix: str,
+        *,
+        chosen: str | None = None,
+        option: str = "--columns",
+        unit: str = "",
+        others: Collection[str] | None = None,
+    ) -> tuple[str, ...]:
+        """The columns that hold what is wanted, in that order.
+
+        Args:
+            wanted: names of the commands or outputs of a model, or of a calibration.
+            prefix: ``COMMANDS`` or ``MEASURED``, which either side may lack.
+            chosen: names separated by commas, where the user gave them: in the order
+                of ``wanted``, unless they are its names.
+            option: by which they are given; "" where a command has none.
+            unit: that the names may hold: "pitch_deg", "u_deg_pitch", "pitch [deg]".
+            others: names of what the table may hold beside them; where they are given,
+                the columns that are neither are said.
+
+        Raises:
+            ValueError: a name is missing, stands twice, or could be either of two.
+        """
+        count = f"{len(wanted)} columns are needed ({', '.join(wanted)})"
+        if chosen is not None:
+            taken = self._chosen(chosen, prefix, unit)
+            if len(taken) != len(wanted):
+                raise ValueError(
+                    f"{self.source}: {count}, {option} names {len(taken)}: "
+                    f"{', '.join(split(chosen))}"
+                )
+            by_name = columns_by_name(wanted, taken, prefix, unit)
+            if None not in by_name:
+                self.say(wanted, by_name, "by name")
+                return tuple(by_name)
+            for name, column, place in zip(wanted, by_name, taken, strict=True):
+                if column not in (None, place):
+                    raise ValueError(
+                        f"{self.source}: {option} has {place!r} in the place of "
+                        f"{name!r}, and {column!r} elsewhere; the order is "
+                        f"{', '.join(wanted)}"
+                    )
+            return taken
+        if not self.headed:
+            if len(self.names) != len(wanted):
+                raise ValueError(
+                    f"{self.source}: {count}, got {len(self.names)} without a header"
+                )
+            say(
+                f"{self.source} has no header: its columns are read by position, as "
+                f"{', '.join(wanted)}"
+            )
+            return self.names
+        try:
+            columns = columns_by_name(wanted, self.header, prefix, unit)
+        except ValueError as error:
+            choose = f"choose with {option}" if option else "rename one of them"
+            raise ValueError(f"{self.source}: {error}; {choose}") from None
+        if missing := [x for x, y in zip(wanted, columns, strict=True) if y is None]:
+            advice = f"; name those of {', '.join(wanted)} in that order with {option}"
+            raise ValueError(
+                f"{self.source}: there is no column {', '.join(map(repr, missing))}, "
+                f"with {prefix} or without; columns: {', '.join(self.header)}"
+                + (advice if option else "")
+            )
+        spare = "" if others is None else self.unread(columns, prefix, others)
+        self.say(wanted, columns, "by name", spare)
+        return tuple(columns)
+
+    def commands(
+        self,
+        chosen: str | None,
+        option: str | None = "--columns",
+        but: Collection[str] = (),
+    ) -> tuple[str, ...]:
+        """Columns of commands: those chosen, else ``u_...``, else all but outputs.
+
+        Args:
+            chosen: names separated by commas, where the user gave them.
+            option: by which they are given; None where a command has none.
+            but: columns that hold readings, or weights.
+
+        Raises:
+            ValueError: there is none, or the values of one number the rows.
+        """
+        if chosen is not None:
+            return self._chosen(chosen, COMMANDS)
+        return self._decided("input", decide(self, {*but}, fit=bool(but)), option)
+
+    def outputs(
+        self, chosen: str | None, option: str | None = "--outputs"
+    ) -> tuple[str, ...]:
+        """Columns of measurements: those chosen, else ``y_...``."""
+        if chosen is not None:
+            return self._chosen(chosen, MEASURED)
+        return self._decided("output", decide(self, fit=True), option)
+
+    def available(self) -> Mask | None:
+        """(N,) True where the column ``available`` is 1; None without that column."""
+        try:
+            name = spelt(self.header, AVAILABLE)
+        except ValueError as error:
+            raise ValueError(f"{self.source}: {error}") from None
+        if name is None or not self.headed:
+            return None
+        truths = truths_of(self.labels.get(name, ()))
+        mask = np.array(truths or self.columns([name])[:, 0])
+        for row in np.flatnonzero((mask != 0.0) & (mask != 1.0)):
+            raise ValueError(
+                f"{self.source}: {self.row} {self.lines[row]}, available must be 0 or "
+                f"1, got {mask[row]:g}"
+            )
+        return np.asarray(mask == 1.0)
+
+    def say(
+        self, wanted: Sequence[str], found: Sequence[Any], how: str, more: str = ""
+    ) -> None:
+        """Say which columns are what; nothing where their names and order say it."""
+        order = [name for name in self.header if name in found]
+        parts = [more] if more else []
+        if [*wanted] != [*found] or order != [*found]:
+            listed = ", ".join(found), how, ", ".join(wanted)
+            parts.insert(0, "columns {} are read {}, as {}".format(*listed))
+        if parts:
+            say(f"{self.source}: {'; '.join(parts)}")
+
+    def bare(self, prefix: str) -> list[str]:
+        """Names of all columns without the prefix."""
+        return [bare(name, prefix) for name in self.header]
+
+    # -- inside ------------------------------------------------------------------------
+
+    def _chosen(self, chosen: str, prefix: str, unit: str = "") -> tuple[str, ...]:
+        """The columns of the names given, which must be there, each once."""
+        given = split(chosen)
+        for name in given:
+            if given.count(name) > 1:
+                raise ValueError(f"{self.source}: column {name!r} is named twice")
+        columns = columns_by_name(given, self.header, prefix, unit)
+        for name, column in zip(given, columns, strict=True):
+            if column is None:
+                self.columns([name])  # says that there is none
+        return tuple(columns)
+
+    def _decided(
+        self, role: str, decisions: Mapping[str, Decision], option: str | None
+    ) -> tuple[str, ...]:
+        """The columns of a role, the rest being said."""
+        prefix, what = (
+            (COMMANDS, "commands")
+            if role == "input"
+            else (MEASURED, "measured columns")
+        )
+        advice = f"begin the names of {what} with {prefix}"
+        if option:
+            advice += f", or name them with {option}"
+        names = tuple(name for name, d in decisions.items() if d.role == role)
+        header = f"columns: {', '.join(self.header)}"
+        if role == "output":
+            for name in names:
+                if decisions[name].asks:
+                    where = f"{self.source}: column {name!r} may be an axis"
+                    raise ValueError(f"{where}, {decisions[name].reason}; {advice}")
+            if not names:
+                axes = [name for name in decisions if name.startswith(prefix)]
+                rule = f"{', '.join(axes)} may be an axis" if axes else ""
+                raise ValueError(
+                    f"{self.source}: {rule or f'no column begins with {prefix}'}; "
+                    f"{advice} ({header})"
+                )
+            return names
+        for place, (name, decision) in enumerate(decisions.items(), start=1):
+            if decision.asks and decision.role == "left out":
+                what = f"column {name!r}" if self.headed else f"column {place}"
+                raise ValueError(
+                    f"{self.source}: {what} {decision.reason}; if it is a command, "
+                    + advice
+                )
+        if not names:
+            rule = f"{self.source}: no column holds commands ({header})"
+            raise ValueError(f"{rule}; {advice}")
+        if text := sentence(decisions):
+            more = f"; other columns are named with {option}" if option else ""
+            say(f"{self.source}: {text}{more}")
+        return names
+
+    def unread(
+        self, columns: Sequence[str], prefix: str, others: Collection[str]
+    ) -> str:
+        """Which columns of numbers are neither these nor ``others``, in words."""
+        other = COMMANDS if prefix == MEASURED else MEASURED
+        beside = {*columns, *columns_by_name([*others], self.header, other)}
+        decisions = decide(self, {*columns})
+        spare = [
+            name
+            for name in self.names
+            if name not in beside
+            and not name.startswith(other)
+            and decisions[name].role in ("input", "output")
+        ]
+        if not spare:
+            return ""
+        listed = ", ".join(map(repr, spare))
+        plural = len(spare) > 1
+        return (
+            f"column{'s' if plural else ''} {listed} {'are' if plural else 'is'} not "
+            "read: nothing here has that name"
+        )
+
+
+# -- reading ---------------------------------------------------------------------------
+
+
+def read_table(path: Any) -> Table:
+    """Read a table of a file or a data frame.
+
+    Files are CSV as spreadsheets, R, numpy and loggers write it: cells separated by
+    commas, semicolons, tabs or blanks, decimal points or commas, comments after #, a
+    row of units, UTF-8, UTF-16 or cp1252. Frames are of pandas, polars or pyarrow, a
+    dict of columns, an xarray dataset, or rows that have names.
+
+    Args:
+        path: of the file, ``-`` for standard input, or the frame.
+
+    Returns:
+        The table. ``decisions`` says what each column is.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: naming the file and what is wrong in it: the line, the column and
+            the cell.
+    """
+    if isinstance(path, Table):
+        return path
+    if not isinstance(path, str | os.PathLike):
+        from jaxcal.tables.frames import table_of_frame
+
+        return table_of_frame("table", path)
+    if path == "-":
+        stream = getattr(sys.stdin, "buffer", None)
+        data = stream.read() if stream else sys.stdin.read().encode()
+        return parse("standard input", data)
+    return parse(os.fspath(path), pathlib.Path(path).read_bytes())
+
+
+def parse(source: str, data: bytes) -> Table:
+    """The table in the bytes of a file; ``source`` is its name in errors."""
+    text, note = decoded(source, data)
+    try:
+        table, notes = _of_text(source, text)
+    except ValueError as error:
+        raise ValueError(f"{error}; {note}" if note else str(error)) from None
+    if notes := [*filter(None, [note]), *notes]:
+        say(f"{source}: {'; '.join(notes)}")
+    return table
+
+
+def _of_text(source: str, text: str) -> tuple[Table, list[str]]:
+    """The table in a text, and what is to be said of how it was read."""
+    sheet = sheet_of(source, text)
+    rows, notes = sheet.rows, [*sheet.notes]
+    _, header = rows[0]
+    mark = decimal_mark(
+        [cell for _, row in rows for cell in row], sheet.delimiter != ","
+    )
+    if not sheet.headed:
+        header = [f"u_{axis_letter(i, len(header))}" for i in range(len(header))]
+    elif numbers := [cell for cell in header if _is_plain(cell)]:
+        name = next(cell for cell in header if not _is_plain(cell))
+        raise ValueError(
+            f"{source}: line {rows[0][0]} must hold names alone or numbers alone, got "
+            f"{name!r} and {numbers[0]!r}: give every column a name"
+        )
+    elif not (rows := rows[1:]):
+        raise ValueError(f"{source}: there are no rows below the header")
+    columns = dict[str, Sequence[str]]()
+    for place, name in enumerate(header, start=1):
+        cells = [row[place - 1] for _, row in rows]
+        if header.count(name) > 1 and name:
+            raise ValueError(f"{source}: column {name!r} comes twice")
+        if name:
+            columns[name] = cells
+        elif any(cells):
+            notes += _unnamed(source, place, cells, columns)
+    lines = tuple(line for line, _ in rows)
+    return table_of(source, columns, lines, mark, headed=sheet.headed), notes
+
+
+def _is_plain(cell: str) -> bool:
+    return numbers_of([cell])[0] is not None and bool(cell)
+
+
+def _unnamed(
+    source: str, place: int, cells: Sequence[str], columns: dict[str, Sequence[str]]
+) -> list[str]:
+    """What is said of a column without a name, a frame's index; words are labels."""
+    if not any(map(_is_plain, cells)) and "index" not in columns:
+        columns["index"] = cells
+        return []
+    if len({*cells}) == len(cells) and all(cell.isdecimal() for cell in cells):
+        return [f"column {place} is not read: it counts the rows"]
+    raise ValueError(f"{source}: column {place} has no name")
+
+
+def table_of(
+    source: str,
+    columns: Mapping[str, Sequence[str] | Array],
+    lines: Sequence[int],
+    mark: tuple[str, bool] = (".", True),
+    *,
+    headed: bool = True,
+    row: str = "line",
+) -> Table:
+    """The table of columns of cells, or of numbers (N,).
+
+    Raises:
+        ValueError: a column holds neither numbers nor words, or words under a name that
+            begins with u_, or with y_ beside these.
+    """
+    numeric: dict[str, Any] = {}
+    table = Table(source, (), np.empty((len(lines), 0)), {}, tuple(lines), headed, row)
+    marked = any(name.startswith(COMMANDS) for name in columns)
+    for name, cells in columns.items():
+        if isinstance(cells, np.ndarray):
+            numeric[name] = cells
+            continue
+        try:
+            numbers = numbers_of(cells, *mark)
+        except Ambiguity as error:
+            i = int(str(error))
+            plain = cells[i].replace(",", "").replace(".", "")
+            raise ValueError(
+                f"{source}: {row} {lines[i]}, column {name!r}: {cells[i]!r} may be "
+                f"{plain} or have three decimals: write {plain}, or a fourth decimal"
+            ) from None
+        must = name.startswith(COMMANDS) or (marked and name.startswith(MEASURED))
+        truths = truths_of(cells, ("true", "false")) if must else None
+        count = sum(number is None for number in numbers)
+        if truths is not None and any(cells):
+            numeric[name] = truths
+        elif not count:
+            numeric[name] = numbers
+        else:
+            filled = sum(map(bool, cells))
+            if must or 2 * count < filled:
+                _require_numbers(table, name, cells, numbers)
+            table.labels[name] = [*cells]
+    if not numeric:
+        listed = ", ".join(columns)
+        raise ValueError(f"{source}: no column holds numbers: {listed}")
+    values = np.array([*numeric.values()], dtype=np.float64)
+    values = values.reshape(len(numeric), len(lines)).T
+    return dataclasses.replace(table, names=tuple(numeric), values=values)
+
+
+def _require_numbers(
+    table: Table, name: str, cells: Sequence[str], numbers: Collection[Any] = ()
+) -> NoReturn:
+    """Refuse a column of cells by the first that is no number."""
+    numbers = numbers or numbers_of(cells)
+    for line, cell, number in zip(table.lines, cells, numbers, strict=True):
+        if number is None:
+            raise ValueError(
+                f"{table.source}: {table.row} {line}, column {name!r} must hold a "
+                f"number, got {cell!r}"
+            )
+    raise AssertionError(name)
