@@ -80,13 +80,8 @@ def curved(rng: np.random.Generator, count: int) -> Case:
 
 def _saturating(u: Array, theta: Array) -> Array:
     gain, rate, offset, slope = theta
-    return np.stack(
-        [
-            gain * np.tanh(rate * u[:, 0]) + offset,
-            slope * u[:, 1] * np.exp(-rate * 0.5 * u[:, 0] ** 2) + gain * 0.1,
-        ],
-        axis=1,
-    )
+    damped = slope * u[1] * np.exp(-rate * 0.5 * u[0] ** 2) + gain * 0.1
+    return np.array([gain * np.tanh(rate * u[0]) + offset, damped])
 
 
 def nonlinear(rng: np.random.Generator, count: int) -> Case:
@@ -95,7 +90,7 @@ def nonlinear(rng: np.random.Generator, count: int) -> Case:
     u = rng.uniform(-1.5, 1.5, (count + 20, 2))
     theta = nominal * (1.0 + 0.2 * rng.normal(size=4))
     noise = 10.0 ** rng.uniform(-3, -1.7)
-    y = _saturating(u, theta) + noise * rng.normal(size=(count + 20, 2))
+    y = model.predict(u, theta) + noise * rng.normal(size=(count + 20, 2))
     return Case(u[:count], y[:count], {"model": model}, noise, (u[count:], y[count:]))
 
 
@@ -105,7 +100,9 @@ def ur5(rng: np.random.Generator, count: int) -> Case:
     joints, measured = real.load("ur5_grid_1000.csv")
     at = rng.choice(len(joints), count + 20, replace=False)
     u, y = joints[at], measured[at]
-    return Case(u[:count], y[:count], {"model": real.arm()}, 0.1, (u[count:], y[count:]))
+    return Case(
+        u[:count], y[:count], {"model": real.arm()}, 0.1, (u[count:], y[count:])
+    )
 
 
 def fr3(rng: np.random.Generator, count: int) -> Case:
@@ -114,7 +111,11 @@ def fr3(rng: np.random.Generator, count: int) -> Case:
     table = real.load()[rng.choice(114, count + 20, replace=False)]
     y = np.zeros((len(table), 6))
     return Case(
-        table[:count], y[:count], {"model": real.arm()}, 1e-3, (table[count:], y[count:])
+        table[:count],
+        y[:count],
+        {"model": real.arm()},
+        1e-3,
+        (table[count:], y[count:]),
     )
 
 
@@ -124,7 +125,11 @@ def positioner(rng: np.random.Generator, count: int) -> Case:
     table = real.load()[rng.choice(205, count + 20, replace=False)]
     y = np.zeros((len(table), 6))
     return Case(
-        table[:count], y[:count], {"model": real.arm()}, 1e-3, (table[count:], y[count:])
+        table[:count],
+        y[:count],
+        {"model": real.arm()},
+        1e-3,
+        (table[count:], y[count:]),
     )
 
 
@@ -142,8 +147,8 @@ MODELS: dict[str, Callable[[np.random.Generator, int], Case]] = {
 
 def _split(case: Case) -> tuple[Array, Array, Callable[[Array], tuple[Array, Array]]]:
     """What was commanded, what was read, and a table of both again."""
-    sensed = case.options["model"].sensed if "model" in case.options else slice(0, 0)
-    if sensed.stop == 0:
+    sensed = _sensed(case)
+    if sensed is None:
         return case.commands, case.measured, lambda y: (case.commands, y)
     read = case.commands[:, sensed]
 
@@ -155,9 +160,15 @@ def _split(case: Case) -> tuple[Array, Array, Callable[[Array], tuple[Array, Arr
     return case.commands, read, table
 
 
+def _sensed(case: Case) -> slice | None:
+    model = case.options.get("model")
+    sensed = slice(0, 0) if model is None else model.sensed
+    return sensed if sensed.stop > sensed.start else None
+
+
 def _spare(case: Case) -> Array:
-    sensed = case.options["model"].sensed if "model" in case.options else slice(0, 0)
-    return case.spare[1] if sensed.stop == 0 else case.spare[0][:, sensed]
+    sensed = _sensed(case)
+    return case.spare[1] if sensed is None else case.spare[0][:, sensed]
 
 
 Spoilt = tuple[Array, Array, str]  # table, and a pattern of what is said
@@ -198,8 +209,10 @@ def shift(case: Case, rng: np.random.Generator) -> Spoilt:
     by = int(rng.choice([-3, -2, -1, 1, 2, 3]))
     rows = "one row" if abs(by) == 1 else f"{abs(by)} rows"
     # np.roll(y, by): the reading of row i stands in row i + by, late by by
-    return (*table(np.roll(y, by, axis=0)), rf"all readings are {rows} "
-            + ("late" if by > 0 else "early"))
+    return (
+        *table(np.roll(y, by, axis=0)),
+        rf"all readings are {rows} " + ("late" if by > 0 else "early"),
+    )
 
 
 def halves(case: Case, rng: np.random.Generator) -> Spoilt:
@@ -217,13 +230,10 @@ def commands_sorted(case: Case, rng: np.random.Generator) -> Spoilt:
     u, y, table = _split(case)
     moved = np.argsort(u[:, 0], kind="stable")
     commands, measured = table(y)
-    commands = commands.copy()
-    n = u.shape[1] - (y.shape[1] if commands.shape[1] != u.shape[1] else 0)
-    sensed = case.options["model"].sensed if "model" in case.options else slice(0, 0)
-    kept = commands[:, sensed].copy()
+    sensed, kept = _sensed(case), commands
     commands = commands[moved]
-    commands[:, sensed] = kept
-    del n
+    if sensed is not None:
+        commands[:, sensed] = kept[:, sensed]
     return commands, measured, "commands are sorted"
 
 
@@ -256,7 +266,10 @@ def lag(case: Case, rng: np.random.Generator) -> Spoilt:
     """Of a recording: smooth commands, readings late by a constant."""
     _, y, table = _split(case)
     by = int(rng.integers(4, 8))
-    return (*table(np.roll(y, by, axis=0)), rf"all readings are {by} rows late|rotation|first commands")
+    return (
+        *table(np.roll(y, by, axis=0)),
+        rf"all readings are {by} rows late|rotation|first commands",
+    )
 
 
 ROWS = {
@@ -301,8 +314,11 @@ def _moved(case: Case) -> int:
 def _name(case: Case, i: int) -> str:
     model = case.options.get("model")
     inputs = getattr(model, "inputs", ())
-    return inputs[i] if inputs else ("u_" + "xyz"[i] if case.commands.shape[1] <= 3
-                                     else f"u_{i + 1}")
+    return (
+        inputs[i]
+        if inputs
+        else ("u_" + "xyz"[i] if case.commands.shape[1] <= 3 else f"u_{i + 1}")
+    )
 
 
 # -- right tables ---------------------------------------------------------------------
@@ -350,7 +366,9 @@ def right(rng: np.random.Generator, count: int) -> tuple[str, Case]:
     if kind == "random walk":
         y += size * np.cumsum(rng.normal(size=(count, m)), axis=0) / np.sqrt(count)
     if kind in ("curve", "swept curve"):
-        y += size * u[:, :1] ** 2 * rng.normal(size=m) + 0.5 * size * np.sin(3 * u[:, :1])
+        y += size * u[:, :1] ** 2 * rng.normal(size=m) + 0.5 * size * np.sin(
+            3 * u[:, :1]
+        )
     if kind == "kink":
         y += size * np.abs(u[:, :1] - 0.2) * rng.normal(size=m)
     if kind == "quantised":
@@ -421,11 +439,21 @@ def main() -> None:
                         print("   refused", seed, error)
                     continue
                 times.append(seconds)
-                result = "found" if re.search(pattern, said) else (
-                    "said" if said else "missed")
+                result = (
+                    "found"
+                    if re.search(pattern, said)
+                    else ("said" if said else "missed")
+                )
                 tally[result] += 1
                 if args.verbose and result != "found":
-                    print("  ", seed, (case.commands.shape, y.shape[1]), pattern, "->", said)
+                    print(
+                        "  ",
+                        seed,
+                        (case.commands.shape, y.shape[1]),
+                        pattern,
+                        "->",
+                        said,
+                    )
             spent = f"{1e3 * np.median(times):.1f} ms" if times else ""
             print(f"{name:11s} {kind:16s} {dict(tally)} {spent}", flush=True)
     tally, wrong = collections.Counter(), collections.Counter()
@@ -444,8 +472,10 @@ def main() -> None:
             if args.verbose:
                 print("  right", seed, kind, case.commands.shape, said)
     if times:
-        print(f"right {sum(tally.values())}, false {sum(wrong.values())} {dict(wrong)}, "
-              f"{1e3 * np.median(times):.1f} ms, at most {1e3 * max(times):.0f}")
+        print(
+            f"right {sum(tally.values())}, false {sum(wrong.values())} {dict(wrong)}, "
+            f"{1e3 * np.median(times):.1f} ms, at most {1e3 * max(times):.0f}"
+        )
 
 
 if __name__ == "__main__":

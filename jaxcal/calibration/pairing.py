@@ -106,42 +106,42 @@ def mispairing(fit: Fit) -> Mispairing | None:
     if table is None:
         return None
     table = dataclasses.replace(table, theta=np.asarray(fit.parameters))
-    return _found(table, fit.input_names, fit.output_names, (), fit.measured_unit)
+    return _found(table, fit.input_names, fit.output_names, fit.measured_unit)
 
 
 def of_new_readings(fit: Fit, commands: Array, measured: Array) -> Mispairing | None:
     """How readings of a machine that was calibrated before were mispaired."""
-    held = Prior(np.inf, mean=np.asarray(fit.estimate))
+    here = Prior(np.inf, mean=np.asarray(fit.estimate))
     counted = np.ones(len(commands), dtype=np.bool_)
-    table = _table(fit.whole, commands, measured, counted, held)
+    table = _table(fit.whole, commands, measured, counted, here, held=True)
     if table is None:
         return None
-    scale = np.asarray(fit.require_noise("check"))
+    noise = np.asarray(fit.require_noise("check"))
     table = dataclasses.replace(
-        table,
-        shared=False,
-        free=np.zeros_like(table.free),
-        theta=np.asarray(fit.estimate),
-        scale=scale,
-        width=table.width * table.scale / scale,
+        table, scale=noise, width=table.width * table.scale / noise
     )
-    moved = dataclasses.replace(table, free=np.ones_like(table.free))
-    slopes = moved.system(as_it_is(table), np.arange(len(commands)))[0]
-    drifted = slopes.transpose(0, 2, 1).reshape(len(commands), -1)
-    del drifted
-    return _found(table, fit.input_names, fit.output_names, (moved,), fit.measured_unit)
+    return _found(table, fit.input_names, fit.output_names, fit.measured_unit)
 
 
 def _table(
-    model: Model, commands: Array, measured: Array, counted: Any, prior: Prior
+    model: Model,
+    commands: Array,
+    measured: Array,
+    counted: Any,
+    prior: Prior,
+    held: bool = False,
 ) -> Table | None:
-    """The table, linearised at the prior's mean; None where there is too little."""
+    """The table, linearised at the prior's mean, or all parameters held there.
+
+    None where there is too little.
+    """
     known = prior.resolve(model)
+    free = known.free & (not held)
     if len(commands) > _ROWS:
         commands, measured, counted = (
             commands[:_ROWS], measured[:_ROWS], counted[:_ROWS],
         )  # fmt: skip
-    flat = bool((known.precisions == 0.0).all() and known.free.all())
+    flat = bool((known.precisions == 0.0).all() and free.all())
     shared = model.multiplicity > 0 and flat
     if counted.sum() < _LEAST:
         return None
@@ -159,7 +159,7 @@ def _table(
     if usual is not None and usual.std is not None:
         scale = np.broadcast_to(np.asarray(usual.std, dtype=np.float64), spread.shape)
     return Table(
-        model, commands, measured, counted, known.mean, known.precisions, known.free,
+        model, commands, measured, counted, known.mean, known.precisions, free,
         known.mean, scale, spread / scale, shared,
     )  # fmt: skip
 
@@ -168,10 +168,9 @@ def _found(
     table: Table,
     inputs: Sequence[str],
     outputs: Sequence[str],
-    others: Sequence[Table],
     unit: str,
 ) -> Mispairing | None:
-    """The mispairing of a table; ``others`` are what else may explain it as it is."""
+    """The mispairing of a table."""
     plain = fitted(table, as_it_is(table))
     if (plain.rms <= _EXACT * table.width).all():
         return None
@@ -190,7 +189,7 @@ def _found(
         if end - start < _BLOCK:
             return None
         sure = _TOGETHER
-    for benign in _benign(table, plain, best, others):
+    for benign in _benign(table, plain, best):
         if best.evidence - benign.evidence < (sure if benign is plain else _SURE):
             return None
         smooth = benign.hypothesis.extra is not None or benign is not plain
@@ -331,9 +330,7 @@ def _anew(table: Table, hypothesis: Hypothesis) -> Table | None:
     return dataclasses.replace(table, model=model, mean=mean, theta=mean)
 
 
-def _benign(
-    table: Table, plain: Fitted, best: Fitted, others: Sequence[Table]
-) -> list[Fitted]:
+def _benign(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
     """The table as it is, with what machines do: drift, curves, a change of their own."""
     count = len(table.commands)
     time = np.linspace(-1.0, 1.0, count)[:, None]
@@ -353,11 +350,12 @@ def _benign(
         for column in commands.T:
             for knot in np.quantile(column, np.linspace(0.1, 0.9, 9)):
                 extras.append(np.maximum(column - knot, 0.0)[:, None])
+    if not table.free.any():  # a machine that changed since it was calibrated
+        ones = np.ones((count, 1))
+        extras += [ones, np.hstack([ones, commands]), np.hstack([ones, commands, time])]
     at = dataclasses.replace(table, theta=plain.theta)
     fits = [plain]
     fits += [fitted(at, as_it_is(table, extra)) for extra in extras]
-    for other in others:
-        fits.append(fitted(other, as_it_is(other)))
     return fits
 
 

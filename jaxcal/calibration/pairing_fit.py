@@ -253,10 +253,11 @@ def _robust(table: Table, slopes: Array, right: Array) -> tuple[Array, Array, Ar
         (r, c) the solution, (K,) weights, and (K, q) residuals of least squares.
     """
     known, (count, _, r), q = table.ridge(slopes.shape[-1]), slopes.shape, table.outputs
-    plain, aim = slopes.reshape(-1, r), right.reshape(-1, right.shape[-1])
+    size = count * slopes.shape[1]
+    plain, aim = slopes.reshape(size, r), right.reshape(size, -1)
     weights, first, solution = np.ones(count), np.zeros((count, q)), np.zeros((r, 1))
     for turn in range(_ROUNDS):
-        flat = (weights[:, None, None] * slopes).reshape(-1, r)
+        flat = (weights[:, None, None] * slopes).reshape(size, r)
         solution = solved(flat.T @ plain, flat.T @ aim, known)
         off = (right - slopes @ solution).reshape(count, q)
         first = off if not turn else first
