@@ -8,6 +8,7 @@ what machines do: outliers, drift, a curve that the model lacks.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Sequence
 from typing import Any
@@ -21,6 +22,7 @@ from jaxcal.calibration.pairing_fit import (
     Hypothesis,
     Table,
     fitted,
+    solved,
 )
 from jaxcal.calibration.pairing_search import (
     FOREIGN,
@@ -34,8 +36,9 @@ from jaxcal.calibration.pairing_search import (
 from jaxcal.checks import in_words
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Prior
+from jaxcal.models.verdict import Verdict
 
-__all__ = ["Mispairing", "mispairing", "of_new_readings"]
+__all__ = ["Mispairing", "against", "mispairing", "of_new_readings"]
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
@@ -48,7 +51,11 @@ _AS_GOOD = 3.0  # log of the odds within which another kind is named too
 _TRIED = 6  # hypotheses that are fitted one by one
 _WORTH = 12.0  # log of the odds: of those that are so much worse at first, none
 _EXACT = 1e-6  # of the spread: readings so near a fit have nothing to explain
+_APART, _LARGE = 8.0, 4.5  # times the noise: neighbours, a residual
+_TREND = 1.4  # of a sum of residuals, over the root of their squares
 _LEAST = 6  # rows
+_NAMED = 2  # other explanations
+_COLUMNS = 6  # changes of columns that are fitted one by one
 _BLOCK = 4  # rows from elsewhere: fewer are outliers
 _TURNS = 6  # of assigning readings and fitting
 _ROWS = 20_000  # of more the first
@@ -123,6 +130,17 @@ def of_new_readings(fit: Fit, commands: Array, measured: Array) -> Mispairing | 
     return _found(table, fit.input_names, fit.output_names, fit.measured_unit)
 
 
+def against(verdict: Verdict, found: Mispairing | None) -> Verdict:
+    """The verdict, which no calibration of a mispaired table passes."""
+    if found is None:
+        return verdict
+    step = "correct the table, then identify again"
+    if found.mendable:
+        step += " (jaxcal identify --repair FILE writes it mended)"
+    reasons = (found.reason, *verdict.reasons)
+    return dataclasses.replace(verdict, good=False, reasons=reasons, next_step=step)
+
+
 def _table(
     model: Model,
     commands: Array,
@@ -172,10 +190,11 @@ def _found(
 ) -> Mispairing | None:
     """The mispairing of a table."""
     plain = fitted(table, as_it_is(table))
-    if (plain.rms <= _EXACT * table.width).all():
+    if _plainly_right(table, plain):
         return None
     fits = _alternatives(table, plain)
-    fits += _columns(table, plain, inputs, outputs)
+    if not any(_explains(plain, fit) for fit in fits):
+        fits += _columns(table, plain, inputs, outputs)
     fits = [fit for fit in fits if np.isfinite(fit.evidence)]
     if not fits:
         return None
@@ -199,12 +218,13 @@ def _found(
     if best.hypothesis.kind == "path":
         best, near = polished(table, best)
     reason = _words(table, best, near, outputs, unit)
-    for fit in sorted(fits, key=lambda fit: -fit.evidence):
-        if fit.evidence < best.evidence - _AS_GOOD or fit is best:
-            continue
-        if fit.hypothesis.kind != best.hypothesis.kind:
-            reason += "; or " + _what(table, fit, {}, outputs, unit)
-            break
+    for fit in _top(fits, len(fits)):
+        other = _what(table, fit, {}, outputs, unit)
+        kind = (fit.hypothesis.kind, fit.hypothesis.change)
+        as_good = fit.evidence > best.evidence - _AS_GOOD
+        if as_good and kind != (best.hypothesis.kind, best.hypothesis.change):
+            if other not in reason and reason.count("; or ") < _NAMED:
+                reason += f"; or {other}"
     return Mispairing(
         best.hypothesis.kind,
         reason,
@@ -215,9 +235,40 @@ def _found(
     )
 
 
+def _plainly_right(table: Table, plain: Fitted) -> bool:
+    """Whether the fit tells neighbours apart, and leaves no row and no trend over.
+
+    Rows that were mispaired are then off by far more than the others.
+    """
+    noise = np.maximum(plain.noise, _EXACT * table.width)
+    if (plain.rms <= _EXACT * table.width).all():
+        return True
+    rows = np.flatnonzero(table.counted)
+    if not plain.inside[rows].all():
+        return False
+    at = dataclasses.replace(table, theta=plain.theta)
+    slopes, right = at.system(as_it_is(table), rows)
+    off = (right - slopes @ plain.solution).reshape(len(rows), -1)
+    said = (right - off.reshape(right.shape)).reshape(off.shape)
+    apart = np.median(np.abs(np.diff(said, axis=0)), axis=0)
+    if (apart < _APART * noise).any() or (np.abs(off) > _LARGE * noise).any():
+        return False
+    scores = off[..., None]
+    if table.shared:
+        scores = scores * slopes / np.sqrt((slopes**2).mean(axis=0))
+    size = np.sqrt((scores**2).sum(axis=0))
+    return bool((np.abs(np.cumsum(scores, axis=0)) < _TREND * size).all())
+
+
 def _better(fit: Fitted, best: Fitted) -> bool:
     """Whether an output's residuals are far larger than the noise of the best."""
     return bool((fit.rms > _RATIO * best.noise).any())
+
+
+def _explains(plain: Fitted, fit: Fitted) -> bool:
+    """Whether nothing is left to explain."""
+    sure = fit.evidence - plain.evidence > _SURE
+    return sure and bool((fit.rms < 0.1 * plain.rms).any())
 
 
 def _alternatives(table: Table, plain: Fitted) -> list[Fitted]:
@@ -227,12 +278,23 @@ def _alternatives(table: Table, plain: Fitted) -> list[Fitted]:
         tables.append(dataclasses.replace(table, theta=plain.theta))
     fits: list[Fitted] = []
     for one in tables:
+        if any(_explains(plain, fit) for fit in fits):
+            break
         base, hypotheses = ranked(one)
         worth = [h for score, h in hypotheses[:_TRIED] if score > base - _WORTH]
-        fits += [fitted(one, hypothesis) for hypothesis in worth]
+        fits += _fits(one, worth)
     paths = [fit for fit in fits if fit.hypothesis.kind == "path"]
     fits += [polished(table, fit)[0] for fit in _top(paths, 2)]
     return fits + _exchanged(table, plain) + _sorted(table, plain)
+
+
+def _fits(table: Table, hypotheses: Sequence[Hypothesis]) -> list[Fitted]:
+    """Those of the hypotheses that the model can answer."""
+    fits = []
+    for hypothesis in hypotheses:
+        with contextlib.suppress(ValueError):
+            fits.append(fitted(table, hypothesis))
+    return fits
 
 
 def _top(fits: list[Fitted], count: int) -> list[Fitted]:
@@ -297,20 +359,35 @@ def _columns(
     least = 0.1 if table.model.resolution else 0.02
     if table.shared or not (plain.rms > least * table.width).any():
         return []
-    fits = []
+    tables, every = [], np.flatnonzero(table.counted)
     for hypothesis in changed_columns(table, inputs, outputs):
         anew = _anew(table, hypothesis)
         if anew is not None:
-            fits.append((anew, fitted_once(anew, hypothesis)))
-    fits.sort(key=lambda each: -each[1].evidence)
-    return [fitted(one, fit.hypothesis) for one, fit in fits[:3]]
+            tables.append((_distance(anew, hypothesis, every), anew, hypothesis))
+    tables.sort(key=lambda each: each[0])
+    return [fit for _, one, each in tables[:_COLUMNS] for fit in _fits(one, [each])]
 
 
-def fitted_once(table: Table, hypothesis: Hypothesis) -> Fitted:
-    """The fit of a table that is linear in its parameters, about ``theta``."""
-    from jaxcal.calibration.pairing_fit import judged
+def _distance(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
+    """Log size of what is off before anything is fitted but what nothing is known of."""
+    off = table.residuals(hypothesis, rows, table.theta)
+    if table.flat:
+        with contextlib.suppress(ValueError):
+            off = _flat_fit(table, hypothesis, rows)
+    size = np.log(np.median(np.abs(off), axis=0) + 1e-300).sum()
+    change = hypothesis.change
+    return (
+        float(size - (change.log_size if change else 0.0)) if size == size else np.inf
+    )
 
-    return judged(table, hypothesis, np.flatnonzero(table.counted))
+
+def _flat_fit(table: Table, hypothesis: Hypothesis, rows: Rows) -> Array:
+    """(K, q) residuals of least squares about ``theta``."""
+    slopes, right = table.system(hypothesis, rows)
+    flat = slopes.reshape(-1, slopes.shape[-1])
+    known = table.ridge(flat.shape[1])
+    solution = solved(flat.T @ flat, flat.T @ right.reshape(len(flat), -1), known)
+    return np.asarray((right - slopes @ solution).reshape(len(rows), -1))
 
 
 def _anew(table: Table, hypothesis: Hypothesis) -> Table | None:
@@ -335,8 +412,8 @@ def _benign(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
     count = len(table.commands)
     time = np.linspace(-1.0, 1.0, count)[:, None]
     extras = [time, np.hstack([time, time**2])]
-    if best.hypothesis.kind in ("offset", "parameters"):  # approached from one side
-        extras += [np.sign(np.gradient(column))[:, None] for column in table.commands.T]
+    for column in table.commands.T:  # approached from one side
+        extras.append(np.sign(np.gradient(column))[:, None])
     commands = table.commands - table.commands.mean(axis=0)
     commands = commands / (commands.std(axis=0) + 1e-300)
     n = commands.shape[1]

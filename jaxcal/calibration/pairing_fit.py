@@ -54,6 +54,11 @@ class ColumnChange:
         """(N, k) put right."""
         return values[:, self.order] * self.factors
 
+    @property
+    def log_size(self) -> float:
+        """Log of what it makes of the size of a reading, of all outputs together."""
+        return float(np.log(np.abs(self.factors)).sum()) if self.of_readings else 0.0
+
 
 @dataclasses.dataclass(frozen=True)
 class Hypothesis:
@@ -229,6 +234,8 @@ def _searched(table: Table, hypothesis: Hypothesis, rows: Rows) -> Array:
         before = cost
         for share in (1.0, 0.3, 0.1, 0.03):
             theta = table.theta + share * (aim - table.theta)
+            if not np.isfinite(theta).all():
+                continue
             cost = _misfit(table, hypothesis, rows, theta)
             if cost < before:
                 break
@@ -313,6 +320,10 @@ def judged(table: Table, hypothesis: Hypothesis, rows: Rows) -> Fitted:
     unpaired[rows] = False
     evidence = float(log_evidence(table, by_level, kept, extra)) - lost[best]
     evidence -= float(costs[unpaired].sum()) + hypothesis.code
+    change, times = hypothesis.change, np.ones(q)
+    if change is not None and change.of_readings:
+        evidence += (kept - table.flat / q) * change.log_size
+        times = np.abs(np.array(change.factors))
     inside = np.zeros(len(table.commands), dtype=np.bool_)
     inside[rows[order[:kept]]] = True
     theta, free = table.theta.copy(), int(table.free.sum())
@@ -322,8 +333,8 @@ def judged(table: Table, hypothesis: Hypothesis, rows: Rows) -> Fitted:
     return Fitted(
         hypothesis,
         evidence,
-        np.sqrt((left**2).sum(axis=0) / max(kept - fixed, 1.0)),
-        np.sqrt((first**2).sum(axis=0) / max(count - fixed, 1.0)),
+        np.sqrt((left**2).sum(axis=0) / max(kept - fixed, 1.0)) / times,
+        np.sqrt((first**2).sum(axis=0) / max(count - fixed, 1.0)) / times,
         theta,
         inside,
         solution,

@@ -144,6 +144,22 @@ class _Systems:
             total.append(np.take(upto, edges, axis=axis))
         return _Sums(*total)
 
+    def total(self, match: Rows) -> _Sums:
+        """Of all rows of matches (H, N)."""
+        slopes, right, paired = self.of(match)
+        count, rows, a, r = slopes.shape
+        flat = slopes.reshape(count, rows * a, r)
+        aim = right.reshape(count, rows * a, -1)
+        turned = np.swapaxes(flat, 1, 2)
+        costs = np.where(paired | ~self.table.counted, 0.0, self.costs)
+        return _Sums(
+            turned @ flat,
+            turned @ aim,
+            (aim**2).sum(axis=1),
+            costs.sum(axis=1),
+            paired.sum(axis=1),
+        )
+
     def evidence(self, sums: _Sums, extra: int = 0) -> Array:
         """(...) of least squares, no outlier left out."""
         known = self.table.ridge(sums.squares.shape[-1])
@@ -158,9 +174,8 @@ def ranked(table: Table) -> tuple[float, list[tuple[float, Hypothesis]]]:
     """Evidence of the table as it is, and hypotheses with theirs, the best first."""
     count = len(table.commands)
     systems = _Systems(table)
-    whole = np.array([count])
     matches, names = _of_all_rows(table, systems.fast)
-    scores = systems.evidence(systems.sums(matches, whole))[:, 0]
+    scores = systems.evidence(systems.total(matches))
     found = [
         (float(score) - code, Hypothesis(kind, match, code, starts))
         for score, match, (kind, code, starts) in zip(
@@ -299,9 +314,6 @@ def _steps(systems: _Systems) -> list[tuple[float, Hypothesis]]:
         return []
     found: list[tuple[float, Hypothesis]] = []
     after = np.arange(count)
-    edges = after[_LEAST : count - _LEAST + 1]
-    if len(edges) > _EDGES:
-        edges = edges[:: len(edges) // _EDGES + 1]
     code = _KINDS + np.log(count)
     slopes, right, _ = systems.of(after[None])
     slopes, right = slopes[0], right[0]
@@ -309,8 +321,11 @@ def _steps(systems: _Systems) -> list[tuple[float, Hypothesis]]:
     for whole in (False, True) if factors is not None else (False,):
         best: tuple[float, Hypothesis] | None = None
         widths = factors.shape[1] if whole and factors is not None else 1
-        if whole and count < 2 * widths + 3:
+        least = widths + 2 if whole else _LEAST
+        edges = after[least : count - least + 1]
+        if not len(edges):
             continue
+        edges = edges[:: len(edges) // _EDGES + 1]
         step = (after[None] >= edges[:, None]).astype(np.float64)[..., None]
         more = step * (factors if whole and factors is not None else 1.0)
         scores = _with_columns(systems, slopes, right, more)
@@ -426,26 +441,27 @@ def matched_anew(table: Table, fit: Fitted) -> list[Rows]:
     each by itself, one output that follows one, and any.
     """
     every = np.arange(len(table.commands))
-    if not table.shared:
+    if not (table.shared or table.model.linear) or not table.free.any():
         return [assigned(table, fit, every)]
     from scipy.optimize import linear_sum_assignment
 
-    read, width = table.measured / table.scale, table.commands.shape[1]
-    factors = table.model.blocks(table.commands)[:, 0]
+    factors, right = table.system(as_it_is(table), every)
+    read, r, c = right.reshape(len(every), -1), factors.shape[-1], right.shape[-1]
+    size = np.sqrt((factors**2).mean(axis=(0, 1))) + 1e-300
     rng = np.random.default_rng(0)
-    size = table.commands.std(axis=0) + 1e-300
-    starts = [np.eye(table.outputs, width), -np.eye(table.outputs, width)]
-    starts += [*rng.normal(size=(_STARTS, table.outputs, width))]
+    starts = [np.eye(r, c), -np.eye(r, c), *rng.normal(size=(_STARTS, r, c))]
     found: list[tuple[float, Rows]] = []
     for start in starts:
-        off = (table.commands / size) @ start.T
-        off = off / (off.std(axis=0) + 1e-300)
+        off = ((factors / size) @ start).reshape(read.shape)
+        off = (off - off.mean(axis=0)) / (off.std(axis=0) + 1e-300)
+        off = off * read.std(axis=0) + read.mean(axis=0)
         match, square = every, np.inf
         for _ in range(_ROUNDS):
             apart = ((read[:, None] - off) ** 2).sum(axis=-1)
             moved = linear_sum_assignment(apart)[1]
-            slopes = np.linalg.lstsq(factors[moved], read)[0]
-            off = factors @ slopes
+            flat = factors[moved].reshape(-1, r)
+            slopes = np.linalg.lstsq(flat, right.reshape(len(flat), c))[0]
+            off = (factors @ slopes).reshape(read.shape)
             before, square = square, float(((read - off[moved]) ** 2).sum())
             if not square < before:
                 break
@@ -502,5 +518,15 @@ def changed_columns(
                     )
                 )  # fmt: skip
     code = _KINDS + np.log(len(changes) + 1.0)
-    rows = np.arange(len(table.commands))
-    return [Hypothesis("columns", rows, code, change=change) for change in changes]
+    rows, several = np.arange(len(table.commands)), np.log(20.0)
+    return [
+        Hypothesis(
+            "columns",
+            rows,
+            code
+            + several * (" and " in change.words)
+            + _KINDS * ("every" in change.words),
+            change=change,
+        )
+        for change in changes
+    ]
