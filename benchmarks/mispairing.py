@@ -13,7 +13,9 @@ from __future__ import annotations
 import argparse
 import collections
 import dataclasses
+import pathlib
 import re
+import sys
 import time
 import warnings
 from collections.abc import Callable
@@ -23,7 +25,9 @@ from numpy.typing import NDArray
 
 import jaxcal
 from jaxcal.calibration.pairing import mispairing, of_new_readings
-from jaxcal.models import Affine, FromFunction, Linear
+from jaxcal.models import FromFunction, Linear
+
+sys.path.append(str(pathlib.Path(__file__).parents[1] / "examples"))
 
 Array = NDArray[np.float64]
 RATIO = 5.0
@@ -317,7 +321,7 @@ def _name(case: Case, i: int) -> str:
     return (
         inputs[i]
         if inputs
-        else ("u_" + "xyz"[i] if case.commands.shape[1] <= 3 else f"u_{i + 1}")
+        else ("u_" + "xyz"[i] if case.commands.shape[1] == 3 else f"u_{i + 1}")
     )
 
 

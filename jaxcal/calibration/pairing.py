@@ -32,13 +32,20 @@ from jaxcal.calibration.pairing_search import (
     matched_anew,
     polished,
     ranked,
+    shifted,
 )
 from jaxcal.checks import in_words
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Prior
 from jaxcal.models.verdict import Verdict
 
-__all__ = ["Mispairing", "against", "mispairing", "of_new_readings"]
+__all__ = [
+    "Mispairing",
+    "against",
+    "mispairing",
+    "of_new_readings",
+    "of_unfitted",
+]
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
@@ -54,6 +61,7 @@ _EXACT = 1e-6  # of the spread: readings so near a fit have nothing to explain
 _APART, _LARGE = 8.0, 4.5  # times the noise: neighbours, a residual
 _TREND = 1.4  # of a sum of residuals, over the root of their squares
 _LEAST = 6  # rows
+_PLACES = 2  # of a sensor, that are tried
 _NAMED = 2  # other explanations
 _COLUMNS = 6  # changes of columns that are fitted one by one
 _BLOCK = 4  # rows from elsewhere: fewer are outliers
@@ -80,7 +88,11 @@ class Mispairing:
         return self.kind not in ("offset", "parameters")
 
     def repaired(self, commands: Array, measured: Array) -> tuple[Array, Array]:
-        """The rows that belong together, (K, n) and (K, q), of the table (N, n), (N, q).
+        """The rows that belong together, (K, n) and (K, q).
+
+        Args:
+            commands: (N, n) of the table.
+            measured: (N, q) of it.
 
         Raises:
             ValueError: rows of two sessions cannot be made one.
@@ -114,6 +126,18 @@ def mispairing(fit: Fit) -> Mispairing | None:
         return None
     table = dataclasses.replace(table, theta=np.asarray(fit.parameters))
     return _found(table, fit.input_names, fit.output_names, fit.measured_unit)
+
+
+def of_unfitted(
+    model: Model, commands: Array, measured: Array, prior: Prior | None, names: Any
+) -> Mispairing | None:
+    """How a table was mispaired that could not be fitted; ``names`` of both sides."""
+    counted = np.ones(len(commands), dtype=np.bool_)
+    with contextlib.suppress(ValueError):
+        prior = prior or model.default_prior()
+        table = _table(model, commands, measured, counted, prior)
+        return None if table is None else _found(table, *names, "")
+    return None
 
 
 def of_new_readings(fit: Fit, commands: Array, measured: Array) -> Mispairing | None:
@@ -211,8 +235,8 @@ def _found(
     for benign in _benign(table, plain, best):
         if best.evidence - benign.evidence < (sure if benign is plain else _SURE):
             return None
-        smooth = benign.hypothesis.extra is not None or benign is not plain
-        if smooth and not _better(benign, best):
+        by_itself = benign is not plain and not benign.hypothesis.code
+        if by_itself and not _better(benign, best):
             return None
     near: dict[int, list[int]] = {}
     if best.hypothesis.kind == "path":
@@ -275,7 +299,8 @@ def _alternatives(table: Table, plain: Fitted) -> list[Fitted]:
     """Other pairings of rows, fitted."""
     tables = [table]
     if not (table.shared or table.model.linear) and table.free.any():
-        tables.append(dataclasses.replace(table, theta=plain.theta))
+        at_fit = dataclasses.replace(table, theta=plain.theta)
+        tables = [*_places(table), at_fit] if table.levels == 1 else [table, at_fit]
     fits: list[Fitted] = []
     for one in tables:
         if any(_explains(plain, fit) for fit in fits):
@@ -361,7 +386,7 @@ def _columns(
         return []
     tables, every = [], np.flatnonzero(table.counted)
     for hypothesis in changed_columns(table, inputs, outputs):
-        anew = _anew(table, hypothesis)
+        anew = _anew(table, hypothesis, every)
         if anew is not None:
             tables.append((_distance(anew, hypothesis, every), anew, hypothesis))
     tables.sort(key=lambda each: each[0])
@@ -369,7 +394,7 @@ def _columns(
 
 
 def _distance(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
-    """Log size of what is off before anything is fitted but what nothing is known of."""
+    """Log size of what is off before anything is fitted that a prior is known of."""
     off = table.residuals(hypothesis, rows, table.theta)
     if table.flat:
         with contextlib.suppress(ValueError):
@@ -390,25 +415,45 @@ def _flat_fit(table: Table, hypothesis: Hypothesis, rows: Rows) -> Array:
     return np.asarray((right - slopes @ solution).reshape(len(rows), -1))
 
 
-def _anew(table: Table, hypothesis: Hypothesis) -> Table | None:
-    """The table of the machine that readings show if the hypothesis holds."""
+def _anew(table: Table, hypothesis: Hypothesis, rows: Rows) -> Table | None:
+    """The table of the machine that these readings show if the hypothesis holds."""
     if not table.free.any():
         return table
-    rows = np.flatnonzero((hypothesis.match >= 0) & table.counted)
     try:
         model = table.model.anew(
             table.commands_of(hypothesis, rows), table.readings_of(hypothesis, rows)
         )
     except ValueError:
         return None
-    if model is table.model:
-        return dataclasses.replace(table, theta=table.mean)
-    mean = np.asarray(model.nominal)
+    mean = table.mean + np.asarray(model.nominal) - table.model.nominal
     return dataclasses.replace(table, model=model, mean=mean, theta=mean)
 
 
+def _places(table: Table) -> list[Table]:
+    """The table with its sensor where some rows, or some pairing of them, put it.
+
+    That of the rows which then fit best come first: where readings are mispaired, all
+    of them together put it nowhere.
+    """
+    count = len(table.commands)
+    every, half = np.arange(count), count // 2
+    windows = [(every, every), (every, every[:half]), (every, every[half:])]
+    matches = [shifted(count, by) for by in (1, -1, 2, -2, 3, -3)]
+    matches += [every[::-1], (every + half) % count, (every - half) % count]
+    windows += [(match, every) for match in matches]
+    found = []
+    for match, rows in windows:
+        hypothesis = Hypothesis("", match)
+        rows = rows[(match[rows] >= 0) & table.counted[rows]]
+        anew = _anew(table, hypothesis, rows)
+        if anew is not None:
+            found.append((_distance(anew, hypothesis, rows), anew))
+    found.sort(key=lambda each: each[0])
+    return [each for _, each in found[:_PLACES]] or [table]
+
+
 def _benign(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
-    """The table as it is, with what machines do: drift, curves, a change of their own."""
+    """The table as it is, with what machines do: drift, curves, another machine."""
     count = len(table.commands)
     time = np.linspace(-1.0, 1.0, count)[:, None]
     extras = [time, np.hstack([time, time**2])]
@@ -427,12 +472,14 @@ def _benign(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
         for column in commands.T:
             for knot in np.quantile(column, np.linspace(0.1, 0.9, 9)):
                 extras.append(np.maximum(column - knot, 0.0)[:, None])
-    if not table.free.any():  # a machine that changed since it was calibrated
-        ones = np.ones((count, 1))
-        extras += [ones, np.hstack([ones, commands]), np.hstack([ones, commands, time])]
     at = dataclasses.replace(table, theta=plain.theta)
     fits = [plain]
     fits += [fitted(at, as_it_is(table, extra)) for extra in extras]
+    if not table.free.any():  # a machine that changed since it was calibrated
+        ones = np.ones((count, 1))
+        for more in (ones, np.hstack([ones, commands])):
+            code = more.shape[1] * float(np.log(table.width).sum())
+            fits.append(fitted(at, as_it_is(table, more, code)))
     return fits
 
 
@@ -472,8 +519,8 @@ def _what(
         return "the readings are in reverse order"
     if kind == "halves":
         return (
-            f"the halves of the readings are exchanged: those from row {-starts[0][1] % count} "
-            "on belong to the first commands"
+            "the halves of the readings are exchanged: those from row "
+            f"{-starts[0][1] % count} on belong to the first commands"
         )
     if kind == "rotation" and abs(starts[0][1]) <= count // 3:
         last = "first" if starts[0][1] > 0 else "last"
@@ -494,16 +541,16 @@ def _what(
         rows = np.flatnonzero(hypothesis.match != np.arange(count))
         return f"the readings of rows {', '.join(map(str, rows))} are exchanged"
     if kind in ("offset", "parameters"):
-        row = starts[1][0]
-        steps = (
-            fit.solution[-1] * table.scale
-            if table.shared
-            else fit.solution[-table.outputs :, 0] * table.scale
-        )
-        by = f": {', '.join(outputs)} change by {in_words(steps)}{' ' + unit if unit else ''}"
+        another = "slope or offset"
+        if kind == "offset":
+            steps = (
+                fit.solution[-1] if table.shared else fit.solution[-table.outputs :, 0]
+            )
+            size = f"{in_words(steps * table.scale)} {unit}".strip()
+            another = f"offset, by {size}"
         return (
-            f"rows of two sessions seem joined: from row {row} on the readings have "
-            f"another {'offset' + by if kind == 'offset' else 'slope or offset'}"
+            f"rows of two sessions seem joined: from row {starts[1][0]} on the readings "
+            f"have another {another}"
         )
     return _path_words(starts, near, count)
 

@@ -35,6 +35,7 @@ __all__ = [
     "matched_anew",
     "polished",
     "ranked",
+    "shifted",
 ]
 
 Array = NDArray[np.float64]
