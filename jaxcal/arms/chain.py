@@ -404,6 +404,19 @@ class SerialChain(Arm, Model):
         arm.require_places(commands, measured)
         return arm
 
+    @property
+    def sensed(self) -> slice:
+        """What its sensor asks for: labels of what was touched, the pose of a board."""
+        return slice(self.num_joints, self.num_inputs)
+
+    def anew(self, commands: Array, measured: Array) -> Self:
+        """This arm located again, what its sensor reads forgotten."""
+        names = {field.name for field in dataclasses.fields(self.sensor)}
+        places = {name: None for name in ("place", "places") if name in names}
+        sensor = dataclasses.replace(self.sensor, **places)
+        arm = dataclasses.replace(self, sensor=sensor)
+        return arm.located(commands, None if not measured.any() else measured)
+
     def require_readings(self, commands: Array, measured: Array | None) -> None:
         """Refuse what no arm like this one takes or gives; None, candidates."""
         from jaxcal.arms.plausible import require_readings, warn_of_radians

@@ -18,6 +18,7 @@ from jaxcal.calibration.file import save, to_dict
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.fit_model import fit_model
 from jaxcal.calibration.inverse import command_for
+from jaxcal.calibration.pairing import Mispairing, against, mispairing
 from jaxcal.checks import aligned, in_words
 from jaxcal.late import late
 from jaxcal.models.model import Model
@@ -106,7 +107,16 @@ class Calibration(Fit):
         (``jaxcal.arms.verdict.ArmVerdict``). The summary, ``report``, exit
         codes and the warning of ``identify`` say this.
         """
-        return self.model.verdict(self)
+        return against(self.model.verdict(self), self.mispairing)
+
+    @functools.cached_property
+    def mispairing(self) -> Mispairing | None:
+        """How the readings and commands of the table were mispaired, if they were.
+
+        ``reason`` says it, ``repaired(commands, measured)`` gives the rows that belong
+        together. None: they pair as they stand, or that cannot be told.
+        """
+        return mispairing(self)
 
     def of(self, tip: str) -> Calibration:
         """The calibration of one of several chains, as if it were the only one.

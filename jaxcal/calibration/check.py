@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.fit import Fit
+from jaxcal.calibration.pairing import of_new_readings
 from jaxcal.checks import array_of, numbers, table, whole_number
 from jaxcal.information.blocks import without
 from jaxcal.models.model import recorded
@@ -51,6 +52,7 @@ class Check:
     slipped: str = ""  # what alone would explain it, and by how much
     enough: int = 0  # rows like these by which it could be told, about; 0 if not so
     blind: tuple[str, ...] = ()  # parameters that nothing placed anew shows
+    mispairing: str = ""  # of the readings that were checked, and how
 
     @property
     def good(self) -> bool:
@@ -68,7 +70,9 @@ class Check:
             f" (p = {self.p_value:.3g}, false alarms 5 %); a change by {change} is "
             f"seen with {self.power:.0%} on average"
         )
-        if self.slipped:
+        if self.mispairing:
+            text += f"; {self.mispairing}"
+        elif self.slipped:
             text += f"; a slip of {self.slipped} would explain it"
         if self.unseen and not self.good:
             text += f", and could hide in {', '.join(self.unseen)}"
@@ -82,6 +86,8 @@ class Check:
         """What to do next, in a sentence."""
         if self.good:
             return "go on using it"
+        if self.mispairing:
+            return "correct the table, then check again"
         if self.says == "does not hold":
             return (
                 "measure one of these rows again to rule out a wrong reading, then "
@@ -164,6 +170,9 @@ def check(
         says = "does not hold"
     else:
         says = "cannot be told" if hidden.any() or not free.any() else "holds"
+    mispaired = None
+    if says == "does not hold" and not placed_anew:
+        mispaired = of_new_readings(calibration, commands, measured)
     sensor = getattr(calibration.model, "sensor", None)
     return Check(
         says=says,
@@ -176,6 +185,7 @@ def check(
         slipped=slipped,
         enough=int(np.ceil(enough)) if enough < _MANY else 0,
         blind=tuple(names[i] for i in np.flatnonzero(off.blind)),
+        mispairing=mispaired.reason if mispaired else "",
     )
 
 

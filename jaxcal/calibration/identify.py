@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.calibration import Calibration
 from jaxcal.calibration.fit_model import fit_model, require_fitting
+from jaxcal.calibration.pairing import of_unfitted
 from jaxcal.checks import (
     array_of,
     axis_names,
@@ -127,17 +128,24 @@ def identify(
     affine = isinstance(model, Affine)
     if plain and (affine or model.affine(model.nominal) is not None):
         loss = "gaussian"
-    fields = fit_model(
-        readings.commands,
-        readings.measured,
-        readings.weights,
-        model=model,
-        prior=prior,
-        noise=noise,
-        loss=loss or "student",
-        common_noise=common_noise,
-        excited=readings.input_names if plain and affine else (),
-    )
+    try:
+        fields = fit_model(
+            readings.commands,
+            readings.measured,
+            readings.weights,
+            model=model,
+            prior=prior,
+            noise=noise,
+            loss=loss or "student",
+            common_noise=common_noise,
+            excited=readings.input_names if plain and affine else (),
+        )
+    except ValueError as error:
+        names = readings.input_names, readings.output_names
+        found = of_unfitted(model, readings.commands, readings.measured, prior, names)
+        if found is None:
+            raise
+        raise ValueError(f"{found.reason}. As it stands: {error}") from None
     if prior is not None and not prior.by_data:
         about["provenance"]["prior"] = "stated"
     calibration = Calibration(**fields, **about)

@@ -101,6 +101,9 @@ class SavedFiles:
         False
     )
     unproven: Annotated[bool, "write the .urdf of a fit that is not good"] = False
+    repair: Annotated[
+        str, "write the rows that belong together, where they were mispaired", "FILE"
+    ] = ""
     servos_out: Annotated[
         str, "write LeRobot's calibration, of --servos, with the zeros found", "FILE"
     ] = ""
@@ -181,6 +184,10 @@ def identify(
     of_urdf = (model or "").lower().endswith(".urdf")
     saved.require(of_urdf, recording.servos)
     page.require()
+    if saved.repair and weights:
+        raise ValueError("--repair writes no weights: leave out one of them")
+    if saved.repair and os.path.realpath(saved.repair) == os.path.realpath(file):
+        raise ValueError(f"--repair must be another file than {file}")
     table = recording.table(file, lambda which: of_arm.of_recording(model, which))
     table = read_table(file) if table is None else table
     machine: Any = of_arm.machine(model, table)
@@ -203,6 +210,8 @@ def identify(
         accuracy=accuracy,
     )
     lines = saved.written(calibration, recording.servos)
+    if saved.repair:
+        lines.append(_repaired(saved.repair, file, calibration, table, readings))
     good = page.written(calibration, (file, model))
     if json:
         write_json("", calibration.to_dict())
@@ -226,6 +235,25 @@ def _noise(machine: Any, stds: list[float] | None, play: float | None) -> Any:
     if std is not None:
         noise = dataclasses.replace(noise, std=std)
     return {"noise": noise, "noise_std": None}
+
+
+def _repaired(
+    path: str,
+    file: str,
+    calibration: Calibration,
+    table: CsvTable,
+    readings: _Readings,
+) -> str:
+    """Write the rows of a mispaired table that belong together; a line that says so."""
+    found = calibration.mispairing
+    if found is None:
+        raise ValueError(f"{path} is not written: the rows of {file} are not mispaired")
+    names, measured = [*readings.inputs], np.zeros((len(table), 0))
+    if {*readings.outputs} <= {*table.names}:
+        names, measured = [*names, *readings.outputs], table.columns(readings.outputs)
+    columns = found.repaired(table.columns(readings.inputs), measured)
+    write_rows(path, names, np.hstack(columns).tolist())
+    return f"saved {path}, {len(columns[0])} of {len(table)} rows; {file} is as it was"
 
 
 class _Readings(NamedTuple):

@@ -218,6 +218,19 @@ class Model(abc.ABC):
 
     # -- the commands and readings of a fit or a choice --------------------------------
 
+    @property
+    def sensed(self) -> slice:
+        """Columns of the commands that come with a reading: what was touched, seen."""
+        return slice(0, 0)
+
+    def anew(self, commands: Array, measured: Array) -> Model:
+        """The model as ``prepared`` has it, where its sensor stood before forgotten.
+
+        Raises:
+            ValueError: as of ``prepared``.
+        """
+        return self
+
     def prepared(self, commands: Array, measured: Array | None = None) -> Model:
         """This model where the commands (and readings) show that its sensor stands.
 

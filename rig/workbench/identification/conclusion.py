@@ -18,6 +18,7 @@ from rig.workbench.identification.drift import estimate_drift, without_drift
 from rig.workbench.identification.fit_affine import (
     held_out_errors,
     identify_affine,
+    mispaired,
     pairs,
     uncertainty,
 )
@@ -107,7 +108,10 @@ def _judged_affine(
     """
     zero_share = chosen[0]["samples"] / zero["samples"]
     limits = uncertainty(chosen, held_out, zero_share)
-    reasons = recalibrate(errors, config.session.verify_limit_deg)
+    reasons = [
+        *mispaired(config, [*chosen, *held_out]),
+        *recalibrate(errors, config.session.verify_limit_deg),
+    ]
     notes |= {
         "mechanism_order": config.mechanism.order,
         "noise_from": limits["basis"],

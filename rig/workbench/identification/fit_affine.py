@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,16 @@ def identify_affine(
     bias = range(-len(noise_std), 0)
     covariance[bias, bias] += zero_share * noise_std**2
     return dataclasses.replace(fitted, joint_covariance=covariance)
+
+
+def mispaired(config: RigConfig, records: list[Record]) -> list[str]:
+    """How readings and postures were mispaired, in the order in which they were
+    measured; nothing where they belong together."""
+    in_order = sorted(records, key=lambda record: record["seq"])
+    with warnings.catch_warnings():  # the verdict of a fit that is not kept
+        warnings.simplefilter("ignore", UserWarning)
+        found = identify_affine(config, in_order).mispairing
+    return [found.reason] if found else []
 
 
 def uncertainty(

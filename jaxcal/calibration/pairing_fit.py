@@ -1,0 +1,349 @@
+"""How well a table fits when its readings are paired with other commands.
+
+A ``Hypothesis`` says which command each reading belongs to. Its evidence is the
+probability of the readings, its parameters and noise integrated out: readings that it
+leaves unpaired, or as outliers, count as drawn from anywhere within their spread.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from jaxcal.models.model import Model, derivative, predict
+
+__all__ = [
+    "AS_IT_IS",
+    "ColumnChange",
+    "Fitted",
+    "Hypothesis",
+    "Table",
+    "fitted",
+    "judged",
+    "log_evidence",
+    "predicted",
+    "solved",
+]
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+AS_IT_IS = "as it is"  # kind of a hypothesis
+OUTLIER = np.log(20.0)  # of one row in twenty
+_FLOOR = 1e-7  # of the spread of the readings: below it is rounding
+_MOST_OUT = 0.35, 0.2  # share of rows that may be outliers: as it is, paired anew
+_FREEDOM = 4.0  # of Student's t, of the robust start
+_ROUNDS = 6  # of robust weights, and of linearising
+_RIDGE = 1e-11  # of a column's square: what no row excites stays at the prior's mean
+
+
+@dataclasses.dataclass(frozen=True)
+class ColumnChange:
+    """Columns of a table as they should be."""
+
+    words: str  # what is wrong with them
+    of_readings: bool
+    order: tuple[int, ...]  # column i is the table's order[i]
+    factors: tuple[float, ...]  # times this
+
+    def __call__(self, values: Array) -> Array:
+        """(N, k) put right."""
+        return values[:, self.order] * self.factors
+
+    @property
+    def log_size(self) -> float:
+        """Log of what it makes of the size of a reading, of all outputs together."""
+        return float(np.log(np.abs(self.factors)).sum()) if self.of_readings else 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Hypothesis:
+    """Which command each reading belongs to."""
+
+    kind: str
+    match: Rows  # (N,) row of the command of each reading, -1 of none
+    code: float = 0.0  # -log of its prior probability
+    starts: tuple[tuple[int, int], ...] = ()  # of shifts by rows: from which row on
+    change: ColumnChange | None = None
+    extra: Array | None = None  # (N, e) columns that are fitted too, of each output
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """N rows of commands and readings, and the model that shall explain them."""
+
+    model: Model
+    commands: Array  # (N, n)
+    measured: Array  # (N, q)
+    counted: NDArray[np.bool_]  # (N,) False: the reading was left out
+    mean: Array  # (p,) of the prior
+    precision: Array  # (p,) of it
+    free: NDArray[np.bool_]  # (p,)
+    theta: Array  # (p,) where the model is linearised
+    scale: Array  # (q,) in which outputs are compared
+    width: Array  # (q,) spread of the readings, in scales
+    shared: bool  # outputs share one regressor, and nothing is known of its factors
+
+    @property
+    def flat(self) -> int:
+        """Free parameters of which nothing is known."""
+        return int((self.free & (self.precision == 0.0)).sum())
+
+    @property
+    def outputs(self) -> int:
+        """q."""
+        return len(self.scale)
+
+    @property
+    def levels(self) -> int:
+        """Levels of noise: one of each output, one of all where a prior counts."""
+        return 1 if (self.precision[self.free] > 0.0).any() else len(self.scale)
+
+    def costs(self) -> Array:
+        """(N,) -log density of readings that are paired with nothing."""
+        middle = np.median(self.measured[self.counted], axis=0)
+        off = (self.measured - middle) / self.scale / self.width
+        log = 0.5 * np.log(2.0 * np.pi) + np.log(self.width)
+        return np.asarray((log + np.minimum(0.5 * off**2, 4.5)).sum(axis=1))
+
+    def commands_of(self, hypothesis: Hypothesis, rows: Rows) -> Array:
+        """(K, n) commands that the readings of these rows belong to."""
+        commands = self.commands[hypothesis.match[rows]]
+        sensed = self.model.sensed
+        commands[:, sensed] = self.commands[rows, sensed]
+        change = hypothesis.change
+        if change is not None and not change.of_readings:
+            commands = change(commands)
+        return commands
+
+    def readings_of(self, hypothesis: Hypothesis, rows: Rows) -> Array:
+        """(K, q) readings of these rows."""
+        change = hypothesis.change
+        if change is not None and change.of_readings:
+            return change(self.measured[rows])
+        return self.measured[rows]
+
+    def residuals(self, hypothesis: Hypothesis, rows: Rows, theta: Array) -> Array:
+        """(K, q) readings less predictions, in scales."""
+        commands = self.commands_of(hypothesis, rows)
+        off = self.readings_of(hypothesis, rows) - predict(
+            self.model, commands, theta, finite=False
+        )
+        return np.asarray(self.model.wrapped(off, commands) / self.scale)
+
+    def system(self, hypothesis: Hypothesis, rows: Rows) -> tuple[Array, Array]:
+        """The readings as linear in what is free, less its mean.
+
+        Returns:
+            (K, a, r) and (K, a, c): each of a readings and c columns has r factors.
+        """
+        extra = np.zeros((len(self.commands), 0))
+        if hypothesis.extra is not None:
+            extra = hypothesis.extra
+        if self.shared:
+            regressors = self.model.blocks(self.commands_of(hypothesis, rows))
+            return (
+                np.concatenate([regressors, extra[rows, None]], axis=-1),
+                self.readings_of(hypothesis, rows)[:, None] / self.scale,
+            )
+        slopes = np.zeros((len(rows), self.outputs, 0))
+        off = self.residuals(hypothesis, rows, self.theta)
+        if self.free.any():
+            commands = self.commands_of(hypothesis, rows)
+            slopes = derivative(self.model, commands, self.theta)[..., self.free]
+            slopes = slopes / self.scale[:, None]
+            off = off + slopes @ (self.theta - self.mean)[self.free]
+        more = np.einsum("ke,ab->kaeb", extra[rows], np.eye(self.outputs))
+        more = more.reshape(len(rows), self.outputs, -1)
+        return np.concatenate([slopes, more], axis=-1), off[..., None]
+
+    def ridge(self, columns: int) -> Array:
+        """(r,) precision of ``columns`` factors of ``system``."""
+        known = np.zeros(columns)
+        if not self.shared:
+            known[: self.free.sum()] = self.precision[self.free]
+        return known
+
+
+class Fitted(NamedTuple):
+    """A hypothesis and its fit."""
+
+    hypothesis: Hypothesis
+    evidence: float
+    noise: Array  # (q,) of the readings in scales, outliers left out
+    rms: Array  # (q,) in scales of all that are paired, by least squares
+    theta: Array  # (p,)
+    inside: NDArray[np.bool_]  # (N,) readings that are paired and no outliers
+    solution: Array  # (r, c) of the linear system
+
+
+def log_evidence(table: Table, square: Array, count: Any, extra: int = 0) -> Array:
+    """Log probability (...,) of readings by their squares (..., L), of ``count`` rows.
+
+    The noise is integrated out, ``extra`` columns cost half the log of the rows each.
+    """
+    outputs, levels = table.outputs, square.shape[-1]
+    free = (table.flat + extra * outputs) / levels
+    dof = np.asarray(count)[..., None] * (outputs / levels) - free
+    log = np.log(np.pi * square + dof.clip(1.0) * (_FLOOR * table.width.max()) ** 2)
+    value = special.gammaln(dof.clip(0.5) / 2.0) - 0.5 * dof * log
+    total = np.where(dof >= 1.0, value, -np.inf).sum(axis=-1)
+    size = np.log(max(int(table.counted.sum()), 2))
+    return np.asarray(total - 0.5 * extra * outputs * size)
+
+
+def solved(matrix: Array, right: Array, known: Array) -> Array:
+    """(..., r, c) solution of normal equations with prior precisions (r,)."""
+    size = np.sqrt(np.einsum("...rr->...r", matrix) + known) + 1e-300
+    scaled = matrix / size[..., None] / size[..., None, :]
+    at = np.arange(len(known))
+    scaled[..., at, at] += known / size**2 + _RIDGE
+    found = np.linalg.solve(scaled, right / size[..., None])
+    return np.asarray(found / size[..., None])
+
+
+def fitted(table: Table, hypothesis: Hypothesis, theta: Array | None = None) -> Fitted:
+    """The most probable parameters, noise and outliers of a hypothesis.
+
+    Args:
+        table: of the measurements.
+        hypothesis: how they belong together.
+        theta: (p,) where the search begins; where the table is linearised if None.
+    """
+    if theta is not None:
+        table = dataclasses.replace(table, theta=theta)
+    rows = np.flatnonzero((hypothesis.match >= 0) & table.counted)
+    linear = table.shared or table.model.linear or not table.free.any()
+    if not linear and hypothesis.extra is None:
+        theta = _searched(table, hypothesis, rows)
+        table = dataclasses.replace(table, theta=theta)
+    return judged(table, hypothesis, rows)
+
+
+def _searched(table: Table, hypothesis: Hypothesis, rows: Rows) -> Array:
+    """(p,) the parameters of a nonlinear model, by robust Gauss-Newton steps."""
+    cost = _misfit(table, hypothesis, rows, table.theta)
+    for _ in range(_ROUNDS):
+        solution = _robust(table, *table.system(hypothesis, rows))[0]
+        aim = table.mean.copy()
+        aim[table.free] += solution[:, 0]
+        before = cost
+        for share in (1.0, 0.3, 0.1, 0.03):
+            theta = table.theta + share * (aim - table.theta)
+            if not np.isfinite(theta).all():
+                continue
+            cost = _misfit(table, hypothesis, rows, theta)
+            if cost < before:
+                break
+        else:
+            break
+        table = dataclasses.replace(table, theta=theta)
+        if before - cost < 1e-3:
+            break
+    return table.theta
+
+
+def _misfit(table: Table, hypothesis: Hypothesis, rows: Rows, theta: Array) -> float:
+    """What a search makes smaller: mean log size of the residuals of an output."""
+    off = np.abs(table.residuals(hypothesis, rows, theta))
+    return float(np.log(off.mean(axis=0) + _FLOOR).sum()) if len(off) else np.inf
+
+
+def _robust(table: Table, slopes: Array, right: Array) -> tuple[Array, Array, Array]:
+    """Student's fit of a linear system.
+
+    Returns:
+        (r, c) the solution, (K,) weights, and (K, q) residuals of least squares.
+    """
+    known, (count, _, r), q = table.ridge(slopes.shape[-1]), slopes.shape, table.outputs
+    size = count * slopes.shape[1]
+    plain, aim = slopes.reshape(size, r), right.reshape(size, -1)
+    weights, first, solution = np.ones(count), np.zeros((count, q)), np.zeros((r, 1))
+    for turn in range(_ROUNDS):
+        flat = (weights[:, None, None] * slopes).reshape(size, r)
+        solution = solved(flat.T @ plain, flat.T @ aim, known)
+        off = (right - slopes @ solution).reshape(count, q)
+        first = off if not turn else first
+        noise = _size(off)
+        weights = (q + _FREEDOM) / (_FREEDOM + ((off / noise) ** 2).sum(axis=1))
+    return solution, weights, first
+
+
+def _size(off: Array) -> Array:
+    """(...) robust size of residuals (K, ...)."""
+    return np.asarray(np.median(np.abs(off), axis=0) / 0.6745 + _FLOOR)
+
+
+def judged(table: Table, hypothesis: Hypothesis, rows: Rows) -> Fitted:
+    """The evidence of a hypothesis about ``table.theta``, its outliers left out."""
+    slopes, right = table.system(hypothesis, rows)
+    solution, weights, first = _robust(table, slopes, right)
+    extra = 0 if hypothesis.extra is None else hypothesis.extra.shape[1]
+    known, count, q = table.ridge(slopes.shape[-1]), len(rows), table.outputs
+    order = np.argsort(-weights, kind="stable")
+    slopes, right, costs = slopes[order], right[order], table.costs()
+    off = right - slopes @ solution
+    noise = _size(off)
+    white = slopes if table.shared else slopes / noise
+    aim = off / noise
+    # Sums over rows, the most likely first: the fits without the least likely.
+    most = int(_MOST_OUT[hypothesis.kind != AS_IT_IS] * count)
+    several = np.linspace(0.0, most, 12).astype(np.intp)
+    out = np.unique(np.append(several, np.arange(min(most, 12) + 1)))
+    at = count - 1 - out
+    squares = np.cumsum(np.einsum("kar,kas->krs", white, white), axis=0)[at]
+    products = np.cumsum(np.einsum("kar,kac->krc", white, aim), axis=0)[at]
+    products -= known[:, None] * solution
+    totals = np.cumsum((aim**2).sum(axis=(1, 2)))[at]
+    steps = solved(squares, products, known)
+    totals = totals - (products * steps).sum(axis=(1, 2))
+    totals += (known[:, None] * solution**2).sum()
+    outlying = np.cumsum((costs[rows[order]] + OUTLIER)[::-1])
+    lost = np.append(0.0, outlying)[out]
+    dof = q * (at + 1.0) - (table.flat + extra * q)
+    log = np.log(np.pi * np.maximum(totals, 1e-12 * np.maximum(dof, 1.0)))
+    value = special.gammaln(np.maximum(dof, 0.5) / 2.0) - 0.5 * dof * log - lost
+    value -= (at + 1.0) * np.log(noise).sum()
+    best = int(np.where(dof >= 1.0, value, -np.inf).argmax())
+    kept = at[best] + 1
+    solution = solution + steps[best] * (noise[0] if table.shared else 1.0)
+    left = (right - slopes @ solution).reshape(count, q)[:kept]
+    by_level = (left**2).sum(axis=0)
+    if table.levels == 1:
+        prior = (known[:, None] * solution**2).sum()
+        by_level = np.array([by_level.sum() + prior])
+    unpaired = table.counted.copy()
+    unpaired[rows] = False
+    evidence = float(log_evidence(table, by_level, kept, extra)) - lost[best]
+    evidence -= float(costs[unpaired].sum()) + hypothesis.code
+    change, times = hypothesis.change, np.ones(q)
+    if change is not None and change.of_readings:
+        evidence += (kept - table.flat / q) * change.log_size
+        times = np.abs(np.array(change.factors))
+    inside = np.zeros(len(table.commands), dtype=np.bool_)
+    inside[rows[order[:kept]]] = True
+    theta, free = table.theta.copy(), int(table.free.sum())
+    if not table.shared and extra == 0:
+        theta[table.free] = table.mean[table.free] + solution[:free, 0]
+    fixed = table.flat / q + extra
+    return Fitted(
+        hypothesis,
+        evidence,
+        np.sqrt((left**2).sum(axis=0) / max(kept - fixed, 1.0)) / times,
+        np.sqrt((first**2).sum(axis=0) / max(count - fixed, 1.0)) / times,
+        theta,
+        inside,
+        solution,
+    )
+
+
+def predicted(table: Table, fit: Fitted) -> Array:
+    """(N, q) what a fit says of the commands as they stand, in scales."""
+    if table.shared:
+        regressors = table.model.blocks(table.commands)[:, 0]
+        return np.asarray(regressors @ fit.solution[: regressors.shape[1]])
+    return predict(table.model, table.commands, fit.theta, finite=False) / table.scale
