@@ -17,8 +17,7 @@ if sys.argv[1:2] == ["stop"]:  # nothing may keep it from the drives
 from jaxcal.arguments import values_of
 from jaxcal.extras import install
 from rig.commands import make_parser
-from rig.faults import EXIT_BAD_INPUT, EXIT_FAULT, EXIT_INTERRUPTED, told
-from rig.journal.errors import JournalError
+from rig.faults import EXIT_BAD_INPUT, EXIT_FAULT, EXIT_INTERRUPTED, JournalError, told
 
 # Looked for before any port opens; finding is quicker than importing.
 NEEDED = ("pydantic", "pymodbus")

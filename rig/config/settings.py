@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from rig.config.axis import Range
-from rig.config.maps import Kind, registers_of
 from rig.config.schema import Section, advanced, key
+from rig.registers import Kind, registers_of
 
 Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
 Sign = Literal[1, -1]
@@ -37,6 +37,7 @@ class BusSettings(Section):
     parity: Literal["N", "E", "O"] = key("of an rtu bus", "N")
     stopbits: int = key("of an rtu bus", 1, 1, 2)
     bytesize: int = key("of an rtu bus", 8, 7, 8)
+    echo: bool = key("of RTU: the adapter sends back what it is sent", False)
     timeout_s: float = key("for one reply", 0.3, 0.01, 5)
     read_retries: int = advanced(
         "of reads, and of a move that the drive has not taken", 2, 0, 10

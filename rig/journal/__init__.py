@@ -3,6 +3,7 @@
 ``stop`` reads these before anything heavy is loaded, so nothing here loads pydantic.
 """
 
+from rig.faults import JournalError, Refused
 from rig.journal.device import (
     HOMED,
     IDENTIFIED,
@@ -12,7 +13,6 @@ from rig.journal.device import (
     ZEROED,
     DeviceRecord,
 )
-from rig.journal.errors import JournalError, Refused
 from rig.journal.lock import BusLock
 from rig.journal.run_folder import (
     JOURNAL,
