@@ -312,7 +312,7 @@ class ModbusDrive(Drive):
     def map(self) -> RegisterMap:
         """The registers of its family."""
         found: Any = self.axis.map  # or what a stop could read of one
-        return found  # type: ignore[no-any-return]  # of a Modbus drive
+        return found
 
     @property
     def counts_from_home(self) -> bool:  # type: ignore[override]  # of the map
