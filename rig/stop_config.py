@@ -172,7 +172,8 @@ def _map_of(
     if not path.is_file():
         names = [each.stem for each in MAP_FOLDER.glob("*.toml")]
         near = difflib.get_close_matches(path.stem, names, 1, NEAR_NAME)
-        faults.append(f"there is no map {name}" + f"; {near[0]} is tried" * bool(near))
+        tried = f"; {near[0]} is tried" if near else ""
+        faults.append(f"there is no map {name}{tried}")
         path = MAP_FOLDER / f"{near[0]}.toml" if near else path
     try:
         return map_of(_decoded(path.read_bytes()), path.parent, faults)

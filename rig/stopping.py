@@ -44,7 +44,7 @@ def main(words: Sequence[str]) -> int:
     path, given, rest = FILE, False, list(words)
     while rest:
         name, equals, value = rest.pop(0).partition("=")
-        if name.startswith("--c") and "--config".startswith(name):
+        if name[:1] == "-" and "config".startswith(name.lstrip("-") or "?"):
             value = value if equals else rest.pop(0) if rest else str(FILE)
         elif name.startswith("-") or given:
             _say(f"{name}: not an option of stop, and not read")
@@ -186,10 +186,10 @@ def _targets(path: pathlib.Path, given: bool) -> list[ArmedBus]:
             targets.append(ArmedBus(config.bus, config))
         else:
             lack = f"{path} names no bus"
-    except OSError as error:
-        lack = f"{path} cannot be read: {error.strerror or error}"
-        if isinstance(error, FileNotFoundError):
-            lack = f"there is no {path}" + " here" * (not given)
+    except FileNotFoundError:
+        lack = f"there is no {path}" + " here" * (not given)
+    except Exception as error:  # of the system, or of a file that nobody thought of
+        lack = f"{path} cannot be read: {getattr(error, 'strerror', None) or error}"
     if not lack:
         return targets
     every = [bus for file in armed_files() if (bus := _armed_bus(read_armed(file)))]
