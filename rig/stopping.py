@@ -35,6 +35,7 @@ ASK_S = 0.5  # for the holder to have told its drives
 END_S = 2.0  # more for one that has, to write its last lines and end
 KILLED_S = 0.5  # for the kernel to end a process that was killed
 REOPEN_S = 12.0  # until a gateway of one connection gives the next
+AGAIN_S = 0.5  # between two tries of that
 NOTHING = "NOTHING WAS STOPPED BY THIS COMMAND"
 LAST_RESORT = "Use the emergency stop"
 
@@ -253,22 +254,27 @@ def _stop_units(target: ArmedBus, stay: bool = False) -> list[UnitStop]:
         except (OSError, Refused):  # stop without the lock
             _say(f"{target.lock.where} is not free: its drives are stopped anyway")
         line, drives = make_drives(bus, axes, silence_s)
-        end = time.monotonic() + REOPEN_S * (target.holder is not None or target.moves)
+        stack.callback(line.close)
+        named = ", ".join(f"{axis.name} (unit {axis.unit})" for axis in axes)
+        _say(f"stopping {named} on {target.lock.where}")
+        again = target.holder is not None or target.moves
+        end = time.monotonic() + REOPEN_S * again
         while True:
             try:
                 line.open()
-                break
+                results = stop.stop_all(drives)
+                reached = any(each.acknowledged or each.standing for each in results)
+                if reached or time.monotonic() > end:
+                    break
+                _say("\n".join(map(str, results)))
             except BusError as error:
                 if time.monotonic() > end:
                     raise BusError(f"{NOTHING}: {error}", LAST_RESORT) from None
-                _say(f"{error}; it is tried again for {REOPEN_S:g} s. {LAST_RESORT}")
-            time.sleep(0.5)
-        with line:
-            results = stop.stop_all(drives)
-            named = ", ".join(f"{axis.name} (unit {axis.unit})" for axis in axes)
-            _say(f"stopping {named} on {target.lock.where}")
-            for text in stop.stay(drives, results, stop.stand_s(drives) * stay):
-                _say(f"WARNING: {text}, and was stopped again")
+                _say(f"{error}. {LAST_RESORT}")
+            _say("the connection may not be free yet: it is tried again")
+            time.sleep(AGAIN_S)
+        for text in stop.stay(drives, results, stop.stand_s(drives) * stay):
+            _say(f"WARNING: {text}, and was stopped again")
         if all(result.standing for result in results) and not lost:
             target.lock.stood()
         return results + lost

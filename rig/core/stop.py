@@ -102,6 +102,7 @@ def _verify(pairs: Pairs) -> None:
     while moving := [pair for pair in pairs if not pair[1].standing]:
         for drive, result in _responsive_first(moving):
             line = drive.line
+            result.acknowledged &= not line.doubts(result.unit)
             wait_s = line.quick_s if drive.axis.unit in line.silent else None
             try:
                 with line.urgent(wait_s):
@@ -109,8 +110,6 @@ def _verify(pairs: Pairs) -> None:
             except Exception as error:
                 result.detail = str(error)
                 continue
-            if drive.line.doubts(result.unit):
-                result.acknowledged = False
             _send([(drive, result)])
             last = before.get(result.unit)
             still = last is not None and abs(status.position - last) <= STILL_COUNTS

@@ -102,6 +102,11 @@ class Bus(Line):
         """Whether the adapter was seen to send back what it is sent."""
         return self._client is not None and bool(self._client.echo)
 
+    @property
+    def noise(self) -> str:
+        """What came last that was no reply, in hex."""
+        return "" if self._client is None else self._client.noise
+
     def doubts(self, unit: int) -> bool:
         """Whether its last acknowledgement may have been the request, sent back."""
         return self.echoes and unit in self._doubted

@@ -49,12 +49,6 @@ def rtu_reply(came: bytes, unit: int, function: int) -> bytes | None:
     return None
 
 
-def shown(came: bytes) -> str:
-    """Bytes in hex, those of a long message cut off."""
-    more = f" ... {len(came)} bytes" if len(came) > HEX_BYTES else ""
-    return came[:HEX_BYTES].hex(" ") + more
-
-
 class Wire:
     """One connection, opened once and kept."""
 
@@ -67,6 +61,7 @@ class Wire:
         self._is_socket = settings.transport != "rtu"
         self._number = time.time_ns() & 0xFFFF
         self._came = b""  # over TCP, and not looked at yet
+        self.noise = ""  # what came last that was no reply, in hex
 
     def open(self) -> None:
         """Connect, unless it is; OSError where that cannot be."""
@@ -140,19 +135,22 @@ class Wire:
             if reply is not None:
                 return reply
             if left <= 0.0:
+                if self.echo and came.startswith(frame):
+                    came = came[len(frame) :]
                 raise BusError(
-                    f"unit {unit}: no valid reply ({self._told(came, late, timeout_s)})"
+                    f"unit {unit}: no valid reply ({self._why(came, late, timeout_s)})"
                 )
         return b""
 
-    def _told(self, came: bytes, late: int, timeout_s: float) -> str:
+    def _why(self, came: bytes, late: int, timeout_s: float) -> str:
         """Why there is no reply, by all that came."""
         if late:
             return f"late by over {timeout_s:g} s, as others were: raise bus.timeout_s"
         if not came:
-            echo = ", and its adapter sends back what it is sent" if self.echo else ""
-            return f"silent for {timeout_s:g} s{echo}"
-        return f"what came is no reply: {shown(came)}"
+            return f"silent for {timeout_s:g} s"
+        more = f" ... {len(came)} bytes" if len(came) > HEX_BYTES else ""
+        self.noise = came[:HEX_BYTES].hex(" ") + more
+        return f"what came is no reply: {self.noise}"
 
     def _numbered_reply(self, unit: int) -> tuple[bytes | None, int]:
         """The reply to the last request, and how many replies to others it passed."""
@@ -162,7 +160,7 @@ class Wire:
             age = self._number - number & 0xFFFF
             if protocol or not 3 <= size <= 254 or age > OLDEST:
                 if self._came[0] not in FILLERS:  # no frame begins anywhere here
-                    text = f"what came is no reply: {shown(self._came)}"
+                    text = self._why(self._came, 0, 0.0)
                     self.close()
                     raise BusError(f"unit {unit}: no valid reply ({text})")
                 self._came = self._came[1:]
