@@ -14,30 +14,37 @@ if sys.argv[1:2] == ["stop"]:  # nothing may keep it from the drives
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that is closed meanwhile
     os.environ["JAXCAL_KERNELS_UNCHECKED"] = "1"  # it calls none
 
-from jaxcal.arguments import values_of
-from jaxcal.extras import install
-from rig.commands import make_parser
-from rig.faults import EXIT_BAD_INPUT, EXIT_FAULT, EXIT_INTERRUPTED, told
-from rig.journal.errors import JournalError
-
 # Looked for before any port opens; finding is quicker than importing.
-NEEDED = ("pydantic", "pymodbus")
+NEEDED = ("pydantic", "serial", "jinja2", "tomlkit")
 NUMBER = re.compile(r"[-+.0-9]+(?:[eE][-+]?[0-9]+)?")
-OTHERS = ("jinja2", "tomlkit")  # not by `stop`; the report is written last
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     argv = _ordered(sys.argv[1:] if argv is None else argv)
+    if argv[:1] == ["stop"] and not {"-h", "--help"} & {*argv}:
+        from rig import stopping
+
+        return stopping.main(argv[1:])
+    from jaxcal.arguments import values_of
+    from jaxcal.extras import install
+    from rig.commands import make_parser
+    from rig.faults import (
+        EXIT_BAD_INPUT,
+        EXIT_FAULT,
+        EXIT_INTERRUPTED,
+        JournalError,
+        told,
+    )
+
     args = make_parser(argv[0] if argv else None).parse_args(argv)
     command, code = args.command, EXIT_BAD_INPUT
     try:
-        for name in NEEDED + OTHERS * (command != "stop"):
+        for name in NEEDED:
             if importlib.util.find_spec(name) is None:
                 raise ModuleNotFoundError(
                     f"{command} needs {name}, which is not installed: {install('rig')}"
                 )
-        code = EXIT_FAULT if command == "stop" else EXIT_BAD_INPUT
         code = args.function(**values_of(args))
         return code
     except KeyboardInterrupt:

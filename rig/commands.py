@@ -433,9 +433,9 @@ def identify(given: DeviceOptions) -> int:
 
 def stop(*, config: ConfigPath | None = None) -> int:
     """quick-stop every drive now, and verify"""
-    from rig.stopping import stop_device
+    from rig import stopping  # as `rig.__main__` does, which loads nothing of this
 
-    return stop_device(config or FILE, config is not None)
+    return stopping.stop_device(config or FILE, config is not None)
 
 
 def check(file: ConfigPath | None = None, *, config: ConfigPath | None = None) -> int:

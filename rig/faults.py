@@ -8,15 +8,20 @@ from __future__ import annotations
 import pathlib
 import time
 
-from rig.journal.errors import JournalError
-from rig.journal.errors import Refused as Refused
-
 EXIT_OK = 0
 EXIT_RECALIBRATE = 1  # done, but the errors say: calibrate (again)
 EXIT_BAD_INPUT = 2
 EXIT_FAULT = 3  # stopped by a fault; `resume` goes on
 EXIT_PAUSED = 4  # paused by Ctrl-C; `resume` goes on
 EXIT_INTERRUPTED = 130
+
+
+class Refused(ValueError):
+    """The request makes no sense for this run; nothing was moved."""
+
+
+class JournalError(RuntimeError):
+    """The journal cannot be written, or is damaged."""
 
 
 class LimitError(Refused):

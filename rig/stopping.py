@@ -1,10 +1,12 @@
 """The command ``stop``: ask who moves the device, end them, stop every drive itself.
 
-The holder of a bus is asked first, before anything heavy is loaded. One that has not
-told its drives to stop ASK_S later, because it hangs or is suspended, is killed: the
-kernel frees the lock and the port. Then each drive is stopped and looked at from here.
-What a session left beside the lock when it armed is enough for that; a configuration
-file is read where nothing is armed. No signal ends this before the drives were told.
+The holder of a bus is asked first. One that has not told its drives to stop ASK_S
+later, because it hangs or is suspended, is killed: the kernel frees the lock and the
+port. Then each drive is stopped and looked at from here. What a session left beside the
+lock when it armed is enough for that, and so is what ``stop_config`` can read of the
+configuration file; each makes up for what the other lacks. No signal ends this before
+the drives were told. Nothing is loaded but the standard library, the lock, the drives
+and, of a serial port, pyserial.
 """
 
 from __future__ import annotations
@@ -14,42 +16,66 @@ import pathlib
 import signal
 import sys
 import time
-import tomllib
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from rig.faults import EXIT_FAULT, EXIT_OK, Fault, Refused
+from rig.drives import make_drives
+from rig.drives.line import BusError
+from rig.faults import EXIT_FAULT, EXIT_OK, Fault, Refused, told
 from rig.journal.lock import BusLock, armed_files, held_by, read_armed
+from rig.stop_config import Bus, StopConfig, read_file
+from rig.stop_config import read_armed as config_of
 
 if TYPE_CHECKING:
     from rig.core.stop import UnitStop
 
+FILE = pathlib.Path("rig.toml")  # without --config
 ASK_S = 0.5  # for the holder to have told its drives
 END_S = 2.0  # more for one that has, to write its last lines and end
 KILLED_S = 0.5  # for the kernel to end a process that was killed
+REOPEN_S = 12.0  # until a gateway of one connection gives the next
+AGAIN_S = 0.5  # between two tries of that
 NOTHING = "NOTHING WAS STOPPED BY THIS COMMAND"
 LAST_RESORT = "Use the emergency stop"
+
+
+def main(words: Sequence[str]) -> int:
+    """The command as it is typed; words that it does not know do not keep it."""
+    path, given, rest = FILE, False, list(words)
+    while rest:
+        name, equals, value = rest.pop(0).partition("=")
+        if name[:1] == "-" and "config".startswith(name.lstrip("-") or "?"):
+            value = value if equals else rest.pop(0) if rest else str(FILE)
+        elif name.startswith("-") or given:
+            _say(f"{name}: not an option of stop, and not read")
+            continue
+        else:
+            value = name + equals + value
+        path, given = pathlib.Path(value), True
+    try:
+        return stop_device(path, given)
+    except Exception as error:  # whatever it is, the exit code says that drives move
+        with contextlib.suppress(OSError, UnicodeError):
+            print(f"jaxcal-rig: {told(error)}", file=sys.stderr)
+        return EXIT_FAULT
 
 
 class ArmedBus:
     """One bus: its lock, and what of it was armed last."""
 
-    def __init__(self, bus: dict[str, Any]) -> None:
-        fields = {
-            "transport": "",
-            "host": "",
-            "port": 502,
-            "device": "",
-            "interface": "",
-        }
-        fields |= bus
-        where = fields["device"] or f"{fields['host']}:{fields['port']}"
-        settings: Any = SimpleNamespace(**fields, where=where)  # pydantic's are heavy
+    def __init__(self, bus: Bus, file: StopConfig | None = None) -> None:
+        settings: Any = bus
+        self.bus, self.file = bus, file
         self.lock = BusLock(settings)
         self.armed = read_armed(self.lock.armed_path)
         self.since = time.monotonic()
         self.holder: dict[str, Any] | None = None
+
+    @property
+    def moves(self) -> bool:
+        """A session armed it, and has not said that all stands."""
+        return self.armed is not None and not self.armed["standing"]
 
     def ask(self) -> None:
         """Tell the holder to stop."""
@@ -103,35 +129,24 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
 
     with Signals() as signals:
         signals.armed = True  # it takes seconds at most: a signal does not cut it short
-        targets, lack = _targets(path, given)
-        if not targets:
-            raise Fault(
-                f"{NOTHING}: {lack}, and no session of this user has armed a device. "
-                f"{LAST_RESORT}"
-            )
-        if lack:
-            _say(f"{lack}: stopping all that sessions of this user have armed")
+        targets = _targets(path, given)
         for target in targets:
             target.ask()
-        # While those asked have time.
-        from rig.core import stop  # noqa: F401
-        from rig.drives import modbus  # noqa: F401
-
         results: list[UnitStop] = []
-        faults: list[Fault] = []
+        faults: list[Exception] = []
         with ThreadPoolExecutor(len(targets)) as pool:
-            jobs = [pool.submit(_stop_units, target, path, True) for target in targets]
+            jobs = [pool.submit(_stop_units, target, True) for target in targets]
             for job in as_completed(jobs):
                 try:
                     results += job.result()
                     _say("\n".join(map(str, job.result())))
-                except Fault as error:
+                except Exception as error:  # of one bus: another is stopped
                     faults.append(error)
         _tell_others([target.lock.armed_path for target in targets])
         if len(faults) == len(jobs):
             raise faults[0]
         for fault in faults:
-            _say(str(fault))
+            _say(told(fault))
         good = all(result.acknowledged and result.standing for result in results)
         return EXIT_OK if good and not faults else EXIT_FAULT
 
@@ -147,27 +162,54 @@ def stop_run(run: pathlib.Path) -> list[UnitStop]:
     """
     for path in armed_files():
         armed = read_armed(path)
-        target = armed and ArmedBus(armed["bus"])
+        target = armed and _armed_bus(armed)
         if target:
             holder = target.lock.holder()
             if holder and holder.get("run") == str(run.resolve()):
                 target.ask()
-                return _stop_units(target, None)
+                return _stop_units(target)
     raise Fault(f"{NOTHING}: no session of this computer moves {run.name}")
 
 
-def _targets(path: pathlib.Path, given: bool) -> tuple[list[ArmedBus], str]:
-    """The buses to stop, and what is wrong with the file."""
+def _targets(path: pathlib.Path, given: bool) -> list[ArmedBus]:
+    """The buses to stop; what is wrong with the file is said.
+
+    Raises:
+        Fault: neither the file names one, nor has a session armed one.
+    """
+    targets: list[ArmedBus] = []
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-        return [ArmedBus(data["bus"])], ""
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        fault = f"{path} names no bus: {' '.join(str(error).split())}"
-        if isinstance(error, FileNotFoundError):
-            fault = f"there is no {path}" + " here" * (not given)
-    every = [armed for file in armed_files() if (armed := read_armed(file))]
-    moving = [armed for armed in every if not armed["standing"]]
-    return [ArmedBus(armed["bus"]) for armed in moving or every], fault
+        config = read_file(path)
+        lack = "; ".join(config.bus_faults)
+        for fault in config.faults:
+            _say(f"{path}: {fault}")
+        if config.bus:
+            targets.append(ArmedBus(config.bus, config))
+        else:
+            lack = f"{path} names no bus"
+    except FileNotFoundError:
+        lack = f"there is no {path}" + " here" * (not given)
+    except Exception as error:  # of the system, or of a file that nobody thought of
+        lack = f"{path} cannot be read: {getattr(error, 'strerror', None) or error}"
+    if not lack:
+        return targets
+    every = [bus for file in armed_files() if (bus := _armed_bus(read_armed(file)))]
+    known = [target.lock.path for target in targets]
+    more = [bus for bus in every if bus.moves and bus.lock.path not in known]
+    if not (targets or more or every):
+        raise Fault(
+            f"{NOTHING}: {lack}, and no session of this user has armed a device. "
+            f"{LAST_RESORT}"
+        )
+    if not targets or more:
+        _say(f"{lack}: stopping all that sessions of this user have armed")
+    return targets + more or every
+
+
+def _armed_bus(armed: dict[str, Any] | None) -> ArmedBus | None:
+    """The bus of what a session left; None where that says nothing of use."""
+    bus = armed and config_of(armed).bus
+    return ArmedBus(bus) if bus else None
 
 
 def _tell_others(stopped: list[pathlib.Path]) -> None:
@@ -176,7 +218,8 @@ def _tell_others(stopped: list[pathlib.Path]) -> None:
         armed = read_armed(path)
         if path in stopped or armed is None or armed["standing"]:
             continue
-        target = ArmedBus(armed["bus"])
+        if (target := _armed_bus(armed)) is None:
+            continue
         holder = target.lock.holder()
         device = f", {armed['device']}" if "device" in armed else ""
         _say(
@@ -196,82 +239,84 @@ def _say(text: str) -> None:
         sys.stdout = None  # nothing is left to be flushed at the end
 
 
-def _stop_units(
-    target: ArmedBus, path: pathlib.Path | None, stay: bool = False
-) -> list[UnitStop]:
+def _stop_units(target: ArmedBus, stay: bool = False) -> list[UnitStop]:
     """Stop the drives that were armed last, else those of the configuration file.
 
     Who was asked to is waited for first. ``stay``: look whether they stay, too.
     """
     from rig.core import stop
-    from rig.drives import make_drives
-    from rig.drives.line import BusError
 
     target.end()
-    settings, silence_s, axes = _drives(target.armed, path)
+    bus, silence_s, axes, lost = _drives(target)
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(target.lock.acquire("stop"))
         except (OSError, Refused):  # stop without the lock
             _say(f"{target.lock.where} is not free: its drives are stopped anyway")
-        line, drives = make_drives(settings, axes, silence_s)
-        try:
-            line.open()
-        except BusError as error:
-            raise BusError(f"{NOTHING}: {error}", LAST_RESORT) from None
-        with line:
-            results = stop.stop_all(drives)
-            named = ", ".join(f"{axis.name} (unit {axis.unit})" for axis in axes)
-            _say(f"stopping {named} on {target.lock.where}")
-            for text in stop.stay(drives, results, stop.stand_s(drives) * stay):
-                _say(f"WARNING: {text}, and was stopped again")
-        if all(result.standing for result in results):
+        line, drives = make_drives(bus, axes, silence_s)
+        stack.callback(line.close)
+        named = ", ".join(f"{axis.name} (unit {axis.unit})" for axis in axes)
+        _say(f"stopping {named} on {target.lock.where}")
+        again = target.holder is not None or target.moves
+        end = time.monotonic() + REOPEN_S * again
+        while True:
+            try:
+                line.open()
+                results = stop.stop_all(drives)
+                reached = any(each.acknowledged or each.standing for each in results)
+                if reached or time.monotonic() > end:
+                    break
+                _say("\n".join(map(str, results)))
+            except BusError as error:
+                if time.monotonic() > end:
+                    raise BusError(f"{NOTHING}: {error}", LAST_RESORT) from None
+                _say(f"{error}. {LAST_RESORT}")
+            _say("the connection may not be free yet: it is tried again")
+            time.sleep(AGAIN_S)
+        for text in stop.stay(drives, results, stop.stand_s(drives) * stay):
+            _say(f"WARNING: {text}, and was stopped again")
+        if all(result.standing for result in results) and not lost:
             target.lock.stood()
-        return results
+        return results + lost
 
 
-def _drives(
-    armed: dict[str, Any] | None, path: pathlib.Path | None
-) -> tuple[Any, float, list[Any]]:
-    """Bus, silence and axes: of what is armed, else of the file, else as armed last.
+def _drives(target: ArmedBus) -> tuple[Any, float, list[Any], list[UnitStop]]:
+    """Bus, silence, axes that can be stopped, and those that cannot: of what is armed,
+    else of the file, else as armed last. Each makes up for what the one before lacks.
 
     Raises:
-        Fault: neither can be read.
+        Fault: no axis can be stopped.
     """
-    faults: list[str] = []
-    moving = armed is not None and not armed["standing"]
-    for source in (armed, path) if moving else (path, armed):
-        if source is None:
-            continue
-        try:
-            drives = _read(source)
-        except Exception as error:  # left by another version; edited since
-            lost = f"what was armed cannot be read ({type(error).__name__}: {error})"
-            faults.append(str(error) if source is path else lost)
-            continue
-        if faults:
-            which = f"of {path}" if source is path else "that were armed last"
-            _say(f"{faults[0]}\nstopping the drives {which} instead")
-        return drives
-    raise Fault(f"{NOTHING}: {'; '.join(faults)}. {LAST_RESORT}")
+    from rig.core.stop import UnitStop
 
-
-def _read(source: dict[str, Any] | pathlib.Path) -> tuple[Any, float, list[Any]]:
-    """Bus, silence and axes, of what a session left or of a configuration file."""
-    from rig.config.axis import Axis
-    from rig.config.config import load_config
-    from rig.config.maps import parse_map
-    from rig.config.settings import BusSettings
-
-    if isinstance(source, pathlib.Path):
-        config = load_config(source)
-        return config.bus, config.silence_s, [*config.axes]
-    axes = [
-        Axis.unmoved(
-            drive["name"],
-            drive["unit"],
-            parse_map(drive["map"], "map", pathlib.Path(drive.get("folder", ""))),
-        )
-        for drive in source["drives"]
-    ]
-    return BusSettings.model_validate(source["bus"]), source["silence_s"], axes
+    armed = config_of(target.armed) if target.armed else None
+    if armed and armed.faults:
+        _say(f"what was armed cannot be read in full: {'; '.join(armed.faults)}")
+    order = (armed, target.file) if target.moves else (target.file, armed)
+    sources = [source for source in order if source is not None]
+    buses = [source.bus for source in sources if source.bus and not source.bus_faults]
+    bus: Any = buses[0] if buses else target.bus
+    axes: list[Any] = []
+    lost: dict[str, UnitStop] = {}
+    for source in sources:
+        first, units = not axes, [axis.unit for axis in axes]
+        axis: Any
+        for axis in source.axes:
+            if not first and axis.name not in lost:
+                continue
+            lost.pop(axis.name, None)
+            try:
+                if axis.unit not in units:
+                    make_drives(bus, [axis])
+                    axes.append(axis)
+            except Refused as error:
+                lost[axis.name] = UnitStop(axis.name, axis.unit, detail=str(error))
+        for name, unit in source.lost if first else ():
+            text = "how it is stopped cannot be read"
+            lost[name] = UnitStop(name, unit, detail=text)
+    if not axes:
+        faults = [fault for source in sources for fault in source.faults]
+        reason = "; ".join(faults) or "no axis is known, of the file or armed"
+        raise Fault(f"{NOTHING}: {reason}. {LAST_RESORT}")
+    silence_s = max(source.silence_s for source in sources)
+    return bus, silence_s, axes, [*lost.values()]

@@ -12,14 +12,14 @@ from pydantic import (
     model_validator,
 )
 
-from rig.config.maps import DriveMap, Units, encode, load_map
+from rig.config.maps import DriveMap, Units, load_map
 from rig.config.schema import Section, advanced, key
+from rig.registers import encode
 
 AXIS_NAMES = ("pitch", "yaw", "roll")  # of the device that `setup` begins with
 MOST_AXES = 6
 DEFAULT_ROTATES = {"pitch": "X", "yaw": "Z", "roll": "Y"}
 ROUNDING = 1e-9  # of a product that is a whole number of counts but for its last bits
-LOWEST, HIGHEST = -(2**31), 2**31 - 1
 
 Pulses = tuple[int, ...]  # (n,) in the order of the axes
 # Keys of a translation, and where their values are kept: in the unit of the axis.

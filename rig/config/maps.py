@@ -9,10 +9,9 @@ import contextlib
 import hashlib
 import json
 import pathlib
-import struct
 import tomllib
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     BeforeValidator,
@@ -22,58 +21,13 @@ from pydantic import (
     WithJsonSchema,
 )
 
+from rig import registers
 from rig.config.schema import Section, key, parse, read_text
+from rig.registers import FLAGS, Kind, Word, registers_in, word_of
+from rig.registers import decode as decode
+from rig.registers import encode as encode
 
 MAP_FOLDER = pathlib.Path(__file__).parent.parent / "maps"
-Kind = Literal["u16", "i16", "u32", "i32"]
-FORMATS: dict[Kind, str] = {
-    "u16": ">H",
-    "i16": ">h",
-    "u32": ">I",
-    "i32": ">i",
-}  # of struct
-VALUES = ("position", "speed", "accel", "decel", "timeout", "min", "max", "home")
-
-
-class Word(NamedTuple):
-    """What a frame has at one place: one or two registers."""
-
-    value: int | str  # a constant, or one of VALUES
-    kind: Kind = "u16"
-
-
-def encode(value: int, kind: Kind, word_order: str) -> list[int]:
-    """Registers of a value; ValueError where it does not fit the type."""
-    try:
-        data = struct.pack(FORMATS[kind], value)
-    except struct.error:
-        raise ValueError(f"{value} does not fit {kind}") from None
-    words = list(struct.unpack(f">{len(data) // 2}H", data))
-    return words if word_order == "big" else words[::-1]
-
-
-def decode(words: list[int], kind: Kind, word_order: str) -> int:
-    """Value of one or two registers."""
-    ordered = words if word_order == "big" else words[::-1]
-    return struct.unpack(FORMATS[kind], struct.pack(f">{len(words)}H", *ordered))[0]
-
-
-def registers_of(kind: Kind) -> int:
-    """Registers that a type takes."""
-    return struct.calcsize(FORMATS[kind]) // 2
-
-
-def _word(word: Any) -> Word:
-    if type(word) is int and 0 <= word <= 0xFFFF:
-        return Word(word)
-    name, _, kind = str(word).partition(":")
-    kinds: dict[str, Kind] = {form: form for form in FORMATS}
-    if isinstance(word, str) and name in VALUES and kind in kinds:
-        return Word(name, kinds[kind])
-    raise ValueError(
-        f"must be 0..65535 or NAME:TYPE with NAME of {', '.join(VALUES)} and TYPE of "
-        f"{', '.join(FORMATS)}, got {word!r}"
-    )
 
 
 def _codes(names: Any) -> Any:
@@ -84,22 +38,18 @@ def _codes(names: Any) -> Any:
 
 
 Register = Annotated[int, Field(ge=0, le=0xFFFF)]
-Bits = tuple[Annotated[int, Field(ge=0, le=31)], ...]
-FrameWord = Annotated[Word, PlainValidator(_word), WithJsonSchema({"type": "string"})]
+BitNumbers = tuple[Annotated[int, Field(ge=0, le=31)], ...]
+FrameWord = Annotated[Word, PlainValidator(word_of), WithJsonSchema({"type": "string"})]
 Names = Annotated[
     dict[int, str], BeforeValidator(_codes), WithJsonSchema({"type": "object"})
 ]
 
 
-class Read(Section):
+class Read(Section, registers.Value):
     """A value to read: one or two registers."""
 
     address: Register
     type: Kind = "u16"
-
-    @property
-    def count(self) -> int:
-        return registers_of(self.type)
 
 
 class Position(Read):
@@ -114,38 +64,24 @@ class Alarm(Read):
     names: Names = key("of codes, such as 0x0001", {})
 
 
-class Predicate(Section):
+class Predicate(Section, registers.Bits):
     """Bits of the status word: every ``set`` bit is 1 and every ``clear`` bit is 0."""
 
-    set: Bits = ()
-    clear: Bits = ()
-
-    def holds(self, word: int) -> bool:
-        """Whether a status word satisfies it."""
-        return all(word >> b & 1 for b in self.set) and not any(
-            word >> b & 1 for b in self.clear
-        )
+    set: BitNumbers = ()
+    clear: BitNumbers = ()
 
     def broken_rules(self) -> Iterator[str]:
         if not self.set and not self.clear:
             yield "set: name at least one bit in set or clear"
 
 
-FLAGS = ("enabled", "done", "moving", "fault")
-
-
-class StatusWord(Read):
+class StatusWord(Read, registers.Flags):
     """The status word and what its bits say."""
 
     done: Predicate
     moving: Predicate
     fault: Predicate
     enabled: Predicate | None = None  # where no bit says it, the drive always is
-
-    def flags(self, word: int) -> dict[str, bool]:
-        """Which of FLAGS a word has."""
-        named = {name: getattr(self, name) for name in FLAGS}
-        return {name: not bits or bits.holds(word) for name, bits in named.items()}
 
     def broken_rules(self) -> Iterator[str]:
         for name in FLAGS:
@@ -154,33 +90,14 @@ class StatusWord(Read):
                 yield f"{name}: must name bits 0..{16 * self.count - 1} of {self.type}"
 
 
-class Write(Section):
+class Write(Section, registers.Frame):
     """One frame to write: constants, and values by name such as ``position:i32``."""
 
     address: Register
     words: Annotated[tuple[FrameWord, ...], Field(min_length=1)]
     function: Literal[6, 16] = Field(
-        default_factory=lambda made: 6 if _registers(made["words"]) == 1 else 16
+        default_factory=lambda made: 6 if registers_in(made["words"]) == 1 else 16
     )
-
-    @property
-    def count(self) -> int:
-        return _registers(self.words)
-
-    def registers(self, word_order: str, **values: int) -> list[int]:
-        """What the frame holds, with the values that its words name."""
-        found = []
-        for value, kind in self.words:
-            number = values[value] if isinstance(value, str) else value
-            found += encode(number, kind, word_order)
-        return found
-
-    def places(self) -> Iterator[tuple[int, Word]]:
-        """Every word with its address."""
-        address = self.address
-        for word in self.words:
-            yield address, word
-            address += registers_of(word.kind)
 
     def broken_rules(self) -> Iterator[str]:
         if self.function == 6 and self.count != 1:
@@ -189,19 +106,10 @@ class Write(Section):
             yield f"words: {self.count} registers from {self.address} do not fit"
 
 
-def _registers(words: tuple[Word, ...]) -> int:
-    return sum(registers_of(word.kind) for word in words)
-
-
-class Writes(Section):
+class Writes(Section, registers.Frames):
     """Frames that are written one after another."""
 
     write: Annotated[tuple[Write, ...], Field(min_length=1)]
-
-    def place_of(self, name: str) -> tuple[int, Kind] | None:
-        """Address and type of a named value, or None where no frame holds it."""
-        places = (place for frame in self.write for place in frame.places())
-        return next(((a, w.kind) for a, w in places if w.value == name), None)
 
 
 class Trigger(Section):

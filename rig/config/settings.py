@@ -8,8 +8,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from rig.config.axis import Range
-from rig.config.maps import Kind, registers_of
 from rig.config.schema import Section, advanced, key
+from rig.registers import Kind, registers_of
+from rig.stop_config import NETWORK, where_of
 
 Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
 Sign = Literal[1, -1]
@@ -17,9 +18,6 @@ Column = Annotated[int, Field(ge=0, le=200)]
 Angle = Annotated[float, Field(ge=-360, le=360)]
 
 # key(what it means, default (... where required), lowest, highest)
-
-
-NETWORK = ("tcp", "rtu_tcp")  # transports that have a host
 
 
 class BusSettings(Section):
@@ -37,6 +35,7 @@ class BusSettings(Section):
     parity: Literal["N", "E", "O"] = key("of an rtu bus", "N")
     stopbits: int = key("of an rtu bus", 1, 1, 2)
     bytesize: int = key("of an rtu bus", 8, 7, 8)
+    echo: bool = key("of RTU: the adapter sends back what it is sent", False)
     timeout_s: float = key("for one reply", 0.3, 0.01, 5)
     read_retries: int = advanced(
         "of reads, and of a move that the drive has not taken", 2, 0, 10
@@ -44,9 +43,7 @@ class BusSettings(Section):
 
     @property
     def where(self) -> str:
-        if self.transport not in NETWORK:
-            return f"{self.device} at {self.baudrate} baud"
-        return f"{self.host}:{self.port} ({self.transport})"
+        return where_of(self)
 
     def broken_rules(self) -> Iterator[str]:
         required = "host" if self.transport in NETWORK else "device"

@@ -20,6 +20,7 @@ from rig.config.axis import Pulses
 from rig.config.config import RigConfig
 from rig.core.proof import Proof, Turns, slopes
 from rig.core.stop import Stopper
+from rig.core.stop_distance import stop_distances
 from rig.drives import Drive, make_drives
 from rig.drives.drive import Status
 from rig.drives.line import BusError
@@ -237,6 +238,7 @@ class Device:
         turns, checked = Turns.of(record), not record.missing(config, SIGN_CHECKED)
         gains = turns.gains if turns and checked else None
         self.proof = Proof(config.axes, self.geometry, checked, simulated, gains)
+        self.proof.stops = stop_distances(record, config.axes)
         self.shown = False  # each axis has turned the phone as `axes` saw it
         self.paces: dict[str, Pace] = {}  # by axis
         self.last_move: tuple[str, Pulses, Pulses] | None = None  # label, from, to

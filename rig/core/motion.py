@@ -61,7 +61,7 @@ def _piece(device: Device, goal: Pulses, label: str) -> bool:
         end = config.to_pulses(config.to_deg(here) + way / steps)
     end = proof.begin(device.imu, attitude, here, end)
     for index, drive in enumerate(device.drives):
-        drive.axis = proof.paced(index, end[index] - here[index])
+        drive.axis = proof.paced(index, end[index] - here[index], end[index])
     device.untrack()  # until it arrives
     if end != here:
         device.last_move = label, here, end

@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from rig.config import RigConfig
 from rig.config.axis import Axis, Pulses
 from rig.config.settings import ImuSettings, ReadingsSettings
+from rig.core.stop_distance import StopDistance
 from rig.faults import MotionFault, TurnedTooFar
 from rig.journal import SIGN_CHECKED, DeviceRecord
 from rig.readings.attitude import Array, matrix_to_euler
@@ -220,6 +221,8 @@ class Proof:
         ]
         self._paced = not simulated  # what is not real need not be slow
         self.ceiling_deg_s: float | None = None  # of the speed of every axis
+        self.stop_proved = False  # once, so that it may be tried at the ceiling
+        self.stops: dict[str, StopDistance] = {}  # of the axes of which it is known
         self._near: tuple[Array, float] | None = None
         self._start: Pulses | None = None  # where the unproved axes began
         self._unit_seen = False  # whether the phone's is proved was looked at
@@ -285,10 +288,18 @@ class Proof:
         self._before, self._heading = attitude, (imu.connections, imu.world)
         return goal
 
-    def paced(self, index: int, pulses: int) -> Axis:
-        """An axis at the speed at which it may move by so many pulses."""
+    def paced(self, index: int, pulses: int, end: int | None = None) -> Axis:
+        """An axis at the speed at which it may move by so many pulses, to ``end``."""
         reach = self.reaches[index]
-        axis = reach.paced(pulses) if self._paced else reach.axis
+        swift = self.stop_proved and self.ceiling_deg_s is not None
+        slow = self._paced and not swift
+        axis = reach.paced(pulses) if slow else reach.axis
+        stop = self.stops.get(axis.name) if self._paced else None
+        if stop and pulses and end is not None:
+            limit = axis.max_pulses if pulses > 0 else axis.min_pulses
+            room = axis.to_deg(limit - end) * math.copysign(1.0, axis.to_deg(pulses))
+            if (speed := stop.fastest(axis, room)) < axis.speed_deg_s:
+                axis = slowed(axis, speed)
         return slowed(axis, self.ceiling_deg_s) if self.ceiling_deg_s else axis
 
     def grows(self, here: Pulses, end: Pulses) -> bool:

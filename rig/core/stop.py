@@ -98,10 +98,11 @@ def _verify(pairs: Pairs) -> None:
     """Poll until each stands; one that answers again is told to stop once more."""
     begun = time.monotonic()
     end = begun + VERIFY_S
-    before: dict[str, int] = {}
+    before: dict[int, int] = {}
     while moving := [pair for pair in pairs if not pair[1].standing]:
         for drive, result in _responsive_first(moving):
             line = drive.line
+            result.acknowledged &= not line.doubts(result.unit)
             wait_s = line.quick_s if drive.axis.unit in line.silent else None
             try:
                 with line.urgent(wait_s):
@@ -110,10 +111,10 @@ def _verify(pairs: Pairs) -> None:
                 result.detail = str(error)
                 continue
             _send([(drive, result)])
-            last = before.get(result.axis)
+            last = before.get(result.unit)
             still = last is not None and abs(status.position - last) <= STILL_COUNTS
             result.standing = still and not status.moving
-            before[result.axis] = result.position = status.position
+            before[result.unit] = result.position = status.position
             if result.standing and result.acknowledged:
                 gone = time.monotonic() - begun
                 late = f"it went on for {gone:.1f} s" * (gone > WENT_ON_S)

@@ -9,14 +9,16 @@ from __future__ import annotations
 import importlib
 import importlib.util
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rig.config.axis import Axis
-from rig.config.maps import DriveMap
-from rig.config.settings import BusSettings
 from rig.drives.drive import ABSTRACT, Drive
 from rig.drives.line import Line
 from rig.faults import Refused
+
+if TYPE_CHECKING:
+    from rig.config.axis import Axis
+    from rig.config.maps import DriveMap
+    from rig.config.settings import BusSettings
 
 KINDS = {
     "modbus": "rig.drives.modbus:ModbusDrive",

@@ -11,11 +11,13 @@ import contextlib
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-from rig.config.axis import Axis
 from rig.drives.line import BusError, Line
 from rig.faults import LimitError, MotionFault
+
+if TYPE_CHECKING:
+    from rig.config.axis import Axis
 
 POLL_S = 0.05
 START_S = 0.2  # a drive that has taken a move shows it within this time

@@ -14,11 +14,13 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rig.config.axis import Axis
 from rig.drives.drive import Drive, Look
 from rig.drives.line import BusError, Line, Refusal
+
+if TYPE_CHECKING:
+    from rig.config.axis import Axis
 
 TRAVEL = ("error:15", "error:3")  # GRBL: the target leaves the machine's travel
 STILL_S = 0.1  # Marlin does not say whether it moves: so long no step

@@ -10,10 +10,12 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from rig.config.settings import BusSettings
 from rig.faults import Fault
+
+if TYPE_CHECKING:
+    from rig.config.settings import BusSettings
 
 QUICK_S = 0.05  # for a reply to a stop in its first round, besides the frames' time
 
@@ -25,13 +27,15 @@ class BusError(Fault):
 
     refused = False  # the drive answered that it does not
     out_of_reach = False  # because it cannot go there
+    lost = False  # there is no connection
 
     def __init__(
         self,
         text: str,
         advice: str = "Check the unit's power, cable and id, and the line's settings",
+        lost: bool = False,
     ) -> None:
-        self.advice = advice
+        self.advice, self.lost = advice, lost
         super().__init__(text)
 
 
@@ -84,6 +88,10 @@ class Line:
 
     def stop_at_once(self, drives: Sequence[Any]) -> None:
         """Send it, where there is one; each gets its own stop as well."""
+
+    def doubts(self, unit: int) -> bool:
+        """Whether what a unit acknowledged last was perhaps not acknowledged."""
+        return False
 
     # Of all of them
 

@@ -1,31 +1,38 @@
 """Modbus: the line, and drives by their register maps.
 
-pymodbus does the framing. What it leaves to its caller is done here: exception replies
-are errors, replies are checked against their request, the silence between frames is
-kept, reads are retried, and a motion write is sent exactly once. After any failed
-exchange the line is emptied (or the connection opened again). RTU frames bear no
-number, so a reply that comes later still could be taken for the answer to the next
-request: a unit that owes one is asked for another number of registers first, until what
-it answers can only be the answer to that.
+``wire`` does the framing. Here exception replies are errors, replies are checked
+against their request, the silence between frames is kept, reads are retried, and a
+motion write is sent exactly once. RTU frames bear no number, so a reply that comes late
+could be taken for the answer to the next request: after a failed exchange the line is
+emptied, and a unit that owes a reply is asked for another number of registers first,
+until what it answers can only be the answer to that. The connection is kept.
 """
 
 from __future__ import annotations
 
 import contextlib
-import logging
 import math
 import os
+import struct
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rig.config.axis import HIGHEST, LOWEST, Axis
-from rig.config.maps import Read, RegisterMap, Writes, decode
-from rig.config.settings import BusSettings, ReadingRegister
 from rig.drives.drive import Drive, Look
 from rig.drives.line import BusError, Line
+from rig.drives.wire import Wire
+from rig.registers import HIGHEST, LOWEST, Frames, Value, decode
 
-METHODS = {3: "read_holding_registers", 6: "write_register", 16: "write_registers"}
+if TYPE_CHECKING:
+    from rig.config.axis import Axis
+    from rig.config.maps import RegisterMap
+    from rig.config.settings import BusSettings, ReadingRegister
+
+EXCEPTIONS = {
+    1: "illegal function", 2: "illegal address", 3: "illegal value",
+    4: "device failure", 5: "acknowledge", 6: "device busy", 7: "negative acknowledge",
+    8: "memory parity error", 10: "gateway path unavailable", 11: "gateway no response",
+}  # fmt: skip
 TURNAROUND_S = 0.05  # for the units to act on a broadcast, which none answers
 GATEWAY_CODES = (10, 11)  # the unit behind the gateway is silent
 PASSING = (5, 6, 8, 10, 11)  # exceptions: acknowledge, busy, CRC; silence at a gateway
@@ -39,15 +46,10 @@ class Rejected(BusError):
     """The drive answered with an exception."""
 
     def __init__(self, unit: int, code: int, address: int) -> None:
-        from pymodbus.constants import ExcCodes
-
         self.code = code
         self.refused = code not in PASSING
         self.out_of_reach = code in OUT_OF_REACH
-        name = next(
-            (exception.name for exception in ExcCodes if exception == code), "unknown"
-        )
-        name = name.lower().replace("_", " ")
+        name = EXCEPTIONS.get(code, "unknown")
         super().__init__(
             f"unit {unit} answered exception {code} ({name}) at 0x{address:04X}",
             "See its manual, and check that the axis's map is that of this drive",
@@ -74,32 +76,40 @@ class Bus(Line):
         # when it was asked; and an address that was read well.
         self._owed: dict[int, list[tuple[int, float]]] = {}
         self._readable: dict[int, int] = {}
-        self._client: Any = None
-
-    def _make_client(self) -> Any:
-        from pymodbus import FramerType
-        from pymodbus.client import ModbusSerialClient, ModbusTcpClient
-
-        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
-        s = self.settings
-        how: dict[str, Any] = {"timeout": s.timeout_s, "retries": 0}
-        how["framer"] = FramerType.SOCKET if s.transport == "tcp" else FramerType.RTU
-        if s.transport != "rtu":
-            return ModbusTcpClient(s.host, port=s.port, **how)
-        line = s.model_dump(include={"baudrate", "parity", "stopbits", "bytesize"})
-        return ModbusSerialClient(s.device, **line, **how)
+        self._client: Wire | None = None
+        self._doubted: set[int] = set()  # whose acknowledgement may be an echo
 
     def connect(self) -> None:
-        self._client = self._client or self._make_client()
-        if not self._client.connect():
-            why, advice = _why_closed(self.settings)
-            raise BusError(f"cannot open {self.settings.where}: {why}", advice)
+        self._client = self._client or Wire(self.settings)
+        try:
+            self._client.open()
+        except ModuleNotFoundError as error:
+            why = f"a serial port needs {error.name}, which is not installed"
+            raise BusError(why, "Install pyserial", lost=True) from None
+        except Exception as error:  # pyserial lets termios' own errors out
+            why, advice = _why_closed(self.settings, error)
+            text = f"cannot open {self.settings.where}: {why}"
+            raise BusError(text, advice, lost=True) from None
 
     def close(self) -> None:
         with self._lock:
             if self._client is not None:
                 self._client.close()
                 self._client = None
+
+    @property
+    def echoes(self) -> bool:
+        """Whether the adapter was seen to send back what it is sent."""
+        return self._client is not None and bool(self._client.echo)
+
+    @property
+    def noise(self) -> str:
+        """What came last that was no reply, in hex."""
+        return "" if self._client is None else self._client.noise
+
+    def doubts(self, unit: int) -> bool:
+        """Whether its last acknowledgement may have been the request, sent back."""
+        return self.echoes and unit in self._doubted
 
     @property
     def quick_s(self) -> float:
@@ -156,19 +166,26 @@ class Bus(Line):
         self.tell(unit, address=address, words=words)
         if not self._urgent:  # an acknowledgement of a stop tells of a stop, also late
             self._catch_up(unit, self._readable.get(unit))
-        reply = self._exchange(function, unit, address, words)
-        echoed = (
-            list(reply.registers) == words
-            if function == 6
-            else reply.count == len(words)
-        )
-        if not echoed or reply.address != address:
+        data = struct.pack(f">{len(words)}H", *words)
+        head = struct.pack(">H", address)
+        if function == 16:
+            head += struct.pack(">H", len(words))
+            data = bytes([len(data)]) + data
+        unsure = function == 6 and (self._client is None or self._client.echo is None)
+        reply = self._exchange(function, unit, head + data, address, owed=0)
+        (self._doubted.add if unsure else self._doubted.discard)(unit)
+        if reply != (head if function == 16 else head + data):
             self._resynchronise(unit, 0)
             raise BusError(f"unit {unit}: the reply to a write does not echo it")
 
     def _read(self, unit: int, address: int, count: int) -> list[int]:
         """The registers of one reply, of any number."""
-        words = list(self._exchange(3, unit, address, count).registers)
+        request = struct.pack(">HH", address, count)
+        reply = self._exchange(3, unit, request, address, owed=count)
+        if not reply or len(reply) != 1 + reply[0] or reply[0] % 2:
+            self._resynchronise(unit, count)
+            raise BusError(f"unit {unit}: the reply to a read has no whole registers")
+        words = [*struct.unpack(f">{reply[0] // 2}H", reply[1:])]
         # Another length: an earlier request's reply; this one's may follow.
         if len(words) != count:
             self._resynchronise(unit, count)
@@ -213,91 +230,69 @@ class Bus(Line):
     def broadcast(self, address: int, function: int, words: list[int]) -> None:
         """Write registers of every unit on a serial line; no unit answers."""
         self.tell(0, address=address, words=words)
+        data = struct.pack(f">{len(words)}H", *words)
+        more = struct.pack(">HB", len(words), len(data)) if function == 16 else b""
         with self._lock:
-            self._send(function, 0, address, words, no_response_expected=True)
+            request = struct.pack(">H", address) + more + data
+            self._send(function, 0, request, answered=False)
             self._quiet_until += TURNAROUND_S
 
-    def _exchange(self, function: int, unit: int, address: int, asked: Any) -> Any:
-        """The reply to one request, for a number of registers or with words to write.
+    def _exchange(
+        self, function: int, unit: int, request: bytes, address: int, owed: int
+    ) -> bytes:
+        """The data of the reply to one request.
 
-        Where none is valid, the line is emptied before BusError is raised.
+        Where none is valid, the line is emptied before BusError is raised; a reply of
+        ``owed`` registers may still come.
         """
         with self._lock:
             if not self._urgent:
                 self.check()  # holding the lock: nothing is sent after another's stop
             self.silent.add(unit)
             try:
-                reply = self._send(function, unit, address, asked)
-                if reply is None or reply.dev_id != unit:
-                    raise BusError(f"unit {unit}: another unit replied")
-                code = reply.exception_code if reply.isError() else 0
-                if code not in GATEWAY_CODES:
-                    self.silent.discard(unit)
-                if code:
-                    raise Rejected(unit, code, address)
-                if reply.function_code != function:
-                    other = reply.function_code
+                reply = self._send(function, unit, request)
+                if reply[0] & 0x7F != function:
+                    other = reply[0]
                     raise BusError(f"unit {unit}: the reply is of function {other}")
-            except Rejected:
-                raise  # a refusal is a whole reply
             except BusError:
-                self._resynchronise(unit, asked if function == 3 else 0)
+                self._resynchronise(unit, owed)
                 raise
-            return reply
+            code = reply[1] if reply[0] & 0x80 and len(reply) > 1 else 0
+            if code not in GATEWAY_CODES:
+                self.silent.discard(unit)
+            if code:
+                raise Rejected(unit, code, address)  # a refusal is a whole reply
+            return reply[1:]
 
     def _send(
-        self, function: int, unit: int, address: int, asked: Any, **more: Any
-    ) -> Any:
-        if self._client is None:
-            self.open()
-        if function == 3:
-            more["count"] = asked
-        else:
-            more |= {"value": asked[0]} if function == 6 else {"values": asked}
+        self, function: int, unit: int, data: bytes, answered: bool = True
+    ) -> bytes:
+        """The PDU of the reply to a request that is sent once."""
         if (silent_s := self._quiet_until - time.monotonic()) > 0.0:
             time.sleep(silent_s)  # sleep(0) takes .1 ms as well
+        self.open()  # connecting, where it is lost, may take as long as configured
+        assert self._client is not None
+        pdu = bytes([function]) + data
         try:
-            # Connecting, where it is lost, may take as long as configured.
-            self._client.comm_params.timeout_connect = self.settings.timeout_s
-            if not self._client.connect():
-                raise ConnectionError("cannot connect")
-            self._client.comm_params.timeout_connect = self._timeout_s
-            send = getattr(self._client, METHODS[function])
-            return send(address, device_id=unit, **more)
-        except Exception as error:
-            # pymodbus lets struct, index and socket errors of mangled frames out.
-            text = " ".join(f"{type(error).__name__}: {error}".split())
-            if "No response" in text:
-                text = f"silent for {self._timeout_s:g} s"
-            raise BusError(f"unit {unit}: no valid reply ({text})") from None
+            return self._client.exchange(unit, pdu, self._timeout_s, answered)
         finally:
             self._quiet_until = time.monotonic() + self.silence_s
 
     def _resynchronise(self, unit: int, owed: int) -> None:
-        """Empty the line; a reply of ``owed`` registers of the unit may still come."""
+        """Empty an RTU line; a reply of ``owed`` registers may still come."""
         with self._lock:
-            if self._client is None:
+            if self._client is None or self.settings.transport == "tcp":
                 return
-            if self.settings.transport != "tcp":
-                replies_owed = self._owed.setdefault(unit, [])
-                replies_owed.append((owed, time.monotonic()))
-            port = self._client.socket
-            if self.settings.transport != "rtu" or port is None:
-                self._client.close()  # the next request connects again
-                return
+            self._owed.setdefault(unit, []).append((owed, time.monotonic()))
             gap = max(0.02, 20 * 11.0 / self.settings.baudrate, self.silence_s)
             end = time.monotonic() + 2 * self._timeout_s
-            try:
-                while time.monotonic() < end:
-                    time.sleep(gap)
-                    if not port.in_waiting:
-                        return
-                    port.reset_input_buffer()
-            except OSError:
-                self._client.close()
+            while self._client.socket is not None and time.monotonic() < end:
+                time.sleep(gap)
+                if not self._client.pending():
+                    return
 
 
-def _why_closed(settings: BusSettings) -> tuple[str, str]:
+def _why_closed(settings: BusSettings, error: Exception) -> tuple[str, str]:
     """The reason, and what to do."""
     if settings.transport != "rtu":
         why = "nothing answers there, or all its connections are taken"
@@ -306,6 +301,8 @@ def _why_closed(settings: BusSettings) -> tuple[str, str]:
         return "there is no such port", "Plug in the adapter, or correct bus.device"
     if not os.access(settings.device, os.R_OK | os.W_OK):
         return "this user may not open it", "Join its group, often dialout"
+    if isinstance(error, ValueError):  # a line format that the port does not know
+        return str(error), "Correct [bus]"
     return "held by another program", "Close that program"
 
 
@@ -319,8 +316,7 @@ class ModbusDrive(Drive):
     @property
     def map(self) -> RegisterMap:
         """The registers of its family."""
-        found = self.axis.map
-        assert isinstance(found, RegisterMap)
+        found: Any = self.axis.map  # or what a stop could read of one
         return found
 
     @property
@@ -438,7 +434,7 @@ class ModbusDrive(Drive):
         watch = self.map.comm_timeout
         assert watch is not None  # the map has one, or it is not asked
         place = watch.place_of("timeout") or (watch.write[0].address, "u16")
-        return self.read(Read(address=place[0], type=place[1]))
+        return self.read(Value(address=place[0], type=place[1]))
 
     def set_watch(self, counts: int) -> None:
         self.write(self.map.comm_timeout, timeout=counts)
@@ -447,7 +443,7 @@ class ModbusDrive(Drive):
         assert self.map.comm_timeout is not None
         return max(1, math.ceil(seconds * self.map.comm_timeout.per_s - 1e-9))
 
-    def write(self, table: Writes | None, **values: int) -> None:
+    def write(self, table: Frames | None, **values: int) -> None:
         """Send the frames of one of the map's tables; none where the map lacks it.
 
         What moves the drive, or stops it, is sent once; the rest may be written twice,
@@ -464,12 +460,12 @@ class ModbusDrive(Drive):
                 if not tries_left or error.refused:
                     raise
 
-    def _write(self, table: Writes | None, values: dict[str, int]) -> None:
+    def _write(self, table: Frames | None, values: dict[str, int]) -> None:
         for frame in table.write if table else ():
             words = frame.registers(self.map.word_order, **values)
             self.line.write(self.axis.unit, frame.address, frame.function, words)
 
-    def read(self, read: Read, retries: int | None = None) -> int:
+    def read(self, read: Value, retries: int | None = None) -> int:
         """The value of one or two registers."""
         order = self.map.word_order
         return decoded(self.line, read, self.axis.unit, order, retries)
@@ -477,7 +473,7 @@ class ModbusDrive(Drive):
 
 def decoded(
     bus: Bus,
-    read: Read | ReadingRegister,
+    read: Value | ReadingRegister,
     unit: int,
     word_order: str,
     retries: int | None = None,

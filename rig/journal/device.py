@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from jaxcal.files import write_text
-from rig.journal.errors import Refused
+from rig.faults import Refused
 
 if TYPE_CHECKING:
     from rig.config import RigConfig

@@ -22,7 +22,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from jaxcal.jsonlines import flock, until
-from rig.journal.errors import Refused
+from rig.faults import Refused
 
 if TYPE_CHECKING:
     from rig.config.config import RigConfig

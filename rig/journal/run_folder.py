@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaxcal.files import write_text
 from jaxcal.jsonlines import DamagedError, JsonLines, Record, flock, read_records
-from rig.journal.errors import JournalError
+from rig.faults import JournalError
 from rig.journal.lock import PATIENCE_S
 
 if TYPE_CHECKING:

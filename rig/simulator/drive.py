@@ -7,17 +7,8 @@ import random
 import time
 
 from rig.config.axis import Axis
-from rig.config.maps import (
-    FLAGS,
-    VALUES,
-    Read,
-    RegisterMap,
-    Write,
-    Writes,
-    decode,
-    encode,
-    registers_of,
-)
+from rig.config.maps import Read, RegisterMap, Write, Writes
+from rig.registers import FLAGS, VALUES, decode, encode, registers_of
 from rig.simulator.faults import FaultInjector
 from rig.simulator.truth import Truth
 

@@ -1,7 +1,6 @@
 """A Modbus server for the simulated drives: TCP, RTU over TCP, RTU on a pty.
 
-Functions 3, 6 and 16. Written from the protocol's text, so that client and server do
-not share a library's mistakes.
+Functions 3, 6 and 16, written from the protocol's text.
 """
 
 from __future__ import annotations
@@ -17,20 +16,11 @@ import time
 import tty
 from collections.abc import Callable
 
+from rig.drives.wire import crc16
 from rig.simulator.drive import DriveException, SimDrive
 from rig.simulator.faults import FaultInjector
 
 TARGET_SILENT = 11  # what a gateway answers for a unit that does not
-
-
-def crc16(data: bytes) -> bytes:
-    """The two CRC bytes of an RTU frame, low byte first."""
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ 0xA001 if crc & 1 else crc >> 1
-    return struct.pack("<H", crc)
 
 
 class ModbusServer:

@@ -12,9 +12,14 @@ from rig.core.device import Device
 from rig.core.record_check import ZeroRecord, check_drives
 from rig.core.session import Beside, Check, open_device, take_zero
 from rig.faults import EXIT_FAULT, PlanOnly, Refused, ending
-from rig.journal import DeviceRecord, JournalError, Record, RunFolder
+from rig.journal import STOP_PROVED, DeviceRecord, JournalError, Record, RunFolder
 from rig.model import model_of
 from rig.signals import Signals
+
+ONE_SPEED = (
+    "the stop was proved at one speed alone, by an earlier version: the axes move "
+    "slowly near their limits. `jaxcal-rig axes` proves it at two"
+)
 
 
 class Run(RunFolder):
@@ -80,6 +85,10 @@ class Run(RunFolder):
             reset_alarms=self.reset_alarms,
             predict=None if self.model is None else self.model.predict,
         ) as device:  # fmt: skip
+            if device.proof.stops and not (self.record.state(STOP_PROVED) or {}).get(
+                "distances"
+            ):
+                self.say(ONE_SPEED)
             yield device
 
     @contextlib.contextmanager

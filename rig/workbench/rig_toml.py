@@ -87,7 +87,7 @@ def new_text(
     """
     import jinja2
 
-    keys = OF_LINE.get(bus.transport, ("host", "port"))
+    keys = OF_LINE.get(bus.transport, ("host", "port")) + ("echo",) * bus.echo
     text = pathlib.Path(__file__).with_name("new.toml.j2").read_text(encoding="utf-8")
     template = jinja2.Template(
         text,

@@ -45,6 +45,7 @@ from harness import (
 from rig.config import RigConfig, parse_config
 from rig.core import motion
 from rig.drives.modbus import Bus, ModbusDrive
+from rig.faults import Refused
 from rig.journal import (
     HOMED,
     IDENTIFIED,
@@ -53,7 +54,6 @@ from rig.journal import (
     DeviceRecord,
     read_journal,
 )
-from rig.journal.errors import Refused
 from rig.simulator import Truth, parse_fault
 from rig.workbench.command_run import Run
 from rig.workbench.commission.operator import Operator

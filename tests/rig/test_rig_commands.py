@@ -231,7 +231,7 @@ def test_a_missing_package_is_one_line_with_the_command_that_installs_it(
 ):
     path = tmp_path / "rig.toml"
     path.write_text(fast_text({"port = 5020": "port = 1"}))
-    for missing, stop in (("pymodbus", 2), ("pydantic", 2), ("jinja2", 3)):
+    for missing in ("serial", "pydantic", "jinja2"):
         real = importlib.util.find_spec
         with monkeypatch.context() as patch:
             patch.setattr(
@@ -245,5 +245,5 @@ def test_a_missing_package_is_one_line_with_the_command_that_installs_it(
             error = capsys.readouterr().err
             assert missing in error and error.count("\n") == 1
             assert "-m pip install" in error and error.endswith("[rig]'\n")
-            assert main(["stop", "--config", str(path)]) == stop
+            assert main(["stop", "--config", str(path)]) == 3  # nobody is there
             capsys.readouterr()

@@ -35,6 +35,7 @@ class Answer:
     families: tuple[str, ...]  # maps that its registers fit, the best first
     identity: dict[str, int]  # registers of the first of them
     pulses_per_rev: int | None = None  # by its own word
+    echo: bool = False  # its adapter sends back what it is sent
 
     def __str__(self) -> str:
         if not self.families:
@@ -109,12 +110,16 @@ def scan(
                 say(str(answer))
             if unit % 10 == 0 or unit == units:
                 say(f"  {unit} of {units} units asked")
+        echo, noise = bus.echoes, bus.noise
+    if echo and not settings.echo:
+        say("the adapter sends back what it is sent: set bus.echo = true")
     if not answers:
+        came = f", but bytes came that are no reply: {noise}" if noise else ""
         say(
-            "no unit answers. Check power, wiring, termination, the line format (baud "
-            "rate and parity) and the units' ids"
+            f"no unit answers{came}. Check power, wiring, termination, the line format "
+            "(baud rate and parity) and the units' ids"
         )
-    return answers
+    return [dataclasses.replace(answer, echo=echo) for answer in answers]
 
 
 def _ask(bus: Bus, unit: int, families: list[RegisterMap]) -> Answer | None:

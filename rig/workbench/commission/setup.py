@@ -196,6 +196,8 @@ def write_config(
     else:
         say(f"2 scan: units 1 to {options.units} on {bus.where}; reads only")
         answers = scan(bus, options.units, lambda text: say(f"  {text}"))
+        if any(answer.echo for answer in answers):
+            bus = bus.model_copy(update={"echo": True})
     say("3 axes: which unit drives which joint. Step 8 checks it by moving them")
     axes = _ask_axes(answers, options, operator)
     source: dict[str, Any]

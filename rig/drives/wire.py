@@ -1,0 +1,213 @@
+"""Modbus frames on one connection: numbered over TCP; with a CRC on a serial port, or
+through a socket.
+
+A reply over TCP bears the number of its request, so the connection is kept when one is
+late, and a late one is dropped: a gateway that gives one connection would give no other
+for seconds. A reply of RTU is looked for in all that came: what an adapter sends back
+of a request, and bytes before a reply, are passed over.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import struct
+import time
+from typing import TYPE_CHECKING, Any
+
+from rig.drives.line import BusError
+
+if TYPE_CHECKING:
+    from rig.config.settings import BusSettings
+
+HEX_BYTES = 32  # shown of what came
+SIZES = {6: 8, 16: 8, 0x83: 5, 0x86: 5, 0x90: 5}  # of RTU replies; of 3 it says its own
+FILLERS = (0x00, 0xFF)  # bytes that a converter puts before a reply
+OLDEST = 4096  # requests since that of a late reply; other numbers are none
+UNACKNOWLEDGED_MS = 5000  # until a connection whose peer is gone is given up
+
+
+def crc16(data: bytes) -> bytes:
+    """The two CRC bytes of an RTU frame, low byte first."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ 0xA001 if crc & 1 else crc >> 1
+    return struct.pack("<H", crc)
+
+
+def rtu_reply(came: bytes, unit: int, function: int) -> bytes | None:
+    """The PDU of the first whole reply in what came; None where there is none yet."""
+    for start in range(len(came) - 4):
+        if came[start] == unit and came[start + 1] & 0x7F == function:
+            size = SIZES.get(came[start + 1], 5 + came[start + 2])
+            frame = came[start : start + size]
+            if len(frame) == size and crc16(frame[:-2]) == frame[-2:]:
+                return frame[1:-2]
+    return None
+
+
+class Wire:
+    """One connection, opened once and kept."""
+
+    def __init__(self, settings: BusSettings) -> None:
+        self.settings = settings
+        self.socket: Any = None  # or the serial port
+        # Whether the adapter sends back what it is sent; None: a read will show it.
+        self.echo: bool | None = settings.echo or None
+        self._numbered = settings.transport == "tcp"
+        self._is_socket = settings.transport != "rtu"
+        self._number = time.time_ns() & 0xFFFF
+        self._came = b""  # over TCP, and not looked at yet
+        self.noise = ""  # what came last that was no reply, in hex
+
+    def open(self) -> None:
+        """Connect, unless it is; OSError where that cannot be."""
+        s = self.settings
+        if self.socket is not None:
+            return
+        self._came = b""
+        if self._is_socket:
+            made = socket.create_connection((s.host, s.port), s.timeout_s)
+            made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            with contextlib.suppress(AttributeError, OSError):  # Linux has it
+                option = socket.TCP_USER_TIMEOUT
+                made.setsockopt(socket.IPPROTO_TCP, option, UNACKNOWLEDGED_MS)
+            self.socket = made
+            return
+        import serial  # type: ignore[import-untyped]  # no stubs
+
+        self.socket = serial.Serial(
+            s.device, s.baudrate, s.bytesize, s.parity, s.stopbits, timeout=0,
+            write_timeout=s.timeout_s, exclusive=True,
+        )  # fmt: skip
+
+    def close(self) -> None:
+        if self.socket is not None:
+            with contextlib.suppress(OSError):
+                self.socket.close()
+            self.socket = None
+
+    def exchange(
+        self, unit: int, pdu: bytes, timeout_s: float, answered: bool = True
+    ) -> bytes:
+        """Send a request once; the PDU of its reply, empty where none is ``answered``.
+
+        Raises:
+            BusError: none came in time; ``lost`` where the connection is.
+        """
+        try:
+            return self._exchange(unit, pdu, timeout_s, answered)
+        except BusError:
+            raise
+        except Exception as error:  # of the system, or of pyserial
+            self.close()
+            text = " ".join(f"{type(error).__name__}: {error}".split())
+            raise BusError(f"unit {unit}: no valid reply ({text})", lost=True) from None
+
+    def _exchange(
+        self, unit: int, pdu: bytes, timeout_s: float, answered: bool
+    ) -> bytes:
+        self.open()
+        came = self.pending()
+        self.open()  # the peer may have closed it meanwhile
+        if self._numbered:
+            self._number = self._number + 1 & 0xFFFF
+            frame = struct.pack(">HHHB", self._number, 0, len(pdu) + 1, unit) + pdu
+            self._came += came
+        else:
+            frame = bytes([unit]) + pdu
+            frame += crc16(frame)
+        (self.socket.sendall if self._is_socket else self.socket.write)(frame)
+        end, came, late = time.monotonic() + timeout_s, b"", 0
+        while answered:
+            left = end - time.monotonic()
+            data = self._read(max(0.0, left))
+            came += data
+            if self._numbered:
+                self._came += data
+                reply, dropped = self._numbered_reply(unit)
+                late += dropped
+            else:
+                reply = self._reply_beside_echo(came, frame)
+            if reply is not None:
+                return reply
+            if left <= 0.0:
+                if self.echo and came.startswith(frame):
+                    came = came[len(frame) :]
+                raise BusError(
+                    f"unit {unit}: no valid reply ({self._why(came, late, timeout_s)})"
+                )
+        return b""
+
+    def _why(self, came: bytes, late: int, timeout_s: float) -> str:
+        """Why there is no reply, by all that came."""
+        if late:
+            return f"late by over {timeout_s:g} s, as others were: raise bus.timeout_s"
+        if not came:
+            return f"silent for {timeout_s:g} s"
+        more = f" ... {len(came)} bytes" if len(came) > HEX_BYTES else ""
+        self.noise = came[:HEX_BYTES].hex(" ") + more
+        return f"what came is no reply: {self.noise}"
+
+    def _numbered_reply(self, unit: int) -> tuple[bytes | None, int]:
+        """The reply to the last request, and how many replies to others it passed."""
+        late = 0
+        while len(self._came) > 7:
+            number, protocol, size, sender = struct.unpack_from(">HHHB", self._came)
+            age = self._number - number & 0xFFFF
+            if protocol or not 3 <= size <= 254 or age > OLDEST:
+                if self._came[0] not in FILLERS:  # no frame begins anywhere here
+                    text = self._why(self._came, 0, 0.0)
+                    self.close()
+                    raise BusError(f"unit {unit}: no valid reply ({text})")
+                self._came = self._came[1:]
+                continue
+            if len(self._came) < 6 + size:
+                break
+            reply, self._came = self._came[7 : 6 + size], self._came[6 + size :]
+            if not age and sender != unit:
+                raise BusError(f"unit {unit}: another unit replied, {sender}")
+            if not age:
+                return reply, late
+            late += 1
+        return None, late
+
+    def _reply_beside_echo(self, came: bytes, request: bytes) -> bytes | None:
+        """The reply of an RTU line. That to function 6 repeats its request."""
+        begin, unit, function = came.find(request), request[0], request[1]
+        if begin >= 0 and (function != 6 or self.echo):
+            self.echo, came = True, came[begin + len(request) :]
+        elif function == 6 and self.echo:
+            return None
+        reply = rtu_reply(came, unit, function)
+        if reply is not None and function == 3 and self.echo is None:
+            self.echo = False
+        return reply
+
+    def _read(self, seconds: float) -> bytes:
+        """What comes within a time, empty where that is nothing.
+
+        Raises:
+            OSError: the peer has closed the connection, or the port is gone.
+        """
+        if not select.select([self.socket], [], [], seconds)[0]:
+            return b""
+        if not self._is_socket:
+            return bytes(self.socket.read(max(1, self.socket.in_waiting)))
+        data: bytes = self.socket.recv(4096)
+        if not data:
+            raise ConnectionResetError("the other end closed the connection")
+        return data
+
+    def pending(self) -> bytes:
+        """What came since; a connection that its peer has closed is closed."""
+        came = b""
+        try:
+            while data := self._read(0.0):
+                came += data
+        except OSError:
+            self.close()
+        return came

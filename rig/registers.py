@@ -1,0 +1,151 @@
+"""Registers of a drive: values, words, frames and bits, without the schema of a map.
+
+``config.maps`` checks a map's tables and has these for what they do. A stop makes them
+of what it can read of a map, whatever else is wrong with that.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+Kind = Literal["u16", "i16", "u32", "i32"]
+FORMATS: dict[Kind, str] = {"u16": ">H", "i16": ">h", "u32": ">I", "i32": ">i"}
+VALUES = ("position", "speed", "accel", "decel", "timeout", "min", "max", "home")
+LOWEST, HIGHEST = -(2**31), 2**31 - 1  # of a position
+FLAGS = ("enabled", "done", "moving", "fault")
+
+
+class Word(NamedTuple):
+    """What a frame has at one place: one or two registers."""
+
+    value: int | str  # a constant, or one of VALUES
+    kind: Kind = "u16"
+
+
+def encode(value: int, kind: Kind, word_order: str) -> list[int]:
+    """Registers of a value; ValueError where it does not fit the type."""
+    try:
+        data = struct.pack(FORMATS[kind], value)
+    except struct.error:
+        raise ValueError(f"{value} does not fit {kind}") from None
+    words = list(struct.unpack(f">{len(data) // 2}H", data))
+    return words if word_order == "big" else words[::-1]
+
+
+def decode(words: list[int], kind: Kind, word_order: str) -> int:
+    """Value of one or two registers."""
+    ordered = words if word_order == "big" else words[::-1]
+    return struct.unpack(FORMATS[kind], struct.pack(f">{len(words)}H", *ordered))[0]
+
+
+def registers_of(kind: Kind) -> int:
+    """Registers that a type takes."""
+    return struct.calcsize(FORMATS[kind]) // 2
+
+
+def word_of(word: Any) -> Word:
+    """A word of a frame as a map writes it; ValueError where it is none."""
+    if type(word) is int and 0 <= word <= 0xFFFF:
+        return Word(word)
+    name, _, kind = str(word).partition(":")
+    kinds: dict[str, Kind] = {form: form for form in FORMATS}
+    if isinstance(word, str) and name in VALUES and kind in kinds:
+        return Word(name, kinds[kind])
+    raise ValueError(
+        f"must be 0..65535 or NAME:TYPE with NAME of {', '.join(VALUES)} and TYPE of "
+        f"{', '.join(FORMATS)}, got {word!r}"
+    )
+
+
+def registers_in(words: Sequence[Word]) -> int:
+    """Registers of all words of a frame."""
+    return sum(registers_of(word.kind) for word in words)
+
+
+class Table:
+    """A table of a map, its keys as attributes."""
+
+    def __init__(self, **values: Any) -> None:
+        vars(self).update(values)
+
+    def __eq__(self, other: object) -> bool:
+        return vars(self) == vars(other)
+
+    __hash__ = None  # type: ignore[assignment]  # as of a dictionary
+
+
+class Value(Table):
+    """A value to read: one or two registers."""
+
+    if TYPE_CHECKING:
+        address: int
+        type: Kind
+
+    @property
+    def count(self) -> int:
+        return registers_of(self.type)
+
+
+class Bits(Table):
+    """Bits of the status word: every ``set`` bit is 1 and every ``clear`` bit is 0."""
+
+    if TYPE_CHECKING:
+        set: tuple[int, ...]
+        clear: tuple[int, ...]
+
+    def holds(self, word: int) -> bool:
+        """Whether a status word satisfies it."""
+        return all(word >> b & 1 for b in self.set) and not any(
+            word >> b & 1 for b in self.clear
+        )
+
+
+class Flags(Value):
+    """The status word and what its bits say."""
+
+    def flags(self, word: int) -> dict[str, bool]:
+        """Which of FLAGS a word has."""
+        named = {name: getattr(self, name) for name in FLAGS}
+        return {name: not bits or bits.holds(word) for name, bits in named.items()}
+
+
+class Frame(Table):
+    """One frame to write: constants, and values by name such as ``position:i32``."""
+
+    if TYPE_CHECKING:
+        address: int
+        words: tuple[Word, ...]
+        function: Literal[6, 16]
+
+    @property
+    def count(self) -> int:
+        return registers_in(self.words)
+
+    def registers(self, word_order: str, **values: int) -> list[int]:
+        """What the frame holds, with the values that its words name."""
+        found = []
+        for value, kind in self.words:
+            number = values[value] if isinstance(value, str) else value
+            found += encode(number, kind, word_order)
+        return found
+
+    def places(self) -> Iterator[tuple[int, Word]]:
+        """Every word with its address."""
+        address = self.address
+        for word in self.words:
+            yield address, word
+            address += registers_of(word.kind)
+
+
+class Frames(Table):
+    """Frames that are written one after another."""
+
+    if TYPE_CHECKING:
+        write: Sequence[Any]
+
+    def place_of(self, name: str) -> tuple[int, Kind] | None:
+        """Address and type of a named value, or None where no frame holds it."""
+        places = (place for frame in self.write for place in frame.places())
+        return next(((a, w.kind) for a, w in places if w.value == name), None)

@@ -1,0 +1,322 @@
+"""What a stop needs of rig.toml: the bus, and unit and map of each axis.
+
+Nothing else of the file is looked at, and what is wrong with it does not matter. Of a
+file that is not TOML every line counts that can be read. A value that is none is
+replaced by its default, and a name by the nearest there is; what cannot be read so is
+told, and the rest is stopped.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import pathlib
+import re
+import tomllib
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+from rig.registers import FLAGS, FORMATS, Bits, Flags, Frame, Frames, Value, word_of
+from rig.registers import registers_in as count_of
+
+MAP_FOLDER = pathlib.Path(__file__).parent / "maps"
+HEADER = re.compile(r"\s*\[+\s*([A-Za-z_][\w.\s\"'-]*?)[^\w\"']*(#.*)?")
+ASSIGNMENT = re.compile(r"\s*([\w-]+)\s*[=:]\s*(.+?)\s*(#.*)?")
+LOOK_AHEAD = 40  # lines of one value
+NEAR, NEAR_NAME = 0.75, 0.6  # of a key, and of the name of a map or a transport
+NETWORK = ("tcp", "rtu_tcp")  # transports that have a host
+TRANSPORTS = (*NETWORK, "rtu", "serial", "can")
+RANGES = {
+    "port": (1, 65535), "baudrate": (1200, 3_000_000), "stopbits": (1, 2),
+    "bytesize": (7, 8), "timeout_s": (0.01, 5), "read_retries": (0, 10),
+}  # fmt: skip
+Faults = list[str]
+
+
+@dataclasses.dataclass
+class Bus:
+    """``[bus]``, with the defaults of its keys."""
+
+    transport: str = ""
+    host: str = ""
+    port: int = 502
+    device: str = ""
+    interface: str = "socketcan"
+    baudrate: int = 115200
+    parity: str = "N"
+    stopbits: int = 1
+    bytesize: int = 8
+    echo: bool = False
+    timeout_s: float = 0.3
+    read_retries: int = 2
+
+    @property
+    def where(self) -> str:
+        return where_of(self)
+
+
+@dataclasses.dataclass
+class StopConfig:
+    """What could be read of a file, or of what a session armed."""
+
+    bus: Bus | None
+    axes: list[SimpleNamespace]  # name, unit and map of each that can be stopped
+    lost: list[tuple[str, int]]  # name and unit, 0 where unknown, of the others
+    faults: Faults
+    bus_faults: Faults
+
+    @property
+    def silence_s(self) -> float:
+        """Silence between frames that the slowest of the drives wants."""
+        return max((axis.map.inter_frame_s for axis in self.axes), default=0.0)
+
+
+def where_of(bus: Any) -> str:
+    """A bus in words."""
+    if bus.transport not in NETWORK:
+        return f"{bus.device} at {bus.baudrate} baud"
+    return f"{bus.host}:{bus.port} ({bus.transport})"
+
+
+def read_file(path: pathlib.Path) -> StopConfig:
+    """All that is of use in a configuration file; OSError where it cannot be opened."""
+    faults: Faults = []
+    data = tables_of(_decoded(path.read_bytes()), faults)
+    return _read(data, _rows(_near(data, "axes")), path.parent, faults)
+
+
+def read_armed(armed: dict[str, Any]) -> StopConfig:
+    """The same of what a session left beside its lock."""
+    return _read(armed, _rows(armed.get("drives")), None, [])
+
+
+def _read(
+    data: dict[str, Any],
+    rows: list[dict[str, Any]],
+    folder: pathlib.Path | None,
+    faults: Faults,
+) -> StopConfig:
+    bus_faults: Faults = []
+    bus = bus_of(_near(data, "bus"), bus_faults)
+    axes: list[SimpleNamespace] = []
+    lost: list[tuple[str, int]] = []
+    for number, row in enumerate(rows, 1):
+        own: Faults = []
+        name = _near(row, "name")
+        if not isinstance(name, str):
+            own.append("it has no name")
+            name = f"axis {number}"
+        unit = int(_number(_near(row, "unit"), 0, 1, 247, "unit", own))
+        drive_map = _map_of(row, folder, own)
+        faults += [f"{name}: {fault}" for fault in own]
+        if not unit or drive_map is None:
+            lost.append((name, unit))
+        elif unit not in [axis.unit for axis in axes]:  # two of one drive are one
+            axes.append(SimpleNamespace(name=name, unit=unit, map=drive_map))
+    if bus and bus.transport in ("serial", "can"):
+        if axes and all(axis.map.drive == "modbus" for axis in axes):
+            bus_faults.append(f"transport: drives of Modbus have none {bus.transport}")
+            bus.transport = "rtu"
+    return StopConfig(bus, axes, lost, faults + bus_faults, bus_faults)
+
+
+def bus_of(table: Any, faults: Faults) -> Bus | None:
+    """The bus of a table; None where it does not say where that is."""
+    table = _rows(table)[0] if _rows(table) else {}
+    bus = Bus()
+    for field in dataclasses.fields(bus):
+        value, default = _near(table, field.name), getattr(bus, field.name)
+        if value is None:
+            continue
+        if isinstance(default, bool):
+            value = value is True or str(value).lower() == "true"
+        elif isinstance(default, str):
+            if not isinstance(value, str):
+                faults.append(f"bus.{field.name}: no text, {value!r}")
+                value = default
+            value = value.strip()
+        else:
+            low, high = RANGES[field.name]
+            value = _number(value, default, low, high, f"bus.{field.name}", faults)
+            value = type(default)(value)
+        setattr(bus, field.name, value)
+    bus.parity = bus.parity[:1].upper() if bus.parity[:1].upper() in "NEO" else "N"
+    fault = "" if bus.transport in TRANSPORTS else f"none of {', '.join(TRANSPORTS)}"
+    word = bus.transport.lower()
+    near = difflib.get_close_matches(word, TRANSPORTS, 1, NEAR_NAME)
+    given, bus.transport = bus.transport, near[0] if near else ""
+    if not (bus.host or bus.device):
+        faults.append("[bus] names no host and no device")
+        return None
+    if not (bus.host if bus.transport in NETWORK else bus.device and bus.transport):
+        fault = fault or "its host or device is missing"
+        bus.transport = "tcp" if bus.host else "rtu"
+    if fault:
+        text = f"bus.transport: {fault}, {given!r}; {bus.transport} is tried"
+        faults.append(text)
+    return bus
+
+
+def _map_of(
+    row: dict[str, Any], folder: pathlib.Path | None, faults: Faults
+) -> SimpleNamespace | None:
+    """The map of an axis: by name or path, or its text where a session left it."""
+    name = _near(row, "map")
+    if not isinstance(name, str) or not name:
+        faults.append("it has no map")
+        return None
+    if folder is None:
+        return map_of(name, pathlib.Path(str(row.get("folder", ""))), faults)
+    path = folder / name if name.endswith(".toml") else MAP_FOLDER / f"{name}.toml"
+    if not path.is_file():
+        names = [each.stem for each in MAP_FOLDER.glob("*.toml")]
+        near = difflib.get_close_matches(path.stem, names, 1, NEAR_NAME)
+        tried = f"; {near[0]} is tried" if near else ""
+        faults.append(f"there is no map {name}{tried}")
+        path = MAP_FOLDER / f"{near[0]}.toml" if near else path
+    try:
+        return map_of(_decoded(path.read_bytes()), path.parent, faults)
+    except OSError as error:
+        faults.append(f"its map {path.name} cannot be read: {error.strerror}")
+        return None
+
+
+def map_of(text: str, folder: pathlib.Path, faults: Faults) -> SimpleNamespace | None:
+    """What of a map stops its drives and sees them stand; None where it cannot."""
+    data = tables_of(text, faults)
+    found = SimpleNamespace(
+        name=str(data.get("name", "map")), drive=str(data.get("drive", "modbus")),
+        folder=folder, text=text, settings=data.get("settings", {}),
+        restart_s=_number(data.get("restart_s", 2.0), 2.0, 2.0, 60, "restart_s", []),
+        inter_frame_s=_number(data.get("inter_frame_s", 0), 0.0, 0, 1, "silence", []),
+        word_order="little" if data.get("word_order") == "little" else "big",
+        broadcast_stop=data.get("broadcast_stop") is True,
+        stop=_frames(_near(data, "stop")), hold=_frames(data.get("hold")),
+        position=_value(data.get("position"), "i32"), status=None, homed=None,
+        move=None, home=None, set_zero=None,
+    )  # fmt: skip
+    set_zero = _frames(data.get("set_zero"))
+    found.home_place = set_zero.place_of("home") if set_zero else None
+    status = _near(data, "status")
+    if (value := _value(status, "u16")) and isinstance(status, dict):
+        bits = {name: _bits(status.get(name)) for name in FLAGS}
+        if bits["done"] and bits["moving"]:
+            never = Bits(set=(0,), clear=(0,))
+            bits["fault"] = bits["fault"] or never
+            found.status = Flags(**vars(value), **bits)
+    if found.drive == "modbus" and found.stop is None:
+        faults.append(f"the map {found.name} has no [stop] that can be read")
+        return None
+    if found.drive == "modbus" and not (found.status and found.position):
+        faults.append(f"of the map {found.name} [status] or [position] cannot be read")
+    return found
+
+
+def _frames(table: Any) -> Frames | None:
+    """Frames of a table; None where one cannot be read."""
+    rows = _rows(table.get("write")) if isinstance(table, dict) else []
+    try:
+        frames = []
+        for row in rows:
+            words = tuple(word_of(word) for word in row["words"])
+            function = row.get("function", 6 if count_of(words) == 1 else 16)
+            address = range(0x10000)[row["address"]]
+            frames.append(Frame(address=address, words=words, function=function))
+    except (KeyError, IndexError, TypeError, ValueError):
+        return None
+    return Frames(write=tuple(frames)) if frames else None
+
+
+def _value(table: Any, kind: str) -> Value | None:
+    if not isinstance(table, dict) or type(table.get("address")) is not int:
+        return None
+    kind = table.get("type", kind)
+    return Value(address=table["address"], type=kind) if kind in FORMATS else None
+
+
+def _bits(table: Any) -> Bits | None:
+    if not isinstance(table, dict):
+        return None
+    names = {
+        name: tuple(bit for bit in table.get(name, ()) if type(bit) is int)
+        for name in ("set", "clear")
+    }
+    return Bits(**names) if any(names.values()) else None
+
+
+def _rows(tables: Any) -> list[dict[str, Any]]:
+    """Tables of a list, or the one that stands alone."""
+    listed = tables if isinstance(tables, list) else [tables]
+    return [table for table in listed if isinstance(table, dict)]
+
+
+def _near(table: dict[str, Any], name: str) -> Any:
+    """The value of a key, or of one that is nearly called so."""
+    if name in table:
+        return table[name]
+    keys = {key.lower(): key for key in table}
+    near = difflib.get_close_matches(name, keys, 1, NEAR)
+    return table[keys[near[0]]] if near else None
+
+
+def _number(
+    value: Any, default: float, low: float, high: float, name: str, faults: Faults
+) -> float:
+    try:
+        number = float(value if type(value) is not bool else "true")
+        if low <= number <= high and (isinstance(default, float) or number % 1 == 0):
+            return number
+    except (TypeError, ValueError):
+        pass
+    used = f"; {default:g} is used" if default else ""
+    faults.append(f"{name}: no number in [{low:g}, {high:g}], {value!r}{used}")
+    return default
+
+
+def _decoded(data: bytes) -> str:
+    """The text of a file, whatever program wrote it."""
+    utf16 = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+    return data.decode("utf-16" if utf16 else "utf-8-sig", errors="replace")
+
+
+def tables_of(text: str, faults: Faults) -> dict[str, Any]:
+    """A TOML text; of one that is broken all lines that can be read."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        faults.append(f"not valid TOML: {error}")
+    root: dict[str, Any] = {}
+    table, lines = root, text.splitlines()
+    while lines:
+        if header := HEADER.fullmatch(lines[0]):
+            *path, last = (part.strip(" \"'") for part in header[1].split("."))
+            table = root
+            for part in path:
+                inner = table.setdefault(part, {})
+                table = inner if isinstance(inner, dict) else {}
+            if lines[0].lstrip().startswith("[[") or last == "axes":
+                rows = table.setdefault(last, [])
+                table = {}
+                if isinstance(rows, list):
+                    rows.append(table)
+            else:
+                inner = table.setdefault(last, {})
+                table = inner if isinstance(inner, dict) else {}
+            del lines[0]
+        else:
+            values, count = _first_value(lines)
+            table.update(values)
+            del lines[:count]
+    return root
+
+
+def _first_value(lines: Sequence[str]) -> tuple[dict[str, Any], int]:
+    """What the first lines say, and how many they are."""
+    for count in range(1, min(len(lines), LOOK_AHEAD) + 1):
+        try:
+            return tomllib.loads("\n".join(lines[:count])), count
+        except tomllib.TOMLDecodeError:
+            continue
+    broken = ASSIGNMENT.fullmatch(lines[0])
+    return ({broken[1]: broken[2].strip(" \"'")} if broken else {}), 1
