@@ -23,7 +23,11 @@ def room_of(module: str) -> str:
     first = rest.partition(".")[0]
     if first in ("__init__", "__main__"):  # doors, from which everything is called
         return "commands"
-    return first if (ROOT / "jaxcal" / first / "__init__.py").is_file() else "base"
+    return (
+        first
+        if first and (ROOT / "jaxcal" / first / "__init__.py").is_file()
+        else "base"
+    )
 
 
 def sources() -> Iterator[tuple[str, str]]:
@@ -74,13 +78,24 @@ def floors(ahead: dict[str, set[str]]) -> dict[str, int]:
     return {room: floor(room) for room in ahead}
 
 
-if __name__ == "__main__":
+def table() -> str:
+    """The table of docs/architecture.md."""
     lines, ahead = lines_of_rooms(), arrows()
     floor = floors(ahead)
-    print("| floor | room | lines | imports |\n|---|---|---|---|")
+    rows = ["| floor | room | lines | imports |", "|---|---|---|---|"]
     for room in sorted(lines, key=lambda name: (-floor[name], name)):
         imports = ", ".join(sorted(ahead[room] - {"base"}))
-        print(f"| {floor[room]} | {room} | {lines[room]:,} | {imports} |")
+        rows.append(f"| {floor[room]} | {room} | {lines[room]:,} | {imports} |")
     count = sum(len(rooms) for rooms in ahead.values())
-    print(f"\n{len(lines)} rooms, {count} arrows, {max(floor.values())} floors")
-    print(f"{sum(lines.values()):,} lines")
+    return "\n".join(
+        [
+            *rows,
+            "",
+            f"{len(lines)} rooms, {count} arrows, {max(floor.values())} floors, "
+            f"{sum(lines.values()):,} lines.",
+        ]
+    )
+
+
+if __name__ == "__main__":
+    print(table())
