@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 
@@ -199,6 +200,39 @@ def test_a_lock_that_cannot_be_read_does_not_keep_it(spoil, rig, folder):
         path.touch(mode=0)
         folder.chmod(0o500)
     assert main(["stop", "--config", str(rig.path)]) == 0
+    assert stopped(rig) == ALL
+
+
+HOLDS = """
+import sys, time
+from rig.config import load_config
+from rig.journal.lock import BusLock
+lock = BusLock(load_config(sys.argv[1]).bus).acquire("calibrate")
+print("holds", flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("spoil", ["folder gone", "file gone", "garbage"])
+def test_a_session_is_asked_whatever_became_of_its_lock(spoil, rig, folder, capsys):
+    child = subprocess.Popen(
+        [sys.executable, "-c", HOLDS, str(rig.path)], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert child.stdout.readline() == "holds\n"
+        if spoil == "folder gone":
+            shutil.rmtree(folder)
+        elif spoil == "file gone":
+            _lock_of(rig).path.unlink()
+        else:
+            _lock_of(rig).path.write_bytes(b"\xff{")
+        assert main(["stop", "--config", str(rig.path)]) == 0
+        assert f"(process {child.pid}," in capsys.readouterr().out
+        assert child.wait(5) == -signal.SIGTERM
+    finally:
+        child.kill()
+        child.wait()
+        child.stdout.close()
     assert stopped(rig) == ALL
 
 
