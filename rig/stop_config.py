@@ -108,7 +108,11 @@ def _read(
             own.append("it has no name")
             name = f"axis {number}"
         unit = int(_number(_near(row, "unit"), 0, 1, 247, "unit", own))
-        drive_map = _map_of(row, folder, own)
+        try:
+            drive_map = _map_of(row, folder, own)
+        except Exception as error:  # of the system, or of a map that nobody foresaw
+            drive_map = None
+            own.append(f"its map cannot be read: {error}")
         faults += [f"{name}: {fault}" for fault in own]
         if not unit or drive_map is None:
             lost.append((name, unit))
@@ -175,11 +179,7 @@ def _map_of(
         tried = f"; {near[0]} is tried" if near else ""
         faults.append(f"there is no map {name}{tried}")
         path = MAP_FOLDER / f"{near[0]}.toml" if near else path
-    try:
-        return map_of(_decoded(path.read_bytes()), path.parent, faults)
-    except OSError as error:
-        faults.append(f"its map {path.name} cannot be read: {error.strerror}")
-        return None
+    return map_of(_decoded(path.read_bytes()), path.parent, faults)
 
 
 def map_of(text: str, folder: pathlib.Path, faults: Faults) -> SimpleNamespace | None:
@@ -215,15 +215,15 @@ def map_of(text: str, folder: pathlib.Path, faults: Faults) -> SimpleNamespace |
 
 def _frames(table: Any) -> Frames | None:
     """Frames of a table; None where one cannot be read."""
-    rows = _rows(table.get("write")) if isinstance(table, dict) else []
+    rows = _rows(table.get("write")) if _rows(table) == [table] else []
     try:
         frames = []
         for row in rows:
             words = tuple(word_of(word) for word in row["words"])
-            function = row.get("function", 6 if count_of(words) == 1 else 16)
-            address = range(0x10000)[row["address"]]
+            function = 6 if count_of(words) == 1 and row.get("function") != 16 else 16
+            address = int(_number(row["address"], 0, 0, 0xFFFF, "address", []))
             frames.append(Frame(address=address, words=words, function=function))
-    except (KeyError, IndexError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError):
         return None
     return Frames(write=tuple(frames)) if frames else None
 
@@ -231,18 +231,21 @@ def _frames(table: Any) -> Frames | None:
 def _value(table: Any, kind: str) -> Value | None:
     if not isinstance(table, dict) or type(table.get("address")) is not int:
         return None
-    kind = table.get("type", kind)
+    kind = str(table.get("type", kind))
     return Value(address=table["address"], type=kind) if kind in FORMATS else None
 
 
 def _bits(table: Any) -> Bits | None:
-    if not isinstance(table, dict):
-        return None
-    names = {
-        name: tuple(bit for bit in table.get(name, ()) if type(bit) is int)
-        for name in ("set", "clear")
-    }
-    return Bits(**names) if any(names.values()) else None
+    lists = (
+        [table.get(name) for name in ("set", "clear")]
+        if _rows(table) == [table]
+        else []
+    )
+    bits = [
+        tuple(bit for bit in each if type(bit) is int) if type(each) is list else ()
+        for each in lists
+    ]
+    return Bits(set=bits[0], clear=bits[1]) if any(bits) else None
 
 
 def _rows(tables: Any) -> list[dict[str, Any]]:
@@ -289,26 +292,27 @@ def tables_of(text: str, faults: Faults) -> dict[str, Any]:
     root: dict[str, Any] = {}
     table, lines = root, text.splitlines()
     while lines:
+        values: dict[str, Any] = {}
+        count = 1
         if header := HEADER.fullmatch(lines[0]):
             *path, last = (part.strip(" \"'") for part in header[1].split("."))
             table = root
             for part in path:
-                inner = table.setdefault(part, {})
-                table = inner if isinstance(inner, dict) else {}
+                table = _inner(table, part)
             if lines[0].lstrip().startswith("[[") or last == "axes":
-                rows = table.setdefault(last, [])
-                table = {}
-                if isinstance(rows, list):
-                    rows.append(table)
-            else:
-                inner = table.setdefault(last, {})
-                table = inner if isinstance(inner, dict) else {}
-            del lines[0]
+                table[last] = [*_rows(table.get(last)), {}]
+            table = _inner(table, last)
         else:
             values, count = _first_value(lines)
-            table.update(values)
-            del lines[:count]
+        table.update(values)
+        del lines[:count]
     return root
+
+
+def _inner(table: dict[str, Any], name: str) -> dict[str, Any]:
+    """The table of a name, or the last of several, made where there is none."""
+    rows = _rows(table.setdefault(name, {})) or [{}]
+    return rows[-1]
 
 
 def _first_value(lines: Sequence[str]) -> tuple[dict[str, Any], int]:

@@ -101,15 +101,22 @@ class BusLock:
         """Who holds the lock now (pid, command, since, run), None where it is free.
 
         Never the word of a dead holder: the flock is tried first. The dictionary is
-        empty where the holder has not said yet who it is.
+        empty where the holder has not said yet who it is. Where the file is gone, or
+        says nothing of use, the kernel is asked who has it open.
         """
         try:
             fd = self._open(os.O_RDONLY)
         except FileNotFoundError:
-            return None
+            return _opener(self.path)
+        except Refused:
+            if told := _opener(self.path):
+                return told
+            raise
         try:
             until(PATIENCE_S, lambda: flock(fd, fcntl.LOCK_SH) or bool(_content(fd)))
-            return None if flock(fd, fcntl.LOCK_SH) else _content(fd)
+            if flock(fd, fcntl.LOCK_SH):
+                return None
+            return _content(fd) or _opener(self.path) or {}
         finally:
             os.close(fd)
 
@@ -246,6 +253,21 @@ def _identity(settings: BusSettings) -> str:
     if address == "::1" or address.startswith("127."):
         address = "localhost"
     return f"{address}:{settings.port}"
+
+
+def _opener(path: pathlib.Path) -> dict[str, Any] | None:
+    """Another process of this user that has a file open, also one that was deleted."""
+    names = (str(path), os.path.realpath(path))
+    with contextlib.suppress(OSError):  # no Linux
+        for pid in filter(str.isdigit, os.listdir("/proc")):
+            with contextlib.suppress(OSError):  # it has ended, or is another user's
+                for fd in os.listdir(f"/proc/{pid}/fd"):
+                    link = os.readlink(f"/proc/{pid}/fd/{fd}")
+                    other = int(pid) != os.getpid()
+                    if other and link.removesuffix(" (deleted)") in names:
+                        known = {"command": "a session", "since": "unknown"}
+                        return {"pid": int(pid), **known}
+    return None
 
 
 def _content(fd: int) -> dict[str, Any]:
