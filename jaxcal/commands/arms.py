@@ -21,7 +21,13 @@ from jaxcal.models.model import as_model
 from jaxcal.models.sensors import SENSORS, Landmarks, Sensor, Socket
 from jaxcal.tables import COMMANDS, Table
 
-__all__ = ["ArmOptions", "ModelPath", "RecordingOptions", "in_degrees"]
+__all__ = [
+    "ArmOptions",
+    "ModelPath",
+    "RecordingOptions",
+    "in_degrees",
+    "is_recording",
+]
 
 Array = NDArray[np.float64]
 
@@ -46,7 +52,7 @@ class ArmOptions:
 
     sensor: Annotated[
         str | None,
-        "of an arm, what its tip is measured with (default position)",
+        "of an arm, what measures its tip (default position)",
         _KINDS,
     ] = None
     base: Annotated[str | None, "of an arm, the link that stands still", "LINK"] = None
@@ -229,8 +235,7 @@ class RecordingOptions:
             path: of a table or a recording.
             arm: gives the arm of the recording; called with its ``which``.
         """
-        recording = os.path.isdir(path) or path.lower().endswith((".mcap", ".db3"))
-        if not recording:
+        if not is_recording(path):
             if self.which is not None or self.topic or self.in_degrees:
                 raise ValueError(
                     "--which, --topic and --in-degrees are of a recording, not a table"
@@ -256,6 +261,11 @@ class RecordingOptions:
         values = np.hstack([commands, read])
         lines = tuple(range(1, len(values) + 1))
         return Table(path, (*names, *model.sensor.outputs), values, {}, lines)
+
+
+def is_recording(path: str) -> bool:
+    """Whether a path is of a bag or a LeRobot dataset, not of a table."""
+    return os.path.isdir(path) or path.lower().endswith((".mcap", ".db3"))
 
 
 def in_degrees(arm: SerialChain, commands: Array) -> Array:

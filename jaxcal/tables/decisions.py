@@ -119,8 +119,7 @@ def _of_y(
     depth = f"z_{root}".casefold() in names
     axis = depth or (f"x_{root}".casefold() in names and not digits)
     if axis and marked:
-        reason = f"it stands beside x_{root}: name what was measured"
-        return Decision("output", reason, asks=True)
+        return Decision("output", f"it stands beside x_{root}", asks=True)
     if marked:
         return Decision("output")
     if axis or (outputs and not any(x.startswith(MEASURED) for x in outputs)):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.tables.cells import numbers_of
+from jaxcal.tables.cells import decimal_mark, numbers_of
 from jaxcal.tables.decisions import decide
 from jaxcal.tables.names import COMMANDS, MEASURED, columns_by_name, say
 from jaxcal.tables.table import Table, table_of
@@ -42,6 +42,8 @@ def _columns_of(values: Any) -> dict[str, Any] | None:
             return None
         rows: list[Any] = [*map(_columns_of, values)]
         return {name: [_cell(row, name) for row in rows] for name in rows[0]}
+    if hasattr(values, "collect") and not hasattr(values, "to_numpy"):
+        values = values.collect()  # of a lazy frame
     names = _names(values)
     if not any(isinstance(name, str | tuple) for name in names):
         return None
@@ -59,7 +61,7 @@ def _columns_of(values: Any) -> dict[str, Any] | None:
 
 def _names(values: Any) -> list[Any]:
     """Names as values hold them; [] where they have none."""
-    if isinstance(values, np.ndarray):
+    if isinstance(values, np.ndarray | np.void):
         return [*(values.dtype.names or ())]
     if hasattr(values, "dims") and not hasattr(values, "data_vars"):
         axis = values.coords.get(values.dims[-1]) if values.dims else None
@@ -86,6 +88,8 @@ def _column(values: Any) -> Any:
     array = np.asarray(values)
     if array.dtype.kind in "iuf":
         return array
+    if array.dtype.kind in "mM":
+        array = array.astype(str)
     cells = array.astype(object).ravel().tolist()
     return ["" if str(x) in ("None", "nan", "NaT", "<NA>") else str(x) for x in cells]
 
@@ -119,7 +123,7 @@ def names_in(
     wanted: Sequence[str],
     prefix: str,
     beside: Collection[str] | None = None,
-) -> tuple[str, ...] | None:
+) -> Any:
     """The columns of a frame that ``of_frame`` takes; None: it has no names.
 
     Args:
@@ -154,7 +158,7 @@ def _numbers(argument: str, name: str, values: Any, used: Any) -> Any:
     if array.dtype.kind == "b":
         array = array.astype(np.float64)
     elif isinstance(cells := _column(values), list):
-        numbers = numbers_of(cells)
+        numbers = numbers_of(cells, *decimal_mark(cells, True))
         for row, number in enumerate(numbers):
             if number is None:
                 raise ValueError(
@@ -186,16 +190,17 @@ def table_of_frame(argument: str, frame: Any) -> Table:
             f"{type(frame).__name__}"
         )
     arrays = {name: _column(np.atleast_1d(x)) for name, x in columns.items()}
-    index = getattr(frame, "index", None)
-    if isinstance(name := getattr(index, "name", None), str) and name not in arrays:
-        arrays[name] = [*map(str, index)]
     count = len(next(iter(arrays.values())))
     for name, array in arrays.items():
         if len(array) != count:
             raise ValueError(
                 f"{argument}: column {name!r} must hold {count} rows, got {len(array)}"
             )
-    return table_of(argument, arrays, range(count), row="row")
+    table = table_of(argument, arrays, range(count), None, row="row")
+    index: Any = getattr(frame, "index", None)
+    if isinstance(label := getattr(index, "name", None), str):
+        table.labels.setdefault(label, [*map(str, index)])
+    return table
 
 
 def inputs_of(argument: str, frame: Any, outputs: Sequence[str] = ()) -> Any:
@@ -226,7 +231,7 @@ def outputs_of(argument: str, frame: Any, beside: bool) -> Any:
         return None
     table = table_of_frame(argument, frame)
     if beside:
-        return table.outputs(None, None)
+        return table.outputs(None, "y_...")
     decisions = decide(table)
     names = [name for name in table.names if not name.startswith(COMMANDS)]
     spare = [x for x in names if decisions[x].role in ("time", "available")]
