@@ -78,7 +78,7 @@ class ArmOptions:
 
     @property
     def kind(self) -> str:
-        """Of the sensor."""
+        """The sensor's kind."""
         return self.sensor or "position"
 
     def read(self, path: str, table: Table | None, places: Any = None) -> SerialChain:

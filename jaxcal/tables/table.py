@@ -244,13 +244,13 @@ class Table:
         return np.asarray(mask == 1.0)
 
     def say(
-        self, wanted: Sequence[str], found: Sequence[Any], how: str, more: str = ""
+        self, wanted: Sequence[str], columns: Sequence[Any], how: str, more: str = ""
     ) -> None:
         """Say which columns are what; nothing where their names and order say it."""
-        order = [name for name in self.header if name in found]
+        order = [name for name in self.header if name in columns]
         parts = [more] if more else []
-        if [*wanted] != [*found] or order != [*found]:
-            listed = ", ".join(found), how, ", ".join(wanted)
+        if [*wanted] != [*columns] or order != [*columns]:
+            listed = ", ".join(columns), how, ", ".join(wanted)
             parts.insert(0, "columns {} are read {}, as {}".format(*listed))
         if parts:
             say(f"{self.source}: {'; '.join(parts)}")
