@@ -162,16 +162,15 @@ def told(at_end: bool = False) -> Iterator[None]:
         at_end: once the block is done, and nothing where it fails: an error is then
             the only line.
     """
-    lines = io.StringIO()
+    lines: Any = io.StringIO() if at_end else sys.stderr
     log, shown = logging.getLogger("jaxcal"), logging.StreamHandler(lines)
     level = log.level
-    if not at_end:
-        shown.setStream(sys.stderr)
     log.setLevel(logging.INFO)
     log.addHandler(shown)
     try:
         yield
-        sys.stderr.write(lines.getvalue())
+        if at_end:
+            sys.stderr.write(lines.getvalue())
     finally:
         log.setLevel(level)
         log.removeHandler(shown)

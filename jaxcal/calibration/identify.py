@@ -35,7 +35,7 @@ from jaxcal.tables import (
     COMMANDS,
     MEASURED,
     columns_by_name,
-    columns_of,
+    header_of,
     inputs_of,
     names_in,
     of_frame,
@@ -194,15 +194,15 @@ def _columns(model: Any, commands: Any, measured: Any) -> tuple[Any, Any]:
     """Names of the columns of commands and of readings; None of what has no names."""
     wanted = getattr(getattr(model, "sensor", None), "outputs", ())
     together, outputs = measured is commands, None
-    readings = [*(columns_of("measured", measured) or ())]
+    readings = header_of("measured", measured)
     if any(columns_by_name(wanted, readings, MEASURED)):
         outputs = names_in("measured", measured, wanted, MEASURED)
     elif readings:
         outputs = outputs_of("measured", measured, together)
+    beside = (outputs or ()) if together else ()
     if inputs := getattr(model, "inputs", ()):
-        beside = outputs if together else ()
-        return names_in("commands", commands, inputs, COMMANDS, beside or ()), outputs
-    return inputs_of("commands", commands, outputs if together else ()), outputs
+        return names_in("commands", commands, inputs, COMMANDS, beside), outputs
+    return inputs_of("commands", commands, beside), outputs
 
 
 def _about(

@@ -24,7 +24,13 @@ from jaxcal.tables import COMMANDS, Table
 if TYPE_CHECKING:
     from jaxcal.arms import Sensor, SerialChain
 
-__all__ = ["ArmOptions", "ModelPath", "RecordingOptions", "in_degrees"]
+__all__ = [
+    "ArmOptions",
+    "ModelPath",
+    "RecordingOptions",
+    "in_degrees",
+    "is_recording",
+]
 
 Array = NDArray[np.float64]
 
@@ -47,8 +53,8 @@ class ArmOptions:
 
     sensor: Annotated[
         str | None,
-        "of an arm, what its tip is measured with: position (default), pose, socket, "
-        "plane, distance, gravity, wrench or board",
+        "of an arm, what measures its tip: position (default), pose, socket, plane, "
+        "distance, gravity, wrench or board",
         "KIND",
     ] = None
     base: Annotated[str | None, "of an arm, the link that stands still", "LINK"] = None
@@ -74,7 +80,7 @@ class ArmOptions:
 
     @property
     def kind(self) -> str:
-        """Of the sensor."""
+        """The sensor's kind."""
         return self.sensor or "position"
 
     def read(self, path: str, table: Table | None, places: Any = None) -> SerialChain:
@@ -236,8 +242,7 @@ class RecordingOptions:
             path: of a table or a recording.
             arm: gives the arm of the recording; called with its ``which``.
         """
-        recording = os.path.isdir(path) or path.lower().endswith((".mcap", ".db3"))
-        if not recording:
+        if not is_recording(path):
             if self.which is not None or self.topic or self.in_degrees:
                 raise ValueError(
                     "--which, --topic and --in-degrees are of a recording, not a table"
@@ -265,6 +270,11 @@ class RecordingOptions:
         values = np.hstack([commands, read])
         lines = tuple(range(1, len(values) + 1))
         return Table(path, (*names, *model.sensor.outputs), values, {}, lines)
+
+
+def is_recording(path: str) -> bool:
+    """Whether a path is of a bag or a LeRobot dataset, not of a table."""
+    return os.path.isdir(path) or path.lower().endswith((".mcap", ".db3"))
 
 
 def in_degrees(arm: SerialChain, commands: Array) -> Array:

@@ -18,6 +18,7 @@ from jaxcal.commands.arms import (
     ModelPath,
     RecordingOptions,
     in_degrees,
+    is_recording,
 )
 from jaxcal.commands.tables import (
     Output,
@@ -113,15 +114,21 @@ class SavedFiles:
         """The arm's own file is written, corrected."""
         return self.out.lower().endswith(".urdf")
 
-    def require(self, of_urdf: bool, servos: str | None) -> None:
+    def require(self, file: str, of_urdf: bool, servos: str | None) -> None:
         """Refuse files that cannot be written, or must not be, before the fit."""
         if self.servos_out and self.as_urdf:
             raise ValueError(
                 "one of --servos-out and --out FILE.urdf must be left out: either "
                 "corrects the zeros, both would twice"
             )
+        if self.unproven and not (self.servos_out or self.as_urdf):
+            raise ValueError("--unproven is of --out FILE.urdf and --servos-out")
+        if self.overwrite and not (self.servos_out or self.as_urdf):
+            raise ValueError("--overwrite is of --out FILE.urdf and --servos-out")
         if self.servos_out and not servos:
             raise ValueError("--servos-out needs --servos, the file that it corrects")
+        if servos and not (self.servos_out or is_recording(file)):
+            raise ValueError("--servos is of a recording, or of --servos-out")
         if self.as_urdf and not of_urdf:
             raise ValueError("--out FILE.urdf needs --model FILE.urdf")
         if self.as_urdf and os.path.exists(self.out) and not self.overwrite:
@@ -182,7 +189,7 @@ def identify(
     dataset does in the place of the table, with the postures at which the arm rested.
     """
     of_urdf = (model or "").lower().endswith(".urdf")
-    saved.require(of_urdf, recording.servos)
+    saved.require(file, of_urdf, recording.servos)
     page.require()
     if saved.repair and weights:
         raise ValueError("--repair writes no weights: leave out one of them")
@@ -191,6 +198,8 @@ def identify(
     table = recording.table(file, lambda which: of_arm.of_recording(model, which))
     table = read_table(file) if table is None else table
     machine: Any = of_arm.machine(model, table)
+    if accuracy is not None and not isinstance(machine, SerialChain):
+        raise ValueError("--accuracy is of an arm, --model FILE.urdf")
     if of_urdf:
         readings = _arm_readings(of_arm, machine, table, inputs, outputs, weights)
         if machine.sensor.lengths:  # files of this format are in metres
@@ -333,6 +342,8 @@ def check(
     these readings; 2: bad input.
     """
     calibrated = Calibration.load(calibration)
+    if recording.servos and not is_recording(file):
+        raise ValueError("--servos is of a recording, not a table")
     table = recording.table(file, lambda which: calibrated.model)
     if table is not None and radians:
         raise ValueError("--radians is of tables, recordings say their unit")

@@ -67,7 +67,7 @@ class DesignOptions:
             required=self.required,
             max_replicates=self.replicates,
             scenarios=self.scenarios,
-            names=next(iter(table.labels.values()), None),
+            names=table.row_names,
         )
         design.candidate_set.axes = names
         return design
@@ -198,6 +198,8 @@ def score(
 ) -> None:
     """Judge a choice made elsewhere."""
     table = read_table(file)
+    if time_limit is not None and reference != "exact":
+        raise ValueError("--time-limit is of --reference exact")
     if (indices is None) == (subset is None):
         raise ValueError("one of --indices and --subset must be given")
     rows = np.array(indices)

@@ -47,6 +47,9 @@ class Output:
         if self.json and self.csv:
             raise ValueError("one of --json and --csv must be left out")
         ending = pathlib.PurePath(self.out).suffix.lower()
+        if (self.json and ending == ".csv") or (self.csv and ending == ".json"):
+            form = "--json" if self.json else "--csv"
+            raise ValueError(f"{form} and --out {self.out} differ: leave one out")
         if ending not in ("", ".csv", ".json", ".txt"):
             raise ValueError(f"--out must end in .csv or .json, got {self.out}")
         if self.json or ending == ".json":

@@ -23,7 +23,7 @@ from jaxcal.models.periods import within_half
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.models.verdict import Verdict, verdict
-from jaxcal.tables import COMMANDS, columns_of, of_frame
+from jaxcal.tables import COMMANDS, header_of, of_frame
 
 __all__ = [
     "ErrorGroups",
@@ -459,7 +459,7 @@ def recorded(model: Any, commands: Any, measured: Any) -> tuple[Any, Any, bool]:
         measured = read if measured is None else measured
     elif measured is None and getattr(getattr(model, "sensor", None), "zeros", False):
         measured = np.zeros((len(commands), model.num_outputs))
-    if measured is None and columns_of("commands", commands):
+    if measured is None and header_of("commands", commands):
         measured = commands  # a table of both, y_... what was measured
     if measured is None:
         raise ValueError("measured must be given: what was read at each of commands")

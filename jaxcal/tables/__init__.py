@@ -6,7 +6,7 @@ otherwise, is said in one line.
 
 from jaxcal.tables.decisions import Decision
 from jaxcal.tables.frames import (
-    columns_of,
+    header_of,
     inputs_of,
     names_in,
     of_frame,
@@ -23,8 +23,8 @@ __all__ = [
     "Decision",
     "Table",
     "columns_by_name",
-    "columns_of",
     "csv_text",
+    "header_of",
     "inputs_of",
     "names_in",
     "of_frame",

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jaxcal.tables.cells import truths_of
 from jaxcal.tables.names import COMMANDS, MEASURED
 
-__all__ = ["AVAILABLE", "Decision", "decide", "sentence", "spelt"]
+__all__ = ["AVAILABLE", "COUNTED", "Decision", "decide", "sentence", "spelt"]
 
 Array = NDArray[np.float64]
 
@@ -35,6 +35,7 @@ _RUNS = re.compile(
 _STAMPS = {"stamp", "timestamp", "date", "datetime", "epoch", "datum"}
 _TIMES = {"time", "uhrzeit", "elapsed", "clock"}
 _SECONDS = re.compile(r"t([ _]?[\[(]?(s|ms|us|ns|sec|seconds|min)[\])]?)?", re.I)
+COUNTED = "it counts the rows or tells their time"
 _EPOCH = 1e8  # seconds; no factor of an experiment is so large
 
 
@@ -103,7 +104,7 @@ def _of_numbers(
     if whole and (
         _NUMBERS.fullmatch(name.strip()) or (distinct and _RUNS.fullmatch(name.strip()))
     ):
-        return Decision("left out", "it counts the rows or tells their time")
+        return Decision("left out", COUNTED)
     if marked:
         reason = f"commands are those that begin with {COMMANDS}"
         return Decision("left out", reason)
@@ -119,8 +120,7 @@ def _of_y(
     depth = f"z_{root}".casefold() in names
     axis = depth or (f"x_{root}".casefold() in names and not digits)
     if axis and marked:
-        reason = f"it stands beside x_{root}: name what was measured"
-        return Decision("output", reason, asks=True)
+        return Decision("output", f"it stands beside x_{root}", asks=True)
     if marked:
         return Decision("output")
     if axis or (outputs and not any(x.startswith(MEASURED) for x in outputs)):
@@ -137,7 +137,7 @@ def _is_stamp(name: str) -> bool:
 
 
 def _words(name: str) -> set[str]:
-    """Its words, as snake, camel or plain text has them, without a unit."""
+    """Words of a name in snake, camel or plain case, without its unit."""
     plain = re.sub(r"[\[(].*", "", name)
     return {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", plain)}
 
@@ -149,7 +149,7 @@ def _of_time(name: str, numbers: Array) -> Decision | None:
         return None
     rising = len(numbers) > 1 and bool((np.diff(numbers) > 0.0).all())
     if stamp or rising or numbers.min() > _EPOCH:
-        return Decision("time", "it counts the rows or tells their time")
+        return Decision("time", COUNTED)
     return Decision("input", "a factor: it does not rise from row to row")
 
 
@@ -224,7 +224,7 @@ def spelt(names: Sequence[str], name: str) -> str | None:
     Raises:
         ValueError: two are.
     """
-    like = [each for each in names if each.strip().casefold() == name]
+    like = [column for column in names if column.strip().casefold() == name]
     if len(like) > 1:
         raise ValueError(
             f"columns {' and '.join(map(repr, like))} could both be {name}"

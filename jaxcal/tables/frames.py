@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.tables.cells import numbers_of
-from jaxcal.tables.decisions import decide
+from jaxcal.tables.cells import decimal_mark, numbers_of
+from jaxcal.tables.decisions import COUNTED, decide
 from jaxcal.tables.names import COMMANDS, MEASURED, columns_by_name, say
 from jaxcal.tables.table import Table, table_of
 
 __all__ = [
-    "columns_of",
+    "header_of",
     "inputs_of",
     "names_in",
     "of_frame",
@@ -22,70 +22,75 @@ __all__ = [
 ]
 
 
-def columns_of(argument: str, values: Any) -> dict[str, Any] | None:
-    """Columns by their names, or the numbers of one row; None of what has no names.
+def header_of(argument: str, values: Any) -> list[str]:
+    """Names of the columns of a frame, or of a row's numbers; [] where there are none.
 
     Raises:
         ValueError: a name comes twice, or some columns have none.
     """
-    try:
-        return _columns_of(values)
-    except ValueError as error:
-        raise ValueError(f"{argument}: {error}") from None
-
-
-def _columns_of(values: Any) -> dict[str, Any] | None:
-    if isinstance(values, Table):
-        return dict(zip(values.names, values.values.T, strict=True)) | values.labels
-    if isinstance(values, list | tuple) and values and not hasattr(values, "_fields"):
-        if _columns_of(values[0]) is None:
-            return None
-        rows: list[Any] = [*map(_columns_of, values)]
-        return {name: [_cell(row, name) for row in rows] for name in rows[0]}
     names = _names(values)
     if not any(isinstance(name, str | tuple) for name in names):
-        return None
+        return []
     for name in names:
         if not isinstance(name, str):
-            raise ValueError(f"every column must have a name, a text, got {name!r}")
+            raise ValueError(
+                f"{argument}: every column must have a name, a text, got {name!r}"
+            )
         if names.count(name) > 1:
-            raise ValueError(f"column {name!r} comes twice")
-    if hasattr(values, "_fields"):
-        return dict(zip(names, values, strict=True))
-    if hasattr(values, "dims") and not hasattr(values, "data_vars"):
-        return dict(zip(names, np.moveaxis(values.values, -1, 0), strict=True))
-    return {name: _cell(values, name) for name in names}
+            raise ValueError(f"{argument}: column {name!r} comes twice")
+    return names
 
 
 def _names(values: Any) -> list[Any]:
     """Names as values hold them; [] where they have none."""
-    if isinstance(values, np.ndarray):
+    if isinstance(values, np.ndarray | np.void):
         return [*(values.dtype.names or ())]
-    if hasattr(values, "dims") and not hasattr(values, "data_vars"):
+    if isinstance(values, Table):
+        return [*values.header]
+    if _is_labelled(values):
         axis = values.coords.get(values.dims[-1]) if values.dims else None
         return [] if axis is None else [*axis.values.tolist()]
     for kind in ("_fields", "data_vars", "column_names", "columns"):
         if hasattr(values, kind):
             return [*getattr(values, kind)]
+    if isinstance(values, list | tuple):  # rows
+        return _names(values[0]) if values else []
     if isinstance(values, Mapping):
         return [*values]
     index = getattr(values, "index", None)  # of a series, which may be a row
     return [] if index is None or callable(index) else [*index]
 
 
-def _cell(values: Any, name: str) -> Any:
-    """The column, or the number, of this name."""
+def _is_labelled(values: Any) -> bool:
+    """Whether it is an array of xarray, whose last axis may have names."""
+    return hasattr(values, "dims") and not hasattr(values, "data_vars")
+
+
+def _column(values: Any, name: str) -> Any:
+    """The column, or the number, of this name, as it is held."""
+    if isinstance(values, Table):
+        if name in values.labels:
+            return values.labels[name]
+        return values.values[:, values.names.index(name)]
+    if hasattr(values, "_fields"):
+        return getattr(values, name)
+    if isinstance(values, list | tuple):
+        return [_column(row, name) for row in values]
+    if _is_labelled(values) or not hasattr(values, "__getitem__"):
+        return np.asarray(values)[..., _names(values).index(name)]
     try:
         return values[name]
     except KeyError:
         raise ValueError(f"every row must have {name!r}, one has not") from None
 
 
-def _column(values: Any) -> Any:
+def _cells(values: Any) -> Any:
     """An array of numbers, or of what is none a list of cells."""
     array = np.asarray(values)
     if array.dtype.kind in "iuf":
         return array
+    if array.dtype.kind in "mM":
+        array = array.astype(str)
     cells = array.astype(object).ravel().tolist()
     return ["" if str(x) in ("None", "nan", "NaT", "<NA>") else str(x) for x in cells]
 
@@ -97,7 +102,7 @@ def of_frame(
 
     Args:
         argument: its name in errors.
-        frame: what ``columns_of`` takes, or has no names.
+        frame: what ``header_of`` takes.
         wanted: names.
         prefix: that they, or the columns, may lack.
         used: (N,) rows whose numbers must be finite; all when not given.
@@ -105,12 +110,47 @@ def of_frame(
     Raises:
         ValueError: a name is missing, or could be either of two; a cell is no number.
     """
+    frame = _collected(frame)
     names = names_in(argument, frame, wanted, prefix)
     if names is None:
         return frame
-    columns = columns_of(argument, frame) or {}
-    arrays = [_numbers(argument, name, columns[name], used) for name in names]
-    return np.stack(arrays, axis=-1)
+    block: Any = None
+    if hasattr(frame, "columns") and hasattr(frame, "__getitem__"):
+        block = None if hasattr(frame, "column_names") else frame[[*names]]
+    if block is None or np.asarray(block).dtype.kind not in "iuf":
+        columns = [_numbers(argument, name, _column(frame, name)) for name in names]
+        block = np.stack(columns, axis=-1)
+    bad = ~np.isfinite(np.asarray(block))
+    for place in np.argwhere(bad if used is None else bad & np.c_[used])[:1]:
+        where = f"row {place[0]}, " if len(place) > 1 else ""
+        raise ValueError(
+            f"{argument}: {where}column {names[place[-1]]!r} must be finite, got "
+            f"{np.asarray(block)[*place]}"
+        )
+    return block
+
+
+def _collected(frame: Any) -> Any:
+    """A lazy frame read."""
+    lazy = hasattr(frame, "collect") and not hasattr(frame, "to_numpy")
+    return frame.collect() if lazy else frame
+
+
+def _numbers(argument: str, name: str, values: Any) -> Any:
+    """Numbers of a column, or of a row's cell."""
+    array = np.asarray(values)
+    if array.dtype.kind == "b":
+        return array.astype(np.float64)
+    if not isinstance(cells := _cells(values), list):
+        return array
+    numbers = numbers_of(cells, *decimal_mark(cells, True))
+    for row, number in enumerate(numbers):
+        if number is None:
+            raise ValueError(
+                f"{argument}: row {row}, column {name!r} must hold a number, got "
+                f"{cells[row]!r}"
+            )
+    return np.array(numbers, dtype=np.float64).reshape(array.shape)
 
 
 def names_in(
@@ -119,56 +159,33 @@ def names_in(
     wanted: Sequence[str],
     prefix: str,
     beside: Collection[str] | None = None,
-) -> tuple[str, ...] | None:
+) -> Any:
     """The columns of a frame that ``of_frame`` takes; None: it has no names.
 
     Args:
         argument: its name in errors.
-        frame: what ``columns_of`` takes, or has no names.
+        frame: what ``header_of`` takes.
         wanted: names.
         prefix: that they, or the columns, may lack.
         beside: columns that are read too; where it is given, others are said.
     """
-    columns = columns_of(argument, frame)
-    if columns is None:
+    header = header_of(argument, frame)
+    if not header:
         return None
     try:
-        names = columns_by_name(wanted, [*columns], prefix)
+        names = columns_by_name(wanted, header, prefix)
     except ValueError as error:
         raise ValueError(f"{argument}: {error}") from None
     if None in names:
         raise ValueError(
             f"{argument} must have the columns {', '.join(wanted)}, "
-            f"{wanted[names.index(None)]!r} is missing (columns: {', '.join(columns)})"
+            f"{wanted[names.index(None)]!r} is missing (columns: {', '.join(header)})"
         )
     if beside is not None:
-        table = table_of_frame(argument, frame)
-        if text := table.unread(names, prefix, beside):
-            say(f"{argument}: {text}")
+        spare = table_of_frame(argument, frame).unread(names, prefix, beside)
+        if spare:
+            say(f"{argument}: {spare}")
     return tuple(names)
-
-
-def _numbers(argument: str, name: str, values: Any, used: Any) -> Any:
-    """Numbers of a column, or of a row's cell; NaN only where it is not used."""
-    array = np.asarray(values)
-    if array.dtype.kind == "b":
-        array = array.astype(np.float64)
-    elif isinstance(cells := _column(values), list):
-        numbers = numbers_of(cells)
-        for row, number in enumerate(numbers):
-            if number is None:
-                raise ValueError(
-                    f"{argument}: row {row}, column {name!r} must hold a number, got "
-                    f"{cells[row]!r}"
-                )
-        array = np.array(numbers, dtype=np.float64).reshape(array.shape)
-    bad = ~np.isfinite(array)
-    for place in np.argwhere(bad if used is None else bad & used)[:1]:
-        where = f"row {place[0]}, " if len(place) else ""
-        raise ValueError(
-            f"{argument}: {where}column {name!r} must be finite, got {array[*place]}"
-        )
-    return array
 
 
 def table_of_frame(argument: str, frame: Any) -> Table:
@@ -177,25 +194,27 @@ def table_of_frame(argument: str, frame: Any) -> Table:
     Raises:
         ValueError: it has no names, or a column under u_ holds words.
     """
+    frame = _collected(frame)
     if isinstance(frame, Table):
         return frame
-    columns = columns_of(argument, frame)
-    if columns is None:
+    header = header_of(argument, frame)
+    if not header:
         raise ValueError(
             f"{argument} must be a path or have names of its columns, got "
             f"{type(frame).__name__}"
         )
-    arrays = {name: _column(np.atleast_1d(x)) for name, x in columns.items()}
-    index = getattr(frame, "index", None)
-    if isinstance(name := getattr(index, "name", None), str) and name not in arrays:
-        arrays[name] = [*map(str, index)]
-    count = len(next(iter(arrays.values())))
-    for name, array in arrays.items():
-        if len(array) != count:
+    columns = {name: _cells(np.atleast_1d(_column(frame, name))) for name in header}
+    count = len(columns[header[0]])
+    for name, cells in columns.items():
+        if len(cells) != count:
             raise ValueError(
-                f"{argument}: column {name!r} must hold {count} rows, got {len(array)}"
+                f"{argument}: column {name!r} must hold {count} rows, got {len(cells)}"
             )
-    return table_of(argument, arrays, range(count), row="row")
+    table = table_of(argument, columns, range(count), None, row="row")
+    index: Any = getattr(frame, "index", None)
+    if isinstance(label := getattr(index, "name", None), str):
+        table.labels.setdefault(label, [*map(str, index)])
+    return table
 
 
 def inputs_of(argument: str, frame: Any, outputs: Sequence[str] = ()) -> Any:
@@ -203,10 +222,10 @@ def inputs_of(argument: str, frame: Any, outputs: Sequence[str] = ()) -> Any:
 
     Args:
         argument: its name in errors.
-        frame: what ``columns_of`` takes.
+        frame: what ``header_of`` takes.
         outputs: columns of it that are readings.
     """
-    if columns_of(argument, frame) is None:
+    if not header_of(argument, frame):
         return None
     return table_of_frame(argument, frame).commands(None, None, outputs)
 
@@ -219,20 +238,24 @@ def outputs_of(argument: str, frame: Any, beside: bool) -> Any:
 
     Args:
         argument: its name in errors.
-        frame: what ``columns_of`` takes.
+        frame: what ``header_of`` takes.
         beside: commands are in it too, so that readings are y_... alone.
     """
-    if columns_of(argument, frame) is None:
+    if not header_of(argument, frame):
         return None
     table = table_of_frame(argument, frame)
     if beside:
-        return table.outputs(None, None)
+        return table.outputs(None, "y_...")
     decisions = decide(table)
-    names = [name for name in table.names if not name.startswith(COMMANDS)]
-    spare = [x for x in names if decisions[x].role in ("time", "available")]
-    spare += [x for x in names if decisions[x].reason.startswith("it counts")]
+    names = [
+        name
+        for name in table.names
+        if not name.startswith(COMMANDS)
+        and decisions[name].role != "available"
+        and decisions[name].reason != COUNTED
+    ]
+    names = names or [*table.names]
     words = [name for name in table.labels if name.startswith(MEASURED)]
-    names = [name for name in names if name not in spare] or names
     if not words and (unread := [x for x in table.header if x not in names]):
         say(f"{argument}: readings {', '.join(names)}; not read: {', '.join(unread)}")
     return (*names, *words)

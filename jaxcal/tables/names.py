@@ -1,4 +1,4 @@
-"""Names of columns: those that hold what is wanted, whatever prefix or unit they bear."""
+"""Columns by name, whatever prefix or unit they bear, and what is said of them."""
 
 from __future__ import annotations
 

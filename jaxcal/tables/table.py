@@ -46,6 +46,14 @@ class Table:
         return (*self.names, *self.labels)
 
     @property
+    def row_names(self) -> list[str] | None:
+        """(N,) the first column of words that are no TRUE and FALSE; None: none is."""
+        for cells in self.labels.values():
+            if truths_of(cells) is None:
+                return cells
+        return None
+
+    @property
     def decisions(self) -> dict[str, Decision]:
         """For each column its role and why: input, output, label, available, time or
         left out; where nothing but the table says it."""
@@ -167,19 +175,56 @@ class Table:
             but: columns that hold readings, or weights.
 
         Raises:
-            ValueError: there is none, or the values of one number the rows.
+            ValueError: there is none, or the values of one number the rows; of a frame,
+                whose columns were chosen, that is said.
         """
         if chosen is not None:
             return self._chosen(chosen, COMMANDS)
-        return self._decided("input", decide(self, {*but}, fit=bool(but)), option)
+        decisions = decide(self, {*but}, fit=bool(but))
+        advice = f"begin the names of commands with {COMMANDS}"
+        advice += f", or name them with {option}" if option else ""
+        for place, (name, decision) in enumerate(decisions.items(), start=1):
+            if not decision.asks or decision.role == "output":
+                continue
+            if self.row != "line":
+                decisions[name] = Decision("input", decision.reason)
+                continue
+            what = f"column {name!r}" if self.headed else f"column {place}"
+            raise ValueError(
+                f"{self.source}: {what} {decision.reason}; if it is a command, {advice}"
+            )
+        names = _of_role("input", decisions)
+        if not names:
+            raise ValueError(
+                f"{self.source}: no column holds commands "
+                f"(columns: {', '.join(self.header)}); {advice}"
+            )
+        if text := sentence(decisions):
+            more = f"; other columns are named with {option}" if option else ""
+            say(f"{self.source}: {text}{more}")
+        return names
 
-    def outputs(
-        self, chosen: str | None, option: str | None = "--outputs"
-    ) -> tuple[str, ...]:
-        """Columns of measurements: those chosen, else ``y_...``."""
+    def outputs(self, chosen: str | None, option: str = "--outputs") -> tuple[str, ...]:
+        """Columns of measurements: those chosen, else ``y_...``.
+
+        Raises:
+            ValueError: there is none, or y_... is an axis beside x_... or z_....
+        """
         if chosen is not None:
             return self._chosen(chosen, MEASURED)
-        return self._decided("output", decide(self, fit=True), option)
+        decisions = decide(self, fit=True)
+        names = _of_role("output", decisions)
+        axes = [name for name in names if decisions[name].asks]
+        if names and not axes:
+            return names
+        axes = axes or [name for name in self.names if name.startswith(MEASURED)]
+        fault = f"no column begins with {MEASURED}"
+        if axes:
+            fault = f"column {axes[0]!r} may be an axis, not what was measured"
+        raise ValueError(
+            f"{self.source}: {fault}; name the measured columns with {option} "
+            f"(columns: {', '.join(self.header)})"
+        )
 
     def available(self) -> Mask | None:
         """(N,) True where the column ``available`` is 1; None without that column."""
@@ -199,13 +244,13 @@ class Table:
         return np.asarray(mask == 1.0)
 
     def say(
-        self, wanted: Sequence[str], found: Sequence[Any], how: str, more: str = ""
+        self, wanted: Sequence[str], columns: Sequence[Any], how: str, more: str = ""
     ) -> None:
         """Say which columns are what; nothing where their names and order say it."""
-        order = [name for name in self.header if name in found]
+        order = [name for name in self.header if name in columns]
         parts = [more] if more else []
-        if [*wanted] != [*found] or order != [*found]:
-            listed = ", ".join(found), how, ", ".join(wanted)
+        if [*wanted] != [*columns] or order != [*columns]:
+            listed = ", ".join(columns), how, ", ".join(wanted)
             parts.insert(0, "columns {} are read {}, as {}".format(*listed))
         if parts:
             say(f"{self.source}: {'; '.join(parts)}")
@@ -227,48 +272,6 @@ class Table:
             if column is None:
                 self.columns([name])  # says that there is none
         return tuple(columns)
-
-    def _decided(
-        self, role: str, decisions: Mapping[str, Decision], option: str | None
-    ) -> tuple[str, ...]:
-        """The columns of a role, the rest being said."""
-        prefix, what = (
-            (COMMANDS, "commands")
-            if role == "input"
-            else (MEASURED, "measured columns")
-        )
-        advice = f"begin the names of {what} with {prefix}"
-        if option:
-            advice += f", or name them with {option}"
-        names = tuple(name for name, d in decisions.items() if d.role == role)
-        header = f"columns: {', '.join(self.header)}"
-        if role == "output":
-            for name in names:
-                if decisions[name].asks:
-                    where = f"{self.source}: column {name!r} may be an axis"
-                    raise ValueError(f"{where}, {decisions[name].reason}; {advice}")
-            if not names:
-                axes = [name for name in decisions if name.startswith(prefix)]
-                rule = f"{', '.join(axes)} may be an axis" if axes else ""
-                raise ValueError(
-                    f"{self.source}: {rule or f'no column begins with {prefix}'}; "
-                    f"{advice} ({header})"
-                )
-            return names
-        for place, (name, decision) in enumerate(decisions.items(), start=1):
-            if decision.asks and decision.role == "left out":
-                what = f"column {name!r}" if self.headed else f"column {place}"
-                raise ValueError(
-                    f"{self.source}: {what} {decision.reason}; if it is a command, "
-                    + advice
-                )
-        if not names:
-            rule = f"{self.source}: no column holds commands ({header})"
-            raise ValueError(f"{rule}; {advice}")
-        if text := sentence(decisions):
-            more = f"; other columns are named with {option}" if option else ""
-            say(f"{self.source}: {text}{more}")
-        return names
 
     def unread(
         self, columns: Sequence[str], prefix: str, others: Collection[str]
@@ -292,6 +295,10 @@ class Table:
             f"column{'s' if plural else ''} {listed} {'are' if plural else 'is'} not "
             "read: nothing here has that name"
         )
+
+
+def _of_role(role: str, decisions: Mapping[str, Decision]) -> tuple[str, ...]:
+    return tuple(name for name, decision in decisions.items() if decision.role == role)
 
 
 # -- reading ---------------------------------------------------------------------------
@@ -392,12 +399,20 @@ def table_of(
     source: str,
     columns: Mapping[str, Sequence[str] | Array],
     lines: Sequence[int],
-    mark: tuple[str, bool] = (".", True),
+    mark: tuple[str, bool] | None,
     *,
     headed: bool = True,
     row: str = "line",
 ) -> Table:
     """The table of columns of cells, or of numbers (N,).
+
+    Args:
+        source: name of the table, for errors.
+        columns: by name.
+        lines: what each row is called in errors.
+        mark: as ``decimal_mark`` says of all cells; None: of each column by itself.
+        headed: the names are the table's own.
+        row: what ``lines`` counts.
 
     Raises:
         ValueError: a column holds neither numbers nor words, or words under a name that
@@ -411,7 +426,7 @@ def table_of(
             numeric[name] = cells
             continue
         try:
-            numbers = numbers_of(cells, *mark)
+            numbers = numbers_of(cells, *(mark or decimal_mark(cells, True)))
         except Ambiguity as error:
             i = int(str(error))
             plain = cells[i].replace(",", "").replace(".", "")

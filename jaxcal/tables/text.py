@@ -1,4 +1,4 @@
-"""Text as rows of cells: what spreadsheets, R, numpy and loggers export, and csv_text."""
+"""Text as rows of cells, as spreadsheets, R, numpy and loggers write it."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _DELIMITERS = "\t;, "  # the first of those that serve alike
 _OF_R = " \t"  # with which R names rows, and not the column of these names
 _LOOKED_AT = 20  # rows by which the delimiter is judged
 _UNIT = re.compile(
-    r"[\[(].*[\])]|[-%°‰]|(?:[/.·*^ ²³0-9-]|[pnuµμmkMG]?(?:deg|rad|m|s|g|V|A|W|N|Nm|Hz|Pa"
-    r"|bar|Ω|l|L|C|F|K|J|rpm|min|h|psi|in|inch|°C|°F|°|%|ct|cts|counts?|steps?|pulses?"
+    r"[\[(].*[\])]|[-%°‰]|(?:[/.·*^ ²³0-9-]|[pnuµμmckMGh]?(?:deg|rad|m|s|g|V|A|W|N|Hz"
+    r"|Pa|bar|Ω|l|L|C|F|K|J|rpm|min|h|psi|in|inch|°C|°F|°|%|ct|cts|counts?|steps?|pulses?"
     r"|degrees?|radians?|volts?|sec|seconds?))+"
 )
 
@@ -82,13 +82,13 @@ def sheet_of(source: str, text: str) -> Sheet:
     rows = _rows(source, lines, delimiter)
     if not rows:
         raise ValueError(f"{source}: the table is empty")
-    if all(map(is_number, rows[0][1])) and comment:
-        for names in ([*_cells([comment[1]], mark)][0][1] for mark in (delimiter, " ")):
+    if comment and all(map(is_number, rows[0][1])):
+        line, text = comment
+        for mark in (delimiter, " "):
+            names = _cells([text], mark)[0][1]
             if len(names) == len(rows[0][1]) and not any(map(is_number, names)):
-                notes.append(
-                    f"names are those of line {comment[0]}: {', '.join(names)}"
-                )
-                rows.insert(0, (comment[0], names))
+                notes.append(f"names are those of line {line}: {', '.join(names)}")
+                rows.insert(0, (line, names))
                 break
     headed = not all(map(is_number, rows[0][1]))
     if headed and len(rows) > 2 and _holds_units(rows[1][1], rows[2:]):
@@ -117,7 +117,9 @@ def _without_comments(
         listed = ", ".join(str(i + 1) for i in inside[:5])
         more = ", ..." if len(inside) > 5 else ""
         notes.append(f"a comment, begun with #, is not read: line {listed}{more}")
-    head = (above[-1] + 1, lines[above[-1]].strip().lstrip("# ")) if above else None
+    head = None
+    if above and (names := lines[above[-1]].strip().lstrip("# \t")):
+        head = (above[-1] + 1, names)
     return ["" if i in {*begin} else line for i, line in enumerate(lines)], head
 
 

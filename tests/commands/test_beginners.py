@@ -159,9 +159,7 @@ def test_the_columns_of_an_arm_in_any_company(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert main("select joints.csv -k 4 --model arm.urdf".split()) == 0
     said = capsys.readouterr().err
-    assert (
-        said == "joints.csv: column 'spare' is not read: nothing here has that name\n"
-    )
+    assert said.startswith("joints.csv: column 'spare' is not read")
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])

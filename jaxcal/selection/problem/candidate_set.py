@@ -27,7 +27,7 @@ from jaxcal.selection.problem.arrays import (
 from jaxcal.selection.problem.scenarios import Scenarios, checked_weights, scenarios_of
 from jaxcal.tables import (
     COMMANDS,
-    columns_of,
+    header_of,
     inputs_of,
     names_in,
     of_frame,
@@ -87,8 +87,8 @@ class CandidateSet:
         if model is not None:
             model = as_model(model)
         require_kind("prior", prior, Prior)
-        labels, axes = _names_of_rows(candidates, names), None
-        if columns_of("candidates", candidates):
+        frame, axes = candidates, None
+        if header_of("candidates", candidates):
             wanted, mask = (
                 getattr(model, "inputs", ()),
                 _available(candidates, available),
@@ -101,6 +101,7 @@ class CandidateSet:
             measured = of_frame("measured", measured, wanted or axes, COMMANDS)
             available = mask
         array = filled("candidates", candidates, "M", "n")
+        labels = _names_of_rows(frame, names, len(array))
         if model is None:
             model = Affine(array.shape[1], array.shape[1])
         if model.multiplicity and array.shape[1] != model.num_inputs:
@@ -195,7 +196,7 @@ class CandidateSet:
             prior=prior,
             noise=noise,
             measured=measured,
-            names=_names_of_rows(array, names),
+            names=_names_of_rows(array, names, len(array)),
             scenarios=scenarios,
             **rules,
         )
@@ -250,19 +251,17 @@ def _available(frame: Any, available: Any) -> Any:
 
 
 def _names_of_rows(
-    candidates: Any, names: Sequence[str] | None
+    candidates: Any, names: Sequence[str] | None, count: int
 ) -> tuple[str, ...] | None:
     """Names of the candidates, of a data frame its index or its column of words."""
-    if names is None and columns_of("candidates", candidates):
+    if names is None and header_of("candidates", candidates):
         rows = tuple(map(str, getattr(candidates, "index", ())))
         if rows and rows != tuple(map(str, range(len(rows)))):
             return rows
-        names = next(
-            iter(table_of_frame("candidates", candidates).labels.values()), None
-        )
+        names = table_of_frame("candidates", candidates).row_names
     if names is None:
         return None
-    labels, count = tuple(names), len(candidates)
+    labels = tuple(names)
     if len(labels) != count or not all(isinstance(name, str) for name in labels):
         raise ValueError(
             f"names must be {count} texts, one for each candidate, got {len(labels)} "
