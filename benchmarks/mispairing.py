@@ -159,7 +159,7 @@ def _split(case: Case) -> tuple[Array, Array, Callable[[Array], tuple[Array, Arr
     def table(y: Array) -> tuple[Array, Array]:
         u = case.commands.copy()
         u[:, sensed] = y
-        return u, case.measured[: len(u)]
+        return u, case.measured
 
     return case.commands, read, table
 
@@ -437,11 +437,8 @@ def main() -> None:
                         tally["small"] += 1
                         continue
                     said, seconds = _told(case, u, y, checked)
-                except ValueError as error:
-                    tally["refused"] += 1
-                    if args.verbose:
-                        print("   refused", seed, error)
-                    continue
+                except ValueError as error:  # which names the mispairing too
+                    said, seconds = f"refused: {error}", 0.0
                 times.append(seconds)
                 result = (
                     "found"

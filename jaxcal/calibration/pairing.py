@@ -52,7 +52,6 @@ Rows = NDArray[np.intp]
 Fit = Any  # a jaxcal.calibration.fit.Fit, whose module need not be known here
 
 _SURE = 8.0  # log of the odds at which a mispairing is said
-_TOGETHER = 1.0  # of rows from elsewhere beside as many outliers
 _RATIO = 2.0  # times the noise without it, least squares of the table as it stands
 _AS_GOOD = 3.0  # log of the odds within which another kind is named too
 _TRIED = 6  # hypotheses that are fitted one by one
@@ -219,28 +218,23 @@ def _found(
     fits = _alternatives(table, plain)
     if not any(_explains(plain, fit) for fit in fits):
         fits += _columns(table, plain, inputs, outputs)
-    fits = [fit for fit in fits if np.isfinite(fit.evidence)]
+    fits = [fit for fit in fits if np.isfinite(fit.evidence) and not _few(fit)]
     if not fits:
         return None
     best = max(fits, key=lambda fit: fit.evidence)
-    if best.evidence - plain.evidence < _TOGETHER or not _better(plain, best):
+    if not _better(plain, best):
         return None
-    sure = _SURE
-    if any(by == FOREIGN for _, by in best.hypothesis.starts):
-        # Outliers that all stand together are none.
-        (start, _), (end, _) = best.hypothesis.starts[1:]
-        if end - start < _BLOCK:
-            return None
-        sure = _TOGETHER
-    for benign in _benign(table, plain, best):
-        if best.evidence - benign.evidence < (sure if benign is plain else _SURE):
-            return None
-        by_itself = benign is not plain and not benign.hypothesis.code
-        if by_itself and not _better(benign, best):
-            return None
+    if not _stands_apart(plain, best):
+        for benign in _benign(table, plain, best):
+            if best.evidence - benign.evidence < _SURE:
+                return None
+            by_itself = benign is not plain and not benign.hypothesis.code
+            if by_itself and not _better(benign, best):
+                return None
     near: dict[int, list[int]] = {}
     if best.hypothesis.kind == "path":
-        best, near = polished(table, best)
+        at_best, near = polished(table, best)
+        best, near = (best, {}) if _few(at_best) else (at_best, near)
     reason = _words(table, best, near, outputs, unit)
     for fit in _top(fits, len(fits)):
         other = _what(table, fit, {}, outputs, unit)
@@ -284,6 +278,27 @@ def _plainly_right(table: Table, plain: Fitted) -> bool:
     return bool((np.abs(np.cumsum(scores, axis=0)) < _TREND * size).all())
 
 
+def _few(fit: Fitted) -> bool:
+    """Whether a hypothesis is of so few rows from elsewhere that they are outliers."""
+    path = fit.hypothesis.starts
+    ends = [start for start, _ in (*path[1:], (len(fit.inside), 0))]
+    return bool(path) and any(
+        by == FOREIGN and end - start < _BLOCK
+        for (start, by), end in zip(path, ends, strict=True)
+    )
+
+
+def _stands_apart(plain: Fitted, best: Fitted) -> bool:
+    """Whether the outliers of a table are one block of rows, as those of none are."""
+    path = best.hypothesis.starts
+    if len(path) != 3 or path[1][1] != FOREIGN:
+        return False
+    block = np.arange(path[1][0], path[2][0])
+    outliers = np.flatnonzero(~plain.inside)
+    most = len(block) + 1  # of outliers, one of which may stand elsewhere
+    return bool(len(outliers) <= most and np.isin(block, outliers).sum() >= _BLOCK)
+
+
 def _better(fit: Fitted, best: Fitted) -> bool:
     """Whether an output's residuals are far larger than the noise of the best."""
     return bool((fit.rms > _RATIO * best.noise).any())
@@ -291,7 +306,7 @@ def _better(fit: Fitted, best: Fitted) -> bool:
 
 def _explains(plain: Fitted, fit: Fitted) -> bool:
     """Whether nothing is left to explain."""
-    sure = fit.evidence - plain.evidence > _SURE
+    sure = fit.evidence - plain.evidence > _SURE or _stands_apart(plain, fit)
     return sure and bool((fit.rms < 0.1 * plain.rms).any())
 
 

@@ -198,7 +198,8 @@ def log_evidence(table: Table, square: Array, count: Any, extra: int = 0) -> Arr
 
 def solved(matrix: Array, right: Array, known: Array) -> Array:
     """(..., r, c) solution of normal equations with prior precisions (r,)."""
-    size = np.sqrt(np.einsum("...rr->...r", matrix) + known) + 1e-300
+    size = np.sqrt(np.einsum("...rr->...r", matrix) + known)
+    size = np.where(size > 0.0, size, 1.0)
     scaled = matrix / size[..., None] / size[..., None, :]
     at = np.arange(len(known))
     scaled[..., at, at] += known / size**2 + _RIDGE

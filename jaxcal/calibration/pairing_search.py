@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +49,7 @@ _MANY = 20  # parameters
 _LEAST = 3  # rows that a change leaves on either side
 _KINDS = np.log(10.0)
 _LAGS = 200  # rows, of a recording
-_STARTS, _ROUNDS = 24, 12  # of a search for an order that was lost
+_STARTS, _REFINED, _ROUNDS = 60, 30, 12  # of a search for an order that was lost
 _TURNS = 1.7453292519943295e-2  # radians in a degree
 _UNITS = {
     "is in radians, degrees are meant": 1.0 / _TURNS,
@@ -447,28 +447,58 @@ def matched_anew(table: Table, fit: Fitted) -> list[Rows]:
     from scipy.optimize import linear_sum_assignment
 
     factors, right = table.system(as_it_is(table), every)
-    read, r, c = right.reshape(len(every), -1), factors.shape[-1], right.shape[-1]
-    size = np.sqrt((factors**2).mean(axis=(0, 1))) + 1e-300
-    rng = np.random.default_rng(0)
-    starts = [np.eye(r, c), -np.eye(r, c), *rng.normal(size=(_STARTS, r, c))]
-    found: list[tuple[float, Rows]] = []
-    for start in starts:
-        off = ((factors / size) @ start).reshape(read.shape)
-        off = (off - off.mean(axis=0)) / (off.std(axis=0) + 1e-300)
-        off = off * read.std(axis=0) + read.mean(axis=0)
-        match, square = every, np.inf
+    read, (_, a, r), c = right.reshape(len(every), -1), factors.shape, right.shape[-1]
+    white = (read - read.mean(axis=0)) / (read.std(axis=0) + 1e-300)
+
+    def refit(match: Rows) -> tuple[float, Rows, Array]:
+        """Square of a match refitted, the next one, and what it predicts."""
+        flat = factors[match].reshape(-1, r)
+        slopes = np.linalg.lstsq(flat, right.reshape(len(flat), c))[0]
+        off = (factors @ slopes).reshape(read.shape)
+        apart = ((read[:, None] - off) ** 2).sum(axis=-1)
+        moved = linear_sum_assignment(apart)[1]
+        return float(apart[every, moved].sum()), moved, off
+
+    tried: list[tuple[float, Rows]] = []
+    for start in _starts(factors, white, a, c):
+        apart = ((white[:, None] - start) ** 2).sum(axis=-1)
+        square, match, _ = refit(linear_sum_assignment(apart)[1])
+        tried.append((square, match))
+    tried.sort(key=lambda each: each[0])
+    best: list[tuple[float, Rows]] = []
+    for square, match in tried[:_REFINED]:
         for _ in range(_ROUNDS):
-            apart = ((read[:, None] - off) ** 2).sum(axis=-1)
-            moved = linear_sum_assignment(apart)[1]
-            flat = factors[moved].reshape(-1, r)
-            slopes = np.linalg.lstsq(flat, right.reshape(len(flat), c))[0]
-            off = (factors @ slopes).reshape(read.shape)
-            before, square = square, float(((read - off[moved]) ** 2).sum())
-            if not square < before:
+            better, moved, _ = refit(match)
+            if not better < square:
                 break
-            match = moved
-        found.append((square, match))
-    return [match for _, match in sorted(found, key=lambda each: each[0])[:2]]
+            square, match = better, moved
+        best.append((square, match))
+    return [match for _, match in sorted(best, key=lambda each: each[0])[:2]]
+
+
+def _starts(factors: Array, white: Array, a: int, c: int) -> Iterator[Array]:
+    """(N, q) readings, of unit size, by parameters that may be right.
+
+    The covariance of readings does not depend on how they are paired, so commands and
+    readings of unit covariance differ by a turn alone.
+    """
+    rng, count = np.random.default_rng(0), len(white)
+    for _ in range(_STARTS):
+        off = (factors @ rng.normal(size=(factors.shape[-1], c))).reshape(count, -1)
+        yield (off - off.mean(axis=0)) / (off.std(axis=0) + 1e-300)
+    if a > 1:  # outputs that share no regressor
+        return
+    commands = factors[:, 0, :-1] - factors[:, 0, :-1].mean(axis=0)
+    n = commands.shape[1]
+    size = commands.std(axis=0) + 1e-300
+    for sign in (1.0, -1.0):  # outputs that follow the commands, each its own
+        yield sign * (commands / size) @ np.eye(n, c)
+    unit = np.linalg.svd(commands, full_matrices=False)[0] * np.sqrt(count)
+    _, scale, axes = np.linalg.svd(white, full_matrices=False)
+    shape = (scale[:, None] / np.sqrt(count)) * axes  # (c, c) of unit readings
+    for _ in range(_STARTS):
+        turn = np.linalg.qr(rng.normal(size=(max(n, c), max(n, c))))[0]
+        yield unit @ turn[: unit.shape[1], : len(shape)] @ shape
 
 
 def changed_columns(

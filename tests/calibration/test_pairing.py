@@ -1,0 +1,291 @@
+"""A table that was mispaired is told how; a right one is left alone.
+
+The oracle is the spoiling: rows of a right table are moved in a known way, and the
+sentence must name it and its row.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+import warnings
+
+import numpy as np
+import pytest
+import ur5
+
+import jaxcal
+from jaxcal.calibration.pairing_fit import Hypothesis, Table, fitted, log_evidence
+from jaxcal.calibration.pairing_search import shifted
+from jaxcal.commands.main import main
+from jaxcal.models import Affine, Linear
+
+MATRIX = np.array([[1.02, 0.05, -0.03], [0.04, 0.97, 0.06], [-0.02, 0.03, 1.01]])
+BIAS = np.array([0.4, -0.7, 0.2])
+NOISE = 0.05
+
+
+def _table(seed=0, count=20):
+    rng = np.random.default_rng(seed)
+    commands = rng.uniform(-10.0, 10.0, (count + 10, 3))
+    measured = commands @ MATRIX.T + BIAS + NOISE * rng.normal(size=commands.shape)
+    return commands, measured
+
+
+def _verdict(commands, measured, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return jaxcal.identify(commands, measured, **options)
+
+
+def _lost(commands, measured, row, count=20):
+    """Readings from ``row`` on were taken at the next command."""
+    return commands[:count], np.delete(measured, row, axis=0)[:count]
+
+
+SPOILT = {
+    "lost": (
+        lambda u, y: _lost(u, y, 12),
+        r"from row 12 on.*readings are one row early",
+    ),
+    "doubled": (
+        lambda u, y: (u[:20], np.insert(y, 12, y[11], axis=0)[:20]),
+        r"from row 12 on.*readings are one row late",
+    ),
+    "a command lost": (
+        lambda u, y: (np.delete(u, 9, axis=0)[:20], y[:20]),
+        r"from row 9 on.*readings are one row late",
+    ),
+    "two rows late": (
+        lambda u, y: (u[2:22], y[:20]),
+        "all readings are 2 rows late",
+    ),
+    "rolled early": (
+        lambda u, y: (u[:20], np.roll(y[:20], -3, axis=0)),
+        "all readings are 3 rows early.*the first 3 stand at the other end",
+    ),
+    "halves": (
+        lambda u, y: (u[:20], np.vstack([y[10:20], y[:10]])),
+        "halves of the readings are exchanged: those from row 10 on",
+    ),
+    "reversed": (lambda u, y: (u[:20], y[19::-1]), "in reverse order"),
+    "commands sorted": (
+        lambda u, y: (u[:20][np.argsort(u[:20, 1])], y[:20]),
+        "the commands are sorted and the readings are not",
+    ),
+    "readings sorted": (
+        lambda u, y: (u[:20], y[:20][np.argsort(y[:20, 2])]),
+        "the readings are sorted and the commands are not",
+    ),
+    "a block from elsewhere": (
+        lambda u, y: (u[:20], np.vstack([y[:7], y[20:25], y[12:20]])),
+        "from row 7 to 11.* the readings do not belong",
+    ),
+    "two sessions": (
+        lambda u, y: (u[:20], y[:20] + (np.arange(20) >= 13)[:, None]),
+        r"from row 13 on the readings have another offset, by \((1|0.9\d*), ",
+    ),
+    "another unit": (
+        lambda u, y: (u[:20], y[:20] * np.where(np.arange(20) < 11, 1, 0.1)[:, None]),
+        "from row 11 on the readings have another slope or offset",
+    ),
+    "rows exchanged": (
+        lambda u, y: (u[:20], y[[*range(5), 14, *range(6, 14), 5, *range(15, 20)]]),
+        "the readings of rows 5, 14 are exchanged",
+    ),
+    "lag": (
+        lambda u, y: (u[6:26], y[:20]),
+        "all readings are 6 rows late",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", SPOILT)
+def test_what_was_spoilt_is_named(kind):
+    spoil, pattern = SPOILT[kind]
+    for seed in range(4):
+        found = _verdict(*spoil(*_table(seed)))
+        verdict = found.verdict
+        assert not verdict.good
+        assert re.search(pattern, verdict.reasons[0]), verdict.reasons[0]
+        noise = found.mispairing.noise
+        assert (0.4 * NOISE < noise).all() and (noise < 2.0 * NOISE).all()
+
+
+def test_the_row_is_named_wherever_it_is():
+    named = []
+    for seed in range(20):
+        row = 3 + seed % 14
+        found = _verdict(*_lost(*_table(100 + seed), row)).mispairing
+        named.append(found is not None and f"from row {row} on" in found.reason)
+    assert sum(named) >= 19
+
+
+def _right_tables():
+    rng = np.random.default_rng(5)
+    for seed in range(12):
+        u, y = _table(seed)
+        u, y = u[:20], y[:20]
+        time = np.linspace(0.0, 1.0, 20)[:, None]
+        yield "plain", u, y
+        yield "drift", u, y + 2.0 * time
+        yield "heteroscedastic", u, y + 0.3 * np.abs(u) * rng.normal(size=y.shape)
+        yield "curve", u, y + 0.05 * u[:, :1] ** 2
+        outliers = y.copy()
+        outliers[rng.integers(20, size=2)] += 20.0
+        yield "outliers", u, outliers
+        yield "replicated", np.repeat(u[:7], 3, axis=0), np.repeat(y[:7], 3, axis=0)
+        yield "few", u[:6], y[:6]
+        yield "random walk", u, y + np.cumsum(rng.normal(size=y.shape), axis=0) / 8.0
+        sweep = np.linspace(-10.0, 10.0, 20)[:, None]
+        yield "sweep", sweep, 1.1 * sweep + 0.02 * sweep**2 + 0.1 * np.sin(sweep)
+        yield "noise alone", u, rng.normal(size=y.shape)
+
+
+def test_right_tables_are_left_alone():
+    for kind, u, y in _right_tables():
+        found = _verdict(u, y).mispairing
+        assert found is None, (kind, found.reason)
+
+
+def test_exchanged_columns_of_an_affine_machine_change_its_slopes_alone():
+    u, y = _table()
+    assert _verdict(u[:20, [1, 0, 2]] * (1.0, -1.0, 0.01), y[:20]).mispairing is None
+
+
+def test_a_noise_that_is_known_and_explains_the_fit_leaves_nothing_to_tell():
+    u, y = _lost(*_table(), 12)
+    assert _verdict(u, y, noise_std=20.0).mispairing is None
+    assert _verdict(u, y, noise_std=NOISE).mispairing is not None
+
+
+def test_the_mended_table_is_the_right_one():
+    u, y = _table()
+    found = _verdict(*_lost(u, y, 12)).mispairing
+    commands, measured = found.repaired(*_lost(u, y, 12))
+    rows = np.delete(np.arange(20), 12)
+    np.testing.assert_array_equal(commands, u[rows])
+    np.testing.assert_array_equal(measured, y[rows])
+    sessions = _verdict(u[:20], y[:20] + (np.arange(20) >= 13)[:, None]).mispairing
+    with pytest.raises(ValueError, match="two sessions cannot be repaired"):
+        sessions.repaired(u[:20], y[:20])
+
+
+def test_a_check_names_columns_and_rows():
+    u, y = _table()
+    fit = jaxcal.identify(u[:20], y[:20])
+    new, read = _table(7)
+    new, read = new[:12], read[:12]
+    spoilt = {
+        "u_x and u_y are exchanged": (new[:, [1, 0, 2]], read),
+        "u_z has the other sign": (new * (1.0, 1.0, -1.0), read),
+        "u_y is in radians": (new * (1.0, np.pi / 180.0, 1.0), read),
+        "y_x and y_z are exchanged": (new, read[:, [2, 1, 0]]),
+        "all readings are one row late": (new[1:], read[:-1]),
+    }
+    for words, table in spoilt.items():
+        result = fit.check(*table)
+        assert result.says == "does not hold" and words in result.mispairing, words
+        assert words in str(result) and "correct the table" in result.next_step
+    drifted = fit.check(new, read + 0.5)
+    assert drifted.says == "does not hold" and not drifted.mispairing
+    assert fit.check(new, read).good
+
+
+def test_a_curve_with_a_lost_reading():
+    model = Linear("1 + x + y + x:y + I(x**2)", 2)
+    rng = np.random.default_rng(3)
+    u = rng.uniform(-1.0, 1.0, (30, 2))
+    y = model.predict(u, rng.normal(size=10)) + 0.01 * rng.normal(size=(30, 2))
+    found = _verdict(u[:-1], np.delete(y, 8, axis=0), model=model).mispairing
+    assert "from row 8 on" in found.reason and "one row early" in found.reason
+
+
+@pytest.mark.parametrize(
+    "spoil, words",
+    [
+        (lambda u, y: _lost(u, y, 9), "from row 9 on"),
+        (lambda u, y: (u[:20], y[19::-1]), "in reverse order"),
+        (
+            lambda u, y: (u[:20, [0, 2, 1, 3, 4, 5]], y[:20]),
+            "u_2 and u_3 are exchanged",
+        ),
+        (lambda u, y: (u[:20] * (1, 1, 1, -1, 1, 1), y[:20]), "u_4 has the other sign"),
+        (lambda u, y: (u[:20], y[:20]), None),
+    ],
+)
+def test_a_real_arm(spoil, words):
+    joints, measured = ur5.load("ur5_grid_1000.csv")
+    at = np.random.default_rng(2).choice(1000, 25, replace=False)
+    found = _verdict(*spoil(joints[at], measured[at]), model=ur5.arm()).mispairing
+    assert (found is None) if words is None else words in found.reason
+
+
+def _write(path, u, y):
+    with path.open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["u_a", "u_b", "u_c", "y_a", "y_b", "y_c"])
+        rows.writerows(np.hstack([u, y]).tolist())
+
+
+def test_repair_writes_another_file_and_only_where_asked(tmp_path, capsys):
+    path, mended = tmp_path / "measured.csv", tmp_path / "mended.csv"
+    u, y = _table()
+    _write(path, *_lost(u, y, 12))
+    before = path.read_bytes()
+    assert main(["identify", str(path), "--report", str(tmp_path / "report")]) == 1
+    assert "from row 12 on, readings are one row early" in capsys.readouterr().out
+    assert not mended.exists()
+    assert main(["identify", str(path), "--repair", str(mended)]) == 0
+    assert "19 of 20 rows" in capsys.readouterr().out
+    assert path.read_bytes() == before
+    written = np.loadtxt(mended, delimiter=",", skiprows=1)
+    rows = np.delete(np.arange(20), 12)
+    np.testing.assert_allclose(written, np.hstack([u[rows], y[rows]]))
+    assert main(["identify", str(mended), "--report", str(tmp_path / "again")]) == 0
+    capsys.readouterr()
+    assert main(["identify", str(mended), "--repair", str(path)]) == 2
+    assert "are not mispaired" in capsys.readouterr().err
+    assert path.read_bytes() == before
+    assert main(["identify", str(path), "--repair", str(path)]) == 2
+    assert "another file" in capsys.readouterr().err
+
+
+def test_evidence_is_that_of_least_squares_with_unknown_noise():
+    """By its integral over slope, offset and noise, on a grid."""
+    rng = np.random.default_rng(0)
+    u, y = rng.normal(size=(7, 1)), rng.normal(size=(7, 1))
+    ones = np.ones(2)
+    table = Table(
+        Affine(1, 1), u, y, np.ones(7, dtype=bool), 0 * ones, 0 * ones,
+        np.ones(2, dtype=bool), 0 * ones, np.ones(1), np.ones(1), True,
+    )  # fmt: skip
+    design = np.column_stack([u, np.ones(7)])
+    values = []
+    for target in (y, y[::-1]):
+        square = float(np.linalg.lstsq(design, target)[1][0])
+        sizes = np.exp(np.linspace(-8.0, 8.0, 4001))
+        # The integral over both parameters is a constant times noise squared.
+        density = sizes**-5.0 * np.exp(-0.5 * square / sizes**2) / sizes
+        integral = np.trapezoid(density, sizes)
+        values.append((np.log(integral), log_evidence(table, np.array([square]), 7)))
+    (first, ours), (second, other) = values
+    assert first - second == pytest.approx(float(ours - other), abs=1e-6)
+
+
+def test_a_fit_leaves_out_an_outlier_and_readings_without_a_command():
+    u, y = _table()
+    y[4] += 30.0
+    counted = np.ones(20, dtype=bool)
+    table = Table(
+        Affine(3, 3), u[:20], y[:20], counted, np.zeros(12), np.zeros(12),
+        np.ones(12, dtype=bool), np.zeros(12), y[:20].std(axis=0), np.ones(3), True,
+    )  # fmt: skip
+    fit = fitted(table, Hypothesis("as it is", np.arange(20)))
+    assert np.flatnonzero(~fit.inside).tolist() == [4]
+    rows = np.delete(np.arange(20), 4)
+    design = np.column_stack([u[rows], np.ones(19)])
+    slopes = np.linalg.lstsq(design, y[rows])[0]
+    np.testing.assert_allclose(fit.solution * table.scale, slopes, rtol=1e-6)
+    assert shifted(5, 2).tolist() == [2, 3, 4, -1, -1]
+    assert not fitted(table, Hypothesis("shift", shifted(20, 2))).inside[18:].any()
