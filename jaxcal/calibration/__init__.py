@@ -11,6 +11,14 @@ from jaxcal.calibration.budget import Budget, Source
 from jaxcal.calibration.calibration import Calibration
 from jaxcal.calibration.check import Check
 from jaxcal.calibration.identify import identify
-from jaxcal.models.verdict import Verdict
+from jaxcal.models.verdict import CalibrationWarning, Verdict
 
-__all__ = ["Budget", "Calibration", "Check", "Source", "Verdict", "identify"]
+__all__ = [
+    "Budget",
+    "Calibration",
+    "CalibrationWarning",
+    "Check",
+    "Source",
+    "Verdict",
+    "identify",
+]
