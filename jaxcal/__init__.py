@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from jaxcal import compiled, moved
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
+    from jaxcal.calibration import Calibration, CalibrationWarning
     from jaxcal.calibration.identify import identify
     from jaxcal.designs import Motion, optimise
     from jaxcal.information.regression import (
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 __all__ = [
     "As",
     "Calibration",
+    "CalibrationWarning",
     "Design",
     "Ds",
     "I",
@@ -65,6 +66,7 @@ if (_PACKAGE.parent / "pyproject.toml").exists():
 
 _HOME = {
     "Calibration": "jaxcal.calibration",
+    "CalibrationWarning": "jaxcal.calibration",
     "identify": "jaxcal.calibration",
     "Noise": "jaxcal.models",
     "Prior": "jaxcal.models",

@@ -13,11 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arms.mistaken import mistaken_columns
-from jaxcal.arms.sensors import Landmarks, Pose, Position, Sensor, Socket
+from jaxcal.arms.sensors import Board, Landmarks, Pose, Position, Sensor, Socket
 from jaxcal.arms.sensors.sensor import hats
 from jaxcal.information.singular import depends, significant
 from jaxcal.models import verdict as models
-from jaxcal.models.verdict import UNLIKELY, left_out, outlying
+from jaxcal.models.verdict import (
+    Reason,
+    in_rows,
+    left_out,
+    never_measured,
+    outlying,
+    wrong_noise,
+)
 
 __all__ = ["CLEAR_UP", "ArmVerdict", "Part", "other_distances", "verdict"]
 
@@ -25,7 +32,11 @@ Array = NDArray[np.float64]
 Chain = Any  # a Chain, whose module imports this one
 Fit = Any  # a jaxcal.Calibration, whose package imports this one
 
-CLEAR_UP = "clear up what ends in a question or an advice, then identify again"
+_LOOK = (
+    "look at the residuals (report, --report); keep the nominal machine until they are "
+    "explained"
+)
+CLEAR_UP = "fix the problems listed above, then run identify again"
 
 _SCATTER = 3.0  # times the sensor's usual noise: the model does not explain that
 _FAR = 4.0  # standard deviations of the prior
@@ -44,7 +55,9 @@ _VAGUE = 3.0  # times the nominal error: the readings leave the arm open
 _TIP = 0.004  # of the arm's length: tools are built nearer to their description
 _LINK = 0.02  # of the arm's length: without a distance an arm shrinks to fit contacts
 _ZERO = 10.0  # degrees: no zero of a joint is set so badly
-_LOUD, _IDLE = 10.0, 0.2  # times the usual noise; of it, what the readings scatter by
+_LOUD = 10.0  # times the usual noise
+_PLACED = 0.01  # of the arm's length: a camera known to that is found
+_NO_WORSE = 2.0  # times the nominal error: an accurate arm that few readings bend
 _PLAIN = 0.01  # of the arm's length: columns as they should be are nearer than that
 _DRAWN = 200  # postures anywhere within the limits
 
@@ -55,8 +68,9 @@ class ArmVerdict(models.Verdict):
 
     Good: held-out errors are below the accuracy asked for. Where none was, it is better
     than the nominal machine, and the noise explains the scatter or what is left is a
-    third of the nominal error. In either case no reading contradicts the others or the
-    arm's description, and contacts do not leave its size open.
+    third of the nominal error; of an accurate arm with a camera or a board, the place
+    of that is known. In each case no reading contradicts the others or the arm's
+    description, and contacts do not leave its size open.
     """
 
     # None where there are too few measurements to tell.
@@ -68,33 +82,37 @@ class ArmVerdict(models.Verdict):
     nominal: float = np.nan  # mean error of the nominal machine
     anywhere: float = np.nan  # standard deviation within the limits; NaN if not known
     accuracy: float | None = None  # that was asked for
+    place: tuple[float, float] | None = None  # std of a camera's or board's on the tip
 
     def lines(self) -> tuple[str, ...]:
         """The errors, and what speaks against the calibration."""
         if self.explains is None:
             return self.reasons
         (low, high), unit = self.interval, f" {self.unit}" if self.unit else ""
-        of_unit = unit or " in the readings' unit"
         lines = [
-            f"held-out error {self.held_out:.3g} [{low:.3g}, {high:.3g}]{of_unit}, "
-            f"nominal {self.nominal:.3g}"
+            f"Cross-validated error {self.held_out:.3g}{unit} (95 %: {low:.3g} to "
+            f"{high:.3g}); before calibration {self.nominal:.3g}{unit}."
         ]
         if np.isfinite(self.anywhere):
             lines.append(
-                f"standard deviation of the tip within the joint limits "
-                f"{self.anywhere:.3g}{unit}, a shift or turn of the whole arm not "
-                "counted"
+                f"Tip uncertainty over the workspace: {self.anywhere:.3g}{unit} (1 "
+                "sigma, base frame excluded)."
+            )
+        if self.place is not None:
+            lines.append(
+                "Place of the camera or board on the tip: known to "
+                f"{self.place[0]:.2g} in length and {self.place[1]:.2g} deg (1 sigma)."
             )
         if self.accuracy is not None and not self.interval[1] <= self.accuracy:
-            lines.append(
-                f"not the accuracy that was asked for, {self.accuracy:g}{unit}"
-            )
+            lines.append(f"Not the accuracy you asked for, {self.accuracy:g}{unit}.")
         if not self.explains:
-            lines.append("this model does not explain these readings by its noise")
-        if self.helps is None:
-            lines.append("whether it is better than the nominal machine is not sure")
+            lines.append("This model does not explain these readings by its noise.")
+        if self.place is not None and not self.helps:
+            lines.append("The arm itself was as accurate before.")
+        elif self.helps is None:
+            lines.append("It may not be better than the nominal machine.")
         elif not self.helps:
-            lines.append("it is no better than the nominal machine")
+            lines.append("It is no better than the nominal machine.")
         return (*lines, *self.reasons)
 
 
@@ -115,23 +133,31 @@ def verdict(calibration: Fit) -> ArmVerdict:
             f"sensor's usual one: {_usual_noise(calibration)})",
             unit=unit,
         )
+    if not model.sensor.zeros and (reason := never_measured(calibration)):
+        return ArmVerdict(
+            good=False, reasons=(reason.fact,), next_step=reason.remedy, unit=unit
+        )
     used = np.flatnonzero(calibration.loss_weights > 0.0)
     commands, usual = calibration.commands[used], np.asarray(model.default_noise().std)
-    measured = calibration.residuals[used] + calibration.predict(commands)
+    measured = calibration.measured[used]
     parts = _parts(calibration, used)
     errors = _errors(calibration, used, measured, usual, parts)
-    explains, scatter = _scattered(calibration, usual, parts)
+    scatter = _scattered(calibration, usual, parts)
+    explains = scatter is None
     mistaken = ""
     if not explains and max(errors.of_parts) > _PLAIN * model.length:
         mistaken = mistaken_columns(model, commands, measured)
-    findings = _findings(calibration, used, parts, scatter, explains, mistaken)
+    findings = _findings(calibration, used, parts, scatter, mistaken)
     at, anywhere = _anywhere(calibration, model, parts)
     nominal = errors.of_parts[at]
     findings = _left_open(findings, parts, _in(calibration), anywhere, nominal)
     clean = not (findings.doubtful or (findings.moved and not explains))
+    place = _place_on_tip(calibration, model, parts)
     accuracy = calibration.provenance.get("accuracy")
     if accuracy is not None:
         good = clean and errors.interval[1] <= accuracy
+    elif place is not None and place[0] < _PLACED * model.length and explains:
+        good = clean and errors.held_out < _NO_WORSE * errors.nominal
     else:
         enough = explains or errors.interval[1] < _LITTLE * errors.nominal
         good = bool(clean and errors.helps and enough)
@@ -139,7 +165,9 @@ def verdict(calibration: Fit) -> ArmVerdict:
     return ArmVerdict(
         good=good,
         reasons=findings.reasons,
-        next_step=models.USE if good else _next_step(model, findings, explains, more),
+        next_step=models.USE
+        if good
+        else _next_step(findings, scatter, calibration.noise_known, more),
         unit=unit,
         explains=explains,
         helps=errors.helps,
@@ -149,7 +177,23 @@ def verdict(calibration: Fit) -> ArmVerdict:
         nominal=errors.nominal,
         anywhere=anywhere,
         accuracy=accuracy,
+        place=place,
     )
+
+
+def _place_on_tip(
+    calibration: Fit, model: Chain, parts: list[Part]
+) -> tuple[float, float] | None:
+    """Standard deviations of where a camera or board is on the tip, length and degrees.
+
+    Nobody knew it, however accurate the arm; None of other sensors.
+    """
+    if not all(isinstance(part.sensor, Board) for part in parts):
+        return None
+    at = [model.names.index(f"tool {axis}") for axis in ("x", "y", "z")]
+    turns = [model.names.index(f"tool r{axis}") for axis in "xyz"]
+    variance = np.asarray(calibration.standard_errors) ** 2
+    return float(np.sqrt(variance[at].sum())), float(np.sqrt(variance[turns].sum()))
 
 
 class Part(NamedTuple):
@@ -222,8 +266,7 @@ def _findings(
     calibration: Fit,
     used: NDArray[np.intp],
     parts: list[Part],
-    scatter: list[str],
-    explains: bool,
+    scatter: Reason | None,
     mistaken: str,
 ) -> _Findings:
     """What is wrong, by name.
@@ -232,22 +275,25 @@ def _findings(
         calibration: of an arm.
         used: (N,) rows of the measurements that count.
         parts: of its sensors.
-        scatter: what was said of the scatter of the readings.
-        explains: the noise explains it.
+        scatter: what the noise does not explain.
         mistaken: what was said of reversed or exchanged columns, if they are.
     """
     model = calibration.model
     swapped: dict[int, int] = {}
     for part in parts:
-        swapped |= _swapped(calibration, part, explains)
+        swapped |= _swapped(calibration, part, scatter is None)
     exchanged = [line for part in parts for line in _exchanged(calibration, part)]
     limit = _LOOSE if len(used) > _SPARSE else 0.0
-    far = (calibration.distance[list(calibration.outliers)] > limit**2).any()
+    of_noise = scatter is not None and calibration.noise_known  # all rows are far off
+    outliers = [] if of_noise else [*calibration.outliers]
+    far = (calibration.distance[outliers] > limit**2).any()
     contradicting: tuple[int, ...] = ()
-    reasons = scatter + _wrong_rows(calibration, used, parts, swapped)
+    reasons = _wrong_rows(calibration, used, parts, swapped, outliers)
+    if scatter:
+        reasons.insert(0, scatter.fact)
     if swapped or exchanged or far:
         reasons.insert(0, "some readings contradict the others")
-        contradicting = tuple(sorted({*swapped, *calibration.outliers}))
+        contradicting = tuple(sorted({*swapped, *outliers}))
     moved = {part.kind: _moved(calibration, part, swapped) for part in parts}
     moved_lines = [line for lines in moved.values() for line in lines]
     tip, doubtful = _other_tip(calibration, model)
@@ -298,17 +344,15 @@ def _left_open(
     if findings.mistaken or sized or not anywhere > _VAGUE * nominal:
         return findings
     if not sockets:
+        reason = "Too few readings:"
+    else:
         reason = (
-            f"so few readings leave the arm open: elsewhere its tip is known to "
-            f"{anywhere:.3g}{unit}, the nominal one is {nominal:.3g} off here. Measure "
-            "more postures of it"
+            "The distance between two sockets is missing (distances=, --distance), so "
+            "the arm's size is open:"
         )
-        return findings._replace(reasons=(*findings.reasons, reason), doubtful=True)
-    reason = (
-        f"contacts without a known distance leave the arm's size open: elsewhere its "
-        f"tip is known to {anywhere:.3g}{unit}, the nominal one is {nominal:.3g} off "
-        "here. Give the distance between two sockets that it touches (distances=, "
-        "--distance)"
+    reason += (
+        f" away from the measured poses the tip is uncertain by {anywhere:.2g}{unit}; "
+        f"uncalibrated it is off by {nominal:.2g}{unit}."
     )
     return findings._replace(reasons=(*findings.reasons, reason), doubtful=True)
 
@@ -318,6 +362,7 @@ def _wrong_rows(
     used: NDArray[np.intp],
     parts: list[Part],
     swapped: dict[int, int],
+    outliers: list[int],
 ) -> list[str]:
     """Rows of another socket, outliers, and contacts that were written twice."""
     commands = calibration.commands
@@ -327,8 +372,9 @@ def _wrong_rows(
         f"measurement {row} fits {kinds[row]} {other} instead"
         for row, other in sorted(swapped.items())
     ]
-    loose = [row for row in calibration.outliers if row not in swapped]
-    said += [outlying(calibration, row) for row in loose]
+    loose = [row for row in outliers if row not in swapped]
+    if reason := outlying(calibration, loose):
+        said.append(reason.fact)
     for doubled in np.flatnonzero(calibration.loss_weights == 0.0):
         same = (commands[used] == commands[doubled]).all(axis=1)
         if same.any() and touching[used[same][0]]:
@@ -336,32 +382,31 @@ def _wrong_rows(
     return said
 
 
-def _next_step(model: Chain, findings: _Findings, explains: bool, more: bool) -> str:
+def _next_step(
+    findings: _Findings, scatter: Reason | None, noise_known: bool, more: bool
+) -> str:
     """What to do about a calibration that is not good.
 
     ``more`` measurements may make it so.
     """
-    kind, rows = findings.moved, ", ".join(map(str, findings.contradicting))
+    kind, residuals = findings.moved, scatter.remedy if scatter else _LOOK
     steps = (
         (findings.mistaken, "correct the columns, then identify again"),
         (findings.exchanged, "look at the sockets' columns"),
+        (scatter and noise_known, residuals),
         (
             findings.contradicting,
-            f"look at measurement {rows} (counted from 0): correct it, measure "
-            "it again or leave it out",
+            f"look at {in_rows(findings.contradicting)} (counted from 0): correct, "
+            "measure again or leave out",
         ),
         (
-            findings.moved and not explains,
+            findings.moved and scatter,
             f"measure again with the {kind} fixed, or number it as two: one {kind} "
             "before it moved and another after",
         ),
         (findings.doubtful, CLEAR_UP),
         (more, "measure more postures: jaxcal postures --measured chooses them"),
-        (
-            True,
-            "look at the residuals (report, --report); keep the nominal machine until "
-            "they are explained",
-        ),
+        (True, residuals),
     )
     return next(step for holds, step in steps if holds)
 
@@ -421,37 +466,23 @@ def _in(calibration: Fit) -> str:
     )
 
 
-def _scattered(
-    calibration: Fit, usual: Array, parts: list[Part]
-) -> tuple[bool, list[str]]:
-    """Whether the noise explains the scatter, and why not."""
+def _scattered(calibration: Fit, usual: Array, parts: list[Part]) -> Reason | None:
+    """Readings that scatter by more than the noise explains."""
     if calibration.noise_known:
-        fit = calibration.lack_of_fit()
-        times = float((np.asarray(calibration.noise_std) / usual).max())
-        ratio = np.sqrt(calibration.square / max(calibration.dof, 1.0))
-        if times > _LOUD and ratio < _IDLE:
-            return False, [
-                f"the noise that was given is {times:.3g} times what this sensor "
-                f"usually has, and the readings scatter by {ratio:.2g} of it: is it in "
-                "their unit?"
-            ]
-        if fit is None or fit > UNLIKELY:
-            return True, []
-        return False, [f"lack of fit under the noise that was given: p = {fit:.2g}"]
+        return wrong_noise(calibration)
     noise = np.asarray(calibration.noise_std)
     times = float(np.sqrt(np.mean((noise / usual) ** 2)))
     if times < _SCATTER:
-        return True, []
+        return None
     largest = float(noise[(noise / usual).argmax()])
     unit = _in(calibration) if np.ptp(usual) == 0.0 else ""
     touches = any(isinstance(part.sensor, Socket) for part in parts)
-    several = touches and times > _LOUD
-    return False, [
+    several = ", or of several sockets as one" * (touches and times > _LOUD)
+    return Reason(
         f"the readings scatter by {largest:.3g}{unit}, {times:.3g} times what this "
-        "sensor usually does: their noise, or what no parameter explains"
-        + several
-        * ", or of several sockets as one"
-    ]
+        "sensor usually does: their noise, or what no parameter explains" + several,
+        _LOOK,
+    )
 
 
 def _far(calibration: Fit) -> list[str]:

@@ -15,9 +15,17 @@ from typing import Any
 from jaxcal.calibration.calibration import Calibration
 from jaxcal.calibration.check import Check
 from jaxcal.calibration.identify import identify
-from jaxcal.models.verdict import Verdict
+from jaxcal.models.verdict import CalibrationWarning, Verdict
 
-__all__ = ["Budget", "Calibration", "Check", "Source", "Verdict", "identify"]
+__all__ = [
+    "Budget",
+    "Calibration",
+    "CalibrationWarning",
+    "Check",
+    "Source",
+    "Verdict",
+    "identify",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -17,7 +17,7 @@ from jaxcal.calibration.check import check, verification
 from jaxcal.calibration.file import save, to_dict
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.fit_model import fit_model
-from jaxcal.calibration.inverse import command_for
+from jaxcal.calibration.inverse import command_for, no_inverse
 from jaxcal.calibration.pairing import Mispairing, against, mispairing
 from jaxcal.checks import aligned, in_words
 from jaxcal.late import late
@@ -41,6 +41,7 @@ class Calibration(Fit):
         return self.summary()
 
     command_for = command_for
+    no_inverse = no_inverse
     check = check
     budget = late("jaxcal.reports.budget:budget")
     report = late("jaxcal.reports.calibration:report")
@@ -208,7 +209,7 @@ class Calibration(Fit):
         """
         fields = fit_model(
             self.commands,
-            self.residuals + self.predict(self.commands),
+            self.measured,
             (self.loss_weights > 0.0).astype(np.float64),
             model=model,
             prior=prior,

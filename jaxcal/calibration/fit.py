@@ -136,7 +136,9 @@ class Fit:
         covariance = self.covariance
         if covariance is None:
             return None
-        return np.where(self.undetermined, np.inf, np.sqrt(np.diag(covariance)))
+        joint = np.asarray(self.joint_covariance)[: len(covariance), : len(covariance)]
+        variance = above_rounding(np.diag(covariance), self.to_parameters, joint)
+        return np.where(self.undetermined, np.inf, np.sqrt(variance))
 
     @property
     def from_data(self) -> Array | None:
@@ -203,6 +205,14 @@ class Fit:
 
     # -- the fit -----------------------------------------------------------------------
 
+    @functools.cached_property
+    def measured(self) -> Array:
+        """(N, m) the readings; of a wrapping one that nearest to the prediction."""
+        at = self.commands
+        if self.estimated_commands is not None:
+            at = self.estimated_commands
+        return self.residuals + predict(self.whole, at, self.estimate)
+
     @property
     def outliers(self) -> dict[int, float]:
         """Rows too far from the fit of the others (1 % in all) and their weights."""
@@ -252,8 +262,10 @@ class Fit:
         points = self.points("commands", commands, self.num_inputs)
         noise = self.require_noise("prediction uncertainty")
         slopes, covariance = self.linear(points.reshape(-1, self.num_inputs))
-        variance = ((slopes @ covariance) * slopes).sum(axis=-1)
-        std = np.sqrt(np.maximum(variance, 0.0) + float(new_measurement) * noise**2)
+        variance = above_rounding(
+            ((slopes @ covariance) * slopes).sum(axis=-1), slopes, covariance
+        )
+        std = np.sqrt(variance + float(new_measurement) * noise**2)
         if self.unidentified is not None:
             std = np.where(depends(slopes, self.unseen), np.inf, std)
         return std.reshape(*points.shape[:-1], self.num_outputs)
@@ -341,6 +353,16 @@ class Fit:
         if self.affine is None:
             raise AttributeError(f"{name}: only an affine model y = A u + b has one")
         return self.affine
+
+
+def above_rounding(variance: Array, rows: Array, covariance: Array) -> Array:
+    """(...) variances of rows (..., P), none below what rounding leaves of theirs.
+
+    Where directions are known to very different degrees, a sum of their covariance
+    (P, P) may cancel to zero or less: that is not known to be certain.
+    """
+    terms = (rows**2 * np.diag(covariance)).sum(axis=-1)
+    return np.asarray(np.maximum(variance, np.finfo(np.float64).eps * terms))
 
 
 def _copied(content: Any) -> Any:

@@ -31,6 +31,7 @@ from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, recorded
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
+from jaxcal.models.verdict import CalibrationWarning
 from jaxcal.tables import (
     COMMANDS,
     MEASURED,
@@ -110,7 +111,8 @@ def identify(
 
     Returns:
         The calibration; its covariance is None where the noise is unknown: nothing was
-        given and no residual degree of freedom is left.
+        given and no residual degree of freedom is left. One that is not good warns
+        (``jaxcal.CalibrationWarning``), once for each line of a program.
 
     Raises:
         ValueError: naming the argument, the rule and the value; for commands that leave
@@ -150,7 +152,7 @@ def identify(
         about["provenance"]["prior"] = "stated"
     calibration = Calibration(**fields, **about)
     if not calibration.verdict.good and not _exact(calibration):
-        warnings.warn(str(calibration.verdict), stacklevel=2)
+        warnings.warn(CalibrationWarning(str(calibration.verdict)), stacklevel=2)
     return calibration
 
 

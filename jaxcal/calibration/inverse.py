@@ -19,13 +19,14 @@ from jaxcal.information.singular import (
 from jaxcal.models.identifiability import unknown
 from jaxcal.models.model import derivative, predict
 
-__all__ = ["command_for"]
+__all__ = ["command_for", "no_inverse"]
 
 Array = NDArray[np.float64]
 
 _FAR = 0.25  # of the range of what was measured, beyond it
 _NAMED = 3  # targets in a warning
 _STARTS, _STEPS, _REACHED = 6, 60, 1e-9  # of the outputs' spread over the measurements
+_SURE = 3.0  # standard deviations from zero: a direction that the outputs respond to
 
 
 def command_for(
@@ -76,6 +77,8 @@ def command_for(
     search = _Search(fit, points.reshape(-1, m), begin)
     if search.affine:
         begin = search.solved()
+    elif fit.affine is not None:
+        search.require_sure(fit.commands.mean(axis=0)[None])
     commands, reached = search.newton(search.nearest[:, 0] if begin is None else begin)
     slack = 1e-9 * search.spread
     low, high = bounds.T
@@ -93,6 +96,31 @@ def command_for(
     return commands.reshape(*points.shape[:-1], n)
 
 
+def no_inverse(fit: Fit) -> str:
+    """Why ``command_for`` refuses whatever is desired; "" where it may find a command.
+
+    Of a linear model with as many inputs as outputs or more; others are not asked.
+    """
+    if fit.num_outputs > fit.num_inputs or not fit.model.linear:
+        return ""
+    responses, of_map = _Responses(fit), fit.affine is not None
+    if of_map and fit.unidentified is None:
+        if _sureness(fit, responses.spread)[0] >= _SURE:
+            return ""
+    refusal = ""
+    for command in fit.commands.mean(axis=0)[None] if of_map else fit.commands:
+        try:
+            if of_map:
+                responses.require_sure(command[None])
+            else:
+                responses.require_regular(command[None])
+            responses.require_determined(command[None])
+            return ""
+        except ValueError as error:
+            refusal = refusal or str(error)
+    return refusal
+
+
 def _limits(limits: ArrayLike | None, names: tuple[str, ...]) -> Array:
     """(n, 2), least below greatest, with at least one finite command between them."""
     if limits is None:
@@ -108,32 +136,30 @@ def _limits(limits: ArrayLike | None, names: tuple[str, ...]) -> Array:
     return bounds
 
 
-class _Search:
-    """Outputs and derivatives in units of their spread over the measurements."""
+def _sureness(fit: Fit, spread: Array) -> tuple[float, Array]:
+    """Least singular value of an affine map's matrix, in standard deviations; (n,) its
+    direction of the commands in their ``spread``. Infinite without noise."""
+    scaled = fit.matrix * spread
+    rows = np.linalg.norm(scaled, axis=1)
+    turn, size, right = np.linalg.svd(scaled / np.where(rows > 0.0, rows, 1.0)[:, None])
+    last = right[len(size) - 1]
+    if fit.joint_covariance is None:
+        return np.inf if significant(size).all() else 0.0, last
+    # Its derivative is that of turn . B last, the outputs' at two commands.
+    ends = fit.model.jacobian(np.stack([last * spread, 0.0 * spread]), fit.parameters)
+    along = (turn[:, -1] / np.where(rows > 0.0, rows, 1.0)) @ (ends[0] - ends[1])
+    variance = along @ fit.joint_covariance @ along
+    return size[-1] / float(np.sqrt(variance) or 1e-300), last
 
-    def __init__(self, fit: Fit, wanted: Array, start: Array | None) -> None:
-        self.fit, self.model, self.wanted = fit, fit.whole, wanted
-        square = fit.num_inputs == wanted.shape[1]
-        self.affine = square and fit.affine is not None
-        # What the machine answers at commands (R, n) if points ``rows`` are reached.
-        self.goal = fit.model.targets(wanted, start)
-        measured_at = fit.commands
+
+class _Responses:
+    """How outputs respond to commands, these in their spread over the measurements."""
+
+    def __init__(self, fit: Fit) -> None:
+        self.fit, self.model = fit, fit.whole
         self.spread = np.where(
-            np.ptp(measured_at, axis=0) > 0.0, measured_at.std(axis=0), 1.0
+            np.ptp(fit.commands, axis=0) > 0.0, fit.commands.std(axis=0), 1.0
         )
-        points, count = np.arange(len(wanted)), len(measured_at)
-        there = self.goal(
-            np.tile(measured_at, (len(wanted), 1)), np.repeat(points, count)
-        )
-        outputs = predict(self.model, measured_at, fit.estimate)
-        there = there.reshape(len(wanted), count, -1) - outputs
-        there = self.model.wrapped(there, measured_at)
-        # Relative outputs spread as what is wanted, seen from where it was measured.
-        spread = np.concatenate(there) if fit.model.relative else outputs
-        self.size = np.where(np.ptp(spread, axis=0) > 0.0, spread.std(axis=0), 1.0)
-        with np.errstate(over="ignore"):
-            order = np.argsort(((there / self.size) ** 2).sum(axis=-1), axis=1)
-        self.nearest = measured_at[order[:, :_STARTS]]  # (P, starts, n)
 
     def say_clipped(self, free: Array, commands: Array) -> None:
         """Warn of the targets (P, n) that the limits keep from being reached."""
@@ -184,43 +210,23 @@ class _Search:
     def outputs(self, commands: Array) -> Array:
         return predict(self.model, commands, self.fit.estimate, finite=False)
 
-    def gap(self, commands: Array, rows: NDArray[np.intp]) -> Array:
-        """(R, q) of points ``rows`` from the outputs at ``commands``, in sizes."""
-        off = self.goal(commands, rows) - self.outputs(commands)
-        return np.asarray(self.model.wrapped(off, commands) / self.size)
-
-    def slopes(self, commands: Array) -> Array:
-        """(P, q, n) in units of the spreads."""
+    def effects(self, commands: Array) -> Array:
+        """(P, q, n) derivatives by the commands in their spread."""
         fit = self.fit
         by = derivative(self.model, commands, fit.estimate, fit.input_names)
-        return by * self.spread / self.size[:, None]
+        return by * self.spread
 
-    def solved(self) -> Array:
-        """(P, n) the commands of a square affine map, which must not be singular."""
-        centre = self.fit.commands.mean(axis=0)[None]
+    def require_sure(self, centre: Array) -> tuple[Array, Array, Array, Array]:
+        """``require_regular`` of an affine map, and by more than its noise."""
         turn, singular, right, rows = self.require_regular(centre)
-        if self.fit.joint_covariance is not None:
-            # Standard deviation of turn . B right, whose value is the smallest one.
-            back, ahead = turn[:, -1] / rows, right[-1] * self.spread
-            entries = [self.model.affine(one) for one in np.eye(len(self.fit.names))]
-            along = np.array([back @ entry[0] @ ahead for entry in entries if entry])
-            variance = along @ self.fit.joint_covariance @ along
-            sure = singular[-1] / float(np.sqrt(variance) or 1e-300)
-            if sure < 3.0:
-                raise ValueError(
-                    "matrix A cannot be told from a singular one: its smallest "
-                    f"singular value is {sure:.2g} standard deviations from zero, so "
-                    f"within the noise {self._insensitive(right[-1])}"
-                )
-        with np.errstate(over="ignore", invalid="ignore"):
-            off = ((self.wanted - self.outputs(centre)) / rows).T
-            step = right.T @ ((turn.T @ off) / singular[:, None])
-            command = np.asarray(centre + self.spread * step.T)
-        if not np.isfinite(command).all():
+        sure, last = _sureness(self.fit, self.spread)
+        if sure < _SURE:
             raise ValueError(
-                "desired must be within reach of finite commands, got larger"
+                "matrix A cannot be told from a singular one: its smallest singular "
+                f"value is {sure:.2g} standard deviations from zero, so within the "
+                f"noise {self._insensitive(last)}"
             )
-        return command
+        return turn, singular, right, rows
 
     def require_regular(self, commands: Array) -> tuple[Array, Array, Array, Array]:
         """Refuse commands at which a direction of the outputs does not respond.
@@ -229,7 +235,7 @@ class _Search:
             Of the last command the singular value decomposition of the derivative, its
             columns in spreads and its rows divided by their length, which comes last.
         """
-        effect = self.slopes(commands) * self.size[:, None]
+        effect = self.effects(commands)
         rows = np.linalg.norm(effect, axis=-1)
         for i, j in np.argwhere(flat(rows, np.abs(self.outputs(commands))))[:1]:
             raise ValueError(
@@ -268,6 +274,55 @@ class _Search:
         direction = exact_zeros(direction) * self.spread
         unseen = direction_in_words(direction, self.fit.input_names)
         return f"the outputs do not respond to the direction {unseen} of the commands"
+
+
+class _Search(_Responses):
+    """Outputs and derivatives in units of their spread over the measurements."""
+
+    def __init__(self, fit: Fit, wanted: Array, start: Array | None) -> None:
+        super().__init__(fit)
+        self.wanted = wanted
+        square = fit.num_inputs == wanted.shape[1]
+        self.affine = square and fit.affine is not None
+        # What the machine answers at commands (R, n) if points ``rows`` are reached.
+        self.goal = fit.model.targets(wanted, start)
+        measured_at = fit.commands
+        points, count = np.arange(len(wanted)), len(measured_at)
+        there = self.goal(
+            np.tile(measured_at, (len(wanted), 1)), np.repeat(points, count)
+        )
+        outputs = predict(self.model, measured_at, fit.estimate)
+        there = there.reshape(len(wanted), count, -1) - outputs
+        there = self.model.wrapped(there, measured_at)
+        # Relative outputs spread as what is wanted, seen from where it was measured.
+        spread = np.concatenate(there) if fit.model.relative else outputs
+        self.size = np.where(np.ptp(spread, axis=0) > 0.0, spread.std(axis=0), 1.0)
+        with np.errstate(over="ignore"):
+            order = np.argsort(((there / self.size) ** 2).sum(axis=-1), axis=1)
+        self.nearest = measured_at[order[:, :_STARTS]]  # (P, starts, n)
+
+    def gap(self, commands: Array, rows: NDArray[np.intp]) -> Array:
+        """(R, q) of points ``rows`` from the outputs at ``commands``, in sizes."""
+        off = self.goal(commands, rows) - self.outputs(commands)
+        return np.asarray(self.model.wrapped(off, commands) / self.size)
+
+    def slopes(self, commands: Array) -> Array:
+        """(P, q, n) in units of the spreads."""
+        return self.effects(commands) / self.size[:, None]
+
+    def solved(self) -> Array:
+        """(P, n) the commands of a square affine map, which must not be singular."""
+        centre = self.fit.commands.mean(axis=0)[None]
+        turn, singular, right, rows = self.require_sure(centre)
+        with np.errstate(over="ignore", invalid="ignore"):
+            off = ((self.wanted - self.outputs(centre)) / rows).T
+            step = right.T @ ((turn.T @ off) / singular[:, None])
+            command = np.asarray(centre + self.spread * step.T)
+        if not np.isfinite(command).all():
+            raise ValueError(
+                "desired must be within reach of finite commands, got larger"
+            )
+        return command
 
     def newton(self, begin: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Damped steps of least length for all points together, and which arrived."""

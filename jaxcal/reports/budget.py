@@ -309,7 +309,7 @@ def _gain(calibration: Fit, width: int) -> Array:
 def _squares(calibration: Fit, source: Source, slopes: Array, gain: Any) -> Array:
     """(R,) variances of the results by one source."""
     m = calibration.num_outputs
-    measured = calibration.residuals + calibration.predict(calibration.commands)
+    measured = calibration.measured
     moved = np.zeros(len(slopes))
     for name, shape in (("offset", np.ones_like(measured)), ("scale", measured)):
         value = getattr(source, name)

@@ -248,7 +248,7 @@ def _nominal_errors(calibration: Fit) -> Array | None:
 
     None of an affine machine whose outputs are not named as its inputs.
     """
-    measured = calibration.residuals + calibration.predict(calibration.commands)
+    measured = calibration.measured
     if calibration.affine is None:
         model, commands = calibration.model, calibration.commands
         return model.wrapped(measured - model.predict(commands), commands)

@@ -124,7 +124,7 @@ def test_students_loss_is_at_its_minimum() -> None:
     expected = optimize.minimize(loss, TRUTH[:5], method="BFGS", tol=1e-10).x
     np.testing.assert_allclose(found.parameters[:5], expected, atol=2e-6)
     assert list(found.outliers) == [4] and found.outliers[4] < 0.05
-    assert "measurement 4 is" in repr(found)
+    assert "Row 4 is an outlier" in repr(found)
     plain = identify(commands, measured, model=WAVE, noise_std=0.05, loss="gaussian")
     error, plain_error = (
         np.linalg.norm((each.parameters - TRUTH)[:5]) for each in (found, plain)
@@ -347,7 +347,7 @@ def test_what_nothing_determines_is_named_and_has_no_interval() -> None:
     assert np.isfinite(found.standard_errors[:5]).all()
     assert np.isfinite(found.predict_std(commands)).all()
     assert found.from_data.tolist() == [1, 1, 1, 1, 1, 0]
-    assert "not determined, held near the prior's mean: idle;" in repr(found)
+    assert "Not determined, held near the prior's mean: idle;" in repr(found)
     assert found.identifiability().directions[0].words == "idle"
     short = Linear("x + y + x:y", 1)
     flat = commands * [1.0, 0.0]

@@ -200,7 +200,7 @@ def test_two_arms_on_a_torso_are_found_together_and_written_in_one_file(tmp_path
 
     again = jaxcal.Calibration.from_dict(json.loads(json.dumps(found.to_dict())))
     np.testing.assert_array_equal(again.predict(others), found.predict(others))
-    assert "left_hand: held-out error" in str(found.verdict)
+    assert "left_hand: Cross-validated error" in str(found.verdict)
     alone = found.of("left_hand")
     rows = others[:, 12] == 0
     own = others[rows][:, [robot.inputs.index(n) for n in alone.input_names]]
@@ -598,4 +598,4 @@ def test_an_arm_that_three_readings_leave_open_is_not_good_beside_another():
     model = Chains.of({"left": left, "right": right})
     verdict = jaxcal.identify(*model.together(tables), model=model).verdict
     assert verdict.of_chains["right"].good and not verdict.good
-    assert "left: so few readings leave the arm open" in str(verdict)
+    assert "left: Too few readings: away from the measured poses" in str(verdict)

@@ -18,6 +18,9 @@ Array = NDArray[np.float64]
 _FEW = 4  # postures that show how the sensor is mounted
 _SPREAD = 0.1  # of the largest: forces along more than a line, and off a plane
 _MASS, _CENTRE = 0.5, 0.1  # of a load: of its mass, of the arm's length
+_TILTED = 0.01  # of the forces' squares: what a base 5 degrees from level leaves
+_UPRIGHT = 0.97  # cosine: nearer to up than 14 degrees, the fit finds the base
+_ROUNDS = 20
 _TURNED = 0.45  # radians on the tool, from which the fit does not find them
 
 
@@ -28,7 +31,9 @@ class Wrench(Sensor):
     With R from the tip to the measuring frame and the load's mass m and centre c in the
     tip's frame, ``force = m magnitude R' down + zero`` and ``torque = c x (the same) +
     zero``: the load pulls on the sensor. A sensor that reads what holds the load has
-    the other sign; negate its readings. The zeros are those of the electronics.
+    the other sign; negate its readings. An arm that hangs needs its base, or ``up``:
+    its readings look the same, as do those of a controller that subtracts a heavier
+    payload, and none of these is assumed. The zeros are those of the electronics.
 
     Lengths, and a turn about the vertical, are not shown and held. How the sensor is
     turned on the tool (``tool rx``, ``ry``, ``rz``, found without a guess from four
@@ -115,8 +120,8 @@ class Wrench(Sensor):
     ) -> tuple[Self, Array | None]:
         """Itself, and how it is turned on the tool where that is far from nominal.
 
-        From differences of the forces: zeros do not matter. Refused are readings of
-        the other sign, and torques in another unit.
+        From differences of the forces: zeros do not matter. Refused are torques in
+        another unit, forces against gravity, and an arm that stands otherwise.
         """
         from scipy.spatial.transform import Rotation
 
@@ -131,21 +136,59 @@ class Wrench(Sensor):
             )
         pull = self._pull(tip)
         pull = pull - pull.mean(axis=0)
-        left, spread, right = np.linalg.svd(pull.T @ force)
+        spread = np.linalg.svd(pull.T @ force, compute_uv=False)
         turned = np.linalg.svd(pull, compute_uv=False) / np.sqrt(len(pull))
         alike = turned[1] < _SPREAD * self.magnitude  # as on a SCARA, always upright
         if alike or spread[1] < _SPREAD * spread[0]:
             return self, None
-        turn, handed = left @ right, np.linalg.det(left @ right)
-        if handed < 0.0 and spread[2] > _SPREAD * spread[0]:
+        (turn, off), against = _turn(pull, force), _turn(pull, -force)[1]
+        if off > _TILTED and against < off / 4.0:
+            other = in_words(0.0 - np.array(self.up))
             raise ValueError(
-                "forces must be those of the load on the sensor, along gravity; these "
-                "have the other sign: negate forces and torques"
+                "forces point against gravity. Three causes fit these readings alike: "
+                f"the arm hangs from the ceiling (give its base, or Wrench(up={other})"
+                "); the sensor reads what holds the load (negate forces and torques); "
+                "the controller subtracts a payload heavier than the load (set it to "
+                "zero and read again). Find out which it is, then identify again"
             )
-        left[:, 2] *= handed
-        turn = left @ right
+        if off > _TILTED:
+            self._require_upright(tip, force, off)
         if Rotation.from_matrix(turn).magnitude() < _TURNED:
             return self, None
         frame = np.eye(4)
         frame[:3, :3] = turn
         return self, frame
+
+    def _require_upright(self, tip: Tip, force: Array, off: float) -> None:
+        """Refuse forces that fit another direction of gravity far better."""
+        best, up = off, np.zeros(3)
+        for start in np.vstack([np.eye(3), -np.eye(3)]):
+            down = -start
+            for _ in range(_ROUNDS):
+                pull = down @ tip.rotation
+                turn, misfit = _turn(pull - pull.mean(axis=0), force)
+                if misfit < best:
+                    best, up = misfit, -down / np.linalg.norm(down)
+                rows = tip.rotation - tip.rotation.mean(axis=0)  # (N, 3, 3), down @ it
+                rows = np.matrix_transpose(rows).reshape(-1, 3)
+                down = np.linalg.lstsq(rows, (force @ turn.T).ravel(), rcond=None)[0]
+        if best < off / 10.0 and up @ self.up < _UPRIGHT:
+            there, other = (
+                in_words((sign * up).round(2) + 0.0) for sign in (1.0, -1.0)
+            )
+            raise ValueError(
+                f"forces fit an arm that stands with up = {there}, or with up = {other}"
+                " if the sensor reads what holds the load, not one with up = "
+                f"{in_words(np.round(self.up, 2))}: give its base, or Wrench(up=...)"
+            )
+
+
+def _turn(pull: Array, force: Array) -> tuple[Array, float]:
+    """The rotation of the sensor that takes pulls (N, 3) nearest to forces (N, 3) but
+    for the mass, and the share of the forces' squares that is left."""
+    left, spread, right = np.linalg.svd(pull.T @ force)
+    handed = np.linalg.det(left @ right)
+    left[:, 2] *= handed
+    trace = spread[0] + spread[1] + handed * spread[2]
+    size = float((pull**2).sum() * (force**2).sum())
+    return left @ right, float(max(1.0 - trace**2 / size, 0.0))
