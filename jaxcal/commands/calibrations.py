@@ -198,7 +198,7 @@ def identify(
     table = recording.table(file, lambda which: of_arm.of_recording(model, which))
     table = read_table(file) if table is None else table
     machine: Any = of_arm.machine(model, table)
-    if accuracy is not None and not isinstance(machine, SerialChain):
+    if accuracy is not None and not _is_arm(machine):
         raise ValueError("--accuracy is of an arm, --model FILE.urdf")
     if of_urdf:
         readings = _arm_readings(of_arm, machine, table, inputs, outputs, weights)
@@ -231,14 +231,19 @@ def identify(
     return int(not good)
 
 
+def _is_arm(model: Any) -> bool:
+    """Whether a model is an arm, of which some options are."""
+    from jaxcal.arms import SerialChain
+
+    return isinstance(model, SerialChain)
+
+
 def _noise(machine: Any, stds: list[float] | None, play: float | None) -> Any:
     """``noise`` and ``noise_std`` of ``identify``, by --noise and --play."""
     std = stds[0] if stds and len(stds) == 1 else stds
     if play is None:
         return {"noise": None, "noise_std": std}
-    from jaxcal.arms import SerialChain
-
-    if not isinstance(machine, SerialChain):
+    if not _is_arm(machine):
         raise ValueError("--play is of an arm, --model FILE.urdf")
     noise = machine.noise_with_play(play)
     if std is not None:
@@ -250,7 +255,7 @@ def _repaired(
     path: str,
     file: str,
     calibration: Calibration,
-    table: CsvTable,
+    table: Table,
     readings: _Readings,
 ) -> str:
     """Write the rows of a mispaired table that belong together; a line that says so."""
@@ -452,9 +457,7 @@ def _commands_for(
 
 def _in_degrees(calibration: Calibration, commands: Array) -> Array:
     """Commands (N, n) of an arm whose joint columns are in radians."""
-    from jaxcal.arms import SerialChain
-
-    if not isinstance(calibration.model, SerialChain):
+    if not _is_arm(calibration.model):
         raise ValueError("--radians is of arms")
     return in_degrees(calibration.model, commands)
 
