@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from typing import Any
 
 import numpy as np
@@ -67,7 +68,8 @@ class FromFunction(Model):
         prior: what is known of the parameters, where none is given to what asks.
         periods: (q,) of readings that wrap, 360 of an angle in degrees, inf of others;
             one number for all.
-        processes: that run f at a time; f must then be importable.
+        processes: that run f at a time; f must then be importable. Or an executor of
+            ``concurrent.futures``, as a cluster's is, which you close.
         cache: file in which runs are kept. It tells functions apart by their code, not
             by what they call or read: delete it when that changes.
         timeout: seconds after which a run of a program has failed.
@@ -89,7 +91,7 @@ class FromFunction(Model):
         noise: Noise | None = None,
         prior: Prior | None = None,
         periods: ArrayLike | None = None,
-        processes: int = 1,
+        processes: int | Executor = 1,
         cache: str | os.PathLike[str] | None = None,
         timeout: float | None = None,
         quiet: bool = False,
@@ -121,9 +123,9 @@ class FromFunction(Model):
         require_kind("noise", noise, Noise)
         require_kind("prior", prior, Prior)
         self._noise, self._prior, self._given_periods = noise, prior, periods
-        self._runs = Runs(
-            f, bool(batch), whole_number("processes", processes, 1), cache, quiet
-        )
+        if not isinstance(processes, Executor):
+            processes = whole_number("processes", processes, 1)
+        self._runs = Runs(f, bool(batch), processes, cache, quiet)
         self.f = f
         self._known = _Memory()
         self._steps: dict[str, Differences] = {}
@@ -237,7 +239,7 @@ class FromFunction(Model):
         }
 
     def close(self) -> None:
-        """End the processes that run f, if there are any; they start again if asked."""
+        """End the processes that run f, if they are not yours; they start if asked."""
         self._runs.close()
 
     # -- inside ------------------------------------------------------------------------

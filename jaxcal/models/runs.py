@@ -21,7 +21,7 @@ import subprocess
 import time
 import types
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import BrokenExecutor
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,7 @@ Answer = Array | str  # readings (q,), or why there are none
 
 _EVERY = 2.0  # seconds between writings of runs to the disk
 _TASKS_EACH = 4  # pieces of work for each process, so that none waits long
+_TASKS = 256  # of an executor, whose size is not known
 
 
 class _RunError(Exception):
@@ -101,7 +102,7 @@ class Runs:
     Args:
         f: one command and the parameters, or with ``batch`` many commands.
         batch: f takes commands (N, n) and returns (N, q).
-        processes: that run at a time.
+        processes: that run at a time, or the caller's own executor.
         cache: file of runs, made where it does not exist; None: nothing is kept.
         quiet: no progress on standard error.
     """
@@ -110,16 +111,21 @@ class Runs:
         self,
         f: Callable[..., Any],
         batch: bool,
-        processes: int,
+        processes: int | concurrent.futures.Executor,
         cache: str | os.PathLike[str] | None,
         quiet: bool,
     ) -> None:
-        self.f, self.batch, self.processes = f, batch, processes
+        self.f, self.batch = f, batch
+        self._pool: concurrent.futures.Executor | None = None
+        self._owned = isinstance(processes, int)  # else the caller closes it
+        if isinstance(processes, int):
+            self.processes, self._num_tasks = processes, _TASKS_EACH * processes
+        else:
+            self.processes, self._num_tasks, self._pool = 0, _TASKS, processes
         self.num_outputs: int | None = None  # of the first run
         self._progress = Progress(quiet=quiet)
-        self._pool: concurrent.futures.Executor | None = None
         self._kept = None if cache is None else _Cache(cache, _content(f))
-        if processes > 1 and not isinstance(f, CommandLine):
+        if self.processes > 1 and not isinstance(f, CommandLine):
             try:
                 pickle.dumps(f)
             except Exception as error:
@@ -161,8 +167,8 @@ class Runs:
         return self._arrays(answers, q)
 
     def close(self) -> None:
-        """End the processes."""
-        if self._pool is not None:
+        """End the processes, but for those of the caller's executor."""
+        if self._pool is not None and self._owned:
             self._pool.shutdown(cancel_futures=True)
             self._pool = None
 
@@ -191,7 +197,7 @@ class Runs:
             for j, of_job in enumerate(answers)
         ]
         total = sum(len(rows) for _, rows in open_rows)
-        size = max(1, -(-total // (_TASKS_EACH * self.processes)))
+        size = max(1, -(-total // self._num_tasks))
         if self.processes == 1:
             size = max(total, 1) if self.batch else 1
         return [
@@ -209,27 +215,35 @@ class Runs:
                 yield (j, rows), _answer(self.f, self.batch, commands[rows], parameters)
             return
         try:
-            broken, futures = [], {}
+            broken: list[tuple[int, list[int]]] = []
+            futures: dict[Any, tuple[int, list[int]]] = {}
+            answers: list[Answer]
             for j, rows in pieces:
                 try:
                     future = self._submit(jobs[j][0][rows], jobs[j][1])
-                except BrokenProcessPool:  # an earlier run killed a worker process
+                except BrokenExecutor:  # an earlier run killed a worker process
                     broken.append((j, rows))
                 else:
                     futures[future] = (j, rows)
             for future in concurrent.futures.as_completed(futures):
                 try:
-                    yield futures[future], future.result()
-                except BrokenProcessPool:
+                    answers = future.result()
+                except Exception as error:
+                    if not _process_ended(error):
+                        raise
                     broken.append(futures[future])
+                else:
+                    yield futures[future], answers
             # A run that ends its process takes those beside it along: one by one.
             for j, rows in broken:
-                answers: list[Answer] = []
+                answers = []
                 for i in rows:
                     self.close()
                     try:
                         answers += self._submit(jobs[j][0][[i]], jobs[j][1]).result()
-                    except BrokenProcessPool:
+                    except Exception as error:
+                        if not _process_ended(error):
+                            raise
                         answers.append("its process ended")
                 self.close()
                 yield (j, rows), answers
@@ -246,7 +260,7 @@ class Runs:
             )
             try:
                 self._pool.submit(callable, self.f).result()
-            except BrokenProcessPool:
+            except BrokenExecutor:
                 raise ValueError(
                     "f must be importable by a new process where processes is above 1: "
                     "put it at the top of a module, and what runs behind `if __name__ "
@@ -267,6 +281,11 @@ class Runs:
             )
         bad = np.flatnonzero(~np.isfinite(answer))
         return f"reading {bad[0] + 1} is {answer[bad[0]]}" if bad.size else answer
+
+
+def _process_ended(error: Exception) -> bool:
+    """Whether a run ended its process; ``KilledWorker`` is what dask calls it."""
+    return isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
 
 
 def _answer(

@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import importlib
+import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
 
@@ -11,6 +12,7 @@ import pytest
 import jaxcal
 from jaxcal.commands import main as jaxcal_main
 from jaxcal.models import FromFunction, from_dict
+from jaxcal.models.runs import Runs
 
 NOMINAL = np.array([2.0, 0.5, 0.0])
 SCALE, NAMES = [0.5, 0.1, 1.0], ("a", "k", "c")
@@ -139,6 +141,48 @@ def test_a_run_may_end_its_process_before_all_are_handed_over(tmp_path, monkeypa
         design = jaxcal.Design(rows, parallel)
     assert design.available.tolist() == [False, True, True, True]
     parallel.close()
+
+
+@pytest.mark.slow
+def test_a_cluster_of_dask_runs_f_and_names_what_ends_a_worker():
+    """Its local cluster; of a function that only this process knows."""
+    distributed = pytest.importorskip("distributed")
+    dask = pytest.importorskip("dask")
+    here = os.getpid()
+
+    def f(u, theta):
+        if u[0] == 3.0:
+            os._exit(1)
+        if u[0] > 7.0:
+            raise RuntimeError("too far")
+        return [theta[0] * np.exp(-theta[1] * u[0]), float(os.getpid() == here)]
+
+    rows = U[[0, 3, 6, 8, 16]]
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 2}),
+        distributed.Client(
+            n_workers=2, threads_per_worker=1, dashboard_address=None
+        ) as client,
+        client.get_executor() as executor,
+    ):
+        runs = Runs(f, False, executor, None, True)
+        (values,), (reasons,) = runs([(rows, np.array([2.0, 0.5]))])
+        runs.close()  # the executor is the caller's
+        assert executor.submit(abs, -1).result() == 1
+    assert reasons == {2: "its process ended", 4: "RuntimeError: too far"}
+    expected = 2.0 * np.exp(-0.5 * rows[[0, 1, 3], 0])
+    np.testing.assert_array_equal(values[[0, 1, 3]], np.c_[expected, np.zeros(3)])
+
+
+def test_an_executor_of_ones_own_keeps_the_order():
+    with concurrent.futures.ThreadPoolExecutor(3) as executor:
+        one = model(processes=executor, quiet=True)
+        np.testing.assert_array_equal(one.predict(U), model().predict(U))
+        np.testing.assert_array_equal(one.jacobian(U), model().jacobian(U))
+        one.close()
+        assert executor.submit(abs, -1).result() == 1
+    with pytest.raises(ValueError, match="processes must be a whole number"):
+        model(processes="four")
 
 
 CALLS = []
