@@ -185,17 +185,16 @@ class _Responses:
         sides = [(fit.input_names, commands, fit.commands[used])]
         if not fit.model.relative:
             readings = predict(self.model, fit.commands, fit.estimate) + fit.residuals
-            sides.append((fit.output_names, self.wanted, readings[used]))
+            sides.insert(0, (fit.output_names, self.wanted, readings[used]))
         far = np.zeros(len(commands), dtype=np.bool_)
-        most, worst = _FAR, ""
+        worst = ""
         for names, values, measured in sides:
             low, high = measured.min(axis=0), measured.max(axis=0)
             width = np.where(high > low, high - low, np.inf)
             beyond = np.maximum(low - values, values - high) / width
             far |= (beyond > _FAR).any(axis=1)
-            if beyond.max(initial=0.0) > most:
+            if not worst and beyond.max(initial=0.0) > _FAR:
                 i, j = np.unravel_index(beyond.argmax(), beyond.shape)
-                most = beyond[i, j]
                 worst = (
                     f"target {i + 1} has {names[j]} = {values[i, j]:.6g}, measured "
                     f"was {low[j]:.6g} to {high[j]:.6g}"

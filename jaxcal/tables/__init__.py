@@ -5,6 +5,7 @@ otherwise, is said in one line.
 """
 
 from jaxcal.tables.decisions import Decision
+from jaxcal.tables.files import parse, read_table
 from jaxcal.tables.frames import (
     header_of,
     inputs_of,
@@ -14,7 +15,7 @@ from jaxcal.tables.frames import (
     table_of_frame,
 )
 from jaxcal.tables.names import COMMANDS, MEASURED, columns_by_name
-from jaxcal.tables.table import Table, parse, read_table
+from jaxcal.tables.table import Table
 from jaxcal.tables.text import csv_text
 
 __all__ = [

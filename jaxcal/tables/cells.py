@@ -24,7 +24,15 @@ _OTHER = {".": ",", ",": "."}
 
 
 class Ambiguity(ValueError):
-    """A cell that could be two numbers."""
+    """A cell that could be two numbers, and its place in the column."""
+
+    def __init__(self, cells: Sequence[str], place: int) -> None:
+        self.place, cell = place, cells[place]
+        plain = cell.replace(",", "").replace(".", "")
+        super().__init__(
+            f"{cell!r} may be {plain} or have three decimals: write {plain}, or a "
+            "fourth decimal"
+        )
 
 
 def truths_of(cells: Iterable[str], words: Sequence[str] = ()) -> list[float] | None:
@@ -84,7 +92,7 @@ def numbers_of(
         decided: as ``decimal_mark`` says.
 
     Raises:
-        Ambiguity: with the place of the first cell that could be two numbers.
+        Ambiguity: a cell could be two numbers.
     """
     numbers = [_number(cell, mark) for cell in cells]
     doubtful = [
@@ -93,14 +101,14 @@ def numbers_of(
         if cell[-4:-3] in (".", ",") and _THOUSANDS.fullmatch(_plain(cell))
     ]
     if grouped := [i for i in doubtful if mark not in cells[i] and not decided]:
-        raise Ambiguity(grouped[0])
+        raise Ambiguity(cells, grouped[0])
     if decimals := [i for i in doubtful if mark in cells[i]]:
         rest = [_plain(cells[i]) for i in {*range(len(cells))} - {*doubtful}]
         rest = [cell for cell in rest if cell.casefold() not in _MISSING]
         if all(cell.lstrip("+-").isdecimal() for cell in rest):
             largest = max((abs(float(cell)) for cell in rest), default=0.0)
             if _LEAST <= largest < 1000.0:
-                raise Ambiguity(decimals[0])
+                raise Ambiguity(cells, decimals[0])
     return numbers
 
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.tables.cells import decimal_mark, numbers_of
 from jaxcal.tables.decisions import COUNTED, decide
 from jaxcal.tables.names import COMMANDS, MEASURED, columns_by_name, say
 from jaxcal.tables.table import Table, table_of
@@ -143,14 +142,9 @@ def _numbers(argument: str, name: str, values: Any) -> Any:
         return array.astype(np.float64)
     if not isinstance(cells := _cells(values), list):
         return array
-    numbers = numbers_of(cells, *decimal_mark(cells, True))
-    for row, number in enumerate(numbers):
-        if number is None:
-            raise ValueError(
-                f"{argument}: row {row}, column {name!r} must hold a number, got "
-                f"{cells[row]!r}"
-            )
-    return np.array(numbers, dtype=np.float64).reshape(array.shape)
+    table = table_of(argument, {name: cells}, range(len(cells)), None, row="row")
+    numbers = table.columns([name]) if table.labels else table.values
+    return numbers.reshape(array.shape)
 
 
 def names_in(

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import pathlib
-import sys
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.checks import axis_letter
 from jaxcal.tables.cells import Ambiguity, decimal_mark, numbers_of, truths_of
-from jaxcal.tables.decisions import AVAILABLE, Decision, decide, sentence, spelt
+from jaxcal.tables.decisions import (
+    AVAILABLE,
+    COUNTED,
+    Decision,
+    decide,
+    sentence,
+    spelt,
+)
 from jaxcal.tables.names import COMMANDS, MEASURED, bare, columns_by_name, say
 from jaxcal.tables.names import split_names as split
-from jaxcal.tables.text import decoded, sheet_of
 
-__all__ = ["Table", "parse", "read_table", "table_of"]
+__all__ = ["Table", "table_of"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -285,7 +287,8 @@ class Table:
             for name in self.names
             if name not in beside
             and not name.startswith(other)
-            and decisions[name].role in ("input", "output")
+            and decisions[name].reason != COUNTED
+            and decisions[name].role != AVAILABLE
         ]
         if not spare:
             return ""
@@ -293,7 +296,7 @@ class Table:
         plural = len(spare) > 1
         return (
             f"column{'s' if plural else ''} {listed} {'are' if plural else 'is'} not "
-            "read: nothing here has that name"
+            "read: nothing asks for it"
         )
 
 
@@ -301,98 +304,7 @@ def _of_role(role: str, decisions: Mapping[str, Decision]) -> tuple[str, ...]:
     return tuple(name for name, decision in decisions.items() if decision.role == role)
 
 
-# -- reading ---------------------------------------------------------------------------
-
-
-def read_table(path: Any) -> Table:
-    """Read a table of a file or a data frame.
-
-    Files are CSV as spreadsheets, R, numpy and loggers write it: cells separated by
-    commas, semicolons, tabs or blanks, decimal points or commas, comments after #, a
-    row of units, UTF-8, UTF-16 or cp1252. Frames are of pandas, polars or pyarrow, a
-    dict of columns, an xarray dataset, or rows that have names.
-
-    Args:
-        path: of the file, ``-`` for standard input, or the frame.
-
-    Returns:
-        The table. ``decisions`` says what each column is.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: naming the file and what is wrong in it: the line, the column and
-            the cell.
-    """
-    if isinstance(path, Table):
-        return path
-    if not isinstance(path, str | os.PathLike):
-        from jaxcal.tables.frames import table_of_frame
-
-        return table_of_frame("table", path)
-    if path == "-":
-        stream = getattr(sys.stdin, "buffer", None)
-        data = stream.read() if stream else sys.stdin.read().encode()
-        return parse("standard input", data)
-    return parse(os.fspath(path), pathlib.Path(path).read_bytes())
-
-
-def parse(source: str, data: bytes) -> Table:
-    """The table in the bytes of a file; ``source`` is its name in errors."""
-    text, note = decoded(source, data)
-    try:
-        table, notes = _of_text(source, text)
-    except ValueError as error:
-        raise ValueError(f"{error}; {note}" if note else str(error)) from None
-    if notes := [*filter(None, [note]), *notes]:
-        say(f"{source}: {'; '.join(notes)}")
-    return table
-
-
-def _of_text(source: str, text: str) -> tuple[Table, list[str]]:
-    """The table in a text, and what is to be said of how it was read."""
-    sheet = sheet_of(source, text)
-    rows, notes = sheet.rows, [*sheet.notes]
-    _, header = rows[0]
-    mark = decimal_mark(
-        [cell for _, row in rows for cell in row], sheet.delimiter != ","
-    )
-    if not sheet.headed:
-        header = [f"u_{axis_letter(i, len(header))}" for i in range(len(header))]
-    elif numbers := [cell for cell in header if _is_plain(cell)]:
-        name = next(cell for cell in header if not _is_plain(cell))
-        raise ValueError(
-            f"{source}: line {rows[0][0]} must hold names alone or numbers alone, got "
-            f"{name!r} and {numbers[0]!r}: give every column a name"
-        )
-    elif not (rows := rows[1:]):
-        raise ValueError(f"{source}: there are no rows below the header")
-    columns = dict[str, Sequence[str]]()
-    for place, name in enumerate(header, start=1):
-        cells = [row[place - 1] for _, row in rows]
-        if header.count(name) > 1 and name:
-            raise ValueError(f"{source}: column {name!r} comes twice")
-        if name:
-            columns[name] = cells
-        elif any(cells):
-            notes += _unnamed(source, place, cells, columns)
-    lines = tuple(line for line, _ in rows)
-    return table_of(source, columns, lines, mark, headed=sheet.headed), notes
-
-
-def _is_plain(cell: str) -> bool:
-    return numbers_of([cell])[0] is not None and bool(cell)
-
-
-def _unnamed(
-    source: str, place: int, cells: Sequence[str], columns: dict[str, Sequence[str]]
-) -> list[str]:
-    """What is said of a column without a name, a frame's index; words are labels."""
-    if not any(map(_is_plain, cells)) and "index" not in columns:
-        columns["index"] = cells
-        return []
-    if len({*cells}) == len(cells) and all(cell.isdecimal() for cell in cells):
-        return [f"column {place} is not read: it counts the rows"]
-    raise ValueError(f"{source}: column {place} has no name")
+# -- making one ------------------------------------------------------------------------
 
 
 def table_of(
@@ -415,7 +327,7 @@ def table_of(
         row: what ``lines`` counts.
 
     Raises:
-        ValueError: a column holds neither numbers nor words, or words under a name that
+        ValueError: a column mixes numbers and words, or holds words under a name that
             begins with u_, or with y_ beside these.
     """
     numeric: dict[str, Any] = {}
@@ -428,12 +340,8 @@ def table_of(
         try:
             numbers = numbers_of(cells, *(mark or decimal_mark(cells, True)))
         except Ambiguity as error:
-            i = int(str(error))
-            plain = cells[i].replace(",", "").replace(".", "")
-            raise ValueError(
-                f"{source}: {row} {lines[i]}, column {name!r}: {cells[i]!r} may be "
-                f"{plain} or have three decimals: write {plain}, or a fourth decimal"
-            ) from None
+            where = f"{source}: {row} {lines[error.place]}, column {name!r}"
+            raise ValueError(f"{where}: {error}") from None
         must = name.startswith(COMMANDS) or (marked and name.startswith(MEASURED))
         truths = truths_of(cells, ("true", "false")) if must else None
         count = sum(number is None for number in numbers)
@@ -446,9 +354,6 @@ def table_of(
             if must or 2 * count < filled:
                 _require_numbers(table, name, cells, numbers)
             table.labels[name] = [*cells]
-    if not numeric:
-        listed = ", ".join(columns)
-        raise ValueError(f"{source}: no column holds numbers: {listed}")
     values = np.array([*numeric.values()], dtype=np.float64)
     values = values.reshape(len(numeric), len(lines)).T
     return dataclasses.replace(table, names=tuple(numeric), values=values)

@@ -255,7 +255,8 @@ def _names_of_rows(
 ) -> tuple[str, ...] | None:
     """Names of the candidates, of a data frame its index or its column of words."""
     if names is None and header_of("candidates", candidates):
-        rows = tuple(map(str, getattr(candidates, "index", ())))
+        index: Any = getattr(candidates, "index", ())
+        rows = () if callable(index) else tuple(map(str, index))
         if rows and rows != tuple(map(str, range(len(rows)))):
             return rows
         names = table_of_frame("candidates", candidates).row_names

@@ -1,0 +1,165 @@
+"""No command loses or writes over what it reads; a flag without effect is refused."""
+
+from __future__ import annotations
+
+import io
+import os
+
+import numpy as np
+import pytest
+
+import jaxcal
+from jaxcal.commands import main
+from jaxcal.models import SerialChain
+
+from .test_beginners import URDF
+
+U = np.random.default_rng(0).uniform(-20.0, 20.0, (12, 2)).round(3)
+Y = U * [0.43, 0.71] + [3.1, -5.8]
+
+
+def csv(header, values):
+    return "\n".join([header, *(",".join(map(repr, row)) for row in values.tolist())])
+
+
+@pytest.fixture
+def ask(tmp_path, monkeypatch, capsys):
+    """Runs a command in a folder with tables; its exit code, output and error."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "t.csv").write_text(csv("a,b", U))
+    (tmp_path / "pairs.csv").write_text(csv("u_a,u_b,y_a,y_b", np.hstack([U, Y])))
+    (tmp_path / "far.csv").write_text("y_a,y_b\n200,0\n5,-5\n")
+
+    def run(typed):
+        try:
+            code = main(typed.split())
+        except SystemExit as left:
+            code = left.code
+        return code, *capsys.readouterr()
+
+    assert run("identify pairs.csv --out c.json")[0] == 0
+    return run
+
+
+@pytest.mark.parametrize("way", ["itself", "symbolic", "hard", "dotted"])
+@pytest.mark.parametrize("typed", ["select t.csv -k 4", "score t.csv --indices 0,1,2"])
+def test_an_input_is_never_written_over(ask, tmp_path, way, typed):
+    before, name = (tmp_path / "t.csv").read_bytes(), "other.csv"
+    if way == "symbolic":
+        os.symlink("t.csv", name)
+    elif way == "hard":
+        os.link("t.csv", name)
+    else:
+        name = "t.csv" if way == "itself" else "./../" + tmp_path.name + "/t.csv"
+    code, out, said = ask(f"{typed} --out {name}")
+    assert (code, out) == (2, "") and said.count("\n") == 1
+    assert f"{name} is what is read" in said
+    assert (tmp_path / "t.csv").read_bytes() == before
+    assert ask(f"{typed} --out new.csv")[0] == 0
+
+
+def test_nor_is_one_that_comes_over_standard_input(ask, monkeypatch, tmp_path):
+    with open("t.csv") as file:
+        monkeypatch.setattr("sys.stdin", file)
+        code, _, said = ask("select - -k 4 --out t.csv")
+    assert code == 2 and "t.csv is what is read" in said
+
+
+@pytest.mark.parametrize(
+    "typed",
+    [
+        "identify pairs.csv --out pairs.csv",
+        "identify pairs.csv --report . --against calibration.json",
+        "predict c.json t.csv --out c.json",
+        "command c.json far.csv --out far.csv",
+    ],
+)
+def test_every_command_that_writes_keeps_what_it_reads(ask, tmp_path, typed):
+    (tmp_path / "calibration.json").write_bytes((tmp_path / "c.json").read_bytes())
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    code, _, said = ask(typed)
+    assert code == 2 and "is what is read" in said
+    assert before == {path: path.read_bytes() for path in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("typed", "message"),
+    [
+        ("identify pairs.csv --noise 1,5", "write 1.5, or 1.0,5.0"),
+        ("select t.csv --noise 0,05", "write 0.05, or 0.0,05.0"),
+        ("plan t.csv --noise 0.1 --accuracy 1,5", "write 1.5, or 1.0,5.0"),
+        ("select t.csv --sensor position", "need --model FILE.urdf"),
+        ("identify pairs.csv --sensor position", "need --model FILE.urdf"),
+        ("identify pairs.csv --accuracy 1", "--accuracy is of an arm"),
+        ("identify pairs.csv --unproven --out d.json", "--unproven is of --out FILE"),
+        ("identify pairs.csv --overwrite --out d.json", "--overwrite is of --out FILE"),
+        ("identify pairs.csv --servos s.json", "--servos is of a recording"),
+        ("check c.json pairs.csv --servos s.json", "--servos is of a recording"),
+        ("score t.csv --indices 0,1,2 --time-limit 1", "is of --reference exact"),
+        ("select t.csv --csv --out plan.json", "--csv and --out plan.json differ"),
+        ("select t.csv --json --out plan.csv", "--json and --out plan.csv differ"),
+    ],
+)
+def test_a_flag_without_effect_is_refused(ask, typed, message):
+    code, out, said = ask(typed)
+    assert (code, out) == (2, "") and message in said
+
+
+def test_two_noises_are_two(ask):
+    assert ask("identify pairs.csv --noise 1.0,5.0")[0] == 0
+    assert ask("identify pairs.csv --noise 0.1,0.2")[0] == 0
+
+
+def test_a_target_far_from_the_readings_is_said(ask):
+    code, out, said = ask("command c.json far.csv")
+    assert code == 0
+    wanted = (200.0 - 3.1) / 0.43
+    assert np.isclose(float(out.splitlines()[1].split(",")[0]), wanted)
+    assert "1 of 2 targets are far outside the measurements: target 1" in said
+    low, high = Y[:, 0].min(), Y[:, 0].max()
+    assert f"y_a = 200, measured was {low:.6g} to {high:.6g}" in said
+
+
+def test_a_clipped_target_is_said(ask):
+    code, _, said = ask("command c.json far.csv --clip --limits=-30,30")
+    assert code == 0
+    assert "1 of 2 targets are clipped: target 1, u_a = 457.907 to 30" in said
+
+
+def test_targets_among_the_readings_are_not_said(ask, tmp_path):
+    (tmp_path / "far.csv").write_text(csv("y_a,y_b", Y * 1.01))
+    assert ask("command c.json far.csv")[2] == ""
+
+
+def test_an_error_stands_alone(ask, tmp_path):
+    (tmp_path / "t.csv").write_text(csv("time,a,b", np.c_[np.arange(12.0), U]))
+    code, _, said = ask("select t.csv -k 99")
+    assert code == 2 and said.count("\n") == 1
+    code, _, said = ask("select t.csv -k 4")
+    assert code == 0 and "column 'time' is not read" in said
+
+
+def test_bytes_come_over_standard_input_too(ask, monkeypatch):
+    text = csv("a,b", U).replace(",", ";").replace(".", ",")
+    stream = io.TextIOWrapper(io.BytesIO(text.encode("utf-16")))
+    monkeypatch.setattr("sys.stdin", stream)
+    piped = ask("select - -k 4 --csv")
+    plain = ask("select t.csv -k 4 --csv")
+    assert piped[:2] == plain[:2]
+
+
+def test_joints_beside_those_of_the_arm_are_said(ask, tmp_path):
+    (tmp_path / "arm.urdf").write_text(URDF)
+    arm = SerialChain.from_urdf(tmp_path / "arm.urdf")
+    joints = np.c_[U, np.arange(12.0)] * 4.0
+    (tmp_path / "t.csv").write_text(csv("turn,elbow,j5", joints))
+    code, _, said = ask("select t.csv -k 4 --model arm.urdf")
+    assert code == 0 and "column 'j5' is not read" in said
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame(joints, columns=["turn", "elbow", "j5"])
+    with pytest.warns(UserWarning, match="column 'j5' is not read"):
+        jaxcal.select(frame, 4, "greedy", model=arm)
+    read = pandas.DataFrame(arm.predict(joints[:, :2]), columns=["y_x", "y_y", "y_z"])
+    found = jaxcal.identify(frame[["elbow", "turn"]], read[["y_z", "y_x"]].join(
+        read["y_y"]), model=arm)  # fmt: skip
+    np.testing.assert_allclose(found.predict(joints[:, :2]), read, atol=1e-6)

@@ -1,0 +1,117 @@
+"""What each column is: by its name, its values and the company it keeps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from jaxcal.tables import parse
+
+RNG = np.random.default_rng(0)
+SORTED, SHUFFLED = np.sort(RNG.uniform(0.0, 9.0, 12)), RNG.permutation(12) + 1.0
+RANDOM = RNG.uniform(-9.0, 9.0, (12, 9)).round(3)
+
+
+def roles(header: str, columns: dict[str, np.ndarray] | None = None, **asked):
+    """name: role, of a table of random numbers but for these columns."""
+    names, values = header.split(","), RANDOM.copy()
+    for name, column in (columns or {}).items():
+        values[:, names.index(name)] = column
+    rows = [",".join(map(repr, row[: len(names)])) for row in values.tolist()]
+    table = parse("t.csv", "\n".join([header, *rows]).encode())
+    return table, {name: decision.role for name, decision in table.decisions.items()}
+
+
+@pytest.mark.parametrize(
+    ("header", "inputs", "outputs"),
+    [
+        ("x_mm,y_mm,z_mm", "x_mm,y_mm,z_mm", ""),
+        ("x_deg,y_deg,z_deg", "x_deg,y_deg,z_deg", ""),
+        ("X_mm,y_mm", "X_mm,y_mm", ""),
+        ("x_1,y_1,z_1,x_2,y_2,z_2", "x_1,y_1,z_1,x_2,y_2,z_2", ""),
+        ("X,Y,Z", "X,Y,Z", ""),
+        ("speed,y_axis", "speed,y_axis", ""),
+        ("u_a,y_axis", "u_a", "y_axis"),
+        ("u_a,u_b,y_a,y_b", "u_a,u_b", "y_a,y_b"),
+        ("pitch,yaw,y_pitch,y_yaw", "pitch,yaw", "y_pitch,y_yaw"),
+        ("x_1,x_2,y_1", "x_1,x_2", "y_1"),
+        ("u_x,u_y,u_z,y_x,y_y,y_z", "u_x,u_y,u_z", "y_x,y_y,y_z"),
+    ],
+)
+def test_y_is_an_output_where_the_table_says_so(header, inputs, outputs):
+    found = roles(header)[1]
+    for role, names in (("input", inputs), ("output", outputs)):
+        assert ",".join(name for name in found if found[name] == role) == names
+
+
+def test_readings_are_named_where_y_is_an_axis():
+    table = roles("x_mm,y_mm,z_mm,r")[0]
+    with pytest.raises(ValueError, match=r"'y_mm' may be an axis.* --outputs"):
+        table.outputs(None)
+    with pytest.warns(UserWarning, match="'y_mm': an axis"):
+        assert table.commands(None, but=["r"]) == ("x_mm", "y_mm", "z_mm")
+    beside = roles("u_a,u_b,x_mm,y_mm,z_mm")[0]
+    with pytest.raises(ValueError, match="'y_mm' may be an axis"):
+        beside.outputs(None)
+
+
+@pytest.mark.parametrize(
+    ("header", "column", "role"),
+    [
+        ("time,a,b", SORTED, "time"),
+        ("Time [s],a,b", SORTED, "time"),
+        ("elapsedTime,a,b", SORTED, "time"),
+        ("time,a,b", RANDOM[:, 0], "input"),
+        ("cure_time,a,b", np.tile([10.0, 20.0, 30.0], 4), "input"),
+        ("t,a,b", np.tile([1.0, 2.0], 6), "input"),
+        ("timestamp,a,b", RANDOM[:, 0], "time"),
+        ("time,a,b", 1.7e9 + RANDOM[:, 0], "time"),
+        ("time,u_a,u_b", RANDOM[:, 0], "left out"),
+        ("run,a,b", SHUFFLED, "left out"),
+        ("RunOrder,a,b", SHUFFLED, "left out"),
+        ("Std Order,a,b", SHUFFLED + 20.0, "left out"),
+        ("run,a,b", np.tile([1.0, 2.0], 6), "input"),
+        ("lot,a,b", SHUFFLED, "left out"),
+        ("lot,a,b", SHUFFLED - 1.0, "left out"),
+        ("lot,a,b", SHUFFLED + 5.0, "input"),
+        ("pose_id,a,b", np.repeat([1.0, 2.0, 3.0], 4), "left out"),
+        ("refractive_index,a,b", RANDOM[:, 0], "input"),
+        ("note,a,b", np.full(12, np.nan), "left out"),
+    ],
+)
+def test_what_counts_the_rows_is_no_command(header, column, role):
+    name = header.split(",")[0]
+    assert roles(header, {name: column})[1][name] == role
+
+
+def test_an_unknown_running_number_is_asked_about():
+    table = roles("lot,a,b", {"lot": SHUFFLED})[0]
+    with pytest.raises(ValueError, match="'lot' holds each number from 1 to 12 once"):
+        table.commands(None)
+    assert table.commands("lot,a,b") == ("lot", "a", "b")
+
+
+def test_levels_of_all_axes_are_axes():
+    shuffled = {name: RNG.permutation(12) for name in "abc"}  # a Latin hypercube
+    assert roles("a,b,c", shuffled)[0].commands(None) == ("a", "b", "c")
+
+
+def test_time_alone_is_what_varies():
+    table = roles("time,y_1", {"time": SORTED})[0]
+    with pytest.warns(UserWarning, match="it is the only one"):
+        assert table.commands(None, but=["y_1"]) == ("time",)
+
+
+def test_what_is_not_read_is_said_with_its_reason():
+    table = roles("time,a,b", {"time": SORTED})[0]
+    with pytest.warns(UserWarning, match="inputs a, b; column 'time' is not read: it"):
+        table.commands(None)
+    words = parse("t.csv", b"mode,a,b\nfast,1,2\nslow,2,5\n")
+    with pytest.warns(UserWarning, match="label 'mode': it holds words"):
+        words.commands(None)
+
+
+def test_columns_that_nothing_asks_for_are_said():
+    table = roles("j1,j2,j3,j4,x", {"j4": np.arange(12.0)})[0]
+    with pytest.warns(UserWarning, match="columns 'j3', 'j4' are not read"):
+        table.named(["j1", "j2"], "u_", others=["x"])

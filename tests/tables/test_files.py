@@ -1,0 +1,194 @@
+"""Tables as people export them; the oracle is the array that each was written from."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+
+import numpy as np
+import pytest
+
+import jaxcal
+from jaxcal.tables import parse
+
+NAMES = ("u_a", "u_b", "y_c")
+VALUES = np.random.default_rng(0).uniform(-20.0, 20.0, (9, 3)).round(4)
+
+
+def text_of(
+    delimiter: str = ",",
+    decimal: str = ".",
+    head: str | None = None,
+    end: str = "\n",
+    form: str = ".4f",
+) -> str:
+    rows = [[f"{x:{form}}".replace(".", decimal) for x in row] for row in VALUES]
+    lines = [delimiter.join(row) for row in rows]
+    return end.join([delimiter.join(NAMES) if head is None else head, *lines, ""])
+
+
+def savetxt(**options: str) -> str:
+    file = io.StringIO()
+    np.savetxt(file, VALUES, fmt="%.18e", **options)
+    return file.getvalue()
+
+
+def of_excel(*, sep: bool = False) -> str:
+    return ("sep=;\r\n" if sep else "") + text_of(";", ",", end="\r\n")
+
+
+PLAIN = text_of()
+LINES = PLAIN.splitlines()
+DIALECTS = {
+    "commas": PLAIN,
+    "quoted": "\n".join('"' + '","'.join(line.split(",")) + '"' for line in LINES),
+    "Excel in German": of_excel(),
+    "Excel with sep=": of_excel(sep=True),
+    "tabs and decimal commas": text_of("\t", ","),
+    "blanks": text_of(" "),
+    "aligned": text_of("    ", form="12.4f"),
+    "blanks and decimal commas": text_of(" ", ","),
+    "decimal commas in quotes": "\n".join(
+        [LINES[0]]
+        + [
+            ",".join(f'"{cell.replace(".", ",")}"' for cell in line.split(","))
+            for line in LINES[1:]
+        ]
+    ),
+    "carriage returns": text_of(end="\r"),
+    "numpy": savetxt(header=" ".join(NAMES)),
+    "numpy with commas": savetxt(header=",".join(NAMES), delimiter=","),
+    "comments": f"# rig 3, morning\n# a b\n{PLAIN}# end\n",
+    "a comment between": "\n".join([*LINES[:4], "# a pause", *LINES[4:]]),
+    "units": "\n".join([LINES[0], "deg,[mm],1/min", *LINES[1:]]),
+    "empty columns": "\n".join(f"{line},," for line in LINES),
+    "a delimiter at the end": "\n".join([LINES[0], *(f"{x}," for x in LINES[1:])]),
+    "empty rows": f"{PLAIN},,\n\n,,\n",
+    "R write.csv": "\n".join(
+        ['"",' + LINES[0], *(f'"{i}",{line}' for i, line in enumerate(LINES[1:], 1))]
+    ),
+    "R write.table": "\n".join(
+        [LINES[0]] + [f'"{i}",{line}' for i, line in enumerate(LINES[1:], 1)]
+    ).replace(",", " "),
+    "an index of pandas, shuffled": "\n".join(
+        ["," + LINES[0], *(f"{7 * i % 23},{line}" for i, line in enumerate(LINES[1:]))]
+    ),
+    "minus signs of typography": PLAIN.replace("-", "\u2212"),
+}
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_what_is_exported_is_read(dialect):
+    table = parse("t.csv", DIALECTS[dialect].encode())
+    assert table.names == NAMES and not table.labels
+    np.testing.assert_allclose(table.values, VALUES, atol=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "cp1252"])
+def test_encodings(encoding):
+    table = parse("t.csv", PLAIN.replace("u_b", "u_b [°]").encode(encoding))
+    assert table.names == ("u_a", "u_b [°]", "y_c")
+    np.testing.assert_array_equal(table.values, VALUES)
+
+
+def test_a_compressed_file(tmp_path):
+    path = tmp_path / "t.csv.gz"
+    path.write_bytes(gzip.compress(PLAIN.encode()))
+    np.testing.assert_array_equal(jaxcal.read_table(path).values, VALUES)
+
+
+@pytest.mark.parametrize("blank", ["'", "\u2019", "\u00a0", "\u202f", "\u2009", " "])
+def test_thousands_between_blanks(blank):
+    numbers = [-838.0, 16295.1, 1234567.25, 0.5]
+    cells = [f"{x:,}".replace(",", blank) for x in numbers]
+    table = parse("t.csv", "\n".join(["u_p", *cells]).encode())
+    np.testing.assert_array_equal(table.values[:, 0], numbers)
+
+
+@pytest.mark.parametrize(
+    ("cells", "numbers"),
+    [
+        (["1,234.5", "2,000", "-3,000.25"], [1234.5, 2000.0, -3000.25]),
+        (["1.234,5", "2.000", "-3.000,25"], [1234.5, 2000.0, -3000.25]),
+        (["1.234.567", "14.036"], [1234567.0, 14036.0]),
+        (["1,5", "2,125"], [1.5, 2.125]),
+        (["14.036", "22.125", "-7.250"], [14.036, 22.125, -7.25]),
+        (["14.036", "-838.5", "512"], [14.036, -838.5, 512.0]),
+        (["14.036", "90", "0"], [14.036, 90.0, 0.0]),
+        (["1e3", "2.5E-1", "+.5"], [1000.0, 0.25, 0.5]),
+    ],
+)
+def test_one_decimal_mark_for_all_cells(cells, numbers):
+    table = parse("t.csv", "\n".join(["a;b", *(f"{x};1" for x in cells)]).encode())
+    np.testing.assert_array_equal(table.values[:, 0], numbers)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("u_a,u_b\n-838,1\n14.036,2\n", "line 3, column 'u_a': '14.036' may be 14036"),
+        ('a,b\n"1,234",1\n"2,345",2\n', "line 2, column 'a': '1,234' may be 1234"),
+        ("a;b\n1,5;2\n3.5;1\n2,5;4\n", "line 3, column 'a' must hold a number, got"),
+        ("u_a,u_on\n1,fast\n2,slow\n", "line 2, column 'u_on' must .* got 'fast'"),
+        ("u_a,y_b\n1,ok\n2,bad\n", "line 2, column 'y_b' must hold a number, got 'ok'"),
+        ("a,b\nfoo,bar\n1,2\n3,4\n5,6\n", "line 2, column 'a' must .* got 'foo'"),
+        ("a,b\n1,5%\n3,4\n5,6\n", "line 2, column 'b' must hold a number, got '5%'"),
+        ("a\n1_000\n2\n3\n", "line 2, column 'a' must hold a number, got '1_000'"),
+        ("u_a,u_b\n1,2\n3,4,5\n", "line 3 has 3 cells, the first has 2"),
+        ("a,b\n1,2\n\x00,4\n", "line 3 is not UTF-8 text"),
+        ("words,more\na,b\n", "no column holds numbers: words, more"),
+    ],
+)
+def test_what_could_be_two_things_is_refused_with_the_cell(text, message):
+    with pytest.raises(ValueError, match=message):
+        parse("t.csv", text.encode())
+
+
+def test_true_and_false_are_numbers_where_a_command_is_asked_for():
+    table = parse("t.csv", b"u_a,u_on,done\n1,TRUE,false\n2,False,TRUE\n")
+    np.testing.assert_array_equal(table.columns(["u_on"])[:, 0], [1.0, 0.0])
+    np.testing.assert_array_equal(table.columns(["done"])[:, 0], [0.0, 1.0])
+    assert table.decisions["done"].role == "label" and table.row_names is None
+
+
+@pytest.mark.parametrize("name", ["available", "Available", "AVAILABLE", " available "])
+@pytest.mark.parametrize("words", [("0", "1"), ("FALSE", "TRUE"), ("No", "yes")])
+def test_available_in_any_spelling(name, words):
+    rows = [f"{i},{words[i % 2]}" for i in range(4)]
+    table = parse("t.csv", "\n".join([f"a,{name}", *rows]).encode())
+    np.testing.assert_array_equal(table.available(), [False, True, False, True])
+
+
+@pytest.mark.parametrize("cell", ["maybe", "2", ""])
+def test_available_is_yes_or_no(cell):
+    table = parse("t.csv", f"a,available\n1,1\n2,{cell}\n".encode())
+    with pytest.raises(ValueError, match="line 3"):
+        table.available()
+    twice = parse("t.csv", b"a,available,Available\n1,1,1\n")
+    with pytest.raises(ValueError, match="could both be available"):
+        twice.available()
+
+
+def test_rows_whose_names_begin_with_a_hash_stay():
+    rows = [f"#{i},{i * i}" for i in range(5)]
+    table = parse("t.csv", "\n".join(["pose,a", *rows]).encode())
+    assert len(table) == 5 and table.row_names == [f"#{i}" for i in range(5)]
+    numbered = parse("t.csv", "\n".join(["#,a", *(x[1:] for x in rows)]).encode())
+    assert numbered.decisions["#"].role == "left out"
+
+
+def test_lines_are_those_of_the_file():
+    table = parse("t.csv", b"# a\na,b\nmm,mm\n# c\n1,2\n\n3,nan\n")
+    assert table.lines == (5, 7)
+    with pytest.raises(ValueError, match="line 7, column 'b'"):
+        table.columns(["b"])
+
+
+def test_read_table_takes_what_csv_writes(tmp_path):
+    path = tmp_path / "t.csv"
+    with open(path, "w", newline="") as file:
+        csv.writer(file, dialect="excel-tab").writerows([NAMES, *VALUES.tolist()])
+    np.testing.assert_array_equal(jaxcal.read_table(str(path)).values, VALUES)

@@ -1,0 +1,182 @@
+"""Frames and rows by name; the oracle is the same question to a plain array."""
+
+from __future__ import annotations
+
+import collections
+
+import numpy as np
+import pytest
+
+import jaxcal
+
+pandas = pytest.importorskip("pandas")
+
+AXES = ("pitch", "yaw", "roll")
+RNG = np.random.default_rng(3)
+U = RNG.uniform(-20.0, 20.0, (12, 3)).round(3)
+Y = U @ np.diag([0.43, 0.71, 0.87]) + [3.1, -5.8, 2.41]
+COMMANDS = pandas.DataFrame(U, columns=AXES)
+READINGS = pandas.DataFrame(Y, columns=[f"y_{axis}" for axis in AXES])
+TARGETS = READINGS.iloc[:3, ::-1]  # roll first
+DICT = TARGETS.to_dict("list")
+ALL = COMMANDS.assign(available=[0, 1] * 6, index=range(12), time=np.arange(12) / 10)
+ALL.insert(0, "Unnamed: 0", range(12))
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    return jaxcal.identify(COMMANDS, READINGS, noise_std=0.01)
+
+
+def of_polars(columns):
+    return pytest.importorskip("polars").DataFrame(columns)
+
+
+def of_pyarrow(columns):
+    return pytest.importorskip("pyarrow").table(columns)
+
+
+def of_xarray(columns):
+    xarray = pytest.importorskip("xarray")
+    values = np.stack([*columns.values()], axis=-1)
+    return xarray.DataArray(values, dims=("row", "axis"), coords={"axis": [*columns]})
+
+
+MAKERS = {
+    "pandas": pandas.DataFrame,
+    "dict": dict,
+    "records": lambda columns: pandas.DataFrame(columns).to_dict("records"),
+    "structured": lambda columns: pandas.DataFrame(columns).to_records(index=False),
+    "tuples": lambda columns: [*pandas.DataFrame(columns).itertuples()],
+    "series": lambda columns: [row for _, row in pandas.DataFrame(columns).iterrows()],
+    "table": lambda columns: jaxcal.read_table(columns),
+    "nullable": lambda columns: pandas.DataFrame(columns).convert_dtypes(),
+    "polars": of_polars,
+    "lazy": lambda columns: of_polars(columns).lazy(),
+    "pyarrow": of_pyarrow,
+    "xarray": of_xarray,
+}
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_targets_are_read_by_name_whatever_holds_them(calibration, maker):
+    found = calibration.command_for(MAKERS[maker](DICT))
+    np.testing.assert_allclose(found, U[:3], atol=1e-9)
+
+
+Target = collections.namedtuple("Target", [*DICT])
+ROWS = {
+    "series": TARGETS.iloc[0],
+    "pandas' tuple": next(TARGETS.itertuples()),
+    "named tuple": Target(*TARGETS.iloc[0]),
+    "dict": TARGETS.iloc[0].to_dict(),
+    "record": TARGETS.to_records(index=False)[0],
+}
+
+
+@pytest.mark.parametrize("kind", ROWS)
+def test_a_row_is_read_by_name(calibration, kind):
+    np.testing.assert_allclose(calibration.command_for(ROWS[kind]), U[0], atol=1e-9)
+
+
+def test_a_row_of_xarray_is_read_by_name(calibration):
+    row = of_xarray(DICT).isel(row=0)
+    np.testing.assert_allclose(calibration.command_for(row), U[0], atol=1e-9)
+
+
+def test_what_has_no_names_is_read_by_its_place(calibration):
+    for given in (Y[0], Y[0].tolist(), tuple(Y[0]), pandas.Series(Y[0])):
+        np.testing.assert_allclose(calibration.command_for(given), U[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("maker", ["pandas", "dict", "polars", "pyarrow", "records"])
+def test_select_leaves_out_what_the_shell_does(maker):
+    mask = np.array([0, 1] * 6)
+    expected = jaxcal.select(U, 4, available=mask).indices
+    with pytest.warns(UserWarning, match="'index', 'time' are not read"):
+        found = jaxcal.select(MAKERS[maker](ALL.to_dict("list")), 4)
+    np.testing.assert_array_equal(found.indices, expected)
+
+
+def test_a_table_of_both_is_identified():
+    both = pandas.concat([COMMANDS.add_prefix("u_"), READINGS], axis=1)
+    for given in (both, both.to_dict("list"), jaxcal.read_table(both)):
+        found = jaxcal.identify(given)
+        assert found.input_names == tuple(f"u_{axis}" for axis in AXES)
+        np.testing.assert_allclose(found.matrix, np.diag([0.43, 0.71, 0.87]), atol=1e-9)
+
+
+def test_three_axes_of_a_frame_are_three():
+    frame = pandas.DataFrame(U, columns=["x_mm", "y_mm", "z_mm"])
+    with pytest.warns(UserWarning, match="'y_mm': an axis"):
+        assert jaxcal.identify(frame, READINGS).input_names == ("x_mm", "y_mm", "z_mm")
+    with pytest.warns(UserWarning, match="'y_mm': an axis"):
+        found = jaxcal.identify(frame, frame.copy())
+    assert found.output_names == ("x_mm", "y_mm", "z_mm")
+
+
+def test_readings_leave_out_the_time():
+    with pytest.warns(UserWarning, match="not read: time"):
+        found = jaxcal.identify(COMMANDS, READINGS.assign(time=np.arange(12.0)))
+    assert found.output_names == tuple(READINGS)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"yaw": ["fast", "slow"] * 6}, None),  # a label, said
+        ({"u_yaw": ["fast", "slow"] * 6}, "row 0, column 'u_yaw' must .* got 'fast'"),
+        ({"yaw": [np.nan, *U[1:, 1]]}, "row 0, column 'yaw' must be finite, got nan"),
+        ({"yaw": [*map(str, U[:-1, 1]), "x"]}, "row 11, column 'yaw' must .* got 'x'"),
+        ({"available": [1] * 11 + [2]}, "row 11, available must be 0 or 1, got 2"),
+    ],
+)
+def test_a_fault_names_row_and_column(changes, message):
+    frame = COMMANDS.assign(**changes)
+    if message is None:
+        with pytest.warns(UserWarning, match="label 'yaw'"):
+            jaxcal.select(frame, 3)
+        return
+    with pytest.raises(ValueError, match=message):
+        jaxcal.select(frame, 4)
+    if "available" in changes:
+        return
+    with pytest.raises(ValueError, match=message.replace("yaw'", "yaw'")):
+        jaxcal.identify(frame, READINGS)
+
+
+def test_words_among_readings_are_refused():
+    with pytest.raises(ValueError, match=r"row 0, column 'y_two' must .* got 'ok'"):
+        jaxcal.identify(COMMANDS, READINGS.assign(y_two=["ok", "bad"] * 6))
+
+
+def test_names_that_are_none_are_refused():
+    for frame, message in (
+        (COMMANDS.rename(columns={"yaw": 3}), "every column must have a name"),
+        (pandas.concat({"a": COMMANDS}, axis=1), "every column must have a name"),
+        (COMMANDS[["pitch", "pitch"]], "column 'pitch' comes twice"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            jaxcal.select(frame, 3)
+    with pytest.raises(ValueError, match="table must be a path or have names"):
+        jaxcal.read_table(U)
+
+
+def test_available_is_given_once():
+    frame = COMMANDS.assign(Available=[0, 1] * 6)
+    mask = np.array([False, True] * 6)
+    found = jaxcal.select(frame, 4, available=mask)
+    np.testing.assert_array_equal(found.indices, jaxcal.select(frame, 4).indices)
+    with pytest.raises(ValueError, match="they differ"):
+        jaxcal.select(frame, 4, available=~mask)
+
+
+def test_an_import_loads_no_frames():
+    import subprocess
+    import sys
+
+    code = (
+        "import sys, jaxcal; jaxcal.read_table\n"
+        "assert not {'pandas', 'polars', 'pyarrow', 'narwhals'} & {*sys.modules}"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
