@@ -17,14 +17,17 @@ from jaxcal.arms.sensors import Board, Landmarks, Pose, Position, Sensor, Socket
 from jaxcal.arms.sensors.sensor import hats
 from jaxcal.information.singular import depends, significant
 from jaxcal.models import verdict as models
-from jaxcal.models.verdict import (
+from jaxcal.models.reasons import (
     Reason,
     in_rows,
-    left_out,
     never_measured,
     outlying,
     wrong_noise,
 )
+from jaxcal.models.sensors import Board, Landmarks, Pose, Position, Sensor, Socket
+from jaxcal.models.sensors.sensor import hats
+from jaxcal.models.serial.mistaken import mistaken_columns
+from jaxcal.models.verdict import left_out
 
 __all__ = ["CLEAR_UP", "ArmVerdict", "Part", "other_distances", "verdict"]
 

@@ -361,6 +361,26 @@ def test_views_in_another_convention_are_told_by_name(moves):
     assert "Rows 0, 1, 2, 3 are outliers" in str(fit.verdict)
 
 
+@pytest.mark.parametrize("moves", ["camera", "board"])
+def test_a_camera_that_is_found_is_good_however_accurate_the_arm(moves):
+    noise = [1.0] * 3 + [0.1] * 3
+    model = SerialChain.from_dh(UR5_TABLE, sensor=Board(moves))
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        joints, seen = _views(moves)  # of an arm without errors
+        read = _as_columns(seen) + noise * rng.normal(size=(len(seen), 6))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", jaxcal.CalibrationWarning)
+            found, wrong = (
+                jaxcal.identify(np.hstack([joints, views]), 0.0 * read, model=model)
+                for views in (read, np.roll(read, 1, axis=0))
+            )
+        off = np.linalg.norm(found.arm.tool[:3, 3] - MOUNT[:3, 3])
+        assert found.verdict.good and off < 3.0 * found.verdict.place[0] < 36.0
+        assert "Place of the camera or board" in str(found.verdict)
+        assert not wrong.verdict.good
+
+
 def test_sockets_planes_and_anchors_are_found_from_nominal_postures():
     commands = np.hstack([JOINTS, WHICH])
     points = ur5().predict(JOINTS)
@@ -552,7 +572,7 @@ def test_a_load_is_weighed_as_by_linear_least_squares():
 
 
 def test_how_a_wrench_is_mounted_is_found_and_its_mistakes_are_named():
-    joints, read, *_ = _weighed()
+    joints, read, forces, _ = _weighed()
     arm = SerialChain.from_dh(UR5_TABLE, sensor=Wrench())
     found = jaxcal.identify(joints, read, model=arm)
     own = dict(zip(found.names, found.parameters, strict=True))
@@ -561,8 +581,22 @@ def test_how_a_wrench_is_mounted_is_found_and_its_mistakes_are_named():
     assert f"a change by {said.tolerance:.3g} N is seen" in str(said)
     turn = found.arm.tool[:3, :3].T @ MOUNT[:3, :3]
     assert np.degrees(Rotation.from_matrix(turn).magnitude()) < 2.0
-    with pytest.raises(ValueError, match="negate forces and torques"):
+    with pytest.raises(ValueError, match="negate forces and torques") as told:
         arm.located(joints, -read)
+    for cause in (
+        "hangs from the ceiling",
+        "Wrench(up=(0, 0, -1))",
+        "a payload heavier",
+    ):
+        assert cause in str(told.value)
+    hanging = SerialChain.from_dh(UR5_TABLE, sensor=Wrench(up=(0.0, 0.0, -1.0)))
+    assert hanging.located(joints, -read) is not hanging  # as it was said to be
+    with pytest.raises(
+        ValueError, match=r"up = \(0, 0, 1\), or with up = \(0, 0, -1\)"
+    ):
+        SerialChain.from_dh(UR5_TABLE, sensor=Wrench(up=(1.0, 0.0, 0.0))).located(
+            joints, 1.6 * np.hstack([forces, forces]) * [1, 1, 1, 10, 10, 10]
+        )
     with pytest.raises(ValueError, match="unit of the arm's lengths"):
         arm.located(joints, read * [1, 1, 1, 1e3, 1e3, 1e3])
     assert arm.located(joints[:3], read[:3]) is arm  # too few to tell

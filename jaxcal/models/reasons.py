@@ -1,0 +1,309 @@
+"""Rules that speak against a calibration: each returns a ``Reason`` or None."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "RULES",
+    "Reason",
+    "computed",
+    "in_rows",
+    "never_measured",
+    "not_invertible",
+    "outlying",
+    "wrong_noise",
+]
+
+Array = NDArray[np.float64]
+Fit = Any  # a jaxcal.Calibration, whose package imports this one
+
+UNLIKELY = 1e-4  # p-value of residuals under the noise that was given
+_CHANCE = 0.01  # that readings of nothing pass for a fit
+_TOO_LARGE = 3.0  # times: no caution makes a stated noise that much larger
+_SIZES = 10.0  # of a parameter: known no better, it is not known
+_STEP = 0.1  # standard errors, by which another step would move the parameters
+_EXACT = 1e-12  # of the largest reading: rounding, and no noise of a sensor
+_UNITS = np.outer([1.0, -1.0], [1.0, np.pi / 180.0, 180.0 / np.pi, 1e3, 1e-3]).ravel()
+_NAMED, _DIGITS = 6, 7  # rows in one sentence; decimals of a table
+
+
+class Reason(NamedTuple):
+    """What speaks against a calibration, and what to do about it."""
+
+    fact: str
+    remedy: str
+
+
+# -- readings that nobody measured -----------------------------------------------------
+
+
+def never_measured(fit: Fit) -> Reason | None:
+    """Commands pasted as readings, or readings that never change."""
+    return _equals_command(fit) or _stands_still(fit)
+
+
+def _equals_command(fit: Fit) -> Reason | None:
+    commands, readings = fit.commands, fit.measured
+    if len(commands) < 3 or not (varies := np.ptp(commands, axis=0) > 0.0).any():
+        return None
+    few = commands[:_NAMED, None, :, None] * _UNITS  # (K, 1, n, units), then all
+    size = 0.1 * np.abs(few).max(axis=0)
+    near = np.abs(readings[:_NAMED, :, None, None] - few).max(axis=0) <= size
+    for output, command, unit in np.argwhere(near & varies[:, None]):
+        times, reading = _UNITS[unit], readings[:, output]
+        image = times * commands[:, command]
+        same = 1e-9 * np.abs(image).max()
+        images = (image, *(image.round(digits) for digits in range(_DIGITS)))
+        if any(np.abs(reading - image).max() <= same for image in images):
+            how = "" if times == 1.0 else f" times {_short(times)}"
+            return Reason(
+                f"{fit.output_names[output]} equals the command "
+                f"{fit.input_names[command]}{how} in every row: it was not measured.",
+                "put what the sensor read into that column",
+            )
+    return None
+
+
+def _stands_still(fit: Fit) -> Reason | None:
+    readings = fit.measured
+    size = np.abs(readings).max(axis=0)
+    still = (np.abs(readings - readings[0]) <= 1e-14 * size).all(axis=0)
+    if len(readings) < 3 or not still.any():
+        return None
+    slopes = fit.model.jacobian(fit.commands, fit.parameters)[:, still]
+    moves = np.ptp(slopes, axis=0).any(axis=-1)  # not by a constant alone
+    if not moves.any():
+        return None
+    return Reason(
+        f"{', '.join(np.array(fit.output_names)[still][moves])}: the reading stands "
+        f"still, {_each(readings[0, still][moves])} in all {len(readings)} rows.",
+        "check that the sensor is connected, recorded and on the part that moves",
+    )
+
+
+def computed(fit: Fit) -> Reason | None:
+    """Readings that a formula made: their residuals are rounding."""
+    size = np.abs(fit.measured).max(axis=0)
+    exact = np.abs(fit.residuals).max(axis=0) <= _EXACT * size
+    if fit.dof < 0.5 or not exact.all() or not size.any():
+        return None
+    return Reason(
+        "The readings fit to the last digit, which no sensor's do.",
+        "give readings of the machine, not computed ones",
+    )
+
+
+# -- what the fit says -----------------------------------------------------------------
+
+
+def _no_noise(fit: Fit) -> Reason | None:
+    if fit.noise_std is not None:
+        return None
+    return Reason(
+        fit.no_noise("intervals"), "measure more rows, or state noise_std, --noise"
+    )
+
+
+def _undetermined(fit: Fit) -> Reason | None:
+    if not fit.undetermined.any():
+        return None
+    names = ", ".join(fit.names[i] for i in np.flatnonzero(fit.undetermined))
+    return Reason(
+        f"Not determined, held near the prior's mean: {names}; see identifiability().",
+        "measure rows that determine them: "
+        "select(candidates, model=..., measured=commands)",
+    )
+
+
+def _explains_nothing(fit: Fit) -> Reason | None:
+    """F test of the fit against constant outputs.
+
+    Of each output where it has parameters of its own and enough residuals, else of all.
+    """
+    from scipy import special
+
+    m, dof = fit.num_outputs, float(fit.dof)
+    varies = (fit.commands != fit.commands[0]).any()
+    if dof < 1.0 or fit.free.sum() <= m or not varies:
+        return None
+    weight = fit.loss_weights
+    off = fit.measured - weight @ fit.measured / weight.sum()
+    total, left = weight @ off**2, weight @ fit.residuals**2
+    moved = total > 0.0
+    share, names = left[moved] / total[moved], np.array(fit.output_names)[moved]
+    more = max(m * fit.num_measurements - dof - m, 1.0)  # parameters but the constants
+    if dof >= 2.0 * m and _apart(fit):
+        dof, more = dof / m, more / m
+    elif moved.any():
+        share, names = share.mean(keepdims=True), np.array([", ".join(names)])
+    ratio = np.maximum(1.0 - share, 0.0) / more / np.maximum(share / dof, 1e-300)
+    nothing = special.fdtrc(more, dof, ratio) > _CHANCE
+    if not nothing.any():
+        return None
+    return Reason(
+        f"The fit explains nothing of {', '.join(names[nothing])}: a constant does as "
+        f"well (R2 = {_each(np.maximum(1.0 - share[nothing], 0.0))} of "
+        f"{fit.num_measurements} rows).",
+        "check that readings and commands belong together (rows, columns, sensor), or "
+        "measure over a wider range",
+    )
+
+
+def _apart(fit: Fit) -> bool:
+    """Whether every output of a linear model has parameters of its own."""
+    if fit.affine is not None or fit.num_outputs == 1:
+        return True
+    if not fit.model.linear:
+        return False
+    seen = np.asarray(fit.model.jacobian(fit.commands, fit.parameters)).any(axis=0)
+    return bool((seen.sum(axis=0) <= 1).all())
+
+
+def _unknown(fit: Fit) -> Reason | None:
+    """Parameters that are known no better than before, or than many of their sizes."""
+    of_prior = fit.prior_precision.any()
+    if fit.noise_std is None or (fit.model.linear and not of_prior):
+        return None
+    errors = fit.standard_errors
+    free = fit.free[: len(errors)] > 0.0
+    sizes = np.fmax(np.abs(fit.parameters), fit.model.parameter_sizes())
+    bad = np.isnan(errors)
+    if not fit.model.linear:
+        bad |= np.isfinite(errors) & (errors > _SIZES * sizes)
+    prior = fit.prior_precision[: len(errors)] > 0.0
+    if free.any() and prior[free].all() and (fit.from_data[free] < 0.1).all():
+        bad |= free
+    if not (bad & free).any():
+        return None
+    names = np.array(fit.names)[bad & free]
+    return Reason(
+        f"{', '.join(names)}: known only to +-{_each(errors[bad & free])} (1 sigma).",
+        "measure where they matter: select(candidates, model=..., measured=commands); "
+        "or begin nearer, Prior(mean=...)",
+    )
+
+
+def _on_its_way(fit: Fit) -> Reason | None:
+    """A fit whose next step would move the parameters: it has not converged."""
+    if fit.model.linear or fit.noise_std is None or fit.estimated_commands is not None:
+        return None
+    white = fit.residuals / fit.noise_std
+    if not _in_noise(fit, white):
+        return None
+    slopes, covariance = fit.linear(fit.commands, misfit=False)
+    rows = slopes / fit.noise_std[:, None]
+    pull = np.einsum("nqp,nq->p", rows, fit.loss_weights[:, None] * white)
+    pull += fit.prior_precision * (fit.prior_mean - fit.estimate)
+    step = float(np.sqrt(max(pull @ covariance @ pull, 0.0)))
+    if step < _STEP:
+        return None
+    return Reason(
+        f"The fit has not converged: another step is {step:.2g} standard errors long.",
+        "begin nearer: Prior(mean=...)",
+    )
+
+
+def wrong_noise(fit: Fit) -> Reason | None:
+    """A noise that was given and that the residuals contradict, by which factor.
+
+    Too small where residuals are too large for it (``UNLIKELY``) and no few outliers
+    make them so; too large where it is over three times theirs.
+    """
+    from scipy import special
+
+    if not fit.noise_known or fit.dof < 0.5:
+        return None
+    white, names = fit.residuals / fit.noise_std, np.array(fit.output_names)
+    squares = (white**2).sum(axis=0)
+    if fit.model.error_groups() is not None or not _in_noise(fit, white):
+        squares, names = np.array([fit.square]), np.array([""])
+    dof, chance = fit.dof / len(squares), UNLIKELY / len(squares)
+    times = np.sqrt(np.maximum(squares, 1e-300) / dof)
+    small = special.chdtrc(dof, squares) < chance
+    if small.any() and 0 < 4 * len(rows := [*fit.outliers]) <= fit.num_measurements:
+        # Without an outlier the sum of squares is less by its distance.
+        rest = max(fit.square - fit.distance[rows].sum(), 0.0)
+        less = max(fit.dof - fit.num_readings * len(rows), 1.0)
+        small &= special.chdtrc(less, rest) < UNLIKELY
+    large = (special.chdtr(dof, squares) < chance) & (times < 1.0 / _TOO_LARGE)
+    if not (small | large).any():
+        return None
+    worst = int(np.where(small | large, np.abs(np.log(times)), -1.0).argmax())
+    noise, where, factor = fit.noise_std, "", times[worst]
+    if times.max() > _TOO_LARGE * times.min():
+        noise, where = noise[[worst]], f" for {names[worst]}"
+    word, ratio = ("small", factor) if small[worst] else ("large", 1.0 / factor)
+    unit = f" {fit.measured_unit}" if fit.measured_unit else ""
+    pattern = "; where residuals have a pattern (--report), the model lacks terms"
+    return Reason(
+        f"The noise you gave{where} ({_each(noise)}{unit}) is about {_short(ratio)} "
+        f"times too {word}: residuals are {_each(factor * noise)}{unit}.",
+        "correct noise_std, --noise, or leave it out" + pattern * bool(small[worst]),
+    )
+
+
+def outlying(fit: Fit, rows: Sequence[int]) -> Reason | None:
+    """Rows that are far from the fit of the others."""
+    if not rows:
+        return None
+    sigma = np.sqrt(fit.distance[list(rows)])
+    size = " to ".join(dict.fromkeys(f"{end:.2g}" for end in (min(sigma), max(sigma))))
+    verb = "are outliers" if len(rows) > 1 else "is an outlier"
+    named = in_rows(rows)
+    return Reason(
+        f"{named.capitalize()} {verb} ({size} sigma).",
+        f"measure {named} (counted from 0) again, or leave out",
+    )
+
+
+def in_rows(rows: Sequence[int]) -> str:
+    """Rows by number, the first few of many: ``rows 3, 14``."""
+    named = ", ".join(map(str, rows[:_NAMED]))
+    more = f" and {len(rows) - _NAMED} more" if len(rows) > _NAMED else ""
+    return f"row{'s' * (len(rows) > 1)} {named}{more}"
+
+
+def _outliers(fit: Fit) -> Reason | None:
+    return None if wrong_noise(fit) else outlying(fit, [*fit.outliers])
+
+
+def not_invertible(fit: Fit) -> Reason | None:
+    """A fit whose inverse ``command_for`` refuses, whatever is desired."""
+    why = fit.no_inverse()
+    if not why:
+        return None
+    return Reason(
+        f"command_for refuses: {why}.", "measure over a wider range, or with less noise"
+    )
+
+
+def _in_noise(fit: Fit, white: Array) -> bool:
+    """Whether the fit took residuals in noise as these (N, m), no row unlike others."""
+    return bool(np.isclose((white**2).sum(), fit.square, rtol=1e-6))
+
+
+def _each(values: Array) -> str:
+    """Numbers with a comma between, those that are alike once."""
+    return ", ".join(dict.fromkeys(_short(value) for value in values))
+
+
+def _short(value: float) -> str:
+    """A number of two digits, without an exponent below a million."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
+Rule = Callable[[Fit], Reason | None]
+RULES: tuple[Rule, ...] = (
+    _no_noise,
+    _undetermined,
+    _explains_nothing,
+    _unknown,
+    _on_its_way,
+    wrong_noise,
+    _outliers,
+)
