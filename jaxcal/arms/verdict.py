@@ -24,9 +24,6 @@ from jaxcal.models.reasons import (
     outlying,
     wrong_noise,
 )
-from jaxcal.models.sensors import Board, Landmarks, Pose, Position, Sensor, Socket
-from jaxcal.models.sensors.sensor import hats
-from jaxcal.models.serial.mistaken import mistaken_columns
 from jaxcal.models.verdict import left_out
 
 __all__ = ["CLEAR_UP", "ArmVerdict", "Part", "other_distances", "verdict"]
