@@ -135,14 +135,18 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
         results: list[UnitStop] = []
         faults: list[Exception] = []
         with ThreadPoolExecutor(len(targets)) as pool:
-            jobs = [pool.submit(_stop_units, target, True) for target in targets]
+            jobs = {
+                pool.submit(_stop_units, target, True): target for target in targets
+            }
+            reached: list[pathlib.Path] = []
             for job in as_completed(jobs):
                 try:
                     results += job.result()
+                    reached.append(jobs[job].lock.armed_path)
                     _say("\n".join(map(str, job.result())))
                 except Exception as error:  # of one bus: another is stopped
                     faults.append(error)
-        _tell_others([target.lock.armed_path for target in targets])
+        _tell_others(reached)
         if len(faults) == len(jobs):
             raise faults[0]
         for fault in faults:

@@ -77,6 +77,7 @@ class Bus(Line):
         self._owed: dict[int, list[tuple[int, float]]] = {}
         self._readable: dict[int, int] = {}
         self._client: Wire | None = None
+        self._spare: Wire | None = None  # a second connection, of a stop
         self._doubted: set[int] = set()  # whose acknowledgement may be an echo
 
     def connect(self) -> None:
@@ -93,9 +94,10 @@ class Bus(Line):
 
     def close(self) -> None:
         with self._lock:
-            if self._client is not None:
-                self._client.close()
-                self._client = None
+            for wire in (self._client, self._spare):
+                if wire is not None:
+                    wire.close()
+            self._client = self._spare = None
 
     @property
     def echoes(self) -> bool:
@@ -272,11 +274,25 @@ class Bus(Line):
             time.sleep(silent_s)  # sleep(0) takes .1 ms as well
         self.open()  # connecting, where it is lost, may take as long as configured
         assert self._client is not None
+        if self._urgent and self._spare is None and self._client.owes:
+            self._add_connection()
         pdu = bytes([function]) + data
         try:
             return self._client.exchange(unit, pdu, self._timeout_s, answered)
+        except BusError:
+            if self._spare is not None:  # by turns, so that each unit has both
+                self._client, self._spare = self._spare, self._client
+            raise
         finally:
             self._quiet_until = time.monotonic() + self.silence_s
+
+    def _add_connection(self) -> None:
+        """A second one for a stop, where a gateway is busy with what came before over
+        the first, and gives one; the first is kept."""
+        self._spare = Wire(self.settings)
+        with contextlib.suppress(Exception):  # it gives none
+            self._spare.open()
+            self._client, self._spare = self._spare, self._client
 
     def _resynchronise(self, unit: int, owed: int) -> None:
         """Empty an RTU line; a reply of ``owed`` registers may still come."""

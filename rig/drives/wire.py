@@ -3,8 +3,10 @@ through a socket.
 
 A reply over TCP bears the number of its request, so the connection is kept when one is
 late, and a late one is dropped: a gateway that gives one connection would give no other
-for seconds. A reply of RTU is looked for in all that came: what an adapter sends back
-of a request, and bytes before a reply, are passed over.
+for seconds. Gateways serve one request after the other, so the same is asked but a few
+times before it is answered: little stands in the way of a stop. A reply of RTU is
+looked for in all that came: what an adapter sends back of a request, and bytes before a
+reply, are passed over.
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 HEX_BYTES = 32  # shown of what came
 SIZES = {6: 8, 16: 8, 0x83: 5, 0x86: 5, 0x90: 5}  # of RTU replies; of 3 it says its own
 FILLERS = (0x00, 0xFF)  # bytes that a converter puts before a reply
+MOST_UNANSWERED = 3  # of one request, which is then waited for and not sent again
+OWED_S = 10.0  # no gateway keeps a reply for so long
 OLDEST = 4096  # requests since that of a late reply; other numbers are none
 UNACKNOWLEDGED_MS = 5000  # until a connection whose peer is gone is given up
 
@@ -60,6 +64,9 @@ class Wire:
         self._numbered = settings.transport == "tcp"
         self._is_socket = settings.transport != "rtu"
         self._number = time.time_ns() & 0xFFFF
+        self._asked = b""  # the last request, without a number,
+        self._unanswered: dict[int, float] = {}  # numbers, and when they were sent
+        self._accepted: set[int] = set()  # those of the last request
         self._came = b""  # over TCP, and not looked at yet
         self.noise = ""  # what came last that was no reply, in hex
 
@@ -68,7 +75,8 @@ class Wire:
         s = self.settings
         if self.socket is not None:
             return
-        self._came = b""
+        self._came, self._asked = b"", b""
+        self._unanswered.clear()
         if self._is_socket:
             made = socket.create_connection((s.host, s.port), s.timeout_s)
             made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -114,13 +122,13 @@ class Wire:
         came = self.pending()
         self.open()  # the peer may have closed it meanwhile
         if self._numbered:
-            self._number = self._number + 1 & 0xFFFF
-            frame = struct.pack(">HHHB", self._number, 0, len(pdu) + 1, unit) + pdu
             self._came += came
+            frame = self._numbered_request(bytes([unit]) + pdu)
         else:
             frame = bytes([unit]) + pdu
             frame += crc16(frame)
-        (self.socket.sendall if self._is_socket else self.socket.write)(frame)
+        if frame:
+            (self.socket.sendall if self._is_socket else self.socket.write)(frame)
         end, came, late = time.monotonic() + timeout_s, b"", 0
         while answered:
             left = end - time.monotonic()
@@ -152,6 +160,26 @@ class Wire:
         self.noise = came[:HEX_BYTES].hex(" ") + more
         return f"what came is no reply: {self.noise}"
 
+    @property
+    def owes(self) -> bool:
+        """Whether a gateway may be busy with requests of before."""
+        recent = time.monotonic() - OWED_S
+        return any(sent > recent for sent in self._unanswered.values())
+
+    def _numbered_request(self, request: bytes) -> bytes:
+        """A frame to send; empty where the same was sent often enough.
+
+        Whichever of several numbers of one request is answered answers it.
+        """
+        if request != self._asked:
+            self._asked, self._accepted = request, set()
+        elif len(self._accepted) >= MOST_UNANSWERED and self.owes:
+            return b""
+        self._number = self._number + 1 & 0xFFFF
+        self._accepted.add(self._number)
+        self._unanswered[self._number] = time.monotonic()
+        return struct.pack(">HHH", self._number, 0, len(request)) + request
+
     def _numbered_reply(self, unit: int) -> tuple[bytes | None, int]:
         """The reply to the last request, and how many replies to others it passed."""
         late = 0
@@ -168,11 +196,14 @@ class Wire:
             if len(self._came) < 6 + size:
                 break
             reply, self._came = self._came[7 : 6 + size], self._came[6 + size :]
-            if not age and sender != unit:
+            self._unanswered.pop(number, None)
+            if number not in self._accepted:
+                late += 1
+                continue
+            self._asked = b""
+            if sender != unit:
                 raise BusError(f"unit {unit}: another unit replied, {sender}")
-            if not age:
-                return reply, late
-            late += 1
+            return reply, late
         return None, late
 
     def _reply_beside_echo(self, came: bytes, request: bytes) -> bytes | None:
