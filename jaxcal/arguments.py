@@ -6,7 +6,8 @@ fields. ``Annotated[T, ...]`` says more of one: its help and, where the type doe
 tell, what stands for its value; two numbers are its range, a list its choices, a
 function makes the value of a text. An underscore at the end is no part of a name. A
 ``bool | None`` has a flag for yes and one for no. Options of a dataclass with a
-``TITLE`` stand under it in the help, and under its ``ABOUT``, if any.
+``TITLE`` stand under it in the help, and under its ``ABOUT``, if any; those of one that
+is ``RARE`` only in that of ``--help all``, which the docstring then names.
 """
 
 from __future__ import annotations
@@ -50,6 +51,7 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **fields: Any) -> None:
         fields.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         super().__init__(allow_abbrev=False, **fields)
+        self.rare: dict[argparse.Action, str | None] = {}  # with its help
 
     def of(self, function: Callable[..., Any]) -> Parser:
         """Itself, for the arguments of a function, or a dataclass called ``options``:
@@ -63,8 +65,17 @@ class Parser(argparse.ArgumentParser):
                 title = getattr(kind, "TITLE", None)
                 about = getattr(kind, "ABOUT", None)
                 groups[kind] = self.add_argument_group(title, about) if title else self
-            _add(groups[kind], *option)
+            action = _add(groups[kind], *option)
+            if getattr(kind, "RARE", False):
+                self.rare[action], action.help = action.help, argparse.SUPPRESS
         return self
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        words = sys.argv[1:] if args is None else [*args]
+        if words[-1:] == ["all"] and words[-2:-1] in (["-h"], ["--help"]):
+            for action, text in self.rare.items():
+                action.help = text
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         if found := re.match(r"argument (?:.*/)?(--[\w-]+): expected one", message):
@@ -105,7 +116,9 @@ def _options(parameter: str, kind: Any) -> Iterator[tuple[Any, ...]]:
         yield (parameter, kind), each.name, hints[each.name], each.default, True
 
 
-def _add(parser: Any, name: str, hint: Any, default: Any, option: bool) -> None:
+def _add(
+    parser: Any, name: str, hint: Any, default: Any, option: bool
+) -> argparse.Action:
     kind: Any = hint
     said: tuple[Any, ...] = ()
     may_be_none = False
@@ -151,7 +164,8 @@ def _add(parser: Any, name: str, hint: Any, default: Any, option: bool) -> None:
     long = f"--{name.rstrip('_').replace('_', '-')}"
     names = [f"-{name}", long] if len(name) == 1 else [long]
     more |= {"dest": name, "help": text.replace("%", "%%")}
-    parser.add_argument(*names if option else (), **more)
+    action: argparse.Action = parser.add_argument(*names if option else (), **more)
+    return action
 
 
 @contextlib.contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,6 +122,14 @@ class MethodOptions:
     least_efficiency: Annotated[
         float | None, "auto stops once this efficiency is proven; default 0.999"
     ] = None
+
+
+@dataclasses.dataclass
+class PolicyOptions:
+    """With method policy: which, and how it is decoded."""
+
+    RARE: ClassVar[bool] = True
+
     checkpoint: Annotated[str | None, "a trained policy", "DIR"] = None
     decoding: Annotated[
         str | None, "with method policy: greedy, first, samples, exchange"
@@ -151,15 +159,18 @@ def select(
     ] = False,
     of_criterion: CriterionOptions,
     of_method: MethodOptions,
+    of_policy: PolicyOptions,
     output: Output,
 ) -> None:
     """Choose the few rows of a table worth measuring.
 
     A column named available (0 or 1) says which rows may be chosen. Columns of text are
     kept as labels. Without --k the fewest rows that identify the model are chosen.
+    --help all has the options of --method policy too.
     """
     table = read_table(file)
-    options = {name: x for name, x in vars(of_method).items() if x is not None}
+    given = vars(of_method) | vars(of_policy)
+    options = {name: x for name, x in given.items() if x is not None}
     design, criterion = (
         of_design.design(table, of_arm),
         of_criterion.by(of_design.scenarios),

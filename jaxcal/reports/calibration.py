@@ -1,25 +1,25 @@
 """The report of a calibration: one page, the files it is of, and ``verdict.json``.
 
-The page is HTML that needs no other file and no network; its pictures are SVG drawn
-here, so no drawing library is loaded. ``verdict.json`` is what a pipeline reads.
+The page is HTML that needs no other file and no network; ``verdict.json`` is what a
+pipeline reads.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-import html
 import json
 import os
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.check import Check
 from jaxcal.calibration.fit import Fit
+from jaxcal.extras import needs
 from jaxcal.files import atomic_write
 from jaxcal.models.verdict import left_out
 from jaxcal.reports import page as pages
@@ -31,6 +31,7 @@ __all__ = ["SCHEMA", "moved", "report"]
 Array = NDArray[np.float64]
 Calibration = Any  # a jaxcal.Calibration, whose module imports this one
 
+_NAMED = 8  # columns beyond which no name is written
 _IN_UNIT = ("residual_rms", "held_out_mean", "nominal_mean", "check_tolerance")
 
 SCHEMA: dict[str, Any] = {
@@ -407,17 +408,14 @@ def _residual_sections(calibration: Fit) -> list[pages.Section]:
     names, residuals = calibration.output_names, calibration.residuals
     unit = f" ({calibration.measured_unit})" if calibration.measured_unit else ""
     rows = np.arange(len(residuals), dtype=float)
-    by_row = _scatter(rows, residuals, names, "row", f"residual{unit}")
-    by_input = [
-        pages.Figure(
-            _scatter(u, residuals, names, name, f"residual{unit}"),
-            f"residuals against {name}",
-        )
-        for name, u in zip(calibration.input_names, calibration.commands.T, strict=True)
-    ]
-    figures = [pages.Figure(by_row, "residuals by row"), *by_input]
+    across = {"row": rows} | dict(
+        zip(calibration.input_names, calibration.commands.T, strict=True)
+    )
+    picture = _scatter(across, residuals, names, f"residual{unit}")
+    words = ", ".join(across)
     table = _residual_table(calibration)
-    sections = [pages.Section("Residuals", [*figures, table], "residuals")]
+    figure = pages.Figure(picture, f"residuals against {words}")
+    sections = [pages.Section("Residuals", [figure, table], "residuals")]
     nominal = _nominal_errors(calibration)
     if nominal is not None:
         sections.append(_before_and_after(calibration, nominal, unit))
@@ -448,7 +446,7 @@ def _before_and_after(calibration: Fit, nominal: Array, unit: str) -> pages.Sect
     )
     labels = ("before", "after, held out" if noise_known else "after")
     rows = np.arange(len(lengths), dtype=float)
-    picture = _scatter(rows, lengths, labels, "row", f"error{unit}", zero=True)
+    picture = _scatter({"row": rows}, lengths, labels, f"error{unit}")
     means = lengths.mean(axis=0)
     text = f"Mean error {means[0]:.3g} before, {means[1]:.3g} {labels[1]}."
     figure = pages.Figure(picture, "errors before and after")
@@ -474,104 +472,23 @@ def _files_section(calibration: Fit, files: Mapping[str, str]) -> pages.Section:
     )
 
 
-# -- pictures --------------------------------------------------------------------------
-
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-_WIDTH, _HEIGHT = 480.0, 230.0  # readable on a phone, which shows 330 pixels
-_LEFT, _RIGHT, _TOP, _BOTTOM = 64.0, 12.0, 46.0, 42.0
-_NAMED = 8  # columns beyond which no name is written
-
-
-def _ticks(low: float, high: float) -> list[float]:
-    """Round numbers from low to high, four to ten of them."""
-    power = 10.0 ** np.floor(np.log10((high - low) / 4.0))
-    step = power * max(f for f in (1.0, 2.0, 5.0) if f * power <= (high - low) / 4.0)
-    first, last = np.ceil(low / step), np.floor(high / step)
-    return [float(step * i) + 0.0 for i in np.arange(first, last + 1.0)]  # no -0
-
-
-class _Axes(NamedTuple):
-    """The ranges of a picture, and where on it a value lies."""
-
-    low: float  # upward
-    high: float
-    first: float  # across
-    last: float
-
-    @classmethod
-    def around(cls, x: Array, columns: Array, from_zero: bool) -> _Axes:
-        """Around dots (N, s) above x (N,), and zero; ``from_zero``: nothing below."""
-        low, high = min(float(np.min(columns)), 0.0), max(float(np.max(columns)), 0.0)
-        if from_zero:
-            low = 0.0
-        room = 0.06 * ((high - low) or 1.0)
-        first, last = float(np.min(x)), float(np.max(x))
-        pad = 0.03 * ((last - first) or 1.0)
-        below = 0.0 if from_zero else room
-        return cls(low - below, high + room, first - pad, last + pad)
-
-    def x(self, value: float) -> float:
-        share = (value - self.first) / (self.last - self.first)
-        return _LEFT + share * (_WIDTH - _LEFT - _RIGHT)
-
-    def y(self, value: float) -> float:
-        share = (value - self.low) / (self.high - self.low)
-        return _HEIGHT - _BOTTOM - share * (_HEIGHT - _TOP - _BOTTOM)
-
-    def drawn(self, across: str, up: str) -> list[str]:
-        """Numbers along both, the line of zero, and what they are called."""
-        parts = []
-        for value in _ticks(self.low, self.high):
-            y = self.y(value)
-            parts.append(f'<text x="{_LEFT - 6:g}" y="{y + 4:.1f}" text-anchor="end">'
-                         f"{value:.3g}</text>")  # fmt: skip
-        below = _HEIGHT - _BOTTOM + 16
-        for value in _ticks(self.first, self.last):
-            parts.append(f'<text x="{self.x(value):.1f}" y="{below:g}" '
-                         f'text-anchor="middle">{value:.3g}</text>')  # fmt: skip
-        middle, end = self.y(0.0), _WIDTH - _RIGHT
-        return [
-            *parts,
-            f'<path d="M{_LEFT:g} {middle:.1f}H{end:g}" stroke="#888" '
-            'stroke-width="1"/>',
-            f'<text x="{_WIDTH / 2:g}" y="{_HEIGHT - 6:g}" text-anchor="middle">'
-            f"{html.escape(across)}</text>",
-            f'<text x="6" y="14">{html.escape(up)}</text>',
-        ]
-
-
 def _scatter(
-    x: Array,
-    columns: Array,
-    names: Sequence[str],
-    across: str,
-    up: str,
-    *,
-    zero: bool = False,
-) -> str:
-    """An SVG file: the columns (N, s) as dots above x (N,), each with its colour."""
-    axes = _Axes.around(x, columns, zero)
-    parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" '
-        f'width="{1.5 * _WIDTH:g}" height="{1.5 * _HEIGHT:g}" '
-        'font-family="sans-serif" font-size="13" fill="#666">',
-        *axes.drawn(across, up),
-    ]
-    for i, name in enumerate(names):
-        colour = _COLOURS[i % len(_COLOURS)]
-        if len(names) <= _NAMED:
-            start = 10.0 + i * (_WIDTH - _RIGHT - 10.0) / max(len(names), 3)
-            parts.append(_named_dot(start, colour, name))
-        dots = zip(x, columns[:, i], strict=True)
-        parts += [
-            f'<circle cx="{axes.x(u):.1f}" cy="{axes.y(v):.1f}" r="3" fill="{colour}" '
-            'fill-opacity="0.8"/>'
-            for u, v in dots
-        ]
-    return "\n".join([*parts, "</svg>\n"])
-
-
-def _named_dot(start: float, colour: str, name: str) -> str:
-    """An entry of the key above a picture."""
-    label = f'<text x="{start + 8:g}" y="34">{html.escape(name)}</text>'
-    return f'<circle cx="{start:g}" cy="30" r="4" fill="{colour}"/>{label}'
+    across: dict[str, Array], columns: Array, names: Sequence[str], up: str
+) -> bytes:
+    """An SVG file: the columns (N, s) as dots, a panel for each of ``across`` (N,)."""
+    with needs("plots", "a report"):
+        from jaxcal.reports.plots.style import BLACK, as_bytes, panels, points
+    shape = (-(-len(across) // 2), min(len(across), 2))
+    figure, axes = panels((8.0, 2.6 * shape[0]), "", shape, sharey=True, squeeze=False)
+    for panel, (name, x) in zip(axes.flat, across.items(), strict=False):
+        panel.axhline(0.0, color=BLACK, linewidth=0.8)
+        for i, column in enumerate(columns.T):
+            panel.plot(x, column, label=names[i], **points(i))
+        panel.set_xlabel(name)
+    for panel in axes.flat[len(across) :]:
+        panel.set_visible(False)
+    figure.supylabel(up)
+    if len(names) <= _NAMED:
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper left", ncols=4, frameon=False)
+    return as_bytes(figure, "svg")

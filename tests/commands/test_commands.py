@@ -256,3 +256,13 @@ def test_an_arm_is_read_from_urdf(tmp_path):
     )
     read = ArmOptions().machine(str(path), None)
     assert read.to_dict() == SerialChain.from_urdf(path).to_dict()
+
+
+def test_rare_options_are_in_the_help_that_asks_for_all(capsys):
+    words = ("--decoding", "--num", "--checkpoint")
+    for asked, shown in ((["--help"], False), (["--help", "all"], True)):
+        with pytest.raises(SystemExit) as ended:
+            main(["select", *asked])
+        text = capsys.readouterr().out
+        assert ended.value.code == 0 and "--help all has the options" in text
+        assert all((f"  {word} " in text) == shown for word in words)
