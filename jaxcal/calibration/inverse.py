@@ -164,45 +164,41 @@ class _Responses:
     def say_clipped(self, free: Array, commands: Array) -> None:
         """Warn of the targets (P, n) that the limits keep from being reached."""
         rows = np.arange(len(commands))
-        lines = []
-        for i in np.flatnonzero(~self._arrived(self.gap(commands, rows))):
-            j = int((np.abs(commands[i] - free[i]) / self.spread).argmax())
-            lines.append(
-                f"target {i + 1}, {self.fit.input_names[j]} = {free[i, j]:.6g} to "
-                f"{commands[i, j]:.6g}"
-            )
-        if lines:
-            more = f"; and {len(lines) - _NAMED} more" if len(lines) > _NAMED else ""
-            listed = "; ".join(lines[:_NAMED]) + more
-            warnings.warn(
-                f"{len(lines)} of {len(commands)} targets are clipped: {listed}",
-                stacklevel=3,
-            )
+        arrived = self._arrived(self.gap(commands, rows))
+        moved = np.abs(commands - free) / self.spread
+        clipped = [
+            f"target {i + 1}, {self.fit.input_names[j]} = {free[i, j]:.6g} to "
+            f"{commands[i, j]:.6g}"
+            for i, j in zip(rows, moved.argmax(axis=1), strict=True)
+            if not arrived[i]
+        ]
+        if clipped:
+            some = "; ".join(clipped[:_NAMED]) + "; ..." * (len(clipped) > _NAMED)
+            count = f"{len(clipped)} of {len(commands)} targets are clipped"
+            warnings.warn(f"{count}: {some}", stacklevel=3)
 
     def say_far(self, commands: Array) -> None:
         """Warn of targets that are reached (P, n) far from what was measured."""
-        fit, used = self.fit, self.fit.loss_weights > 0.0
-        sides = [(fit.input_names, commands, fit.commands[used])]
+        fit, used, far, worst = self.fit, self.fit.loss_weights > 0.0, set(), ""
+        sides = [(fit.input_names, commands, fit.commands)]
         if not fit.model.relative:
             readings = predict(self.model, fit.commands, fit.estimate) + fit.residuals
-            sides.insert(0, (fit.output_names, self.wanted, readings[used]))
-        far = np.zeros(len(commands), dtype=np.bool_)
-        worst = ""
+            sides.insert(0, (fit.output_names, self.wanted, readings))
         for names, values, measured in sides:
-            low, high = measured.min(axis=0), measured.max(axis=0)
+            low, high = measured[used].min(axis=0), measured[used].max(axis=0)
             width = np.where(high > low, high - low, np.inf)
             beyond = np.maximum(low - values, values - high) / width
-            far |= (beyond > _FAR).any(axis=1)
-            if not worst and beyond.max(initial=0.0) > _FAR:
+            far |= {*np.flatnonzero((beyond > _FAR).any(axis=1))}
+            if far and not worst:
                 i, j = np.unravel_index(beyond.argmax(), beyond.shape)
                 worst = (
-                    f"target {i + 1} has {names[j]} = {values[i, j]:.6g}, measured "
-                    f"was {low[j]:.6g} to {high[j]:.6g}"
+                    f"target {i + 1} has {names[j]} = {values[i, j]:.6g}, measured was "
+                    f"{low[j]:.6g} to {high[j]:.6g}"
                 )
-        if worst:
+        if far:
             warnings.warn(
-                f"{far.sum()} of {len(far)} targets are far outside the measurements: "
-                f"{worst}; nothing shows that the calibration holds there",
+                f"{len(far)} of {len(commands)} targets are far outside the "
+                f"measurements: {worst}; the calibration was never tried there",
                 stacklevel=3,
             )
 

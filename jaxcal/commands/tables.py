@@ -24,6 +24,8 @@ __all__ = [
     "write_rows",
 ]
 
+_WRITTEN = {"out", "servos_out", "picture", "json"}  # arguments that are files
+
 TablePath = Annotated[str, "CSV, or - (standard input)"]
 
 
@@ -63,22 +65,22 @@ class Output:
 
 
 def require_kept(given: Mapping[str, Any]) -> None:
-    """Refuse to write over what is read: an input of these arguments, by any path.
+    """Refuse arguments that would write over a file they read, by any path to it.
 
     Raises:
         ValueError: naming the option and the file.
     """
-    options = ("out", "servos_out", "picture", "json")
-    written: dict[str, Any] = {name: given.get(name) for name in options}
+    written = {name: given.get(name) for name in _WRITTEN}
     if folder := given.get("report"):
-        for name in ("index.html", "verdict.json", "calibration.json"):
-            written[f"report {name}"] = os.path.join(folder, name)
+        pages = ("index.html", "verdict.json", "calibration.json")
+        written |= {f"report {page}": os.path.join(folder, page) for page in pages}
     for option, path in written.items():
         if not isinstance(path, str | pathlib.Path) or given.get("overwrite"):
             continue
-        for name, value in given.items():
-            values = value if isinstance(value, list | tuple) else [value]
-            if name not in written and any(_same_file(path, x) for x in values):
+        for name in given.keys() - _WRITTEN:
+            values = given[name]
+            values = values if isinstance(values, list | tuple) else [values]
+            if any(_same_file(path, value) for value in values):
                 raise ValueError(
                     f"--{option.replace('_', '-')}: {path} is what is read "
                     f"({name.replace('_', '-')}); write to another file"

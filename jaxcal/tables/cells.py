@@ -36,12 +36,7 @@ class Ambiguity(ValueError):
 
 
 def truths_of(cells: Iterable[str], words: Sequence[str] = ()) -> list[float] | None:
-    """1 and 0 for TRUE and FALSE, yes and no; NaN where empty; else None.
-
-    Args:
-        cells: of a column, in any case.
-        words: those that count, all of them when not given.
-    """
+    """1 and 0 for these words, TRUE and yes for two; NaN where empty; else None."""
     known = {word: _TRUTHS[word] for word in words or _TRUTHS} | {"": math.nan}
     numbers = [known.get(cell.casefold()) for cell in cells]
     return None if None in numbers else numbers  # type: ignore[return-value]  # as said
@@ -54,11 +49,10 @@ def is_number(cell: str) -> bool:
 
 
 def decimal_mark(cells: Sequence[str], semicolons: bool) -> tuple[str, bool]:
-    """The decimal mark of a table, and whether a cell decides it.
+    """The decimal mark of a table's cells, and whether a cell decides it.
 
-    Args:
-        cells: all of the table's.
-        semicolons: cells are not separated by commas, so 1,234 has decimals.
+    With ``semicolons``, or other marks than commas between the cells, 1,234 has
+    decimals.
     """
     if not any("," in cell or cell.count(".") > 1 for cell in cells):
         return ".", True
@@ -85,11 +79,6 @@ def numbers_of(
     cells: Sequence[str], mark: str = ".", decided: bool = True
 ) -> list[float | None]:
     """Each cell as a number, NaN where it is empty, None where it holds none.
-
-    Args:
-        cells: of a column.
-        mark: the decimal one.
-        decided: as ``decimal_mark`` says.
 
     Raises:
         Ambiguity: a cell could be two numbers.

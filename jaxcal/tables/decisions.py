@@ -6,7 +6,7 @@ Names decide first: u_, y_, available, id and the like; values where names do no
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jaxcal.tables.cells import truths_of
 from jaxcal.tables.names import COMMANDS, MEASURED
 
-__all__ = ["AVAILABLE", "COUNTED", "Decision", "decide", "sentence", "spelt"]
+__all__ = ["AVAILABLE", "COUNTED", "Decision", "decide", "sentence"]
 
 Array = NDArray[np.float64]
 
@@ -192,41 +192,26 @@ def _count(column: Array) -> str | None:
 
 def sentence(decisions: dict[str, Decision]) -> str:
     """What was read as what, in one line; "" where names alone say it."""
-    if not any(decision.reason for decision in decisions.values()):
+    groups: dict[tuple[str, str], list[str]] = {}
+    for name, (role, reason, _) in decisions.items():
+        if reason:
+            verb = f"read as {role}" if role in ("input", "output", "label") else ""
+            groups.setdefault((verb or "not read", reason), []).append(name)
+    if not groups:
         return ""
-    parts = []
-    for role in ("input", "output"):
-        if names := [name for name, d in decisions.items() if d.role == role]:
-            reasons = {decisions[n].reason: n for n in names if decisions[n].reason}
-            more = "".join(f" ({name!r}: {why})" for why, name in reasons.items())
-            plural = "s" if len(names) > 1 else ""
-            parts.append(f"{role}{plural} {', '.join(names)}{more}")
+    parts = [f"inputs {', '.join(of_role('input', decisions))}"]
     parts += [
-        f"label {name!r}: {decision.reason}"
-        for name, decision in decisions.items()
-        if decision.role == "label"
-    ]
-    apart: dict[str, list[str]] = {}
-    for name, decision in decisions.items():
-        if decision.role in ("time", "left out") and decision.reason:
-            apart.setdefault(decision.reason, []).append(name)
-    parts += [
-        f"column{'s' if len(names) > 1 else ''} {', '.join(map(repr, names))} "
-        f"{'are' if len(names) > 1 else 'is'} not read: {reason}"
-        for reason, names in apart.items()
+        listed(names, f"{verb}: {reason}") for (verb, reason), names in groups.items()
     ]
     return "; ".join(parts)
 
 
-def spelt(names: Sequence[str], name: str) -> str | None:
-    """The one of the names that is ``name`` but for case and blanks; None: none is.
+def of_role(role: str, decisions: Mapping[str, Decision]) -> tuple[str, ...]:
+    """The columns of a role."""
+    return tuple(name for name, decision in decisions.items() if decision.role == role)
 
-    Raises:
-        ValueError: two are.
-    """
-    like = [column for column in names if column.strip().casefold() == name]
-    if len(like) > 1:
-        raise ValueError(
-            f"columns {' and '.join(map(repr, like))} could both be {name}"
-        )
-    return like[0] if like else None
+
+def listed(names: Sequence[str], what: str) -> str:
+    """Columns and what they are, as part of a sentence."""
+    quoted = ", ".join(map(repr, names))
+    return f"columns {quoted} are {what}" if names[1:] else f"column {quoted} is {what}"

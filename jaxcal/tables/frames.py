@@ -156,12 +156,7 @@ def names_in(
 ) -> Any:
     """The columns of a frame that ``of_frame`` takes; None: it has no names.
 
-    Args:
-        argument: its name in errors.
-        frame: what ``header_of`` takes.
-        wanted: names.
-        prefix: that they, or the columns, may lack.
-        beside: columns that are read too; where it is given, others are said.
+    With ``beside``, columns that are read too, all others are said.
     """
     header = header_of(argument, frame)
     if not header:
@@ -214,10 +209,7 @@ def table_of_frame(argument: str, frame: Any) -> Table:
 def inputs_of(argument: str, frame: Any, outputs: Sequence[str] = ()) -> Any:
     """Names of the commands in a frame, by the rules of files; None: it has no names.
 
-    Args:
-        argument: its name in errors.
-        frame: what ``header_of`` takes.
-        outputs: columns of it that are readings.
+    ``outputs`` are those of its columns that are known to be readings.
     """
     if not header_of(argument, frame):
         return None
@@ -227,13 +219,8 @@ def inputs_of(argument: str, frame: Any, outputs: Sequence[str] = ()) -> Any:
 def outputs_of(argument: str, frame: Any, beside: bool) -> Any:
     """Names of the readings in a frame; None: it has no names.
 
-    All but commands, u_..., and what is no reading by its name: the time, a number of
-    the rows.
-
-    Args:
-        argument: its name in errors.
-        frame: what ``header_of`` takes.
-        beside: commands are in it too, so that readings are y_... alone.
+    All but u_..., the time and numbers of the rows; where commands are ``beside`` them,
+    y_... alone.
     """
     if not header_of(argument, frame):
         return None

@@ -15,8 +15,9 @@ from jaxcal.tables.decisions import (
     COUNTED,
     Decision,
     decide,
+    listed,
+    of_role,
     sentence,
-    spelt,
 )
 from jaxcal.tables.names import COMMANDS, MEASURED, bare, columns_by_name, say
 from jaxcal.tables.names import split_names as split
@@ -195,7 +196,7 @@ class Table:
             raise ValueError(
                 f"{self.source}: {what} {decision.reason}; if it is a command, {advice}"
             )
-        names = _of_role("input", decisions)
+        names = of_role("input", decisions)
         if not names:
             raise ValueError(
                 f"{self.source}: no column holds commands "
@@ -215,7 +216,7 @@ class Table:
         if chosen is not None:
             return self._chosen(chosen, MEASURED)
         decisions = decide(self, fit=True)
-        names = _of_role("output", decisions)
+        names = of_role("output", decisions)
         axes = [name for name in names if decisions[name].asks]
         if names and not axes:
             return names
@@ -230,12 +231,13 @@ class Table:
 
     def available(self) -> Mask | None:
         """(N,) True where the column ``available`` is 1; None without that column."""
-        try:
-            name = spelt(self.header, AVAILABLE)
-        except ValueError as error:
-            raise ValueError(f"{self.source}: {error}") from None
-        if name is None or not self.headed:
+        names = [x for x in self.header if x.strip().casefold() == AVAILABLE]
+        if len(names) > 1:
+            both = " and ".join(map(repr, names))
+            raise ValueError(f"{self.source}: columns {both} could both be {AVAILABLE}")
+        if not names:
             return None
+        name = names[0]
         truths = truths_of(self.labels.get(name, ()))
         mask = np.array(truths or self.columns([name])[:, 0])
         for row in np.flatnonzero((mask != 0.0) & (mask != 1.0)):
@@ -290,21 +292,7 @@ class Table:
             and decisions[name].reason != COUNTED
             and decisions[name].role != AVAILABLE
         ]
-        if not spare:
-            return ""
-        listed = ", ".join(map(repr, spare))
-        plural = len(spare) > 1
-        return (
-            f"column{'s' if plural else ''} {listed} {'are' if plural else 'is'} not "
-            "read: nothing asks for it"
-        )
-
-
-def _of_role(role: str, decisions: Mapping[str, Decision]) -> tuple[str, ...]:
-    return tuple(name for name, decision in decisions.items() if decision.role == role)
-
-
-# -- making one ------------------------------------------------------------------------
+        return listed(spare, "not read: nothing asks for it") if spare else ""
 
 
 def table_of(
@@ -318,13 +306,7 @@ def table_of(
 ) -> Table:
     """The table of columns of cells, or of numbers (N,).
 
-    Args:
-        source: name of the table, for errors.
-        columns: by name.
-        lines: what each row is called in errors.
-        mark: as ``decimal_mark`` says of all cells; None: of each column by itself.
-        headed: the names are the table's own.
-        row: what ``lines`` counts.
+    ``mark`` is what ``decimal_mark`` says of all cells; None: of each column by itself.
 
     Raises:
         ValueError: a column mixes numbers and words, or holds words under a name that

@@ -48,7 +48,7 @@ def test_readings_are_named_where_y_is_an_axis():
     table = roles("x_mm,y_mm,z_mm,r")[0]
     with pytest.raises(ValueError, match=r"'y_mm' may be an axis.* --outputs"):
         table.outputs(None)
-    with pytest.warns(UserWarning, match="'y_mm': an axis"):
+    with pytest.warns(UserWarning, match="'y_mm' is read as input: an axis"):
         assert table.commands(None, but=["r"]) == ("x_mm", "y_mm", "z_mm")
     beside = roles("u_a,u_b,x_mm,y_mm,z_mm")[0]
     with pytest.raises(ValueError, match="'y_mm' may be an axis"):
@@ -107,7 +107,9 @@ def test_what_is_not_read_is_said_with_its_reason():
     with pytest.warns(UserWarning, match="inputs a, b; column 'time' is not read: it"):
         table.commands(None)
     words = parse("t.csv", b"mode,a,b\nfast,1,2\nslow,2,5\n")
-    with pytest.warns(UserWarning, match="label 'mode': it holds words"):
+    with pytest.warns(
+        UserWarning, match="column 'mode' is read as label: it holds words"
+    ):
         words.commands(None)
 
 

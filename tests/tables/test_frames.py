@@ -108,9 +108,9 @@ def test_a_table_of_both_is_identified():
 
 def test_three_axes_of_a_frame_are_three():
     frame = pandas.DataFrame(U, columns=["x_mm", "y_mm", "z_mm"])
-    with pytest.warns(UserWarning, match="'y_mm': an axis"):
+    with pytest.warns(UserWarning, match="'y_mm' is read as input: an axis"):
         assert jaxcal.identify(frame, READINGS).input_names == ("x_mm", "y_mm", "z_mm")
-    with pytest.warns(UserWarning, match="'y_mm': an axis"):
+    with pytest.warns(UserWarning, match="'y_mm' is read as input: an axis"):
         found = jaxcal.identify(frame, frame.copy())
     assert found.output_names == ("x_mm", "y_mm", "z_mm")
 
@@ -134,7 +134,7 @@ def test_readings_leave_out_the_time():
 def test_a_fault_names_row_and_column(changes, message):
     frame = COMMANDS.assign(**changes)
     if message is None:
-        with pytest.warns(UserWarning, match="label 'yaw'"):
+        with pytest.warns(UserWarning, match="'yaw' is read as label"):
             jaxcal.select(frame, 3)
         return
     with pytest.raises(ValueError, match=message):
