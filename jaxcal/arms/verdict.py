@@ -36,6 +36,7 @@ _LOOK = (
     "look at the residuals (report, --report); keep the nominal machine until they are "
     "explained"
 )
+_MORE = "measure more postures: jaxcal postures --measured chooses them"
 CLEAR_UP = "fix the problems listed above, then run identify again"
 
 _SCATTER = 3.0  # times the sensor's usual noise: the model does not explain that
@@ -260,6 +261,7 @@ class _Findings(NamedTuple):
     moved: str  # kind of what seems to have moved: socket, plane
     contradicting: tuple[int, ...]  # measurements that contradict the others
     doubtful: bool  # the readings or the description of the arm may be wrong
+    remedy: str = CLEAR_UP  # of the doubt
 
 
 def _findings(
@@ -344,17 +346,21 @@ def _left_open(
     if findings.mistaken or sized or not anywhere > _VAGUE * nominal:
         return findings
     if not sockets:
-        reason = "Too few readings:"
+        reason, remedy = "Too few readings:", _MORE
     else:
+        remedy = "give the distance between two sockets (distances=, --distance)"
         reason = (
-            "The distance between two sockets is missing (distances=, --distance), so "
-            "the arm's size is open:"
+            "The distance between two sockets is missing, so the arm's size is open:"
         )
     reason += (
         f" away from the measured poses the tip is uncertain by {anywhere:.2g}{unit}; "
         f"uncalibrated it is off by {nominal:.2g}{unit}."
     )
-    return findings._replace(reasons=(*findings.reasons, reason), doubtful=True)
+    return findings._replace(
+        reasons=(*findings.reasons, reason),
+        doubtful=True,
+        remedy=findings.remedy if findings.doubtful else remedy,
+    )
 
 
 def _wrong_rows(
@@ -404,8 +410,8 @@ def _next_step(
             f"measure again with the {kind} fixed, or number it as two: one {kind} "
             "before it moved and another after",
         ),
-        (findings.doubtful, CLEAR_UP),
-        (more, "measure more postures: jaxcal postures --measured chooses them"),
+        (findings.doubtful, findings.remedy),
+        (more, _MORE),
         (True, residuals),
     )
     return next(step for holds, step in steps if holds)

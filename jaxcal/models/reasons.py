@@ -133,9 +133,9 @@ def _explains_nothing(fit: Fit) -> Reason | None:
         return None
     weight = fit.loss_weights
     off = fit.measured - weight @ fit.measured / weight.sum()
-    total, left = weight @ off**2, weight @ fit.residuals**2
+    total, unexplained = weight @ off**2, weight @ fit.residuals**2
     moved = total > 0.0
-    share, names = left[moved] / total[moved], np.array(fit.output_names)[moved]
+    share, names = unexplained[moved] / total[moved], np.array(fit.output_names)[moved]
     more = max(m * fit.num_measurements - dof - m, 1.0)  # parameters but the constants
     if dof >= 2.0 * m and _apart(fit):
         dof, more = dof / m, more / m
