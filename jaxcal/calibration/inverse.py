@@ -161,47 +161,6 @@ class _Responses:
             np.ptp(fit.commands, axis=0) > 0.0, fit.commands.std(axis=0), 1.0
         )
 
-    def say_clipped(self, free: Array, commands: Array) -> None:
-        """Warn of the targets (P, n) that the limits keep from being reached."""
-        rows = np.arange(len(commands))
-        arrived = self._arrived(self.gap(commands, rows))
-        moved = np.abs(commands - free) / self.spread
-        clipped = [
-            f"target {i + 1}, {self.fit.input_names[j]} = {free[i, j]:.6g} to "
-            f"{commands[i, j]:.6g}"
-            for i, j in zip(rows, moved.argmax(axis=1), strict=True)
-            if not arrived[i]
-        ]
-        if clipped:
-            some = "; ".join(clipped[:_NAMED]) + "; ..." * (len(clipped) > _NAMED)
-            count = f"{len(clipped)} of {len(commands)} targets are clipped"
-            warnings.warn(f"{count}: {some}", stacklevel=3)
-
-    def say_far(self, commands: Array) -> None:
-        """Warn of targets that are reached (P, n) far from what was measured."""
-        fit, used, far, worst = self.fit, self.fit.loss_weights > 0.0, set(), ""
-        sides = [(fit.input_names, commands, fit.commands)]
-        if not fit.model.relative:
-            readings = predict(self.model, fit.commands, fit.estimate) + fit.residuals
-            sides.insert(0, (fit.output_names, self.wanted, readings))
-        for names, values, measured in sides:
-            low, high = measured[used].min(axis=0), measured[used].max(axis=0)
-            width = np.where(high > low, high - low, np.inf)
-            beyond = np.maximum(low - values, values - high) / width
-            far |= {*np.flatnonzero((beyond > _FAR).any(axis=1))}
-            if far and not worst:
-                i, j = np.unravel_index(beyond.argmax(), beyond.shape)
-                worst = (
-                    f"target {i + 1} has {names[j]} = {values[i, j]:.6g}, measured was "
-                    f"{low[j]:.6g} to {high[j]:.6g}"
-                )
-        if far:
-            warnings.warn(
-                f"{len(far)} of {len(commands)} targets are far outside the "
-                f"measurements: {worst}; the calibration was never tried there",
-                stacklevel=3,
-            )
-
     def outputs(self, commands: Array) -> Array:
         return predict(self.model, commands, self.fit.estimate, finite=False)
 
@@ -295,6 +254,47 @@ class _Search(_Responses):
         with np.errstate(over="ignore"):
             order = np.argsort(((there / self.size) ** 2).sum(axis=-1), axis=1)
         self.nearest = measured_at[order[:, :_STARTS]]  # (P, starts, n)
+
+    def say_clipped(self, free: Array, commands: Array) -> None:
+        """Warn of the targets (P, n) that the limits keep from being reached."""
+        rows = np.arange(len(commands))
+        arrived = self._arrived(self.gap(commands, rows))
+        moved = np.abs(commands - free) / self.spread
+        clipped = [
+            f"target {i + 1}, {self.fit.input_names[j]} = {free[i, j]:.6g} to "
+            f"{commands[i, j]:.6g}"
+            for i, j in zip(rows, moved.argmax(axis=1), strict=True)
+            if not arrived[i]
+        ]
+        if clipped:
+            some = "; ".join(clipped[:_NAMED]) + "; ..." * (len(clipped) > _NAMED)
+            count = f"{len(clipped)} of {len(commands)} targets are clipped"
+            warnings.warn(f"{count}: {some}", stacklevel=3)
+
+    def say_far(self, commands: Array) -> None:
+        """Warn of targets that are reached (P, n) far from what was measured."""
+        fit, used, far, worst = self.fit, self.fit.loss_weights > 0.0, set(), ""
+        sides = [(fit.input_names, commands, fit.commands)]
+        if not fit.model.relative:
+            readings = predict(self.model, fit.commands, fit.estimate) + fit.residuals
+            sides.insert(0, (fit.output_names, self.wanted, readings))
+        for names, values, measured in sides:
+            low, high = measured[used].min(axis=0), measured[used].max(axis=0)
+            width = np.where(high > low, high - low, np.inf)
+            beyond = np.maximum(low - values, values - high) / width
+            far |= {*np.flatnonzero((beyond > _FAR).any(axis=1))}
+            if far and not worst:
+                i, j = np.unravel_index(beyond.argmax(), beyond.shape)
+                worst = (
+                    f"target {i + 1} has {names[j]} = {values[i, j]:.6g}, measured was "
+                    f"{low[j]:.6g} to {high[j]:.6g}"
+                )
+        if far:
+            warnings.warn(
+                f"{len(far)} of {len(commands)} targets are far outside the "
+                f"measurements: {worst}; the calibration was never tried there",
+                stacklevel=3,
+            )
 
     def gap(self, commands: Array, rows: NDArray[np.intp]) -> Array:
         """(R, q) of points ``rows`` from the outputs at ``commands``, in sizes."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -459,7 +459,7 @@ def _in_degrees(calibration: Calibration, commands: Array) -> Array:
     """Commands (N, n) of an arm whose joint columns are in radians."""
     if not _is_arm(calibration.model):
         raise ValueError("--radians is of arms")
-    return in_degrees(calibration.model, commands)
+    return in_degrees(cast("Any", calibration.model), commands)
 
 
 def _readings_for(
