@@ -131,8 +131,8 @@ class Wire:
             (self.socket.sendall if self._is_socket else self.socket.write)(frame)
         end, came, late = time.monotonic() + timeout_s, b"", 0
         while answered:
-            left = end - time.monotonic()
-            data = self._read(max(0.0, left))
+            wait_s = end - time.monotonic()
+            data = self._read(max(0.0, wait_s))
             came += data
             if self._numbered:
                 self._came += data
@@ -142,7 +142,7 @@ class Wire:
                 reply = self._reply_beside_echo(came, frame)
             if reply is not None:
                 return reply
-            if left <= 0.0:
+            if wait_s <= 0.0:
                 if self.echo and came.startswith(frame):
                     came = came[len(frame) :]
                 raise BusError(
