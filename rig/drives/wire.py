@@ -242,3 +242,12 @@ class Wire:
         except OSError:
             self.close()
         return came
+
+    def discard(self) -> bool:
+        """Empty what came; whether there was anything."""
+        if self._is_socket:
+            return bool(self.pending())
+        waiting = bool(self.socket.in_waiting)
+        if waiting:
+            self.socket.reset_input_buffer()
+        return waiting
