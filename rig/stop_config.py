@@ -87,7 +87,7 @@ def read_file(path: pathlib.Path) -> StopConfig:
 
 
 def read_armed(armed: dict[str, Any]) -> StopConfig:
-    """The same of what a session left beside its lock."""
+    """All that is of use in what a session left beside its lock."""
     return _read(armed, _rows(armed.get("drives")), None, [])
 
 
@@ -102,18 +102,18 @@ def _read(
     axes: list[SimpleNamespace] = []
     lost: list[tuple[str, int]] = []
     for number, row in enumerate(rows, 1):
-        own: Faults = []
+        axis_faults: Faults = []
         name = _near(row, "name")
         if not isinstance(name, str):
-            own.append("it has no name")
+            axis_faults.append("it has no name")
             name = f"axis {number}"
-        unit = int(_number(_near(row, "unit"), 0, 1, 247, "unit", own))
+        unit = int(_number(_near(row, "unit"), 0, 1, 247, "unit", axis_faults))
         try:
-            drive_map = _map_of(row, folder, own)
+            drive_map = _map_of(row, folder, axis_faults)
         except Exception as error:  # of the system, or of a map that nobody foresaw
             drive_map = None
-            own.append(f"its map cannot be read: {error}")
-        faults += [f"{name}: {fault}" for fault in own]
+            axis_faults.append(f"its map cannot be read: {error}")
+        faults += [f"{name}: {fault}" for fault in axis_faults]
         if not unit or drive_map is None:
             lost.append((name, unit))
         elif unit not in [axis.unit for axis in axes]:  # two of one drive are one
@@ -174,7 +174,7 @@ def _map_of(
         return map_of(name, pathlib.Path(str(row.get("folder", ""))), faults)
     path = folder / name if name.endswith(".toml") else MAP_FOLDER / f"{name}.toml"
     if not path.is_file():
-        names = [each.stem for each in MAP_FOLDER.glob("*.toml")]
+        names = [path.stem for path in MAP_FOLDER.glob("*.toml")]
         near = difflib.get_close_matches(path.stem, names, 1, NEAR_NAME)
         tried = f"; {near[0]} is tried" if near else ""
         faults.append(f"there is no map {name}{tried}")
@@ -185,7 +185,7 @@ def _map_of(
 def map_of(text: str, folder: pathlib.Path, faults: Faults) -> SimpleNamespace | None:
     """What of a map stops its drives and sees them stand; None where it cannot."""
     data = tables_of(text, faults)
-    found = SimpleNamespace(
+    drive_map = SimpleNamespace(
         name=str(data.get("name", "map")), drive=str(data.get("drive", "modbus")),
         folder=folder, text=text, settings=data.get("settings", {}),
         restart_s=_number(data.get("restart_s", 2.0), 2.0, 2.0, 60, "restart_s", []),
@@ -197,20 +197,22 @@ def map_of(text: str, folder: pathlib.Path, faults: Faults) -> SimpleNamespace |
         move=None, home=None, set_zero=None,
     )  # fmt: skip
     set_zero = _frames(data.get("set_zero"))
-    found.home_place = set_zero.place_of("home") if set_zero else None
+    drive_map.home_place = set_zero.place_of("home") if set_zero else None
     status = _near(data, "status")
     if (value := _value(status, "u16")) and isinstance(status, dict):
         bits = {name: _bits(status.get(name)) for name in FLAGS}
         if bits["done"] and bits["moving"]:
             never = Bits(set=(0,), clear=(0,))
             bits["fault"] = bits["fault"] or never
-            found.status = Flags(**vars(value), **bits)
-    if found.drive == "modbus" and found.stop is None:
-        faults.append(f"the map {found.name} has no [stop] that can be read")
+            drive_map.status = Flags(**vars(value), **bits)
+    if drive_map.drive == "modbus" and drive_map.stop is None:
+        faults.append(f"the map {drive_map.name} has no [stop] that can be read")
         return None
-    if found.drive == "modbus" and not (found.status and found.position):
-        faults.append(f"of the map {found.name} [status] or [position] cannot be read")
-    return found
+    if drive_map.drive == "modbus" and not (drive_map.status and drive_map.position):
+        faults.append(
+            f"of the map {drive_map.name} [status] or [position] cannot be read"
+        )
+    return drive_map
 
 
 def _frames(table: Any) -> Frames | None:
@@ -242,8 +244,10 @@ def _bits(table: Any) -> Bits | None:
         else []
     )
     bits = [
-        tuple(bit for bit in each if type(bit) is int) if type(each) is list else ()
-        for each in lists
+        tuple(bit for bit in numbers if type(bit) is int)
+        if type(numbers) is list
+        else ()
+        for numbers in lists
     ]
     return Bits(set=bits[0], clear=bits[1]) if any(bits) else None
 

@@ -198,8 +198,8 @@ def _targets(path: pathlib.Path, given: bool) -> list[ArmedBus]:
     if not lack:
         return targets
     every = [bus for file in armed_files() if (bus := _armed_bus(read_armed(file)))]
-    known = [target.lock.path for target in targets]
-    more = [bus for bus in every if bus.moves and bus.lock.path not in known]
+    paths = [target.lock.path for target in targets]
+    more = [bus for bus in every if bus.moves and bus.lock.path not in paths]
     if not (targets or more or every):
         raise Fault(
             f"{NOTHING}: {lack}, and no session of this user has armed a device. "
@@ -267,7 +267,7 @@ def _stop_units(target: ArmedBus, stay: bool = False) -> list[UnitStop]:
             try:
                 line.open()
                 results = stop.stop_all(drives)
-                reached = any(each.acknowledged or each.standing for each in results)
+                reached = any(unit.acknowledged or unit.standing for unit in results)
                 if reached or time.monotonic() > end:
                     break
                 _say("\n".join(map(str, results)))

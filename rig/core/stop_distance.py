@@ -27,7 +27,7 @@ LEAST_ROOM_DEG = 0.1  # a target on the limit itself is gone to
 
 
 class StopDistance(NamedTuple):
-    """Of one axis; degrees, or millimetres."""
+    """The stopping distance of an axis, in degrees or millimetres."""
 
     delay_s: float
     per_square: float  # degrees for (deg/s)^2: 1 / (2 a)
@@ -73,12 +73,12 @@ def stop_distances(record: DeviceRecord, axes: tuple[Axis, ...]) -> dict[str, An
     evidence = record.state(STOP_PROVED) or {}
     measured = evidence.get("distances", {})
     once = evidence.get("ways", {}).get(BY_UNITS, {})
-    found = {}
+    distances = {}
     for axis in axes:
-        if known := measured.get(axis.name):
-            found[axis.name] = StopDistance.of(**known)
+        if fit := measured.get(axis.name):
+            distances[axis.name] = StopDistance.of(**fit)
         elif axis.name in once:
             speed, accel = axis.drive_motion
             way = [abs(once[axis.name])]
-            found[axis.name] = StopDistance.of([min(SLOW_DEG_S, speed)], way, accel)
-    return found
+            distances[axis.name] = StopDistance.of([min(SLOW_DEG_S, speed)], way, accel)
+    return distances

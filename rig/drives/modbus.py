@@ -302,10 +302,13 @@ class Bus(Line):
             self._owed.setdefault(unit, []).append((owed, time.monotonic()))
             gap = max(0.02, 20 * 11.0 / self.settings.baudrate, self.silence_s)
             end = time.monotonic() + 2 * self._timeout_s
-            while self._client.socket is not None and time.monotonic() < end:
-                time.sleep(gap)
-                if not self._client.pending():
-                    return
+            try:
+                while self._client.socket is not None and time.monotonic() < end:
+                    time.sleep(gap)
+                    if not self._client.discard():
+                        return
+            except OSError:
+                self._client.close()
 
 
 def _why_closed(settings: BusSettings, error: Exception) -> tuple[str, str]:

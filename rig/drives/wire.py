@@ -131,8 +131,8 @@ class Wire:
             (self.socket.sendall if self._is_socket else self.socket.write)(frame)
         end, came, late = time.monotonic() + timeout_s, b"", 0
         while answered:
-            left = end - time.monotonic()
-            data = self._read(max(0.0, left))
+            wait_s = end - time.monotonic()
+            data = self._read(max(0.0, wait_s))
             came += data
             if self._numbered:
                 self._came += data
@@ -142,7 +142,7 @@ class Wire:
                 reply = self._reply_beside_echo(came, frame)
             if reply is not None:
                 return reply
-            if left <= 0.0:
+            if wait_s <= 0.0:
                 if self.echo and came.startswith(frame):
                     came = came[len(frame) :]
                 raise BusError(
@@ -242,3 +242,12 @@ class Wire:
         except OSError:
             self.close()
         return came
+
+    def discard(self) -> bool:
+        """Empty what came; whether there was anything."""
+        if self._is_socket:
+            return bool(self.pending())
+        waiting = bool(self.socket.in_waiting)
+        if waiting:
+            self.socket.reset_input_buffer()
+        return waiting

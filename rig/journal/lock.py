@@ -265,8 +265,8 @@ def _opener(path: pathlib.Path) -> dict[str, Any] | None:
                     link = os.readlink(f"/proc/{pid}/fd/{fd}")
                     other = int(pid) != os.getpid()
                     if other and link.removesuffix(" (deleted)") in names:
-                        known = {"command": "a session", "since": "unknown"}
-                        return {"pid": int(pid), **known}
+                        words = {"command": "a session", "since": "unknown"}
+                        return {"pid": int(pid), **words}
     return None
 
 

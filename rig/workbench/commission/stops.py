@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -108,11 +109,11 @@ def _distances(
     of the speed that the first distance is to be blamed on.
     """
     tries, way = [first], 2 * REACH_DEG * min(1.0, ADD_UP / len(run.config.axes))
-    fast, left = FAST_DEG_S, (1.0 - LATE - SHORT) * way
+    fast, rest = FAST_DEG_S, (1.0 - LATE - SHORT) * way
     for axis in run.config.axes:
         if axis.name in first.speeds:
             speed, accel = axis.drive_motion
-            grown = (left / max(abs(first.after_deg[axis.name]), 1e-3)) ** 0.5
+            grown = (rest / max(abs(first.after_deg[axis.name]), 1e-3)) ** 0.5
             reached = (BEGIN * way * accel) ** 0.5  # within less than BEGIN of its way
             fast = min(fast, speed, reached, first.speeds[axis.name] * grown)
     if fast > FASTER * max(first.speeds.values()):
@@ -125,17 +126,17 @@ def _distances(
                 tries = [_timed(run, device, [first], slow, low, high, usual), *trials]
         finally:
             device.proof.stop_proved = False
-    found = {}
+    points = {}
     for axis in run.config.axes:
         if axis.name in first.speeds:
             speed, accel = axis.drive_motion
-            known: dict[str, Any] = {
-                "speeds": [round(each.speeds[axis.name], 4) for each in tries],
-                "distances": [round(each.distances[axis.name], 4) for each in tries],
+            point: dict[str, Any] = {
+                "speeds": [round(trial.speeds[axis.name], 4) for trial in tries],
+                "distances": [round(trial.distances[axis.name], 4) for trial in tries],
                 "accel": round(accel, 4),
             }
-            found[axis.name] = known
-            distance, unit = StopDistance.of(**known), axis.unit_name
+            points[axis.name] = point
+            distance, unit = StopDistance.of(**point), axis.unit_name
             slowest = distance.fastest(axis, 0.0)
             run.say(
                 f"  {axis.name}: its stop takes {distance.at(speed):.2g} {unit} at "
@@ -143,7 +144,7 @@ def _distances(
                 + f"; a move that ends at a limit goes at {slowest:.3g} {unit}/s, one "
                 "that ends further away goes faster" * (slowest < speed)
             )
-    return found
+    return points
 
 
 def _timed(
@@ -249,7 +250,7 @@ def _prove(
             speeds[axis.name], distances[axis.name] = speed, max(0.0, went_on)
             took_s = before.time - before.asked + heard_s - sent_s
             unsure_s = max(unsure_s, took_s)
-    return StopTrial(after_deg, speeds, distances, unsure_s)
+    return StopTrial(after_deg, speeds, distances, unsure_s if speeds else math.inf)
 
 
 def _require_stopped(
