@@ -44,6 +44,9 @@ def _names(values: Any) -> list[Any]:
     """Names as values hold them; [] where they have none."""
     if isinstance(values, np.ndarray | np.void):
         return [*(values.dtype.names or ())]
+    if isinstance(values, list | tuple) and not hasattr(values, "_fields"):  # rows
+        number = not values or isinstance(values[0], int | float)
+        return [] if number else _names(values[0])
     if isinstance(values, Table):
         return [*values.header]
     if _is_labelled(values):
@@ -52,8 +55,6 @@ def _names(values: Any) -> list[Any]:
     for kind in ("_fields", "data_vars", "column_names", "columns"):
         if hasattr(values, kind):
             return [*getattr(values, kind)]
-    if isinstance(values, list | tuple):  # rows
-        return _names(values[0]) if values else []
     if isinstance(values, Mapping):
         return [*values]
     index = getattr(values, "index", None)  # of a series, which may be a row

@@ -217,6 +217,7 @@ class Table:
             return self._chosen(chosen, MEASURED)
         decisions = decide(self, fit=True)
         names = of_role("output", decisions)
+        names += tuple(x for x in self.labels if x.startswith(MEASURED))  # refused
         axes = [name for name in names if decisions[name].asks]
         if names and not axes:
             return names

@@ -105,6 +105,20 @@ def test_a_flag_without_effect_is_refused(ask, typed, message):
     assert (code, out) == (2, "") and message in said
 
 
+@pytest.mark.parametrize("header", ["u_a,u_b,y_a,y_b", "a,b,y_a,y_b"])
+@pytest.mark.parametrize("column", [0, 3])
+def test_words_are_no_command_and_no_reading(ask, tmp_path, header, column):
+    rows = np.hstack([U, Y]).astype(object)
+    rows[:, column] = ["fast", "slow"] * 6
+    text = "\n".join([header, *(",".join(map(str, row)) for row in rows)])
+    (tmp_path / "pairs.csv").write_text(text)
+    flags = "" if header.startswith("u") else " --inputs a,b"
+    code, out, said = ask("identify pairs.csv" + flags)
+    name = header.split(",")[column]
+    assert (code, out) == (2, "")
+    assert f"line 2, column '{name}' must hold a number, got 'fast'" in said
+
+
 def test_two_noises_are_two(ask):
     assert ask("identify pairs.csv --noise 1.0,5.0")[0] == 0
     assert ask("identify pairs.csv --noise 0.1,0.2")[0] == 0

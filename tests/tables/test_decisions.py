@@ -108,7 +108,7 @@ def test_what_is_not_read_is_said_with_its_reason():
         table.commands(None)
     words = parse("t.csv", b"mode,a,b\nfast,1,2\nslow,2,5\n")
     with pytest.warns(
-        UserWarning, match="column 'mode' is read as label: it holds words"
+        UserWarning, match="'mode' is read as label: it holds words"
     ):
         words.commands(None)
 
