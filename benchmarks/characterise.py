@@ -27,10 +27,10 @@ import numpy as np
 
 from benchmarks.sequential.sequence import optimise
 from benchmarks.tasks.breakaway import Cautious, breakaway
+from examples.tasks.backlash import backlash, dead_zone
 from jaxcal.adaptive.estimates import estimates
 from jaxcal.adaptive.grid import GridBelief, GridTask
 from jaxcal.adaptive.rules import Gain, Random
-from jaxcal.adaptive.tasks.backlash import backlash, dead_zone
 
 ENOUGH_DEG = 0.02
 Chooser = Callable[[int, Any, Any, Any], Any]  # number, weights, gains, keys: designs

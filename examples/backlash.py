@@ -10,9 +10,9 @@ import sys
 
 import common
 import numpy as np
+from tasks.backlash import backlash, backlash_bins, residual
 
 from jaxcal.adaptive import next_measurement
-from jaxcal.adaptive.tasks.backlash import backlash, backlash_bins, residual
 
 SIGMA, COUNT = 0.02, 6  # degrees; measurements
 BINS = backlash_bins(1.0, 0.1, 0.04)

@@ -34,12 +34,12 @@ __all__ = ["TASKS", "main"]
 
 TASKS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "backlash": (
-        "backlash",
+        "examples/tasks/backlash.py",
         {"cells": 24, "offset_cells": 5, "bin_width": 0.1, "sigma": 0.05,
          "seconds": (5.0, 20.0)},
     ),
     "transmission": (
-        "transmission",
+        "examples/tasks/transmission.py",
         {"cells": 24, "phases": 8, "num_postures": 25, "num_bins": 8,
          "seconds": (6.0, 24.0)},
     ),

@@ -1,23 +1,22 @@
 """Backlash, dead zone and transmission error, against the mechanism played."""
 
+import pathlib
+
 import jax
 import numpy as np
 import pytest
+from tasks.backlash import backlash, backlash_bins, dead_zone, dead_zone_bins
+from tasks.transmission import transmission_error
 
 from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.estimates import estimates
 from jaxcal.adaptive.grid import GridBelief
 from jaxcal.adaptive.loop import next_measurement, run
 from jaxcal.adaptive.rules import Gain, Random
-from jaxcal.adaptive.tasks.backlash import (
-    backlash,
-    backlash_bins,
-    dead_zone,
-    dead_zone_bins,
-)
+from jaxcal.adaptive.tasks import registry
 from jaxcal.adaptive.tasks.readings import Bins
-from jaxcal.adaptive.tasks.transmission import transmission_error
 
+TASKS = pathlib.Path(__file__).parents[2] / "examples" / "tasks"
 SMALL = {"cells": 10, "offset_cells": 4, "bin_width": 0.1, "outliers": 0.0}
 
 
@@ -157,3 +156,11 @@ def test_transmission_error_is_a_sine():
 
 
 pytestmark = pytest.mark.slow  # minutes together
+
+
+def test_each_is_a_file_that_commands_take():
+    for name in ("backlash", "dead_zone", "transmission"):
+        entry = registry.load(str(TASKS / f"{name}.py"))
+        assert entry.about and len(entry.make().designs)
+    with pytest.raises(ValueError, match=r"one of knee, or .* examples/tasks do, got"):
+        registry.load("backlash")

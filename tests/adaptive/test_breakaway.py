@@ -3,12 +3,12 @@
 import jax
 import numpy as np
 import pytest
+from tasks.backlash import dead_zone, dead_zone_bins
 
 from benchmarks.tasks.breakaway import Cautious, breakaway
 from jaxcal.adaptive.episodes import play
 from jaxcal.adaptive.grid import GridBelief
 from jaxcal.adaptive.rules import Gain
-from jaxcal.adaptive.tasks.backlash import dead_zone, dead_zone_bins
 
 
 def test_breakaway_is_a_joint_that_yields_late_and_a_noisy_reading():

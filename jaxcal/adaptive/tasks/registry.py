@@ -23,10 +23,7 @@ __all__ = ["FREE", "Entry", "load", "names", "options_from"]
 
 _GROUP = "jaxcal.tasks"  # entry points
 _OWN = {
-    "backlash": "jaxcal.adaptive.tasks.backlash:ENTRY",
-    "dead_zone": "jaxcal.adaptive.tasks.backlash:DEAD_ZONE",
     "knee": "jaxcal.adaptive.tasks.knee:ENTRY",
-    "transmission": "jaxcal.adaptive.tasks.transmission:ENTRY",
 }
 
 FREE = {"priced": Priced(1.0, 0.0, 0.0), "state": StateRule(1.0, 0.0, 0.0)}
@@ -72,7 +69,7 @@ def load(name: str) -> Entry:
     else:
         raise ValueError(
             f"task must be one of {', '.join(names())}, or a Python file that defines "
-            f"ENTRY, got {name!r}"
+            f"ENTRY, as those in examples/tasks do, got {name!r}"
         )
     if not isinstance(entry, Entry):
         raise ValueError(f"task {name} must be an Entry, got {type(entry).__name__}")
