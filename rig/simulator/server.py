@@ -1,6 +1,7 @@
 """A Modbus server for the simulated drives: TCP, RTU over TCP, RTU on a pty.
 
-Functions 3, 6 and 16, written from the protocol's text.
+Functions 3, 6 and 16, written from the protocol's text. The frames are pymodbus's: those
+of the rig, ``rig.drives.wire``, meet another hand's in every simulated session.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ import time
 import tty
 from collections.abc import Callable
 
-from rig.drives.wire import crc16
+from pymodbus.framer import FramerRTU, FramerSocket
+from pymodbus.pdu import DecodePDU
+
 from rig.simulator.drive import DriveException, SimDrive
 from rig.simulator.faults import FaultInjector
 
@@ -96,6 +99,7 @@ class ModbusServer:
 
     def _take(self, fd: int, buffer: bytes, rtu: bool) -> bytes:
         """Answer the requests in a buffer; what is left of it."""
+        framer = (FramerRTU if rtu else FramerSocket)(DecodePDU(True))
         while len(buffer) >= 8:
             size = 6 + int.from_bytes(buffer[4:6], "big")
             if rtu:
@@ -105,24 +109,22 @@ class ModbusServer:
             if len(buffer) < size:
                 break
             frame = buffer[:size]
-            if rtu and crc16(frame[:-2]) != frame[-2:]:
+            crc = int.from_bytes(frame[-2:], "big")
+            if rtu and not FramerRTU.check_CRC(frame[:-2], crc):
                 buffer = buffer[1:]
                 continue
             buffer = buffer[size:]
             body = frame[:-2] if rtu else frame[6:]
+            number = int.from_bytes(frame[:2], "big")  # over TCP
             if (answer := self._answer(body[0], body[1:])) is not None:
                 noise, reply, spoilt = answer
                 if spoilt and not rtu:  # what the drives mangle, the gateway refuses
                     reply = bytes([body[1] | 0x80, TARGET_SILENT])
-                sent = body[:1] + reply
-                if rtu:
-                    sent += crc16(sent)
-                    if spoilt:
-                        place = self._random.randrange(len(sent))
-                        wrong = sent[place] ^ self._random.randrange(1, 256)
-                        sent = sent[:place] + bytes([wrong]) + sent[place + 1 :]
-                else:
-                    sent = frame[:4] + struct.pack(">H", len(sent)) + sent
+                sent = framer.encode(reply, body[0], number)
+                if rtu and spoilt:
+                    place = self._random.randrange(len(sent))
+                    wrong = sent[place] ^ self._random.randrange(1, 256)
+                    sent = sent[:place] + bytes([wrong]) + sent[place + 1 :]
                 os.write(fd, noise + sent)
         return buffer
 
