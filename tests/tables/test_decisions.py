@@ -107,9 +107,7 @@ def test_what_is_not_read_is_said_with_its_reason():
     with pytest.warns(UserWarning, match="inputs a, b; column 'time' is not read: it"):
         table.commands(None)
     words = parse("t.csv", b"mode,a,b\nfast,1,2\nslow,2,5\n")
-    with pytest.warns(
-        UserWarning, match="'mode' is read as label: it holds words"
-    ):
+    with pytest.warns(UserWarning, match="'mode' is read as label: it holds words"):
         words.commands(None)
 
 
