@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import pathlib
+import sys
 from typing import TYPE_CHECKING, Any
 
 from jaxcal import compiled, moved
@@ -59,7 +60,7 @@ __all__ = [
 
 __version__ = "0.2.0"
 
-moved.install_finder()
+sys.meta_path.insert(0, moved.Finder)  # type: ignore[arg-type]  # its class serves
 _PACKAGE = pathlib.Path(__file__).parent
 if (_PACKAGE.parent / "pyproject.toml").exists():
     compiled.check(_PACKAGE)

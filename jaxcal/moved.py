@@ -1,15 +1,8 @@
 """Import paths of 0.2 whose modules have moved; they work, and warn, until 0.4."""
 
-from __future__ import annotations
-
 import importlib
-import importlib.abc
-import importlib.machinery
 import sys
-import warnings
-from typing import Any
-
-__all__ = ["MOVED", "install_finder"]
+from importlib.machinery import ModuleSpec
 
 MOVED = {  # longer names first
     "jaxcal.calibration.budget": "jaxcal.reports.budget",
@@ -30,36 +23,27 @@ MOVED = {  # longer names first
 }
 
 
-class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Finds a module that has moved, asked first: a folder that an older checkout left
-    would be an empty package."""
+class Finder:
+    """On ``sys.meta_path``, first: a folder that an older checkout left would be found
+    as an empty package."""
 
-    def find_spec(
-        self, fullname: str, path: Any = None, target: Any = None
-    ) -> importlib.machinery.ModuleSpec | None:
-        if _new_name(fullname) is None:
-            return None
-        return importlib.machinery.ModuleSpec(fullname, self)
+    @staticmethod
+    def find_spec(name: str, path: object = None, target: object = None) -> object:
+        for old in MOVED if name.startswith("jaxcal.") else ():
+            if name == old or name.startswith(f"{old}."):
+                new = MOVED[old] + name[len(old) :]
+                return ModuleSpec(name, Finder, origin=new)  # type: ignore[arg-type]
+        return None
 
-    def exec_module(self, module: Any) -> None:
-        old = module.__name__
-        new = _new_name(old)
-        assert new is not None  # find_spec has asked
-        warnings.warn(
-            f"{old} is {new} since jaxcal 0.3; the old name goes with 0.4",
-            DeprecationWarning,
-            stacklevel=2,
-        )
+    @staticmethod
+    def create_module(spec: ModuleSpec) -> None:
+        """As usual; ``exec_module`` puts the one that has moved in its place."""
+
+    @staticmethod
+    def exec_module(module: object) -> None:
+        import warnings
+
+        old, new = module.__spec__.name, module.__spec__.origin  # type: ignore[attr-defined]
+        text = f"{old} is {new} since jaxcal 0.3; the old name goes with 0.4"
+        warnings.warn(text, DeprecationWarning, stacklevel=2)
         sys.modules[old] = importlib.import_module(new)
-
-
-def _new_name(name: str) -> str | None:
-    for old, new in MOVED.items() if name.startswith("jaxcal.") else ():
-        if name == old or name.startswith(f"{old}."):
-            return new + name[len(old) :]
-    return None
-
-
-def install_finder() -> None:
-    """Let old paths be imported."""
-    sys.meta_path.insert(0, _Finder())

@@ -7,7 +7,7 @@ import functools
 import os
 import warnings
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +18,14 @@ from jaxcal.calibration.file import save, to_dict
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.fit_model import fit_model
 from jaxcal.calibration.inverse import command_for, no_inverse
-from jaxcal.calibration.pairing import Mispairing, against, mispairing
 from jaxcal.checks import aligned, in_words
 from jaxcal.late import late
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.models.verdict import Verdict
+
+if TYPE_CHECKING:
+    from jaxcal.calibration.pairing import Mispairing
 
 __all__ = ["Calibration"]
 
@@ -108,6 +110,8 @@ class Calibration(Fit):
         (``jaxcal.arms.verdict.ArmVerdict``). The summary, ``report``, exit
         codes and the warning of ``identify`` say this.
         """
+        from jaxcal.calibration.pairing import against
+
         return against(self.model.verdict(self), self.mispairing)
 
     @functools.cached_property
@@ -117,6 +121,8 @@ class Calibration(Fit):
         ``reason`` says it, ``repaired(commands, measured)`` gives the rows that belong
         together. None: they pair as they stand, or that cannot be told.
         """
+        from jaxcal.calibration.pairing import mispairing
+
         return mispairing(self)
 
     def of(self, tip: str) -> Calibration:

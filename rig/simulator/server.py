@@ -1,7 +1,7 @@
 """A Modbus server for the simulated drives: TCP, RTU over TCP, RTU on a pty.
 
-Functions 3, 6 and 16, written from the protocol's text. The frames are pymodbus's: those
-of the rig, ``rig.drives.wire``, meet another hand's in every simulated session.
+Functions 3, 6 and 16, written from the protocol's text. The frames are pymodbus's:
+those of ``rig.drives.wire`` meet another hand's in every simulated session.
 """
 
 from __future__ import annotations

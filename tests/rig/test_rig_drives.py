@@ -21,8 +21,8 @@ from rig.config.maps import load_map
 from rig.config.settings import BusSettings
 from rig.core.stop import stop_all
 from rig.drives.modbus import Bus, BusError, ModbusDrive, Rejected
-from rig.simulator import parse_fault
 from rig.drives.wire import crc16
+from rig.simulator import parse_fault
 
 
 @pytest.fixture

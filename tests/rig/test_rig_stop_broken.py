@@ -266,8 +266,8 @@ sys.exit(code)
 HEAVY = {"numpy", "scipy", "jax", "pydantic", "pydantic_core", "pymodbus", "jinja2",
          "tomlkit", "nicegui", "matplotlib", "serial"}  # fmt: skip
 MAY = {  # all of rig and jaxcal that a stop over a network may load
-    "jaxcal", "jaxcal.compiled", "jaxcal.jsonlines", "rig", "rig.__main__", "rig.core",
-    "rig.core.stop", "rig.drives", "rig.drives.drive", "rig.drives.line",
+    "jaxcal", "jaxcal.compiled", "jaxcal.jsonlines", "jaxcal.moved", "rig",
+    "rig.__main__", "rig.core", "rig.core.stop", "rig.drives", "rig.drives.drive", "rig.drives.line",
     "rig.drives.modbus", "rig.drives.wire", "rig.faults", "rig.journal",
     "rig.journal.lock", "rig.registers", "rig.signals", "rig.stop_config",
     "rig.stopping",
@@ -296,7 +296,7 @@ def test_what_it_loads_can_be_read_in_a_morning():
         path = f"{path}.py" if os.path.isfile(f"{path}.py") else f"{path}/__init__.py"
         with open(path, encoding="utf-8") as file:
             lines += len(file.readlines())
-    assert lines < 3300, lines
+    assert lines < 3400, lines
 
 
 def test_a_folder_that_is_gone_does_not_keep_it(rig, tmp_path):
