@@ -267,7 +267,8 @@ HEAVY = {"numpy", "scipy", "jax", "pydantic", "pydantic_core", "pymodbus", "jinj
          "tomlkit", "nicegui", "matplotlib", "serial"}  # fmt: skip
 MAY = {  # all of rig and jaxcal that a stop over a network may load
     "jaxcal", "jaxcal.compiled", "jaxcal.jsonlines", "jaxcal.moved", "rig",
-    "rig.__main__", "rig.core", "rig.core.stop", "rig.drives", "rig.drives.drive", "rig.drives.line",
+    "rig.__main__", "rig.core", "rig.core.stop", "rig.drives", "rig.drives.drive",
+    "rig.drives.line",
     "rig.drives.modbus", "rig.drives.wire", "rig.faults", "rig.journal",
     "rig.journal.lock", "rig.registers", "rig.signals", "rig.stop_config",
     "rig.stopping",
