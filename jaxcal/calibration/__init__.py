@@ -22,13 +22,21 @@ __all__ = [
     "Calibration",
     "CalibrationWarning",
     "Check",
+    "Mispairing",
     "Source",
     "Verdict",
     "identify",
 ]
 
 
+_HOME = {
+    "Budget": "jaxcal.reports.budget",
+    "Mispairing": "jaxcal.calibration.pairing",
+    "Source": "jaxcal.reports.budget",
+}
+
+
 def __getattr__(name: str) -> Any:
-    if name not in ("Budget", "Source"):
+    if name not in _HOME:
         raise AttributeError(f"module 'jaxcal.calibration' has no attribute {name!r}")
-    return getattr(importlib.import_module("jaxcal.reports.budget"), name)
+    return getattr(importlib.import_module(_HOME[name]), name)
