@@ -56,17 +56,10 @@ class CalibrationWarning(UserWarning):
     """
 
     def __str__(self) -> str:
-        return _Alike(super().__str__())
-
-
-class _Alike(str):
-    """A text that is any other's like, to the registry of warnings that were shown."""
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Alike) or str.__eq__(self, other)
-
-    def __hash__(self) -> int:
-        return hash(_Alike)
+        # Python keeps the text that it is first told, and shows no second of that text.
+        text = super().__str__() if vars(self).get("told") else "not good"
+        self.told = True
+        return text
 
 
 def left_out(fit: Fit) -> Array:
