@@ -37,7 +37,7 @@ class Finder:
 
     @staticmethod
     def create_module(spec: ModuleSpec) -> None:
-        """As usual; ``exec_module`` puts the one that has moved in its place."""
+        """None, for an empty module, which ``exec_module`` replaces."""
 
     @staticmethod
     def exec_module(module: object) -> None:
