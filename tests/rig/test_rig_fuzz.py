@@ -17,9 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from rig.config.settings import BusSettings
 from rig.drives.modbus import Bus, BusError
-from rig.drives.wire import Wire
+from rig.drives.wire import Wire, crc16
 from rig.readings.stream import MAX_LINE, LineSplitter, StreamParser
-from rig.simulator.server import crc16
 
 IMU = changed(fast_config().imu, max_jump_deg=180.0)
 FIELD = re.compile(r"[ \t]*[+-]?[0-9]+([.][0-9]+)?([eE][+-]?[0-9]+)?[ \t]*")

@@ -9,7 +9,7 @@ import pytest
 from recorder import Recorder, axis_with, rtu_over_tcp
 
 from rig.drives.modbus import Bus, ModbusDrive
-from rig.simulator.server import crc16
+from rig.drives.wire import crc16
 
 
 def mirrored(value, bits):

@@ -343,7 +343,7 @@ HELD = jaxcal.Prior(1.0, fixed=("a11", "a12", "a13", "b1"))
         ("prior must leave", BARE | {"model": Affine(3, 1), "prior": HELD}),
         (r"measured must have shape \(N, 3\)", BARE | {"measured": U[:, :2]}),
         (
-            '"checkpoint" was trained for criterion D',
+            '"policy" is trained for criterion D, got A',
             BARE | {"method": "policy", "criterion": "A"},
         ),
     ],
