@@ -88,7 +88,7 @@ _HOME = {
 
 _ROOMS = (
     *("adaptive", "arms", "calibration", "candidates", "designs", "learning", "models"),
-    *("reports", "selection"),
+    *("reports", "selection", "tables"),
 )
 
 
