@@ -131,11 +131,17 @@ def identify(
             excited=readings.input_names if plain and affine else (),
         )
     except ValueError as error:
-        names = readings.input_names, readings.output_names
-        found = of_unfitted(model, readings.commands, readings.measured, prior, names)
-        if found is None:
+        mispaired = of_unfitted(
+            model,
+            readings.commands,
+            readings.measured,
+            prior,
+            getattr(model, "inputs", ()) or readings.input_names,
+            readings.output_names,
+        )
+        if mispaired is None:
             raise
-        raise ValueError(f"{found.reason}. As it stands: {error}") from None
+        raise ValueError(f"{mispaired.reason}. As it stands: {error}") from None
     if prior is not None and not prior.by_data:
         about["provenance"]["prior"] = "stated"
     calibration = Calibration(**fields, **about)

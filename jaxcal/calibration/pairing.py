@@ -128,14 +128,19 @@ def mispairing(fit: Fit) -> Mispairing | None:
 
 
 def of_unfitted(
-    model: Model, commands: Array, measured: Array, prior: Prior | None, names: Any
+    model: Model,
+    commands: Array,
+    measured: Array,
+    prior: Prior | None,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
 ) -> Mispairing | None:
-    """How a table was mispaired that could not be fitted; ``names`` of both sides."""
+    """How a table was mispaired that could not be fitted, with names of its columns."""
     counted = np.ones(len(commands), dtype=np.bool_)
     with contextlib.suppress(ValueError):
         prior = prior or model.default_prior()
         table = _table(model, commands, measured, counted, prior)
-        return None if table is None else _found(table, *names, "")
+        return None if table is None else _found(table, inputs, outputs, "")
     return None
 
 
@@ -184,6 +189,10 @@ def _table(
         )  # fmt: skip
     flat = bool((known.precisions == 0.0).all() and free.all())
     shared = model.multiplicity > 0 and flat
+    # A measurement that is written twice counts once.
+    rows = np.hstack([commands, measured])
+    first = np.unique(rows, axis=0, return_index=True)[1]
+    counted = counted & np.isin(np.arange(len(rows)), first)
     if counted.sum() < _LEAST:
         return None
     if shared:
@@ -564,8 +573,8 @@ def _what(
             size = f"{in_words(steps * table.scale)} {unit}".strip()
             another = f"offset, by {size}"
         return (
-            f"rows of two sessions seem joined: from row {starts[1][0]} on the readings "
-            f"have another {another}"
+            f"rows of two sessions seem joined: from row {starts[1][0]} on the "
+            f"readings have another {another}"
         )
     return _path_words(starts, near, count)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,8 +78,9 @@ class _Sums(NamedTuple):
     costs: Array  # (...) of readings that are paired with nothing
     counts: Array  # (...)
 
-    def __getitem__(self, at: object) -> _Sums:  # type: ignore[override]
-        return _Sums(*(tuple.__getitem__(self, i)[at] for i in range(5)))
+    def at(self, rows: Any) -> _Sums:
+        """Of some of them."""
+        return _Sums(*(part[rows] for part in self))
 
     def plus(self, other: _Sums, sign: float = 1.0) -> _Sums:
         """These and the ``other``, or without them."""
@@ -241,11 +242,11 @@ def _paths(systems: _Systems) -> list[tuple[float, Hypothesis]]:
     inner = np.arange(1, last)
     inner = inner[(edges[inner] >= _LEAST) & (count - edges[inner] >= 1)]
     found: list[tuple[float, tuple[tuple[int, int], ...]]] = []
-    plain = of_shift[0]
+    plain = of_shift.at(0)
     for index, by in enumerate(_SHIFTS[1:], 1):
-        other = of_shift[index]
-        after = plain[inner].plus(other[[last]].plus(other[inner], -1.0))
-        before = other[inner].plus(plain[[last]].plus(plain[inner], -1.0))
+        other = of_shift.at(index)
+        after = plain.at(inner).plus(other.at([last]).plus(other.at(inner), -1.0))
+        before = other.at(inner).plus(plain.at([last]).plus(plain.at(inner), -1.0))
         for sums, (first, then) in ((after, (0, by)), (before, (by, 0))):
             scores = systems.evidence(sums) - code
             best = int(scores.argmax())
@@ -278,8 +279,9 @@ def _blocks(
     if not len(first):
         return []
     code = _KINDS + np.log(0.5 * count**2)
-    plain, found = of_shift[0], []
-    around = plain[[last]].plus(plain[second].plus(plain[first], -1.0), -1.0)
+    plain = of_shift.at(0)
+    found: list[tuple[float, tuple[tuple[int, int], ...]]] = []
+    around = plain.at([last]).plus(plain.at(second).plus(plain.at(first), -1.0), -1.0)
     costs = np.append(0.0, np.cumsum(systems.costs * systems.table.counted))[edges]
     none = around._replace(costs=around.costs + costs[second] - costs[first])
     scores = systems.evidence(none) - code
@@ -289,8 +291,10 @@ def _blocks(
     # Shifted: about the best edges of a block that does not belong.
     near = np.argsort(-scores)[:60]
     for index, by in enumerate(_SHIFTS[1:], 1):
-        other = of_shift[index]
-        sums = around[near].plus(other[second[near]].plus(other[first[near]], -1.0))
+        other = of_shift.at(index)
+        sums = around.at(near).plus(
+            other.at(second[near]).plus(other.at(first[near]), -1.0)
+        )
         scores_here = systems.evidence(sums) - code - np.log(6.0)
         best = int(scores_here.argmax())
         begin, end = int(edges[first[near[best]]]), int(edges[second[near[best]]])
@@ -319,11 +323,13 @@ def _steps(systems: _Systems) -> list[tuple[float, Hypothesis]]:
     slopes, right, _ = systems.of(after[None])
     slopes, right = slopes[0], right[0]
     factors = slopes[:, 0] if table.shared else None
+    before = np.append(0, _distinct(table.commands)[:-1])
+    behind = _distinct(table.commands[::-1])[::-1]
     for whole in (False, True) if factors is not None else (False,):
         best: tuple[float, Hypothesis] | None = None
         widths = factors.shape[1] if whole and factors is not None else 1
         least = widths + 2 if whole else _LEAST
-        edges = after[least : count - least + 1]
+        edges = after[(before >= least) & (behind >= least)]
         if not len(edges):
             continue
         edges = edges[:: len(edges) // _EDGES + 1]
@@ -340,6 +346,12 @@ def _steps(systems: _Systems) -> list[tuple[float, Hypothesis]]:
         )
         found.append(best)
     return found
+
+
+def _distinct(commands: Array) -> Rows:
+    """(N,) how many different commands there are up to each row."""
+    first = np.unique(commands, axis=0, return_index=True)[1]
+    return np.cumsum(np.isin(np.arange(len(commands)), first))
 
 
 def _with_columns(systems: _Systems, slopes: Array, right: Array, more: Array) -> Array:
@@ -378,7 +390,8 @@ def _with_columns(systems: _Systems, slopes: Array, right: Array, more: Array) -
 
 def polished(table: Table, fit: Fitted) -> tuple[Fitted, dict[int, list[int]]]:
     """A path with its changes at their most probable rows, and rows about as good."""
-    path, near = list(fit.hypothesis.starts), {}
+    path = list(fit.hypothesis.starts)
+    near: dict[int, list[int]] = {}
     count, costs = len(table.commands), table.costs()
     noise = np.maximum(fit.noise, 1e-7)
     for _ in range(2):

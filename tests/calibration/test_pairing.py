@@ -83,7 +83,7 @@ SPOILT = {
     ),
     "two sessions": (
         lambda u, y: (u[:20], y[:20] + (np.arange(20) >= 13)[:, None]),
-        r"from row 13 on the readings have another offset, by \((1|0.9\d*), ",
+        r"from row 13 on the readings have another offset, by \((1|0\.9|1\.0)\d*, ",
     ),
     "another unit": (
         lambda u, y: (u[:20], y[:20] * np.where(np.arange(20) < 11, 1, 0.1)[:, None]),
