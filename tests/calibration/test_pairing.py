@@ -15,8 +15,8 @@ import pytest
 import ur5
 
 import jaxcal
-from jaxcal.calibration.pairing_fit import Hypothesis, Table, fitted, log_evidence
-from jaxcal.calibration.pairing_search import shifted
+from jaxcal.calibration.pairing.fit import fitted, log_evidence
+from jaxcal.calibration.pairing.table import Hypothesis, Table, shifted
 from jaxcal.commands.main import main
 from jaxcal.models import Affine, Linear
 

@@ -1,47 +1,37 @@
-"""Which commands the readings of a table may belong to: what is tried, and ranked.
+"""Pairings of rows that are tried, and ranked by least squares.
 
 Every change of the pairing at any row is one hypothesis. Its least squares follow from
-sums of normal equations over the rows before and after, so all of them are solved at
-once; the best are then fitted one by one (``pairing_fit.fitted``).
+sums of normal equations over the rows before and after, so all are solved at once.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.pairing_fit import (
-    AS_IT_IS,
-    ColumnChange,
-    Fitted,
-    Hypothesis,
-    Table,
-    fitted,
+from jaxcal.calibration.pairing.fit import (
     log_evidence,
-    predicted,
     solved,
 )
+from jaxcal.calibration.pairing.table import (
+    AS_IT_IS,
+    FOREIGN,
+    Hypothesis,
+    Table,
+    as_it_is,
+    path_match,
+    shifted,
+)
 
-__all__ = [
-    "FOREIGN",
-    "as_it_is",
-    "assigned",
-    "changed_columns",
-    "matched_anew",
-    "polished",
-    "ranked",
-    "shifted",
-]
+__all__ = ["ranked"]
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
-FOREIGN = 99  # shift of readings that belong to no command
 _SHIFTS = (0, 1, -1, 2, -2, 3, -3)
 _EDGES = 128  # rows at which a change is tried first, and of models of many parameters:
 _EDGES_OF_MANY = 40
@@ -49,24 +39,6 @@ _MANY = 20  # parameters
 _LEAST = 3  # rows that a change leaves on either side
 _KINDS = np.log(10.0)
 _LAGS = 200  # rows, of a recording
-_STARTS, _REFINED, _ROUNDS = 60, 30, 12  # of a search for an order that was lost
-_TURNS = 1.7453292519943295e-2  # radians in a degree
-_UNITS = {
-    "is in radians, degrees are meant": 1.0 / _TURNS,
-    "is in degrees, radians are meant": _TURNS,
-    "is too small by 1000 (m for mm?)": 1000.0,
-    "is too large by 1000 (mm for m?)": 0.001,
-    "is too small by 10": 10.0,
-    "is too large by 10": 0.1,
-    "is too small by 100": 100.0,
-    "is too large by 100": 0.01,
-}
-
-
-def as_it_is(table: Table, extra: Array | None = None, code: float = 0.0) -> Hypothesis:
-    """Each reading belongs to the command beside it."""
-    match = np.arange(len(table.commands))
-    return Hypothesis(AS_IT_IS, match, code, extra=extra)
 
 
 class _Sums(NamedTuple):
@@ -192,12 +164,6 @@ def ranked(table: Table) -> tuple[float, list[tuple[float, Hypothesis]]]:
     return base, sorted(found, key=lambda each: -each[0])
 
 
-def shifted(count: int, by: int) -> Rows:
-    """(count,) the row of the command ``by`` rows on, -1 where there is none."""
-    match = np.arange(count) + by
-    return np.where((match >= 0) & (match < count), match, -1)
-
-
 def _of_all_rows(
     table: Table, fast: bool
 ) -> tuple[Rows, list[tuple[str, float, tuple[tuple[int, int], ...]]]]:
@@ -302,16 +268,6 @@ def _blocks(
     return found
 
 
-def path_match(count: int, path: Sequence[tuple[int, int]]) -> Rows:
-    """(count,) match of shifts that begin at rows."""
-    match = np.full(count, -1)
-    ends = [*(start for start, _ in path[1:]), count]
-    for (start, by), end in zip(path, ends, strict=True):
-        if by != FOREIGN:
-            match[start:end] = shifted(count, by)[start:end]
-    return match
-
-
 def _steps(systems: _Systems) -> list[tuple[float, Hypothesis]]:
     """Rows of two sessions: from one on another offset, or other parameters too."""
     table, count = systems.table, len(systems.table.commands)
@@ -386,191 +342,3 @@ def _with_columns(systems: _Systems, slopes: Array, right: Array, more: Array) -
         ones * table.counted.sum(),
     )  # fmt: skip
     return systems.evidence(sums, e)
-
-
-def polished(table: Table, fit: Fitted) -> tuple[Fitted, dict[int, list[int]]]:
-    """A path with its changes at their most probable rows, and rows about as good."""
-    path = list(fit.hypothesis.starts)
-    near: dict[int, list[int]] = {}
-    count, costs = len(table.commands), table.costs()
-    noise = np.maximum(fit.noise, 1e-7)
-    for _ in range(2):
-        of_rows: dict[int, Array] = {}
-        for by in {shift for _, shift in path}:
-            cost = costs.copy()
-            match = path_match(count, [(0, by)])
-            rows = np.flatnonzero((match >= 0) & table.counted)
-            if len(rows):
-                off = _off(table, fit, match, rows) / noise
-                inside = 0.5 * (off**2).sum(axis=1) + np.log(noise).sum()
-                inside += 0.5 * table.outputs * np.log(2.0 * np.pi)
-                cost[rows] = np.minimum(inside, costs[rows] + np.log(20.0))
-            of_rows[by] = cost * table.counted
-        near = {}
-        for i in range(1, len(path)):
-            low = path[i - 1][0] + 1
-            high = path[i + 1][0] if i + 1 < len(path) else count
-            gain = of_rows[path[i - 1][1]] - of_rows[path[i][1]]
-            upto = np.append(0.0, np.cumsum(gain))[low:high]
-            best = int(upto.argmin())
-            near[i] = [low + int(k) for k in np.flatnonzero(upto < upto[best] + 2.0)]
-            path[i] = (low + best, path[i][1])
-        if tuple(path) == fit.hypothesis.starts:
-            break
-        match = path_match(count, path)
-        fit = fitted(
-            table,
-            dataclasses.replace(fit.hypothesis, match=match, starts=tuple(path)),
-            fit.theta,
-        )
-        noise = np.maximum(fit.noise, 1e-7)
-    return fit, near
-
-
-def _off(table: Table, fit: Fitted, match: Rows, rows: Rows) -> Array:
-    """(K, q) residuals of rows paired by ``match``, in scales, at the fit."""
-    if table.shared:
-        reading = table.measured[rows] / table.scale
-        return np.asarray(reading - predicted(table, fit)[match[rows]])
-    return table.residuals(Hypothesis("", match), rows, fit.theta)
-
-
-def assigned(table: Table, fit: Fitted, rows: Rows) -> Rows:
-    """(N,) match in which readings of ``rows`` have those commands that fit best."""
-    from scipy.optimize import linear_sum_assignment
-
-    match = fit.hypothesis.match.copy()
-    commands = match[rows]
-    noise = np.maximum(fit.noise, 1e-7)
-    off = table.measured[rows, None] / table.scale - predicted(table, fit)[commands]
-    own, others = linear_sum_assignment(((off / noise) ** 2).sum(axis=-1))
-    match[rows[own]] = commands[others]
-    return match
-
-
-def matched_anew(table: Table, fit: Fitted) -> list[Rows]:
-    """Matches (N,) by which readings that lost their order fit some parameters best.
-
-    Assigned and fitted in turn, from several starts: outputs that follow the commands,
-    each by itself, one output that follows one, and any.
-    """
-    every = np.arange(len(table.commands))
-    if not (table.shared or table.model.linear) or not table.free.any():
-        return [assigned(table, fit, every)]
-    from scipy.optimize import linear_sum_assignment
-
-    factors, right = table.system(as_it_is(table), every)
-    read, (_, a, r), c = right.reshape(len(every), -1), factors.shape, right.shape[-1]
-    white = (read - read.mean(axis=0)) / (read.std(axis=0) + 1e-300)
-
-    def refit(match: Rows) -> tuple[float, Rows, Array]:
-        """Square of a match refitted, the next one, and what it predicts."""
-        flat = factors[match].reshape(-1, r)
-        slopes = np.linalg.lstsq(flat, right.reshape(len(flat), c))[0]
-        off = (factors @ slopes).reshape(read.shape)
-        apart = ((read[:, None] - off) ** 2).sum(axis=-1)
-        moved = linear_sum_assignment(apart)[1]
-        return float(apart[every, moved].sum()), moved, off
-
-    tried: list[tuple[float, Rows]] = []
-    for start in _starts(factors, white, a, c):
-        apart = ((white[:, None] - start) ** 2).sum(axis=-1)
-        square, match, _ = refit(linear_sum_assignment(apart)[1])
-        tried.append((square, match))
-    tried.sort(key=lambda each: each[0])
-    best: list[tuple[float, Rows]] = []
-    for square, match in tried[:_REFINED]:
-        for _ in range(_ROUNDS):
-            better, moved, _ = refit(match)
-            if not better < square:
-                break
-            square, match = better, moved
-        best.append((square, match))
-    return [match for _, match in sorted(best, key=lambda each: each[0])[:2]]
-
-
-def _starts(factors: Array, white: Array, a: int, c: int) -> Iterator[Array]:
-    """(N, q) readings, of unit size, by parameters that may be right.
-
-    The covariance of readings does not depend on how they are paired, so commands and
-    readings of unit covariance differ by a turn alone.
-    """
-    rng, count = np.random.default_rng(0), len(white)
-    for _ in range(_STARTS):
-        off = (factors @ rng.normal(size=(factors.shape[-1], c))).reshape(count, -1)
-        yield (off - off.mean(axis=0)) / (off.std(axis=0) + 1e-300)
-    if a > 1:  # outputs that share no regressor
-        return
-    commands = factors[:, 0, :-1] - factors[:, 0, :-1].mean(axis=0)
-    n = commands.shape[1]
-    size = commands.std(axis=0) + 1e-300
-    for sign in (1.0, -1.0):  # outputs that follow the commands, each its own
-        yield sign * (commands / size) @ np.eye(n, c)
-    unit = np.linalg.svd(commands, full_matrices=False)[0] * np.sqrt(count)
-    _, scale, axes = np.linalg.svd(white, full_matrices=False)
-    shape = (scale[:, None] / np.sqrt(count)) * axes  # (c, c) of unit readings
-    for _ in range(_STARTS):
-        turn = np.linalg.qr(rng.normal(size=(max(n, c), max(n, c))))[0]
-        yield unit @ turn[: unit.shape[1], : len(shape)] @ shape
-
-
-def changed_columns(
-    table: Table, inputs: Sequence[str], outputs: Sequence[str]
-) -> list[Hypothesis]:
-    """Columns with another sign or unit, or in the place of another's."""
-    width = np.arange(table.commands.shape[1])
-    moved = len(width) - len(width[table.model.sensed])
-    tables = [(inputs, len(inputs), moved, False)]
-    if not table.model.relative:
-        tables.append((outputs, len(outputs), len(outputs), True))
-    changes: list[ColumnChange] = []
-    for names, size, count, of_readings in tables:
-        if of_readings and not table.measured.any():
-            continue
-        order, ones = tuple(range(size)), (1.0,) * size
-        single = [((i,), f"{names[i]}") for i in range(count)]
-        every = [
-            (
-                tuple(range(count)),
-                "every column of "
-                + ("the readings" if of_readings else "the commands"),
-            )
-        ]
-        for columns, words in single + (every if count > 1 else []):
-            for what, factor in {"has the other sign": -1.0, **_UNITS}.items():
-                if len(columns) > 1 and factor == -1.0:
-                    continue
-                factors = tuple(factor if i in columns else 1.0 for i in range(size))
-                changes.append(
-                    ColumnChange(f"{words} {what}", of_readings, order, factors)
-                )
-        for i, j in itertools.combinations(range(count), 2):
-            swapped = list(order)
-            swapped[i], swapped[j] = j, i
-            changes.append(
-                ColumnChange(
-                    f"{names[i]} and {names[j]} are exchanged",
-                    of_readings, tuple(swapped), ones,
-                )
-            )  # fmt: skip
-            if not of_readings:
-                factors = tuple(-1.0 if k in (i, j) else 1.0 for k in range(size))
-                changes.append(
-                    ColumnChange(
-                        f"{names[i]} and {names[j]} have the other sign",
-                        of_readings, order, factors,
-                    )
-                )  # fmt: skip
-    code = _KINDS + np.log(len(changes) + 1.0)
-    rows, several = np.arange(len(table.commands)), np.log(20.0)
-    return [
-        Hypothesis(
-            "columns",
-            rows,
-            code
-            + several * (" and " in change.words)
-            + _KINDS * ("every" in change.words),
-            change=change,
-        )
-        for change in changes
-    ]

@@ -2,7 +2,7 @@
 
 The commonest fault of a logged calibration is a reading that was lost: all later ones
 stand beside the command before theirs. ``mispairing`` looks for that and its kin, and
-says one where it explains the readings far better than the table as it stands and than
+names one where it explains the readings far better than the table as it stands and than
 what machines do: outliers, drift, a curve that the model lacks.
 """
 
@@ -16,39 +16,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.pairing_fit import (
-    ColumnChange,
+from jaxcal.calibration.pairing.columns import changed_columns, places
+from jaxcal.calibration.pairing.fit import (
     Fitted,
-    Hypothesis,
-    Table,
+    fits_of,
     fitted,
-    solved,
+    top,
 )
-from jaxcal.calibration.pairing_search import (
+from jaxcal.calibration.pairing.orders import exchanged, polished, sorted_alone
+from jaxcal.calibration.pairing.search import ranked
+from jaxcal.calibration.pairing.table import (
     FOREIGN,
+    ColumnChange,
+    Table,
     as_it_is,
-    assigned,
-    changed_columns,
-    matched_anew,
-    polished,
-    ranked,
-    shifted,
 )
-from jaxcal.checks import in_words
+from jaxcal.calibration.pairing.words import sentence, what_is_wrong
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Prior
 from jaxcal.models.verdict import Verdict
 
-__all__ = [
-    "Mispairing",
-    "against",
-    "mispairing",
-    "of_new_readings",
-    "of_unfitted",
-]
+__all__ = ["Mispairing", "against", "mispairing", "of_new_readings", "of_unfitted"]
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
+
 Fit = Any  # a jaxcal.calibration.fit.Fit, whose module need not be known here
 
 _SURE = 8.0  # log of the odds at which a mispairing is said
@@ -60,11 +52,8 @@ _EXACT = 1e-6  # of the spread: readings so near a fit have nothing to explain
 _APART, _LARGE = 8.0, 4.5  # times the noise: neighbours, a residual
 _TREND = 1.4  # of a sum of residuals, over the root of their squares
 _LEAST = 6  # rows
-_PLACES = 2  # of a sensor, that are tried
 _NAMED = 2  # other explanations
-_COLUMNS = 6  # changes of columns that are fitted one by one
 _BLOCK = 4  # rows from elsewhere: fewer are outliers
-_TURNS = 6  # of assigning readings and fitting
 _ROWS = 20_000  # of more the first
 
 
@@ -226,7 +215,7 @@ def _found(
         return None
     fits = _alternatives(table, plain)
     if not any(_explains(plain, fit) for fit in fits):
-        fits += _columns(table, plain, inputs, outputs)
+        fits += changed_columns(table, plain, inputs, outputs)
     fits = [fit for fit in fits if np.isfinite(fit.evidence) and not _few(fit)]
     if not fits:
         return None
@@ -244,9 +233,9 @@ def _found(
     if best.hypothesis.kind == "path":
         at_best, near = polished(table, best)
         best, near = (best, {}) if _few(at_best) else (at_best, near)
-    reason = _words(table, best, near, outputs, unit)
-    for fit in _top(fits, len(fits)):
-        other = _what(table, fit, {}, outputs, unit)
+    reason = sentence(table, best, near, outputs, unit)
+    for fit in top(fits, len(fits)):
+        other = what_is_wrong(table, fit, {}, outputs, unit)
         kind = (fit.hypothesis.kind, fit.hypothesis.change)
         as_good = fit.evidence > best.evidence - _AS_GOOD
         if as_good and kind != (best.hypothesis.kind, best.hypothesis.change):
@@ -324,156 +313,17 @@ def _alternatives(table: Table, plain: Fitted) -> list[Fitted]:
     tables = [table]
     if not (table.shared or table.model.linear) and table.free.any():
         at_fit = dataclasses.replace(table, theta=plain.theta)
-        tables = [*_places(table), at_fit] if table.levels == 1 else [table, at_fit]
+        tables = [*places(table), at_fit] if table.levels == 1 else [table, at_fit]
     fits: list[Fitted] = []
     for one in tables:
         if any(_explains(plain, fit) for fit in fits):
             break
         base, hypotheses = ranked(one)
         worth = [h for score, h in hypotheses[:_TRIED] if score > base - _WORTH]
-        fits += _fits(one, worth)
+        fits += fits_of(one, worth)
     paths = [fit for fit in fits if fit.hypothesis.kind == "path"]
-    fits += [polished(table, fit)[0] for fit in _top(paths, 2)]
-    return fits + _exchanged(table, plain) + _sorted(table, plain)
-
-
-def _fits(table: Table, hypotheses: Sequence[Hypothesis]) -> list[Fitted]:
-    """Those of the hypotheses that the model can answer."""
-    fits = []
-    for hypothesis in hypotheses:
-        with contextlib.suppress(ValueError):
-            fits.append(fitted(table, hypothesis))
-    return fits
-
-
-def _top(fits: list[Fitted], count: int) -> list[Fitted]:
-    return sorted(fits, key=lambda fit: -fit.evidence)[:count]
-
-
-def _exchanged(table: Table, plain: Fitted) -> list[Fitted]:
-    """Outliers whose readings fit one another's commands."""
-    rows = np.flatnonzero(~plain.inside & table.counted)
-    count = len(table.commands)
-    sensed = len(np.arange(table.commands.shape[1])[table.model.sensed])
-    if not 2 <= len(rows) <= count // 2 or sensed:
-        return []
-    match = assigned(table, plain, rows)
-    moved = np.flatnonzero(match != np.arange(count))
-    if len(moved) < 2:
-        return []
-    code = 2.3 + float(len(moved) * np.log(count))
-    return [fitted(table, Hypothesis("exchanged", match, code), plain.theta)]
-
-
-def _sorted(table: Table, plain: Fitted) -> list[Fitted]:
-    """Commands or readings that were sorted without the others."""
-    count = len(table.commands)
-    sensed = len(np.arange(table.commands.shape[1])[table.model.sensed])
-    poor = (plain.rms > 0.3 * table.width).any()
-    if sensed or not poor or count > 150:
-        return []
-    fits: list[Fitted] = []
-    starts: list[Rows] = []
-    for side, kind in (
-        (table.commands, "commands sorted"),
-        (table.measured, "readings sorted"),
-    ):
-        for column in side.T:
-            way = np.sign(np.diff(column))
-            if not (np.ptp(way) < 2 and np.abs(way).sum() > 0.7 * count):
-                continue
-            code = 2.3 + float(np.log(np.arange(1, count + 1)).sum())
-            if side is table.measured:  # by chance noise is in no order
-                code = 5.0 * np.log(count)
-            starts = starts or matched_anew(table, plain)
-            fits += [_matched(table, Hypothesis(kind, each, code)) for each in starts]
-    return fits
-
-
-def _matched(table: Table, hypothesis: Hypothesis) -> Fitted:
-    """An assignment that is refined in turn with its fit."""
-    fit, every = fitted(table, hypothesis), np.arange(len(table.commands))
-    for _ in range(_TURNS):
-        match = assigned(table, fit, every)
-        if (match == fit.hypothesis.match).all():
-            break
-        fit = fitted(table, dataclasses.replace(hypothesis, match=match), fit.theta)
-    return fit
-
-
-def _columns(
-    table: Table, plain: Fitted, inputs: Sequence[str], outputs: Sequence[str]
-) -> list[Fitted]:
-    """Columns with another sign, unit or place."""
-    least = 0.1 if table.model.resolution else 0.02
-    if table.shared or not (plain.rms > least * table.width).any():
-        return []
-    tables, every = [], np.flatnonzero(table.counted)
-    for hypothesis in changed_columns(table, inputs, outputs):
-        anew = _anew(table, hypothesis, every)
-        if anew is not None:
-            tables.append((_distance(anew, hypothesis, every), anew, hypothesis))
-    tables.sort(key=lambda each: each[0])
-    return [fit for _, one, each in tables[:_COLUMNS] for fit in _fits(one, [each])]
-
-
-def _distance(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
-    """Log size of what is off before anything is fitted that a prior is known of."""
-    off = table.residuals(hypothesis, rows, table.theta)
-    if table.flat:
-        with contextlib.suppress(ValueError):
-            off = _flat_fit(table, hypothesis, rows)
-    size = np.log(np.median(np.abs(off), axis=0) + 1e-300).sum()
-    change = hypothesis.change
-    return (
-        float(size - (change.log_size if change else 0.0)) if size == size else np.inf
-    )
-
-
-def _flat_fit(table: Table, hypothesis: Hypothesis, rows: Rows) -> Array:
-    """(K, q) residuals of least squares about ``theta``."""
-    slopes, right = table.system(hypothesis, rows)
-    flat = slopes.reshape(-1, slopes.shape[-1])
-    known = table.ridge(flat.shape[1])
-    solution = solved(flat.T @ flat, flat.T @ right.reshape(len(flat), -1), known)
-    return np.asarray((right - slopes @ solution).reshape(len(rows), -1))
-
-
-def _anew(table: Table, hypothesis: Hypothesis, rows: Rows) -> Table | None:
-    """The table of the machine that these readings show if the hypothesis holds."""
-    if not table.free.any():
-        return table
-    try:
-        model = table.model.anew(
-            table.commands_of(hypothesis, rows), table.readings_of(hypothesis, rows)
-        )
-    except ValueError:
-        return None
-    mean = table.mean + np.asarray(model.nominal) - table.model.nominal
-    return dataclasses.replace(table, model=model, mean=mean, theta=mean)
-
-
-def _places(table: Table) -> list[Table]:
-    """The table with its sensor where some rows, or some pairing of them, put it.
-
-    That of the rows which then fit best come first: where readings are mispaired, all
-    of them together put it nowhere.
-    """
-    count = len(table.commands)
-    every, half = np.arange(count), count // 2
-    windows = [(every, every), (every, every[:half]), (every, every[half:])]
-    matches = [shifted(count, by) for by in (1, -1, 2, -2, 3, -3)]
-    matches += [every[::-1], (every + half) % count, (every - half) % count]
-    windows += [(match, every) for match in matches]
-    found = []
-    for match, rows in windows:
-        hypothesis = Hypothesis("", match)
-        rows = rows[(match[rows] >= 0) & table.counted[rows]]
-        anew = _anew(table, hypothesis, rows)
-        if anew is not None:
-            found.append((_distance(anew, hypothesis, rows), anew))
-    found.sort(key=lambda each: each[0])
-    return [each for _, each in found[:_PLACES]] or [table]
+    fits += [polished(table, fit)[0] for fit in top(paths, 2)]
+    return fits + exchanged(table, plain) + sorted_alone(table, plain)
 
 
 def _benign(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
@@ -505,98 +355,3 @@ def _benign(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
             code = more.shape[1] * float(np.log(table.width).sum())
             fits.append(fitted(at, as_it_is(table, more, code)))
     return fits
-
-
-def _words(
-    table: Table,
-    fit: Fitted,
-    near: dict[int, list[int]],
-    outputs: Sequence[str],
-    unit: str,
-) -> str:
-    noise = f"{in_words(fit.noise * table.scale)} {unit}".strip()
-    without = "with each apart" if fit.hypothesis.extra is not None else "without that"
-    return f"{_what(table, fit, near, outputs, unit)}; {without} the noise is {noise}"
-
-
-def _rows_late(by: int) -> str:
-    rows = "one row" if abs(by) == 1 else f"{abs(by)} rows"
-    where = "the command that far below" if by > 0 else "the command that far above"
-    return f"{rows} {'early' if by > 0 else 'late'} (each belongs to {where})"
-
-
-def _what(
-    table: Table,
-    fit: Fitted,
-    near: dict[int, list[int]],
-    outputs: Sequence[str],
-    unit: str,
-) -> str:
-    """The mispairing as a sentence; rows are counted from 0."""
-    hypothesis, count = fit.hypothesis, len(table.commands)
-    kind, starts = hypothesis.kind, hypothesis.starts
-    if hypothesis.change is not None:
-        return hypothesis.change.words
-    if kind == "shift":
-        return f"all readings are {_rows_late(starts[0][1])}"
-    if kind == "reversed":
-        return "the readings are in reverse order"
-    if kind == "halves":
-        return (
-            "the halves of the readings are exchanged: those from row "
-            f"{-starts[0][1] % count} on belong to the first commands"
-        )
-    if kind == "rotation" and abs(starts[0][1]) <= count // 3:
-        last = "first" if starts[0][1] > 0 else "last"
-        return (
-            f"all readings are {_rows_late(starts[0][1])}; the {last} "
-            f"{abs(starts[0][1])} stand at the other end"
-        )
-    if kind == "rotation":
-        return (
-            f"the readings from row {-starts[0][1] % count} on belong to the first "
-            "commands, those before to the last"
-        )
-    if kind == "commands sorted":
-        return "the commands are sorted and the readings are not"
-    if kind == "readings sorted":
-        return "the readings are sorted and the commands are not"
-    if kind == "exchanged":
-        rows = np.flatnonzero(hypothesis.match != np.arange(count))
-        return f"the readings of rows {', '.join(map(str, rows))} are exchanged"
-    if kind in ("offset", "parameters"):
-        another = "slope or offset"
-        if kind == "offset":
-            steps = (
-                fit.solution[-1] if table.shared else fit.solution[-table.outputs :, 0]
-            )
-            size = f"{in_words(steps * table.scale)} {unit}".strip()
-            another = f"offset, by {size}"
-        return (
-            f"rows of two sessions seem joined: from row {starts[1][0]} on the "
-            f"readings have another {another}"
-        )
-    return _path_words(starts, near, count)
-
-
-def _path_words(
-    path: Sequence[tuple[int, int]], near: dict[int, list[int]], count: int
-) -> str:
-    parts = []
-    for i, (start, by) in enumerate(path):
-        if by == 0:
-            continue
-        end = path[i + 1][0] if i + 1 < len(path) else count
-        where = (
-            f"from row {start} on" if end == count else f"from row {start} to {end - 1}"
-        )
-        if start == 0:
-            where = f"up to row {end - 1}"
-        rows = near.get(i, [])
-        if len(rows) > 1:
-            where += f" (or {', '.join(str(row) for row in rows if row != start)})"
-        if by == FOREIGN:
-            parts.append(f"{where} the readings do not belong to these commands")
-        else:
-            parts.append(f"{where}, readings are {_rows_late(by)}")
-    return "; ".join(parts)

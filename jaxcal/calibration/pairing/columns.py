@@ -1,0 +1,180 @@
+"""Columns with another sign, unit or place, and where a sensor stands then."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.calibration.pairing.fit import (
+    Fitted,
+    fits_of,
+    solved,
+)
+from jaxcal.calibration.pairing.table import (
+    ColumnChange,
+    Hypothesis,
+    Table,
+    shifted,
+)
+
+__all__ = ["changed_columns", "places"]
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+_TURNS = 1.7453292519943295e-2  # radians in a degree
+_UNITS = {
+    "is in radians, degrees are meant": 1.0 / _TURNS,
+    "is in degrees, radians are meant": _TURNS,
+    "is too small by 1000 (m for mm?)": 1000.0,
+    "is too large by 1000 (mm for m?)": 0.001,
+    "is too small by 10": 10.0,
+    "is too large by 10": 0.1,
+    "is too small by 100": 100.0,
+    "is too large by 100": 0.01,
+}
+_COLUMNS = 6  # changes of columns that are fitted one by one
+_PLACES = 2  # of a sensor, that are tried
+_KINDS = np.log(10.0)
+
+
+def changed_columns(
+    table: Table, plain: Fitted, inputs: Sequence[str], outputs: Sequence[str]
+) -> list[Fitted]:
+    """Columns with another sign, unit or place."""
+    least = 0.1 if table.model.resolution else 0.02
+    if table.shared or not (plain.rms > least * table.width).any():
+        return []
+    tables, every = [], np.flatnonzero(table.counted)
+    for hypothesis in _kinds_of_columns(table, inputs, outputs):
+        anew = _anew(table, hypothesis, every)
+        if anew is not None:
+            tables.append((_distance(anew, hypothesis, every), anew, hypothesis))
+    tables.sort(key=lambda each: each[0])
+    return [fit for _, one, each in tables[:_COLUMNS] for fit in fits_of(one, [each])]
+
+
+def _kinds_of_columns(
+    table: Table, inputs: Sequence[str], outputs: Sequence[str]
+) -> list[Hypothesis]:
+    """Columns with another sign or unit, or in the place of another's."""
+    width = np.arange(table.commands.shape[1])
+    moved = len(width) - len(width[table.model.sensed])
+    tables = [(inputs, len(inputs), moved, False)]
+    if not table.model.relative:
+        tables.append((outputs, len(outputs), len(outputs), True))
+    changes: list[ColumnChange] = []
+    for names, size, count, of_readings in tables:
+        if of_readings and not table.measured.any():
+            continue
+        order, ones = tuple(range(size)), (1.0,) * size
+        single = [((i,), f"{names[i]}") for i in range(count)]
+        every = [
+            (
+                tuple(range(count)),
+                "every column of "
+                + ("the readings" if of_readings else "the commands"),
+            )
+        ]
+        for columns, words in single + (every if count > 1 else []):
+            for what, factor in {"has the other sign": -1.0, **_UNITS}.items():
+                if len(columns) > 1 and factor == -1.0:
+                    continue
+                factors = tuple(factor if i in columns else 1.0 for i in range(size))
+                changes.append(
+                    ColumnChange(f"{words} {what}", of_readings, order, factors)
+                )
+        for i, j in itertools.combinations(range(count), 2):
+            swapped = list(order)
+            swapped[i], swapped[j] = j, i
+            changes.append(
+                ColumnChange(
+                    f"{names[i]} and {names[j]} are exchanged",
+                    of_readings, tuple(swapped), ones,
+                )
+            )  # fmt: skip
+            if not of_readings:
+                factors = tuple(-1.0 if k in (i, j) else 1.0 for k in range(size))
+                changes.append(
+                    ColumnChange(
+                        f"{names[i]} and {names[j]} have the other sign",
+                        of_readings, order, factors,
+                    )
+                )  # fmt: skip
+    code = _KINDS + np.log(len(changes) + 1.0)
+    rows, several = np.arange(len(table.commands)), np.log(20.0)
+    return [
+        Hypothesis(
+            "columns",
+            rows,
+            code
+            + several * (" and " in change.words)
+            + _KINDS * ("every" in change.words),
+            change=change,
+        )
+        for change in changes
+    ]
+
+
+def _distance(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
+    """Log size of what is off before anything is fitted that a prior is known of."""
+    off = table.residuals(hypothesis, rows, table.theta)
+    if table.flat:
+        with contextlib.suppress(ValueError):
+            off = _flat_fit(table, hypothesis, rows)
+    size = np.log(np.median(np.abs(off), axis=0) + 1e-300).sum()
+    change = hypothesis.change
+    return (
+        float(size - (change.log_size if change else 0.0)) if size == size else np.inf
+    )
+
+
+def _flat_fit(table: Table, hypothesis: Hypothesis, rows: Rows) -> Array:
+    """(K, q) residuals of least squares about ``theta``."""
+    slopes, right = table.system(hypothesis, rows)
+    flat = slopes.reshape(-1, slopes.shape[-1])
+    known = table.ridge(flat.shape[1])
+    solution = solved(flat.T @ flat, flat.T @ right.reshape(len(flat), -1), known)
+    return np.asarray((right - slopes @ solution).reshape(len(rows), -1))
+
+
+def _anew(table: Table, hypothesis: Hypothesis, rows: Rows) -> Table | None:
+    """The table of the machine that these readings show if the hypothesis holds."""
+    if not table.free.any():
+        return table
+    try:
+        model = table.model.anew(
+            table.commands_of(hypothesis, rows), table.readings_of(hypothesis, rows)
+        )
+    except ValueError:
+        return None
+    mean = table.mean + np.asarray(model.nominal) - table.model.nominal
+    return dataclasses.replace(table, model=model, mean=mean, theta=mean)
+
+
+def places(table: Table) -> list[Table]:
+    """The table with its sensor where some rows, or some pairing of them, put it.
+
+    That of the rows which then fit best come first: where readings are mispaired, all
+    of them together put it nowhere.
+    """
+    count = len(table.commands)
+    every, half = np.arange(count), count // 2
+    windows = [(every, every), (every, every[:half]), (every, every[half:])]
+    matches = [shifted(count, by) for by in (1, -1, 2, -2, 3, -3)]
+    matches += [every[::-1], (every + half) % count, (every - half) % count]
+    windows += [(match, every) for match in matches]
+    found = []
+    for match, rows in windows:
+        hypothesis = Hypothesis("", match)
+        rows = rows[(match[rows] >= 0) & table.counted[rows]]
+        anew = _anew(table, hypothesis, rows)
+        if anew is not None:
+            found.append((_distance(anew, hypothesis, rows), anew))
+    found.sort(key=lambda each: each[0])
+    return [each for _, each in found[:_PLACES]] or [table]
