@@ -3,9 +3,9 @@
     python -m benchmarks.mispairing              # 20 seeds of each kind and model
     python -m benchmarks.mispairing --seeds 5
 
-A table is spoilt in one way; it counts where the least-squares residual of the table as
-spoilt is at least five times the noise. Found means that the sentence names the kind and
-the row, to one; said, that something else is named.
+A table is spoilt in one way; it counts where the least-squares residual of the table
+as spoilt is at least five times the noise. Found means that the sentence names the kind
+and the row, to one; said, that something else is named.
 """
 
 from __future__ import annotations
@@ -195,7 +195,7 @@ def lost(case: Case, rng: np.random.Generator) -> Spoilt:
 
 
 def lost_short(case: Case, rng: np.random.Generator) -> Spoilt:
-    u, y, table = _split(case)
+    _, y, table = _split(case)
     k = _at(rng, len(y))
     commands, measured = table(np.vstack([np.delete(y, k, axis=0), y[-1:]]))
     return commands[:-1], measured[:-1], rf"row ({_near(k)})\b.*one row early"
@@ -209,7 +209,7 @@ def doubled(case: Case, rng: np.random.Generator) -> Spoilt:
 
 
 def shift(case: Case, rng: np.random.Generator) -> Spoilt:
-    u, y, table = _split(case)
+    _, y, table = _split(case)
     by = int(rng.choice([-3, -2, -1, 1, 2, 3]))
     rows = "one row" if abs(by) == 1 else f"{abs(by)} rows"
     # np.roll(y, by): the reading of row i stands in row i + by, late by by
@@ -267,7 +267,7 @@ def sessions(case: Case, rng: np.random.Generator) -> Spoilt:
 
 
 def lag(case: Case, rng: np.random.Generator) -> Spoilt:
-    """Of a recording: smooth commands, readings late by a constant."""
+    """Readings late by a constant, as of a recording."""
     _, y, table = _split(case)
     by = int(rng.integers(4, 8))
     return (
@@ -277,10 +277,18 @@ def lag(case: Case, rng: np.random.Generator) -> Spoilt:
 
 
 ROWS = {
-    "lost": lost, "lost, short": lost_short, "doubled": doubled, "shift": shift,
-    "halves": halves, "reversed": order, "commands sorted": commands_sorted,
-    "readings sorted": readings_sorted, "block": block, "sessions": sessions, "lag": lag,
-}  # fmt: skip
+    "lost": lost,
+    "lost, short": lost_short,
+    "doubled": doubled,
+    "shift": shift,
+    "halves": halves,
+    "reversed": order,
+    "commands sorted": commands_sorted,
+    "readings sorted": readings_sorted,
+    "block": block,
+    "sessions": sessions,
+    "lag": lag,
+}
 
 
 def columns_exchanged(case: Case, rng: np.random.Generator) -> Spoilt:
@@ -400,7 +408,7 @@ def _told(case: Case, u: Array, y: Array, checked: bool) -> tuple[str, float]:
 
 
 def _excess(case: Case, u: Array, y: Array) -> float:
-    """Residual of the spoilt table, in noise, where that is known from the right one."""
+    """Residual of the spoilt table over that of the right one."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         size = []

@@ -243,13 +243,13 @@ def _repaired(
     readings: _Readings,
 ) -> str:
     """Write the rows of a mispaired table that belong together; a line that says so."""
-    found = calibration.mispairing
-    if found is None:
+    mispairing = calibration.mispairing
+    if mispairing is None:
         raise ValueError(f"{path} is not written: the rows of {file} are not mispaired")
     names, measured = [*readings.inputs], np.zeros((len(table), 0))
     if {*readings.outputs} <= {*table.names}:
         names, measured = [*names, *readings.outputs], table.columns(readings.outputs)
-    columns = found.repaired(table.columns(readings.inputs), measured)
+    columns = mispairing.repaired(table.columns(readings.inputs), measured)
     write_rows(path, names, np.hstack(columns).tolist())
     return f"saved {path}, {len(columns[0])} of {len(table)} rows; {file} is as it was"
 

@@ -55,8 +55,12 @@ def changed_columns(
         anew = _anew(table, hypothesis, every)
         if anew is not None:
             tables.append((_distance(anew, hypothesis, every), anew, hypothesis))
-    tables.sort(key=lambda each: each[0])
-    return [fit for _, one, each in tables[:_COLUMNS] for fit in fits_of(one, [each])]
+    tables.sort(key=lambda row: row[0])
+    return [
+        fit
+        for _, anew, hypothesis in tables[:_COLUMNS]
+        for fit in fits_of(anew, [hypothesis])
+    ]
 
 
 def _kinds_of_columns(
@@ -169,12 +173,12 @@ def places(table: Table) -> list[Table]:
     matches = [shifted(count, by) for by in (1, -1, 2, -2, 3, -3)]
     matches += [every[::-1], (every + half) % count, (every - half) % count]
     windows += [(match, every) for match in matches]
-    found = []
+    ranked = []
     for match, rows in windows:
         hypothesis = Hypothesis("", match)
         rows = rows[(match[rows] >= 0) & table.counted[rows]]
         anew = _anew(table, hypothesis, rows)
         if anew is not None:
-            found.append((_distance(anew, hypothesis, rows), anew))
-    found.sort(key=lambda each: each[0])
-    return [each for _, each in found[:_PLACES]] or [table]
+            ranked.append((_distance(anew, hypothesis, rows), anew))
+    ranked.sort(key=lambda pair: pair[0])
+    return [anew for _, anew in ranked[:_PLACES]] or [table]

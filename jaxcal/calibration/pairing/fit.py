@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from jaxcal.calibration.pairing.table import (
     AS_IT_IS,
@@ -62,6 +61,8 @@ def log_evidence(table: Table, square: Array, count: Any, extra: int = 0) -> Arr
 
     The noise is integrated out, ``extra`` columns cost half the log of the rows each.
     """
+    from scipy import special  # loaded only where a fit is in doubt
+
     outputs, levels = table.outputs, square.shape[-1]
     free = (table.flat + extra * outputs) / levels
     dof = np.asarray(count)[..., None] * (outputs / levels) - free
@@ -136,13 +137,13 @@ def _robust(table: Table, slopes: Array, right: Array) -> tuple[Array, Array, Ar
     Returns:
         (r, c) the solution, (K,) weights, and (K, q) residuals of least squares.
     """
-    known, (count, _, r), q = table.ridge(slopes.shape[-1]), slopes.shape, table.outputs
+    ridge, (count, _, r), q = table.ridge(slopes.shape[-1]), slopes.shape, table.outputs
     size = count * slopes.shape[1]
     plain, aim = slopes.reshape(size, r), right.reshape(size, -1)
     weights, first, solution = np.ones(count), np.zeros((count, q)), np.zeros((r, 1))
     for turn in range(_ROUNDS):
         flat = (weights[:, None, None] * slopes).reshape(size, r)
-        solution = solved(flat.T @ plain, flat.T @ aim, known)
+        solution = solved(flat.T @ plain, flat.T @ aim, ridge)
         off = (right - slopes @ solution).reshape(count, q)
         first = off if not turn else first
         noise = _size(off)
@@ -157,10 +158,12 @@ def _size(off: Array) -> Array:
 
 def judged(table: Table, hypothesis: Hypothesis, rows: Rows) -> Fitted:
     """The evidence of a hypothesis about ``table.theta``, its outliers left out."""
+    from scipy import special
+
     slopes, right = table.system(hypothesis, rows)
     solution, weights, first = _robust(table, slopes, right)
     extra = 0 if hypothesis.extra is None else hypothesis.extra.shape[1]
-    known, count, q = table.ridge(slopes.shape[-1]), len(rows), table.outputs
+    ridge, count, q = table.ridge(slopes.shape[-1]), len(rows), table.outputs
     order = np.argsort(-weights, kind="stable")
     slopes, right, costs = slopes[order], right[order], table.costs()
     off = right - slopes @ solution
@@ -174,11 +177,11 @@ def judged(table: Table, hypothesis: Hypothesis, rows: Rows) -> Fitted:
     at = count - 1 - out
     squares = np.cumsum(np.einsum("kar,kas->krs", white, white), axis=0)[at]
     products = np.cumsum(np.einsum("kar,kac->krc", white, aim), axis=0)[at]
-    products -= known[:, None] * solution
+    products -= ridge[:, None] * solution
     totals = np.cumsum((aim**2).sum(axis=(1, 2)))[at]
-    steps = solved(squares, products, known)
+    steps = solved(squares, products, ridge)
     totals = totals - (products * steps).sum(axis=(1, 2))
-    totals += (known[:, None] * solution**2).sum()
+    totals += (ridge[:, None] * solution**2).sum()
     outlying = np.cumsum((costs[rows[order]] + OUTLIER)[::-1])
     lost = np.append(0.0, outlying)[out]
     dof = q * (at + 1.0) - (table.flat + extra * q)
@@ -191,7 +194,7 @@ def judged(table: Table, hypothesis: Hypothesis, rows: Rows) -> Fitted:
     left = (right - slopes @ solution).reshape(count, q)[:kept]
     by_level = (left**2).sum(axis=0)
     if table.levels == 1:
-        prior = (known[:, None] * solution**2).sum()
+        prior = (ridge[:, None] * solution**2).sum()
         by_level = np.array([by_level.sum() + prior])
     unpaired = table.counted.copy()
     unpaired[rows] = False
@@ -227,7 +230,7 @@ def predicted(table: Table, fit: Fitted) -> Array:
 
 
 def fits_of(table: Table, hypotheses: Sequence[Hypothesis]) -> list[Fitted]:
-    """Those of the hypotheses that the model can answer."""
+    """Fits of the hypotheses that the model can answer."""
     fits = []
     for hypothesis in hypotheses:
         with contextlib.suppress(ValueError):

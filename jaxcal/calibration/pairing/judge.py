@@ -49,7 +49,7 @@ _AS_GOOD = 3.0  # log of the odds within which another kind is named too
 _TRIED = 6  # hypotheses that are fitted one by one
 _WORTH = 12.0  # log of the odds: of those that are so much worse at first, none
 _EXACT = 1e-6  # of the spread: readings so near a fit have nothing to explain
-_APART, _LARGE = 8.0, 4.5  # times the noise: neighbours, a residual
+_APART, _LARGE = 8.0, 3.0  # times the residuals: neighbours, a row
 _TREND = 1.4  # of a sum of residuals, over the root of their squares
 _LEAST = 6  # rows
 _NAMED = 2  # other explanations
@@ -102,6 +102,8 @@ class Mispairing:
 
 def mispairing(fit: Fit) -> Mispairing | None:
     """How the measurements of a calibration were mispaired; None: they were not."""
+    if len(fit.commands) < _LEAST or _plainly_right(fit):
+        return None
     if fit.noise_known:
         lack = fit.lack_of_fit()
         if lack is None or lack > 1e-3:
@@ -126,6 +128,8 @@ def of_unfitted(
 ) -> Mispairing | None:
     """How a table was mispaired that could not be fitted, with names of its columns."""
     counted = np.ones(len(commands), dtype=np.bool_)
+    if not isinstance(prior, Prior | None):  # refused by the fit
+        return None
     with contextlib.suppress(ValueError):
         prior = prior or model.default_prior()
         table = _table(model, commands, measured, counted, prior)
@@ -151,8 +155,9 @@ def against(verdict: Verdict, found: Mispairing | None) -> Verdict:
     """The verdict, which no calibration of a mispaired table passes."""
     if found is None:
         return verdict
-    step = "correct the table, then identify again"
-    if found.mendable:
+    what = "columns" if found.kind == "columns" else "table"
+    step = f"correct the {what}, then identify again"
+    if found.mendable and found.kind != "columns":
         step += " (jaxcal identify --repair FILE writes it mended)"
     reasons = (found.reason, *verdict.reasons)
     return dataclasses.replace(verdict, good=False, reasons=reasons, next_step=step)
@@ -170,13 +175,13 @@ def _table(
 
     None where there is too little.
     """
-    known = prior.resolve(model)
-    free = known.free & (not held)
+    resolved = prior.resolve(model)
+    free = resolved.free & (not held)
     if len(commands) > _ROWS:
         commands, measured, counted = (
             commands[:_ROWS], measured[:_ROWS], counted[:_ROWS],
         )  # fmt: skip
-    flat = bool((known.precisions == 0.0).all() and free.all())
+    flat = bool((resolved.precisions == 0.0).all() and free.all())
     shared = model.multiplicity > 0 and flat
     # A measurement that is written twice counts once.
     rows = np.hstack([commands, measured])
@@ -192,14 +197,14 @@ def _table(
         half = np.roll(np.arange(len(commands)), len(commands) // 2)
         paired = commands[half]
         paired[:, model.sensed] = commands[:, model.sensed]
-        spread = np.sqrt((model.predict(paired, known.mean) ** 2).mean(axis=0))
+        spread = np.sqrt((model.predict(paired, resolved.mean) ** 2).mean(axis=0))
     spread = np.where(spread > 0.0, spread, 1.0)
     usual, scale = model.default_noise(), spread
     if usual is not None and usual.std is not None:
         scale = np.broadcast_to(np.asarray(usual.std, dtype=np.float64), spread.shape)
     return Table(
-        model, commands, measured, counted, known.mean, known.precisions, free,
-        known.mean, scale, spread / scale, shared,
+        model, commands, measured, counted, resolved.mean, resolved.precisions, free,
+        resolved.mean, scale, spread / scale, shared,
     )  # fmt: skip
 
 
@@ -211,7 +216,7 @@ def _found(
 ) -> Mispairing | None:
     """The mispairing of a table."""
     plain = fitted(table, as_it_is(table))
-    if _plainly_right(table, plain):
+    if (plain.rms <= _EXACT * table.width).all():
         return None
     fits = _alternatives(table, plain)
     if not any(_explains(plain, fit) for fit in fits):
@@ -251,29 +256,26 @@ def _found(
     )
 
 
-def _plainly_right(table: Table, plain: Fitted) -> bool:
+def _plainly_right(fit: Fit) -> bool:
     """Whether the fit tells neighbours apart, and leaves no row and no trend over.
 
     Rows that were mispaired are then off by far more than the others.
     """
-    noise = np.maximum(plain.noise, _EXACT * table.width)
-    if (plain.rms <= _EXACT * table.width).all():
+    off, used = fit.residuals, fit.loss_weights > 0.0
+    if not used.all():
+        return False
+    said = fit.predict(fit.commands)
+    rms = np.sqrt((off**2).mean(axis=0))
+    apart = np.sort(np.abs(said[1:] - said[:-1]), axis=0)[len(off) // 2 - 1]
+    if (rms <= _EXACT * apart).all():
         return True
-    rows = np.flatnonzero(table.counted)
-    if not plain.inside[rows].all():
+    if (apart < _APART * rms).any() or (np.abs(off) > _LARGE * rms).any():
         return False
-    at = dataclasses.replace(table, theta=plain.theta)
-    slopes, right = at.system(as_it_is(table), rows)
-    off = (right - slopes @ plain.solution).reshape(len(rows), -1)
-    said = (right - off.reshape(right.shape)).reshape(off.shape)
-    apart = np.median(np.abs(np.diff(said, axis=0)), axis=0)
-    if (apart < _APART * noise).any() or (np.abs(off) > _LARGE * noise).any():
-        return False
-    scores = off[..., None]
-    if table.shared:
-        scores = scores * slopes / np.sqrt((slopes**2).mean(axis=0))
+    moved = fit.commands - fit.commands.mean(axis=0)
+    factors = np.concatenate([np.ones((len(off), 1)), moved], axis=1)
+    scores = off[..., None] * factors[:, None]
     size = np.sqrt((scores**2).sum(axis=0))
-    return bool((np.abs(np.cumsum(scores, axis=0)) < _TREND * size).all())
+    return bool((np.abs(scores.cumsum(axis=0)) <= _TREND * size).all())
 
 
 def _few(fit: Fitted) -> bool:

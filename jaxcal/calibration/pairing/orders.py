@@ -84,8 +84,8 @@ def assigned(table: Table, fit: Fitted, rows: Rows) -> Rows:
     commands = match[rows]
     noise = np.maximum(fit.noise, 1e-7)
     off = table.measured[rows, None] / table.scale - predicted(table, fit)[commands]
-    own, others = linear_sum_assignment(((off / noise) ** 2).sum(axis=-1))
-    match[rows[own]] = commands[others]
+    reading, other = linear_sum_assignment(((off / noise) ** 2).sum(axis=-1))
+    match[rows[reading]] = commands[other]
     return match
 
 
@@ -125,7 +125,7 @@ def sorted_alone(table: Table, plain: Fitted) -> list[Fitted]:
             if side is table.measured:  # by chance noise is in no order
                 code = 5.0 * np.log(count)
             starts = starts or matched_anew(table, plain)
-            fits += [_matched(table, Hypothesis(kind, each, code)) for each in starts]
+            fits += [_matched(table, Hypothesis(kind, start, code)) for start in starts]
     return fits
 
 
@@ -169,7 +169,7 @@ def matched_anew(table: Table, fit: Fitted) -> list[Rows]:
         apart = ((white[:, None] - start) ** 2).sum(axis=-1)
         square, match, _ = refit(linear_sum_assignment(apart)[1])
         tried.append((square, match))
-    tried.sort(key=lambda each: each[0])
+    tried.sort(key=lambda pair: pair[0])
     best: list[tuple[float, Rows]] = []
     for square, match in tried[:_REFINED]:
         for _ in range(_ROUNDS):
@@ -178,7 +178,7 @@ def matched_anew(table: Table, fit: Fitted) -> list[Rows]:
                 break
             square, match = better, moved
         best.append((square, match))
-    return [match for _, match in sorted(best, key=lambda each: each[0])[:2]]
+    return [match for _, match in sorted(best, key=lambda pair: pair[0])[:2]]
 
 
 def _starts(factors: Array, white: Array, a: int, c: int) -> Iterator[Array]:

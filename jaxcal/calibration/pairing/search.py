@@ -51,7 +51,7 @@ class _Sums(NamedTuple):
     counts: Array  # (...)
 
     def at(self, rows: Any) -> _Sums:
-        """Of some of them."""
+        """Sums at some of the edges."""
         return _Sums(*(part[rows] for part in self))
 
     def plus(self, other: _Sums, sign: float = 1.0) -> _Sums:
@@ -83,8 +83,8 @@ class _Systems:
                 (self.read + self.of_commands[match]) * paired[..., None, None],
                 paired,
             )
-        found = [self._one(each) for each in match.reshape(-1, match.shape[-1])]
-        slopes, right = (np.stack(each) for each in zip(*found, strict=True))
+        systems = [self._one(rows) for rows in match.reshape(-1, match.shape[-1])]
+        slopes, right = (np.stack(parts) for parts in zip(*systems, strict=True))
         lead = match.shape[:-1]
         return (
             slopes.reshape(*lead, *slopes.shape[1:]),
@@ -99,7 +99,7 @@ class _Systems:
         return slopes, right
 
     def sums(self, match: Rows, edges: Rows) -> _Sums:
-        """Of matches (..., N), up to each of the edges (B,): (..., B, ...)."""
+        """Sums of matches (..., N) up to each of the edges (B,): (..., B, ...)."""
         slopes, right, paired = self.of(match)
         costs = np.where(paired | ~self.table.counted, 0.0, self.costs)
         products = np.swapaxes(slopes, -1, -2)
@@ -119,7 +119,7 @@ class _Systems:
         return _Sums(*total)
 
     def total(self, match: Rows) -> _Sums:
-        """Of all rows of matches (H, N)."""
+        """Sums over all rows of matches (H, N)."""
         slopes, right, paired = self.of(match)
         count, rows, a, r = slopes.shape
         flat = slopes.reshape(count, rows * a, r)
@@ -150,18 +150,18 @@ def ranked(table: Table) -> tuple[float, list[tuple[float, Hypothesis]]]:
     systems = _Systems(table)
     matches, names = _of_all_rows(table, systems.fast)
     scores = systems.evidence(systems.total(matches))
-    found = [
+    hypotheses = [
         (float(score) - code, Hypothesis(kind, match, code, starts))
         for score, match, (kind, code, starts) in zip(
             scores, matches, names, strict=True
         )
     ]
-    base, found = found[0][0], found[1:]
+    base, hypotheses = hypotheses[0][0], hypotheses[1:]
     if count >= 2 * _LEAST:
         paths = _paths(systems)
-        found += paths
-        found += _steps(systems)
-    return base, sorted(found, key=lambda each: -each[0])
+        hypotheses += paths
+        hypotheses += _steps(systems)
+    return base, sorted(hypotheses, key=lambda pair: -pair[0])
 
 
 def _of_all_rows(
@@ -207,7 +207,7 @@ def _paths(systems: _Systems) -> list[tuple[float, Hypothesis]]:
     code = _KINDS + np.log(12.0 * count)
     inner = np.arange(1, last)
     inner = inner[(edges[inner] >= _LEAST) & (count - edges[inner] >= 1)]
-    found: list[tuple[float, tuple[tuple[int, int], ...]]] = []
+    scored: list[tuple[float, tuple[tuple[int, int], ...]]] = []
     plain = of_shift.at(0)
     for index, by in enumerate(_SHIFTS[1:], 1):
         other = of_shift.at(index)
@@ -217,11 +217,11 @@ def _paths(systems: _Systems) -> list[tuple[float, Hypothesis]]:
             scores = systems.evidence(sums) - code
             best = int(scores.argmax())
             at = int(edges[inner[best]])
-            found.append((float(scores[best]), ((0, first), (at, then))))
-    found += _blocks(systems, of_shift, edges)
+            scored.append((float(scores[best]), ((0, first), (at, then))))
+    scored += _blocks(systems, of_shift, edges)
     return [
         (score, Hypothesis("path", path_match(count, path), _code(count, path), path))
-        for score, path in found
+        for score, path in scored
     ]
 
 
@@ -246,14 +246,14 @@ def _blocks(
         return []
     code = _KINDS + np.log(0.5 * count**2)
     plain = of_shift.at(0)
-    found: list[tuple[float, tuple[tuple[int, int], ...]]] = []
+    scored: list[tuple[float, tuple[tuple[int, int], ...]]] = []
     around = plain.at([last]).plus(plain.at(second).plus(plain.at(first), -1.0), -1.0)
     costs = np.append(0.0, np.cumsum(systems.costs * systems.table.counted))[edges]
     none = around._replace(costs=around.costs + costs[second] - costs[first])
     scores = systems.evidence(none) - code
     for best in np.argsort(-scores)[:2]:
         begin, end = int(edges[first[best]]), int(edges[second[best]])
-        found.append((float(scores[best]), ((0, 0), (begin, FOREIGN), (end, 0))))
+        scored.append((float(scores[best]), ((0, 0), (begin, FOREIGN), (end, 0))))
     # Shifted: about the best edges of a block that does not belong.
     near = np.argsort(-scores)[:60]
     for index, by in enumerate(_SHIFTS[1:], 1):
@@ -264,8 +264,8 @@ def _blocks(
         scores_here = systems.evidence(sums) - code - np.log(6.0)
         best = int(scores_here.argmax())
         begin, end = int(edges[first[near[best]]]), int(edges[second[near[best]]])
-        found.append((float(scores_here[best]), ((0, 0), (begin, by), (end, 0))))
-    return found
+        scored.append((float(scores_here[best]), ((0, 0), (begin, by), (end, 0))))
+    return scored
 
 
 def _steps(systems: _Systems) -> list[tuple[float, Hypothesis]]:
@@ -273,7 +273,7 @@ def _steps(systems: _Systems) -> list[tuple[float, Hypothesis]]:
     table, count = systems.table, len(systems.table.commands)
     if not (table.shared or table.free.any()):
         return []
-    found: list[tuple[float, Hypothesis]] = []
+    scored: list[tuple[float, Hypothesis]] = []
     after = np.arange(count)
     code = _KINDS + np.log(count)
     slopes, right, _ = systems.of(after[None])
@@ -300,8 +300,8 @@ def _steps(systems: _Systems) -> list[tuple[float, Hypothesis]]:
                 kind, after, code, ((0, 0), (int(edges[at]), 0)), None, more[at]
             ),
         )
-        found.append(best)
-    return found
+        scored.append(best)
+    return scored
 
 
 def _distinct(commands: Array) -> Rows:
@@ -313,8 +313,8 @@ def _distinct(commands: Array) -> Rows:
 def _with_columns(systems: _Systems, slopes: Array, right: Array, more: Array) -> Array:
     """(H,) evidence with columns (H, N, e) of each output besides."""
     table, (count, a, r), e = systems.table, slopes.shape, more.shape[-1]
-    each = more[:, :, None, :, None] * np.eye(a)[:, None, :]  # (H, N, a, e, a)
-    extra = each.reshape(len(more), count * a, e * a)
+    spread = more[:, :, None, :, None] * np.eye(a)[:, None, :]  # (H, N, a, e, a)
+    extra = spread.reshape(len(more), count * a, e * a)
     flat, aim = slopes.reshape(count * a, r), right.reshape(count * a, -1)
     counted = np.repeat(table.counted, a)[:, None]
     flat, aim, extra = flat * counted, aim * counted, extra * counted

@@ -30,8 +30,10 @@ def sentence(
     unit: str,
 ) -> str:
     noise = f"{in_words(fit.noise * table.scale)} {unit}".strip()
-    without = "with each apart" if fit.hypothesis.extra is not None else "without that"
-    return f"{what_is_wrong(table, fit, near, outputs, unit)}; {without} the noise is {noise}"
+    joined = fit.hypothesis.extra is not None
+    without = "with each apart" if joined else "without that"
+    text = what_is_wrong(table, fit, near, outputs, unit)
+    return f"{text}; {without} the noise is {noise}"
 
 
 def what_is_wrong(
@@ -109,7 +111,7 @@ def _path_words(
             where = f"up to row {end - 1}"
         rows = near.get(i, [])
         if len(rows) > 1:
-            where += f" (or {', '.join(str(row) for row in rows if row != start)})"
+            where += f" (or any from {rows[0]} to {rows[-1]})"
         if by == FOREIGN:
             parts.append(f"{where} the readings do not belong to these commands")
         else:

@@ -88,9 +88,9 @@ def conclude(
         "fit": {"good": bool(verdict.good), "reasons": list(verdict.reasons)},
     }  # fmt: skip
     reasons = recalibrate(summary, config.session.verify_limit_deg)
-    found = calibration.mispairing
-    if found is not None and found.reason not in reasons:
-        reasons.insert(0, found.reason)
+    mispairing = calibration.mispairing
+    if mispairing is not None and mispairing.reason not in reasons:
+        reasons.insert(0, mispairing.reason)
     notes |= {"verdict": {"good": not reasons, "reasons": reasons}}
     provenance = {**calibration.provenance, "notes": notes}
     return dataclasses.replace(calibration, provenance=provenance), summary
