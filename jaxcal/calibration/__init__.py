@@ -11,6 +11,15 @@ from jaxcal.calibration.budget import Budget, Source
 from jaxcal.calibration.calibration import Calibration
 from jaxcal.calibration.check import Check
 from jaxcal.calibration.identify import identify
+from jaxcal.calibration.pairing import Mispairing
 from jaxcal.models.verdict import Verdict
 
-__all__ = ["Budget", "Calibration", "Check", "Source", "Verdict", "identify"]
+__all__ = [
+    "Budget",
+    "Calibration",
+    "Check",
+    "Mispairing",
+    "Source",
+    "Verdict",
+    "identify",
+]
