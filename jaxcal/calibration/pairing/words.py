@@ -96,66 +96,6 @@ def _rows_late(by: int) -> str:
     return f"{rows} {late} (each belongs to the command {rows} {where})"
 
 
-def what_is_wrong(
-    table: Table,
-    fit: Fitted,
-    near: dict[int, list[int]],
-    outputs: Sequence[str],
-    unit: str,
-) -> str:
-    """The mispairing as a sentence; rows are counted from 0."""
-    hypothesis, count = fit.hypothesis, len(table.commands)
-    kind, starts = hypothesis.kind, hypothesis.starts
-    if hypothesis.change is not None:
-        return hypothesis.change.words
-    if kind == "shift":
-        return f"all readings are {_rows_late(starts[0][1])}"
-    if kind == "reversed":
-        return "the readings are in reverse order"
-    if kind == "halves":
-        return (
-            "the halves of the readings are exchanged: those from row "
-            f"{-starts[0][1] % count} on belong to the first commands"
-        )
-    if kind == "rotation" and abs(starts[0][1]) <= count // 3:
-        last = "first" if starts[0][1] > 0 else "last"
-        return (
-            f"all readings are {_rows_late(starts[0][1])}; the {last} "
-            f"{abs(starts[0][1])} stand at the other end"
-        )
-    if kind == "rotation":
-        return (
-            f"the readings from row {-starts[0][1] % count} on belong to the first "
-            "commands, those before to the last"
-        )
-    if kind == "commands sorted":
-        return "the commands are sorted and the readings are not"
-    if kind == "readings sorted":
-        return "the readings are sorted and the commands are not"
-    if kind == "exchanged":
-        rows = np.flatnonzero(hypothesis.match != np.arange(count))
-        return f"the readings of rows {', '.join(map(str, rows))} are exchanged"
-    if kind in ("offset", "parameters"):
-        another = "slope or offset"
-        if kind == "offset":
-            steps = (
-                fit.solution[-1] if table.shared else fit.solution[-table.outputs :, 0]
-            )
-            size = f"{in_words(steps * table.scale)} {unit}".strip()
-            another = f"offset, by {size}"
-        return (
-            f"rows of two sessions seem joined: from row {starts[1][0]} on the "
-            f"readings have another {another}"
-        )
-    return _path_words(starts, near, count)
-
-
-def _rows_late(by: int) -> str:
-    rows = "one row" if abs(by) == 1 else f"{abs(by)} rows"
-    where = "the command that far below" if by > 0 else "the command that far above"
-    return f"{rows} {'early' if by > 0 else 'late'} (each belongs to {where})"
-
-
 def _path_words(
     path: Sequence[tuple[int, int]], near: dict[int, list[int]], count: int
 ) -> str:
