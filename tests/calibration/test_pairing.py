@@ -10,6 +10,7 @@ import csv
 import re
 import warnings
 
+import contacts
 import numpy as np
 import pytest
 import ur5
@@ -18,7 +19,7 @@ import jaxcal
 from jaxcal.calibration.pairing.fit import fitted, log_evidence
 from jaxcal.calibration.pairing.table import Hypothesis, Table, shifted
 from jaxcal.commands.main import main
-from jaxcal.models import Affine, Linear
+from jaxcal.models import Affine, FromFunction, Linear
 
 MATRIX = np.array([[1.02, 0.05, -0.03], [0.04, 0.97, 0.06], [-0.02, 0.03, 1.01]])
 BIAS = np.array([0.4, -0.7, 0.2])
@@ -219,6 +220,26 @@ def test_a_real_arm(spoil, words):
     at = np.random.default_rng(2).choice(1000, 25, replace=False)
     found = _verdict(*spoil(joints[at], measured[at]), model=ur5.arm()).mispairing
     assert (found is None) if words is None else words in found.reason
+
+
+def test_contacts_that_an_arm_at_rest_would_fit_better_are_left_alone():
+    joints, sockets = contacts.load("dinova_1")["left"]
+    commands = np.column_stack([joints, sockets])
+    zeros = np.zeros((len(joints), 3))
+    found = _verdict(commands, zeros, model=contacts.arm("dinova_1")).mispairing
+    assert found is None
+
+
+def test_a_search_that_lost_its_way_on_a_sweep_is_no_shift_of_rows():
+    def peak(u, theta):
+        return theta[0] / theta[1] * np.exp(-0.5 * ((u - theta[2]) / theta[1]) ** 2)
+
+    u = np.linspace(400.0, 500.0, 35)[:, None]
+    y = peak(u, (1.55, 4.1, 451.5)) + 1e-3 * np.random.default_rng(0).normal(
+        size=(35, 1)
+    )
+    model = FromFunction(lambda one, theta: peak(one, theta), [1.0, 10.0, 500.0])
+    assert _verdict(u, y, model=model, loss="gaussian").mispairing is None
 
 
 def _write(path, u, y):

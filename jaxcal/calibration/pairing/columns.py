@@ -72,6 +72,8 @@ def _kinds_of_columns(
     tables = [(inputs, len(inputs), moved, False)]
     if not table.model.relative:
         tables.append((outputs, len(outputs), len(outputs), True))
+    # A machine that hardly moves has zero readings everywhere, as contacts.
+    units = _UNITS if table.measured.any() else {}
     changes: list[ColumnChange] = []
     for names, size, count, of_readings in tables:
         if of_readings and not table.measured.any():
@@ -86,7 +88,7 @@ def _kinds_of_columns(
             )
         ]
         for columns, words in single + (every if count > 1 else []):
-            for what, factor in {"has the other sign": -1.0, **_UNITS}.items():
+            for what, factor in {"has the other sign": -1.0, **units}.items():
                 if len(columns) > 1 and factor == -1.0:
                     continue
                 factors = tuple(factor if i in columns else 1.0 for i in range(size))

@@ -54,6 +54,7 @@ _TREND = 1.4  # of a sum of residuals, over the root of their squares
 _LEAST = 6  # rows
 _NAMED = 2  # other explanations
 _BLOCK = 4  # rows from elsewhere: fewer are outliers
+_SORTED = ("commands sorted", "readings sorted")  # kinds
 _ROWS = 20_000  # of more the first
 
 
@@ -222,6 +223,8 @@ def _found(
     if not any(_explains(plain, fit) for fit in fits):
         fits += changed_columns(table, plain, inputs, outputs)
     fits = [fit for fit in fits if np.isfinite(fit.evidence) and not _few(fit)]
+    if _lost_its_way(table, plain):
+        fits = [fit for fit in fits if fit.hypothesis.kind in _SORTED]
     if not fits:
         return None
     best = max(fits, key=lambda fit: fit.evidence)
@@ -276,6 +279,15 @@ def _plainly_right(fit: Fit) -> bool:
     scores = off[..., None] * factors[:, None]
     size = np.sqrt((scores**2).sum(axis=0))
     return bool((np.abs(scores.cumsum(axis=0)) <= _TREND * size).all())
+
+
+def _lost_its_way(table: Table, plain: Fitted) -> bool:
+    """Whether a search explains nothing of a sweep, which other parameters might."""
+    if table.shared or table.model.linear or not table.free.any():
+        return False
+    steps = np.sign(np.diff(table.commands, axis=0))
+    swept = (np.ptp(steps, axis=0) < 2.0) & steps.any(axis=0)
+    return bool(swept.any() and (plain.rms > 0.9 * table.width).all())
 
 
 def _few(fit: Fitted) -> bool:
