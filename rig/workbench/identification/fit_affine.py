@@ -20,6 +20,15 @@ def pairs(records: list[Record]) -> tuple[Array, Array]:
     return commands, np.array([r["measured_deg"] for r in records], dtype=np.float64)
 
 
+def fit_quietly(*measurements: Array, **options: Any) -> Any:
+    """``jaxcal.identify`` without its warning: the summary holds the verdict."""
+    import jaxcal
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return jaxcal.identify(*measurements, **options)
+
+
 def identify_affine(
     config: RigConfig,
     records: list[Record],
@@ -37,9 +46,7 @@ def identify_affine(
         zero_share: variance of the zero posture's mean over that of another's. It
             shifts every posture equally, so it adds to the variance of the bias.
     """
-    import jaxcal
-
-    fitted: Any = jaxcal.identify(
+    fitted = fit_quietly(
         *pairs(records),
         noise_std=noise_std,
         input_names=config.axis_names,
@@ -60,9 +67,7 @@ def mispaired(config: RigConfig, records: list[Record]) -> list[str]:
     """How readings and postures were mispaired, in the order in which they were
     measured; nothing where they belong together."""
     in_order = sorted(records, key=lambda record: record["seq"])
-    with warnings.catch_warnings():  # the verdict of a fit that is not kept
-        warnings.simplefilter("ignore", UserWarning)
-        found = identify_affine(config, in_order).mispairing
+    found = identify_affine(config, in_order).mispairing
     return [found.reason] if found else []
 
 
@@ -86,12 +91,10 @@ def uncertainty(
         noise_std_deg (m,), dof of an axis, basis, and ci95 (m, n + 1), half-widths of
         [A | b], which hold all of these at once (Bonferroni).
     """
-    import jaxcal
-
     everything, count = [*chosen, *held_out], len(chosen[0]["commanded_deg"]) + 1
     basis, dof = f"the fit of all {len(everything)} postures", len(everything) - count
     if dof:
-        noise = np.array(jaxcal.identify(*pairs(everything)).noise_std)
+        noise = np.array(fit_quietly(*pairs(everything)).noise_std)
     else:
         basis = "scatter of single readings only"
         dof = (chosen[0]["samples"] - 1) * len(chosen)

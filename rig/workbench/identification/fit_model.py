@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from rig.journal import Record
 from rig.model import DeviceModel
 from rig.readings.attitude import Array
 from rig.readings.geometry import geometry_of
-from rig.workbench.identification.fit_affine import spread
+from rig.workbench.identification.fit_affine import fit_quietly, spread
 from rig.workbench.outputs.messages import recalibrate
 
 WIDE = 1.96  # standard errors, of 95 %
@@ -32,20 +31,16 @@ def outputs(config: RigConfig, records: list[Record]) -> tuple[Array, Array]:
 
 def identify_model(config: RigConfig, model: DeviceModel, records: list[Record]) -> Any:
     """The parameters of the model from chosen postures: a ``jaxcal.Calibration``."""
-    import jaxcal
-
-    with warnings.catch_warnings():  # the verdict, which the summary holds
-        warnings.simplefilter("ignore", UserWarning)
-        return jaxcal.identify(
-            *outputs(config, records),
-            model=model.model,
-            prior=model.prior,
-            input_names=config.axis_names,
-            output_names=config.output_names,
-            command_unit=config.axis_unit,
-            measured_unit=config.output_unit,
-            accuracy=config.session.verify_limit_deg,
-        )
+    return fit_quietly(
+        *outputs(config, records),
+        model=model.model,
+        prior=model.prior,
+        input_names=config.axis_names,
+        output_names=config.output_names,
+        command_unit=config.axis_unit,
+        measured_unit=config.output_unit,
+        accuracy=config.session.verify_limit_deg,
+    )
 
 
 def held_out_errors(
