@@ -256,13 +256,16 @@ class Bus(Line):
                 if reply[0] & 0x7F != function:
                     other = reply[0]
                     raise BusError(f"unit {unit}: the reply is of function {other}")
+                refused = bool(reply[0] & 0x80)
+                if refused and (len(reply) != 2 or not reply[1]):
+                    raise BusError(f"unit {unit}: the refusal holds no code")
             except BusError:
                 self._resynchronise(unit, owed)
                 raise
-            code = reply[1] if reply[0] & 0x80 and len(reply) > 1 else 0
+            code = reply[1] if refused else 0
             if code not in GATEWAY_CODES:
                 self.silent.discard(unit)
-            if code:
+            if refused:
                 raise Rejected(unit, code, address)  # a refusal is a whole reply
             return reply[1:]
 

@@ -20,6 +20,7 @@ from harness import changed, fast_config, fast_text, simulator
 
 from rig.__main__ import main
 from rig.config import load_config
+from rig.config.settings import BusSettings
 from rig.core import stop as core_stop
 from rig.core.stop import stop_all
 from rig.drives.modbus import Bus, BusError, ModbusDrive
@@ -149,6 +150,7 @@ def test_a_connection_that_the_gateway_ended_is_opened_again_by_the_next_request
 HOLDS = """
 import sys, time
 from rig.config import load_config
+from rig.config.settings import BusSettings
 from rig.drives.modbus import Bus, ModbusDrive
 from rig.journal.lock import BusLock
 config = load_config(sys.argv[1])
@@ -368,3 +370,26 @@ def test_what_a_session_leaves_for_a_stop_says_the_echo(tmp_path):
     BusLock(config.bus).leave(config)
     armed = lock.read_armed(BusLock(config.bus).armed_path)
     assert armed["bus"]["echo"] is True
+
+
+def test_a_refusal_without_a_code_is_no_acknowledgement():
+    """Function 16 with the exception bit, and the words of an acknowledgement."""
+    listener = socket.create_server(("127.0.0.1", 0))
+
+    def answer():
+        connection, _ = listener.accept()
+        with connection:
+            request = connection.recv(64)
+            pdu = bytes([0x90]) + request[8:12]
+            head = request[:4] + (len(pdu) + 1).to_bytes(2, "big") + request[6:7]
+            connection.sendall(head + pdu)
+            connection.recv(64)
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    port = listener.getsockname()[1]
+    with Bus(BusSettings(transport="tcp", host="127.0.0.1", port=port)) as bus:
+        with pytest.raises(BusError, match="the refusal holds no code"):
+            bus.write(10, 0x00D3, 16, [1, 2])
+    thread.join()
+    listener.close()

@@ -53,6 +53,7 @@ _APART, _LARGE = 8.0, 3.0  # times the residuals: neighbours, a row
 _TREND = 1.4  # of a sum of residuals, over the root of their squares
 _LEAST = 6  # rows
 _NAMED = 2  # other explanations
+_READINGS = 1.5  # for each parameter; of fewer another machine explains as much
 _BLOCK = 4  # rows from elsewhere: fewer are outliers
 _SORTED = ("commands sorted", "readings sorted")  # kinds
 _ROWS = 20_000  # of more the first
@@ -188,7 +189,9 @@ def _table(
     rows = np.hstack([commands, measured])
     first = np.unique(rows, axis=0, return_index=True)[1]
     counted = counted & np.isin(np.arange(len(rows)), first)
-    if counted.sum() < _LEAST:
+    readings = counted.sum() * measured.shape[1]
+    few = not model.linear and readings < _READINGS * free.sum()
+    if counted.sum() < _LEAST or few:
         return None
     if shared:
         commands = commands - commands.mean(axis=0)
