@@ -19,6 +19,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,32 +110,24 @@ def ur5(rng: np.random.Generator, count: int) -> Case:
     )
 
 
+def _of_poses(arm: Any, table: Array, rng: np.random.Generator, count: int) -> Case:
+    """A case of an arm whose readings are zero where the pose is as it should be."""
+    drawn = table[rng.choice(len(table), count + 20, replace=False)]
+    zeros = np.zeros((len(drawn), 6))
+    rest = drawn[count:], zeros[count:]
+    return Case(drawn[:count], zeros[:count], {"model": arm}, 1e-3, rest)
+
+
 def fr3(rng: np.random.Generator, count: int) -> Case:
     import fr3 as real
 
-    table = real.load()[rng.choice(114, count + 20, replace=False)]
-    y = np.zeros((len(table), 6))
-    return Case(
-        table[:count],
-        y[:count],
-        {"model": real.arm()},
-        1e-3,
-        (table[count:], y[count:]),
-    )
+    return _of_poses(real.arm(), real.load(), rng, count)
 
 
 def positioner(rng: np.random.Generator, count: int) -> Case:
     import positioner as real
 
-    table = real.load()[rng.choice(205, count + 20, replace=False)]
-    y = np.zeros((len(table), 6))
-    return Case(
-        table[:count],
-        y[:count],
-        {"model": real.arm()},
-        1e-3,
-        (table[count:], y[count:]),
-    )
+    return _of_poses(real.arm(), real.load(), rng, count)
 
 
 MODELS: dict[str, Callable[[np.random.Generator, int], Case]] = {

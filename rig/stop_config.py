@@ -110,7 +110,7 @@ def _read(
         unit = int(_number(_near(row, "unit"), 0, 1, 247, "unit", axis_faults))
         try:
             drive_map = _map_of(row, folder, axis_faults)
-        except Exception as error:  # of the system, or of a map that nobody foresaw
+        except Exception as error:  # any fault of a map costs its own axis alone
             drive_map = None
             axis_faults.append(f"its map cannot be read: {error}")
         faults += [f"{name}: {fault}" for fault in axis_faults]

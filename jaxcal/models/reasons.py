@@ -39,7 +39,7 @@ class Reason(NamedTuple):
     remedy: str
 
 
-# -- readings that nobody measured -----------------------------------------------------
+# -- readings that were not measured ---------------------------------------------------
 
 
 def never_measured(fit: Fit) -> Reason | None:

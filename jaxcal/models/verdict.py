@@ -76,9 +76,10 @@ def left_out(fit: Fit) -> Array:
 
 
 def verdict(fit: Fit) -> Verdict:
-    """Good where no rule speaks against the fit, nor its inverse is refused.
+    """Good if no rule speaks against the fit and its inverse is not refused.
 
-    Readings that nobody measured are the only reason, what follows from them is none.
+    Where readings were not measured, that is the only reason given: the others would
+    follow from it.
     """
     first = never_measured(fit) or computed(fit)
     reasons = [first] if first else [reason for rule in RULES if (reason := rule(fit))]
