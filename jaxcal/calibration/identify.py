@@ -158,7 +158,9 @@ def identify(
         about["provenance"]["prior"] = "stated"
     calibration = Calibration(**fields, **about)
     if not calibration.verdict.good and not _exact(calibration):
-        warnings.warn(CalibrationWarning(str(calibration.verdict)), stacklevel=2)
+        warning = CalibrationWarning(str(calibration.verdict))
+        warning.new = True
+        warnings.warn(warning, stacklevel=2)
     return calibration
 
 

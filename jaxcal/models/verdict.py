@@ -55,11 +55,11 @@ class CalibrationWarning(UserWarning):
     none after ``warnings.simplefilter("ignore", jaxcal.CalibrationWarning)``.
     """
 
+    new = False  # set where it is issued: Python has not looked at its text yet
+
     def __str__(self) -> str:
-        # Python keeps the text that it is first told, and shows no second of that text.
-        text = super().__str__() if vars(self).get("told") else "not good"
-        self.told = True
-        return text
+        # Python shows a text once for each line: at its first look all are the same.
+        return "not good" if vars(self).pop("new", False) else super().__str__()
 
 
 def left_out(fit: Fit) -> Array:

@@ -6,6 +6,7 @@ The judges are known truths: readings that follow the commands, or do not.
 from __future__ import annotations
 
 import dataclasses
+import pickle
 import subprocess
 import sys
 import warnings
@@ -251,3 +252,12 @@ def test_a_program_warns_once_and_can_be_told_to_be_quiet():
     )
     assert run.stderr.count("CalibrationWarning") == 1
     assert run.stderr.count("explains nothing") == 1
+
+
+def test_the_text_of_a_warning_is_the_whole_verdict_wherever_it_is_read():
+    rng = np.random.default_rng(0)
+    with pytest.warns(jaxcal.CalibrationWarning, match="explains nothing") as given:
+        found = jaxcal.identify(rng.normal(size=(20, 2)), rng.normal(size=(20, 2)))
+    texts = [str(given[0].message), str(pickle.loads(pickle.dumps(given[0].message)))]
+    assert texts == [str(found.verdict)] * 2
+    assert type(texts[0]) is str
