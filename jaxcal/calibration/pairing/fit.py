@@ -105,8 +105,9 @@ def fitted(table: Table, hypothesis: Hypothesis, theta: Array | None = None) -> 
 def _searched(table: Table, hypothesis: Hypothesis, rows: Rows) -> Array:
     """(p,) the parameters of a nonlinear model, by robust Gauss-Newton steps."""
     cost = _misfit(table, hypothesis, rows, table.theta)
+    system, sound = table.system(hypothesis, rows), table
     for _ in range(_ROUNDS):
-        solution = _robust(table, *table.system(hypothesis, rows))[0]
+        solution = _robust(table, *system)[0]
         aim = table.mean.copy()
         aim[table.free] += solution[:, 0]
         before = cost
@@ -120,9 +121,14 @@ def _searched(table: Table, hypothesis: Hypothesis, rows: Rows) -> Array:
         else:
             break
         table = dataclasses.replace(table, theta=theta)
+        try:
+            system = table.system(hypothesis, rows)
+        except ValueError:  # no derivative there
+            break
+        sound = table
         if before - cost < 1e-3:
             break
-    return table.theta
+    return sound.theta
 
 
 def _misfit(table: Table, hypothesis: Hypothesis, rows: Rows, theta: Array) -> float:

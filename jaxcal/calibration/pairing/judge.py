@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -28,8 +29,10 @@ from jaxcal.calibration.pairing.search import ranked
 from jaxcal.calibration.pairing.table import (
     FOREIGN,
     ColumnChange,
+    Hypothesis,
     Table,
     as_it_is,
+    path_match,
 )
 from jaxcal.calibration.pairing.words import sentence, what_is_wrong
 from jaxcal.models.model import Model
@@ -49,12 +52,13 @@ _AS_GOOD = 3.0  # log of the odds within which another kind is named too
 _TRIED = 6  # hypotheses that are fitted one by one
 _WORTH = 12.0  # log of the odds: of those that are so much worse at first, none
 _EXACT = 1e-6  # of the spread: readings so near a fit have nothing to explain
-_APART, _LARGE = 8.0, 3.0  # times the residuals: neighbours, a row
+_NEXT, _LARGE = 8.0, 3.0  # times the residuals: neighbours, a row
 _TREND = 1.4  # of a sum of residuals, over the root of their squares
 _LEAST = 6  # rows
 _NAMED = 2  # other explanations
 _READINGS = 1.5  # for each parameter; of fewer another machine explains as much
-_BLOCK = 4  # rows from elsewhere: fewer are outliers
+_CHANCE = 0.02  # that so many outliers stand so near one another
+_APART = "apart"  # kind: outliers that are one block
 _SORTED = ("commands sorted", "readings sorted")  # kinds
 _ROWS = 20_000  # of more the first
 
@@ -231,9 +235,11 @@ def _found(
     if not fits:
         return None
     best = max(fits, key=lambda fit: fit.evidence)
+    if best.evidence - plain.evidence <= _SURE:
+        best = next((fit for fit in fits if fit.hypothesis.kind == _APART), best)
     if not _better(plain, best):
         return None
-    if not _stands_apart(plain, best):
+    if best.hypothesis.kind != _APART:
         for benign in _benign(table, plain, best):
             if best.evidence - benign.evidence < _SURE:
                 return None
@@ -242,9 +248,13 @@ def _found(
                 return None
     near: dict[int, list[int]] = {}
     if best.hypothesis.kind == "path":
-        at_best, near = polished(table, best)
-        best, near = (best, {}) if _few(at_best) else (at_best, near)
+        with contextlib.suppress(ValueError):
+            at_best, rows_near = polished(table, best)
+            best, near = (best, {}) if _few(at_best) else (at_best, rows_near)
     reason = sentence(table, best, near, outputs, unit)
+    match = best.hypothesis.match
+    if best.hypothesis.kind == _APART:
+        match = path_match(len(match), best.hypothesis.starts)
     for fit in top(fits, len(fits)):
         other = what_is_wrong(table, fit, {}, outputs, unit)
         kind = (fit.hypothesis.kind, fit.hypothesis.change)
@@ -256,7 +266,7 @@ def _found(
         best.hypothesis.kind,
         reason,
         best.noise * table.scale,
-        best.hypothesis.match,
+        match,
         best.hypothesis.change,
         table.model.sensed,
     )
@@ -275,7 +285,7 @@ def _plainly_right(fit: Fit) -> bool:
     apart = np.sort(np.abs(said[1:] - said[:-1]), axis=0)[len(off) // 2 - 1]
     if (rms <= _EXACT * apart).all():
         return True
-    if (apart < _APART * rms).any() or (np.abs(off) > _LARGE * rms).any():
+    if (apart < _NEXT * rms).any() or (np.abs(off) > _LARGE * rms).any():
         return False
     moved = fit.commands - fit.commands.mean(axis=0)
     factors = np.concatenate([np.ones((len(off), 1)), moved], axis=1)
@@ -295,23 +305,49 @@ def _lost_its_way(table: Table, plain: Fitted) -> bool:
 
 def _few(fit: Fitted) -> bool:
     """Whether a hypothesis is of so few rows from elsewhere that they are outliers."""
-    path = fit.hypothesis.starts
-    ends = [start for start, _ in (*path[1:], (len(fit.inside), 0))]
+    path, count = fit.hypothesis.starts, len(fit.inside)
+    ends = [start for start, _ in (*path[1:], (count, 0))]
     return bool(path) and any(
-        by == FOREIGN and end - start < _BLOCK
+        by == FOREIGN and _chance(end - start, end - start, count) > _CHANCE
         for (start, by), end in zip(path, ends, strict=True)
     )
 
 
-def _stands_apart(plain: Fitted, best: Fitted) -> bool:
-    """Whether the outliers of a table are one block of rows, as those of none are."""
-    path = best.hypothesis.starts
-    if len(path) != 3 or path[1][1] != FOREIGN:
-        return False
-    block = np.arange(path[1][0], path[2][0])
-    outliers = np.flatnonzero(~plain.inside)
-    most = len(block) + 1  # of outliers, one of which may stand elsewhere
-    return bool(len(outliers) <= most and np.isin(block, outliers).sum() >= _BLOCK)
+def _chance(outliers: int, width: int, count: int) -> float:
+    """That so many outliers among ``count`` rows stand within so many rows."""
+    if outliers < 2:
+        return 1.0
+    placed = sum(
+        (count - wide + 1) * math.comb(wide - 2, outliers - 2)
+        for wide in range(outliers, width + 1)
+    )
+    return placed / math.comb(count, outliers)
+
+
+def _apart(table: Table, plain: Fitted) -> list[Fitted]:
+    """Outliers that are one block of rows, as those of none are.
+
+    A reading from elsewhere may agree with its command by chance, and one outlier may
+    stand apart.
+    """
+    count = len(table.commands)
+    outliers = np.flatnonzero(~plain.inside & table.counted)
+    for rows in (outliers, outliers[1:], outliers[:-1]):
+        if len(rows) < 3:
+            continue
+        start, end = int(rows[0]), int(rows[-1]) + 1
+        if (
+            start == 0
+            or end == count
+            or _chance(len(rows), end - start, count) > _CHANCE
+        ):
+            continue
+        path = ((0, 0), (start, FOREIGN), (end, 0))
+        code = math.log(0.5 * count**2)
+        match = np.arange(count)
+        match[rows] = -1
+        return [fitted(table, Hypothesis(_APART, match, code, path), plain.theta)]
+    return []
 
 
 def _better(fit: Fitted, best: Fitted) -> bool:
@@ -321,7 +357,7 @@ def _better(fit: Fitted, best: Fitted) -> bool:
 
 def _explains(plain: Fitted, fit: Fitted) -> bool:
     """Whether nothing is left to explain."""
-    sure = fit.evidence - plain.evidence > _SURE or _stands_apart(plain, fit)
+    sure = fit.evidence - plain.evidence > _SURE or fit.hypothesis.kind == _APART
     return sure and bool((fit.rms < 0.1 * plain.rms).any())
 
 
@@ -330,17 +366,24 @@ def _alternatives(table: Table, plain: Fitted) -> list[Fitted]:
     tables = [table]
     if not (table.shared or table.model.linear) and table.free.any():
         at_fit = dataclasses.replace(table, theta=plain.theta)
-        tables = [*places(table), at_fit] if table.levels == 1 else [table, at_fit]
+        expected = [dataclasses.replace(table, theta=table.mean)]
+        tables = [*(places(table) if table.levels == 1 else expected), at_fit]
     fits: list[Fitted] = []
     for one in tables:
         if any(_explains(plain, fit) for fit in fits):
             break
-        base, hypotheses = ranked(one)
-        worth = [h for score, h in hypotheses[:_TRIED] if score > base - _WORTH]
-        fits += fits_of(one, worth)
+        with contextlib.suppress(ValueError):  # parameters that predict nothing there
+            base, hypotheses = ranked(one)
+            worth = [h for score, h in hypotheses[:_TRIED] if score > base - _WORTH]
+            fits += fits_of(one, worth)
     paths = [fit for fit in fits if fit.hypothesis.kind == "path"]
-    fits += [polished(table, fit)[0] for fit in top(paths, 2)]
-    return fits + exchanged(table, plain) + sorted_alone(table, plain)
+    for path in top(paths, 2):
+        with contextlib.suppress(ValueError):
+            fits.append(polished(table, path)[0])
+    for search in (_apart, exchanged, sorted_alone):
+        with contextlib.suppress(ValueError):
+            fits += search(table, plain)
+    return fits
 
 
 def _benign(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
@@ -364,11 +407,10 @@ def _benign(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
             for knot in np.quantile(column, np.linspace(0.1, 0.9, 9)):
                 extras.append(np.maximum(column - knot, 0.0)[:, None])
     at = dataclasses.replace(table, theta=plain.theta)
-    fits = [plain]
-    fits += [fitted(at, as_it_is(table, extra)) for extra in extras]
+    fits = [plain, *fits_of(at, [as_it_is(table, extra) for extra in extras])]
     if not table.free.any():  # a machine that changed since it was calibrated
         ones = np.ones((count, 1))
         for more in (ones, np.hstack([ones, commands])):
             code = more.shape[1] * float(np.log(table.width).sum())
-            fits.append(fitted(at, as_it_is(table, more, code)))
+            fits += fits_of(at, [as_it_is(table, more, code)])
     return fits

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,10 @@ __all__ = ["exchanged", "polished", "sorted_alone"]
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
-_STARTS, _REFINED, _ROUNDS = 60, 30, 12  # of a search for an order that was lost
+_MOST_ROWS = 150  # of a table whose lost order is looked for
+_STARTS, _REFINED, _ROUNDS = 12_000, 8, 12  # of that search: rows times starts, ...
+_SOLVED = 0.003  # share of the squares that the right order leaves
+_FAR = 1e9  # noises: what a model cannot predict
 _TURNS = 6  # of assigning readings and fitting
 
 
@@ -84,7 +86,8 @@ def assigned(table: Table, fit: Fitted, rows: Rows) -> Rows:
     commands = match[rows]
     noise = np.maximum(fit.noise, 1e-7)
     off = table.measured[rows, None] / table.scale - predicted(table, fit)[commands]
-    reading, other = linear_sum_assignment(((off / noise) ** 2).sum(axis=-1))
+    apart = np.minimum(np.nan_to_num(off / noise, nan=_FAR), _FAR) ** 2
+    reading, other = linear_sum_assignment(apart.sum(axis=-1))
     match[rows[reading]] = commands[other]
     return match
 
@@ -109,29 +112,39 @@ def sorted_alone(table: Table, plain: Fitted) -> list[Fitted]:
     count = len(table.commands)
     sensed = len(np.arange(table.commands.shape[1])[table.model.sensed])
     poor = (plain.rms > 0.3 * table.width).any()
-    if sensed or not poor or count > 150:
+    if sensed or not poor or count > _MOST_ROWS:
         return []
-    fits: list[Fitted] = []
-    starts: list[Rows] = []
-    for side, kind in (
-        (table.commands, "commands sorted"),
-        (table.measured, "readings sorted"),
-    ):
-        for column in side.T:
-            way = np.sign(np.diff(column))
-            if not (np.ptp(way) < 2 and np.abs(way).sum() > 0.7 * count):
-                continue
-            code = 2.3 + float(np.log(np.arange(1, count + 1)).sum())
-            if side is table.measured:  # by chance noise is in no order
-                code = 5.0 * np.log(count)
-            starts = starts or matched_anew(table, plain)
-            fits += [_matched(table, Hypothesis(kind, start, code)) for start in starts]
-    return fits
+    kinds = []
+    if _in_order(table.commands, 0.1):  # as levels, of which many rows have one
+        code = 2.3 + float(np.log(np.arange(1, count + 1)).sum())
+        kinds.append(("commands sorted", code))
+    if _in_order(table.measured, 0.7):  # by chance noise is in no order
+        kinds.append(("readings sorted", 5.0 * np.log(count)))
+    if not kinds:
+        return []
+    expected = dataclasses.replace(table, theta=table.mean)
+    fits = [_matched(table, match) for match in matched_anew(expected, plain)]
+    return [
+        fit._replace(
+            hypothesis=dataclasses.replace(fit.hypothesis, kind=kind, code=code),
+            evidence=fit.evidence - code,
+        )
+        for kind, code in kinds
+        for fit in fits
+    ]
 
 
-def _matched(table: Table, hypothesis: Hypothesis) -> Fitted:
+def _in_order(side: Array, share: float) -> bool:
+    """Whether a column never falls, or never rises, and moves at enough rows."""
+    way = np.sign(np.diff(side, axis=0))
+    moves = np.abs(way).sum(axis=0) >= share * len(side)
+    return bool((moves & (np.ptp(way, axis=0) < 2)).any())
+
+
+def _matched(table: Table, match: Rows) -> Fitted:
     """An assignment that is refined in turn with its fit."""
-    fit, every = fitted(table, hypothesis), np.arange(len(table.commands))
+    hypothesis, every = Hypothesis("sorted", match), np.arange(len(match))
+    fit = fitted(table, hypothesis)
     for _ in range(_TURNS):
         match = assigned(table, fit, every)
         if (match == fit.hypothesis.match).all():
@@ -143,64 +156,70 @@ def _matched(table: Table, hypothesis: Hypothesis) -> Fitted:
 def matched_anew(table: Table, fit: Fitted) -> list[Rows]:
     """Matches (N,) by which readings that lost their order fit some parameters best.
 
-    Assigned and fitted in turn, from several starts: outputs that follow the commands,
-    each by itself, one output that follows one, and any.
+    One output alone is matched by sorting, for many parameters at once: predictions in
+    their order take the readings in theirs, least squares give the next predictions.
+    The best such matches are refined with all outputs by assignment.
     """
-    every = np.arange(len(table.commands))
-    if not (table.shared or table.model.linear) or not table.free.any():
-        return [assigned(table, fit, every)]
     from scipy.optimize import linear_sum_assignment
 
+    every = np.arange(len(table.commands))
+    if not table.free.any():
+        return [assigned(table, fit, every)]
     factors, right = table.system(as_it_is(table), every)
-    read, (_, a, r), c = right.reshape(len(every), -1), factors.shape, right.shape[-1]
-    white = (read - read.mean(axis=0)) / (read.std(axis=0) + 1e-300)
-
-    def refit(match: Rows) -> tuple[float, Rows, Array]:
-        """Square of a match refitted, the next one, and what it predicts."""
-        flat = factors[match].reshape(-1, r)
-        slopes = np.linalg.lstsq(flat, right.reshape(len(flat), c))[0]
-        off = (factors @ slopes).reshape(read.shape)
-        apart = ((read[:, None] - off) ** 2).sum(axis=-1)
-        moved = linear_sum_assignment(apart)[1]
-        return float(apart[every, moved].sum()), moved, off
-
-    tried: list[tuple[float, Rows]] = []
-    for start in _starts(factors, white, a, c):
-        apart = ((white[:, None] - start) ** 2).sum(axis=-1)
-        square, match, _ = refit(linear_sum_assignment(apart)[1])
-        tried.append((square, match))
-    tried.sort(key=lambda pair: pair[0])
-    best: list[tuple[float, Rows]] = []
-    for square, match in tried[:_REFINED]:
-        for _ in range(_ROUNDS):
-            better, moved, _ = refit(match)
-            if not better < square:
-                break
-            square, match = better, moved
-        best.append((square, match))
-    return [match for _, match in sorted(best, key=lambda pair: pair[0])[:2]]
+    (count, a, r), c = factors.shape, right.shape[-1]
+    read = (table.measured / table.scale).reshape(count, -1)
+    fixed = read - right.reshape(count, -1)  # of predictions, by nothing that is free
+    flat = factors.reshape(count * a, r)
+    inverse = np.linalg.pinv(flat)
+    middle = read.mean(axis=0)  # of both, so that squares keep their digits
+    read, fixed = read - middle, fixed - middle
+    all_of_it = (read**2).sum()
+    tried: dict[bytes, tuple[float, Rows]] = {}
+    for k in range(read.shape[1]):
+        for match in _sorted_matches(factors[:, k % a], fixed[:, k], read[:, k]):
+            square = np.inf
+            for _ in range(_ROUNDS):
+                aim = (read[np.argsort(match)] - fixed).reshape(count * a, c)
+                said = fixed + (flat @ (inverse @ aim)).reshape(count, -1)
+                apart = (said**2).sum(axis=1) - 2.0 * read @ said.T
+                better = float(apart[every, match].sum() + all_of_it)
+                if not better < square:
+                    break
+                square, match = better, linear_sum_assignment(apart)[1]
+            tried[match.tobytes()] = square, match
+            if square < _SOLVED * all_of_it:
+                return [match]
+    best = sorted(tried.values(), key=lambda pair: pair[0])[:2]
+    return [match for _, match in best]
 
 
-def _starts(factors: Array, white: Array, a: int, c: int) -> Iterator[Array]:
-    """(N, q) readings, of unit size, by parameters that may be right.
+def _sorted_matches(factors: Array, fixed: Array, read: Array) -> Rows:
+    """(K, N) matches of one output's readings (N,) that fit it best.
 
-    The covariance of readings does not depend on how they are paired, so commands and
-    readings of unit covariance differ by a turn alone.
+    Args:
+        factors: (N, r) of the commands.
+        fixed: (N,) what is predicted besides.
+        read: (N,) readings.
     """
-    rng, count = np.random.default_rng(0), len(white)
-    for _ in range(_STARTS):
-        off = (factors @ rng.normal(size=(factors.shape[-1], c))).reshape(count, -1)
-        yield (off - off.mean(axis=0)) / (off.std(axis=0) + 1e-300)
-    if a > 1:  # outputs that share no regressor
-        return
-    commands = factors[:, 0, :-1] - factors[:, 0, :-1].mean(axis=0)
-    n = commands.shape[1]
-    size = commands.std(axis=0) + 1e-300
-    for sign in (1.0, -1.0):  # outputs that follow the commands, each its own
-        yield sign * (commands / size) @ np.eye(n, c)
-    unit = np.linalg.svd(commands, full_matrices=False)[0] * np.sqrt(count)
-    _, scale, axes = np.linalg.svd(white, full_matrices=False)
-    shape = (scale[:, None] / np.sqrt(count)) * axes  # (c, c) of unit readings
-    for _ in range(_STARTS):
-        turn = np.linalg.qr(rng.normal(size=(max(n, c), max(n, c))))[0]
-        yield unit @ turn[: unit.shape[1], : len(shape)] @ shape
+    count = len(read)
+    axes = np.linalg.svd(factors - factors.mean(axis=0), full_matrices=False)[0]
+    into = factors @ np.linalg.pinv(factors)
+    starts = max(_STARTS // count, 60)
+    turns = np.random.default_rng(0).normal(size=(starts, axes.shape[1]))
+    size = read.std() * np.sqrt(count)
+    if fixed.any():  # parameters near those that are expected
+        size *= np.linspace(0.0, 1.0, starts)[:, None] ** 2
+    said = fixed + size * turns @ axes.T / np.sqrt(axes.shape[1])
+    lines, ordered = np.arange(starts)[:, None], np.sort(read)
+    aim = np.empty_like(said)
+    for _ in range(_ROUNDS):
+        aim[lines, np.argsort(said, axis=1)] = ordered
+        said = fixed + (aim - fixed) @ into
+    squares = ((aim - said) ** 2).sum(axis=1)
+    ranks = np.argsort(np.argsort(aim[np.argsort(squares)], axis=1), axis=1)
+    _, first = np.unique(ranks, axis=0, return_index=True)
+    best = ranks[np.sort(first)[:_REFINED]]
+    matches = np.empty_like(best)  # of the reading of a rank, its command
+    by_rank = np.argsort(best, axis=1)
+    matches[:, np.argsort(read, kind="stable")] = by_rank
+    return matches

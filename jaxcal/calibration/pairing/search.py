@@ -131,7 +131,7 @@ class _Systems:
             turned @ aim,
             (aim**2).sum(axis=1),
             costs.sum(axis=1),
-            paired.sum(axis=1),
+            paired.sum(axis=1, dtype=np.float64),
         )
 
     def evidence(self, sums: _Sums, extra: int = 0) -> Array:
