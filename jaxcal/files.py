@@ -6,10 +6,14 @@ import contextlib
 import os
 import pathlib
 import secrets
-from collections.abc import Iterator
-from typing import IO
+import sys
+from collections.abc import Iterator, Mapping
+from typing import IO, Any
 
-__all__ = ["atomic_write", "require_writable_folder", "write_text"]
+__all__ = ["atomic_write", "require_kept", "require_writable_folder", "write_text"]
+
+_WRITTEN = {"out", "servos_out", "picture", "json"}  # arguments that are files
+_RECORDS = {".json", ".jsonl", ".toml", ".csv"}
 
 
 @contextlib.contextmanager
@@ -90,3 +94,42 @@ def require_writable_folder(folder: str | os.PathLike[str]) -> None:
         raise PermissionError(
             f"cannot write in {place}: {error.strerror or error}"
         ) from None
+
+
+def require_kept(given: Mapping[str, Any]) -> None:
+    """Refuse arguments that would write over a file they read, by any path to it.
+
+    Raises:
+        ValueError: naming the option and the file.
+    """
+    written = {name: given.get(name) for name in _WRITTEN}
+    if folder := given.get("report"):
+        pages = ("index.html", "verdict.json", "calibration.json")
+        written |= {f"report {page}": os.path.join(folder, page) for page in pages}
+    for option, path in written.items():
+        if not isinstance(path, str | pathlib.Path) or given.get("overwrite"):
+            continue
+        for name in given.keys() - _WRITTEN:
+            values = given[name]
+            values = values if isinstance(values, list | tuple) else [values]
+            if any(_same_file(path, value) for value in values):
+                raise ValueError(
+                    f"--{option.replace('_', '-')}: {path} is what is read "
+                    f"({name.replace('_', '-')}); write to another file"
+                )
+
+
+def _same_file(path: Any, value: Any) -> bool:
+    """Whether what is written is what is read, or a file of the folder that is."""
+    try:
+        if value == "-":
+            return os.path.samestat(os.stat(path), os.fstat(sys.stdin.fileno()))
+        if not isinstance(value, str | pathlib.Path):
+            return False
+        if os.path.isdir(value) and os.path.isfile(path):  # of a folder its records
+            if pathlib.PurePath(path).suffix not in _RECORDS:
+                return False
+            path = os.path.dirname(os.path.abspath(path))
+        return os.path.samefile(path, value)
+    except (OSError, ValueError):
+        return False

@@ -28,6 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return stopping.main(argv[1:])
     from jaxcal.arguments import values_of
     from jaxcal.extras import install
+    from jaxcal.files import require_kept
     from rig.commands import make_parser
     from rig.faults import (
         EXIT_BAD_INPUT,
@@ -45,6 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 raise ModuleNotFoundError(
                     f"{command} needs {name}, which is not installed: {install('rig')}"
                 )
+        require_kept(vars(args))
         code = args.function(**values_of(args))
         return code
     except KeyboardInterrupt:

@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 from jaxcal.arguments import Parser, refused, several, told, typed_line, values_of
-from jaxcal.commands.tables import require_kept
 from jaxcal.extras import MissingExtraError, needs
-from jaxcal.files import require_writable_folder, write_text
+from jaxcal.files import require_kept, require_writable_folder, write_text
 
 if TYPE_CHECKING:
     from jaxcal.evaluation.dataset import Dataset

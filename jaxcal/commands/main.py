@@ -13,8 +13,9 @@ from typing import Annotated
 
 from jaxcal.arguments import Parser, refused, told, values_of
 from jaxcal.checks import aligned
-from jaxcal.commands.tables import require_kept, write_json
+from jaxcal.commands.tables import write_json
 from jaxcal.extras import MissingExtraError, install
+from jaxcal.files import require_kept
 
 __all__ = ["COMMANDS", "main"]
 

@@ -6,10 +6,9 @@ import csv
 import dataclasses
 import io
 import json
-import os
 import pathlib
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -19,12 +18,9 @@ from jaxcal.files import write_text
 __all__ = [
     "Output",
     "TablePath",
-    "require_kept",
     "write_json",
     "write_rows",
 ]
-
-_WRITTEN = {"out", "servos_out", "picture", "json"}  # arguments that are files
 
 TablePath = Annotated[str, "CSV, or - (standard input)"]
 
@@ -62,38 +58,6 @@ class Output:
         else:
             return False
         return True
-
-
-def require_kept(given: Mapping[str, Any]) -> None:
-    """Refuse arguments that would write over a file they read, by any path to it.
-
-    Raises:
-        ValueError: naming the option and the file.
-    """
-    written = {name: given.get(name) for name in _WRITTEN}
-    if folder := given.get("report"):
-        pages = ("index.html", "verdict.json", "calibration.json")
-        written |= {f"report {page}": os.path.join(folder, page) for page in pages}
-    for option, path in written.items():
-        if not isinstance(path, str | pathlib.Path) or given.get("overwrite"):
-            continue
-        for name in given.keys() - _WRITTEN:
-            values = given[name]
-            values = values if isinstance(values, list | tuple) else [values]
-            if any(_same_file(path, value) for value in values):
-                raise ValueError(
-                    f"--{option.replace('_', '-')}: {path} is what is read "
-                    f"({name.replace('_', '-')}); write to another file"
-                )
-
-
-def _same_file(path: Any, value: Any) -> bool:
-    try:
-        if value == "-":
-            return os.path.samestat(os.stat(path), os.fstat(sys.stdin.fileno()))
-        return isinstance(value, str | pathlib.Path) and os.path.samefile(path, value)
-    except (OSError, ValueError):
-        return False
 
 
 def write_rows(out: str, names: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

@@ -2,10 +2,11 @@
 
 import pytest
 from commission import device, quick_text
+from harness import prove_stops
 
 from rig.config import load_config
 from rig.core import proof
-from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, STOP_PROVED, DeviceRecord
+from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
 from rig.workbench.commission import steps, stops
 
 
@@ -27,6 +28,7 @@ def commissioned(at):
         (at / "rig.toml").write_text(quick_text(bus, port))
         config = load_config("rig.toml")
         record = DeviceRecord.load(config.device_path)
-        for state in (IDENTIFIED, HOMED, SIGN_CHECKED, STOP_PROVED):
+        for state in (IDENTIFIED, HOMED, SIGN_CHECKED):
             record.reach(state, config)
+        prove_stops(record, config)
         yield sim

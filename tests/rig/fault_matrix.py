@@ -38,6 +38,7 @@ from harness import (
     fast_config,
     fast_text,
     in_the_middle,
+    prove_stops,
     session,
     simulator,
 )
@@ -352,7 +353,7 @@ def _unknown_cell(fault: str, folder: pathlib.Path) -> Outcome:
         show_identity(place)
         assert go_home(place, here=True) == 0, said
         record.reach(SIGN_CHECKED, served)
-        record.reach(STOP_PROVED, served)
+        prove_stops(record, served)
         before = sim.executions()
         if fault == "pushed_while_off":
             for drive, axis in zip(sim.drives, served.axes, strict=True):
@@ -425,7 +426,7 @@ def _changed_cell(fault: str, folder: pathlib.Path) -> Outcome:
         for state in (IDENTIFIED, HOMED):
             record.reach(state, served)
         record.reach(SIGN_CHECKED, served, turns=turns(sim, served))
-        record.reach(STOP_PROVED, served)
+        prove_stops(record, served)
         sim.faults.add(parse_fault(fault))
         far, away = _watch_joints(sim)
         code = session(served, folder, sim, said, record=record)

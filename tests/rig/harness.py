@@ -164,10 +164,21 @@ def commissioned(
         record.left_at(dict.fromkeys(config.axis_names))
         for drive in sim.drives if sim else ():
             drive.alarm = 0
-    for name in (IDENTIFIED, HOMED, SIGN_CHECKED, STOP_PROVED):
+    for name in (IDENTIFIED, HOMED, SIGN_CHECKED):
         if record.state(name) is None:
             record.reach(name, config)
+    if record.state(STOP_PROVED) is None:
+        prove_stops(record, config)
     return record
+
+
+def prove_stops(record: DeviceRecord, config: RigConfig) -> None:
+    """The state STOP_PROVED of a device that stands at once, as the simulated one."""
+    distances = {
+        axis.name: {"speeds": [5.0], "distances": [0.0], "accel": axis.drive_motion[1]}
+        for axis in config.axes
+    }
+    record.reach(STOP_PROVED, config, distances=distances)
 
 
 def notes_of(config: RigConfig) -> dict:

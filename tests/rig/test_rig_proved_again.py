@@ -11,7 +11,7 @@ import harness
 import numpy as np
 import pytest
 from commission import device, quick_text, turns
-from harness import fast_config, no_figures
+from harness import fast_config, no_figures, prove_stops
 
 from rig.__main__ import main
 from rig.config import load_config
@@ -48,7 +48,7 @@ def commission(sim):
     for state in (IDENTIFIED, HOMED):
         record.reach(state, config)
     record.reach(SIGN_CHECKED, config, turns=turns(sim, config))
-    record.reach(STOP_PROVED, config)
+    prove_stops(record, config)
 
 
 def joints(sim):

@@ -495,6 +495,18 @@ def test_no_name_of_a_run_or_a_map_ends_a_comment(inverse):
     pytest.importorskip("yaml").safe_load(LANGUAGES["ros"](nasty))
 
 
+def test_export_writes_over_no_record_that_it_reads(run, capsys):
+    record = run / "calibration.json"
+    before = record.read_bytes()
+    for folder in (run, record):
+        arguments = ["export", str(folder), "--to", "json", "--out", str(record)]
+        assert main(arguments) == 2
+        assert f"{record} is what is read (run); write to" in capsys.readouterr().err
+    assert record.read_bytes() == before
+    again = ["export", str(run), "--to", "c", "--out", str(run / "inverse.h")]
+    assert main(again) == main(again) == 0
+
+
 def test_export_prints_or_writes_and_warns(run, capsys, tmp_path):
     assert main(["export", str(run), "--to", "json"]) == 0
     printed = capsys.readouterr()

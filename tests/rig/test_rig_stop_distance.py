@@ -83,11 +83,21 @@ def test_a_record_of_before_is_read_with_the_bound_of_its_one_speed(tmp_path):
     once = {BY_UNITS: {"pitch": 0.1, "yaw": -0.2}}
     record = SimpleNamespace(state=lambda name: {"ways": once})
     found = stop_distances(record, config.axes)
-    assert found.keys() == {"pitch", "yaw"}
+    assert found["roll"].delay_s == 1.0  # of it nothing is known
     assert found["yaw"].at(5.0) == pytest.approx(0.2)
     assert found["yaw"].at(90.0) == pytest.approx(0.2 * 18**2)
     empty = SimpleNamespace(state=lambda name: None)
     assert stop_distances(empty, config.axes) == {}
+
+
+def test_a_stop_that_was_proved_without_a_distance_is_taken_for_slow():
+    config = fast_config(SLOWER)
+    proved = SimpleNamespace(state=lambda name: {})
+    for axis in config.axes:
+        known = stop_distances(proved, config.axes)[axis.name]
+        fastest = known.fastest(axis, 2.0)
+        assert fastest + fastest**2 / (2 * known.accel) < 4.0  # a second, and its ramp
+        assert fastest < 3.0
 
 
 SLOWER = {"speed_deg_s = 400": "speed_deg_s = 90", "accel_deg_s2 = 8000":
