@@ -57,13 +57,22 @@ class TaskEnv(FunctionalEnv):
         key_state, key = jax.random.split(key)
         return self._seen(self._sessions.reset(self._given, key_state), key)
 
-    def observe(self, episode: _Episode) -> jax.Array:
+    def steps(self, episode: _Episode) -> jax.Array:
+        return episode.session.made
+
+    @property
+    def longest(self) -> int:
+        return int(self._given.task.horizon)
+
+    def observation(self, episode: _Episode) -> jax.Array:
         seen = episode.seen
         parts = seen.features, jnp.maximum(seen.log_score, -10.0), seen.valid
         return jnp.concatenate([part.astype(jnp.float32).ravel() for part in parts])
 
-    def advance(self, episode: _Episode, action: jax.Array) -> tuple[Any, ...]:
-        seen = episode.seen
+    def advance(
+        self, episode: _Episode, action: jax.typing.ArrayLike
+    ) -> tuple[Any, ...]:
+        seen, action = episode.seen, jnp.asarray(action)
         key_step, key = jax.random.split(episode.key)
         action = jnp.where(seen.valid[action], action, 0)
         step = self._sessions.step(self._given, episode, seen, action, key_step)

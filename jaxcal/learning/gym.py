@@ -1,13 +1,14 @@
-"""Postures as a vector environment of Gymnasium; importing this registers it.
+"""Postures under Gymnasium's interfaces; importing this registers them.
 
     import gymnasium
     import jaxcal.learning.gym
 
+    env = gymnasium.make("jaxcal/Postures-v0", num_candidates=50)
     envs = gymnasium.make_vec("jaxcal/Postures-v0", num_envs=256, num_candidates=50)
 
-All environments are one JAX program. Observations, rewards and ends are numpy arrays;
-``infos["action_mask"]`` says what may be chosen next. An episode that ends begins anew
-in the same step; its last observation is in ``infos["final_obs"]``.
+The environments of a batch are one JAX program. Observations, rewards and ends are
+numpy arrays; ``infos["action_mask"]`` says what may be chosen next, of one environment
+``action_masks()`` too, as sb3-contrib asks for it.
 """
 
 from __future__ import annotations
@@ -24,31 +25,102 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from jaxcal.learning.environments.functional import FunctionalEnv, PosturesEnv
+from jaxcal.learning.environments.functional import (
+    FunctionalEnv,
+    PosturesEnv,
+    renewed,
+)
 from jaxcal.learning.environments.selection import SelectionConfig
 
-__all__ = ["JaxVector", "postures"]
+__all__ = ["JaxSingle", "JaxVector", "posture", "postures"]
 
 Array = NDArray[Any]
 
 
-class JaxVector(VectorEnv):
-    """A batch of any ``FunctionalEnv``."""
+def _spaces(env: FunctionalEnv) -> tuple[spaces.Discrete, spaces.Box]:
+    return spaces.Discrete(env.num_actions), spaces.Box(*env.observation_range)
 
-    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP}
 
-    def __init__(self, env: FunctionalEnv, num_envs: int = 1) -> None:
-        self.num_envs, self._env = num_envs, env
-        self.single_action_space = spaces.Discrete(env.num_actions)
-        self.single_observation_space = spaces.Box(
-            -np.inf, np.inf, (env.observation_size,), np.float32
+class JaxSingle(gymnasium.Env):
+    """One of any ``FunctionalEnv``."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+
+    def __init__(self, env: FunctionalEnv) -> None:
+        self.action_space, self.observation_space = _spaces(env)
+        self._metric, self._state, self._mask = env.metric, None, None
+
+        def seen(state: Any, *more: Any) -> tuple[Any, ...]:
+            return state, env.observation(state), env.available(state), *more
+
+        self._begin = jax.jit(lambda key: seen(env.begin(key)))
+        self._advance = jax.jit(lambda state, action: seen(*env.advance(state, action)))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """A new episode; without a seed the random numbers go on."""
+        super().reset(seed=seed)
+        key = jax.random.key(int(self.np_random.integers(2**31)))
+        self._state, observation, self._mask = self._begin(key)
+        return np.array(observation), {"action_mask": self.action_masks()}
+
+    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """One step.
+
+        Raises:
+            ValueError: there is no such action.
+        """
+        if not self.action_space.contains(action):
+            raise ValueError(
+                f"action must be a whole number in [0, {self.action_space.n}), got "
+                f"{action!r}"
+            )
+        self._state, observation, self._mask, *rest = self._advance(
+            self._state, int(action)
         )
+        reward, done, metric = (leaf.item() for leaf in rest)
+        info = {"action_mask": self.action_masks(), self._metric: metric}
+        return np.array(observation), reward, done, False, info
+
+    def action_masks(self) -> Array:
+        """(num_actions,) bool, what may be chosen."""
+        return np.array(self._mask)
+
+
+class JaxVector(VectorEnv):
+    """A batch of any ``FunctionalEnv``.
+
+    Args:
+        env: of each.
+        num_envs: how many.
+        autoreset_mode: "SameStep": an episode that ends begins anew in the same step,
+            ``infos["final_obs"]`` and ``infos["final_info"]`` are of its end;
+            "NextStep": in the next one, whose action counts for nothing.
+    """
+
+    def __init__(
+        self,
+        env: FunctionalEnv,
+        num_envs: int = 1,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+    ) -> None:
+        mode = AutoresetMode(autoreset_mode)
+        if mode is AutoresetMode.DISABLED:
+            raise ValueError(
+                "autoreset_mode must be SameStep or NextStep, got Disabled"
+            )
+        self.metadata = {"autoreset_mode": mode, "render_modes": []}
+        self.num_envs, self._env = num_envs, env
+        self._same_step = mode is AutoresetMode.SAME_STEP
+        self.single_action_space, self.single_observation_space = _spaces(env)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._reset = jax.jit(jax.vmap(env.begin))
-        self._look = jax.jit(jax.vmap(lambda s: (env.observe(s), env.available(s))))
+        self._look = jax.jit(jax.vmap(self._seen))
         self._step = jax.jit(jax.vmap(self._one))
         self._key, self._state = jax.random.key(0), None
+        self._ended = np.zeros(num_envs, bool)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -58,6 +130,7 @@ class JaxVector(VectorEnv):
             self._key = jax.random.key(seed)
         self._key, key = jax.random.split(self._key)
         self._state = self._reset(jax.random.split(key, self.num_envs))
+        self._ended = np.zeros(self.num_envs, bool)
         obs, mask = map(np.asarray, self._look(self._state))
         return obs, {"action_mask": mask}
 
@@ -75,40 +148,70 @@ class JaxVector(VectorEnv):
                 f"actions must be one for each environment, ({self.num_envs},), got "
                 f"shape {np.shape(actions)}"
             )
-        self._state, last, reward, done, metric = self._step(
-            self._state, jnp.asarray(actions)
+        self._state, *seen = self._step(self._state, self._ended, jnp.asarray(actions))
+        (obs, mask), (last, last_mask), reward, done, metric = jax.tree.map(
+            np.asarray, seen
         )
-        obs, mask = map(np.asarray, self._look(self._state))
-        ended = np.asarray(done)
-        infos = {"action_mask": mask, self._env.metric: np.asarray(metric)}
-        if ended.any():
-            infos |= {"final_obs": np.asarray(last), "_final_obs": ended}
-        reward = np.asarray(reward, np.float64)
-        return obs, reward, ended, np.zeros_like(ended), infos
+        self._ended = done
+        infos = self._infos(mask, metric)
+        if self._same_step and done.any():
+            final = self._infos(last_mask, metric)
+            infos |= {"final_obs": last, "final_info": final}
+            infos |= {"_final_obs": done, "_final_info": done}
+        return obs, reward.astype(np.float64), done, np.zeros_like(done), infos
 
-    def _one(self, state: Any, action: jax.Array) -> tuple[Any, ...]:
-        """The state that goes on, the last observation, reward, done, metric."""
+    def _infos(self, mask: Array, metric: Array) -> dict[str, Any]:
+        every = np.ones(self.num_envs, bool)
+        infos = {"action_mask": mask, self._env.metric: metric}
+        return infos | {f"_{name}": every for name in infos}
+
+    def _seen(self, state: Any) -> tuple[jax.Array, jax.Array]:
+        return self._env.observation(state), self._env.available(state)
+
+    def _one(self, state: Any, ended: jax.Array, action: jax.Array) -> tuple[Any, ...]:
+        """The state that goes on; observation and mask, those of the state stepped to;
+        reward, done, metric."""
         after, reward, done, metric = self._env.advance(state, action)
-        fresh = self._env.begin(after.key)
-        goes_on = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, after)
-        return goes_on, self._env.observe(after), reward, done, metric
+        last = self._seen(after)
+        if not self._same_step:  # where the episode was over, this begins one
+            reward, metric, done = (
+                jnp.where(ended, 0, x) for x in (reward, metric, done)
+            )
+            done = done.astype(bool)
+        begins = done if self._same_step else ended
+        state = renewed(self._env.begin, begins, after.key, after)
+        return state, self._seen(state), last, reward, done, metric
 
 
-def postures(num_envs: int = 1, **sizes: Any) -> JaxVector:
-    """The environment ``jaxcal/Postures-v0``.
+def _postures(sizes: dict[str, Any]) -> PosturesEnv:
+    fields = [field.name for field in dataclasses.fields(SelectionConfig)]
+    for name in sizes:
+        if name not in fields:
+            raise ValueError(f"options must be of {', '.join(fields)}, got {name}")
+    return PosturesEnv(SelectionConfig(**sizes))
+
+
+def posture(**sizes: Any) -> JaxSingle:
+    """The environment ``jaxcal/Postures-v0``; ``sizes`` as of ``postures``."""
+    return JaxSingle(_postures(sizes))
+
+
+def postures(
+    num_envs: int = 1, autoreset_mode: str | AutoresetMode = "SameStep", **sizes: Any
+) -> JaxVector:
+    """The environment ``jaxcal/Postures-v0`` of many.
 
     Args:
         num_envs: how many.
+        autoreset_mode: see ``JaxVector``.
         sizes: fields of ``SelectionConfig``.
 
     Raises:
         ValueError: a name that is none of them, or a value that it refuses.
     """
-    fields = [field.name for field in dataclasses.fields(SelectionConfig)]
-    for name in sizes:
-        if name not in fields:
-            raise ValueError(f"options must be of {', '.join(fields)}, got {name}")
-    return JaxVector(PosturesEnv(SelectionConfig(**sizes)), num_envs)
+    return JaxVector(_postures(sizes), num_envs, autoreset_mode)
 
 
-gymnasium.register("jaxcal/Postures-v0", vector_entry_point=postures)
+gymnasium.register(
+    "jaxcal/Postures-v0", entry_point=posture, vector_entry_point=postures
+)

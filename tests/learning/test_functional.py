@@ -25,7 +25,7 @@ def play(env, batch, steps, seed=0):
         key, key_action, key_step = jax.random.split(key, 3)
         action = jax.random.categorical(key_action, jnp.where(mask, 0.0, -1e9))
         before = np.asarray(obs), np.asarray(mask), np.asarray(action)
-        obs, state, reward, done, info = step(
+        obs, state, reward, done, _, info = step(
             jax.random.split(key_step, batch), state, action
         )
         mask = info["action_mask"]
@@ -68,4 +68,4 @@ def test_sessions_of_a_task_end_and_begin_anew():
     rewards = np.stack([row[3] for row in kept])
     assert (rewards >= -1e-6).all() and rewards.max() > 0.01
     assert np.stack([row[4] for row in kept]).any()
-    assert set(kept[0][5]) == {"action_mask", "gain"}
+    assert {"action_mask", "gain", "final_observation"} <= kept[0][5].keys()

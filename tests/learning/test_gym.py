@@ -47,3 +47,46 @@ def test_a_bad_option_and_a_bad_step_are_one_line():
     for actions in (np.zeros(2, int), 0, np.zeros((3, 1), int)):
         with pytest.raises(ValueError, match=r"^actions must be .* \(3,\), got shape"):
             envs.step(actions)
+
+
+def test_gymnasiums_checker_finds_nothing_in_one(recwarn):
+    from gymnasium.utils.env_checker import check_env
+
+    env = gymnasium.make("jaxcal/Postures-v0", num_candidates=8)
+    check_env(env.unwrapped)
+    assert not [w for w in recwarn if issubclass(w.category, UserWarning)]
+    _, info = env.reset(seed=1)
+    np.testing.assert_array_equal(env.unwrapped.action_masks(), info["action_mask"])
+    env.step(3)
+    assert list(np.flatnonzero(~env.unwrapped.action_masks())) == [3]
+    with pytest.raises(ValueError, match=r"^action must be a whole number in \[0, 8\)"):
+        env.unwrapped.step(8)
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
+def test_a_batch_behaves_as_gymnasiums_own_of_single_ones(mode):
+
+    name = "jaxcal/Postures-v0"
+    ours = gymnasium.make_vec(
+        name, num_envs=3, vectorization_mode="vector_entry_point",
+        num_candidates=8, autoreset_mode=mode,
+    )  # fmt: skip
+    theirs = gymnasium.make_vec(
+        name, num_envs=3, vectorization_mode="sync", num_candidates=8,
+        vector_kwargs={"autoreset_mode": mode},
+    )  # fmt: skip
+    both = ours, theirs
+    assert len({str(envs.metadata["autoreset_mode"]) for envs in both}) == 1
+    infos = [envs.reset(seed=0)[1] for envs in both]
+    for _ in range(11):
+        steps = []
+        for envs, info in zip(both, infos, strict=True):
+            steps.append(envs.step(info["action_mask"].argmax(axis=1)))
+            assert steps[-1][0] in envs.observation_space
+        for one, other in zip(*(step[:4] for step in steps), strict=True):
+            assert (one.shape, one.dtype) == (other.shape, other.dtype)
+        for part in (2, 3):
+            np.testing.assert_array_equal(steps[0][part], steps[1][part])
+        np.testing.assert_array_equal(steps[0][1] != 0, steps[1][1] != 0)
+        infos = [step[4] for step in steps]
+        assert infos[0].keys() >= infos[1].keys()

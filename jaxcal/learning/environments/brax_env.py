@@ -34,7 +34,7 @@ class EpisodeEnv(Env):
         episode, zero = self.functional.begin(rng), jnp.zeros(())
         return State(
             pipeline_state=episode,
-            obs=self.functional.observe(episode),
+            obs=self.functional.observation(episode),
             reward=zero,
             done=zero,
             metrics={self.functional.metric: zero},
@@ -47,7 +47,7 @@ class EpisodeEnv(Env):
         after, reward, done, metric = env.advance(state.pipeline_state, action)
         return state.replace(
             pipeline_state=after,
-            obs=env.observe(after),
+            obs=env.observation(after),
             reward=reward,
             done=done.astype(jnp.float32),
             metrics=state.metrics | {env.metric: metric},

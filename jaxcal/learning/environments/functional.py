@@ -1,36 +1,85 @@
-"""Episodes for loops of one's own: ``reset`` and ``step`` as gymnax has them.
+"""Episodes for loops of one's own: the interface of gymnax 1.x.
 
     env = PosturesEnv()
     obs, state = jax.vmap(env.reset)(keys)
-    obs, state, reward, done, info = jax.vmap(env.step)(keys, state, actions)
+    obs, state, reward, terminated, truncated, info = jax.vmap(env.step)(
+        keys, state, actions
+    )
 
-A step that ends an episode returns the first observation of a fresh one;
-``info["action_mask"]`` says what may be chosen next. brax and Gymnasium see the same
-episodes through ``learning.brax`` and ``learning.gym``.
+A step that ends an episode returns the first observation of a fresh one, drawn only
+where one of the batch has ended; ``info["action_mask"]`` says what may be chosen next.
+brax and Gymnasium see the same episodes through ``learning.brax`` and
+``learning.gym``.
 """
 
 from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
+import math
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
+from flax import struct
 
 from jaxcal.learning.environments import selection
 from jaxcal.learning.environments.selection import CandidateSource, SelectionConfig
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 
-__all__ = ["FunctionalEnv", "PosturesEnv"]
+__all__ = ["EnvParams", "FunctionalEnv", "PosturesEnv", "renewed"]
+
+_LARGEST = float(np.finfo(np.float32).max)
+
+
+@struct.dataclass
+class EnvParams:
+    """What may be varied without compiling again."""
+
+    max_steps_in_episode: int | jax.Array  # an episode of so many steps is cut off
+
+
+def renewed(begin: Callable[[jax.Array], Any], done: Any, key: Any, after: Any) -> Any:
+    """``begin(key)`` where ``done``, else ``after``: a tree of arrays.
+
+    Under ``jax.vmap`` nothing begins while none of the batch is done.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def chosen(done: Any, key: Any, after: Any) -> Any:
+        return jax.tree.map(
+            lambda new, old: jnp.where(done, new, old), begin(key), after
+        )
+
+    @chosen.def_vmap
+    def of_batch(size: int, batched: Any, done: Any, key: Any, after: Any) -> Any:
+        def whole(is_batched: Any, leaf: Any) -> Any:
+            return leaf if is_batched else jnp.broadcast_to(leaf, (size, *leaf.shape))
+
+        def where_done(new: jax.Array, old: jax.Array) -> jax.Array:
+            return jnp.where(done.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
+
+        done, key, after = jax.tree.map(whole, batched, [done, key, after])
+        out = jax.lax.cond(
+            done.any(),
+            lambda: jax.tree.map(where_done, jax.vmap(begin)(key), after),
+            lambda: after,
+        )
+        return out, jax.tree.map(lambda _: True, out)
+
+    return chosen(done, key, after)
 
 
 class FunctionalEnv(abc.ABC):
     """One episode as pure functions; ``jax.vmap`` makes a batch.
 
     A state is a dataclass of arrays with a field ``key``, of what comes next in it.
+    The methods below ``step`` are those of ``gymnax.environments.Environment``.
     """
 
     metric: ClassVar[str]  # name of the number that ``advance`` returns last
@@ -40,7 +89,7 @@ class FunctionalEnv(abc.ABC):
         """The state of a new episode."""
 
     @abc.abstractmethod
-    def observe(self, state: Any) -> jax.Array:
+    def observation(self, state: Any) -> jax.Array:
         """(observation_size,) float32 input of a policy."""
 
     @abc.abstractmethod
@@ -48,12 +97,27 @@ class FunctionalEnv(abc.ABC):
         """(num_actions,) bool, what may be chosen."""
 
     @abc.abstractmethod
-    def advance(self, state: Any, action: jax.Array) -> tuple[Any, ...]:
+    def advance(self, state: Any, action: jax.typing.ArrayLike) -> tuple[Any, ...]:
         """The state after the step, () reward, () bool done, () metric."""
+
+    @abc.abstractmethod
+    def steps(self, state: Any) -> jax.Array:
+        """() int32, steps made of this episode."""
+
+    @property
+    @abc.abstractmethod
+    def longest(self) -> int:
+        """Steps after which every episode has ended."""
 
     @abc.abstractmethod
     def network(self) -> nn.Module:
         """(..., observation_size) -> masked logits (..., num_actions), value (...)."""
+
+    @property
+    def observation_range(self) -> tuple[Any, Any]:
+        """Least and largest number at each place of an observation, finite."""
+        whole = np.full(self.observation_size, _LARGEST, np.float32)
+        return -whole, whole
 
     @property
     def num_actions(self) -> int:
@@ -63,34 +127,119 @@ class FunctionalEnv(abc.ABC):
     @property
     def observation_size(self) -> int:
         """Length of an observation."""
-        return int(self._shape(self.observe).shape[0])
+        return int(self._shape(self.observation).shape[0])
 
     def _shape(self, function: Any) -> Any:
         key = jax.random.key(0)
         return jax.eval_shape(lambda key: function(self.begin(key)), key)
 
-    def reset(self, key: jax.Array) -> tuple[jax.Array, Any]:
+    @functools.partial(jax.jit, static_argnames="self")
+    def reset(
+        self, key: jax.Array, params: EnvParams | None = None
+    ) -> tuple[jax.Array, Any]:
         """Observation and state of a new episode."""
-        state = self.begin(key)
-        return self.observe(state), state
+        return self.reset_env(key, params)
 
+    @functools.partial(jax.jit, static_argnames="self")
     def step(
-        self, key: jax.Array, state: Any, action: jax.Array
-    ) -> tuple[jax.Array, Any, jax.Array, jax.Array, dict[str, jax.Array]]:
-        """Observation, state, () reward, () bool done and info; a new episode after
-        the last step of one.
+        self,
+        key: jax.Array,
+        state: Any,
+        action: jax.typing.ArrayLike,
+        params: EnvParams | None = None,
+    ) -> tuple[Any, ...]:
+        """One step, and a new episode after the last of one.
 
-        ``info``: ``action_mask`` (num_actions,) of the state that is returned, and the
-        environment's ``metric`` ().
+        Returns:
+            Observation, state, () reward, () bool terminated, () bool truncated, and
+            info: ``action_mask`` (num_actions,) of the state that is returned, the
+            environment's ``metric`` (), ``terminated``, ``truncated``, and
+            ``final_observation``, of the episode that the step was made in.
         """
         key_step, key_reset = jax.random.split(key)
-        begun = dataclasses.replace(state, key=key_step)
-        after, reward, done, metric = self.advance(begun, action)
-        state = jax.tree.map(
-            lambda new, old: jnp.where(done, new, old), self.begin(key_reset), after
+        last, after, reward, terminated, info = self.step_env(
+            key_step, state, action, params
         )
-        info = {"action_mask": self.available(state), self.metric: metric}
-        return self.observe(state), state, reward, done, info
+        truncated = self.is_truncated(after, params)
+        obs, state = renewed(
+            self.reset_env, terminated | truncated, key_reset, (last, after)
+        )
+        info |= {"action_mask": self.available(state), "final_observation": last}
+        info |= {"terminated": terminated, "truncated": truncated}
+        return obs, state, reward, terminated, truncated, info
+
+    # -- as gymnax names them ----------------------------------------------------------
+
+    @property
+    def name(self) -> str:
+        """Name of the environment."""
+        return type(self).__name__
+
+    @property
+    def default_params(self) -> EnvParams:
+        """Parameters that cut nothing off."""
+        return EnvParams(self.longest)
+
+    def reset_env(
+        self, key: jax.Array, params: EnvParams | None = None
+    ) -> tuple[jax.Array, Any]:
+        """Observation and state of a new episode."""
+        state = self.begin(key)
+        return self.observation(state), state
+
+    def step_env(
+        self,
+        key: jax.Array,
+        state: Any,
+        action: jax.typing.ArrayLike,
+        params: EnvParams | None = None,
+    ) -> tuple[jax.Array, Any, jax.Array, jax.Array, dict[str, jax.Array]]:
+        """Observation, state, reward, terminated and info: no new episode."""
+        begun = dataclasses.replace(state, key=key)
+        after, reward, terminated, metric = self.advance(begun, action)
+        return self.observation(after), after, reward, terminated, {self.metric: metric}
+
+    def observe(
+        self, key: Any, state: Any, action: Any = None, params: Any = None
+    ) -> jax.Array:
+        """``observation`` of a state."""
+        return self.observation(state)
+
+    def is_truncated(self, state: Any, params: EnvParams | None = None) -> jax.Array:
+        """() bool, whether ``params`` cut the episode off."""
+        most = self.longest if params is None else params.max_steps_in_episode
+        return (self.steps(state) >= most) & (most < self.longest)
+
+    def action_space(self, params: EnvParams | None = None) -> Any:
+        """``Discrete``; as all spaces, of gymnax, which must be installed."""
+        return _spaces().Discrete(self.num_actions)
+
+    def observation_space(self, params: EnvParams | None = None) -> Any:
+        """``Box`` of the finite ``observation_range``."""
+        low, high = map(jnp.asarray, self.observation_range)
+        return _spaces().Box(low, high, low.shape, jnp.float32)
+
+    def state_space(self, params: EnvParams | None = None) -> Any:
+        """``Dict`` of a state's arrays, its key left out."""
+        return _space_of(self._shape(lambda state: state))
+
+
+def _spaces() -> Any:
+    try:
+        from gymnax.environments import spaces
+    except ImportError:
+        raise ImportError(
+            "spaces are those of gymnax, which is not installed: pip install gymnax"
+        ) from None
+    return spaces
+
+
+def _space_of(shape: Any) -> Any:
+    if dataclasses.is_dataclass(shape):
+        parts = {f.name: getattr(shape, f.name) for f in dataclasses.fields(shape)}
+        parts.pop("key", None)
+        return _spaces().Dict({name: _space_of(part) for name, part in parts.items()})
+    return _spaces().Box(-_LARGEST, _LARGEST, shape.shape, shape.dtype)
 
 
 class PosturesEnv(FunctionalEnv):
@@ -120,14 +269,36 @@ class PosturesEnv(FunctionalEnv):
     def begin(self, key: jax.Array) -> Any:
         return selection.reset(key, self.config, self._draw)
 
-    def observe(self, state: Any) -> jax.Array:
+    def observation(self, state: Any) -> jax.Array:
         return selection.observe(state, self.config)
 
     def available(self, state: Any) -> jax.Array:
         mask: jax.Array = state.available
         return mask
 
-    def advance(self, state: Any, action: jax.Array) -> tuple[Any, ...]:
+    def steps(self, state: Any) -> jax.Array:
+        count: jax.Array = state.count
+        return count
+
+    @property
+    def longest(self) -> int:
+        return self.config.num_selected
+
+    @property
+    def observation_range(self) -> tuple[Any, Any]:
+        if self._draw is not None:
+            return super().observation_range
+        # Of candidates in [0, 1]; ``context_features`` has a ridge of 0.01.
+        n, k = self.config.num_inputs, self.config.num_selected
+        low = np.zeros(self.observation_size, np.float32)
+        high = np.ones_like(low)
+        least, largest = math.log(0.01), math.log(k + 0.01)
+        low[-3:] = least / 1.25, 0.0, (least - largest) / 4.0
+        high[-3:] = largest / 1.25, 1.0 + 0.01 / k, 0.0
+        slack = 1e-3 * (np.arange(len(low)) >= (n + 1) * self.config.num_candidates)
+        return low - np.float32(slack), high + np.float32(slack)
+
+    def advance(self, state: Any, action: jax.typing.ArrayLike) -> tuple[Any, ...]:
         after, reward, done = selection.step(state, action, self.config)
         return after, reward, done, reward / self.config.reward_scale
 

@@ -130,7 +130,7 @@ def reset_from(
 
 
 def step(
-    state: SelectionState, action: jax.Array, config: SelectionConfig
+    state: SelectionState, action: jax.typing.ArrayLike, config: SelectionConfig
 ) -> tuple[SelectionState, jax.Array, jax.Array]:
     """Choose one posture.
 
@@ -143,7 +143,7 @@ def step(
         The next state, () reward, () bool done.
     """
     p = config.num_regressors
-    action = action.astype(jnp.int32)
+    action = jnp.asarray(action, jnp.int32)
     chosen = jnp.where(
         jnp.arange(config.num_selected) == state.count, action, state.chosen
     )
