@@ -224,8 +224,9 @@ def _configuration(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
     if arguments.trainer == "brax":
         config = _for_brax(config, arguments, flags)
     if arguments.resume:
+        budget = _budget(flags)
         _refuse_with_resume(flags | _swept(arguments), out)
-        return _configuration_of(out, candidates)
+        return _prolonged(_configuration_of(out, candidates), budget)
     _refuse_to_overwrite(out)
     if candidates is None:
         config = presets.with_values(config, flags)
@@ -301,6 +302,7 @@ def _task_configuration(arguments: TrainOptions, out: pathlib.Path) -> PolicyCon
     flags = given_flags(arguments, task=True)
     if arguments.resume:
         more = {"with": arguments.with_} if arguments.with_ else {}
+        budget = _budget(flags)
         _refuse_with_resume(flags | more | _swept(arguments), out)
         _, meta = checkpoint.read_meta(out, training.SCHEMA)
         config = PolicyConfig.from_meta(meta)
@@ -308,7 +310,7 @@ def _task_configuration(arguments: TrainOptions, out: pathlib.Path) -> PolicyCon
         moved = held.suffix == ".py" and held.name == given_task.name
         if held != given_task and not moved:
             raise ValueError(f"--task must be {config.task}, that of {out}")
-        return dataclasses.replace(config, task=arguments.task)
+        return _prolonged(dataclasses.replace(config, task=arguments.task), budget)
     _refuse_to_overwrite(out)
     options = entry.train_on
     if arguments.with_:
@@ -339,6 +341,29 @@ def _tuned(entry: Entry, options: Mapping[str, Any]) -> StateRule:
 
 def _swept(arguments: TrainOptions) -> dict[str, Any]:
     return {"sweep": arguments.sweep} if arguments.sweep else {}
+
+
+def _budget(flags: dict[str, Any]) -> dict[str, int]:
+    """What a run may be prolonged to, taken out of the flags."""
+    names = [name for name in ("num_episodes", "num_updates") if name in flags]
+    return {name: flags.pop(name) for name in names}
+
+
+def _prolonged(config: Any, budget: Mapping[str, int]) -> Any:
+    """A run to go on with to a larger budget; what it imitates stays what it was."""
+    from jaxcal.commands.train_arguments import flag_of
+
+    for name, value in budget.items():
+        if value <= (held := getattr(config.ppo, name)):
+            raise ValueError(
+                f"{flag_of(name)} must be more than the run's {held}, got {value}"
+            )
+    imitated = getattr(config, "num_imitated", 0)
+    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **budget))
+    if imitated:
+        share = imitated / config.ppo.num_updates
+        config = dataclasses.replace(config, imitation=share)
+    return config
 
 
 def _refuse_with_resume(given: Mapping[str, Any], out: pathlib.Path) -> None:
@@ -425,7 +450,8 @@ def _show(report: Report, measured: tuple[str, ...]) -> None:
         f"{report.update:9,d} {report.played:10,d} {report.per_second:6,.0f} "
         f"{_clock(report.seconds):>9} {_clock(report.eta):>9} "
         + (" imitate " if reward is None else f"{_or_dash(reward, '.4f'):>8} ")
-        + " ".join(cells),
+        + " ".join(cells)
+        + f"  {report.skipped} updates skipped, not finite" * bool(report.skipped),
         flush=True,
     )
 

@@ -56,6 +56,7 @@ more examples:
   {program} --sweep learning_rate=1e-3,3e-3 entropy_start=0.01,0.02 --out runs/sweep
                                    one table of four
   {program} --resume --out runs/compact      go on where a run stopped
+  {program} --resume --episodes 200000 --out runs/compact   or longer than it was to
   {program} --preset general --export checkpoints/default.npz   what ships
   {program} --trainer brax --episodes 50000  the same task, brax's own PPO
   srun {program}                             all tasks of a SLURM job step

@@ -164,19 +164,70 @@ def test_a_run_resumes_bit_for_bit_in_the_middle_of_sessions(tmp_path):
             np.testing.assert_array_equal(a, b)
 
 
-def test_a_run_that_diverges_keeps_its_last_finite_state(tmp_path):
-    """Its second task pays infinity: the first update is finite, the second is not."""
-    config, tasks = Config(), (jnp.float32(1.0), jnp.float32(np.inf))
-    with pytest.raises(
-        DivergedError, match="loss is nan in update 2; the state of update 1"
-    ):
+def test_a_run_that_diverges_keeps_its_last_finite_weights(tmp_path):
+    """Its second task pays infinity: of that no update is finite, of the first all."""
+    ppo = dataclasses.replace(SHORT, num_updates=20)
+    config, tasks = Config(ppo), (jnp.float32(1.0), jnp.float32(np.inf))
+    says = "loss is nan in 5 updates in a row, the last of them 10; the weights before"
+    with pytest.raises(DivergedError, match=says):
         run(recipe(config, *tasks), tmp_path)
     state, meta = checkpoint.restore(tmp_path, recipe(config, *tasks).init(), "probe")
-    assert meta["progress"]["updates"] == 1 and int(state.num_updates) == 1
+    assert meta["progress"]["updates"] == 10 and int(state.num_updates) == 10
     assert all(
         np.isfinite(x).all() for x in jax.tree.leaves((state.params, state.average))
     )
-    assert len((tmp_path / "metrics.csv").read_text().splitlines()) == 3
+    rows = np.genfromtxt(tmp_path / "metrics.csv", delimiter=",", names=True)
+    assert list(np.isnan(rows["policy_loss"])) == [False, True] * 5
+
+
+def test_one_bad_batch_is_skipped_and_the_run_goes_on(tmp_path):
+    """What is played goes on behind it, so the same batch does not come again."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Once(Late):
+        """Pays nan in the sessions of one update."""
+
+        def step(self, task, state, seen, action, key):
+            step = super().step(task, state, seen, action, key)
+            bad = jax.random.uniform(key) < task
+            return step.replace(reward=jnp.where(bad, jnp.nan, step.reward))
+
+    config = Config(dataclasses.replace(SHORT, num_updates=24), environment=Once())
+    reports = []
+    state = run(recipe(config, jnp.float32(0.004)), tmp_path, report=reports.append)
+    assert int(state.num_updates) == 24
+    rows = np.genfromtxt(tmp_path / "metrics.csv", delimiter=",", names=True)
+    skipped = np.isnan(rows["policy_loss"])
+    assert 0 < skipped.sum() == reports[-1].skipped and not skipped.all()
+    made = np.flatnonzero(~skipped)
+    assert made[-1] > np.flatnonzero(skipped)[0]  # after the first that was skipped
+
+
+def test_a_folder_is_written_by_one_training_at_a_time(tmp_path):
+    said = []
+
+    def second(report):
+        with pytest.raises(BlockingIOError, match="is being written by another"):
+            run(recipe(Config(), jnp.float32(1.0)), tmp_path)
+        said.append(report)
+
+    run(recipe(Config(), jnp.float32(1.0)), tmp_path, report=second)
+    assert said
+
+
+def test_a_damaged_checkpoint_is_put_aside_and_the_one_before_it_goes_on(tmp_path):
+    made = recipe(Config(), jnp.float32(1.0))
+    run(made, tmp_path, num_updates=2)
+    whole = run(made, tmp_path, num_updates=3, resume=True)
+    for path in (tmp_path / "checkpoint" / "3" / "state").rglob("*"):
+        if path.is_file():
+            path.write_bytes(b"")
+    with pytest.warns(UserWarning, match=r"3 cannot be resumed.*damaged-3 now.*2$"):
+        again = run(made, tmp_path, num_updates=3, resume=True)
+    for a, b in zip(leaves(whole), leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+    state, _ = checkpoint.restore(tmp_path, made.init(), "probe")
+    assert int(state.num_updates) == 3  # written anew
 
 
 @pytest.mark.slow

@@ -220,6 +220,28 @@ def test_a_missing_folder_and_a_policy_without_state_are_told(finished, tmp_path
         training.train(CONFIG, tmp_path, resume=True)
 
 
+def test_a_full_disk_is_one_line(finished, tmp_path, monkeypatch):
+    def full(*args, **kwargs):
+        raise ValueError("RESOURCE_EXHAUSTED: Error writing: No space left on device")
+
+    monkeypatch.setattr(checkpoint.ocp.CheckpointManager, "save", full)
+    with pytest.raises(OSError, match=r"^\S+ cannot be written: the disk is full$"):
+        checkpoint.save(tmp_path, 1, finished[1].average, CONFIG.as_meta())
+
+
+def test_a_finished_run_is_prolonged(finished, tmp_path, capsys):
+    copy = tmp_path / "copy"
+    shutil.copytree(finished[0], copy)
+    line = ["--resume", "--out", str(copy), "--no-validation", "--episodes"]
+    assert command.main([*line, "384"]) == 2
+    assert "--episodes must be more than the run's 384, got 384" in (
+        capsys.readouterr().err
+    )
+    assert command.main([*line, "512"]) == 0
+    _, meta = checkpoint.read_meta(copy)
+    assert meta["progress"]["updates"] == 8 and meta["ppo"]["num_episodes"] == 512
+
+
 def test_a_save_writes_nothing_twice(finished):
     """The averaged weights, the weights and Adam's two moments: four times as much."""
     folder, state = finished

@@ -335,7 +335,8 @@ def make_update(
     On a mesh every device plays some of the rows and keeps them: of each minibatch it
     draws an equal part from its own, and gradients alone are summed over the devices.
 
-    An update in which a loss or a gradient is not finite leaves the state as it was.
+    An update in which a loss or a gradient is not finite is skipped: weights and
+    optimiser are as they were, and the metric ``skipped`` is 1; what is played goes on.
 
     Args:
         config: the optimisation.
@@ -393,16 +394,16 @@ def make_update(
         rate = schedule(ppo)((before.num_updates + 1) * ppo.steps_per_update)
         fine = jnp.isfinite(jnp.stack(jax.tree.leaves(losses))).all()
         after = dataclasses.replace(
-            state,
+            jax.lax.cond(fine, lambda: state, lambda: before),
             key=jax.random.key_data(key),
             num_updates=before.num_updates + 1,
             playing=playing,
         )
-        keep = jax.lax.cond(fine, lambda: after, lambda: before)
-        playing = placed(keep.playing, mesh, "sets")
-        metrics = played | losses | {"learning_rate": rate}
-        keep, metrics = placed((dataclasses.replace(keep, playing=()), metrics), mesh)
-        return dataclasses.replace(keep, playing=playing), metrics
+        playing = placed(after.playing, mesh, "sets")
+        skipped = jnp.where(fine, 0.0, 1.0)
+        metrics = played | losses | {"learning_rate": rate, "skipped": skipped}
+        after, metrics = placed((dataclasses.replace(after, playing=()), metrics), mesh)
+        return dataclasses.replace(after, playing=playing), metrics
 
     return update
 

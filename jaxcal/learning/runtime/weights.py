@@ -53,14 +53,14 @@ def locate(checkpoint: str | pathlib.Path | None) -> pathlib.Path:
     """Path of a weights file, or of the newest complete step of a run.
 
     Args:
-        checkpoint: a weights file, a training run's folder or its checkpoint folder;
-            the policy of postures that ships when None.
+        checkpoint: a weights file, a training run's folder, its checkpoint folder or a
+            step in that; the policy of postures that ships when None.
 
     Raises:
         CheckpointError: there is no such file or folder, or no step in it.
     """
     path = shipped() if checkpoint is None else pathlib.Path(checkpoint)
-    if path.is_file():
+    if path.is_file() or (path / "meta" / "metadata").is_file():
         return path
     if not path.is_dir():
         hint = " (train one with: jaxcal train)" if checkpoint is None else ""

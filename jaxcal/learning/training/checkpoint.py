@@ -13,11 +13,14 @@ here alone, so that changing it touches one file.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import datetime
 import json
 import logging
 import pathlib
+import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -110,12 +113,17 @@ def save(
         enable_async_checkpointing=False,
         multiprocessing_options=_alone(),
     )
-    with ocp.CheckpointManager(root.absolute(), options=options) as manager:
-        if step in manager.all_steps():
-            return
-        manager.save(
-            step, args=ocp.args.Composite(meta=ocp.args.JsonSave(meta), **items)
-        )
+    with _quiet_after_failure():
+        try:
+            with ocp.CheckpointManager(root.absolute(), options=options) as manager:
+                if step in manager.all_steps():
+                    return
+                items["meta"] = ocp.args.JsonSave(meta)
+                manager.save(step, args=ocp.args.Composite(**items))
+        except Exception as error:  # orbax and tensorstore raise many kinds
+            full = "No space left" in str(error)
+            why = "the disk is full" if full else _first_line(error)
+            raise OSError(f"{root} cannot be written: {why}") from error
 
 
 def _rest(state: TrainState) -> dict[str, Any]:
@@ -134,7 +142,11 @@ def _is_key(leaf: Any) -> bool:
 
 
 class _TolerantLoop(asyncio.SelectorEventLoop):
-    """An event loop that ignores results which arrive after it is closed."""
+    """An event loop that ignores results which arrive after it is closed, and prints
+    no error that nobody waits for: the one that is raised says it."""
+
+    def call_exception_handler(self, context: Any) -> None:
+        """Nothing."""
 
     def call_soon_threadsafe(  # type: ignore[override]  # generic in its arguments
         self, *arguments: Any, **options: Any
@@ -150,6 +162,28 @@ class _TolerantPolicy(asyncio.DefaultEventLoopPolicy):
         return _TolerantLoop()
 
 
+@contextlib.contextmanager
+def _quiet_after_failure() -> Iterator[None]:
+    """One error, where orbax and asyncio print many.
+
+    After one failed file orbax's others end in a thread of tensorstore when their event
+    loop is closed already; asyncio would print an error for each.
+    """
+    before, log = asyncio.get_event_loop_policy(), logging.getLogger("absl")
+    level = log.level
+    asyncio.set_event_loop_policy(_TolerantPolicy())
+    log.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        asyncio.set_event_loop_policy(before)
+        log.setLevel(level)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+
+
 def _read(path: pathlib.Path, like: Any, what: str) -> Any:
     """A tree of arrays that orbax saved, of the shapes and types of ``like``.
 
@@ -157,26 +191,23 @@ def _read(path: pathlib.Path, like: Any, what: str) -> Any:
         CheckpointError: it cannot be read, or has another shape.
     """
     like = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), like)
-    # After one failed read, orbax's other reads end in a thread of tensorstore when
-    # their event loop is closed already; asyncio would print an error for each.
-    before = asyncio.get_event_loop_policy()
-    asyncio.set_event_loop_policy(_TolerantPolicy())
+    options = _alone()
     try:
-        with ocp.StandardCheckpointer(multiprocessing_options=_alone()) as reader:
+        with (
+            _quiet_after_failure(),
+            ocp.StandardCheckpointer(multiprocessing_options=options) as reader,
+        ):
             tree = reader.restore(path.absolute(), like)
         for leaf, wanted in zip(*map(jax.tree.leaves, (tree, like)), strict=True):
             if leaf.shape != wanted.shape:
                 raise ValueError(f"shape {leaf.shape}, not {wanted.shape}")
     except Exception as error:  # orbax and tensorstore raise many kinds
         raise _unreadable(path.parent, what, error) from error
-    finally:
-        asyncio.set_event_loop_policy(before)
     return jax.tree.map(jax.numpy.asarray, tree)
 
 
 def _unreadable(path: pathlib.Path, what: str, error: Exception) -> CheckpointError:
-    line = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
-    return CheckpointError(f"checkpoint {path} cannot be {what} ({line})")
+    return CheckpointError(f"checkpoint {path} cannot be {what} ({_first_line(error)})")
 
 
 def read_meta(
@@ -280,7 +311,9 @@ def read(path: pathlib.Path, meta: dict[str, Any], like: Any) -> Any:
 def restore(
     folder: str | pathlib.Path, fresh: TrainState, schema: str = SCHEMA
 ) -> tuple[TrainState, dict[str, Any]]:
-    """The training state of the newest step, and its meta.
+    """The training state of the newest whole step, and its meta.
+
+    A damaged step is warned of and renamed, and the one before it is read.
 
     Args:
         folder: of a run, or its checkpoint folder.
@@ -288,9 +321,34 @@ def restore(
         schema: of the run.
 
     Raises:
-        CheckpointError: none, damaged, or one without a training state.
+        CheckpointError: none, all are damaged, or one without a training state.
     """
-    path, meta = read_meta(folder, schema)
+    newest = locate(folder)
+    if not newest.name.isdigit():  # weights alone
+        return _restored(newest, fresh, schema)
+    every = [int(p.name) for p in newest.parent.iterdir() if p.name.isdigit()]
+    older = sorted((n for n in every if n <= int(newest.name)), reverse=True)
+    failed: dict[pathlib.Path, CheckpointError] = {}
+    for path in (newest.with_name(str(number)) for number in older):
+        try:
+            restored = _restored(path, fresh, schema)
+        except CheckpointError as error:
+            failed[path] = error
+            continue
+        for damaged, reason in failed.items():
+            aside = damaged.rename(damaged.with_name(f"damaged-{damaged.name}"))
+            warnings.warn(
+                f"{reason}; it is {aside.name} now, the run goes on from {path}",
+                stacklevel=2,
+            )
+        return restored
+    raise failed[newest]
+
+
+def _restored(
+    path: pathlib.Path, fresh: TrainState, schema: str
+) -> tuple[TrainState, dict[str, Any]]:
+    _, meta = read_meta(path, schema)
     if not (path / "state").exists():
         raise CheckpointError(
             f"checkpoint {path} holds a policy but no training state to resume from"

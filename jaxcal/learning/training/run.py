@@ -12,11 +12,12 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
+import fcntl
 import functools
 import os
 import pathlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TextIO
 
 import jax
@@ -38,13 +39,14 @@ _LOSSES = (
     "entropy", "policy_loss", "value_loss", "kl", "kl_after", "clip_fraction",
     "explained_variance", "grad_norm", "learning_rate",
 )  # fmt: skip
+_SKIPS = 5  # updates of the same task in a row, not finite, that end a run
 _LAST = 1000  # episodes whose rewards are kept
 _UPDATES = 16  # updates in one call
 _CALL_SECONDS = 2.0  # of one call: what a signal waits for
 
 
 class DivergedError(ArithmeticError):
-    """A loss or a gradient is not finite; the last finite state is saved."""
+    """Losses or gradients stay not finite; the last finite weights are saved."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,6 +115,7 @@ class Report:
     eta: float  # seconds left
     metrics: dict[str, float]  # of the last update, validation included; means of seeds
     spread: dict[str, float]  # of validation: standard deviation over seeds, 0 for one
+    skipped: int  # updates so far that were not finite in some run
 
 
 @functools.lru_cache(maxsize=32)
@@ -214,11 +217,27 @@ def run(
 
     Raises:
         CheckpointError: nothing to resume from, or damaged.
-        DivergedError: a loss is not finite, in every run; the state before is saved.
-        OSError: the folder cannot be written.
+        DivergedError: losses are not finite in five updates in a row of one task, in
+            every run; the weights before are saved. Fewer are skipped.
+        OSError: the folder cannot be written, or another training writes it.
     """
     last = recipe.config.ppo.num_updates if num_updates is None else num_updates
     root = pathlib.Path(folder)
+    with contextlib.ExitStack() as held:
+        if devices.is_first():
+            held.enter_context(_locked(root))
+        return _run(recipe, root, mesh, resume, report, should_stop, last)
+
+
+def _run(
+    recipe: Recipe,
+    root: pathlib.Path,
+    mesh: Mesh | None,
+    resume: bool,
+    report: Callable[[Report], None],
+    should_stop: Callable[[], bool],
+    last: int,
+) -> TrainState:
     state, before, recent = devices.on_first(lambda: _begin(root, recipe, resume))
     if mesh is not None:
         state = devices.replicate(state, mesh)
@@ -226,6 +245,7 @@ def run(
     seeds = len(recipe.runs) if len(recipe.runs) > 1 else 0
     count, timed, broken = 1, False, ""
     held = list(state.playing)
+    in_row = np.zeros((len(held), len(recipe.runs)), int)  # updates skipped
 
     def whole(state: TrainState) -> TrainState:
         return dataclasses.replace(state, playing=tuple(held))
@@ -252,13 +272,14 @@ def run(
             with collective():
                 state, metrics = update(state, np.int32(count), *given)
                 # One transfer for all that these updates measured.
-                rows, made = jax.device_get(devices.local((metrics, state.num_updates)))
+                rows = jax.device_get(devices.local(metrics))
             held[which] = state.playing
             first, done = done, done + count
-            if made.max() < done:  # every run has kept its last finite state
-                broken = _broken(rows, int(made.max()) - first, int(made.max()))
-                done = int(made.max())
-                count = done - first + 1  # rows, that of the broken update included
+            for number in range(count):
+                fine = np.ravel(rows["skipped"][number]) == 0.0
+                in_row[which] = np.where(fine, 0, in_row[which] + 1)
+                if in_row[which].min() == _SKIPS:
+                    broken = _broken(rows, number, first + number + 1)
             if recorder is not None:
                 recorder.note(whole(state), first, count, rows, save=not broken)
             seconds = (time.perf_counter() - begun) / count
@@ -272,7 +293,7 @@ def run(
     return whole(state)
 
 
-def _broken(rows: Mapping[str, Any], number: int, made: int) -> str:
+def _broken(rows: Mapping[str, Any], number: int, update: int) -> str:
     """What is not finite in row ``number``, and what to do."""
     losses = ("policy_loss", "value_loss", *_LOSSES)  # what to name first
     values = [
@@ -280,9 +301,28 @@ def _broken(rows: Mapping[str, Any], number: int, made: int) -> str:
     ]
     name, value = next((n, v) for n, v in values if not np.isfinite(v))
     return (
-        f"diverged: {name} is {value} in update {made + 1}; the state of update {made} "
-        "is saved: begin anew with a smaller learning rate"
+        f"diverged: {name} is {value} in {_SKIPS} updates in a row, the last of them "
+        f"{update}; the weights before are saved: begin anew with a smaller learning "
+        "rate"
     )
+
+
+@contextlib.contextmanager
+def _locked(root: pathlib.Path) -> Iterator[None]:
+    """The run's folder, made where missing, for this training alone.
+
+    Raises:
+        OSError: another training writes it.
+    """
+    root.mkdir(parents=True, exist_ok=True)
+    with (root / ".lock").open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BlockingIOError(
+                f"{root} is being written by another training: name another folder"
+            ) from None
+        yield
 
 
 @dataclasses.dataclass
@@ -312,6 +352,7 @@ class _Recorder:
         self._of_seeds: list[
             dict[str, float]
         ] = []  # of every seed, at the last validation
+        self._skipped = 0
 
     def note(
         self,
@@ -330,6 +371,7 @@ class _Recorder:
             # Only the end of a call is timed: interpolate.
             at = self._noted + (now - self._noted) * (number + 1) / count
             done = first + number + 1
+            self._skipped += bool(np.any(metrics["skipped"][number]))
             row: dict[str, float] = {
                 name: _mean(values[number]) for name, values in metrics.items()
             }
@@ -376,6 +418,7 @@ class _Recorder:
                 eta=(self.last - done) / rate,
                 metrics=row,
                 spread=spread,
+                skipped=self._skipped,
             )
         )
 
@@ -413,7 +456,6 @@ def _begin(
     root: pathlib.Path, recipe: Recipe, resume: bool
 ) -> tuple[TrainState, float, np.ndarray]:
     """The state to start from, seconds already trained, the last rewards."""
-    root.mkdir(parents=True, exist_ok=True)
     state = recipe.init()
     if not resume:
         return state, 0.0, np.zeros(0, np.float32)
