@@ -12,9 +12,11 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <time.h>
 #include <unistd.h>
 
-enum { UNITS = 3, REGISTERS = 0x7000, POLLS = 2 };
+enum { UNITS = 3, REGISTERS = 0x7000 };
+static const double RATE = 50000.0;      /* pulses a second: 180 degrees of a joint */
 
 typedef struct {
     const char *name;
@@ -31,20 +33,45 @@ static const family_t families[] = {
 };
 static const family_t *family = families;
 static modbus_mapping_t *drive[UNITS + 1];
-static int32_t target[UNITS + 1];
-static int busy[UNITS + 1];
+static int32_t start[UNITS + 1], target[UNITS + 1];
+static double begun[UNITS + 1]; /* of a move, seconds; 0 at rest */
+
+static double now(void) {
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return t.tv_sec + 1e-9 * t.tv_nsec;
+}
+
+static int32_t position(int unit) {
+    uint16_t *r = drive[unit]->tab_registers;
+    return (int32_t)((uint32_t)r[family->position] << 16 | r[family->position + 1]);
+}
+
+/* Where it has come to; at rest there. */
+static void move(int unit) {
+    uint16_t *r = drive[unit]->tab_registers;
+    if (begun[unit] == 0.0) return;
+    double way = (double)target[unit] - start[unit], gone = RATE * (now() - begun[unit]);
+    int there = gone >= (way < 0 ? -way : way);
+    int32_t at = there ? target[unit] : start[unit] + (int32_t)(way < 0 ? -gone : gone);
+    r[family->position] = (uint32_t)at >> 16;
+    r[family->position + 1] = (uint32_t)at & 0xFFFF;
+    if (there) begun[unit] = 0.0, r[family->status] = family->idle;
+}
 
 static void go(int unit) {
     uint16_t *r = drive[unit]->tab_registers;
     if (r[family->status] == family->off && family->off != family->idle) return;
     target[unit] = (int32_t)((uint32_t)r[family->target] << 16 | r[family->target + 1]);
-    busy[unit] = POLLS;
+    start[unit] = position(unit);
+    begun[unit] = now();
     r[family->status] = family->moving;
     printf("move %d %d\n", unit, (int)target[unit]);
 }
 
 static void rest(int unit, const char *word) {
-    busy[unit] = 0;
+    move(unit);
+    begun[unit] = 0.0;
     drive[unit]->tab_registers[family->status] = family->idle;
     printf("%s %d\n", word, unit);
 }
@@ -52,14 +79,9 @@ static void rest(int unit, const char *word) {
 static void act(int unit, const uint8_t *pdu) {
     uint16_t *r = drive[unit]->tab_registers;
     int function = pdu[0], address = pdu[1] << 8 | pdu[2], last = address;
-    if (function == 16 || function == 3) last += (pdu[3] << 8 | pdu[4]) - 1;
+    if (function == 16) last += (pdu[3] << 8 | pdu[4]) - 1;
     if (function == 3) {
-        int asked = address <= family->status && family->status <= last;
-        if (asked && busy[unit] > 0 && --busy[unit] == 0) {
-            r[family->position] = (uint32_t)target[unit] >> 16;
-            r[family->position + 1] = (uint32_t)target[unit] & 0xFFFF;
-            r[family->status] = family->idle;
-        }
+        move(unit);
     } else if (family == &families[0]) {
         /* PR0: mode at 6200h, 1 = absolute; 6207h = 10h runs it; 6002h = 40h stops */
         if (function == 16 && last == 0x6207 && r[0x6207] == 0x10 && r[0x6200] == 1)
