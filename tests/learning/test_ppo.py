@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import subprocess
+import sys
 from typing import NamedTuple
 
 import flax.linen as nn
@@ -114,6 +117,42 @@ def test_the_loss_is_that_of_the_definition(rng):
     np.testing.assert_allclose(metrics["kl"], kl / number, rtol=1e-4)
     whole = -gain + config.value_coefficient * error - 0.1 * entropy
     np.testing.assert_allclose(found, whole / number, rtol=1e-5)
+
+
+@pytest.mark.parametrize("least", [-1e9, -np.inf])
+def test_a_mask_of_minus_infinity_is_taken(least):
+    one = jnp.zeros((1, 1))
+    batch = ppo.Batch(None, one.astype(int), one - 0.7, one + 1.0, one)
+
+    def loss(free):
+        logits = jnp.array([0.0, 0.0, least]).at[1].set(free)[None, None]
+        return ppo.surrogate(TINY, logits, one, batch, 0)[0]
+
+    value, gradient = jax.value_and_grad(loss)(0.3)
+    expected, slope = jax.value_and_grad(
+        lambda free: ppo.surrogate(
+            TINY, jnp.array([0.0, free])[None, None], one, batch, 0
+        )[0]
+    )(0.3)
+    np.testing.assert_allclose([value, gradient], [expected, slope], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_it_trains_with_64_bits_switched_on():
+    code = (
+        "import jax\n"
+        "from jaxcal.learning import SelectionConfig, Task, make_train\n"
+        "from jaxcal.learning import EpisodesConfig, NetworkConfig, TrainConfig\n"
+        "ppo = EpisodesConfig(num_episodes=128, episodes_per_update=64,\n"
+        "    episodes_per_set=4, num_minibatches=2, warmup_updates=1)\n"
+        "task = Task(SelectionConfig(8, 3, 2, 2))\n"
+        "config = TrainConfig(network=NetworkConfig(width=8, encoder_rounds=0),\n"
+        "    ppo=ppo, tasks=(task,))\n"
+        "state, metrics = jax.jit(make_train(config))(jax.random.key(0))\n"
+        "assert not metrics['skipped'].any(), metrics\n"
+    )
+    wide = os.environ | {"JAX_ENABLE_X64": "1"}
+    subprocess.run([sys.executable, "-c", code], env=wide, check=True)
 
 
 def test_a_value_that_is_far_off_is_still_pulled():

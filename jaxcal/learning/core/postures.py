@@ -85,6 +85,16 @@ def _mapped(function: Callable[..., Any], at_once: int, leaves: Any) -> Any:
     return jax.lax.map(function, leaves, batch_size=at_once)
 
 
+def _single(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+    """A function of no arguments whose numbers are float32, with 64 bits switched on
+    too."""
+
+    def called() -> Any:
+        return jax.tree.map(lambda x: x.astype(jnp.float32), function(*arguments))
+
+    return called
+
+
 def _followed(first: jax.Array, others: jax.Array) -> jax.Array:
     """(1 + T G, ...) from (1, ...) and (T, G, ...)."""
     return jnp.concatenate([first, others.reshape(-1, *others.shape[2:])])
@@ -183,8 +193,8 @@ class Postures:
             decision = network.decision_features(
                 features, state.chosen, state.available, count
             )
-            by_network = functools.partial(decode, network, params, memory, decision)
-            by_lookahead = functools.partial(network.lookahead_logits, decision)
+            by_network = _single(decode, network, params, memory, decision)
+            by_lookahead = _single(network.lookahead_logits, decision)
             if isinstance(learns, bool):
                 return decision, *(by_network if learns else by_lookahead)()
             return decision, *jax.lax.cond(learns, by_network, by_lookahead)

@@ -47,6 +47,8 @@ __all__ = [
     "surrogate",
 ]
 
+_LEAST = -1e9  # logit of what is not available, as ``mask_logits`` has it
+
 Metrics = dict[str, jax.Array]
 
 
@@ -152,13 +154,13 @@ def surrogate(
 
     Args:
         config: coefficients and limits.
-        logits: (B, T, ..., A) of the decisions in ``batch``, masked by a finite
-            minimum.
+        logits: (B, T, ..., A) of the decisions in ``batch``, masked by a large finite
+            minimum or -inf.
         value: (B, T, ...) reward units.
         batch: what was played.
         done: () updates made; the entropy bonus follows it.
     """
-    log_probs = jax.nn.log_softmax(logits)
+    log_probs = jax.nn.log_softmax(jnp.maximum(logits, _LEAST))
     taken = jnp.take_along_axis(log_probs, batch.action[..., None], axis=-1)[..., 0]
     log_ratio = taken - batch.log_prob
     ratio = jnp.exp(log_ratio)
@@ -271,7 +273,7 @@ def descend(
     # Exponential average with bias correction: the share of the newest weights is 1 at
     # the first step, so the initial weights do not enter.
     decay, count = config.average_decay, opt_state[0].count
-    share = (1.0 - decay) / (1.0 - decay**count)
+    share = jnp.asarray((1.0 - decay) / (1.0 - decay**count), jnp.float32)
     average = optax.incremental_update(params, state.average, share)
     changed = {"params": params, "average": average, "opt_state": opt_state}
     return dataclasses.replace(state, **changed), norm
