@@ -30,7 +30,7 @@ from rig.core.device import Device, Posture
 from rig.core.motion import move
 from rig.faults import Fault, StopRequested
 from rig.signals import Signals
-from rig.simulator import Simulator, Truth, parse_fault
+from rig_workbench.simulator import Simulator, Truth, parse_fault
 
 SLOW = {
     "timeout_s = 0.5": "timeout_s = 0.3",

@@ -20,6 +20,22 @@ MOVED = {  # longer names first
     "jaxcal.plots": "jaxcal.reports.plots",
     "jaxcal.selection.continuous": "jaxcal.designs.continuous",
     "jaxcal.selection.fastest": "jaxcal.designs.travel",
+    "rig.model": "rig_workbench.model",
+    "rig.readings.numbers": "rig_workbench.numbers",
+    "rig.simulator": "rig_workbench.simulator",
+    "rig.workbench.commission.breakaway": "rig_workbench.commission.breakaway",
+    "rig.workbench.commission.characterise": "rig_workbench.commission.characterise",
+    "rig.workbench.commission.connections": "rig_workbench.commission.connections",
+    "rig.workbench.commission.setup": "rig_workbench.commission.setup",
+    "rig.workbench.commission": "rig.prove",
+    "rig.workbench.identification.refit": "rig_workbench.refit",
+    "rig.workbench.live": "rig_workbench.live",
+    "rig.workbench.outputs.export": "rig_workbench.outputs.export",
+    "rig.workbench.outputs.report": "rig_workbench.outputs.report",
+    "rig.workbench.outputs.trend": "rig_workbench.outputs.trend",
+    "rig.workbench.outputs.view": "rig_workbench.outputs.view",
+    "rig.workbench.rig_toml": "rig.prove.rig_toml",
+    "rig.workbench": "rig",
 }
 
 
@@ -29,7 +45,7 @@ class Finder:
 
     @staticmethod
     def find_spec(name: str, path: object = None, target: object = None) -> object:
-        for old in MOVED if name.startswith("jaxcal.") else ():
+        for old in MOVED if name.startswith(("jaxcal.", "rig.")) else ():
             if name == old or name.startswith(f"{old}."):
                 new = MOVED[old] + name[len(old) :]
                 return ModuleSpec(name, Finder, origin=new)  # type: ignore[arg-type]

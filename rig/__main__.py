@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import os
 import re
 import signal
 import sys
@@ -12,10 +11,12 @@ from collections.abc import Sequence
 
 if sys.argv[1:2] == ["stop"]:  # nothing may keep it from the drives
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that is closed meanwhile
-    os.environ["JAXCAL_KERNELS_UNCHECKED"] = "1"  # it calls none
 
 # Looked for before any port opens; finding is quicker than importing.
-NEEDED = ("pydantic", "serial", "jinja2", "tomlkit")
+NEEDED = {
+    "rig": ("pydantic", "serial", "tomlkit"),
+    "workbench": ("pydantic", "serial", "tomlkit", "jinja2"),
+}
 NUMBER = re.compile(r"[-+.0-9]+(?:[eE][-+]?[0-9]+)?")
 
 
@@ -37,14 +38,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         JournalError,
         told,
     )
+    from rig.parts import extra_of
 
-    args = make_parser(argv[0] if argv else None).parse_args(argv)
-    command, code = args.command, EXIT_BAD_INPUT
+    command, code = "", EXIT_BAD_INPUT
     try:
-        for name in NEEDED:
+        args = make_parser(argv[0] if argv else None).parse_args(argv)
+        command, extra = args.command, extra_of(args.function.__module__)
+        for name in NEEDED[extra]:
             if importlib.util.find_spec(name) is None:
                 raise ModuleNotFoundError(
-                    f"{command} needs {name}, which is not installed: {install('rig')}"
+                    f"{command} needs {name}, which is not installed: {install(extra)}"
                 )
         require_kept(vars(args))
         code = args.function(**values_of(args))

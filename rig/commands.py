@@ -1,38 +1,34 @@
-"""The commands: what each takes, and what it does. Each loads what it needs."""
+"""The commands that move, measure and stop, and the parser of every command.
+
+Each loads what it needs. All of them, of other packages too, are entry points.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import pathlib
-import sys
-import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from jaxcal.arguments import Parser
-from rig.faults import EXIT_FAULT, EXIT_OK, EXIT_RECALIBRATE, Refused
+from jaxcal.extras import MissingExtraError, installed
+from rig.faults import EXIT_FAULT, EXIT_OK, Refused
+from rig.parts import COMMANDS, part
 
 if TYPE_CHECKING:
     from rig.config import RigConfig
-    from rig.simulator import Simulator
-    from rig.workbench.commission.steps import Site
+    from rig.prove.steps import Site
+    from rig.sessions import SimulatedDevice
 
 
 def _axes(text: str) -> list[str]:
     return text.split(",")
 
 
-def _numbers(text: str) -> list[float]:
-    return [float(number) for number in text.split(",")]
-
-
 Path = pathlib.Path
 FILE = Path("rig.toml")  # without --config
 AxisName = Annotated[str, "of rig.toml"]
-Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
-Angles = tuple[float, float, float]
-CIRCLE = (-360, 360)
 WIDE = (-1e6, 1e6)
 RunPath = Annotated[Path, "the run's folder"]
 Saved = Annotated[Path, "its file, or its run's folder"]
@@ -87,9 +83,8 @@ class DeviceOptions(Simulation):
         from rig.config import ConfigError, example_text, load_config, parse_config
 
         if self.fault == ["list"]:
-            from rig.simulator.faults import KINDS
-
-            print(*(f"{kind:<16} {text}" for kind, text in KINDS.items()), sep="\n")
+            kinds = part("simulator", "--fault").KINDS.items()
+            print(*(f"{kind:<16} {text}" for kind, text in kinds), sep="\n")
             raise SystemExit
         if self.config is None:
             if self.simulate or simulated:
@@ -103,19 +98,11 @@ class DeviceOptions(Simulation):
 
     def simulator(
         self, config: RigConfig, options: dict[str, Any] | None = None
-    ) -> Simulator:
+    ) -> SimulatedDevice:
         """A simulated rig as these options, or those of a run, describe it."""
-        from rig.simulator import Simulator, parse_fault, truth_of
-
-        options = options or self.simulation
-        return Simulator(
-            config,
-            truth_of(options, config),
-            [parse_fault(text, config.axis_names) for text in self.fault or ()],
-            transport=options["transport"],
-            rate_hz=options["rate"],
-            speedup=options["speedup"],
-        )
+        options, simulator = options or self.simulation, part("simulator", "--simulate")
+        made: SimulatedDevice = simulator.simulated(config, options, self.fault or ())
+        return made
 
 
 @dataclasses.dataclass
@@ -146,65 +133,9 @@ class Session(DeviceOptions):
 # Commissioning
 
 
-def setup(
-    given: Step,
-    *,
-    bus: BusName = "",
-    units: Units = 16,
-    imu: Annotated[str, "APP[:PORT]: hyperimu, sensorlogger or lines"] = "",
-    home: Annotated[Literal["here", "drive"], "how"] = "here",
-    axes: Annotated[
-        str, "NAME:KIND,... with a KIND of X, Y, Z (a phone's), deg or mm"
-    ] = "",
-    drives: Annotated[str, "their map: grbl, marlin, cia402, FILE.toml, ..."] = "",
-    readings: Annotated[
-        str, "numbers, not a phone: tcp:HOST:PORT, listen:PORT, serial:DEVICE, ..."
-    ] = "",
-    urdf: Annotated[str, "of an arm, whose joints are the axes"] = "",
-    example: Annotated[
-        Literal["turntable", "gimbal", "stage", "servos"], "these for a device"
-    ]
-    | None = None,
-    set: Annotated[list[str], "KEY=VALUE of the new rig.toml"] | None = None,
-) -> int:
-    """from cables to a device that may be calibrated; writes rig.toml"""
-    from rig.journal import DeviceRecord
-    from rig.workbench.commission import setup as wizard
-    from rig.workbench.commission import steps
-
-    path, operator = given.config or FILE, steps.Operator(given.yes, _say)
-    values = dict(map(wizard.setting, set or ()))
-    asked = wizard.asked(
-        bus=bus, imu=imu, units=units, values=values, home=home, axes=axes,
-        drives=drives, readings=readings, model=urdf, example=example or "",
-    )  # fmt: skip
-    if given.simulate and (axes or drives or readings or urdf or example):
-        raise Refused(
-            "--simulate commissions the simulator's own device: leave out --axes, "
-            "--drives, --readings, --urdf and --example"
-        )
-    with contextlib.ExitStack() as stack:
-        if given.simulate:
-            device = dataclasses.replace(given, config=None)
-            simulator = stack.enter_context(device.simulator(device.load()))
-            asked = wizard.simulated(simulator, asked)
-            path = given.config or steps.own_folder(simulator.config) / "rig.toml"
-            if path.exists():  # its bus may be that of a real device
-                raise Refused(
-                    f"{path} exists: --simulate writes a file of its own. Name a new "
-                    "one, or leave out --config or --simulate"
-                )
-        config = wizard.begin(path, asked, operator)
-        site = steps.Site(
-            config, DeviceRecord.load(config.device_path), operator, path,
-            reset_alarms=given.reset_alarms, full_speed=given.simulate,
-        )  # fmt: skip
-        return wizard.go(site, asked)
-
-
 def ports() -> int:
     """list serial ports"""
-    from rig.workbench.commission.scan import serial_lines
+    from rig.prove.scan import serial_lines
 
     print(*(serial_lines() or ["no serial port on this computer"]), sep="\n")
     return EXIT_OK
@@ -212,33 +143,22 @@ def ports() -> int:
 
 def scan(given: DeviceOptions, *, bus: BusName = "", units: Units = 16) -> int:
     """which units answer, and of which family; reads only"""
-    from rig.workbench.commission import scan as scanning
+    from rig.prove import scan as scanning
 
     if bus and not given.simulate:
-        units_found = scanning.scan(scanning.parse_bus(bus), units, _say)
+        units_found = scanning.scan(scanning.parse_bus(bus), units, say)
     else:
-        from rig.workbench.commission import steps
+        from rig.prove import steps
 
-        with _place(given) as site:
+        with place(given) as site:
             maps = tuple(axis.map for axis in site.config.axes)
             # Units of other lines than Modbus are those of rig.toml.
             units_found = list[Any](maps)
             if site.config.bus.transport in scanning.OF_BUS:
-                units_found = list(scanning.scan(site.config.bus, units, _say, maps))
+                units_found = list(scanning.scan(site.config.bus, units, say, maps))
             if units_found:
                 steps.show_identity(site)
     return EXIT_OK if units_found else EXIT_FAULT
-
-
-def imu(
-    given: Step, *, seconds: Annotated[float, "to look at it", (1, 600)] = 5.0
-) -> int:
-    """what to type into the phone, and what it sends"""
-    from rig.workbench.commission import setup, steps
-
-    with _place(given) as site:
-        setup.pin(site, steps.look_at_phone(site, seconds))
-    return EXIT_OK
 
 
 def jog(
@@ -249,11 +169,6 @@ def jog(
 ) -> int:
     """move one axis by a step"""
     return _step(given, "IDENTIFIED", "jog", axis, step)
-
-
-def characterise(axis: AxisName, *, given: Step) -> int:
-    """measure play, dead zone and breakaway of one axis"""
-    return _step(given, "SIGN_CHECKED", "characterise", axis)
 
 
 def home(
@@ -275,20 +190,20 @@ def zero(given: Step) -> int:
 
 def _step(given: Step, state: str, name: str, *options: Any) -> int:
     """Run a function of ``steps`` at the device."""
-    from rig.workbench.commission import steps
+    from rig.prove import steps
 
-    with _place(given, state) as site:
+    with place(given, state) as site:
         code: int = getattr(steps, name)(site, *options)
         return code
 
 
 @contextlib.contextmanager
-def _place(given: DeviceOptions, state: str = "") -> Iterator[Site]:
+def place(given: DeviceOptions, state: str = "") -> Iterator[Site]:
     """The device that a command is about, which has reached a state."""
     from rig.journal import DeviceRecord
-    from rig.workbench.commission import steps
+    from rig.prove import steps
 
-    config, operator = given.load(), steps.Operator(getattr(given, "yes", False), _say)
+    config, operator = given.load(), steps.Operator(getattr(given, "yes", False), say)
     with contextlib.ExitStack() as stack:
         if given.simulate:
             simulator = given.simulator(config)
@@ -307,7 +222,7 @@ def _place(given: DeviceOptions, state: str = "") -> Iterator[Site]:
         yield site
 
 
-def _say(text: str) -> None:
+def say(text: str) -> None:
     print(text, flush=True)
 
 
@@ -341,7 +256,7 @@ def goto(
 
 def resume(run: RunPath, *, given: Session) -> int:
     """go on with a run that was paused, stopped or killed"""
-    from rig.workbench.sessions import recorded, records_of, run_session
+    from rig.sessions import recorded, records_of, run_session
 
     config, start = recorded(run, given.config)
     if given.simulate and start["simulated"] is None:
@@ -366,7 +281,7 @@ def _session(
     to: tuple[float, ...] | None = None,
 ) -> int:
     """Run a new session; returns the exit code."""
-    from rig.workbench.sessions import run_session
+    from rig.sessions import run_session
 
     if count is not None and count < 1:
         raise Refused(f"--count must be at least 1, got {count}")
@@ -384,29 +299,12 @@ def _session(
 # Of the device, and of runs
 
 
-def watch(run: RunPath) -> int:
-    """show a run, also a running one, as a page in the browser"""
-    from jaxcal.extras import needs
-    from rig.journal import JOURNAL
-    from rig.workbench.live import listen
-
-    if not (run / JOURNAL).is_file():
-        raise Refused(f"{run} is not the folder of a run: it holds no {JOURNAL}")
-    with needs("live", "the live page"):
-        from rig.workbench.live.server import serve
-    sock, line = listen()
-    print(f"{line}\nCtrl-C ends", flush=True)
-    with contextlib.suppress(KeyboardInterrupt):
-        serve(run, sock)
-    return EXIT_OK
-
-
 def identify(given: DeviceOptions) -> int:
     """read identity and status of every drive; write nothing"""
     from rig.drives.line import BusError
 
     code = EXIT_OK
-    with _place(given) as site, site.bus("identify") as drives:
+    with place(given) as site, site.bus("identify") as drives:
         for drive in drives:
             axis = drive.axis
             unit = f"{axis.name} (unit {axis.unit}"
@@ -446,7 +344,7 @@ def check(file: ConfigPath | None = None, *, config: ConfigPath | None = None) -
     path = config or file or FILE
     loaded = load_config(path)
     if loaded.model is not None:
-        from rig.model import model_of  # scipy: half of the time of this command
+        from rig.device_model import model_of  # numpy: half of this command's time
 
         model_of(loaded)
     make_drives(loaded.bus, loaded.axes)
@@ -469,110 +367,6 @@ def example(name: Annotated[str, "without it they are listed"] | None = None) ->
     return EXIT_OK
 
 
-def refit(
-    run: RunPath,
-    *,
-    order: Annotated[Order, "mechanism.order: axes of the joints"] | None = None,
-    imu_order: Annotated[Order, "imu.order: of the phone's angles"] | None = None,
-    signs: Annotated[tuple[int, int, int], "imu.signs", (-1, 1)] | None = None,
-    mounting: Annotated[Angles, "imu.mounting_deg: Z, Y, X", CIRCLE] | None = None,
-    factors: Annotated[list[float], "readings.factors", _numbers] | None = None,
-) -> int:
-    """identify a recorded calibration anew"""
-    from rig.workbench.identification.refit import refit as identify_anew
-    from rig.workbench.sessions import recorded, records_of
-
-    then, start = recorded(run)
-    if start["mode"] != "calibrate":
-        raise Refused(f"{run} is a {start['mode']} run; refit takes a calibration")
-    values = {
-        "mechanism.order": order,
-        "imu.order": imu_order,
-        "imu.signs": signs,
-        "imu.mounting_deg": mounting,
-        "readings.factors": factors,
-    }
-    return identify_anew(run, records_of(run), then, values, print)
-
-
-def report(run: RunPath) -> int:
-    """write report.html of any run, also unfinished"""
-    from rig.workbench.outputs.report import write_report
-    from rig.workbench.sessions import records_of
-
-    print(write_report(run, records_of(run)))
-    return EXIT_OK
-
-
-def export(
-    run: RunPath,
-    *,
-    to: Literal["c", "st", "ros", "json"],
-    out: Annotated[Path, "file to write; without it it is printed"] | None = None,
-) -> int:
-    """print the inverse map of a calibration for a controller"""
-    from jaxcal.files import write_text
-    from rig.workbench.outputs.export import LANGUAGES, load_inverse
-    from rig.workbench.sessions import records_of
-
-    inverse = load_inverse(run, records_of(run))
-    for text in inverse["warnings"]:
-        print(f"WARNING: {text}", file=sys.stderr)
-    text = LANGUAGES[to](inverse)
-    if out is None:
-        print(text, end="")
-    else:
-        write_text(out, text)
-        print(f"{out}: SHA-256 of the numbers {inverse['checksum']}")
-    return EXIT_OK
-
-
-def trend(folder: Annotated[Path, "of runs, searched with its subfolders"]) -> int:
-    """compare the calibrations of a device over time"""
-    from rig.workbench.outputs.trend import read_runs, trend_lines, write_trend
-
-    if not folder.is_dir():
-        raise Refused(f"{folder} is no folder")
-    devices, skipped = read_runs(folder)
-    for text in skipped:
-        print(f"left out: {text}", file=sys.stderr)
-    if not devices:
-        raise Refused(f"{folder} holds no finished calibration or verification")
-    for device in devices:
-        print(*trend_lines(device), sep="\n")
-    print(f"saved: {write_trend(folder, devices)}")
-    again = any(device.reasons for device in devices)
-    return EXIT_RECALIBRATE if again else EXIT_OK
-
-
-def simulate(
-    given: DeviceOptions, *, bus_port: Annotated[int, "0: any free one"] | None = None
-) -> int:
-    """serve simulated drives and a phone on loopback"""
-    config = given.load(simulated=True)
-    with given.simulator(config) as simulator:
-        served = simulator.start(config.bus.port if bus_port is None else bus_port)
-        phone = f"listens on 127.0.0.1:{served.source.port}"
-        if config.source.transport in ("listen", "udp"):
-            port = config.source.port or 2055
-            simulator.start_phone(port)
-            phone = f"sends to 127.0.0.1:{port}"
-        print(f"drives: {served.bus.where}; units {[a.unit for a in config.axes]}")
-        print(f"{'phone: ' + config.imu.format if config.imu else 'sensor'}, {phone}")
-        print("Ctrl-C ends", flush=True)
-        with contextlib.suppress(KeyboardInterrupt):
-            while True:
-                time.sleep(3600)
-    return EXIT_OK
-
-
-COMMANDS = (
-    setup, ports, scan, imu, jog, characterise, home, axes, zero, calibrate, collect,
-    verify, goto, resume, watch, identify, stop, check, example, refit, report, export,
-    trend, simulate,
-)  # fmt: skip
-
-
 EPILOG = """\
 exit codes: 0 done; 1 done, but the error says calibrate (again); 2 bad input, nothing
 moved; 3 stopped by a fault; 4 paused by Ctrl-C; 128 + signal stopped by a signal.
@@ -586,9 +380,29 @@ emergency stop is required.
 def make_parser(only: str | None = None) -> Parser:
     """The parser of every command; with the options of one alone it is made quicker."""
     about = "Calibrate a device of one to six axes: its drives, and what measures them."
+    about += " Begin with `setup`."
     parser = Parser(prog="jaxcal-rig", description=about, epilog=EPILOG)
     added = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for function in [each for each in COMMANDS if each.__name__ == only] or COMMANDS:
+    absent: dict[str, str] = {}
+    if only in (names := installed(COMMANDS)):
+        functions = [part(only, only, COMMANDS)]
+    else:
+        functions = _loaded(names, absent)
+    for function in functions:
         name, text = function.__name__, function.__doc__
         added.add_parser(name, help=text, description=text).of(function)
+    for name, text in absent.items():
+        added.add_parser(name, help=text)
     return parser
+
+
+def _loaded(names: Iterable[str], absent: dict[str, str]) -> list[Any]:
+    """The functions of commands in the order of their modules' lines; to ``absent``
+    are added those that cannot be loaded, and what to install."""
+    functions = []
+    for name in names:
+        try:
+            functions.append(part(name, name, COMMANDS))
+        except MissingExtraError as error:
+            absent[name] = str(error)
+    return sorted(functions, key=lambda f: (f.__module__, f.__code__.co_firstlineno))

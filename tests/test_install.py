@@ -77,8 +77,15 @@ CASES = {
         [(["python", "-c", "import jaxcal.reports.plots, jinja2"], 0, "")],
     ),
     "rig": (
+        ("jax", "flax", "brax", "mujoco", "matplotlib", "pymodbus"),
+        [
+            (["jaxcal-rig", "calibrate", "--simulate"], 2, "[workbench]'"),
+            (["jaxcal-rig", "example", "simulate"], 0, "[bus]"),
+        ],
+    ),
+    "workbench": (
         ("jax", "flax", "brax", "mujoco"),
-        [(["jaxcal-rig", "calibrate", "--simulate"], 0, "")],
+        [(["jaxcal-rig", "calibrate", "--simulate"], 0, "report.html")],
     ),
     "live": (
         ("jax", "flax", "brax", "mujoco"),

@@ -66,7 +66,7 @@ def test_who_calls_no_kernel_minds_none(package, monkeypatch):
     monkeypatch.setenv(compiled.UNCHECKED, "1")
     compiled.check(package)
     assert (
-        f'os.environ["{compiled.UNCHECKED}"]' in (ROOT / "rig/__main__.py").read_text()
+        f'os.environ["{compiled.UNCHECKED}"]' in (ROOT / "rig/__init__.py").read_text()
     )
 
 

@@ -23,6 +23,7 @@ FAR = (
     "jaxcal.reports",
     "jaxcal.learning",
     "rig",
+    "rig_workbench",
 )
 FOREIGN = ("jax", "flax", "matplotlib", "jinja2", "pydantic", "pandas", "joblib")
 
@@ -113,6 +114,10 @@ def test_import_costs_numpy_alone(tmp_path):
         ("jaxcal.models.sensors", "jaxcal.arms.sensors"),
         ("jaxcal.pages", "jaxcal.reports.page"),
         ("jaxcal.calibration.budget", "jaxcal.reports.budget"),
+        ("rig.simulator", "rig_workbench.simulator"),
+        ("rig.simulator.truth", "rig_workbench.simulator.truth"),
+        ("rig.workbench.commission.steps", "rig.prove.steps"),
+        ("rig.workbench.outputs.view", "rig_workbench.outputs.view"),
     ],
 )
 def test_an_old_path_is_the_new_module_and_warns(tmp_path, old, new):
@@ -125,7 +130,7 @@ import {new} as new
 assert old is new and sys.modules["{old}"] is new
 assert new.__name__ == "{new}", new.__name__
 assert any("{old} is {new}" in str(warning.message) for warning in given), given
-from {old} import __all__
+from {old} import *
 """
     modules_of(body, tmp_path)
 
@@ -141,3 +146,36 @@ def test_models_have_the_names_of_arms(tmp_path):
         assert getattr(jaxcal.models, name) is getattr(jaxcal.arms, name)
     with pytest.raises(AttributeError, match="no attribute 'NoModel'"):
         _ = jaxcal.models.NoModel
+
+
+_RIG = """
+from rig.__main__ import main
+assert main({words!r}) == 0
+"""
+
+
+def test_a_session_and_a_stop_load_nothing_of_the_workbench(tmp_path):
+    """Nor does calibrating load what draws a report: another process writes it."""
+    from commission import device, quick_text
+    from harness import prove_stops
+
+    from rig.config import load_config
+    from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
+
+    path = tmp_path / "rig.toml"
+    with device() as (_, bus, port):
+        path.write_text(quick_text(bus, port))
+        config = load_config(path)
+        record = DeviceRecord.load(config.device_path)
+        for state in (IDENTIFIED, HOMED, SIGN_CHECKED):
+            record.reach(state, config)
+        prove_stops(record, config)
+        words = ["calibrate", "--config", str(path), "--arm", "--zero"]
+        session = modules_of(_RIG.format(words=words), tmp_path)
+        stop = modules_of(_RIG.format(words=["stop", "--config", str(path)]), tmp_path)
+    assert list(tmp_path.glob("**/report.html"))
+    far = ("rig_workbench", "jaxcal.arms", "jaxcal.adaptive", "jaxcal.reports")
+    heavy = ("jax", "flax", "matplotlib", "jinja2", "pymodbus", "nicegui", "pandas")
+    assert required_apart(session, (*far, *heavy)) == []
+    assert "rig.procedures.calibrate" in session
+    assert required_apart(stop, (*far, *heavy, "jaxcal.models", "scipy")) == []

@@ -1,8 +1,8 @@
 """What is measured: a phone's attitude, or the numbers of a sensor.
 
 ``source`` is what motion and measurement ask; ``phone`` with ``receiver``, ``stream``
-and ``attitude``, and ``numbers`` are its kinds; ``geometry`` is how two readings
-compare.
+and ``attitude``, and ``rig_workbench.numbers`` are its kinds; ``geometry`` is how two
+readings compare.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from rig.config import RigConfig
+from rig.parts import part
 from rig.readings.source import Source
 
 
@@ -19,9 +20,8 @@ def make_source(
 ) -> Source:
     """What a device is measured with; to be opened. ``report`` gets its events."""
     if config.readings is not None:
-        from rig.readings.numbers import Sensor
-
-        return Sensor(config.readings, report)
+        source: Source = part("numbers", "[readings]")(config.readings, report)
+        return source
     from rig.readings.phone import Imu
 
     return Imu(config.phone, report)

@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from rig.__main__ import main
 from rig.config import AXIS_NAMES
-from rig.simulator import Truth
-from rig.workbench.commission.scan import parse_bus
-from rig.workbench.commission.setup import setting
-from rig.workbench.rig_toml import set_values
+from rig.prove.rig_toml import set_values
+from rig.prove.scan import parse_bus
+from rig_workbench.commission.setup import setting
+from rig_workbench.simulator import Truth
 
 QUICK = (  # of the new rig.toml: short windows, quick axes
     "settle.window_s=0.04", "settle.min_samples=5", "settle.samples=5",
@@ -53,7 +53,7 @@ def set_up(bus: str, port: int, *more: str, values=QUICK) -> int:
 
 
 def quick_text(bus, port):
-    from rig.workbench.rig_toml import new_text
+    from rig_workbench.commission.new_file import new_text
 
     axes = [
         {"name": name, "kind": letter, "unit": unit, "family": "leadshine_pr",

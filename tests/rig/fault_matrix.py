@@ -43,6 +43,7 @@ from harness import (
     simulator,
 )
 
+from rig.command_run import Run
 from rig.config import RigConfig, parse_config
 from rig.core import motion
 from rig.drives.modbus import Bus, ModbusDrive
@@ -55,11 +56,10 @@ from rig.journal import (
     DeviceRecord,
     read_journal,
 )
-from rig.simulator import Truth, parse_fault
-from rig.workbench.command_run import Run
-from rig.workbench.commission.operator import Operator
-from rig.workbench.commission.steps import Site, go_home, show_identity
-from rig.workbench.commission.steps import axes as check_the_axes
+from rig.prove.operator import Operator
+from rig.prove.steps import Site, go_home, show_identity
+from rig.prove.steps import axes as check_the_axes
+from rig_workbench.simulator import Truth, parse_fault
 
 PHASES = ("zeroing", "moving", "settling", "measuring", "saving")
 FAULTS = (

@@ -17,19 +17,28 @@ from unittest import mock
 
 import numpy as np
 
-from rig import simulator as simulators
+from rig.command_run import Run, run_safely
 from rig.config import RigConfig, parse_config
 from rig.config.config import EXAMPLES
 from rig.config.maps import RegisterMap, available_maps, load_map
 from rig.core import motion, stop
-from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, STOP_PROVED, DeviceRecord
+from rig.journal import (
+    HOMED,
+    IDENTIFIED,
+    JOURNAL,
+    SIGN_CHECKED,
+    STOP_PROVED,
+    DeviceRecord,
+    read_journal,
+)
 from rig.journal.lock import BusLock
+from rig.outputs import results
+from rig.outputs.console import listen
+from rig.procedures.calibrate import calibrate
 from rig.signals import Signals
-from rig.simulator import Truth
-from rig.workbench.command_run import Run, run_safely
-from rig.workbench.outputs import report
-from rig.workbench.outputs.console import listen
-from rig.workbench.procedures.calibrate import calibrate
+from rig_workbench import simulator as simulators
+from rig_workbench.outputs import report
+from rig_workbench.simulator import Truth
 
 AS_OF_A_DEVICE = (
     stop.VERIFY_S,
@@ -278,10 +287,20 @@ def on_phase(run: Run, listener) -> None:
     )
 
 
+@contextlib.contextmanager
 def no_figures():
-    """The report without its figures, which take longer than a fast session."""
-    text = "no figures in this test"
-    return mock.patch.object(report, "drawn", lambda *_: text)
+    """The report written here, and without its figures: another process that loads
+    matplotlib takes longer than a fast session."""
+
+    def here(folder: pathlib.Path) -> str:
+        report.write_report(folder, read_journal(folder / JOURNAL))
+        return ""
+
+    with (
+        mock.patch.object(results, "write_report", here),
+        mock.patch.object(report, "drawn", lambda *_: "no figures in this test"),
+    ):
+        yield
 
 
 def in_the_middle(run: Run, phase: str) -> bool:

@@ -7,10 +7,10 @@ from harness import SESSION, fast_text
 
 from rig.config import parse_config
 from rig.journal import DeviceRecord
-from rig.simulator.faults import FaultInjector
-from rig.simulator.sensor import SimSensor
-from rig.workbench.commission import steps
-from rig.workbench.commission.operator import Operator
+from rig.prove import steps
+from rig.prove.operator import Operator
+from rig_workbench.simulator.faults import FaultInjector
+from rig_workbench.simulator.sensor import SimSensor
 
 AXIS = """
 [[axes]]

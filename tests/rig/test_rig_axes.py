@@ -18,8 +18,8 @@ import jaxcal
 from rig.__main__ import main
 from rig.config import ConfigError, parse_config
 from rig.journal import SIGN_CHECKED, STOP_PROVED, DeviceRecord, read_journal
-from rig.simulator import Truth
-from rig.workbench.outputs.export import load_inverse
+from rig_workbench.outputs.export import load_inverse
+from rig_workbench.simulator import Truth
 
 TABLE = {"table": "Z"}
 GIMBAL = {"pan": "Z", "tilt": "X"}

@@ -9,14 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from rig.config import AXIS_NAMES
 from rig.faults import MotionFault
-from rig.readings.attitude import ORDERS, angle_between_deg, euler_to_matrix
-from rig.workbench.commission.axis_check import (
+from rig.prove.axis_check import (
     Stand,
     corner_name,
     corners_of,
     find,
     proposals,
 )  # fmt: skip
+from rig.readings.attitude import ORDERS, angle_between_deg, euler_to_matrix
 
 CONFIG = fast_config()
 GAINS = (0.43, 0.71, 0.87)  # of the paper's device

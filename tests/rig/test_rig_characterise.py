@@ -14,10 +14,11 @@ from harness import Simulator, commissioned, fast_config, fast_text, simulator
 
 from rig.config import AXIS_NAMES
 from rig.journal import read_journal
-from rig.simulator import Truth
-from rig.workbench.commission import characterise, steps
-from rig.workbench.commission.characterise import ENOUGH_DEG
-from rig.workbench.commission.operator import Operator
+from rig.prove import steps
+from rig.prove.operator import Operator
+from rig_workbench.commission import characterise
+from rig_workbench.commission.characterise import ENOUGH_DEG
+from rig_workbench.simulator import Truth
 
 pytestmark = pytest.mark.slow  # minutes together
 
@@ -37,7 +38,7 @@ def measured(tmp_path, monkeypatch):
                 served, record, Operator(yes=True, say=told.append),
                 full_speed=True, listeners=(sim.answer,),
             )  # fmt: skip
-            code = steps.characterise(place, AXIS_NAMES[axis])
+            code = characterise.step(place, AXIS_NAMES[axis])
         runs = tmp_path.glob("characterise-*/journal.jsonl")
         records = read_journal(max(runs, key=lambda path: path.stat().st_mtime_ns))
         return code, records, "\n".join(told)

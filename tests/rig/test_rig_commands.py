@@ -25,7 +25,7 @@ import jaxcal
 from rig.__main__ import main
 from rig.commands import make_parser
 from rig.journal import read_journal
-from rig.simulator import Truth, parse_fault
+from rig_workbench.simulator import Truth, parse_fault
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 
@@ -231,7 +231,12 @@ def test_a_missing_package_is_one_line_with_the_command_that_installs_it(
 ):
     path = tmp_path / "rig.toml"
     path.write_text(fast_text({"port = 5020": "port = 1"}))
-    for missing in ("serial", "pydantic", "jinja2"):
+    calibrate = ["calibrate", "--simulate", "--out", str(tmp_path)]
+    for missing, words, extra in (
+        ("serial", calibrate, "rig"),
+        ("pydantic", calibrate, "rig"),
+        ("jinja2", ["report", str(tmp_path)], "workbench"),
+    ):
         real = importlib.util.find_spec
         with monkeypatch.context() as patch:
             patch.setattr(
@@ -241,9 +246,39 @@ def test_a_missing_package_is_one_line_with_the_command_that_installs_it(
                     None if name == gone else real(name, *more)
                 ),
             )
-            assert main(["calibrate", "--simulate", "--out", str(tmp_path)]) == 2
+            assert main(words) == 2
             error = capsys.readouterr().err
             assert missing in error and error.count("\n") == 1
-            assert "-m pip install" in error and error.endswith("[rig]'\n")
+            assert "-m pip install" in error and error.endswith(f"[{extra}]'\n")
             assert main(["stop", "--config", str(path)]) == 3  # nobody is there
             capsys.readouterr()
+
+
+WITHOUT = """
+import sys
+class Gone:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "rig_workbench":
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Gone())
+from rig.__main__ import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_without_the_workbench_its_commands_say_what_to_install(tmp_path):
+    def typed(*words):
+        return subprocess.run(
+            [sys.executable, "-c", WITHOUT, *words],
+            capture_output=True, text=True, cwd=tmp_path,
+        )  # fmt: skip
+
+    whole = " ".join(typed("--help").stdout.split())
+    for name in ("calibrate", "setup", "watch", "report", "simulate"):
+        assert f" {name} " in whole
+    assert "setup needs rig_workbench, which is not installed: " in whole
+    for words in (["report", "RUN"], ["calibrate", "--simulate"]):
+        done = typed(*words)
+        assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+        assert "needs rig_workbench" in done.stderr
+        assert done.stderr.endswith("[workbench]'\n")

@@ -15,11 +15,11 @@ from rig.config import load_config
 from rig.core.record_check import check_drives
 from rig.faults import Refused
 from rig.journal import HOMED, SIGN_CHECKED, ZEROED, DeviceRecord
-from rig.simulator import Truth
-from rig.simulator.drive import SimDrive
-from rig.workbench.commission import home, steps
-from rig.workbench.commission.operator import Operator
-from rig.workbench.rig_toml import edit
+from rig.prove import home, steps
+from rig.prove.operator import Operator
+from rig.prove.rig_toml import edit
+from rig_workbench.simulator import Truth
+from rig_workbench.simulator.drive import SimDrive
 
 
 @pytest.mark.slow

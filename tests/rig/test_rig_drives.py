@@ -22,7 +22,7 @@ from rig.config.settings import BusSettings
 from rig.core.stop import stop_all
 from rig.drives.modbus import Bus, BusError, ModbusDrive, Rejected
 from rig.drives.wire import crc16
-from rig.simulator import parse_fault
+from rig_workbench.simulator import parse_fault
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import pytest
 from fault_matrix import calibration, cells, run_cell, uninterrupted
 from harness import fast_config, session, simulator
 
-from rig.simulator import parse_fault
+from rig_workbench.simulator import parse_fault
 
 QUICK = {  # cell: how its first session ends
     ("wrong_gearing", "start"): "refused",

@@ -11,6 +11,9 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from rig.config import AXIS_NAMES
+from rig.identification.drift import estimate_drift, without_drift
+from rig.identification.fit_affine import uncertainty
+from rig.outputs.messages import drift_text, recalibrate
 from rig.readings.attitude import (
     ORDERS,
     AttitudeFrame,
@@ -19,11 +22,8 @@ from rig.readings.attitude import (
     raw_fields,
 )
 from rig.readings.geometry import Attitudes
-from rig.simulator import Truth
-from rig.workbench.identification.drift import estimate_drift, without_drift
-from rig.workbench.identification.fit_affine import uncertainty
-from rig.workbench.identification.refit import attitudes
-from rig.workbench.outputs.messages import drift_text, recalibrate
+from rig_workbench.refit import attitudes
+from rig_workbench.simulator import Truth
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 LETTERS = ("X", "Z", "Y")

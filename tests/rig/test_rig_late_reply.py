@@ -12,8 +12,8 @@ import pytest
 from harness import changed, fast_config, simulator
 
 from rig.drives.modbus import Bus, BusError, ModbusDrive
-from rig.simulator import parse_fault
-from rig.simulator.drive import DriveException
+from rig_workbench.simulator import parse_fault
+from rig_workbench.simulator.drive import DriveException
 
 PAIRS = {'map = "leadshine_pr"': 'map = "oriental_az"'}  # status and position: 2 and 2
 PLACE = 123456

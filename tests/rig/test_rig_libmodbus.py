@@ -1,7 +1,8 @@
 """Against drives that libmodbus serves, and a phone written by hand from the formats.
 
-Nothing of ``rig.simulator`` is used: the C program stores the registers, and the phone
-below turns the drives' positions into attitudes with scipy and Android's own formulas.
+Nothing of ``rig_workbench.simulator`` is used: the C program stores the registers, and
+the phone below turns the drives' positions into attitudes with scipy and Android's own
+formulas.
 """
 
 import json

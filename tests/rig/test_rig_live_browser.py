@@ -23,8 +23,8 @@ from harness import changed, fast_text, simulator
 
 from rig.config import parse_config
 from rig.journal import read_journal
-from rig.workbench import live
-from rig.workbench.live import SERVER, draw
+from rig_workbench import live
+from rig_workbench.live import draw
 
 pytest.importorskip("nicegui")
 webdriver = pytest.importorskip("selenium.webdriver")
@@ -67,9 +67,9 @@ class Rig:
         sock = socket.create_server(("127.0.0.1", 0))
         self.port = sock.getsockname()[1]
         with sock:
-            command = [sys.executable, "-m", SERVER, str(self.folder)]
+            command = [sys.executable, "-m", "rig", "watch", str(self.folder)]
             self.page = subprocess.Popen(
-                [*command, str(sock.fileno())], pass_fds=[sock.fileno()]
+                [*command, "--socket", str(sock.fileno())], pass_fds=[sock.fileno()]
             )
         self.url = f"http://127.0.0.1:{self.port}/"
 
@@ -478,6 +478,6 @@ def _pages(folder):
     for path in pathlib.Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
             words = path.read_bytes().decode(errors="replace")
-            if "rig.workbench.live" in words and str(folder) in words:
+            if "\0watch\0" in words and str(folder) in words:
                 found.append(int(path.parent.name))
     return found

@@ -13,13 +13,13 @@ import urllib.request
 
 import pytest
 
+from rig import pages
 from rig.faults import Refused
 from rig.journal import Journal
 from rig.journal.run_folder import SCHEMA
 from rig.signals import PAUSE
-from rig.workbench import live
-from rig.workbench.live.watcher import Watcher
-from rig.workbench.outputs import view
+from rig_workbench.live.watcher import Watcher
+from rig_workbench.outputs import view
 
 HOST = "127.0.0.1:8642"
 OWN = f"http://{HOST}"
@@ -35,7 +35,7 @@ async def _application(scope, receive, send):
 
 def answer(headers, method="GET", kind="http", path="/"):
     """Status (101 for a websocket that was accepted) and headers of one request."""
-    server = pytest.importorskip("rig.workbench.live.server")
+    server = pytest.importorskip("rig_workbench.live.server")
     headers = {"host": HOST} | headers
     scope = {
         "type": kind,
@@ -191,8 +191,8 @@ def served(tmp_path_factory):
     folder = tmp_path_factory.mktemp("served")
     _journal(folder, os.getpid()).close()
     sock = socket.create_server(("127.0.0.1", 0))
-    command = [sys.executable, "-m", live.SERVER, str(folder), str(sock.fileno())]
-    page = subprocess.Popen(command, pass_fds=[sock.fileno()])
+    command = [sys.executable, "-m", "rig", "watch", str(folder), "--socket"]
+    page = subprocess.Popen([*command, str(sock.fileno())], pass_fds=[sock.fileno()])
     port = sock.getsockname()[1]
     sock.close()
     yield port
@@ -263,7 +263,7 @@ def test_a_page_without_a_viewer_ends(tmp_path):
     pytest.importorskip("nicegui")
     _journal(tmp_path, os.getpid()).close()
     code = (
-        "import pathlib, socket; from rig.workbench.live.server import serve;"
+        "import pathlib, socket; from rig_workbench.live.server import serve;"
         "sock = socket.create_server(('127.0.0.1', 0));"
         f"serve(pathlib.Path({str(tmp_path)!r}), sock, linger_s=0.2)"
     )
@@ -272,15 +272,15 @@ def test_a_page_without_a_viewer_ends(tmp_path):
 
 
 def test_without_the_extra_a_session_says_so_in_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr(live.importlib.util, "find_spec", lambda name: None)
-    line = live.start(tmp_path)
+    monkeypatch.setattr(pages.importlib.util, "find_spec", lambda name: None)
+    line = pages.start(tmp_path)
     assert line.startswith("no live page: nicegui is not installed: ")
     assert line.endswith("[live]'")
     assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_takes_no_log_only_costs_the_page(tmp_path):
-    assert live.start(tmp_path / "none").startswith("no live page: ")
+    assert pages.start(tmp_path / "none").startswith("no live page: ")
 
 
 def test_starting_the_page_takes_no_time_of_the_session(tmp_path, monkeypatch):
@@ -292,8 +292,8 @@ def test_starting_the_page_takes_no_time_of_the_session(tmp_path, monkeypatch):
         made.append(popen(["sleep", "60"], **more))
         return made[-1]
 
-    monkeypatch.setattr(live.subprocess, "Popen", hanging)
-    line = live.start(tmp_path)
+    monkeypatch.setattr(pages.subprocess, "Popen", hanging)
+    line = pages.start(tmp_path)
     assert line.startswith("live page: http://127.0.0.1:")
     assert made[0].poll() is None
     assert os.getpgid(made[0].pid) != os.getpgrp()

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 
 from rig.config import parse_config
 from rig.journal import Journal, is_written, read_journal
-from rig.workbench import live
-from rig.workbench.live import charts
-from rig.workbench.live.watcher import Tail, Watcher
-from rig.workbench.outputs import view
-from rig.workbench.outputs.run_state import RunState
+from rig.outputs.run_state import RunState
+from rig_workbench import live
+from rig_workbench.live import charts
+from rig_workbench.live.watcher import Tail, Watcher
+from rig_workbench.outputs import view
 
 
 @pytest.fixture(scope="module")
@@ -280,7 +280,7 @@ def test_the_last_word_of_a_session_that_ends_meanwhile_is_read(tmp_path, monkey
 
     watcher = Watcher(tmp_path)
     monkeypatch.setattr(watcher, "ask", lambda number: None)
-    monkeypatch.setattr("rig.workbench.live.watcher.is_written", ends)
+    monkeypatch.setattr("rig_workbench.live.watcher.is_written", ends)
     assert [each.axis for each in watcher.stop()] == ["yaw"]
 
 

@@ -24,7 +24,7 @@ from rig.config.schema import parse
 from rig.drives.modbus import Bus, BusError, ModbusDrive
 from rig.faults import MotionFault, StopRequested
 from rig.journal import read_journal
-from rig.simulator import Truth, parse_fault
+from rig_workbench.simulator import Truth, parse_fault
 
 # Time enough for a busy computer: a reply that is late is one lost reply more.
 TIMEOUT = {"timeout_s = 0.5": "timeout_s = 0.25"}

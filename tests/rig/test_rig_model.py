@@ -20,8 +20,8 @@ from jaxcal.models import Gravity, SerialChain
 from rig.__main__ import main
 from rig.config import ConfigError, parse_config
 from rig.journal import SIGN_CHECKED, STOP_PROVED, DeviceRecord
-from rig.model import model_of
-from rig.simulator import Truth, parse_fault
+from rig_workbench.model import model_of
+from rig_workbench.simulator import Truth, parse_fault
 
 STAGE = {"x": "translation", "y": "translation"}
 BENT = """

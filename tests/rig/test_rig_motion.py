@@ -26,12 +26,12 @@ from rig.faults import (
     StopRequested,
     Unreachable,
 )
+from rig.prove.home import unlimited
 from rig.readings.attitude import Reading, euler_to_matrix
 from rig.readings.geometry import geometry_of
 from rig.readings.phone import ReadingError
 from rig.signals import Signals
-from rig.simulator import Truth, parse_fault
-from rig.workbench.commission.home import unlimited
+from rig_workbench.simulator import Truth, parse_fault
 
 
 @contextlib.contextmanager
@@ -459,7 +459,7 @@ def test_the_motion_and_stop_modules_never_load_jax():
 
     program = (
         "import sys, rig.core.motion, rig.core.measure, rig.core.stop\n"
-        "heavy = {'jax', 'matplotlib', 'flax', 'rig.workbench.outputs'}\n"
+        "heavy = {'jax', 'matplotlib', 'flax', 'rig.outputs'}\n"
         "heavy &= set(sys.modules)\n"
         "sys.exit(f'loaded {heavy}' if heavy else 0)\n"
     )

@@ -19,7 +19,7 @@ from rig.drives import make_drives
 from rig.drives.line import BusError, Refusal
 from rig.faults import LimitError, Refused
 from rig.journal import SIGN_CHECKED, STOP_PROVED
-from rig.workbench.commission import steps
+from rig.prove import steps
 
 KINDS = ("grbl", "marlin", "cia402")
 CAN = 'transport = "can"\ninterface = "virtual"\ndevice = "{}"'

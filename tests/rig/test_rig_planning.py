@@ -13,9 +13,9 @@ from harness import (
 
 import jaxcal
 from rig.config import example_text, parse_config
-from rig.workbench.identification.fit_affine import held_out_errors
-from rig.workbench.procedures.goto import _command
-from rig.workbench.procedures.plan import (
+from rig.identification.fit_affine import held_out_errors
+from rig.procedures.goto import _command
+from rig.procedures.plan import (
     choose,
     draw_candidates,
     draw_held_out,

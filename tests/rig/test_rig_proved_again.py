@@ -14,6 +14,7 @@ from commission import device, quick_text, turns
 from harness import fast_config, no_figures, prove_stops
 
 from rig.__main__ import main
+from rig.command_run import Run
 from rig.config import load_config
 from rig.core import motion, stop
 from rig.journal import (
@@ -24,8 +25,7 @@ from rig.journal import (
     DeviceRecord,
     read_journal,
 )
-from rig.simulator import parse_fault
-from rig.workbench.command_run import Run
+from rig_workbench.simulator import parse_fault
 
 
 @contextlib.contextmanager

@@ -14,8 +14,8 @@ from harness import measured_text
 from rig.config import ConfigError, parse_config
 from rig.readings import make_source
 from rig.readings.source import ReadingError
-from rig.simulator.faults import FaultInjector
-from rig.simulator.server import ModbusServer
+from rig_workbench.simulator.faults import FaultInjector
+from rig_workbench.simulator.server import ModbusServer
 
 AXES = {"x": "translation", "y": "translation"}
 LINES = b"torn,9,9\r\n 7,1.5,-2e1\r\n7,nan,1\r\n7,1.5\n\n7,1.0,-20.0\r\n7,1,2"

@@ -13,7 +13,7 @@ from rig.config.maps import MAP_FOLDER
 from rig.core.stop import stop_all
 from rig.drives.modbus import ModbusDrive
 from rig.faults import MotionFault
-from rig.simulator import Truth, parse_fault
+from rig_workbench.simulator import Truth, parse_fault
 
 
 def realistic(config=None, **truth):

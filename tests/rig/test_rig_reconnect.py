@@ -14,10 +14,10 @@ from harness import (
     simulator,
 )
 
+from rig.command_run import run_safely
 from rig.journal import read_journal
-from rig.simulator import Truth, parse_fault
-from rig.workbench.command_run import run_safely
-from rig.workbench.procedures.collect import collect
+from rig.procedures.collect import collect
+from rig_workbench.simulator import Truth, parse_fault
 
 TURNED = 25.0  # degrees: beyond the envelope of the limits, too
 

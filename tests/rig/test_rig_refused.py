@@ -18,10 +18,10 @@ from rig.config import ConfigError, parse_config
 from rig.config.maps import load_map
 from rig.core.record_check import check_drives
 from rig.drives.modbus import Bus, ModbusDrive
+from rig.identification.conclusion import conclude
 from rig.journal import HOMED, STOP_PROVED, Journal, lock
 from rig.journal.lock import BusLock
-from rig.workbench.identification.conclusion import conclude
-from rig.workbench.procedures.collect import collect
+from rig.procedures.collect import collect
 
 BAD = '\n[session]\nmethod = "exact"\nverify_postures = 1\nverify_limit_deg = 0.001\n'
 

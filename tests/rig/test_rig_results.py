@@ -33,13 +33,13 @@ import jaxcal
 from rig.__main__ import main
 from rig.config import AXIS_NAMES, parse_config
 from rig.journal import read_journal
-from rig.simulator import Truth
-from rig.workbench.identification.refit import attitudes, reread
-from rig.workbench.outputs import trend
-from rig.workbench.outputs.export import LANGUAGES, follow, load_inverse
-from rig.workbench.outputs.export import checksum as checksum_of
-from rig.workbench.outputs.messages import numbers
-from rig.workbench.outputs.report import write_report
+from rig.outputs.messages import numbers
+from rig_workbench.outputs import trend
+from rig_workbench.outputs.export import LANGUAGES, follow, load_inverse
+from rig_workbench.outputs.export import checksum as checksum_of
+from rig_workbench.outputs.report import write_report
+from rig_workbench.refit import attitudes, reread
+from rig_workbench.simulator import Truth
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 SESSION = '\n[session]\nmethod = "exact"\nverify_postures = 2\n'
@@ -569,7 +569,7 @@ def test_trend_tells_what_moved_and_separates_devices(run, capsys):
 def test_parameters_are_drawn_over_time(finished):
     from matplotlib.figure import Figure
 
-    from rig.workbench.outputs.report import draw_parameters as parameters
+    from rig_workbench.outputs.report import draw_parameters as parameters
 
     summary = json.loads((finished / "summary.json").read_text())
     runs = [summary | {"time": 0.0}, summary | {"time": 86400.0}]

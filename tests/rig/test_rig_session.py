@@ -29,15 +29,15 @@ from scipy import special
 
 import jaxcal
 from rig.__main__ import main
+from rig.command_run import run_safely
 from rig.config import parse_config
 from rig.faults import Refused
+from rig.identification.conclusion import order_residuals
 from rig.journal import read_journal
-from rig.simulator import Truth
-from rig.workbench.command_run import run_safely
-from rig.workbench.identification.conclusion import order_residuals
-from rig.workbench.procedures.calibrate import calibrate
-from rig.workbench.procedures.collect import collect
-from rig.workbench.procedures.plan import choose, draw_candidates
+from rig.procedures.calibrate import calibrate
+from rig.procedures.collect import collect
+from rig.procedures.plan import choose, draw_candidates
+from rig_workbench.simulator import Truth
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 
@@ -209,12 +209,10 @@ def test_a_posture_out_of_reach_is_masked_and_the_rest_selected_again(tmp_path):
 
 
 def test_a_disk_that_fills_while_saving_loses_nothing(tmp_path, monkeypatch):
-    import rig.workbench.outputs.report
-
-    def full(path, page):
+    def full(path, text):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(rig.workbench.outputs.report, "write_page", full)
+    monkeypatch.setattr("rig.journal.run_folder.write_text", full)
     said = []
     with simulator(fast_config()) as sim:
         config = sim.start()
@@ -236,7 +234,7 @@ def test_a_stop_that_is_lost_while_planning_opens_no_port(tmp_path, monkeypatch)
         runs[0].signals.request_stop("SIGTERM", 143)
         return choose(config, candidates)
 
-    monkeypatch.setattr("rig.workbench.procedures.calibrate.choose", lost)
+    monkeypatch.setattr("rig.procedures.calibrate.choose", lost)
     config = fast_config()
     runs = [make_run(config, tmp_path, "calibrate", said.append,
                 record=commissioned(config, tmp_path))]  # fmt: skip
@@ -399,7 +397,7 @@ def test_a_session_leaves_no_thread_and_no_open_socket(tmp_path):
 def test_without_matplotlib_the_report_says_that_figures_are_missing(
     finished, tmp_path, monkeypatch
 ):
-    from rig.workbench.outputs.report import write_report
+    from rig_workbench.outputs.report import write_report
 
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     summary = json.loads((finished[0] / "summary.json").read_text())

@@ -18,10 +18,11 @@ from rig.config import load_config, parse_config
 from rig.config.config import EXAMPLES
 from rig.faults import Refused
 from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED, DeviceRecord
-from rig.simulator import Truth
-from rig.workbench.commission import setup, steps
-from rig.workbench.commission.operator import Operator
-from rig.workbench.commission.scan import Answer
+from rig.prove import steps
+from rig.prove.operator import Operator
+from rig.prove.scan import Answer
+from rig_workbench.commission import setup
+from rig_workbench.simulator import Truth
 
 
 @pytest.mark.slow

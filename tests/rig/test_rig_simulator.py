@@ -10,8 +10,8 @@ from harness import Simulator, fast_config, fast_text
 from rig.commands import make_parser
 from rig.config import parse_config
 from rig.drives.modbus import Bus, ModbusDrive
-from rig.simulator import Truth, truth_of
-from rig.simulator.drive import COMM_ALARM, SimDrive
+from rig_workbench.simulator import Truth, truth_of
+from rig_workbench.simulator.drive import COMM_ALARM, SimDrive
 
 STILL = {"noise_deg": 0.0}
 
@@ -164,7 +164,7 @@ def test_a_drive_ends_on_its_target_and_never_passes_it(monkeypatch):
     """However often it is looked at; play keeps what it once went too far."""
     now, rng = [0.0], np.random.default_rng(0)
     clock = SimpleNamespace(monotonic=lambda: now[0])
-    monkeypatch.setattr("rig.simulator.drive.time", clock)
+    monkeypatch.setattr("rig_workbench.simulator.drive.time", clock)
     axis = fast_config().axes[0]
     for target in rng.integers(100, 8000, 60):
         drive = SimDrive(axis, speedup=3.0)

@@ -23,17 +23,17 @@ from test_rig_motion import bench
 
 from rig import stopping
 from rig.__main__ import main
+from rig.command_run import run_safely
 from rig.config import load_config
 from rig.core.stop import UnitStop, stop_all
 from rig.drives.modbus import Bus, BusError, ModbusDrive
 from rig.faults import StopRequested
 from rig.journal import lock
 from rig.journal.lock import BusLock, read_armed
+from rig.outputs.messages import event_lines
+from rig.procedures.collect import collect
 from rig.signals import Signals
-from rig.simulator import parse_fault
-from rig.workbench.command_run import run_safely
-from rig.workbench.outputs.messages import event_lines
-from rig.workbench.procedures.collect import collect
+from rig_workbench.simulator import parse_fault
 
 GENERIC = {'map = "leadshine_pr"': 'map = "generic"', **HASTY}
 
@@ -315,7 +315,7 @@ def test_a_suspended_session_is_ended_and_its_drives_are_stopped(
 def test_the_page_says_stopped_from_the_word_of_the_drives(suspended, rig, tmp_path):
     """C: it said "STOP sent", and the drives of a suspended session went on."""
     pytest.importorskip("nicegui", reason="the page needs the extra live")
-    from rig.workbench.live.watcher import Watcher
+    from rig_workbench.live.watcher import Watcher
 
     with running_session(rig, tmp_path) as child:
         if suspended:

@@ -15,8 +15,8 @@ from test_rig_motion import bench
 from rig.__main__ import main
 from rig.core.stop_distance import BY_UNITS, StopDistance, stop_distances
 from rig.journal import STOP_PROVED, DeviceRecord
-from rig.simulator import Truth
-from rig.simulator import drive as sim_drive
+from rig_workbench.simulator import Truth
+from rig_workbench.simulator import drive as sim_drive
 
 RAMP = 149.0  # deg/s^2: it stops within .08 deg at 5 deg/s, and within 27 at 90
 

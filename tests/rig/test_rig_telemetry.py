@@ -11,8 +11,8 @@ from harness import fast_config, session, simulator
 
 from rig.drives.drive import Status
 from rig.journal import read_journal
+from rig.outputs import telemetry
 from rig.readings.attitude import Reading, euler_to_matrix, frame_at
-from rig.workbench.outputs import telemetry
 
 
 class Phone:

@@ -24,9 +24,11 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from rig.__main__ import main
+from rig.command_run import run_safely
 from rig.config import example_text, parse_config
 from rig.core.record_check import ZeroRecord, check_zero, moved
 from rig.faults import MotionFault, Refused
+from rig.identification.conclusion import check_matrix
 from rig.journal import (
     HOMED,
     IDENTIFIED,
@@ -36,17 +38,15 @@ from rig.journal import (
     DeviceRecord,
     read_journal,
 )
+from rig.procedures.collect import collect
+from rig.procedures.goto import unchecked
+from rig.procedures.verify import load_calibration, verify
 from rig.readings.attitude import euler_to_matrix, frame_at
 from rig.readings.geometry import geometry_of
 from rig.readings.phone import Imu
-from rig.simulator import Truth
-from rig.simulator.faults import FaultInjector
-from rig.simulator.phone import Phone
-from rig.workbench.command_run import run_safely
-from rig.workbench.identification.conclusion import check_matrix
-from rig.workbench.procedures.collect import collect
-from rig.workbench.procedures.goto import unchecked
-from rig.workbench.procedures.verify import load_calibration, verify
+from rig_workbench.simulator import Truth
+from rig_workbench.simulator.faults import FaultInjector
+from rig_workbench.simulator.phone import Phone
 
 LOST = 1.4  # degrees, as was seen
 

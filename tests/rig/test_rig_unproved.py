@@ -15,11 +15,11 @@ from rig.config.config import EXAMPLES
 from rig.core import proof
 from rig.core.proof import GROWTH, Reach
 from rig.faults import MotionFault, Refused
-from rig.simulator import Truth, parse_fault
-from rig.simulator.drive import SimDrive
-from rig.workbench.commission import steps
-from rig.workbench.commission.axis_check import require_gearing, require_unit
-from rig.workbench.commission.operator import Operator
+from rig.prove.axis_check import require_gearing, require_unit
+from rig.prove.operator import Operator
+from rig_workbench.commission import connections
+from rig_workbench.simulator import Truth, parse_fault
+from rig_workbench.simulator.drive import SimDrive
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def slow(at, monkeypatch):
     """Speeds as they are with a real device."""
     monkeypatch.undo()
     monkeypatch.chdir(at)
-    monkeypatch.setattr(steps, "WATCH_S", 0.3)
+    monkeypatch.setattr(connections, "WATCH_S", 0.3)
     return at
 
 

@@ -10,6 +10,7 @@ import pytest
 from harness import HASTY, Simulator, changed, fast_config, fast_text, session
 from test_rig_motion import bench
 
+from rig.command_run import Run
 from rig.config import load_config
 from rig.config.config import EXAMPLES
 from rig.config.maps import decode
@@ -17,8 +18,7 @@ from rig.core import stop
 from rig.core.device import timeouts_left
 from rig.faults import MotionFault
 from rig.journal import read_journal
-from rig.simulator import Truth, parse_fault
-from rig.workbench.command_run import Run
+from rig_workbench.simulator import Truth, parse_fault
 
 WATCHED = {'map = "leadshine_pr"': 'map = "generic"'}
 REGISTER, BEFORE = 0x2B, [0, 60000, 45000]  # what the drives held; 0: no watch

@@ -27,8 +27,8 @@ from rig.drives.modbus import Bus, BusError, ModbusDrive
 from rig.drives.wire import crc16, rtu_reply
 from rig.journal import lock
 from rig.journal.lock import BusLock
-from rig.simulator import parse_fault
-from rig.workbench.commission import scan as scanning
+from rig.prove import scan as scanning
+from rig_workbench.simulator import parse_fault
 
 TIMEOUT_S = 0.1
 
@@ -306,7 +306,7 @@ def test_scan_finds_an_echo_and_setup_writes_its_key(capsys):
         assert [answer.unit for answer in answers] == [1, 2, 3]
         assert all(answer.echo for answer in answers)
         assert any("bus.echo = true" in line for line in said)
-    from rig.workbench.rig_toml import new_text
+    from rig_workbench.commission.new_file import new_text
 
     text = new_text(changed(settings, echo=True), [], "hyperimu", 2055)
     assert "echo = true" in text

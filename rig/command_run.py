@@ -1,0 +1,148 @@
+"""A command's run: what the operator asked for, what is said, and how it ends."""
+
+from __future__ import annotations
+
+import contextlib
+import pathlib
+from collections.abc import Callable, Iterable, Iterator
+
+from rig.config import RigConfig
+from rig.config.axis import Pulses
+from rig.core.device import Device
+from rig.core.record_check import ZeroRecord, check_drives
+from rig.core.session import Beside, Check, open_device, take_zero
+from rig.device_model import model_of
+from rig.faults import EXIT_FAULT, PlanOnly, Refused, ending
+from rig.journal import STOP_PROVED, DeviceRecord, JournalError, Record, RunFolder
+from rig.signals import Signals
+
+ONE_SPEED = (
+    "the stop was proved at one speed alone, by an earlier version: the axes move "
+    "slowly near their limits. `jaxcal-rig axes` proves it at two"
+)
+
+
+class Run(RunFolder):
+    """The folder of a run, and the options of its command."""
+
+    check: Check = staticmethod(check_drives)  # of the drives, before they are armed
+    simulated = False  # nothing real moves: it need not be slow
+    again = ""  # the command of a run that is not resumed, but begun again
+
+    def __init__(
+        self,
+        config: RigConfig,
+        folder: pathlib.Path,
+        mode: str,
+        say: Callable[[str], None] = print,
+        *,
+        record: DeviceRecord,
+        start: Record | None = None,
+        reset_alarms: bool = False,
+        zero_at: Pulses | None = None,
+        kept_zero: ZeroRecord | None = None,
+        dry_run: bool = False,
+        signals: Signals | None = None,
+    ) -> None:
+        self._say = say
+        self.confirm: Callable[[Run], None] = lambda run: None  # before ports open
+        self.beside: list[Beside] = []  # what runs while the ports are open
+        self.record = record
+        self.zero_at = zero_at
+        self.kept_zero = kept_zero
+        self.dry_run = dry_run
+        self.reset_alarms = reset_alarms
+        self.model = model_of(config)  # None: affine
+        self.signals = signals or Signals()
+        super().__init__(config, folder, mode, start or {})
+
+    def say(self, *lines: str) -> None:
+        """Print lines. A terminal that is gone ends the run, but never a stop."""
+        try:
+            for line in lines:
+                self._say(line)
+        except OSError:
+            self.signals.request_stop("the terminal is gone", EXIT_FAULT)
+
+    @property
+    def zero_pulses(self) -> Pulses:
+        """Where the zero posture was taken; where drives count 0 before it was."""
+        zeros = self.journal.events("zero")
+        return tuple(zeros[-1]["pulses"]) if zeros else (0,) * len(self.config.axes)
+
+    def lacks(self, names: Iterable[str]) -> bool:
+        """Some of these postures are neither measured nor known to be out of reach."""
+        lost = {record["name"] for record in self.journal.events("unreachable")}
+        return not lost.union(self.postures()).issuperset(names)
+
+    @contextlib.contextmanager
+    def armed(self) -> Iterator[Device]:
+        """The device, armed once the operator has confirmed it."""
+        self.confirm(self)
+        with open_device(
+            self.config, self, self.record, self.signals,
+            check=self.check, beside=self.beside, simulated=self.simulated,
+            reset_alarms=self.reset_alarms,
+            predict=None if self.model is None else self.model.predict,
+        ) as device:  # fmt: skip
+            if device.proof.stops and not (self.record.state(STOP_PROVED) or {}).get(
+                "distances"
+            ):
+                self.say(ONE_SPEED)
+            yield device
+
+    @contextlib.contextmanager
+    def device(self) -> Iterator[Device]:
+        """The device, armed and its zero taken.
+
+        Raises:
+            PlanOnly: this is a dry run. Refused: it is not known well enough.
+        """
+        if self.dry_run:
+            raise PlanOnly
+        if text := self.record.missing(self.config):
+            raise Refused(text)
+        with self.armed() as device:
+            take_zero(device, self.zero_at, self.kept_zero)
+            yield device
+
+    @property
+    def to_go_on(self) -> str:
+        """What goes on after a pause or a fault."""
+        if self.again:
+            return self.again
+        resume = f"jaxcal-rig resume {self.folder}"
+        if self.journal.records[0].get("simulated") is None:  # or it begins anew
+            if lack := self.record.missing(self.config):
+                return f"{lack}. Then {resume}"
+        return resume
+
+
+def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
+    """Run a procedure, and say how it ended; returns the exit code.
+
+    Its drives were told to stop by then, whatever happened: `open_device` does it.
+    """
+    moved = len(run.journal.events("command"))
+    with run.signals:
+        try:
+            code, event, reason = procedure(run), "end", ""
+        except BaseException as error:
+            run.signals.ending = True
+            code, event, reason = ending(error, run.folder)
+            if isinstance(error, PlanOnly):
+                run.say("dry run: nothing was sent to the bus")
+            if event == "refused" and len(run.journal.events("command")) > moved:
+                code, event = EXIT_FAULT, "fault"
+        run.signals.ending = True
+        told = {} if event in ("end", "refused") else {"go_on": run.to_go_on}
+        try:
+            run.emit(event, sync=True, code=code, reason=reason, **told)
+        except JournalError as error:
+            run.say(f"the run has no last line, as after a kill: {error}")
+        if event != "end":
+            run.say(f"{event}: {reason}")
+            if told:
+                run.say(f"to go on: {told['go_on']}")
+        run.journal.close()
+    return code

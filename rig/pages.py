@@ -1,0 +1,74 @@
+"""Pages of a run, each made by a process of its own: the live one, and the report.
+
+A session starts these commands of ``jaxcal-rig`` and loads nothing of what they need.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import pathlib
+import socket
+import subprocess
+import sys
+
+from jaxcal.extras import install
+
+HOST, PORT = "127.0.0.1", 8642  # the usual port; where it is taken, any free one
+LOG = "live.log"
+REPORT = "report.html"
+REPORT_S = 120.0  # that it may take
+
+
+def listen() -> tuple[socket.socket, str]:
+    """A listening socket of this computer alone, and the line to print."""
+    try:
+        sock = socket.create_server((HOST, PORT))
+    except OSError:
+        sock = socket.create_server((HOST, 0))
+    return sock, f"live page: http://{HOST}:{sock.getsockname()[1]}/"
+
+
+def start(folder: pathlib.Path) -> str:
+    """Start the live page of a run; returns the line to print. Never raises or waits.
+
+    It has its own process group, so that Ctrl-C in the terminal is not for it, and its
+    words go to ``live.log`` in the run's folder.
+    """
+    if importlib.util.find_spec("nicegui") is None:
+        return f"no live page: nicegui is not installed: {install('live')}"
+    try:
+        sock, line = listen()
+        with sock, (folder / LOG).open("ab") as log:
+            subprocess.Popen(
+                [*_command("watch", folder), "--socket", str(sock.fileno())],
+                pass_fds=[sock.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
+    except OSError as error:
+        return f"no live page: {error}"
+    return line
+
+
+def write_report(folder: pathlib.Path) -> str:
+    """Have ``report.html`` of a run written; why there is none, if so. Never raises."""
+    try:
+        subprocess.run(
+            _command("report", folder),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=REPORT_S,
+        )
+    except subprocess.CalledProcessError as error:
+        return str(error.stderr).strip().rpartition("\n")[2] or str(error)
+    except (OSError, subprocess.SubprocessError) as error:
+        return str(error)
+    return ""
+
+
+def _command(name: str, folder: pathlib.Path) -> list[str]:
+    return [sys.executable, "-m", "rig", name, str(folder)]

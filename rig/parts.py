@@ -1,0 +1,32 @@
+"""What another package adds to the rig, found by entry points: rig imports none of it.
+
+``jaxcal_rig.commands`` are the commands, ``jaxcal_rig.parts`` what a session may need:
+``model`` (of a device that is not affine), ``numbers`` (of a sensor), ``simulator``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from jaxcal.extras import MissingExtraError, install, installed, needs
+
+COMMANDS, PARTS = "jaxcal_rig.commands", "jaxcal_rig.parts"
+
+
+def part(name: str, purpose: str, group: str = PARTS) -> Any:
+    """A part of the rig by its name, loaded.
+
+    Raises:
+        MissingExtraError: its package is not installed; in one line, with the command
+            that installs it for this ``purpose``.
+    """
+    point = installed(group).get(name)
+    if point is None:  # installed by an earlier version
+        raise MissingExtraError(f"{purpose}: install jaxcal anew: {install('rig')}")
+    with needs(extra_of(point.module), purpose):
+        return point.load()
+
+
+def extra_of(module: str) -> str:
+    """The extra of jaxcal that brings what a module of the rig needs."""
+    return "rig" if module.partition(".")[0] == "rig" else "workbench"

@@ -1,0 +1,182 @@
+"""The calibration session: choose, visit, identify, verify, save."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rig.command_run import Run
+from rig.core.device import Device, Posture, check_plan
+from rig.core.session import visit
+from rig.faults import MotionFault
+from rig.identification.conclusion import check_matrix, conclude
+from rig.identification.fit_affine import identify_affine
+from rig.journal import SIGN_CHECKED
+from rig.outputs.console import plan_lines
+from rig.outputs.results import save_result
+from rig.outputs.run_state import roles_of
+from rig.procedures.plan import (
+    Choice,
+    choose,
+    draw_candidates,
+    draw_held_out,
+    travel_order,
+)
+from rig.readings.attitude import Array
+
+MIDDLE, END = "reference:middle", "reference:end"  # visits of the zero posture
+
+
+def calibrate(run: Run) -> int:
+    """Run the whole session; returns the exit code."""
+    config = run.config
+    candidates, choice = _plan(run)
+    check_plan(config, [tuple(candidates[i].tolist()) for i in choice.indices])
+    if run.lacks([END]):
+        with run.device() as device:
+            _visit_chosen(run, device, candidates, choice)
+            run.emit("phase", phase="saving")
+            chosen = [r for r in run.postures().values() if r["role"] == "select"]
+            first = None
+            if run.model is None:
+                first = identify_affine(config, chosen)
+                _check_gains(run, first.matrix)
+            held = _held_out(run, first)
+            if held:
+                visit(device, Posture(MIDDLE, run.zero_pulses), role="reference")
+            visit_pairs(run, device, held)
+            visit(device, Posture(END, run.zero_pulses), role="reference")
+        run.say("drives at rest; identifying")
+        run.emit("phase", phase="finishing")
+        run.signals.check_stop()
+    return _identify(run)
+
+
+def _plan(run: Run) -> tuple[Array, Choice]:
+    """(M, n) candidate pulses and the first choice; made once, then remembered."""
+    config = run.config
+
+    def make() -> dict[str, Any]:
+        session = config.session
+        run.say(
+            f"planning: {config.k} of {session.candidates} candidates by "
+            f"{config.method}, and the proven optimum; nothing moves yet"
+        )
+        candidates = draw_candidates(config)
+        choice = choose(config, config.to_deg(candidates))
+        choice = _ordered(run, choice, candidates, config.to_deg(run.zero_pulses))
+        return {
+            "candidates": candidates.tolist(),
+            "choice": dataclasses.asdict(choice),
+        }
+
+    record = run.remember("plan", make)
+    candidates, choice = np.array(record["candidates"]), Choice(**record["choice"])
+    run.say(*plan_lines(config, choice, candidates, config.to_deg(run.zero_pulses)))
+    return candidates, choice
+
+
+def _ordered(
+    run: Run, choice: Choice, candidates: Array, here: Array, done: Sequence[int] = ()
+) -> Choice:
+    """A choice in the order of its visits, from (n,) degrees; done ones first."""
+    left = np.array([i for i in choice.indices if i not in done], dtype=int)
+    points = run.config.to_deg(candidates[left])
+    queue = left[travel_order(run.config, points, here)].tolist()
+    return dataclasses.replace(choice, indices=(*done, *queue))
+
+
+def _visit_chosen(run: Run, device: Device, candidates: Array, choice: Choice) -> None:
+    """Measure K postures; without one out of reach the rest are selected again."""
+    config, degrees = run.config, run.config.to_deg(candidates)
+    available = np.ones(len(candidates), dtype=bool)
+    done: list[int] = []
+    here = config.to_deg(run.zero_pulses)
+    plans = iter(run.journal.events("replan"))
+    while True:
+        queue = [index for index in choice.indices if index not in done]
+        run.emit("queue", names=[f"select:{index}" for index in queue])
+        for index in queue:
+            posture = Posture(f"select:{index}", tuple(candidates[index].tolist()))
+            if visit(device, posture, role="select", index=index) is None:
+                break
+            here = degrees[index]
+            done.append(index)
+        else:
+            return
+        available[index] = False
+        plan = next(plans, None)
+        if plan is None:
+            choice = choose(config, degrees, available, tuple(done))
+            choice = _ordered(run, choice, candidates, here, done)
+            plan = run.emit("replan", sync=True, choice=dataclasses.asdict(choice))
+        choice = Choice(**plan["choice"])
+
+
+def _check_gains(run: Run, matrix: Any) -> None:
+    """Refuse a fit whose axes are reversed or exchanged: the sign check is void."""
+    try:
+        run.say(*(f"WARNING: {text}" for text in check_matrix(run.config, matrix)))
+    except MotionFault as fault:
+        run.record.void(SIGN_CHECKED, str(fault))
+        raise
+
+
+def _held_out(run: Run, calibration: Any) -> list[Any]:
+    """Pairs of pulses, raw and compensated; drawn once for one set of chosen postures.
+
+    Where a chosen posture was withdrawn since, the compensated commands came from a
+    wrong calibration: they are drawn again, and what was measured there is withdrawn.
+    """
+    drawn = run.journal.events("held_out")
+    voids = [
+        record["seq"]
+        for record in run.journal.events("void")
+        if any(name.startswith("select:") for name in record["names"])
+    ]
+    if drawn and not (voids and voids[-1] > drawn[-1]["seq"]):
+        return drawn[-1]["pairs"]
+    stale = [n for n in run.postures() if n.startswith(("before:", "after:", "held:"))]
+    if stale:
+        run.emit("void", sync=True, names=stale)
+    count = run.config.session.verify_postures
+    targets = draw_held_out(run.config, calibration, count)
+    if len(targets) < count:
+        run.say(
+            f"  note: only {len(targets)} of {count} held-out targets can be reached "
+            "compensated within the ranges"
+        )
+    return run.emit("held_out", sync=True, pairs=targets)["pairs"]
+
+
+def pair_names(held: list[Any]) -> list[str]:
+    """Names of the visits of held-out targets, all raw and then all compensated."""
+    roles = roles_of(held[0]) if held else ()
+    return [f"{role}:{i}" for role in roles for i in range(len(held))]
+
+
+def visit_pairs(run: Run, device: Device, held: list[Any]) -> None:
+    """Visit held-out targets raw and compensated, in the order of least travel."""
+    names = pair_names(held)
+    visits = range(len(held[0])) if held else ()
+    targets = [pair[number] for number in visits for pair in held]
+    points = run.config.to_deg(targets or np.empty((0, len(run.config.axes))))
+    start = run.config.to_deg(run.zero_pulses)
+    queue = travel_order(run.config, points, start)
+    run.emit("queue", names=[names[number] for number in queue])
+    for number in queue:
+        role = names[number].partition(":")[0]
+        visit(device, Posture(names[number], tuple(targets[number])), role=role)
+
+
+def _identify(run: Run) -> int:
+    """Identify A and b, save them and what they come to; returns the exit code."""
+    simulated = run.journal.records[0].get("simulated")
+    notes = {"run": run.folder.name, "simulated": simulated is not None}
+    calibration, summary = conclude(run.config, run.journal.records, notes)
+    choice = [*run.journal.events("plan"), *run.journal.events("replan")][-1]["choice"]
+    told = {"mode": "calibrate", "simulated": simulated, "choice": choice}
+    return save_result(run, calibration, summary | told, run.say)

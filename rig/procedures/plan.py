@@ -1,0 +1,202 @@
+"""What to visit and in which order. Runs between moves; nothing here moves anything."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from jaxcal.designs.travel import Motion, fastest_tour, travel_times
+from jaxcal.models.affine import Affine
+from rig.config import RigConfig
+from rig.config.axis import Pulses
+from rig.device_model import DeviceModel, model_of
+from rig.readings.attitude import Array
+
+EXACT_LIMIT_S = 20.0  # for the proof that the choice is (or is not) the optimum
+REPLAN_LIMIT_S = 5.0  # the same while the drives stand armed
+MOST_IMPROVED = 200  # postures whose tour is searched; beyond, nearest neighbours
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """The postures to measure, and how good they are."""
+
+    indices: tuple[int, ...]
+    log_det: float  # of the information matrix of [A | b], commands in degrees
+    best_log_det: float  # of the best subset known
+    efficiency: float  # D-efficiency (det S / det S*) ** (1 / parameters)
+    proven: bool  # that best is the proven optimum
+    method: str
+    note: str = ""
+    criterion: str = "D"
+
+
+def draw(config: RigConfig, count: int, *seed: int) -> Array:
+    """(count, n) int pulses, uniform in the ranges; only whole ones can be sent."""
+    low, high = np.array(config.ranges).T
+    rng = np.random.default_rng([config.session.seed, *seed])
+    angles = rng.uniform(low, high, size=(count, len(low)))
+    return np.array([config.to_pulses(angle) for angle in angles])
+
+
+def draw_candidates(config: RigConfig) -> Array:
+    """(M, n) int pulses from which the postures are chosen."""
+    return draw(config, config.session.candidates)
+
+
+def choose(
+    config: RigConfig,
+    candidates_deg: Array,
+    available: Array | None = None,
+    required: tuple[int, ...] = (),
+) -> Choice:
+    """The K postures to measure of (M, n) candidates.
+
+    Args:
+        config: names K, the method and the efficiency under which exact replaces it.
+        candidates_deg: (M, n).
+        available: (M,) False where a posture cannot be reached. The drives stand armed
+            then: it is the exact solver alone, and less time.
+        required: indices measured already, which stay in the choice.
+    """
+    import jaxcal
+
+    session, replanning = config.session, available is not None
+    if (made := model_of(config)) is not None:
+        limit = REPLAN_LIMIT_S if replanning else EXACT_LIMIT_S
+        return _choose_by_model(
+            config, made, candidates_deg, limit, available=available,
+            required=list(required) or None,
+        )  # fmt: skip
+    n, m = len(config.axes), len(config.output_names)
+    model, parameters = None if m == n else Affine(n, m), m * (n + 1)
+    limit = REPLAN_LIMIT_S if replanning else EXACT_LIMIT_S
+
+    def select(method: str, **more: Any) -> Any:
+        if method != "greedy":  # which draws nothing
+            more["seed"] = session.seed
+        return jaxcal.select(
+            candidates_deg, config.k, method=method, model=model,
+            available=available, required=list(required) or None, **more,
+        )  # fmt: skip
+
+    exact, chosen, note = select("exact", time_limit=limit), None, ""
+    if config.method != "exact" and not replanning:
+        chosen, note = _by_its_method(config, select, limit)
+    chosen = chosen or exact
+    best = max(exact.log_det, chosen.log_det)
+    efficiency = math.exp((chosen.log_det - best) / parameters)
+    if efficiency < session.min_efficiency:
+        note = (
+            f"{config.method} reached a D-efficiency of {efficiency:.3f}, under "
+            f"session.min_efficiency = {session.min_efficiency:g}; using exact"
+        )
+        chosen, efficiency = exact, math.exp((exact.log_det - best) / parameters)
+    return Choice(
+        indices=tuple(int(i) for i in chosen.indices),
+        log_det=float(chosen.log_det),
+        best_log_det=float(best),
+        efficiency=efficiency,
+        proven=bool(exact.proven),
+        method=str(chosen.method),
+        note=note,
+    )
+
+
+def _by_its_method(
+    config: RigConfig, select: Callable[..., Any], limit_s: float
+) -> tuple[Any, str]:
+    """What the configured method selects, and a note; None where it has no policy."""
+    more: dict[str, Any] = {}
+    if config.method == "auto":
+        least = config.session.min_efficiency
+        more = {"least_efficiency": least, "time_limit": limit_s}
+    try:
+        chosen = select(config.method, **more)
+    except Exception as error:
+        if config.method not in ("policy", "auto"):
+            raise
+        # A missing or foreign checkpoint must not keep a rig from being calibrated.
+        reason = " ".join(str(error).split())[:200]
+        return None, f"no policy could be used ({reason}); exact is used instead"
+    return chosen, getattr(chosen, "reason", "")
+
+
+def _choose_by_model(
+    config: RigConfig, made: DeviceModel, candidates: Array, limit_s: float, **more: Any
+) -> Choice:
+    """The postures that predict best what any candidate measures (I)."""
+    import jaxcal
+
+    session = config.session
+    design = jaxcal.Design(candidates, model=made.model, prior=made.prior, **more)
+    options: dict[str, Any] = {"seed": session.seed}
+    method = session.method or "auto"
+    if method == "auto":
+        options |= {"least_efficiency": session.min_efficiency, "time_limit": limit_s}
+    elif method == "exact":
+        options["time_limit"] = limit_s
+    elif method == "greedy":
+        options = {}
+    chosen = design.select(config.k, method=method, **options)
+    return Choice(
+        indices=tuple(int(i) for i in chosen.indices),
+        log_det=float(chosen.log_det),
+        best_log_det=float(chosen.log_det),
+        efficiency=float(chosen.efficiency),
+        proven=bool(chosen.proven),
+        method=str(chosen.method),
+        note=str(chosen.reason),
+        criterion=chosen.criterion,
+    )
+
+
+def travel_order(config: RigConfig, points_deg: Array, start_deg: Array) -> list[int]:
+    """Order of visits of (N, n) points of least travel time from (n,), ending anywhere.
+
+    The axes move at the same time, so the slowest of them sets the time. Optimal for N
+    up to 12; above 200 each next point is the nearest.
+    """
+    if not len(points_deg):
+        return []
+    speed = tuple(axis.speed_deg_s for axis in config.axes)
+    motion = Motion(speed, tuple(axis.accel_deg_s2 for axis in config.axes))
+    here = travel_times([start_deg], points_deg, motion)[0]
+    if len(points_deg) <= MOST_IMPROVED:
+        times = travel_times(points_deg, points_deg, motion)
+        return [int(i) for i in fastest_tour(times, here)[0]]
+    order: list[int] = []
+    unvisited = np.arange(len(points_deg))
+    while len(unvisited):
+        order.append(int(unvisited[here[unvisited].argmin()]))
+        unvisited = unvisited[unvisited != order[-1]]
+        here = travel_times(points_deg[order[-1:]], points_deg, motion)[0]
+    return order
+
+
+def draw_held_out(
+    config: RigConfig, calibration: Any, count: int
+) -> list[tuple[Pulses, ...]]:
+    """Held-out targets in pulses, each as it is and as its compensated command.
+
+    Fewer than ``count`` where little of the range can be reached compensated. By a
+    ``[model]`` they are predicted, and visited once. Of other numbers than axes what
+    the calibration says there is the target, and both are the same.
+    """
+    if config.model is not None:
+        return [(tuple(pulses.tolist()),) for pulses in draw(config, count, 1)]
+    low, high = np.array(config.ranges).T
+    pairs: list[tuple[Pulses, ...]] = []
+    for pulses in draw(config, 200 * count, 1):
+        if len(pairs) == count:
+            break
+        command = config.to_deg(pulses)
+        if len(config.output_names) == len(config.axes):
+            command = calibration.command_for(command)
+        if ((command >= low) & (command <= high)).all():
+            pairs.append((tuple(pulses.tolist()), config.to_pulses(command)))
+    return pairs

@@ -1,0 +1,493 @@
+"""What small moves of the drives say about a device: axes, signs, gearing, placement.
+
+Everything is taken from rotations of the phone against its attitude at the start, so
+neither the heading of the phone's world nor the zero posture enters. A rotation vector
+is (3,) degrees in the phone's own frame at the start.
+
+A drive's axis there, with its sign, is the direction of its rotation vector for
+positive pulses. With these axes alone, a phone that is placed differently cannot be
+told from drives whose names and signs are exchanged, so the configured placement is
+taken as known, as good as ``NEAREST``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import tomllib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rig.command_run import Run
+from rig.config import RigConfig
+from rig.config.axis import Axis
+from rig.core.device import Device, Posture
+from rig.core.measure import measure
+from rig.core.motion import move
+from rig.core.proof import RADIANS
+from rig.faults import MotionFault
+from rig.readings.attitude import Array, euler_to_matrix, matrix_to_euler
+from rig.readings.geometry import geometry_of
+
+CLEAR = 4.0  # standard deviations that make a difference a finding
+NEAREST = 0.7  # cosine: an axis within 45 degrees of where it is expected
+EXCHANGED = 0.3  # of the sum of cosines: exchanged drives must explain more by it
+LETTERS = ("X", "Y", "Z")
+# A smaller turn of the phone cannot be told from cross-coupling of the axes, and the
+# linear calibration takes it up as such.
+MOUNTING_DEG = 3.0
+# Measured against commanded: what A may take up, and what only a wrong gearing does.
+SOUND_RATIO = (0.4, 1.5)
+# Measured against commanded, once radians and degrees are exchanged.
+NEAR_UNIT = (0.3, 2.0)
+UNPROVED_FACTOR = 2.0  # by which a gearing is corrected on the phone's word alone
+BY_PLATE = (
+    "Nothing was corrected. Set pulses_per_rev and reduction as the drives and the "
+    "gearboxes' plates say, then run `jaxcal-rig axes` again"
+)
+DIGITS = 4  # of a reduction that was measured
+OF_DRIVE = ("unit", "map", "pulses_per_rev", "comm_timeout_s")  # go with the cable
+
+
+@dataclasses.dataclass(frozen=True)
+class Stand:
+    """The device measured at one place."""
+
+    pulses: Array  # (n,)
+    attitude: Array  # (3, 3) phone to its world
+    std_deg: float  # of one reading
+    samples: int
+
+
+def stand_at(run: Run, device: Device, posture: Posture, samples: int = 0) -> Stand:
+    """Move and measure, with ``samples`` readings or as configured; journalled."""
+    run.signals.check_pause()
+    measured = measure(move(device, posture), samples or None)
+    run.emit("stand", sync=True, name=posture.name, **measured)
+    return Stand(
+        np.array(measured["pulses"], dtype=np.float64),
+        np.array(measured["attitude"]),
+        float(np.max(measured["std_deg"])),
+        int(measured["samples"]),
+    )
+
+
+def corners_of(count: int) -> list[tuple[int, ...]]:
+    """Signs of combined moves of so many axes, one changed at a time; none of one."""
+    signs: list[tuple[int, ...]] = [()]
+    for _ in range(count):
+        signs = [(*s, -1) for s in signs] + [(*s, 1) for s in reversed(signs)]
+    return signs if count > 1 else []
+
+
+def corner_name(config: RigConfig, signs: Sequence[int]) -> str:
+    """Name of the corner with these signs, as ``pitch+ yaw- roll+``."""
+    named = zip(config.axis_names, signs, strict=True)
+    return " ".join(f"{name}{'+' if sign > 0 else '-'}" for name, sign in named)
+
+
+def turn(base: Array, attitude: Array) -> Array:
+    """(3,) rotation vector in degrees from one attitude to another, in the former."""
+    return Rotation.from_matrix(base.T @ attitude).as_rotvec(degrees=True)
+
+
+def rates_of(config: RigConfig, stands: Mapping[str, Stand]) -> Array:
+    """(3, n) columns, rotation vector for one pulse of each drive; (m, n) numbers."""
+    base, columns, way = stands["start"].attitude, [], geometry_of(config).way
+    for j, name in enumerate(config.axis_names):
+        parts = ("look", "plus", "back", "minus")
+        places = [stands[f"{name}:{part}"] for part in parts]
+        look, plus, back, minus = (way(base, stand.attitude) for stand in places)
+        at = [stand.pulses[j] for stand in places]
+        # On the way up and on the way down the play is taken up: no reversal between.
+        moved = np.array([at[1] - at[0], at[3] - at[2]])
+        rates = np.array([plus - look, minus - back]) / moved[:, None]
+        columns.append(np.average(rates, axis=0, weights=abs(moved)))
+    return np.column_stack(columns)
+
+
+def _inner(
+    config: RigConfig, stands: Mapping[str, Stand], rates: Array
+) -> list[int] | None:
+    """For each drive how many joints its own carries; [] where nothing fits.
+
+    With A nearer to the base the phone turns by exp(a) exp(b), otherwise by exp(b)
+    exp(a). The two differ by a x b: half of it, up or down, in the direction in which
+    neither turns alone. It changes its sign with either move, so its mean over the
+    corners, each with the product of the two signs, is free of what A or B turn
+    alone, of play and of a steady drift. Angles read in a wrong order or with wrong
+    signs turn like a mirror image, and combine like nothing. None: the phone is too
+    noisy to tell.
+    """
+    count, base = rates.shape[1], stands["start"]
+    corners = [stands[corner_name(config, signs)] for signs in corners_of(count)]
+    if not corners:  # of a single axis
+        return [0]
+    turned = np.array([turn(base.attitude, corner.attitude) for corner in corners])
+    ways = np.array([corner.pulses - base.pulses for corner in corners])
+    number = len(corners)
+    noise = (
+        base.std_deg * np.sqrt(sum(1 / corner.samples for corner in corners)) / number
+    )
+    inner = [0] * count
+    for a, b in itertools.combinations(range(count), 2):
+        product = ways[:, a] * ways[:, b]  # as large at each
+        normal = np.cross(rates[:, a], rates[:, b])
+        scale = np.linalg.norm(normal)
+        share = np.sign(product) @ turned @ normal / scale / number
+        whole = np.radians(np.abs(product).mean() * scale) / 2
+        if CLEAR * noise > whole / 2:
+            return None
+        if not whole / 2 < abs(share) < 2 * whole:
+            return []
+        inner[a if share > 0 else b] += 1
+    return inner if sorted(inner) == [*range(count)] else []
+
+
+def check_numbers(
+    config: RigConfig, stands: Mapping[str, Stand], expected: Array | None = None
+) -> tuple[list[Change], list[float]]:
+    """What the places say of axes that are measured by numbers.
+
+    A number of the name of an axis rises with that axis; where it has its unit too, it
+    changes about as far. Or they change as a model says, ``expected`` (m, n) for a unit
+    of each axis.
+
+    Returns:
+        Corrections of directions, and what a commanded unit of each axis changes.
+
+    Raises:
+        MotionFault: it changes by far more, or less.
+    """
+    rates, changes, low, high = rates_of(config, stands), [], *SOUND_RATIO
+    ratios = []
+    for j, axis in enumerate(config.axes):
+        per_unit = rates[:, j] * axis.pulses_per_deg
+        ratios.append(float(np.linalg.norm(per_unit)))
+        if expected is not None:
+            changes += _against(config, axis, per_unit, expected[:, j])
+            continue
+        if axis.name not in config.output_names:
+            continue
+        rate = per_unit[config.output_names.index(axis.name)]
+        same = config.output_unit == axis.unit_name
+        if same and not low <= abs(rate) <= high:
+            raise MotionFault(
+                f"{axis.name} was measured to move {abs(rate):.3g} {axis.unit_name} "
+                f"for each that it was commanded; sound is {low:g} to {high:g}. "
+                f"{BY_PLATE}"
+            )
+        if rate < 0:
+            reason = f"what is measured as {axis.name} falls as it is commanded up"
+            key = f"axes.{axis.name}.direction"
+            changes.append(Change(key, axis.direction, -axis.direction, reason))
+    return changes, ratios
+
+
+def _against(
+    config: RigConfig, axis: Axis, seen: Array, expected: Array
+) -> list[Change]:
+    """An axis changed the readings as the model says, the other way, or neither."""
+    size, way = float(np.linalg.norm(seen)), float(np.linalg.norm(expected))
+    cosine = float(seen @ expected) / max(size * way, 1e-12)
+    low, high = SOUND_RATIO
+    told = (
+        f"{axis.name} changed what is measured by {size:.3g} for each {axis.unit_name} "
+        f"commanded, the model says {way:.3g}"
+    )
+    if not low * way <= size <= high * way:
+        raise MotionFault(f"{told}; sound is {low:g} to {high:g} of it. {BY_PLATE}")
+    if abs(cosine) < NEAREST:
+        raise MotionFault(
+            f"{told}, and in another direction: units, cables or readings are "
+            "exchanged, or [model] is of another device. Nothing was corrected"
+        )
+    if cosine > 0:
+        return []
+    key = f"axes.{axis.name}.direction"
+    reason = "what is measured changes the other way than the model says"
+    return [Change(key, axis.direction, -axis.direction, reason)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Findings:
+    """Findings by drive, in the order of the configuration's axes if not said."""
+
+    joints: tuple[int, ...]  # for each drive: the axis that it turns
+    deg_per_pulse: Array  # (n,) of the phone, > 0 where pulses turn the joint positive
+    mounting: Array  # (3, 3) phone to end-effector, nearest to the axes
+    turned_deg: float  # that from the configured one
+    order: str | None  # axes of the mechanism from the base outwards; None: not clear
+
+
+def find(
+    config: RigConfig,
+    stands: Mapping[str, Stand],
+    expected: Array | None = None,
+) -> Findings:
+    """Read the findings from the places that ``axes.measure`` went to.
+
+    Args:
+        config: as the moves were made.
+        stands: ``start``; of each axis NAME ``NAME:look``, ``:plus``, ``:back``,
+            ``:minus``; of each of ``corners_of`` its ``corner_name``.
+        expected: (3, n) axes of an arm's joints in its tip's frame at the start, of
+            which the order of the joints is known.
+
+    Raises:
+        MotionFault: the axes fit no joints, or the readings are no rotations.
+    """
+    rates = rates_of(config, stands)
+    size = np.linalg.norm(rates, axis=0)
+    axes = rates / size
+    told = euler_to_matrix(config.phone.mounting_deg, "ZYX")
+    if expected is not None:
+        joints, signs, mounting = _placed(config, axes, expected)
+        turned = float(np.linalg.norm(turn(told, mounting)))
+        return Findings(joints, signs * size, mounting, turned, None)
+    joints, signs, mounting = _placed(config, axes, _expected(config))
+    order, inner = None, _inner(config, stands, rates)
+    if inner is not None:
+        if not inner:
+            raise MotionFault(
+                "the phone's readings do not combine as rotations of joints do: "
+                "imu.order, imu.columns or imu.signs is wrong, or the phone is loose. "
+                "Nothing was corrected"
+            )
+        order = "".join(config.letters[joints[i]] for i in np.argsort(inner)[::-1])
+    turned_as_told = axes * _directions(config)  # of fewer axes nothing is a mirror
+    mirrored = rates.shape[1] == 3 and (
+        np.linalg.det(turned_as_told @ _expected(config)) < 0
+    )
+    if mirrored and order is None:
+        raise MotionFault(
+            "the axes are mirrored, and the phone is too noisy to tell whether a "
+            "direction is wrong or imu.signs. Raise settle.samples, then run "
+            "`jaxcal-rig axes` again"
+        )
+    turned = float(np.linalg.norm(turn(told, mounting)))
+    return Findings(joints, signs * size, mounting, turned, order)
+
+
+def _expected(config: RigConfig) -> Array:
+    """(3, n) columns: axis of each joint in the end-effector's frame."""
+    return np.eye(3)[:, [LETTERS.index(letter) for letter in config.letters]]
+
+
+def _directions(config: RigConfig) -> Array:
+    """(n,) the configured ones of the drives."""
+    return np.array([float(axis.direction) for axis in config.axes])
+
+
+def _placed(
+    config: RigConfig, axes: Array, expected: Array
+) -> tuple[tuple[int, ...], Array, Array]:
+    """Joint and sign of each drive, and the mounting that fits them best.
+
+    Joints whose axes are parallel cannot be told apart: where as much is explained
+    otherwise, drives turn the joints that they are named after.
+    """
+    told = euler_to_matrix(config.phone.mounting_deg, "ZYX")
+    cosines = expected.T @ told @ axes  # rows: joints
+    joints: tuple[int, ...] = max(
+        itertools.permutations(range(len(cosines))),  # the first is as named
+        key=lambda order: (
+            np.abs(cosines[order, range(len(order))]).sum()
+            - EXCHANGED * (order != tuple(range(len(order))))
+        ),
+    )
+    cosine = cosines[joints, range(len(joints))]
+    signs = np.sign(cosine)
+    if np.abs(cosine).min() < NEAREST:
+        unit = config.axes[int(np.abs(cosine).argmin())].unit
+        raise MotionFault(
+            f"unit {unit} turns the phone about an axis more than 45 deg from every "
+            "joint's, so the phone is not placed as imu.mounting_deg says. Correct "
+            "that roughly, then run `jaxcal-rig axes` again"
+        )
+    goal, turned = expected[:, joints] * signs, told @ axes
+    if len(joints) == 1:  # the least turn that fits it
+        across = np.cross(turned[:, 0], goal[:, 0])
+        sine = np.linalg.norm(across)
+        angle = np.arctan2(sine, turned[:, 0] @ goal[:, 0])
+        correction = Rotation.from_rotvec(across * (angle / max(sine, 1e-12)))
+    else:
+        correction, _ = Rotation.align_vectors(goal.T, turned.T)
+    return joints, signs, correction.as_matrix() @ told
+
+
+# What follows for rig.toml
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """One key of rig.toml; ``key`` is such as ``axes.roll.direction``."""
+
+    key: str
+    old: Any
+    new: Any
+    reason: str
+
+    def __str__(self) -> str:
+        if self.new is None:
+            return f"{self.key} is taken out (is {self.old!r}): {self.reason}"
+        return f"{self.key} = {self.new!r} (is {self.old!r}): {self.reason}"
+
+
+def ratios_of(config: RigConfig, findings: Findings) -> list[float]:
+    """What each drive turned the phone, as a share of what it was commanded."""
+    pairs = zip(findings.deg_per_pulse, config.axes, strict=True)
+    return [float(abs(each * axis.pulses_per_deg)) for each, axis in pairs]
+
+
+def require_unit(
+    config: RigConfig, ratios: Sequence[float], proved: bool = False
+) -> None:
+    """The unit of the phone's angles is the configured one, by what the axes turned.
+
+    Two gearings of the file that agree with the phone prove it (of a single axis the
+    one): both would have to be wrong by 57.3. A gearing is corrected only where the
+    unit is proved, so that no phone's radians are taken for a gearbox.
+
+    Args:
+        config: names the unit.
+        ratios: of the axes, measured against commanded, by the drives' own registers
+            where they have one.
+        proved: only that not all turn as if the unit were the other.
+
+    Raises:
+        MotionFault: it is the other unit, or that is not clear.
+    """
+    unit = config.phone.unit
+    other, factor = ("rad", RADIANS) if unit == "deg" else ("deg", 1.0 / RADIANS)
+    shown, (low, high) = _seen(config, ratios), NEAR_UNIT
+    if all(low <= ratio * factor <= high for ratio in ratios):
+        raise MotionFault(
+            f'{shown}, about {1 / factor:.3g}: rig.toml says imu.unit = "{unit}", and '
+            f'the phone sends {other}. Set imu.unit = "{other}", then run `jaxcal-rig '
+            "axes` again"
+        )
+    low, high = SOUND_RATIO
+    sound = sum(low <= ratio <= high for ratio in ratios)
+    if not proved and sound < min(2, len(ratios)):
+        raise MotionFault(
+            f"{shown}, and none of its angles is over 6.3: either imu.unit or the "
+            f"gearings are wrong. {BY_PLATE}"
+        )
+
+
+def require_gearing(
+    config: RigConfig, ratios: Sequence[float], told: Sequence[int | None]
+) -> None:
+    """A gearing that is off by more than a factor of 2 has a second proof.
+
+    That is the drive's own register, or another axis that turns as it is told: what is
+    off by as much on all of them may be the phone, or what the file says of all drives.
+
+    Args:
+        config, ratios: as of ``require_unit``.
+        told: pulses for one turn by each drive's own word, None where it has none.
+
+    Raises:
+        MotionFault: there is none.
+    """
+    low, high = SOUND_RATIO
+    if any(low <= ratio <= high for ratio in ratios):
+        return
+    for axis, ratio, register in zip(config.axes, ratios, told, strict=True):
+        if register is None and max(ratio, 1.0 / ratio) > UNPROVED_FACTOR:
+            raise MotionFault(
+                f"{_seen(config, ratios)}, and the drive of {axis.name} has no "
+                "register that "
+                "says its pulses for a turn, so it is not known what is wrong. "
+                f"{BY_PLATE}"
+            )
+
+
+def _seen(config: RigConfig, ratios: Sequence[float]) -> str:
+    *most, last = config.axis_names
+    names = f"{', '.join(most)} and {last}" if most else last
+    text = ", ".join(f"{ratio:.3g}" for ratio in ratios)
+    return f"the phone turned {text} of what {names} were commanded"
+
+
+def proposals(
+    config: RigConfig, findings: Findings, told: Sequence[int | None]
+) -> list[Change]:
+    """Corrections of the configuration.
+
+    Args:
+        config: as the moves were made, with a phone whose unit is proved.
+        findings: what they showed.
+        told: pulses for one turn by each drive's own word, None where it has none.
+    """
+    tables = {table["name"]: table for table in tomllib.loads(config.text)["axes"]}
+    changes: list[Change] = []
+    low, high = SOUND_RATIO
+    for drive, joint in enumerate(findings.joints):
+        source, axis = config.axes[drive], config.axes[joint]
+        edits: dict[str, tuple[Any, Any, str]] = {}  # key: old, new, reason
+        for name in OF_DRIVE:
+            # A map stands in the file as its name or its path.
+            old, new = tables[axis.name].get(name), tables[source.name].get(name)
+            reason = f"unit {source.unit} turns {axis.name}"
+            if name == "pulses_per_rev" and told[drive] not in (None, new):
+                new, reason = told[drive], f"unit {source.unit} says so itself"
+            edits[name] = old, new, reason
+        rate, pulses = (
+            findings.deg_per_pulse[drive],
+            told[drive] or source.pulses_per_rev,
+        )
+        reason = f"positive pulses turn it the {_way(rate)} way"
+        edits["direction"] = axis.direction, 1 if rate > 0 else -1, reason
+        geared = axis.model_copy(update={"pulses_per_rev": pulses})
+        ratio = abs(float(rate) * geared.pulses_per_deg)
+        if not low <= ratio <= high:
+            new = float(f"{axis.reduction / ratio:.{DIGITS}g}")
+            reason = f"it turns {ratio:.3g} of what is commanded; sound is {low:g} to "
+            edits["reduction"] = axis.reduction, new, f"{reason}{high:g}"
+        for name, values in edits.items():
+            if values[0] != values[1]:
+                changes.append(Change(f"axes.{axis.name}.{name}", *values))
+    if findings.turned_deg > MOUNTING_DEG:
+        angles = matrix_to_euler(findings.mounting, "ZYX").round(2) + 0.0
+        before, reason = list(config.phone.mounting_deg), "the axes put the phone"
+        reason += f" {findings.turned_deg:.1f} deg from there"
+        changes.append(Change("imu.mounting_deg", before, angles.tolist(), reason))
+    if findings.order is not None and findings.order != config.joint_order:
+        reason = "combined moves show which joint carries which"
+        order, letters = config.mechanism.order, iter(str(findings.order))
+        # What no joint turns about keeps its place.
+        new = "".join(next(letters) if at in config.letters else at for at in order)
+        changes.append(Change("mechanism.order", order, new, reason))
+    return changes
+
+
+def _way(rate: float) -> str:
+    return "positive" if rate > 0 else "negative"
+
+
+def lines(config: RigConfig, findings: Findings) -> list[str]:
+    """The findings in words, a line for each drive and each thing found."""
+    ratios = ratios_of(config, findings)
+    text = ["  unit  turns   sense     measured/commanded"]
+    for drive, joint in enumerate(findings.joints):
+        axis, unit = config.axes[joint], config.axes[drive].unit
+        text.append(
+            f"  {unit:>4}  {axis.name:<6}  {_way(findings.deg_per_pulse[drive]):<8}  "
+            f"{ratios[drive]:18.3f}"
+        )
+    angles = matrix_to_euler(findings.mounting, "ZYX")
+    text.append(
+        f"  phone: turned by [{' '.join(f'{angle:.1f}' for angle in angles)}] deg "
+        f"about Z, Y, X, {findings.turned_deg:.1f} from imu.mounting_deg"
+    )
+    if config.is_arm:
+        text.append("  parallel joints look alike: watch that each is the one named")
+    else:
+        order = findings.order or "not clear from these moves"
+        text.append(f"  joints from the base outwards: {order}")
+    return text

@@ -1,0 +1,236 @@
+"""Small moves of each axis that show what unit turns what, which way and how far."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rig.command_run import Run
+from rig.config.axis import Axis
+from rig.core.device import Device, Posture
+from rig.core.motion import move
+from rig.core.proof import FIRST_MOTOR_DEG, slopes, unit_proved
+from rig.faults import MotionFault, Refused
+from rig.journal import SIGN_CHECKED
+from rig.prove.axis_check import (
+    CLEAR,
+    Change,
+    Stand,
+    check_numbers,
+    corner_name,
+    corners_of,
+    find,
+    lines,
+    proposals,
+    rates_of,
+    ratios_of,
+    require_gearing,
+    require_unit,
+    stand_at,
+)
+from rig.prove.stops import prove_stops
+
+REACH_DEG = 3.0  # each way
+FAR_ENOUGH = 1.1  # a move that would be no longer than that is not made
+SURE_SIGMA = 3.0
+CORNER_DEG = 6.0  # commanded at most, so that the phone turns about REACH_DEG
+# Of the mean over the corners: two rotations of REACH_DEG make 0.08 deg there.
+CORNER_STD_DEG = 0.015
+ROOM_DEG = 0.2  # left to a limit
+SEEN_DEG = 0.03  # the phone must turn at least this much in a whole move
+SEEN_SIGMA = 6.0
+
+
+def check_axes(run: Run, device: Device) -> list[Change]:
+    """Move, measure and say what is found; the corrections that follow from it.
+
+    Where nothing is to be corrected the device is SIGN_CHECKED, and once every way to
+    stop it has been tried, STOP_PROVED.
+    """
+    stands = measure_axes(run, device)
+    start, model, expected = stands["start"].pulses, run.model, None
+    if run.config.imu is None:
+        if model is not None:
+            expected = slopes(model.predict, run.config.to_deg(start))
+        changes, ratios = check_numbers(run.config, stands, expected)
+        return _conclude(run, device, stands, changes, ratios, {})
+    if model is not None and model.rotations is not None:
+        expected = model.axes_at(run.config.to_deg(start))
+    findings = find(run.config, stands, expected)
+    told = [drive.pulses_per_rev() for drive in device.drives]
+    ratios = ratios_of(run.config, findings)
+    if run.config.phone.unit == "rad":
+        require_unit(run.config, ratios, proved=True)
+    require_gearing(run.config, ratios, told)
+    changes = proposals(run.config, findings, told)
+    run.say(*lines(run.config, findings))
+    more = {"phone_turned_deg": round(findings.turned_deg, 2)}
+    return _conclude(run, device, stands, changes, ratios, more)
+
+
+def _conclude(
+    run: Run,
+    device: Device,
+    stands: dict[str, Stand],
+    changes: list[Change],
+    ratios: list[float],
+    more: dict[str, float],
+) -> list[Change]:
+    """Keep what was seen, where nothing is to be corrected, and prove the stops."""
+    names = run.config.axis_names
+    evidence = {
+        "ratio": dict(zip(names, np.round(ratios, 4).tolist(), strict=True)),
+        **more,
+        "run": run.folder.name,
+    }
+    scales = np.array([axis.pulses_per_deg for axis in run.config.axes])
+    turns = {
+        "pulses": stands["start"].pulses.tolist(),
+        "deg": (rates_of(run.config, stands) * scales).round(6).tolist(),
+    }
+    run.emit("axes", sync=True, **evidence, changes=[str(change) for change in changes])
+    units = {axis.name: axis.unit_name for axis in run.config.axes}
+    for name, pace in device.paces.items():
+        run.say(
+            f"  {name}: {pace.seen_deg_s:.3g} {units[name]}/s at least, "
+            f"{pace.asked_deg_s:.3g} asked"
+        )
+    if not changes:
+        run.record.reach(SIGN_CHECKED, run.config, **evidence, turns=turns)
+        run.say("each unit turns its own joint, the right way and about as far as told")
+        prove_stops(run, device)
+    return changes
+
+
+def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
+    """Visit the places that ``axis_check.find`` reads from, and come back.
+
+    Raises:
+        Refused: an axis stands too near to a limit.
+        MotionFault: an axis does not turn the phone, or turns it too far, or the unit
+            of the phone's angles is not the one that is configured.
+    """
+    config, start = run.config, device.positions()
+    room = [_room_deg(axis, at) for axis, at in zip(config.axes, start, strict=True)]
+    # Of numbers it does not matter which axis carries which; of an arm it is known.
+    corners = corners_of(len(config.axes)) if config.imu and not config.is_arm else []
+    run.say(
+        f"axes: about {1 + 7 * len(start) + len(corners)} places; each axis first by "
+        f"{FIRST_MOTOR_DEG:g} deg of its motor, then as far as what is seen allows, "
+        f"{REACH_DEG:g} deg or mm at most either way"
+    )
+    tour = _Tour(run, device, start)
+    device.proof.stay_near(tour.base.attitude)
+    if not unit_proved(config.source, tour.base.attitude):
+        tour.prove_unit()
+    corner: list[int] = []  # pulses of each axis
+    for j, axis in enumerate(config.axes):
+        far, turned = tour.measure_axis(j)
+        most = min(CORNER_DEG, room[j]) / abs(axis.to_deg(far))
+        corner.append(round(far * min(REACH_DEG / turned, most)))
+    clear = CLEAR * tour.base.std_deg / CORNER_STD_DEG
+    clear = int(np.ceil(clear**2 / max(1, len(corners))))
+    samples = min(max(clear, config.settle.samples), 8 * config.settle.samples)
+    for signs in corners:
+        ways = {j: sign * corner[j] for j, sign in enumerate(signs)}
+        tour.visit(corner_name(config, signs), ways, samples)
+    move(device, Posture("back", start))
+    return tour.stands
+
+
+def _room_deg(axis: Axis, pulses: int) -> float:
+    """Degrees from here to the nearer limit, less what is left to it.
+
+    Raises:
+        Refused: it is less than the check needs.
+    """
+    here = axis.to_deg(pulses)
+    room = min(here - axis.min_deg, axis.max_deg - here) - ROOM_DEG
+    if room < REACH_DEG:
+        raise Refused(
+            f"{axis.name} stands {room + ROOM_DEG:.1f} deg from a limit; the check "
+            f"moves it {REACH_DEG:g} deg either way. Move it inwards: "
+            f"jaxcal-rig jog {axis.name} DEG"
+        )
+    return room
+
+
+class _Tour:
+    """The places around the start, each of them measured."""
+
+    def __init__(self, run: Run, device: Device, start: tuple[int, ...]) -> None:
+        self.run, self.device, self.start = run, device, start
+        self.stands: dict[str, Stand] = {}
+        samples = run.config.settle.samples
+        self.base = self.visit("start", {}, 4 * samples)
+        self.noise = SURE_SIGMA * self.base.std_deg * (2.0 / samples) ** 0.5
+
+    def visit(self, name: str, offset: dict[int, int], samples: int = 0) -> Stand:
+        """Stand at pulses away from the start, and measure."""
+        target = tuple(p + offset.get(axis, 0) for axis, p in enumerate(self.start))
+        stand = stand_at(self.run, self.device, Posture(name, target), samples)
+        self.stands[name] = stand
+        return stand
+
+    def turned(self, stand: Stand) -> float:
+        """How far the phone turned from the start, or the numbers changed."""
+        return self.device.geometry.apart(self.base.attitude, stand.attitude)
+
+    def grow(self, j: int, unit: bool, samples: int = 0) -> tuple[int, int]:
+        """Move an axis further and further; pulses of the last two places."""
+        config, geometry = self.run.config, self.device.geometry
+        reach = self.device.proof.renew(j, unit)
+        furthest, counts = config.axes[j].to_pulses(REACH_DEG), [0]
+        way = int(np.sign(furthest))
+        while True:
+            count = reach.pulses(furthest, REACH_DEG * geometry.scale)
+            if count <= FAR_ENOUGH * counts[-1]:
+                return way * counts[-2], way * counts[-1]
+            name = f"{config.axis_names[j]}:plus"
+            stand = self.visit(name, {j: way * count}, samples)
+            reach.saw(count, self.turned(stand), self.noise)
+            counts.append(count)
+
+    def prove_unit(self) -> None:
+        """Short moves that tell degrees of the phone from radians."""
+        config = self.run.config
+        self.run.say(
+            "  no angle of the phone is over 6.3, so degrees are not told from "
+            "radians: shorter moves show first which they are"
+        )
+        ratios = []
+        for j, axis in enumerate(config.axes):
+            _, far = self.grow(j, False, 4 * config.settle.samples)
+            turned = self.turned(self.stands[f"{axis.name}:plus"])
+            told = self.device.drives[j].pulses_per_rev() or axis.pulses_per_rev
+            geared = told / axis.pulses_per_rev
+            ratios.append(geared * turned / abs(axis.to_deg(far)))
+            self.visit(f"{axis.name}:back", {j: 0})
+        require_unit(config, ratios)
+
+    def measure_axis(self, j: int) -> tuple[int, float]:
+        """Places of one axis, both ways; pulses of the furthest, and what it turned."""
+        axis, geometry = self.run.config.axes[j], self.device.geometry
+        look, far = self.grow(j, True)
+        plus = self.stands[f"{axis.name}:plus"]
+        turned = self.turned(plus)
+        commanded = abs(axis.to_deg(far))
+        least = SEEN_SIGMA * self.base.std_deg / plus.samples**0.5
+        if turned < max(SEEN_DEG * geometry.scale, least):
+            raise MotionFault(
+                f"unit {axis.unit} turned its motor by {commanded:g} {axis.unit_name} "
+                f"of {axis.name}, and {geometry.told} {turned:.3g}. Look for a loose "
+                "coupling, a stream that does not change, or a reduction that is far "
+                "too small"
+            )
+        # Once more on the way up, where its play is taken up.
+        down = tuple(p - far * (i == j) for i, p in enumerate(self.start))
+        move(self.device, Posture(axis.name, down))
+        near = look if 2 * abs(look) <= abs(far) else far // 4
+        for name, count in ("look", near), ("plus", far), ("back", 0), ("minus", -far):
+            self.visit(f"{axis.name}:{name}", {j: count})
+        move(self.device, Posture(axis.name, self.start))
+        self.run.say(
+            f"  {axis.name}: {commanded:.2f} {axis.unit_name} commanded, "
+            f"{geometry.told} {turned:.3g}"
+        )
+        return far, turned

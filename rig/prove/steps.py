@@ -1,0 +1,260 @@
+"""The steps of commissioning, each a run with a folder of its own, or reads alone."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import os
+import pathlib
+from collections.abc import Callable, Iterator
+
+from rig.command_run import Run, run_safely
+from rig.config import RigConfig
+from rig.core import session
+from rig.core.device import Device, Posture
+from rig.core.motion import move
+from rig.core.proof import ALLOWED_DEG, slowed
+from rig.core.record_check import check_drives
+from rig.drives import Drive, make_drives
+from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
+from rig.journal import (
+    HOMED,
+    IDENTIFIED,
+    STATES,
+    DeviceRecord,
+    Record,
+    new_run_folder,
+)
+from rig.journal.lock import BusLock
+from rig.outputs.console import listen
+from rig.prove.axis_check import Change
+from rig.prove.axis_moves import check_axes
+from rig.prove.home import can_home, home, identity, unlimited
+from rig.prove.operator import Operator
+from rig.prove.rig_toml import edit
+
+MOST_JOG_DEG = 10.0  # in one step
+
+
+class TurnReached(Exception):
+    """The phone has turned as far as the whole step was to turn it."""
+
+
+@dataclasses.dataclass
+class Site:
+    """A device, its files, and who stands at it."""
+
+    config: RigConfig  # with the addresses that are really used
+    record: DeviceRecord
+    operator: Operator
+    path: pathlib.Path | None = None  # rig.toml, where there is one to correct
+    full_speed: bool = False  # of a simulated device
+    reset_alarms: bool = False
+    listeners: tuple[Callable[[Record], None], ...] = ()
+
+    def say(self, text: str) -> None:
+        self.operator.say(text)
+
+    def take(self, written: RigConfig) -> None:
+        """A configuration that was edited, reached as the one before."""
+        where = {name: getattr(self.config.source, name) for name in ("host", "port")}
+        source = written.source.model_copy(update=where)
+        which = "imu" if written.imu else "readings"
+        update = {"bus": self.config.bus, which: source}
+        self.config = written.model_copy(update=update)
+
+    def command(self, words: str) -> str:
+        """A command about this device, to be typed."""
+        where = "" if self.path is None else f" --config {os.path.relpath(self.path)}"
+        # A simulated device is gone with its command; another is made as rig.toml says.
+        return f"jaxcal-rig {words}{' --simulate' * self.full_speed}{where}"
+
+    @contextlib.contextmanager
+    def bus(self, what: str) -> Iterator[list[Drive]]:
+        """The drives, to be read, under the lock of the bus."""
+        config = self.config
+        line, drives = make_drives(config.bus, config.axes, config.silence_s)
+        with BusLock(config.bus).acquire(what), line:
+            yield drives
+
+    def run(
+        self,
+        name: str,
+        procedure: Callable[[Run, Device], object],
+        limits: bool = True,
+        again: str = "",
+    ) -> int:
+        """Run a step that moves or writes; returns the exit code."""
+        config, real = self.config, not self.full_speed
+        axes = tuple(slowed(axis) if real else axis for axis in config.axes)
+        # Every way to a place is straight, so that play is seen and not made a bias.
+        motion = config.motion.model_copy(update={"approach_overshoot_deg": 0.0})
+        config = config.model_copy(update={"axes": axes, "motion": motion})
+        # Homed drives are where they were left; the gearing is still to be checked.
+        check: session.Check = functools.partial(check_drives, geared=False)
+        with BusLock(config.bus).acquire(name) as lock:
+            run = Run(
+                config if limits else unlimited(config),
+                new_run_folder(pathlib.Path(config.output), name),
+                name, self.say, record=self.record, reset_alarms=self.reset_alarms,
+                start={"simulated": None, "inputs": {}, "maps_from": ""},
+            )  # fmt: skip
+            run.check = check if limits else lambda *_: None
+            run.again, run.simulated = self.command(again or name), self.full_speed
+            listen(run)
+            run.listeners += self.listeners
+            lock.tell(run=str(run.folder.resolve()))
+
+            def whole(run: Run) -> int:
+                with run.armed() as device:
+                    procedure(run, device)
+                return EXIT_OK
+
+            return run_safely(run, whole)
+
+
+def own_folder(config: RigConfig) -> pathlib.Path:
+    """A new one, of a simulated device."""
+    return new_run_folder(pathlib.Path(config.output), "simulated")
+
+
+def show_identity(site: Site) -> None:
+    """The configured units answer as the configured families: IDENTIFIED."""
+    with site.bus("scan") as drives:
+        found = identity(drives)
+    site.record.reach(IDENTIFIED, site.config, identity=found)
+    each = [f"{axis.name} is unit {axis.unit}" for axis in site.config.axes]
+    site.say(f"IDENTIFIED: {', '.join(each)}")
+
+
+def go_home(site: Site, here: bool) -> int:
+    """Make the counts mean a place: HOMED."""
+    names = [axis.name for axis in site.config.axes]
+    if not here and not can_home(site.config):
+        without = {a.map.name for a in site.config.axes if not a.map.homes}
+        raise Refused(
+            f"the map {', '.join(sorted(without))} has no homing. Put the device into "
+            "its home posture, then run `jaxcal-rig home --here`"
+        )
+    what = "nothing moves; where the device stands becomes the origin of its counts"
+    if not here:
+        what = (
+            f"the drives run their own homing one after another, {', '.join(names)}, "
+        )
+        what += "as far and as fast as they are set to"
+    site.operator.confirm(
+        "home: the drives are armed; keep out of the device's reach, hand on the "
+        f"emergency stop; {what}",
+        "home",
+    )
+    return site.run(
+        "home", lambda run, dev: home(run, dev, site.config, here), limits=False,
+        again="home" + " --here" * here,
+    )  # fmt: skip
+
+
+def number_of(config: RigConfig, name: str) -> int:
+    """Number of an axis by its name; Refused where there is none."""
+    if name not in config.axis_names:
+        raise Refused(f"no axis {name!r}: have {', '.join(config.axis_names)}")
+    return config.axis_names.index(name)
+
+
+def jog(site: Site, name: str, way_deg: float) -> int:
+    """Move one axis by so many degrees, cut at its limits.
+
+    Where its gearing is not proved it stops once the phone has turned so far.
+    """
+    axis = number_of(site.config, name)
+    unit = site.config.axes[axis].unit_name
+    homed = site.record.missing(site.config, HOMED) is None
+    if not homed:
+        site.say("the device is not HOMED: the soft limits are not in force")
+    site.operator.confirm(f"jog: {name} will move by {way_deg:g} {unit}, slowly", "jog")
+
+    def procedure(run: Run, device: Device) -> None:
+        moved, here = run.config.axes[axis], list(device.positions())
+        start, checked = here[axis], device.proof.reaches[axis].checked
+        goal = min(max(moved.to_deg(start) + way_deg, moved.min_deg), moved.max_deg)
+        here[axis] = moved.to_pulses(goal)
+        base = device.attitude()
+        device.proof.stay_near(base, max(ALLOWED_DEG, 2.0 * abs(way_deg)))
+
+        def look() -> None:
+            turned = device.geometry.apart(base, device.imu.latest().value)
+            if turned > device.geometry.scale * abs(way_deg) and not checked:
+                raise TurnReached(f"{turned:.1f}")
+
+        device.meanwhile = look
+        try:
+            move(device, Posture("jog", tuple(here)))
+        except TurnReached as turned:
+            device.stopper.stop("far enough by what is measured", latch=False)
+            gone = abs(moved.to_deg(device.positions()[axis] - start))
+            run.say(
+                f"  stopped: {device.geometry.told} {turned} {device.geometry.unit} "
+                f"after {gone:.2g} {unit} commanded. Check the reduction of {name}"
+            )
+        run.say(
+            f"  {name} stands at {moved.to_deg(device.positions()[axis]):.3f} {unit}"
+        )
+
+    return site.run("jog", procedure, limits=homed, again=f"jog {name} {way_deg:g}")
+
+
+def axes(site: Site) -> int:
+    """Check each axis, correct rig.toml after a yes, and check again: SIGN_CHECKED."""
+    site.operator.confirm(
+        "axes: the device stands in its zero posture. Each axis in turn will move a "
+        "little, then up to 3 deg either way; then all by turns, up to 6 deg. "
+        "Watch that the joint that moves is the one that is named, and keep out of the "
+        "device's reach",
+        "axes",
+    )
+    return _check_axes(site)
+
+
+def _check_axes(site: Site, again: bool = False) -> int:
+    changes: list[Change] = []
+    code = site.run("axes", lambda run, dev: changes.extend(check_axes(run, dev)))
+    if code or not changes:
+        return code
+    site.say("rig.toml does not say what the device does:")
+    for change in changes:
+        site.say(f"  {change}")
+    if again or site.path is None:
+        site.say(
+            "the device is NOT SIGN_CHECKED: correct rig.toml, then run `jaxcal-rig "
+            "axes` again"
+        )
+        return EXIT_RECALIBRATE
+    site.operator.confirm(
+        f"axes: write this to {site.path}, then move the axes again", "correct"
+    )
+    # What was proved of the drives goes with their cables.
+    site.take(edit(site.path, {change.key: change.new for change in changes}))
+    site.say(f"  written; the old file is kept beside {site.path}")
+    homed = site.record.state(HOMED) or {}
+    show_identity(site)
+    # Which also forgets where each named axis was left: it is not what it was.
+    site.record.reach(HOMED, site.config, **homed)
+    return _check_axes(site, again=True)
+
+
+def take_zero(site: Site) -> int:
+    """Measure the zero posture: ZEROED."""
+    site.operator.confirm(
+        "zero: the device stands in its zero posture (jig, level), or moves to pulse 0 "
+        'with session.zero = "drive"; what is measured there is its zero',
+        "zero",
+    )
+    return site.run("zero", lambda run, device: session.take_zero(device))
+
+
+def commissioned(path: pathlib.Path, config: RigConfig, through: str) -> DeviceRecord:
+    """A new record of a simulated device, up to a state: nothing of it was moved."""
+    record = DeviceRecord(path)
+    for state in STATES[: STATES.index(through) + 1] if through else ():
+        record.reach(state, config)
+    return record

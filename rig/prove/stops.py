@@ -1,0 +1,397 @@
+"""Every way that the software has to stop the drives, tried in a slow move.
+
+The axes move together, 3 degrees (or mm) either side of where they stood, less of more
+than three, which may add up, or one after another where their line moves them in turn,
+and are stopped on the way: by the frame to each unit, by the broadcast where the map
+has one, and by the drives' own watch of the line where they have one. Each must stand
+short of its target, by its drive and by the phone, and must stay there. The stop of
+each unit is then tried in a faster move: how far an axis went on at either speed says
+how fast it may be near a limit.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rig.command_run import Run
+from rig.config.axis import Pulses
+from rig.core import stop
+from rig.core.device import Device, Posture
+from rig.core.motion import move
+from rig.core.stop_distance import BY_UNITS, FASTER, StopDistance, stop_distances
+from rig.drives import Drive
+from rig.drives.drive import STILL_COUNTS, Status
+from rig.faults import MotionFault
+from rig.journal import STOP_PROVED
+
+REACH_DEG = 3.0  # either side
+ADD_UP = 3.0  # axes: more move less far
+SPEED_DEG_S = 5.0
+FAST_DEG_S = 15.0  # of the second stop, at most
+BEGIN, LATE = 0.3, 0.6  # share of the way at which a stop is sent, and the latest
+SHORT = 0.1  # share of the way that must be left
+TRIES = 4  # each half as fast, where the stop came late
+STAND_S = 3.0
+REPEATS, UNSURE, UNSURE_S = 3, 1.5, 0.001  # of a stop whose times are uncertain
+SILENCE_S = 0.5  # besides the drives' own timeout
+TURNED_DEG = 0.3  # of the phone, while the drives stand
+
+
+Times = list[tuple[float, float]]
+
+
+class _ShareReached(Exception):
+    """All axes have gone a share of their way."""
+
+
+class StopTrial(NamedTuple):
+    """What a stop did, by axis."""
+
+    after_deg: dict[str, float]  # that it went on from where it was last seen
+    speeds: dict[str, float]  # deg/s
+    distances: dict[str, float]  # degrees from where it was when its stop was sent
+    unsure_s: float = 0.0  # of the times of that: how long the exchanges took
+
+
+def prove_stops(run: Run, device: Device) -> None:
+    """Try each way to stop; the device is STOP_PROVED.
+
+    Raises:
+        MotionFault: an axis went on, or moved again.
+    """
+    start = device.positions()
+    evidence: dict[str, dict[str, float]] = {}
+    distances: dict[str, dict[str, Any]] = {}
+    reach = REACH_DEG * min(1.0, ADD_UP / len(run.config.axes))
+    offsets = [axis.to_pulses(reach) for axis in run.config.axes]
+    low = tuple(int(p) for p in np.subtract(start, offsets))
+    high = tuple(int(p) for p in np.add(start, offsets))
+    timeout_s = max(run.config.comm_timeouts_s.values(), default=0.0)
+    ways: dict[str, tuple[Callable[[], Times], float]] = {
+        BY_UNITS: (functools.partial(_stop_units, device), SPEED_DEG_S)
+    }
+    if device.line.stops_at_once(device.drives):
+        ways["the broadcast stop"] = (lambda: _broadcast(device), SPEED_DEG_S)
+    if timeout_s:
+        left_deg = (1.0 - LATE - SHORT) * 2 * reach
+        slow = min(SPEED_DEG_S, left_deg / (timeout_s + SILENCE_S))
+        silent = timeout_s + SILENCE_S
+        ways["their watch of the line"] = (lambda: _be_silent(device, silent), slow)
+    for name, (act, speed) in ways.items():
+        for moved in _together(device):
+            end = tuple(b if i in moved else a for i, (a, b) in _numbered(low, high))
+            tried = _prove(run, device, name, act, speed, low, end)
+            evidence[name] = evidence.get(name, {}) | tried.after_deg
+            if name == BY_UNITS:
+                distances |= _distances(run, device, tried, low, end)
+    device.proof.ceiling_deg_s = None
+    move(device, Posture("back", start))
+    more = {"ways": evidence, "distances": distances}
+    run.emit("stop_proved", sync=True, **more)
+    run.record.reach(STOP_PROVED, run.config, **more, run=run.folder.name)
+    device.proof.stops = stop_distances(run.record, run.config.axes)
+    run.say(f"the drives stop, and stay: {', '.join(evidence)}")
+
+
+def _distances(
+    run: Run, device: Device, first: StopTrial, low: Pulses, high: Pulses
+) -> dict[str, dict[str, Any]]:
+    """Speeds of two stops and how far each axis went on, for ``StopDistance.of``.
+
+    The second is only as fast as leaves all short of their targets, were it the square
+    of the speed that the first distance is to be blamed on.
+    """
+    tries, way = [first], 2 * REACH_DEG * min(1.0, ADD_UP / len(run.config.axes))
+    fast, rest = FAST_DEG_S, (1.0 - LATE - SHORT) * way
+    for axis in run.config.axes:
+        if axis.name in first.speeds:
+            speed, accel = axis.drive_motion
+            grown = (rest / max(abs(first.after_deg[axis.name]), 1e-3)) ** 0.5
+            reached = (BEGIN * way * accel) ** 0.5  # within less than BEGIN of its way
+            fast = min(fast, speed, reached, first.speeds[axis.name] * grown)
+    if fast > FASTER * max(first.speeds.values()):
+        usual = max(_least_s(drive) for drive in device.drives)
+        device.proof.stop_proved = True
+        try:
+            trials = [_timed(run, device, [], fast, low, high, usual)]
+            if trials[0].speeds:
+                slow = max(first.speeds.values())
+                tries = [_timed(run, device, [first], slow, low, high, usual), *trials]
+        finally:
+            device.proof.stop_proved = False
+    points = {}
+    for axis in run.config.axes:
+        if axis.name in first.speeds:
+            speed, accel = axis.drive_motion
+            point: dict[str, Any] = {
+                "speeds": [round(trial.speeds[axis.name], 4) for trial in tries],
+                "distances": [round(trial.distances[axis.name], 4) for trial in tries],
+                "accel": round(accel, 4),
+            }
+            points[axis.name] = point
+            distance, unit = StopDistance.of(**point), axis.unit_name
+            slowest = distance.fastest(axis, 0.0)
+            run.say(
+                f"  {axis.name}: its stop takes {distance.at(speed):.2g} {unit} at "
+                f"{speed:.4g} {unit}/s"
+                + f"; a move that ends at a limit goes at {slowest:.3g} {unit}/s, one "
+                "that ends further away goes faster" * (slowest < speed)
+            )
+    return points
+
+
+def _timed(
+    run: Run,
+    device: Device,
+    trials: list[StopTrial],
+    speed: float,
+    low: Pulses,
+    high: Pulses,
+    usual_s: float,
+) -> StopTrial:
+    """The stop at a speed whose times are known best, of those before and of new ones
+    while a busy computer has made them uncertain."""
+    name = f"{BY_UNITS}, at {speed:.3g} {run.config.axis_unit}/s"
+    stop_units = functools.partial(_stop_units, device)
+    while not trials or min(t.unsure_s for t in trials) > UNSURE * usual_s + UNSURE_S:
+        if len(trials) == REPEATS:
+            break
+        trials.append(
+            _prove(run, device, name, stop_units, speed, low, high, look=False)
+        )
+    return min(trials, key=lambda trial: trial.unsure_s)
+
+
+def _least_s(drive: Drive) -> float:
+    """Seconds that a look at a drive takes at least, its stop besides."""
+    looks = [drive.status() for _ in range(REPEATS)]
+    return 1.5 * min(look.time - look.asked for look in looks)
+
+
+def _together(device: Device) -> list[list[int]]:
+    """Axes that move at the same time."""
+    every = [*range(len(device.drives))]
+    return [[i] for i in every] if device.line.in_turn else [every]
+
+
+def _numbered(low: Pulses, high: Pulses) -> Iterator[tuple[int, tuple[int, int]]]:
+    return enumerate(zip(low, high, strict=True))
+
+
+def _prove(
+    run: Run,
+    device: Device,
+    name: str,
+    act: Callable[[], Times],
+    speed_deg_s: float,
+    low: Pulses,
+    high: Pulses,
+    look: bool = True,
+) -> StopTrial:
+    """Stop a move from low to high; ``look`` whether all stay where they stand."""
+    for number in range(TRIES):
+        device.proof.ceiling_deg_s = None
+        move(device, Posture("the start of the stop", low))
+        device.proof.ceiling_deg_s = speed_deg_s / 2**number
+        places = _go(device, low, high)
+        if max(_shares(device, low, high, places)) <= LATE:
+            break
+        _wait_until_still(device)  # it may end
+        device.untrack()
+    else:
+        raise MotionFault(
+            "no move is slow enough to be stopped on its way: bus and computer take "
+            "too long between two looks at the drives"
+        )
+    last = [_last(drive) for drive in device.drives]
+    told = [drive.axis.drive_motion[0] for drive in device.drives]
+    sent = act()
+    statuses = _wait_until_still(device)
+    at = [status.position for status in statuses]
+    gone = _shares(device, low, high, at)
+    names = run.config.axis_names
+    going = [names[i] for i, (a, b) in _numbered(low, high) if a != b]
+    if look:
+        shares = dict(zip(going, gone, strict=True))
+        _require_stopped(run, device, name, statuses, shares)
+    else:
+        _reset_alarms(run, device, name)
+        device.untrack()
+    after_deg = {
+        axis.name: round(axis.to_deg(b - a), 3)
+        for axis, a, b in zip(run.config.axes, places, at, strict=True)
+        if axis.name in going
+    }
+    run.say(
+        f"  {name}: stood after "
+        + ", ".join(f"{axis} {abs(deg):.2f}" for axis, deg in after_deg.items())
+        + f" {run.config.axis_unit}"
+        + f", and {stop.stand_s(device.drives):g} s later" * look
+    )
+    speeds: dict[str, float] = {}
+    distances: dict[str, float] = {}
+    unsure_s = 0.0
+    rows = zip(run.config.axes, low, last, told, sent, strict=False)
+    for axis, begun, before, asked_deg_s, (sent_s, heard_s) in rows:
+        # Its target, not its stop, may be where it stands.
+        if axis.name in after_deg and max(gone) <= 1.0 - SHORT:
+            seen_s = (before.asked + 3.0 * before.time) / 4.0  # status, then position
+            way = abs(axis.to_deg(before.position - begun))
+            speed = min(asked_deg_s, (2.0 * axis.drive_motion[1] * way) ** 0.5)
+            meanwhile = speed * max(0.0, (sent_s + heard_s) / 2.0 - seen_s)
+            went_on = abs(after_deg[axis.name]) - meanwhile
+            speeds[axis.name], distances[axis.name] = speed, max(0.0, went_on)
+            took_s = before.time - before.asked + heard_s - sent_s
+            unsure_s = max(unsure_s, took_s)
+    return StopTrial(after_deg, speeds, distances, unsure_s if speeds else math.inf)
+
+
+def _require_stopped(
+    run: Run,
+    device: Device,
+    name: str,
+    statuses: list[Status],
+    shares: dict[str, float],
+) -> None:
+    """Refuse a stop after which an axis went on, or moved again; alarms are reset.
+
+    Args:
+        name: of the stop.
+        statuses: of the drives as they stood.
+        shares: of the way that each axis that moved had gone by then.
+    """
+    went_on = [axis for axis, share in shares.items() if share > 1.0 - SHORT]
+    attitude = device.attitude(time.monotonic())
+    after = _look(device, statuses)
+    moved = [
+        axis
+        for axis, now, then in zip(run.config.axis_names, after, statuses, strict=True)
+        if abs(now.position - then.position) > STILL_COUNTS and now.enabled
+    ]
+    turned = device.geometry.apart(attitude, device.attitude(time.monotonic()))
+    _reset_alarms(run, device, name)
+    device.untrack()
+    if went_on:
+        raise MotionFault(
+            f"{', '.join(went_on)} went on to the target after {name}: this program "
+            "cannot stop it. Correct [stop], broadcast_stop or [comm_timeout] of the "
+            "map; until then the emergency stop alone stops the device"
+        )
+    if moved or turned > TURNED_DEG * device.geometry.scale:
+        raise MotionFault(
+            f"{', '.join(moved) or 'what is measured'} moved again after {name} "
+            f"({device.geometry.told} {turned:.2f} {device.geometry.unit}). Set the "
+            "drive so that it does not go on by itself after a stop"
+        )
+
+
+def _go(device: Device, low: Pulses, high: Pulses) -> list[int]:
+    """Begin to move; where the drives are once all have gone BEGIN of their way."""
+
+    def look() -> None:
+        places = [_last(drive).position for drive in device.drives]
+        if min(_shares(device, low, high, places)) >= BEGIN:
+            raise _ShareReached
+
+    device.meanwhile = look
+    try:
+        move(device, Posture("try the stop", high))
+    except _ShareReached:
+        pass
+    finally:
+        device.meanwhile = lambda: None
+    return [_last(drive).position for drive in device.drives]
+
+
+def _last(drive: Drive) -> Status:
+    assert drive.last is not None  # it moves
+    return drive.last
+
+
+def _shares(
+    device: Device, low: Pulses, high: Pulses, at: Sequence[int]
+) -> list[float]:
+    """Shares of the way that those axes have gone that move."""
+    return [(p - a) / (b - a) for a, b, p in zip(low, high, at, strict=True) if a != b]
+
+
+def _stop_units(device: Device) -> Times:
+    """When each was sent its stop, and has answered, by the monotonic clock."""
+    times = [time.monotonic()]
+    for drive in device.drives:
+        drive.stop()
+        times.append(time.monotonic())
+    return [*itertools.pairwise(times)]
+
+
+def _broadcast(device: Device) -> Times:
+    stop.broadcast(device.drives)
+    return []
+
+
+def _be_silent(device: Device, seconds: float) -> Times:
+    """Send nothing, while this program is well."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        device.requests.check_stop()
+        device.heartbeat.feed(moving=True)
+        time.sleep(0.02)
+    device.heartbeat.feed(moving=False)
+    return []
+
+
+def _wait_until_still(device: Device) -> list[Status]:
+    """Statuses of all drives once they stand, or STAND_S later."""
+    end = time.monotonic() + STAND_S
+    before = [drive.status() for drive in device.drives]
+    while True:
+        device.guard()
+        time.sleep(stop.POLL_S)
+        now = [drive.status() for drive in device.drives]
+        still = all(
+            not b.moving and abs(b.position - a.position) <= STILL_COUNTS
+            for a, b in zip(before, now, strict=True)
+        )
+        if still or time.monotonic() > end:
+            return now
+        before = now
+
+
+def _look(device: Device, statuses: list[Status]) -> list[Status]:
+    """Look at drives that stand, after the time within which one might go on."""
+    for drive, status in zip(device.drives, statuses, strict=True):
+        drive.hold(status.position)
+    end = time.monotonic() + stop.stand_s(device.drives)
+    while time.monotonic() < end:
+        device.guard()
+        now = [drive.steady() for drive in device.drives]
+        if any(status.moving for status in now):
+            return _wait_until_still(device)
+        time.sleep(stop.LOOK_S)
+    return [drive.steady() for drive in device.drives]
+
+
+def _reset_alarms(run: Run, device: Device, name: str) -> None:
+    """Reset alarms of drives that raise one when they stop themselves."""
+    for drive in device.drives:
+        if not drive.status().fault:
+            continue
+        resettable = drive.can_reset
+        if (
+            not resettable
+            or drive.bring(drive.reset, lambda status: not status.fault).fault
+        ):
+            raise MotionFault(
+                f"{drive.axis.name} stays in alarm after {name}: {drive.alarm()}. "
+                "Reset it, then run `jaxcal-rig axes` again"
+            )
+        run.say(f"  {drive.axis.name}: its alarm after {name} was reset")
+        if not drive.bring(drive.arm, lambda status: status.enabled).enabled:
+            raise MotionFault(f"{drive.axis.name} does not enable after {name}")

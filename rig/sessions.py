@@ -1,0 +1,212 @@
+"""A session as a command asks for it: new or resumed, real or simulated."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import pathlib
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from rig import pages
+from rig.command_run import Run, run_safely
+from rig.config import RigConfig, load_config, parse_config
+from rig.core.record_check import ZeroRecord
+from rig.faults import Refused
+from rig.journal import (
+    JOURNAL,
+    STOP_PROVED,
+    BusLock,
+    DeviceRecord,
+    JournalError,
+    Record,
+    new_run_folder,
+    read_journal,
+)
+from rig.journal.run_folder import SCHEMA
+from rig.outputs.console import listen
+from rig.procedures import calibrate, verify
+from rig.procedures.collect import collect
+from rig.procedures.goto import goto
+from rig.prove import steps
+from rig.prove.operator import Operator
+
+
+class SimulatedDevice(Protocol):
+    """What a session and commissioning ask of ``rig_workbench.simulator``."""
+
+    config: RigConfig
+
+    def start(self, port: int = 0) -> RigConfig:
+        """Serve the drives; the configuration that reaches them."""
+
+    def start_phone(self, port: int) -> int:
+        """Send to the port the rig listens on, or listen; the port."""
+
+    def hear(self, record: Record) -> None:
+        """Listen to the events of a session."""
+
+    def __enter__(self) -> SimulatedDevice: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+class SessionOptions(Protocol):
+    """How a session is begun and shown."""
+
+    out: pathlib.Path | None  # folder for the run's folder
+    dry_run: bool
+    arm: bool  # these three stand for the typed words
+    zero: bool
+    use: bool
+    reset_alarms: bool
+    live: bool
+    config: pathlib.Path | None
+
+    def simulator(
+        self, config: RigConfig, options: dict[str, Any] | None = None
+    ) -> SimulatedDevice:
+        """A simulated device as these options, or those of a run, describe it."""
+
+
+def say(text: str) -> None:
+    """Print a line at once."""
+    print(text, flush=True)
+
+
+def run_session(
+    options: SessionOptions,
+    command: str,
+    config: RigConfig,
+    start: dict[str, Any],
+    folder: pathlib.Path | None = None,
+) -> int:
+    """Run a session under the lock of its bus; returns the exit code.
+
+    Args:
+        options: the options of the command.
+        command: its name, told to whoever finds the bus locked.
+        config: of the device.
+        start: mode, inputs and simulation, as the journal's first record keeps them.
+        folder: of the run that is resumed; a new one without it.
+    """
+    real = start["simulated"] is None
+    procedure, kept_zero, doubts = _procedure(start, config)
+    with contextlib.ExitStack() as stack:
+        simulator, text = None, config.text
+        if not real:
+            simulator = options.simulator(config, start["simulated"])
+            config = stack.enter_context(simulator).start()
+        lock, record = BusLock(config.bus), DeviceRecord.load(config.device_path)
+        if not options.dry_run:
+            stack.enter_context(lock.acquire(command))
+            if real and (lack := record.missing(config)):
+                raise Refused(lack)
+        if folder is None:
+            folder = new_run_folder(
+                options.out or pathlib.Path(config.output), start["mode"]
+            )
+            (folder / "rig.toml").write_text(text, encoding="utf-8")
+        if simulator is not None:
+            record = steps.commissioned(folder / "device.json", config, STOP_PROVED)
+        lock.tell(run=str(folder.resolve()))
+        run = Run(
+            config,
+            folder,
+            start["mode"],
+            say,
+            start={key: start[key] for key in ("simulated", "inputs", "maps_from")},
+            reset_alarms=options.reset_alarms,
+            record=record,
+            # With --zero the operator put the device into its zero posture.
+            zero_at=kept_zero.pulses if kept_zero and not options.zero else None,
+            kept_zero=kept_zero,
+            dry_run=options.dry_run,
+        )
+        listen(run)
+        run.confirm = functools.partial(_confirm, options, doubts)
+        if simulator is not None:
+            run.simulated = True
+            run.listeners.append(simulator.hear)
+        if options.live:
+            run.say(pages.start(folder))
+        return run_safely(run, procedure)
+
+
+def _procedure(
+    start: dict[str, Any], config: RigConfig
+) -> tuple[Callable[[Run], int], ZeroRecord | None, list[str]]:
+    """What a session does, the zero posture that it must find, and why the calibration
+    that it moves by is not to be used."""
+    mode, inputs = start["mode"], start["inputs"]
+    if mode == "calibrate":
+        return calibrate.calibrate, None, []
+    if mode == "collect":
+        return lambda run: collect(run, inputs["count"]), None, []
+    if mode == "goto" and config.is_arm:
+        raise Refused(
+            "goto: an arm is moved by its own controller. Give it calibrated.urdf of "
+            "the calibration's folder in place of the URDF"
+        )
+    calibration, kept = verify.load_calibration(
+        pathlib.Path(inputs["calibration"]), config, start["simulated"] is not None
+    )
+    if mode == "verify":
+        return lambda run: verify.verify(run, calibration, inputs["count"]), kept, []
+    doubts = verify.doubts(calibration)
+    return lambda run: goto(run, calibration, inputs["to"]), kept, doubts
+
+
+def _confirm(options: SessionOptions, doubts: list[str], session: Run) -> None:
+    """Ask for what --arm, --zero and --use would have confirmed."""
+    takes_zero = not session.journal.events("zero") and session.zero_at is None
+    questions = {}
+    if doubts:
+        questions["use"] = (
+            f"the session that made this calibration said not to use it: "
+            f"{' and '.join(doubts)}"
+        )
+    if not session.simulated:
+        questions["arm"] = (
+            "the device will move; its way is clear, no patient is attached, the "
+            "emergency stop is at hand"
+        )
+        if takes_zero and session.config.session.zero == "here":
+            questions["zero"] = "the device stands in its zero posture"
+    for word, text in questions.items():
+        if not getattr(options, word):
+            Operator(say=say, option=f"--{word}").confirm(text, word)
+
+
+def recorded(
+    run: pathlib.Path, config: pathlib.Path | None = None
+) -> tuple[RigConfig, Record]:
+    """Configuration and start of a run that is resumed or identified anew."""
+    start = records_of(run)[0]
+    if start["mode"] == "refit":
+        source = start["inputs"]["run"]
+        raise Refused(f"{run} is a refit of {source}; give that run instead")
+    if start["mode"] not in ("calibrate", "collect", "verify", "goto"):
+        raise Refused(f"{run} is a step of commissioning: run it again instead")
+    if config is not None:
+        return load_config(config), start
+    text = (run / "rig.toml").read_text(encoding="utf-8")
+    return parse_config(text, pathlib.Path(start["maps_from"]), str(run)), start
+
+
+def records_of(run: pathlib.Path) -> list[Record]:
+    """The journal of a run; Refused where its folder holds none, or a damaged one."""
+    if not (run / JOURNAL).is_file():
+        raise Refused(f"{run} is not the folder of a run: it holds no {JOURNAL}")
+    try:
+        records = read_journal(run / JOURNAL)
+    except JournalError as error:
+        raise Refused(str(error)) from None
+    if not records or records[0]["event"] != "start":
+        raise Refused(f"{run} is not the folder of a run: its journal has no start")
+    if records[0].get("schema") != SCHEMA:
+        raise Refused(
+            f"{run} was written by an earlier version of jaxcal, whose runs are not "
+            "read. Make a new one"
+        )
+    return records

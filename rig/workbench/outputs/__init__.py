@@ -1,1 +1,0 @@
-"""What a run leaves behind: the journal, words on the console, the report."""

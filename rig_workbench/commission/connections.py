@@ -1,0 +1,114 @@
+"""What this computer reaches: serial ports, and a phone's stream, told in figures."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from rig.config.settings import ImuSettings, ReadingsSettings
+from rig.core.session import STREAM_WAIT_S
+from rig.prove.steps import Site
+from rig.readings import make_source
+from rig.readings.geometry import Attitudes, Geometry, geometry_of
+from rig.readings.source import Source
+
+WATCH_S = 5.0
+LOOK_S = 1.0
+# Below these a session's settle window would hardly ever fill.
+SLOW_HZ, LONG_GAP_S = 5.0, 0.3
+
+
+def look_at_phone(site: Site, seconds: float = WATCH_S) -> str:
+    """Wait for the phone and tell what it sends; its address."""
+    config = site.config
+    with make_source(config) as imu:
+        where = (
+            addresses_text(config.imu, imu.port)
+            if config.imu
+            else sensor_text(config.source, imu.port)  # type: ignore[arg-type]
+        )
+        site.say(
+            f"imu: {where}; then start its stream "
+            f"(waiting for it up to {STREAM_WAIT_S:g} s)"
+        )
+        for listener in site.listeners:
+            listener({"event": "listening", "port": imu.port})
+        geometry = geometry_of(config)
+        watch(imu, geometry, seconds, STREAM_WAIT_S, site.say)
+        return imu.sender
+
+
+def addresses_text(settings: ImuSettings, port: int) -> str:
+    """What to type into the phone's app."""
+    if settings.transport == "connect":
+        return f"connecting to the phone at {settings.host}:{port}"
+    host = settings.host
+    if host in ("0.0.0.0", "::"):
+        host = own_address() or "(this computer has no network address)"
+    return f"type into the phone's app ({settings.format}): {host} port {port}"
+
+
+def sensor_text(settings: ReadingsSettings, port: int) -> str:
+    """Where a sensor's numbers come from."""
+    if settings.transport in ("listen", "udp"):
+        host = settings.host
+        if host in ("0.0.0.0", "::"):
+            host = own_address() or "(this computer has no network address)"
+        return f"waiting for the sensor on {host} port {port}"
+    return f"readings from {settings.device or f'{settings.host}:{settings.port}'}"
+
+
+def watch(
+    imu: Source,
+    geometry: Geometry,
+    seconds: float,
+    wait_s: float,
+    say: Callable[[str], None],
+) -> None:
+    """Wait for an open stream and look at it for so long, telling each second.
+
+    Raises:
+        ReadingError: nothing came, or the stream is not to be trusted.
+    """
+    start, spent = imu.wait_for_stream(wait_s).time, 0.0
+    while spent < seconds:
+        time.sleep(min(LOOK_S, seconds - spent))
+        imu.latest()
+        readings, spent = imu.since(start), time.monotonic() - start
+        gaps = np.diff([reading.time for reading in readings])
+        values = [reading.value for reading in readings[-500:]]
+        mean = geometry.mean(values)
+        apart = [geometry.apart(mean, value) for value in values]
+        scatter = float(np.sqrt(np.mean(np.square(apart)) / len(mean)))
+        stands = "reads " + " ".join(f"{value:.6g}" for value in np.ravel(mean))
+        if isinstance(geometry, Attitudes):
+            tilt = np.degrees(np.arccos(np.clip(mean[2, 2], -1.0, 1.0)))
+            stands = f"tilt {tilt:.1f} deg"
+        dropped = [f"{n} {why}" for why, n in imu.counts.items() if why != "accepted"]
+        rate, gap = len(readings) / spent, float(gaps.max(initial=0.0)) or spent
+        say(
+            f"  {rate:.0f} readings per s, longest gap {gap:.2f} s, scatter "
+            f"{scatter:.3g}, {stands}, dropped: " + (", ".join(dropped) or "none")
+        )
+    if rate < SLOW_HZ or gap > LONG_GAP_S:
+        say(
+            f"  note: sessions want {SLOW_HZ:g} readings per s without gaps over "
+            f"{LONG_GAP_S:g} s. {imu.lost}, raise its rate; or raise "
+            f"{imu.table}.stale_s and settle.window_s"
+        )
+
+
+def own_address() -> str:
+    """IPv4 address under which a phone can reach this computer; empty without one."""
+    # Connecting UDP sends nothing; it tells the address packets leave from.
+    with (
+        contextlib.suppress(OSError),
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe,
+    ):
+        probe.connect(("192.0.2.1", 9))
+        return str(probe.getsockname()[0])
+    return ""

@@ -1,0 +1,337 @@
+"""From cables to a device that may be calibrated, one question at a time."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+import re
+import socket
+import tomllib
+from typing import Any
+
+from jaxcal.files import write_text
+from rig.config import RigConfig, load_config, parse_config
+from rig.config.axis import DEFAULT_ROTATES as DEFAULT_AXES
+from rig.faults import EXIT_OK, Refused
+from rig.journal import HOMED, IDENTIFIED, STOP_PROVED, ZEROED
+from rig.prove import steps
+from rig.prove.home import can_home
+from rig.prove.operator import Operator
+from rig.prove.rig_toml import edit, set_values
+from rig.prove.scan import Answer, parse_bus, scan, serial_lines
+from rig.sessions import SimulatedDevice
+from rig_workbench.commission.connections import look_at_phone
+from rig_workbench.commission.new_file import new_text
+from rig_workbench.model import joint_names
+
+FORMATS = ["hyperimu", "sensorlogger", "lines"]
+UNITS = 16
+SAFETY = (
+    "Research software, not a medical device. Confirm: no patient is attached, no "
+    "person is within reach of the device, a hardware emergency stop is at hand."
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class SetupOptions:
+    """What the command line says, so that it is not asked."""
+
+    bus: str = ""
+    imu: str = ""  # FORMAT or FORMAT:PORT
+    units: int = UNITS
+    values: dict[str, Any] = dataclasses.field(default_factory=dict)  # of rig.toml
+    home: str = "here"
+    # Axis to X, Y or Z that it turns about, deg of a rotation, mm of a translation.
+    axes: dict[str, str] = dataclasses.field(default_factory=lambda: dict(DEFAULT_AXES))
+    drives: str = ""  # map of the drives; none: Modbus drives that are found
+    readings: str = ""  # where numbers come from; none: a phone
+    model: str = ""  # URDF file of an arm
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the axes."""
+        return tuple(self.axes)
+
+
+KINDS = ("X", "Y", "Z", "deg", "mm")
+OF_READINGS = {  # keys of [readings]
+    "tcp": ("host", "port"),
+    "listen": ("port",),
+    "udp": ("port",),
+    "serial": ("device", "baudrate"),
+    "modbus": ("host", "port"),
+}
+EXAMPLES: dict[str, dict[str, Any]] = {  # of --example
+    "turntable": {"axes": {"table": "Z"}},
+    "gimbal": {"axes": {"pan": "Z", "tilt": "X"}},
+    "stage": {
+        "axes": {"x": "mm", "y": "mm", "z": "mm"}, "drives": "grbl",
+        "bus": "serial:/dev/ttyUSB0,115200", "readings": "serial:/dev/ttyUSB1,9600",
+    },
+    "servos": {
+        "axes": {"pan": "Z", "tilt": "X"}, "drives": "cia402", "bus": "can:can0,500000",
+    },
+}  # fmt: skip
+
+
+def axis_kinds(text: str) -> dict[str, str]:
+    """``NAME:KIND,...``; ValueError where that is not what it is."""
+    kinds = {}
+    for word in text.split(","):
+        name, _, kind = word.partition(":")
+        if not re.fullmatch("[a-z][a-z0-9_]*", name) or kind not in KINDS:
+            raise ValueError(
+                f"must be NAME:KIND,... with a KIND of {', '.join(KINDS)}, got {word!r}"
+            )
+        if name in kinds:
+            raise ValueError(f"the axis {name} is there twice")
+        kinds[name] = kind
+    return kinds
+
+
+def asked(*, axes: str, example: str, **given: Any) -> SetupOptions:
+    """What the command line says, where it says nothing as of the example.
+
+    Raises:
+        Refused: an option is not what it must be.
+    """
+    options = dict(EXAMPLES.get(example, {}))
+    options |= {name: value for name, value in given.items() if value}
+    if axes:
+        try:
+            options["axes"] = axis_kinds(axes)
+        except ValueError as error:
+            raise Refused(f"--axes {error}") from None
+    elif urdf := options.get("model"):
+        options["axes"] = dict.fromkeys(joint_names(urdf), "deg")
+    made = SetupOptions(**options)
+    if options.get("readings") and options.get("imu"):
+        raise Refused("--imu and --readings: either a phone or a sensor measures")
+    by_phone = {"X", "Y", "Z"} | ({"deg"} if made.model else set())
+    wrong = [
+        f"{name}:{kind}" for name, kind in made.axes.items() if kind not in by_phone
+    ]
+    if wrong and not made.readings:
+        raise Refused(
+            f"--axes {', '.join(wrong)}: a phone measures rotations about X, Y, Z; "
+            "others take --readings"
+        )
+    return made
+
+
+def sensor_of(text: str) -> dict[str, Any]:
+    """Keys of ``[readings]`` of ``tcp:HOST:PORT``, ``listen:PORT``, ``udp:PORT``,
+    ``serial:DEVICE[,BAUD]`` or ``modbus:HOST[:PORT]``."""
+    transport, _, rest = text.partition(":")
+    names = OF_READINGS.get(transport, ())
+    words = rest.split("," if transport == "serial" else ":")
+    if not names or len(words) > len(names) or not all(words):
+        raise Refused(
+            "--readings must be tcp:HOST:PORT, listen:PORT, udp:PORT, "
+            f"serial:DEVICE[,BAUD] or modbus:HOST[:PORT], got {text!r}"
+        )
+    values = [int(word) if word.isdecimal() else word for word in words]
+    sensor: dict[str, Any] = {"transport": transport}
+    if transport in ("listen", "udp"):
+        sensor["host"] = "0.0.0.0"  # every address of this computer
+    return sensor | dict(zip(names, values, strict=False))
+
+
+def setting(text: str) -> tuple[str, Any]:
+    """A key of rig.toml and its value; what is no TOML is a text."""
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise Refused(f"--set must be KEY=VALUE, got {text!r}")
+    try:
+        return key, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key, value
+
+
+def simulated(simulator: SimulatedDevice, options: SetupOptions) -> SetupOptions:
+    """What an operator would answer of a simulated device, and its phone started."""
+    bus = simulator.start().bus
+    where = f"{bus.transport}:{bus.host}:{bus.port}"
+    if bus.transport == "rtu":
+        where = f"rtu:{bus.device},{bus.baudrate},N,8,1"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    simulator.start_phone(port)
+    imu = simulator.config.phone
+    values: dict[str, Any] = {"imu.host": "127.0.0.1", "imu.stale_s": imu.stale_s}
+    for axis in simulator.config.axes:
+        for name in ("reduction", "speed_deg_s", "accel_deg_s2"):
+            values[f"axes.{axis.name}.{name}"] = getattr(axis, name)
+    return dataclasses.replace(
+        options, bus=where, imu=f"{imu.format}:{port}", values=values | options.values
+    )
+
+
+def begin(path: pathlib.Path, options: SetupOptions, operator: Operator) -> RigConfig:
+    """The configuration of a file, which is written where there is none."""
+    operator.confirm(SAFETY, "setup")
+    if not path.exists():
+        return write_config(path, options, operator)
+    if options.values:
+        raise Refused(f"{path} exists: edit it, or leave out --set")
+    operator.say(f"{path} exists and is used; delete it to begin anew")
+    return load_config(path)
+
+
+def write_config(
+    path: pathlib.Path, options: SetupOptions, operator: Operator
+) -> RigConfig:
+    """Ask for bus, axes and phone, and write a new rig.toml."""
+    say = operator.say
+    say("1 ports")
+    lines = serial_lines()
+    for line in lines or ["no serial port on this computer"]:
+        say(f"  {line}")
+    default = f"rtu:{lines[0].partition(':')[0]},115200,N,8,1" if lines else ""
+    question = "bus, as rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT"
+    bus = parse_bus(options.bus or operator.ask(question, default))
+    answers: list[Answer] = []
+    if options.drives:
+        say(f"2 scan: left out, --drives {options.drives} says what they are")
+    else:
+        say(f"2 scan: units 1 to {options.units} on {bus.where}; reads only")
+        answers = scan(bus, options.units, lambda text: say(f"  {text}"))
+        if any(answer.echo for answer in answers):
+            bus = bus.model_copy(update={"echo": True})
+    say("3 axes: which unit drives which joint. Step 8 checks it by moving them")
+    axes = _ask_axes(answers, options, operator)
+    source: dict[str, Any]
+    if options.readings:
+        say("4 sensor")
+        kinds = set(options.axes.values())
+        source = {"names": options.names, "sensor": sensor_of(options.readings)}
+        source["unit"] = operator.ask(
+            "unit of the readings", "mm" if "mm" in kinds else "deg"
+        )
+        if options.model:
+            source |= {"names": ("x", "y", "z"), "unit": "m"}
+    else:
+        say("4 phone")
+        form, _, port = (options.imu or "").partition(":")
+        form = form or operator.choose(
+            f"app of the phone ({', '.join(FORMATS)})", FORMATS, FORMATS[0]
+        )
+        port = port or operator.ask("TCP port that the phone sends to", "2055")
+        source = {"form": form, "port": int(port)}
+    values = dict(options.values)
+    for name in options.names:
+        key = f"axes.{name}.reduction"
+        if key not in values:
+            question = f"{name}: motor turns for one turn of the joint (gearbox)"
+            values[key] = operator.number(question, 1.0)
+    text = set_values(new_text(bus, axes, **source, model=options.model), values)
+    config = parse_config(text, path.parent, str(path))
+    operator.confirm(f"setup writes {path}", "write")
+    write_text(path, text)
+    return config
+
+
+def _ask_axes(
+    answers: list[Answer], options: SetupOptions, operator: Operator
+) -> list[dict[str, Any]]:
+    usable = {answer.unit: answer for answer in answers if answer.families}
+    if options.drives:
+        usable = {unit: Answer(unit, (options.drives,), {}) for unit in range(1, 7)}
+    if len(usable) < len(options.names):
+        unknown = [answer.unit for answer in answers if not answer.families]
+        raise Refused(
+            f"{len(options.names)} drives of a known family are needed, for "
+            f"{', '.join(options.names)}; found {len(usable)}"
+            + (f"; units {unknown} answer, of no known family" if unknown else "")
+            + ". Check power, wiring, termination, the line format, and that every "
+            "drive has a unit id of its own; another family needs a map (docs/rig.md)"
+        )
+    free, axes = sorted(usable), []
+    for name, kind in options.axes.items():
+        choices = [str(unit) for unit in free]
+        unit = int(operator.choose(f"unit of {name}", choices, choices[0]))
+        free.remove(unit)
+        answer = usable[unit]
+        family = answer.families[0]
+        if len(answer.families) > 1:
+            question = f"unit {unit} could be {' or '.join(answer.families)}: which"
+            family = operator.choose(question, list(answer.families), family)
+        pulses = answer.pulses_per_rev or int(
+            operator.number(f"{name}: pulses for one motor turn", 10000)
+        )
+        axis = dict(name=name, kind=kind, unit=unit, family=family, pulses=pulses)
+        if kind == "mm":
+            question = f"{name}: mm for one turn of its screw, pulley or pinion"
+            axis["lead"] = operator.number(question, 1.0)
+        axes.append(axis)
+    return axes
+
+
+def go(site: steps.Site, options: SetupOptions) -> int:
+    """All steps from IDENTIFIED on; those that stand already are left out."""
+    operator, say, record = site.operator, site.say, site.record
+    assert site.path is not None
+    say(f"device record: {record.path}")
+    if record.missing(site.config, IDENTIFIED):
+        steps.show_identity(site)
+    say("5 imu")
+    pin(site, look_at_phone(site))
+    if record.missing(site.config, HOMED):
+        say("6 jog and home")
+        names = site.config.axis_names
+        choices = [*names, "no"]
+        question = f"move an axis towards the zero posture ({', '.join(choices)})"
+        while not operator.yes:
+            if (name := operator.choose(question, choices, "no")) == "no":
+                break
+            way = operator.number(f"{name}: degrees", 1.0, steps.MOST_JOG_DEG)
+            steps.jog(site, name, way)
+        how = "here"
+        if can_home(site.config):
+            question = (
+                "home here (the device stands in its zero posture), or drive (each "
+                "drive runs its own homing)"
+            )
+            how = operator.choose(question, ["here", "drive"], options.home)
+        if code := steps.go_home(site, how == "here"):
+            return code
+        say("7 limits")
+        _ask_limits(site)
+    if record.missing(site.config, STOP_PROVED):
+        say("8 axes")
+        if code := steps.axes(site):
+            return code
+    if record.missing(site.config, ZEROED):
+        say("9 zero")
+        if code := steps.take_zero(site):
+            return code
+    say(f"the device is commissioned: {record.path}")
+    say(f"next: {site.command('calibrate')}")
+    return EXIT_OK
+
+
+def pin(site: steps.Site, sender: str) -> None:
+    """Only this phone is listened to from now on."""
+    phone = site.config.imu
+    if site.path is None or not sender or phone is None or sender in phone.allow:
+        return
+    site.operator.confirm(
+        f"imu: listen to {sender} only, and to no other sender", "listen"
+    )
+    site.take(edit(site.path, {"imu.allow": [sender]}))
+
+
+def _ask_limits(site: steps.Site) -> None:
+    assert site.path is not None
+    values: dict[str, float] = {}
+    for axis in site.config.axes:
+        for end, name in (("lowest", "min_deg"), ("highest", "max_deg")):
+            now = getattr(axis, name)
+            what = "place" if axis.kind == "translation" else "angle"
+            question = (
+                f"{axis.name}: {end} {what} that is safe, {axis.unit_name} from home"
+            )
+            if (number := site.operator.number(question, now)) != now:
+                values[f"axes.{axis.name}.{axis.key_of(name)}"] = number
+    if values:
+        site.take(edit(site.path, values))

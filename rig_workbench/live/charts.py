@@ -1,0 +1,137 @@
+"""The plots as options of ECharts: pure functions of the state."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from rig.outputs.run_state import ACTIVE, Record, RunState
+
+# Of axes and of what is measured, in their order; on light and dark.
+AXIS_COLORS = ["#3b9de0", "#e39a12", "#1fae85", "#b07ce8", "#e0568f", "#8c98a6"]
+MARK_COLORS = ["#8c98a655", "#e39a12", "#3b9de0", "#1fae85"]  # of `_commands`
+TEXT, GRID = "#7b8794", "#8793a055"  # on both, too: style sheets do not reach a canvas
+SHOWN_S = 30.0  # of telemetry
+POINTS = 300  # of a line, at most
+
+Points = list[list[Any]]  # (x, y) of one axis
+
+
+def charts(
+    state: RunState, samples: Sequence[Record], end: float
+) -> dict[str, dict[str, Any]]:
+    """The plots by their titles.
+
+    Args:
+        state: of the run.
+        samples: of telemetry.
+        end: Unix time at the right edge of those over time.
+    """
+    step = max(1, -(-len(samples) // POINTS))
+    shown = [s for s in list(samples)[::step] if s["time"] > end - SHOWN_S]
+
+    axes, outputs = state.names
+    mark = "°" if state.unit == "deg" else f" {state.unit}"
+
+    def over_time(key: str, count: int, least: float = -math.inf) -> list[Points]:
+        told = [(round(s["time"] - end, 2), s[key]) for s in shown if s.get(key)]
+        return [
+            [[t, v[i] if v[i] is None else max(least, v[i])] for t, v in told]
+            for i in range(count)
+        ]
+
+    recent = {"name": "seconds", "min": -SHOWN_S, "max": 0}
+    angles = _lines(outputs, over_time("deg", len(outputs)))
+    dashed = {"width": 1, "type": [3, 3]}
+    drives = over_time("drives", len(axes))
+    angles += _lines(axes, drives, ", drive", lineStyle=dashed)
+    settling = _lines(outputs, over_time("std", len(outputs), 0.001))
+    limit = state.setting("settle", "std_deg", None)
+    if limit and settling:
+        settling[0]["markLine"] = {
+            "silent": True,
+            "symbol": "none",
+            "lineStyle": {"color": "#d1453b", "type": "dashed"},
+            "label": {
+                "formatter": f"limit {limit:g}{mark}",
+                "position": "insideStartTop",
+            },
+            "data": [{"yAxis": limit}],
+        }
+    begin = state.drift[0][0] if state.drift else 0.0
+    visits: list[Points] = [
+        [[(when - begin) / 60, deg[i]] for when, deg in state.drift]
+        for i in range(len(outputs))
+    ]
+    since = {"name": "minutes since the zero", "min": 0}
+    drift = _lines(outputs, visits, showSymbol=True, symbolSize=7)
+    return {
+        "Angles": _chart(state, recent, angles),
+        "Settling": _chart(state, recent, settling, type="log", min=0.001, max=100),
+        "Commands": _commands(state),
+        "Drift": _chart(state, since, drift),
+    }
+
+
+def _commands(state: RunState) -> dict[str, Any]:
+    """Where the commands lie: the first axis to the right, the second upwards, the
+    third as the size."""
+    postures = [p for p in state.postures.values() if p.commanded]
+    groups: dict[str, list[Any]] = {
+        "candidate": state.candidates,
+        "to come": [p.commanded for p in postures],
+        "now": [p.commanded for p in postures if p.state in ACTIVE],
+        "measured": [p.commanded for p in state.done],
+    }
+    ranges = state.setting("session", "ranges", [])
+
+    def mark(point: Any) -> Record:
+        size = 9.0
+        if len(point) > 2 and len(ranges) > 2:
+            low, high = ranges[2]
+            size = 5 + 8 * (point[2] - low) / (high - low)
+        return {"value": [*point, 0.0][:2], "symbolSize": size}
+
+    series = [
+        {"type": "scatter", "name": name, "data": [mark(point) for point in points]}
+        for name, points in groups.items()
+    ]
+    unit = "degrees" if state.axis_unit == "deg" else state.axis_unit
+    right, up, *_ = [*(f"{name}, {unit}" for name in state.names[0]), "", ""]
+    chart = _chart(state, {"name": right, "scale": True}, series, name=up)
+    chart["legend"] |= {"data": list(groups)}
+    return chart | {"color": MARK_COLORS}
+
+
+def _chart(
+    state: RunState, x: Record, series: list[Record], **y: Any
+) -> dict[str, Any]:
+    """What is measured, unless ``y`` says otherwise."""
+    unit = "degrees" if state.unit == "deg" else state.unit
+    label = {"color": TEXT, "fontSize": 11}
+    rules = {"lineStyle": {"color": GRID}, "onZero": False}
+    axis = {"type": "value", "axisLabel": label, "axisLine": rules, "splitLine": rules}
+    below = {"nameLocation": "middle", "nameGap": 24, "nameTextStyle": label}
+    above = {**label, "align": "left", "padding": [0, 0, 0, -40]}
+    box = {"itemWidth": 14, "itemHeight": 8, "textStyle": label}
+    return {
+        "animation": False,
+        "color": AXIS_COLORS,  # again from the first, where there are more lines
+        "grid": {"left": 52, "right": 14, "top": 34, "bottom": 40},
+        "legend": {"top": 0, "right": 8, "icon": "roundRect", **box}
+        | {"data": state.names[1]},
+        "xAxis": {**axis, **below, **x},
+        "yAxis": {**axis, "name": unit, "scale": True, "nameTextStyle": above} | y,
+        "series": series,
+    }
+
+
+def _lines(
+    names: Sequence[str], lines: list[Points], suffix: str = "", **look: Any
+) -> list[Record]:
+    line = {"type": "line", "showSymbol": False, "symbol": "circle"}
+    return [
+        {**line, **look, "name": name + suffix, "data": data}
+        for name, data in zip(names, lines, strict=True)
+    ]

@@ -1,0 +1,244 @@
+"""The model of a device that is not ``y = A u + b``: what rig.toml names, loaded.
+
+What a session of such a device comes to, parameters and verdict, it says too.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import importlib.util
+import re
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rig.config import ConfigError, RigConfig
+from rig.identification.fit_affine import fit_quietly, spread
+from rig.journal import Record
+from rig.outputs.messages import recalibrate
+from rig.readings.geometry import RADIAN, geometry_of
+
+if TYPE_CHECKING:
+    from jaxcal.models.model import Model
+    from jaxcal.models.uncertainty import Prior
+
+Array = NDArray[np.float64]
+# A phone tells where up is as a direction: it has neither scale nor bias.
+OF_A_DIRECTION = ("gravity scale", "bias x", "bias y", "bias z")
+WIDE = 1.96  # standard errors, of 95 %
+
+
+@dataclasses.dataclass(frozen=True)
+class DeviceModel:
+    """A ``jaxcal`` model of a device, and what is known of it before measuring."""
+
+    model: Model
+    prior: Prior | None = None  # None: the model's own
+    # (N, n) commands to (N, 3, 3) attitudes of the tip, of an arm as its file has it.
+    rotations: Callable[[Array], Array] | None = None
+
+    def predict(self, command: Array) -> Array:
+        """(m,) that is measured at a command (n,) by the device as designed."""
+        return np.asarray(self.model.predict(command[None]), dtype=np.float64)[0]
+
+    def drawn(self, seed: int) -> Array:
+        """(p,) parameters of such a device, drawn from what is known before."""
+        known = (self.prior or self.model.default_prior()).resolve(self.model)
+        deviation = np.random.default_rng(seed).normal(size=len(known.mean))
+        with np.errstate(divide="ignore"):
+            std = np.diagonal(known.precision) ** -0.5
+        std = np.where(np.isfinite(std), std, 0.05 * np.maximum(1.0, abs(known.mean)))
+        return known.mean + np.where(known.free, std * deviation, 0.0)
+
+    def attitude_with(self, parameters: Array) -> Callable[[Array], Array]:
+        """Command (n,) to attitude (3, 3) of the tip of an arm with parameters (p,)."""
+        arm: Any = self.model.calibrated(parameters)
+        return lambda command: arm.rotations(command[None], np.zeros((1, 3)))[0]
+
+    def axes_at(self, command: Array) -> Array:
+        """(3, n) axes about which the joints of an arm turn, in the tip's frame."""
+        assert self.rotations is not None
+        steps = np.vstack([0 * command, np.eye(len(command))])
+        here, *turned = self.rotations(command + steps)
+        return (
+            Rotation.from_matrix([here.T @ each for each in turned])
+            .as_rotvec(degrees=True)
+            .T
+        )
+
+    def outputs(self, config: RigConfig, records: list[Record]) -> tuple[Array, Array]:
+        """(N, n) commands and (N, m) of what it predicts, of N posture records."""
+        geometry = geometry_of(config)
+        commands = np.array([r["commanded_deg"] for r in records], dtype=np.float64)
+        values = [
+            geometry.outputs(np.array(r["attitude"]), np.array(r["measured_deg"]))
+            for r in records
+        ]
+        return commands, np.array(values)
+
+    def identify(self, config: RigConfig, records: list[Record]) -> Any:
+        """The parameters from chosen postures: a ``jaxcal.Calibration``."""
+        return fit_quietly(
+            *self.outputs(config, records),
+            model=self.model,
+            prior=self.prior,
+            input_names=config.axis_names,
+            output_names=config.output_names,
+            command_unit=config.axis_unit,
+            measured_unit=config.output_unit,
+            accuracy=config.session.verify_limit_deg,
+        )
+
+    def held_out_errors(
+        self, config: RigConfig, calibration: Any, records: list[Record]
+    ) -> Record:
+        """Errors of the predictions at held-out postures: of the device as designed,
+        and of the calibration; nothing where there are none."""
+        if not records:
+            return {}
+        commands, measured = self.outputs(config, records)
+        designed = self.model.predict(commands)
+        predicted = calibration.predict(commands)
+        return {
+            "before": spread(measured - designed),
+            "prediction": spread(measured - predicted),
+        }
+
+    def conclude(
+        self,
+        config: RigConfig,
+        postures: dict[str, Record],
+        notes: Record,
+        told: Record,
+    ) -> tuple[Any, Record]:
+        """The calibration, with ``notes`` in its file, and its summary with what is
+        ``told`` of any session."""
+        chosen, held = (
+            [record for record in postures.values() if record["role"] == role]
+            for role in ("select", "held")
+        )
+        calibration = self.identify(config, chosen)
+        errors = self.held_out_errors(config, calibration, held)
+        verdict = calibration.verdict
+        summary = told | errors | {
+            "model": calibration.model.title,
+            "parameters": parameters(calibration),
+            "noise_std_deg": np.ravel(calibration.noise_std).tolist()
+            if calibration.noise_std is not None else None,
+            "fit": {"good": bool(verdict.good), "reasons": list(verdict.reasons)},
+        }  # fmt: skip
+        reasons = recalibrate(summary, config.session.verify_limit_deg)
+        mispairing = calibration.mispairing
+        if mispairing is not None and mispairing.reason not in reasons:
+            reasons.insert(0, mispairing.reason)
+        notes |= {"verdict": {"good": not reasons, "reasons": reasons}}
+        provenance = {**calibration.provenance, "notes": notes}
+        return dataclasses.replace(calibration, provenance=provenance), summary
+
+
+def parameters(calibration: Any) -> dict[str, Record]:
+    """What was fitted, by its name: designed, found, half-width of its interval."""
+    fixed = np.zeros(len(calibration.names), dtype=bool)
+    errors = calibration.standard_errors
+    if errors is not None:
+        fixed = np.asarray(errors) == 0.0
+    return {
+        name: {
+            "designed": float(calibration.model.nominal[i]),
+            "value": float(calibration.parameters[i]),
+            "half_width": None if errors is None else WIDE * float(errors[i]),
+        }
+        for i, name in enumerate(calibration.names)
+        if not fixed[i]
+    }
+
+
+def model_of(config: RigConfig) -> DeviceModel | None:
+    """The model of a device; None where it is affine.
+
+    Raises:
+        ConfigError: it cannot be loaded, or is of other axes or readings.
+    """
+    if config.model is None:
+        return None
+    key = "model.urdf" if config.is_arm else "model.factory"
+    try:
+        made = _arm(config) if config.is_arm else _made(config)
+        commands, outputs = len(config.axes), len(config.output_names)
+        takes = made.model.num_inputs
+        gives = len(made.predict(np.zeros(takes)))  # a function says it by its answer
+        if (takes, gives) != (commands, outputs):
+            raise ValueError(
+                f"it takes {takes} commands and predicts {gives} readings; the device "
+                f"has {commands} axes and measures {outputs}"
+            )
+    except Exception as error:  # whatever a file of Python raises
+        where = config.model.urdf or config.model.factory
+        raise ConfigError(key, [f"{where}: {error}"]) from None
+    return made
+
+
+def _arm(config: RigConfig) -> DeviceModel:
+    from jaxcal.arms import SerialChain
+    from jaxcal.arms.sensors import Gravity, Position
+    from jaxcal.models.uncertainty import Prior
+
+    assert config.model is not None and config.model_path is not None
+    by_phone, size = config.imu is not None, config.model.magnitude
+    sensor: Any = Gravity(magnitude=RADIAN if by_phone else size)
+    if config.model.sensor == "position":
+        sensor = Position()
+    arm = SerialChain.from_urdf(
+        config.model_path,
+        base=config.model.base or None,
+        tip=config.model.tip or None,
+        sensor=sensor,
+    )
+    names = _in_small_letters(arm.joint_names)
+    if tuple(names) != config.axis_names:
+        raise ValueError(
+            f"its joints are {', '.join(names)} from the base outwards; the axes must "
+            f"be the same, in this order, got {', '.join(config.axis_names)}"
+        )
+    prior = arm.default_prior()
+    if by_phone:
+        fixed = (*prior.fixed, *OF_A_DIRECTION)
+        prior = Prior(prior.std, prior.mean, fixed, prior.by_data)
+    return DeviceModel(
+        arm, prior, lambda commands: arm.rotations(commands, 0.0 * commands[:, :3])
+    )
+
+
+def _in_small_letters(names: Sequence[str]) -> list[str]:
+    return [re.sub("[^a-z0-9]+", "_", name.lower()) for name in names]
+
+
+def joint_names(urdf: str) -> list[str]:
+    """Names of the axes of an arm, from the base outwards; ValueError, OSError."""
+    from jaxcal.arms import SerialChain
+
+    return _in_small_letters(SerialChain.from_urdf(urdf).joint_names)
+
+
+def _made(config: RigConfig) -> DeviceModel:
+    from jaxcal.models.model import as_model
+
+    assert config.model is not None
+    where, _, name = config.model.factory.rpartition(":")
+    if config.model_path is None:
+        module: Any = importlib.import_module(where)
+    else:
+        spec = importlib.util.spec_from_file_location("device_model", config.model_path)
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    if not hasattr(module, name):
+        raise ValueError(f"it has no {name}")
+    made = getattr(module, name)
+    if not hasattr(made, "predict") and callable(made):
+        made = made()
+    return DeviceModel(as_model(made))

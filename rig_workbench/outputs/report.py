@@ -1,0 +1,180 @@
+"""report.html of a run of any kind, also of one that is not finished.
+
+Made from the journal and, where there is one, the summary; loaded after the last move.
+Figures need matplotlib; without it the page says so.
+"""
+
+from __future__ import annotations
+
+import datetime
+import functools
+import json
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxcal.extras import install
+from jaxcal.reports.page import Code, Figure, Page, Section, Table, Text, write_page
+from rig.journal import JOURNAL, Record, is_written, measured_postures
+from rig.outputs.messages import (
+    choice_text,
+    numbers,
+)
+from rig.outputs.run_state import RunState
+from rig_workbench.outputs.view import headline, trouble, verdict
+
+FOOTER = (
+    "Research software, not a medical device. Calibrate with no patient attached; a "
+    "hardware emergency stop is required."
+)
+MOST_ROWS = 60  # of the table of postures; more are in pairs.csv
+
+
+def write_report(folder: pathlib.Path, records: list[Record]) -> pathlib.Path:
+    """Write ``report.html`` of a run, from the records of its journal."""
+    start, summary, state = records[0], {}, RunState()
+    for record in records:
+        state.apply(record)
+    if (folder / "summary.json").is_file():
+        text = (folder / "summary.json").read_text(encoding="utf-8")
+        summary = json.loads(text)
+    made = f"{start['started']} on {start['host']}, jaxcal {start['jaxcal']}"
+    running = is_written(folder / JOURNAL)
+    told = ["made on a simulated device"] if start.get("simulated") else []
+    told += trouble(state, running, str(folder))
+    intro = [Text(f"{made}."), Text(f"{headline(state, running)[1]}.")]
+    intro += [Text(f"{text}.", "warning") for text in told]
+    sections = [*_result(state, summary), _measured(state, records)]
+    rows = [
+        [f"{datetime.datetime.fromtimestamp(when):%H:%M:%S}", line]
+        for when, line in state.log
+    ]
+    table = Table(["", ""], rows, numeric=False)
+    sections.append(Section("What happened", [table]))
+    path, kind = folder / "report.html", str(start["mode"])
+    kind = "Calibration" if kind == "calibrate" else kind.capitalize()
+    title = f"{kind} {folder.name}"
+    write_page(path, Page(title, sections, intro=intro, footer=(FOOTER,)))
+    return path
+
+
+def _result(state: RunState, summary: Record) -> list[Section]:
+    """What console and page say, errors at held-out targets, and what a refit did."""
+    lines = verdict(state, summary)
+    if choice := summary.get("choice"):
+        lines.append(f"chosen by {choice_text(choice)}. {choice['note']}")
+    warned = ("WARNING", "RECALIBRATE")
+    parts: list[Any] = [
+        Text(Code(line), "warning" if line.startswith(warned) else "") for line in lines
+    ]
+    if "before" in summary:
+        shown = {"raw": "before", "compensated": "after"}
+        if state.start["config"].get("model"):
+            shown = {"as designed": "before", "calibrated": "prediction"}
+        errors = {t: summary[key]["each"] for t, key in shown.items() if key in summary}
+        alt = f"held-out errors in {state.unit}, {' and '.join(errors)}"
+        names = summary.get("outputs", state.names[1])
+        draw = functools.partial(draw_errors, names=names, unit=state.unit)
+        parts.append(drawn(draw, errors, (9, 3.4), alt))
+    if rms := summary.get("orders", {}).get("rms"):
+        rows = [[order, f"{left:.4f}"] for order, left in rms.items()]
+        told = f"configured: {summary['orders']['configured']}"
+        parts.append(Table(["Euler order", "residual, degrees rms"], rows, told))
+    sections = [Section("Result", parts)] if parts else []
+    if changes := summary.get("changed"):
+        rows = [[key, str(old), str(new)] for key, (old, new) in changes.items()]
+        head = ["key of rig.toml", "as recorded", "here"]
+        title = f"Identified anew from {summary['refit_of']}"
+        sections.append(Section(title, [Table(head, rows, numeric=False)]))
+    return sections
+
+
+def _measured(state: RunState, records: list[Record]) -> Section:
+    """Every posture measured so far."""
+    postures = list(measured_postures(records).values())
+    if not postures:
+        planned = any(r["event"] in ("plan", "collection") for r in records)
+        what = "measured" if planned else "planned or measured"
+        return Section("Postures", [f"Nothing was {what}."])
+    rows = [
+        [
+            r["name"], numbers(r["commanded_deg"], 0, 3),
+            numbers(r["measured_deg"], 0, 3), numbers(r["std_deg"], 0, 4),
+        ]
+        for r in postures[:MOST_ROWS]
+    ]  # fmt: skip
+    told = f"[{state.unit}]"
+    head = ["posture", "commanded", f"measured {told}", f"scatter {told}"]
+    head[1] += f" [{state.axis_unit}]"
+    more = f", the first {MOST_ROWS} of them" if len(postures) > MOST_ROWS else ""
+    table = Table(head, rows, f"{len(postures)} measured{more}")
+    draw = functools.partial(draw_postures, names=state.names[0], unit=state.axis_unit)
+    picture = drawn(draw, postures, (6, 5), "commanded postures")
+    return Section("Postures", [picture, table])
+
+
+# Figures
+
+
+def drawn(
+    draw: Callable[[Any, Any], None], data: Any, size: tuple[float, float], alt: str
+) -> Any:
+    """A block of a page: the figure, or words where matplotlib is not installed."""
+    try:
+        import matplotlib.figure
+
+        from jaxcal.reports.plots import as_bytes
+    except ModuleNotFoundError:
+        missing = f"no figure: matplotlib is not installed ({install('plots')})"
+        return Text(f"{alt}: {missing}", "note")
+    figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
+    draw(figure, data)
+    return Figure(as_bytes(figure, "svg"), alt)
+
+
+def draw_errors(
+    figure: Any, each: dict[str, Any], names: Sequence[str], unit: str
+) -> None:
+    """Errors at held-out targets, raw beside compensated, each on its scale."""
+    from jaxcal.reports import plots
+
+    axes = figure.subplots(1, len(each), squeeze=False)[0]
+    for axis, (title, values) in zip(axes, each.items(), strict=True):
+        plots.before_after(axis, {title: values}, names, unit)
+
+
+def draw_postures(
+    figure: Any, records: list[Record], names: Sequence[str], unit: str
+) -> None:
+    """Commands of all visits, and of those the calibration is identified from; of more
+    than three axes the first three."""
+    from jaxcal.reports import plots
+
+    commands = np.array([r["commanded_deg"] for r in records])[:, :3]
+    chosen = [i for i, r in enumerate(records) if r.get("role") == "select"]
+    names = [f"{name} [{unit}]" for name in names[:3]]
+    if len(names) == 1:  # against nothing
+        commands, names = np.column_stack([commands, 0 * commands]), [*names, ""]
+    axes = figure.add_subplot(projection="3d" if len(names) == 3 else None)
+    shown = chosen or range(len(commands))
+    plots.selection(axes, commands, list(shown), names, label="measured")
+
+
+def draw_parameters(figure: Any, runs: list[Record]) -> None:
+    """A and b with their intervals, calibration after calibration."""
+    values = np.array([np.column_stack([r["A"], r["b"]]) for r in runs])
+    _, rows, columns = values.shape
+    last = runs[-1]
+    outputs = last["outputs"] if "outputs" in last else last["axes"]
+    head = [*(f"u {name}" for name in runs[-1]["axes"]), "b"]
+    axes = figure.subplots(rows, columns, sharex=True, squeeze=False)
+    wide = np.array([r["ci95"] for r in runs])
+    days = np.array([r["time"] for r in runs]) / 86400.0
+    for row, column in np.ndindex(rows, columns):
+        y, e = values[:, row, column], wide[:, row, column]
+        axis = axes[row, column]
+        axis.errorbar(days - days[0], y, e, fmt="o-", capsize=3, markersize=4)
+        axis.set_title(f"{outputs[row]}: {head[column]}", fontsize=9)
+        axis.set_xlabel("days" if row == rows - 1 else "")

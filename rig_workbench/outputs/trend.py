@@ -1,0 +1,151 @@
+"""Calibrations of a device over time: what moved, and whether the last one holds."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import json
+import math
+import pathlib
+
+import numpy as np
+
+from jaxcal.checks import aligned
+from jaxcal.reports.page import Badge, Block, Page, Section, Table, Text, write_page
+from rig.journal import JournalError, Record, read_journal
+from rig.outputs.messages import held_out, recalibrate
+from rig_workbench.outputs.report import draw_parameters, drawn
+
+HEAD = ["measured", "run", "mode", "held-out error", "moved since the one before"]
+HOLDS = "the last calibration still holds"
+
+
+@dataclasses.dataclass
+class DeviceHistory:
+    """What was found of one device fingerprint, the oldest first."""
+
+    fingerprint: Record
+    rows: list[list[str]]  # of a table under HEAD
+    calibrations: list[Record]  # summaries of those that identified, with their time
+    reasons: list[str]  # to calibrate again; none where the last calibration holds
+
+    @property
+    def verdict(self) -> str:
+        return f"RECALIBRATE: {'; '.join(self.reasons)}" if self.reasons else HOLDS
+
+
+def read_runs(folder: pathlib.Path) -> tuple[list[DeviceHistory], list[str]]:
+    """The devices with finished calibrations and verifications under a folder.
+
+    Runs of different device fingerprints are never compared. A refit stands at the time
+    at which its run was measured.
+
+    Returns:
+        The devices, and a line for each journal that could not be read.
+    """
+    runs_of_device: dict[str, list[Record]] = {}
+    skipped = []
+    for path in sorted(folder.rglob("journal.jsonl")):
+        try:
+            start = read_journal(path)[0]
+            text = (path.parent / "summary.json").read_text(encoding="utf-8")
+            device = start["device"]
+            if start.get("simulated"):  # never compared with a real one
+                device = {"simulated": True, **device}
+            run = json.loads(text) | {
+                "limit": start["config"]["session"]["verify_limit_deg"],
+                "name": path.parent.name, "mode": start["mode"], "device": device,
+            }  # fmt: skip
+            run["time"] = run.get("measured_at", start["time"])
+        except FileNotFoundError:
+            continue  # not finished, or of a kind without a summary
+        except (OSError, JournalError, ValueError, KeyError, IndexError) as error:
+            skipped.append(f"{path.parent}: {error}")
+            continue
+        runs_of_device.setdefault(json.dumps(device, sort_keys=True), []).append(run)
+    return [_device(runs) for runs in runs_of_device.values()], skipped
+
+
+def _device(runs: list[Record]) -> DeviceHistory:
+    device = DeviceHistory(runs[0]["device"], [], [], [])
+    for run in sorted(runs, key=lambda run: run["time"]):
+        moved, error = "", "not measured"
+        if "A" in run or "parameters" in run:
+            before = device.calibrations[-1:]
+            moved = (
+                (", ".join(_moved(before[0], run)) or "nothing") if before else "first"
+            )
+            device.calibrations.append(run)
+        if "prediction" in run:
+            _, worst = held_out(run)
+            error = f"{worst:.4f} {run.get('unit', 'deg')} (limit {run['limit']:g})"
+            reasons = recalibrate(run, run["limit"])
+            device.reasons = [f"{run['name']}: {reason}" for reason in reasons]
+        when = f"{datetime.datetime.fromtimestamp(run['time']):%Y-%m-%d %H:%M}"
+        device.rows.append([when, run["name"], run["mode"], error, moved])
+    return device
+
+
+def _moved(before: Record, now: Record) -> list[str]:
+    """Parameters that differ by more than their intervals allow, A before b."""
+    if "parameters" in now:
+        return _moved_parameters(before["parameters"], now["parameters"])
+    then, new = (np.column_stack([run["A"], run["b"]]) for run in (before, now))
+    change, allowed = new - then, np.hypot(now["ci95"], before["ci95"])
+    axes, last = now["axes"], len(now["axes"])
+    outputs = now["outputs"] if "outputs" in now else axes
+    names = [[f"A[{y}, {u}]" for u in axes] + [f"b[{y}]"] for y in outputs]
+    return [
+        f"{names[i][j]} {change[i, j]:+.4f} (interval {allowed[i, j]:.4f})"
+        for i, j in sorted(np.ndindex(change.shape), key=lambda at: at[1] == last)
+        if abs(change[i, j]) > allowed[i, j]
+    ]
+
+
+def _moved_parameters(before: Record, now: Record) -> list[str]:
+    """Parameters of a model that differ by more than their intervals allow."""
+    moved = []
+    for name, parameter in now.items():
+        if name not in before or parameter["half_width"] is None:
+            continue
+        change = parameter["value"] - before[name]["value"]
+        allowed = math.hypot(parameter["half_width"], before[name]["half_width"] or 0.0)
+        if abs(change) > allowed:
+            moved.append(f"{name} {change:+.4g} (interval {allowed:.4g})")
+    return moved
+
+
+def trend_lines(device: DeviceHistory) -> list[str]:
+    """The table and the verdict for the console."""
+    table = [f"  {line}" for line in aligned([HEAD, *device.rows], "<")]
+    told, keys = device.fingerprint, ("map", "unit", "pulses_per_rev", "reduction")
+    parts = [key.split(".") for key in told]
+    names = dict.fromkeys(part[1] for part in parts if part[0] == "axes")
+    axes = (
+        " ".join([name, *(str(told.get(f"axes.{name}.{k}", "?")) for k in keys)])
+        for name in names
+    )
+    label = f"{'; '.join(axes)}; order {told.get('mechanism.order', '-')}"
+    simulated = "simulated: " if told.get("simulated") else ""
+    return [f"device {simulated}{label}", *table, f"  {device.verdict}"]
+
+
+def write_trend(folder: pathlib.Path, devices: list[DeviceHistory]) -> pathlib.Path:
+    """Write ``trend.html``; returns its path."""
+    sections = []
+    for number, device in enumerate(devices):
+        bad = bool(device.reasons)
+        blocks: list[Block] = [
+            Text(device.verdict, "warning" if bad else ""),
+            Table(HEAD, device.rows, numeric=False),
+        ]
+        if device.calibrations and "A" in device.calibrations[-1]:
+            alt = "A and b over time, with their 95 % intervals"
+            blocks.append(drawn(draw_parameters, device.calibrations, (11, 7), alt))
+        rows = [[key, json.dumps(v)] for key, v in device.fingerprint.items()]
+        blocks.append(Table(["fingerprint", ""], rows, numeric=False))
+        badge = Badge("recalibrate", "bad") if bad else Badge("holds", "good")
+        sections.append(Section(f"Device {number + 1}", blocks, badge=badge))
+    path = folder / "trend.html"
+    write_page(path, Page(f"Calibrations in {folder.resolve().name}", sections))
+    return path

@@ -1,0 +1,150 @@
+"""The phone: its attitude in the published formats, at a steady rate."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import random
+import socket
+import time
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rig.config.settings import ImuSettings
+from rig.readings.attitude import Array, euler_to_matrix, matrix_to_euler
+from rig_workbench.simulator.faults import FaultInjector
+from rig_workbench.simulator.sender import Sender
+
+INTRUSION_S = 0.15  # that another sender is heard, where it is let
+BATCH = 5  # readings that Sensor Logger pushes at once
+
+
+def format_line(
+    settings: ImuSettings, matrix: Array, stamp_s: float, order: str
+) -> str:
+    """One line as the configured app would send it, without its end."""
+    columns: tuple[int, ...] = settings.quaternion_columns or settings.columns
+    if settings.quaternion_columns:
+        numbers, digits = Rotation.from_matrix(matrix).as_quat(), 9
+    else:
+        numbers, digits = matrix_to_euler(matrix, order) * np.array(settings.signs), 7
+        if settings.format == "hyperimu":
+            numbers[0] %= 360.0  # the azimuth runs from 0 to 360
+        if settings.unit == "rad":
+            numbers = np.radians(numbers)
+    width = settings.column_count or 1 + max(*columns, settings.stamp_column)
+    fields = ["0.0"] * width
+    for column, value in zip(columns, numbers, strict=True):
+        fields[column] = f"{value:.{digits}f}"
+    if settings.stamp_column >= 0:
+        fields[settings.stamp_column] = str(round(stamp_s * 1000))
+    return settings.separator.join(fields)
+
+
+class Phone(Sender):
+    """Sends ``attitude()`` as the app of a phone does."""
+
+    listens = "connect"
+
+    def __init__(
+        self,
+        settings: ImuSettings,
+        attitude: Callable[[], Array],
+        faults: FaultInjector,
+        rate_hz: float = 100.0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(settings, faults, rate_hz)
+        self._attitude = attitude
+        self._random = random.Random(seed)
+        self._frozen = np.eye(3)
+        self._session = 0  # of the app, counted
+
+    def send(self) -> None:
+        if self.settings.format == "sensorlogger":
+            self._push()
+        else:
+            self._stream(self.connected())
+
+    def _stream(self, connection: socket.socket) -> None:
+        held = b""
+        next_time = time.monotonic()
+        with connection:
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            connection.settimeout(1.0)
+            while not self._closing.is_set() and not self._take("imu_disconnect"):
+                if self._take("imu_second_sender"):
+                    connection.close()
+                    return self._intrude()
+                if not self._take("imu_gap"):
+                    data = self._line()
+                    if self._take("imu_reorder") and not held:
+                        held = data
+                    else:
+                        connection.sendall(data + held)
+                        held = b""
+                next_time += self._period
+                self._closing.wait(max(0.0, next_time - time.monotonic()))
+
+    def _intrude(self) -> None:
+        """Angles of something else, from another address, for as long as it is let."""
+        settings, other = self.settings, euler_to_matrix([40.0, 30.0, 20.0], "ZYX")
+        address, source = ("127.0.0.1", self._port), ("127.0.0.2", 0)
+        with socket.create_connection(address, 1.0, source) as connection:
+            for _ in range(max(3, round(INTRUSION_S / self._period))):
+                line = format_line(settings, other, time.time(), str(settings.order))
+                connection.sendall(line.encode() + b"\r\n")
+                self._closing.wait(self._period)
+
+    def _line(self) -> bytes:
+        s, order = self.settings, str(self.settings.order)
+        if self._take("imu_wrong_order"):
+            order = "XYZ" if order != "XYZ" else "ZYX"
+        if not self._take("imu_frozen"):
+            self._frozen = self._attitude()
+        if self._take("imu_radians"):
+            s = s.model_copy(update={"unit": "rad"})
+        fields = format_line(s, self._frozen, time.time(), order).split(s.separator)
+        if self._take("imu_nan"):
+            fields[(s.quaternion_columns or s.columns)[0]] = "NaN"
+        if self._take("imu_columns"):
+            fields.append("1.0")
+        return self._garbled(s.separator.join(fields).encode() + b"\r\n")
+
+    def _garbled(self, data: bytes) -> bytes:
+        if not self._take("imu_garbage"):
+            return data
+        cut = self._random.randrange(len(data))
+        return (
+            data[:cut]
+            + self._random.randbytes(self._random.randint(1, 40))
+            + data[cut:]
+        )
+
+    def _push(self) -> None:
+        connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=2.0)
+        with contextlib.closing(connection):
+            while not self._closing.is_set():
+                if self._take("imu_disconnect"):
+                    self._session += 1
+                    return
+                payload = []
+                for _ in range(BATCH):
+                    q = Rotation.from_matrix(self._attitude()).as_quat()
+                    q = q * np.nan if self._take("imu_nan") else q
+                    values = dict(
+                        zip(("qx", "qy", "qz", "qw"), q.tolist(), strict=True)
+                    )
+                    stamped = {"name": "orientation", "time": time.time_ns()}
+                    payload.append(stamped | {"values": values})
+                    self._closing.wait(self._period)
+                if self._take("imu_gap"):
+                    continue
+                named = {"deviceId": "simulated", "sessionId": str(self._session)}
+                body = json.dumps(named | {"payload": payload}).encode()
+                headers = {"Content-Type": "application/json"}
+                connection.request("POST", "/", self._garbled(body), headers)
+                connection.getresponse().read()
