@@ -1,9 +1,7 @@
 """rig: jaxcal on hardware. Drives over Modbus, a phone's IMU, one safe session.
 
-What moves, measures and stops; ``rig_workbench`` beside it commissions, simulates,
-shows and reports, and is found by entry points. The package imports jaxcal and is never
-imported by it. Importing it loads neither JAX nor matplotlib; the motion loop and the
-stop path never touch either.
+What moves, measures and stops; it finds ``rig_workbench`` by entry points, and jaxcal
+never imports it. The motion loop and the stop path touch neither JAX nor matplotlib.
 """
 
 from __future__ import annotations

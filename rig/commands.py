@@ -12,9 +12,9 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from jaxcal.arguments import Parser
-from jaxcal.extras import MissingExtraError, installed
+from jaxcal.extras import MissingExtraError
 from rig.faults import EXIT_FAULT, EXIT_OK, Refused
-from rig.parts import COMMANDS, part
+from rig.parts import COMMANDS, offered, part
 
 if TYPE_CHECKING:
     from rig.config import RigConfig
@@ -384,7 +384,7 @@ def make_parser(only: str | None = None) -> Parser:
     parser = Parser(prog="jaxcal-rig", description=about, epilog=EPILOG)
     added = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     absent: dict[str, str] = {}
-    if only in (names := installed(COMMANDS)):
+    if only in (names := offered(COMMANDS)):
         functions = [part(only, only, COMMANDS)]
     else:
         functions = _loaded(names, absent)

@@ -6,11 +6,25 @@
 
 from __future__ import annotations
 
+from importlib.metadata import EntryPoint
 from typing import Any
 
 from jaxcal.extras import MissingExtraError, install, installed, needs
 
 COMMANDS, PARTS = "jaxcal_rig.commands", "jaxcal_rig.parts"
+
+
+def offered(group: str) -> dict[str, EntryPoint]:
+    """What is installed of a group, by name.
+
+    Raises:
+        MissingExtraError: nothing, as where an earlier version was installed.
+    """
+    if not (points := installed(group)):
+        raise MissingExtraError(
+            f"jaxcal is not installed, or of an earlier version: {install('rig')}"
+        )
+    return points
 
 
 def part(name: str, purpose: str, group: str = PARTS) -> Any:
@@ -20,9 +34,7 @@ def part(name: str, purpose: str, group: str = PARTS) -> Any:
         MissingExtraError: its package is not installed; in one line, with the command
             that installs it for this ``purpose``.
     """
-    point = installed(group).get(name)
-    if point is None:  # installed by an earlier version
-        raise MissingExtraError(f"{purpose}: install jaxcal anew: {install('rig')}")
+    point = offered(group)[name]
     with needs(extra_of(point.module), purpose):
         return point.load()
 

@@ -46,19 +46,14 @@ def addresses_text(settings: ImuSettings, port: int) -> str:
     """What to type into the phone's app."""
     if settings.transport == "connect":
         return f"connecting to the phone at {settings.host}:{port}"
-    host = settings.host
-    if host in ("0.0.0.0", "::"):
-        host = own_address() or "(this computer has no network address)"
+    host = reached_at(settings.host)
     return f"type into the phone's app ({settings.format}): {host} port {port}"
 
 
 def sensor_text(settings: ReadingsSettings, port: int) -> str:
     """Where a sensor's numbers come from."""
     if settings.transport in ("listen", "udp"):
-        host = settings.host
-        if host in ("0.0.0.0", "::"):
-            host = own_address() or "(this computer has no network address)"
-        return f"waiting for the sensor on {host} port {port}"
+        return f"waiting for the sensor on {reached_at(settings.host)} port {port}"
     return f"readings from {settings.device or f'{settings.host}:{settings.port}'}"
 
 
@@ -102,8 +97,10 @@ def watch(
         )
 
 
-def own_address() -> str:
-    """IPv4 address under which a phone can reach this computer; empty without one."""
+def reached_at(host: str) -> str:
+    """IPv4 address under which a phone reaches what listens on ``host``."""
+    if host not in ("0.0.0.0", "::"):
+        return host
     # Connecting UDP sends nothing; it tells the address packets leave from.
     with (
         contextlib.suppress(OSError),
@@ -111,4 +108,4 @@ def own_address() -> str:
     ):
         probe.connect(("192.0.2.1", 9))
         return str(probe.getsockname()[0])
-    return ""
+    return "(this computer has no network address)"

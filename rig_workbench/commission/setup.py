@@ -7,11 +7,13 @@ import pathlib
 import re
 import socket
 import tomllib
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jaxcal.files import write_text
 from rig.config import RigConfig, load_config, parse_config
 from rig.config.axis import DEFAULT_ROTATES as DEFAULT_AXES
+from rig.config.settings import BusSettings
 from rig.faults import EXIT_OK, Refused
 from rig.journal import HOMED, IDENTIFIED, STOP_PROVED, ZEROED
 from rig.prove import steps
@@ -21,7 +23,6 @@ from rig.prove.rig_toml import edit, set_values
 from rig.prove.scan import Answer, parse_bus, scan, serial_lines
 from rig.sessions import SimulatedDevice
 from rig_workbench.commission.connections import look_at_phone
-from rig_workbench.commission.new_file import new_text
 from rig_workbench.model import joint_names
 
 FORMATS = ["hyperimu", "sensorlogger", "lines"]
@@ -60,6 +61,11 @@ OF_READINGS = {  # keys of [readings]
     "udp": ("port",),
     "serial": ("device", "baudrate"),
     "modbus": ("host", "port"),
+}
+OF_LINE = {  # keys of [bus]
+    "rtu": ("device", "baudrate", "parity", "stopbits", "bytesize"),
+    "serial": ("device", "baudrate"),
+    "can": ("device", "baudrate"),
 }
 EXAMPLES: dict[str, dict[str, Any]] = {  # of --example
     "turntable": {"axes": {"table": "Z"}},
@@ -229,6 +235,45 @@ def write_config(
     operator.confirm(f"setup writes {path}", "write")
     write_text(path, text)
     return config
+
+
+def new_text(
+    bus: BusSettings,
+    axes: Sequence[Mapping[str, Any]],
+    form: str = "",
+    port: int = 0,
+    *,
+    names: Sequence[str] = (),
+    unit: str = "mm",
+    sensor: Mapping[str, Any] | None = None,
+    model: str = "",
+) -> str:
+    """A whole configuration.
+
+    Args:
+        bus: as it was reached.
+        axes: name, kind (X, Y, Z, deg or mm), unit, family, pulses and, of mm, lead of
+            each.
+        form: of the phone's app; none: numbers are measured.
+        port: that the phone connects to.
+        names, unit: of the numbers.
+        sensor: keys of ``[readings]`` that say where they come from.
+        model: URDF file of an arm.
+    """
+    import jinja2
+
+    keys = OF_LINE.get(bus.transport, ("host", "port")) + ("echo",) * bus.echo
+    text = pathlib.Path(__file__).with_name("new.toml.j2").read_text(encoding="utf-8")
+    template = jinja2.Template(
+        text,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    return template.render(
+        bus=dict(bus), keys=keys, axes=axes, form=form, port=port, names=list(names),
+        unit=unit, sensor=dict(sensor or {}), model=model,
+    )  # fmt: skip
 
 
 def _ask_axes(

@@ -53,7 +53,7 @@ def set_up(bus: str, port: int, *more: str, values=QUICK) -> int:
 
 
 def quick_text(bus, port):
-    from rig_workbench.commission.new_file import new_text
+    from rig_workbench.commission.setup import new_text
 
     axes = [
         {"name": name, "kind": letter, "unit": unit, "family": "leadshine_pr",

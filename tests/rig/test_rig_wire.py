@@ -306,7 +306,7 @@ def test_scan_finds_an_echo_and_setup_writes_its_key(capsys):
         assert [answer.unit for answer in answers] == [1, 2, 3]
         assert all(answer.echo for answer in answers)
         assert any("bus.echo = true" in line for line in said)
-    from rig_workbench.commission.new_file import new_text
+    from rig_workbench.commission.setup import new_text
 
     text = new_text(changed(settings, echo=True), [], "hyperimu", 2055)
     assert "echo = true" in text
