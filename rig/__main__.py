@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import re
 import signal
 import sys
@@ -12,11 +11,6 @@ from collections.abc import Sequence
 if sys.argv[1:2] == ["stop"]:  # nothing may keep it from the drives
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that is closed meanwhile
 
-# Looked for before any port opens; finding is quicker than importing.
-NEEDED = {
-    "rig": ("pydantic", "serial", "tomlkit"),
-    "workbench": ("pydantic", "serial", "tomlkit", "jinja2"),
-}
 NUMBER = re.compile(r"[-+.0-9]+(?:[eE][-+]?[0-9]+)?")
 
 
@@ -28,7 +22,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         return stopping.main(argv[1:])
     from jaxcal.arguments import values_of
-    from jaxcal.extras import install
     from jaxcal.files import require_kept
     from rig.commands import make_parser
     from rig.faults import (
@@ -38,17 +31,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         JournalError,
         told,
     )
-    from rig.parts import extra_of
+    from rig.parts import require
 
-    command, code = "", EXIT_BAD_INPUT
+    command, code = argv[0] if argv else None, EXIT_BAD_INPUT
     try:
-        args = make_parser(argv[0] if argv else None).parse_args(argv)
-        command, extra = args.command, extra_of(args.function.__module__)
-        for name in NEEDED[extra]:
-            if importlib.util.find_spec(name) is None:
-                raise ModuleNotFoundError(
-                    f"{command} needs {name}, which is not installed: {install(extra)}"
-                )
+        args = make_parser(command).parse_args(argv)
+        require(args.command)
         require_kept(vars(args))
         code = args.function(**values_of(args))
         return code

@@ -12,6 +12,8 @@ import subprocess
 import sys
 
 from jaxcal.extras import install
+from rig.faults import Fault
+from rig.parts import require
 
 HOST, PORT = "127.0.0.1", 8642  # the usual port; where it is taken, any free one
 LOG = "live.log"
@@ -52,8 +54,14 @@ def start(folder: pathlib.Path) -> str:
     return line
 
 
-def write_report(folder: pathlib.Path) -> str:
-    """Have ``report.html`` of a run written; why there is none, if so. Never raises."""
+def write_report(folder: pathlib.Path) -> None:
+    """Have ``report.html`` of a run written.
+
+    Raises:
+        MissingExtraError: what writes it is not installed.
+        Fault: it was not written.
+    """
+    require("report")
     try:
         subprocess.run(
             _command("report", folder),
@@ -62,12 +70,13 @@ def write_report(folder: pathlib.Path) -> str:
             text=True,
             check=True,
             timeout=REPORT_S,
+            start_new_session=True,  # Ctrl-C is not for it
         )
     except subprocess.CalledProcessError as error:
-        return str(error.stderr).strip().rpartition("\n")[2] or str(error)
-    except (OSError, subprocess.SubprocessError) as error:
-        return str(error)
-    return ""
+        text = str(error.stderr).strip().rpartition("\n")[2] or error
+        raise Fault(f"no {REPORT} was written: {text}") from None
+    except subprocess.TimeoutExpired as error:
+        raise Fault(f"no {REPORT} was written: {error}") from None
 
 
 def _command(name: str, folder: pathlib.Path) -> list[str]:

@@ -6,12 +6,17 @@
 
 from __future__ import annotations
 
+import importlib.util
 from importlib.metadata import EntryPoint
 from typing import Any
 
 from jaxcal.extras import MissingExtraError, install, installed, needs
 
 COMMANDS, PARTS = "jaxcal_rig.commands", "jaxcal_rig.parts"
+NEEDED = {  # by an extra; looked for before any port opens, quicker than importing
+    "rig": ("pydantic", "serial", "tomlkit"),
+    "workbench": ("pydantic", "serial", "tomlkit", "jinja2"),
+}
 
 
 def offered(group: str) -> dict[str, EntryPoint]:
@@ -35,10 +40,24 @@ def part(name: str, purpose: str, group: str = PARTS) -> Any:
             that installs it for this ``purpose``.
     """
     point = offered(group)[name]
-    with needs(extra_of(point.module), purpose):
+    with needs(_extra_of(point.module), purpose):
         return point.load()
 
 
-def extra_of(module: str) -> str:
-    """The extra of jaxcal that brings what a module of the rig needs."""
+def require(command: str) -> None:
+    """Refuse a command of which a package is not installed.
+
+    Raises:
+        MissingExtraError: in one line, with the command that installs it.
+    """
+    module = offered(COMMANDS)[command].module
+    extra = _extra_of(module)
+    for name in (module.partition(".")[0], *NEEDED[extra]):
+        if importlib.util.find_spec(name) is None:
+            raise MissingExtraError(
+                f"{command} needs {name}, which is not installed: {install(extra)}"
+            )
+
+
+def _extra_of(module: str) -> str:
     return "rig" if module.partition(".")[0] == "rig" else "workbench"

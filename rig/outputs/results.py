@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
+from jaxcal.extras import MissingExtraError
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE
 from rig.journal import Record, RunFolder
 from rig.outputs.messages import recalibrate, summary_lines
@@ -31,9 +32,10 @@ def save_result(
     limit = run.config.session.verify_limit_deg
     for line in summary_lines(summary, limit):
         say(line)
-    if lack := write_report(run.folder):
-        say(f"  note: no {REPORT}: {lack}")
-    else:
+    try:
+        write_report(run.folder)
         saved.append(REPORT)
+    except MissingExtraError as lack:
+        say(f"  note: no report: {lack}")
     say(f"saved: {run.folder}/{', '.join(saved)}")
     return EXIT_RECALIBRATE if recalibrate(summary, limit) else EXIT_OK

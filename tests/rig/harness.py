@@ -292,9 +292,8 @@ def no_figures():
     """The report written here, and without its figures: another process that loads
     matplotlib takes longer than a fast session."""
 
-    def here(folder: pathlib.Path) -> str:
+    def here(folder: pathlib.Path) -> None:
         report.write_report(folder, read_journal(folder / JOURNAL))
-        return ""
 
     with (
         mock.patch.object(results, "write_report", here),
