@@ -314,7 +314,7 @@ def _few(fit: Fitted) -> bool:
 
 
 def _chance(outliers: int, width: int, count: int) -> float:
-    """That so many outliers among ``count`` rows stand within so many rows."""
+    """Probability that so many outliers of ``count`` rows are within ``width`` rows."""
     if outliers < 2:
         return 1.0
     placed = sum(
