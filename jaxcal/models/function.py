@@ -435,6 +435,7 @@ class _Memory:
         labels = [row.tobytes() for row in rows]
         new = list(dict.fromkeys(x for x in labels if x not in results))
         if new:
-            first = [labels.index(x) for x in new]
+            places = {label: i for i, label in enumerate(labels)}
+            first = [places[label] for label in new]
             results |= dict(zip(new, make(rows[first]), strict=True))
         return np.array([results[x] for x in labels])

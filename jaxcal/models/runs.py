@@ -279,8 +279,11 @@ class Runs:
                 f"f must return ({self.num_outputs},) for every command, got "
                 f"({len(answer)},) for {in_words(command)}"
             )
-        bad = np.flatnonzero(~np.isfinite(answer))
-        return f"reading {bad[0] + 1} is {answer[bad[0]]}" if bad.size else answer
+        finite = np.isfinite(answer)
+        if finite.all():
+            return answer
+        bad = int(finite.argmin())
+        return f"reading {bad + 1} is {answer[bad]}"
 
 
 def _process_ended(error: Exception) -> bool:
