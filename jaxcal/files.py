@@ -109,7 +109,7 @@ def require_kept(given: Mapping[str, Any]) -> None:
     for option, path in written.items():
         if not isinstance(path, str | pathlib.Path) or given.get("overwrite"):
             continue
-        for name in given.keys() - _WRITTEN:
+        for name in given.keys() - _WRITTEN - {"report"}:
             values = given[name]
             values = values if isinstance(values, list | tuple) else [values]
             if any(_same_file(path, value) for value in values):

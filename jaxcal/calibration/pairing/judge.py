@@ -300,7 +300,7 @@ def _lost_its_way(table: Table, plain: Fitted) -> bool:
         return False
     steps = np.sign(np.diff(table.commands, axis=0))
     swept = (np.ptp(steps, axis=0) < 2.0) & steps.any(axis=0)
-    return bool(swept.any() and (plain.rms > 0.9 * table.width).all())
+    return bool(swept.any() and (plain.rms > 0.5 * table.width).all())
 
 
 def _few(fit: Fitted) -> bool:
