@@ -142,6 +142,9 @@ class EpisodesConfig(PPOConfig):
     episodes_per_set: int = setting(
         8, "episodes on the same candidates, which share a baseline"
     )
+    explore_once: bool = setting(
+        False, "draw and learn one decision of an episode; the likeliest follow it"
+    )
     normalise_per_decision: bool = setting(
         True, "advantages: own mean and scale for each decision of an episode"
     )
@@ -151,6 +154,11 @@ class EpisodesConfig(PPOConfig):
         counts = ("num_episodes", "episodes_per_update", "episodes_per_set")
         require(self, "at least 1", lambda v: v >= 1, *counts)
         self.require_whole("episodes_per_update", "episodes_per_set")
+        if self.explore_once and self.episodes_per_set < 2:
+            raise ValueError(
+                "episodes_per_set must be at least 2 with explore_once, got "
+                f"{self.episodes_per_set}: the others' mean is the baseline"
+            )
 
     @property
     def num_updates(self) -> int:

@@ -12,7 +12,7 @@ from jaxcal.learning.core.network import Network, mask_logits
 from jaxcal.learning.environments.observation import context_features
 from jaxcal.learning.policies.networks import NetworkConfig
 
-__all__ = ["HEADS", "PaperNetwork"]
+__all__ = ["HEADS", "Decision", "Observing", "PaperFeatures", "PaperNetwork"]
 
 HEADS = ("actor", "critic_1", "critic_2")  # everything else is shared
 
@@ -54,7 +54,35 @@ class _Keys(nn.Module):
         return jnp.einsum("...w,...mw->...m", query @ self.kernel.T, poses)
 
 
-class PaperNetwork(Network):
+class Observing(Network):
+    """A network whose decisions are functions of the paper's observation alone."""
+
+    def candidate_features(
+        self, candidates: jax.Array, usable: jax.Array
+    ) -> PaperFeatures:
+        return PaperFeatures(candidates)
+
+    def decision_features(
+        self,
+        features: PaperFeatures,
+        chosen: jax.Array,
+        available: jax.Array,
+        count: jax.typing.ArrayLike,
+    ) -> Decision:
+        return Decision(context_features(features.poses, chosen), available)
+
+    def from_observation(
+        self, observation: jax.Array, num_candidates: int, num_inputs: int
+    ) -> tuple[jax.Array, jax.Array]:
+        """Logits and value from the (..., 210) numbers of ``selection.observe``."""
+        m, n = num_candidates, num_inputs
+        poses = observation[..., : n * m].reshape(*observation.shape[:-1], m, n)
+        available = observation[..., n * m : (n + 1) * m] > 0.5
+        decision = Decision(observation[..., (n + 1) * m :], available)
+        return self.decode(self.encode(PaperFeatures(poses)), decision)
+
+
+class PaperNetwork(Observing):
     """The paper's attention policy: hidden 768, 3.5 M parameters, 71 % shared.
 
     Candidates are encoded one by one, a context encoder reads the ten numbers of the
@@ -78,20 +106,6 @@ class PaperNetwork(Network):
         self.critic_1 = nn.Dense(max(width * 2 // 3, 1))
         self.critic_2 = nn.Dense(1, kernel_init=nn.initializers.orthogonal(0.1))
 
-    def candidate_features(
-        self, candidates: jax.Array, usable: jax.Array
-    ) -> PaperFeatures:
-        return PaperFeatures(candidates)
-
-    def decision_features(
-        self,
-        features: PaperFeatures,
-        chosen: jax.Array,
-        available: jax.Array,
-        count: jax.typing.ArrayLike,
-    ) -> Decision:
-        return Decision(context_features(features.poses, chosen), available)
-
     def encode(self, features: PaperFeatures) -> jax.Array:
         """The candidates (..., M, width), encoded one by one."""
         poses = nn.relu(self.pose_1(2.0 * features.poses - 1.0))
@@ -111,13 +125,3 @@ class PaperNetwork(Network):
         logits = self.key.scores(self.actor(shared), memory) * scale
         value = self.critic_2(nn.relu(self.critic_1(shared)))[..., 0]
         return mask_logits(logits, decision.available), value
-
-    def from_observation(
-        self, observation: jax.Array, num_candidates: int, num_inputs: int
-    ) -> tuple[jax.Array, jax.Array]:
-        """Logits and value from the (..., 210) numbers of ``selection.observe``."""
-        m, n = num_candidates, num_inputs
-        poses = observation[..., : n * m].reshape(*observation.shape[:-1], m, n)
-        available = observation[..., n * m : (n + 1) * m] > 0.5
-        decision = Decision(observation[..., (n + 1) * m :], available)
-        return self.decode(self.encode(PaperFeatures(poses)), decision)

@@ -1,17 +1,22 @@
-"""The preset ``paper``: the network and the schedule of the paper's Table 2.
+"""The paper's observation, learned in two ways.
+
+``paper``: the network and the schedule of the paper's Table 2.
 
 An update every 16 episodes, 10 epochs, 200,000 episodes, and no more: the paper gives
 no learning rate, clip range or entropy bonus. Adam at 1e-4, 0.2 and 0.01 without
 schedule are the usual ones for a network of this size.
+
+``observation``: a network of products that sees the same 210 numbers, by PPO alone.
 """
 
 from __future__ import annotations
 
 from jaxcal.learning.config import EpisodesConfig
+from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training.config import TrainConfig
 
-__all__ = ["PAPER"]
+__all__ = ["OBSERVATION", "PAPER"]
 
 PAPER = TrainConfig(
     preset="paper",
@@ -33,4 +38,25 @@ PAPER = TrainConfig(
         advantage_limit=1e9,
         average_decay=0.99,
     ),
+)
+
+# Updates take turns: the last decision, the one before, ... Each is learned from many
+# episodes that stand in the same state, the choices after it being the likeliest.
+OBSERVATION = TrainConfig(
+    preset="observation",
+    about="the paper's 210 numbers, a network of products, PPO alone from nothing",
+    network=NetworkConfig(kind="observation", decoder_rounds=2),
+    ppo=EpisodesConfig(
+        num_episodes=10_000_000,
+        episodes_per_update=1024,
+        episodes_per_set=16,
+        explore_once=True,
+        num_minibatches=1,
+        warmup_updates=40,
+        entropy_start=0.3,
+        value_coefficient=0.0,
+        advantage_limit=5.0,
+        average_decay=0.995,
+    ),
+    tasks=tuple(Task(num_given=given) for given in (3, 2, 1, 0)),
 )

@@ -435,6 +435,7 @@ def test_the_averaged_weights_owe_nothing_to_the_initial_ones(rng):
         ({"learning_rate": 0.0}, "learning_rate"),
         ({"gae_lambda": 1.5}, "gae_lambda"),
         ({"average_decay": 1.0}, "average_decay"),
+        ({"explore_once": True, "episodes_per_set": 1}, "episodes_per_set must be at"),
     ],
 )
 def test_a_bad_configuration_is_named(values, named):

@@ -457,11 +457,9 @@ def test_a_field_in_which_the_tasks_differ_is_not_changed_in_one_of_them():
 
 
 def test_an_unknown_network_or_preset_is_named():
-    with pytest.raises(ValueError, match="preset must be one of compact, general, pap"):
+    with pytest.raises(ValueError, match="preset must be one of compact, general, obs"):
         presets.load("large")
-    with pytest.raises(
-        ValueError, match=r"kind must be one of compact, paper, .*'big'"
-    ):
+    with pytest.raises(ValueError, match=r"kind must be one of compact, .*, got 'big'"):
         NetworkConfig(kind="big")
 
 
@@ -529,7 +527,7 @@ BRAX = ["--trainer", "brax"]
         (["--seed", "one"], "--seed: must be a whole number, got 'one'"),
         (["--resume"], "does not exist"),
         (["--out", "/proc/nowhere/run"], "cannot write in /proc"),
-        (["--kind", "big"], "kind must be one of compact, paper, got 'big'"),
+        (["--kind", "big"], "must be one of compact, observation, paper, got 'big'"),
         ([*BRAX, "--num-epochs", "3"], "does not read --num-epochs: leave it out"),
         ([*BRAX, "--devices", "2", "--kind=paper"], "not read --devices, --kind"),
         ([*BRAX, "--preset", "general"], "trains on one task, preset general has 12"),

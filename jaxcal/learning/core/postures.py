@@ -2,13 +2,16 @@
 
 A row is a fresh candidate set and G episodes on it. They share its features, its
 encoding and the first decision, whose baseline is the mean return of the others. Of the
-K choices the network learns the first T; its look-ahead makes the rest.
+K choices the network learns the first T; its look-ahead makes the rest. With
+``explore_once`` a row's episodes have ``num_given`` choices in common, each draws and
+learns the next one and goes on greedily: T = 1.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -42,6 +45,10 @@ class Episode(Protocol):
         """K, choices of an episode."""
 
     @property
+    def num_given(self) -> int:
+        """Choices that episodes on a set have in common, with ``explore_once``."""
+
+    @property
     def value_scale(self) -> float:
         """Reward per unit of the network's value."""
 
@@ -66,6 +73,8 @@ class RowInputs:
     decisions: Any  # leaves (1 + (T - 1) G, ...): of the first decision, which the
     # episodes share, then of the others, decision by decision
 
+
+_RANDOM = 0.3  # share of the given choices that are random, not drawn from the policy
 
 # Bytes of the (M, M) arrays of a look-ahead that are held at a time while it plays.
 _ROOM = {"cpu": 2**29, "gpu": 2**33, "tpu": 2**33}
@@ -135,6 +144,8 @@ class Postures:
         m = jax.eval_shape(self.task.reset, keys[0, 0]).available.shape[0]
         held = _at_once(self.config.episodes_per_set, m)  # episodes of a row at a time
         rows = _at_once(len(keys), m, held)
+        if self.config.explore_once and jax.default_backend() == "cpu":
+            rows = math.gcd(rows, self.config.slice_rows)  # in a core's cache
         play = functools.partial(self._play, params, held)
         batch, value, reward, log_det = _mapped(play, rows, keys[:, :2])
         metrics = {
@@ -182,7 +193,10 @@ class Postures:
         ``keys`` (2,) are of the set and of the actions.
         """
         task, network = self.task, self.network
-        learned = task.num_decisions - network.num_unlearned
+        once = self.config.explore_once
+        given = task.num_given if once else 0
+        decided = task.num_decisions - network.num_unlearned  # by the network
+        learned = 1 if once else decided
         start = task.reset(keys[0])
         features = network.candidate_features(start.candidates, start.available)
         memory = encode(network, params, features)
@@ -215,24 +229,34 @@ class Postures:
         def decide(state: Any, now: Any) -> tuple[Any, tuple[Any, ...]]:
             count, noise = now
             learns = (
-                count < learned if 1 < learned < task.num_decisions else learned > 1
+                count < decided if 1 < decided < task.num_decisions else decided > 1
             )
             score_at = functools.partial(score, count=count, learns=learns)
             decision, logits, value = _mapped(score_at, at_once, state)
             state, record = jax.vmap(act)(state, logits, value, noise)
             return state, (decision, record)
 
-        shape = task.num_decisions, self.config.episodes_per_set, len(start.available)
+        for i in range(given):
+            key_random, key_noise = jax.random.split(jax.random.fold_in(keys[0], i))
+            _, logits, _ = score(start, i, True)
+            random = jax.random.bernoulli(key_random, _RANDOM)
+            logits = jnp.where(random & start.available, 0.0, logits)
+            noise = jax.random.gumbel(key_noise, logits.shape)
+            start = task.step(start, jnp.argmax(logits + noise))[0]
+        number = task.num_decisions - given
+        shape = number, self.config.episodes_per_set, len(start.available)
         noise = jax.random.gumbel(keys[1], shape)  # at once: compiled once
+        if once:
+            noise = noise.at[1:].set(0.0)
         # The first decision is the same for every episode.
-        first, logits, value = score(start, 0, learned > 0)
+        first, logits, value = score(start, given, decided > given)
         begin = jax.vmap(act, in_axes=(None, None, None, 0))
         state, record = begin(start, logits, value, noise[0])
         played = jax.tree.map(lambda leaf: leaf[None], record)
         decisions = jax.tree.map(lambda leaf: leaf[None], first)
         if len(noise) > 1:
             # One program for all; the last choices, by the look-ahead, teach nothing.
-            now = jnp.arange(1, len(noise)), noise[1:]
+            now = jnp.arange(given + 1, task.num_decisions), noise[1:]
             state, (seen, record) = jax.lax.scan(decide, state, now)
             seen = jax.tree.map(lambda leaf: leaf[: max(learned - 1, 0)], seen)
             decisions = jax.tree.map(_followed, decisions, seen)

@@ -20,7 +20,7 @@ from jaxcal.learning.environments.selection import (
     SelectionConfig,
     SelectionState,
 )
-from jaxcal.learning.settings import named, path_of
+from jaxcal.learning.settings import named, path_of, require
 
 __all__ = ["GivenCandidates", "Task"]
 
@@ -72,8 +72,17 @@ class Task:
     environment: SelectionConfig = field(default_factory=SelectionConfig)
     shapes: tuple[str, ...] = ("uniform",)  # see scenarios.SHAPES
     masked: float = 0.0  # greatest share of candidates masked
+    num_given: int = 0  # choices before the one that is learned, with explore_once
     random_starts: float = 0.0  # share of imitated episodes begun with random choices
     given: GivenCandidates | None = None  # instead of shapes and masked
+
+    def __post_init__(self) -> None:
+        require(
+            self,
+            f"in [0, {self.num_decisions})",
+            lambda v: 0 <= v < self.num_decisions,
+            "num_given",
+        )
 
     @property
     def draw(self) -> CandidateSource:

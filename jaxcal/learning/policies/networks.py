@@ -26,7 +26,9 @@ GROUP = "jaxcal.networks"
 class NetworkConfig:
     """Which network, and its size."""
 
-    kind: str = setting("compact", "compact, paper, MODULE:NAME or FILE.py:NAME")
+    kind: str = setting(
+        "compact", "compact, paper, observation, MODULE:NAME or FILE.py:NAME"
+    )
     width: int = setting(32, "features of a candidate; hidden width of paper")
     encoder_rounds: int = setting(3, "message rounds over the whole set, for each set")
     decoder_rounds: int = setting(

@@ -1,0 +1,107 @@
+"""The network of products: what it sees, and how its preset plays."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxcal.learning.core.network import decode, encode, initial
+from jaxcal.learning.core.postures import Postures
+from jaxcal.learning.environments import selection
+from jaxcal.learning.environments.task import Task
+from jaxcal.learning.policies.build import build
+from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.paper.preset import OBSERVATION
+
+TASK = Task()
+NETWORK = build(OBSERVATION.network)
+
+
+@pytest.fixture(scope="module")
+def params():
+    return initial(NETWORK, jax.random.key(0), 50, 3, 4)
+
+
+def _state(seed: int, *chosen: int):
+    state = TASK.reset(jax.random.key(seed))
+    for action in chosen:
+        state = TASK.step(state, jnp.asarray(action))[0]
+    return state
+
+
+def _logits(params, state):
+    features = NETWORK.candidate_features(state.candidates, state.available)
+    decision = NETWORK.decision_features(features, state.chosen, state.available, 0)
+    return decode(NETWORK, params, encode(NETWORK, params, features), decision)[0]
+
+
+@pytest.mark.parametrize("chosen", [(), (7,), (7, 3), (7, 3, 40)])
+def test_the_210_numbers_are_all_that_it_sees(params, chosen) -> None:
+    state = _state(len(chosen), *chosen)
+    observation = selection.observe(state, TASK.environment)
+    assert observation.shape == (210,)
+    logits, value = NETWORK.apply(
+        {"params": params}, observation, 50, 3, method="from_observation"
+    )
+    assert logits.shape == (50,)
+    assert value.shape == ()
+    np.testing.assert_allclose(logits, _logits(params, state), rtol=1e-5, atol=1e-5)
+    assert (np.asarray(logits)[list(chosen)] < -1e8).all()
+    # Of the ten numbers of the context, which follow from the others, it uses none.
+    other = NETWORK.apply(
+        {"params": params}, observation.at[200:].set(9.0), 50, 3,
+        method="from_observation",
+    )  # fmt: skip
+    np.testing.assert_array_equal(other[0], logits)
+
+
+@pytest.mark.parametrize("chosen", [(), (7,), (7, 12, 40)])
+def test_the_order_of_the_candidates_does_not_matter(params, chosen) -> None:
+    """But for that in which the chosen ones are read, which stays."""
+    state = _state(5, *chosen)
+    order = np.random.default_rng(0).permutation(50)
+    kept = [i for i in order if i in chosen]
+    order[np.isin(order, chosen)] = sorted(kept)
+    moved = state.replace(
+        candidates=state.candidates[order], available=state.available[order]
+    )
+    np.testing.assert_allclose(
+        _logits(params, moved), _logits(params, state)[order], rtol=1e-4, atol=1e-4
+    )
+
+
+def test_another_number_of_inputs_and_candidates_runs() -> None:
+    network = build(NetworkConfig(kind="observation", decoder_rounds=1, width=8))
+    weights = initial(network, jax.random.key(0), 12, 2, 3)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(weights))
+
+
+@pytest.mark.parametrize("given", [0, 2])
+def test_episodes_of_a_row_part_in_one_state_and_go_on_greedily(given) -> None:
+    small = NetworkConfig(kind="observation", decoder_rounds=0, width=8)
+    ppo = dataclasses.replace(OBSERVATION.ppo, episodes_per_update=8 * 16)
+    learner = Postures(ppo, Task(num_given=given), build(small))
+    weights = learner.init(jax.random.key(0))
+    keys = jax.random.split(jax.random.key(1), ppo.rows_per_update)
+    rows, _, metrics = jax.jit(learner.gather)(weights, learner.begin(keys))
+    assert rows.action.shape == (8, 1, 16)
+    free = np.asarray(rows.seen.decisions.available)
+    assert free.shape == (8, 1, 50)
+    assert (free.sum(-1) == 50 - given).all()
+    actions = np.asarray(rows.action[:, 0])
+    rewards = np.asarray(metrics["rewards"]).reshape(8, 16)
+    for row in range(8):
+        assert free[row, 0, actions[row]].all()
+        for action in np.unique(actions[row]):
+            assert len(np.unique(rewards[row][actions[row] == action])) == 1
+    assert float(np.std(rewards, axis=1).min()) > 0.0
+    np.testing.assert_allclose(np.asarray(rows.advantage).mean(), 0.0, atol=0.05)
+
+
+def test_a_number_of_given_choices_that_leaves_none_is_named() -> None:
+    with pytest.raises(ValueError, match=r"num_given must be in \[0, 4\), got 4"):
+        Task(num_given=4)
