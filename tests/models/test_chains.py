@@ -523,7 +523,7 @@ def test_a_distance_from_one_hand_to_the_other_is_judged_by_both(apart, tmp_path
         told = re.search(r"0 and 2 are given as 0.23 .* say (\S+) \+- (\S+):", said[0])
         free, std = map(float, told.groups())
         assert abs(free - 0.24) < 3.0 * std < 0.003
-        assert "clear up" in verdict.next_step
+        assert "fix the problems listed" in verdict.next_step
 
 
 def rng_postures(seed):

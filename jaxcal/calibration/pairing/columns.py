@@ -53,8 +53,9 @@ def changed_columns(
     tables, every = [], np.flatnonzero(table.counted)
     for hypothesis in _kinds_of_columns(table, inputs, outputs):
         anew = _anew(table, hypothesis, every)
-        if anew is not None:
-            tables.append((_distance(anew, hypothesis, every), anew, hypothesis))
+        with contextlib.suppress(ValueError):  # the number of a chain has no sign
+            if anew is not None:
+                tables.append((_distance(anew, hypothesis, every), anew, hypothesis))
     tables.sort(key=lambda row: row[0])
     return [
         fit
