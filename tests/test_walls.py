@@ -1,16 +1,9 @@
 """Walls hold at run time: what a command or a call loads, seen in a new process."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
+from loaded import modules_of, required_apart
 
-LOADED = r"""
-import sys
-{body}
-print("\n\x1e" + "\n".join(sorted(sys.modules)))
-"""
 _COMMAND = """
 from jaxcal.commands import main
 assert main({words!r}) == 0
@@ -26,18 +19,6 @@ FAR = (
     "rig_workbench",
 )
 FOREIGN = ("jax", "flax", "matplotlib", "jinja2", "pydantic", "pandas", "joblib")
-
-
-def modules_of(body: str, folder) -> set[str]:
-    """Names of the modules that a program has loaded at its end."""
-    done = subprocess.run(
-        [sys.executable, "-c", LOADED.format(body=body)],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return set(done.stdout.rpartition("\n\x1e")[2].split())
 
 
 @pytest.fixture
@@ -58,15 +39,6 @@ def tables(tmp_path):
         tmp_path / "targets.csv", targets, header=header.replace("u_", "y_"), **save
     )
     return tmp_path
-
-
-def required_apart(names: set[str], forbidden) -> list[str]:
-    return sorted(
-        name
-        for name in names
-        for room in forbidden
-        if name == room or name.startswith(f"{room}.")
-    )
 
 
 @pytest.mark.parametrize(
@@ -146,36 +118,3 @@ def test_models_have_the_names_of_arms(tmp_path):
         assert getattr(jaxcal.models, name) is getattr(jaxcal.arms, name)
     with pytest.raises(AttributeError, match="no attribute 'NoModel'"):
         _ = jaxcal.models.NoModel
-
-
-_RIG = """
-from rig.__main__ import main
-assert main({words!r}) == 0
-"""
-
-
-def test_a_session_and_a_stop_load_nothing_of_the_workbench(tmp_path):
-    """Nor does calibrating load what draws a report: another process writes it."""
-    from commission import device, quick_text
-    from harness import prove_stops
-
-    from rig.config import load_config
-    from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
-
-    path = tmp_path / "rig.toml"
-    with device() as (_, bus, port):
-        path.write_text(quick_text(bus, port))
-        config = load_config(path)
-        record = DeviceRecord.load(config.device_path)
-        for state in (IDENTIFIED, HOMED, SIGN_CHECKED):
-            record.reach(state, config)
-        prove_stops(record, config)
-        words = ["calibrate", "--config", str(path), "--arm", "--zero"]
-        session = modules_of(_RIG.format(words=words), tmp_path)
-        stop = modules_of(_RIG.format(words=["stop", "--config", str(path)]), tmp_path)
-    assert list(tmp_path.glob("**/report.html"))
-    far = ("rig_workbench", "jaxcal.arms", "jaxcal.adaptive", "jaxcal.reports")
-    heavy = ("jax", "flax", "matplotlib", "jinja2", "pymodbus", "nicegui", "pandas")
-    assert required_apart(session, (*far, *heavy)) == []
-    assert "rig.procedures.calibrate" in session
-    assert required_apart(stop, (*far, *heavy, "jaxcal.models", "scipy")) == []
