@@ -27,7 +27,7 @@ def offered(group: str) -> dict[str, EntryPoint]:
     """
     if not (points := installed(group)):
         raise MissingExtraError(
-            f"jaxcal is not installed, or of an earlier version: {install('rig')}"
+            f"the installed jaxcal is missing or too old: {install('rig')}"
         )
     return points
 

@@ -193,7 +193,7 @@ def _targets(path: pathlib.Path, given: bool) -> list[ArmedBus]:
             lack = f"{path} names no bus"
     except FileNotFoundError:
         lack = f"there is no {path}" + " here" * (not given)
-    except Exception as error:  # of the system, or of a file that nobody thought of
+    except Exception as error:  # whatever is wrong, drives are stopped
         lack = f"{path} cannot be read: {getattr(error, 'strerror', None) or error}"
     if not lack:
         return targets

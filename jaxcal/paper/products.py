@@ -37,6 +37,10 @@ class ProductNetwork(Observing):
 
     config: NetworkConfig
 
+    @property
+    def mask_is_chosen(self) -> bool:
+        return True
+
     def encode(self, features: PaperFeatures) -> jax.Array:
         """(..., M, n + 1) centred and scaled commands, and 1."""
         x = (features.poses - 0.5) * _SCALE

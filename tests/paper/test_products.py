@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import pathlib
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxcal
 from jaxcal.learning.core.network import decode, encode, initial
 from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments import selection
@@ -19,6 +21,8 @@ from jaxcal.paper.preset import OBSERVATION
 
 TASK = Task()
 NETWORK = build(OBSERVATION.network)
+
+SHIPPED = pathlib.Path(__file__).parents[2] / "checkpoints" / "paper.npz"
 
 
 @pytest.fixture(scope="module")
@@ -105,3 +109,13 @@ def test_episodes_of_a_row_part_in_one_state_and_go_on_greedily(given) -> None:
 def test_a_number_of_given_choices_that_leaves_none_is_named() -> None:
     with pytest.raises(ValueError, match=r"num_given must be in \[0, 4\), got 4"):
         Task(num_given=4)
+
+
+def test_a_mask_and_another_number_of_inputs_are_refused_by_name(rng):
+    options = {"checkpoint": SHIPPED}
+    candidates, available = rng.random((50, 3)), np.arange(50) >= 20
+    with pytest.raises(ValueError, match=r"must be available, got 20 that are not"):
+        jaxcal.select(candidates, 4, "policy", available=available, **options)
+    with pytest.raises(ValueError, match=r"chooses for 3 inputs, got 2$"):
+        jaxcal.select(candidates[:, :2], 3, "policy", **options)
+    assert jaxcal.select(candidates, 4, "policy", **options).efficiency > 0.5

@@ -250,7 +250,7 @@ def test_a_missing_package_is_one_line_with_the_command_that_installs_it(
             error = capsys.readouterr().err
             assert missing in error and error.count("\n") == 1
             assert "-m pip install" in error and error.endswith(f"[{extra}]'\n")
-            assert main(["stop", "--config", str(path)]) == 3  # nobody is there
+            assert main(["stop", "--config", str(path)]) == 3  # no drive answers
             capsys.readouterr()
 
 

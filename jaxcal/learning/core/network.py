@@ -35,6 +35,11 @@ class Network(nn.Module):
         """Choices at the end of an episode that need no parameters."""
         return 0
 
+    @property
+    def mask_is_chosen(self) -> bool:
+        """Whether it takes a candidate that is not available for a chosen one."""
+        return False
+
     def candidate_features(self, candidates: jax.Array, usable: jax.Array) -> Any:
         """Features of sets (..., M, n); (..., M) bool usable: available or chosen."""
         raise NotImplementedError(_OWN)  # abstract

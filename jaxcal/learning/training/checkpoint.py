@@ -142,11 +142,11 @@ def _is_key(leaf: Any) -> bool:
 
 
 class _TolerantLoop(asyncio.SelectorEventLoop):
-    """An event loop that ignores results which arrive after it is closed, and prints
-    no error that nobody waits for: the one that is raised says it."""
+    """An event loop that ignores results that arrive after it is closed, and does not
+    print the errors of tasks: ``save`` and ``_read`` raise the first of them."""
 
     def call_exception_handler(self, context: Any) -> None:
-        """Nothing."""
+        """Print nothing."""
 
     def call_soon_threadsafe(  # type: ignore[override]  # generic in its arguments
         self, *arguments: Any, **options: Any

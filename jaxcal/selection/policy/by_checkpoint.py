@@ -81,13 +81,35 @@ class _ThroughJax:
     def __init__(self, path: pathlib.Path) -> None:
         from jaxcal.learning.training import checkpoint
 
-        self._policy = checkpoint.load(path)
+        self._path, self._policy = path, checkpoint.load(path)
+
+    def _require_read(self, problems: Sequence[Problem]) -> None:
+        """Refuse sets that the network would read as something else.
+
+        Raises:
+            ValueError: of another number of inputs, or with candidates masked where the
+                network takes what is not available for chosen.
+        """
+        trained = self._policy.meta["tasks"][0]["environment"]["num_inputs"]
+        inputs = problems[0].num_regressors - 1
+        if inputs != trained:
+            raise ValueError(
+                f"checkpoint {self._path} chooses for {trained} inputs, got {inputs}"
+            )
+        masked = max(int((~problem.available).sum()) for problem in problems)
+        if masked and self._policy.network.mask_is_chosen:
+            raise ValueError(
+                f"checkpoint {self._path} takes what is not available for chosen: "
+                f"every candidate must be available, got {masked} that are not; leave "
+                "them out"
+            )
 
     def __call__(
         self, problems: Sequence[Problem], decoding: str, num: int, seed: int
     ) -> Indices:
         from jaxcal.learning.policies import scorer
 
+        self._require_read(problems)
         m, tries = len(problems[0].available), 1 if decoding == "greedy" else num
         # A power of two, filled up by repeating the last set: few shapes to compile.
         most = max(1, min(_LARGEST_CALL, _CELLS // (m * m * tries)))
