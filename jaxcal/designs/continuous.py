@@ -67,6 +67,7 @@ _PAIRED, _GAIN = 6, 1e-7  # inputs up to which differences are tried; of log eff
 _STEP = 1e-5  # share of the limits, of differences where a model has no derivative
 _ROUGH = 1e-3  # the same where derivatives are differences already
 _SHARP = (10.0, 50.0, 250.0)  # of the least eigenvalue, by one over it
+_SHARP_BOUND = (30.0, 300.0, 3000.0)  # of the largest d, by one over it
 _CORNERS = 14  # inputs up to which all corners are looked at
 _DRAWS = 200  # batches of points, until enough are allowed
 _TOLD = 1e-4  # efficiency that another round of the bound must gain
@@ -877,17 +878,25 @@ class _Ascent:
         support, blocks = commands, self.blocks(commands)
         weights = np.ones(len(commands)) / len(commands)
         best, error = np.inf, 0.0
+        lowered = self.smooth and not self.worst  # E: its metric is found by itself
+        metric = self.gradient(self.information(blocks))
         for _ in range(_ROUNDS):
-            begun, weights = weights, self._weights(blocks, weights)
-            roots = np.sqrt(self.k * weights)[:, None, None, None]
-            information = self.information(roots * blocks)
-            at = float(self.phi(information))
-            if not np.isfinite(at):
-                break
-            if self.smooth:
-                _, metric, at = self.soft(information, _SHARP[-1] / self.unit(at))
+            begun = weights
+            if lowered:
+                metric, information = self._lowered(metric, blocks), self.prior
+                at = float((metric * self.prior).sum())
             else:
-                metric = self.gradient(information)
+                weights = self._weights(blocks, weights)
+                roots = np.sqrt(self.k * weights)[:, None, None, None]
+                information = self.information(roots * blocks)
+                at = float(self.phi(information))
+                if not np.isfinite(at):
+                    break
+                if self.worst:
+                    sharp = _SHARP[-1] / self.unit(at)
+                    _, metric, at = self.soft(information, sharp)
+                else:
+                    metric = self.gradient(information)
             off = float((metric * (self.prior - information)).sum())
             if certain:
                 peaks, differ = self._corners(), 0.0
@@ -912,9 +921,49 @@ class _Ascent:
                 blocks = np.concatenate([blocks, self.blocks(new)])
                 fill = np.full(len(new), 0.02 / len(new))
                 weights = np.concatenate([0.98 * weights, fill])
-            elif np.abs(weights - begun).max() < _SETTLED:
+            elif lowered or np.abs(weights - begun).max() < _SETTLED:
                 break  # the weights have converged
         return max(best, phi), error, certain
+
+    def _lowered(self, metric: Array, blocks: Array) -> Array:
+        """(S, p, p) of which E's bound at blocks (N, S, q, p) and the spread is low.
+
+        Any W of trace 1 in E's coordinates bounds k commands by ``trace(W P)`` and k
+        times the largest ``trace(W B.T B)``: convex, and lowered here by the square
+        root of each scenario's W, the largest smoothed.
+        """
+        grams = self.squares(np.concatenate([blocks, self._spread_blocks]))
+        roots = np.stack([member.criterion.root for member in self.members])
+        halves = np.linalg.inv(roots)
+        sizes = (self.scale * self.weights)[:, None, None]
+        values, vectors = np.linalg.eigh(
+            roots @ metric @ np.matrix_transpose(roots) / sizes
+        )
+        begun = vectors * np.sqrt(np.maximum(values, 1e-6))[:, None, :]
+        unit = self.k * float(self.leverage(blocks, metric).max())
+
+        def of(x: Array) -> tuple[Array, Array, Array]:
+            v = x.reshape(begun.shape)
+            v = v / np.sqrt((v * v).sum(axis=(1, 2), keepdims=True))
+            along = halves @ v
+            return v, along, sizes * along @ np.matrix_transpose(along)
+
+        def down(x: Array, sharp: float) -> tuple[float, Array]:
+            v, along, w = of(x)
+            d = np.tensordot(grams, w, 3) * self.k / unit
+            e = np.exp(sharp * (d - d.max()))
+            mean = np.tensordot(e / e.sum(), grams, 1)
+            slope = (self.prior + self.k * mean) / unit
+            value = d.max() + np.log(e.sum()) / sharp + (w * self.prior).sum() / unit
+            slope = 2.0 * sizes * np.matrix_transpose(halves) @ slope @ along
+            slope -= (slope * v).sum(axis=(1, 2), keepdims=True) * v
+            return float(value), slope.ravel()
+
+        x = begun.ravel()
+        for sharp in _SHARP_BOUND:
+            smoothed = functools.partial(down, sharp=sharp)
+            x = of(_descended(smoothed, x, -np.inf, np.inf, 300))[0].ravel()
+        return of(x)[2]
 
     def _corners(self) -> Array:
         """(2^n, n) of the limits."""
