@@ -1,6 +1,7 @@
 """What a session visits, and in which order; nothing moves."""
 
 import itertools
+import warnings
 
 import numpy as np
 import pytest
@@ -132,6 +133,20 @@ def test_travel_order_takes_the_least_time(rng):
         many = travel_order(config, rng.uniform(-20, 20, (count, 3)), np.zeros(3))
         assert sorted(many) == list(range(count))
     assert travel_order(config, np.empty((0, 3)), np.zeros(3)) == []
+
+
+def test_targets_that_are_drawn_and_not_visited_are_not_warned_of(rng):
+    """By far most are out of what the machine reaches: eighteen lines of one session."""
+    config = parse_config(example_text("simulate"))
+    u = rng.uniform(-20, 20, (6, 3))
+    calibration = jaxcal.identify(u, 0.3 * u + [3.1, -5.8, 2.4])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        held = draw_held_out(config, calibration, 4)
+    assert len(held) == 4
+    for target, command in held:
+        reached = 0.3 * config.to_deg(command) + [3.1, -5.8, 2.4]
+        np.testing.assert_allclose(reached, config.to_deg(target), atol=0.01)
 
 
 def test_of_more_numbers_than_axes_targets_are_what_the_calibration_says(rng):
