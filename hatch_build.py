@@ -1,13 +1,15 @@
 """Compile the kernels when the package is built; as a script, in this checkout.
 
 A kernel is a file ``*kernel.py`` in Cython's pure Python mode. It is compiled with the
-machine's C compiler or, where there is none, with that of the package ziglang, which
-the build then asks for. On x86-64 each module holds its code twice, for every processor
-and for those with AVX2 and FMA, and takes the one that fits when it is loaded.
+compiler in CC, the machine's or, where there is none and on Windows, with that of the
+package ziglang, which the build then asks for; CFLAGS are added. On x86-64 each module
+holds its code twice, for every processor and for those with AVX2 and FMA, and takes the
+one that fits when it is loaded.
 """
 
 from __future__ import annotations
 
+import itertools
 import os
 import pathlib
 import platform
@@ -31,7 +33,11 @@ DIRECTIVES = {
     "cdivision": True,
     "initializedcheck": False,
 }
-FLAGS = ["-fPIC", "-fno-math-errno", "-fno-trapping-math", "-w"]
+# What is built for: of cibuildwheel and crossenv not the machine that builds.
+PLATFORM = sysconfig.get_platform()
+WINDOWS, MACOS = PLATFORM.startswith("win"), PLATFORM.startswith("macosx")
+FLAGS = ["-fno-math-errno", "-fno-trapping-math", "-w"]
+FLAGS += [] if WINDOWS else ["-fPIC"]  # clang refuses it there
 # Rounds as written, the same on every processor.
 EXACT = ["-ffp-contract=off"]
 # In a kernel with this line a product and a sum may be one operation, rounded once. The
@@ -39,7 +45,23 @@ EXACT = ["-ffp-contract=off"]
 FUSES = "# Products may be fused."
 FUSED = ["-ffp-contract=fast"]
 
-X86 = platform.machine().lower() in ("x86_64", "amd64") and sys.maxsize > 2**32
+
+def machine() -> str:
+    """The processor that is built for, as compilers call it."""
+    flags = shlex.split(os.environ.get("ARCHFLAGS", ""))  # macOS
+    given = {after for flag, after in itertools.pairwise(flags) if flag == "-arch"}
+    if len(given) > 1:
+        raise SystemExit(
+            f"ARCHFLAGS must name one processor, got {' '.join(sorted(given))}: "
+            "build a wheel for each"
+        )
+    name = given.pop() if given else PLATFORM.rpartition("-")[2]
+    if name not in ("x86_64", "amd64", "arm64", "aarch64"):  # universal2, win32
+        name = platform.machine().lower()
+    return {"amd64": "x86_64", "arm64": "aarch64"}.get(name, name)
+
+
+X86 = machine() == "x86_64" and sys.maxsize > 2**32
 # x86-64-v3 of the psABI: AVX2, FMA, BMI, LZCNT.
 CHOICE = """\
 #include <Python.h>
@@ -67,6 +89,8 @@ PyMODINIT_FUNC PyInit_NAME(void) {
 def compiler() -> list[str] | None:
     """The command of the machine's C compiler; None where there is none."""
     given = shlex.split(os.environ.get("CC", ""))
+    if WINDOWS:
+        return given or None
     found = [[name] for name in ("cc", "gcc", "clang") if shutil.which(name)]
     return given or next(iter(found), None)
 
@@ -74,10 +98,25 @@ def compiler() -> list[str] | None:
 def _zig() -> list[str]:
     """The compiler of the package ziglang, for any processor of this kind."""
     command = [sys.executable, "-m", "ziglang", "cc"]
-    if sys.platform == "linux":
+    if WINDOWS:
+        command += ["-target", f"{machine()}-windows-gnu"]
+    elif MACOS:
+        command += ["-target", f"{machine()}-macos"]
+    elif sys.platform == "linux":
         libc = "gnu.2.28" if platform.libc_ver()[0] == "glibc" else "musl"
-        command += ["-target", f"{platform.machine()}-linux-{libc}"]
+        command += ["-target", f"{machine()}-linux-{libc}"]
     return command
+
+
+def _link() -> list[str]:
+    """Flags of a module that Python loads."""
+    if WINDOWS:  # all symbols must be known
+        libraries = pathlib.Path(sys.base_prefix) / "libs"
+        version = sysconfig.get_config_var("py_version_nodot")
+        return ["-shared", "-s", "-L", str(libraries), f"-lpython{version}"]
+    if MACOS:
+        return ["-bundle", "-undefined", "dynamic_lookup"]
+    return ["-shared", "-s", "-lm"]
 
 
 def _run(command: list[object]) -> None:
@@ -114,10 +153,12 @@ class _Build:
                 "the headers of this Python (on Debian and Ubuntu python3-dev)"
             )
         self.cc = [*(found or _zig()), "-I", str(headers)]
-        if (
-            self.zig
-        ):  # Debian's Python.h includes from the folder above, as cc looks it up
+        if self.zig and not WINDOWS:
+            # Debian's Python.h includes from the folder above, as cc looks it up
             self.cc += ["-idirafter", str(headers.parent)]
+        if MACOS and not self.zig:
+            self.cc += ["-arch", {"aarch64": "arm64"}.get(machine(), machine())]
+        self.cc += shlex.split(os.environ.get("CFLAGS", ""))
         common = [ROOT / "hatch_build.py", *ROOT.glob("jaxcal/**/*.pxd")]
         self.changed = max(path.stat().st_mtime for path in common)
 
@@ -150,11 +191,9 @@ class _Build:
             _run([*cython, f"--shared={SHARED}", "-o", code, source])
             fused = FUSES in (ROOT / source).read_text()
             objects = self._objects(code, ["-O3", *(FUSED if fused else EXACT)])
-        link = ["-bundle", "-undefined", "dynamic_lookup"]
-        link = link if sys.platform == "darwin" else ["-shared", "-s"]
         # Written beside and moved: a process that runs keeps the module it loaded.
         beside = module.with_name(f"{module.name}.{os.getpid()}")
-        _run([*self.cc, *link, *objects, "-o", beside, "-lm"])
+        _run([*self.cc, *objects, "-o", beside, *_link()])
         beside.replace(module)
         return target
 

@@ -8,19 +8,25 @@ never a guess. The journals of closed loops and of the rig are such files.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import pathlib
+import sys
 import threading
 import time
 from collections.abc import Callable
 from typing import Any
 
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
 __all__ = ["DamagedError", "JsonLines", "Record", "flock", "read_records", "until"]
 
 Record = dict[str, Any]
 LOOK_S = 0.02  # between two tries
+EXCLUSIVE = 2  # flock's LOCK_EX
 
 
 class DamagedError(ValueError):
@@ -51,10 +57,10 @@ class JsonLines:
     ) -> None:
         self.path = pathlib.Path(path)
         self._lock = threading.Lock()
-        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
+        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_BINARY", 0)
         self._fd = os.open(self.path, flags, 0o644)
         try:
-            if not until(patience_s, lambda: flock(self._fd, fcntl.LOCK_EX)):
+            if not until(patience_s, lambda: flock(self._fd)):
                 raise ValueError(f"{path}: a running session is writing it")
             self.records, self._size = read_records(self.path, whole)
             check(self.records)
@@ -130,10 +136,22 @@ def until(seconds: float, holds: Callable[[], bool]) -> bool:
     return held
 
 
-def flock(fd: int, kind: int) -> bool:
-    """Take the flock of an open file, unless another holds it; whether it was taken."""
+def flock(fd: int, kind: int = EXCLUSIVE) -> bool:
+    """Take the lock of an open file, unless another holds it; whether it was taken.
+
+    On Windows, where a lock keeps others from reading, it is that of a byte far behind
+    the file's end, and always exclusive.
+    """
     try:
-        fcntl.flock(fd, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
+        if sys.platform == "win32":
+            at = os.lseek(fd, 0, os.SEEK_CUR)
+            os.lseek(fd, 1 << 30, os.SEEK_SET)
+            try:
+                msvcrt.locking(fd, msvcrt.LK_NBLCK, 1)
+            finally:
+                os.lseek(fd, at, os.SEEK_SET)
+        else:
+            fcntl.flock(fd, kind | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
         return False
     return True

@@ -16,6 +16,12 @@ NUMBER = re.compile(r"[-+.0-9]+(?:[eE][-+]?[0-9]+)?")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
+    if sys.platform == "win32":
+        print(
+            "jaxcal-rig needs Linux or macOS: its locks and signals are POSIX's",
+            file=sys.stderr,
+        )
+        return 2
     argv = _ordered(sys.argv[1:] if argv is None else argv)
     if argv[:1] == ["stop"] and not {"-h", "--help"} & {*argv}:
         from rig import stopping

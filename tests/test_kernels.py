@@ -193,3 +193,33 @@ for thread in threads:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    "platform, flags, expected",
+    [
+        ("win-amd64", "", "x86_64 True ['-m', 'ziglang', 'cc', '-target', "
+         "'x86_64-windows-gnu'] ['-lpython3']"),
+        ("win-arm64", "", "aarch64 False ['-m', 'ziglang', 'cc', '-target', "
+         "'aarch64-windows-gnu'] ['-lpython3']"),
+        ("macosx-11.0-arm64", "", "aarch64 False ['-undefined', 'dynamic_lookup']"),
+        ("macosx-11.0-arm64", "-arch x86_64", "x86_64 True ['-undefined', "
+         "'dynamic_lookup']"),
+        ("linux-aarch64", "", "aarch64 False ['-lm']"),
+    ],
+)  # fmt: skip
+def test_kernels_are_for_the_processor_that_the_wheel_is_for(platform, flags, expected):
+    """Not for the one that builds: cibuildwheel and crossenv set these."""
+    code = """if True:
+        import hatch_build as b
+        windows = b.WINDOWS and b.compiler() is None and "-fPIC" not in b.FLAGS
+        link = [flag[:9] for flag in b._link() if flag[:2] in ("-l", "-u")]
+        link = b._link()[1:] if b.MACOS else link
+        print(b.machine(), b.X86, *([b._zig()[1:]] if windows else []), link)
+    """
+    given = {"_PYTHON_HOST_PLATFORM": platform, "ARCHFLAGS": flags, "CC": ""}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | given, cwd=ROOT,
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.strip() == expected

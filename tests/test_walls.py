@@ -118,3 +118,20 @@ def test_models_have_the_names_of_arms(tmp_path):
         assert getattr(jaxcal.models, name) is getattr(jaxcal.arms, name)
     with pytest.raises(AttributeError, match="no attribute 'NoModel'"):
         _ = jaxcal.models.NoModel
+
+
+def test_a_table_and_an_arm_need_nothing_that_only_posix_has(tmp_path):
+    body = """
+import sys
+for name in ("fcntl", "grp", "pwd", "resource", "termios"):
+    sys.modules[name] = None  # as on Windows: ImportError
+from jaxcal.commands import main
+assert main(["example", "table", "--folder", "t"]) == 0
+assert main("select t/candidates.csv -k 6 --json".split()) == 0
+assert main("identify t/measured.csv --out c.json".split()) == 0
+assert main("command c.json t/targets.csv --limits=-20,20".split()) == 0
+assert main(["example", "arm", "--folder", "a"]) == 0
+given = "a/measured.csv --model a/arm.urdf --noise 0.0001 --out a.json"
+assert main(["identify", *given.split()]) == 0
+"""
+    modules_of(body, tmp_path)

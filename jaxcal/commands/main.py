@@ -35,6 +35,7 @@ _HERE = {  # command: one line of help, and the module with its flags and functi
     "predict": ("where a calibrated machine goes for given commands", "calibrations"),
     "command": ("what to command to reach given outputs", "calibrations"),
     "loop": ("measure in a closed loop that another program drives", "loops"),
+    "example": ("files to try the commands with", "example"),
     "doctor": ("versions and devices, for a bug report", "main"),
 }
 _WHOLE = {  # commands that parse their own arguments

@@ -136,7 +136,7 @@ def test_travel_order_takes_the_least_time(rng):
 
 
 def test_targets_that_are_drawn_and_not_visited_are_not_warned_of(rng):
-    """By far most are out of what the machine reaches: eighteen lines of one session."""
+    """Most are out of what the machine reaches: eighteen lines of one session."""
     config = parse_config(example_text("simulate"))
     u = rng.uniform(-20, 20, (6, 3))
     calibration = jaxcal.identify(u, 0.3 * u + [3.1, -5.8, 2.4])

@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
-import fcntl
 import functools
 import os
 import pathlib
@@ -26,6 +25,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxcal.files import atomic_write, write_text
+from jaxcal.jsonlines import flock
 from jaxcal.learning.config import PPOConfig, runs_of
 from jaxcal.learning.core import ppo
 from jaxcal.learning.core.ppo import Learner, TrainState
@@ -316,12 +316,10 @@ def _locked(root: pathlib.Path) -> Iterator[None]:
     """
     root.mkdir(parents=True, exist_ok=True)
     with (root / ".lock").open("a") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if not flock(file.fileno()):
             raise BlockingIOError(
                 f"{root} is being written by another training: name another folder"
-            ) from None
+            )
         yield
 
 
