@@ -81,6 +81,17 @@ def distances(calibration: jaxcal.Calibration, angles: Array, reached: Array) ->
     return np.linalg.norm(calibration.predict(angles) - reached, axis=1)
 
 
+def identified(
+    angles: Array, reached: Array, prior: jaxcal.Prior, loss: str = "student"
+) -> jaxcal.Calibration:
+    """A fit without its advice: most of these have too few readings, on purpose."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", jaxcal.CalibrationWarning)
+        return jaxcal.identify(
+            angles, reached, model=arm(), noise=NOISE, prior=prior, loss=loss
+        )
+
+
 def study(full: bool) -> dict[tuple[str, int], Array]:
     """(rule, K) to (runs, 3): mean and largest error of the rest, mean of the tests."""
     pools = POOLS if full else 2
@@ -98,13 +109,8 @@ def study(full: bool) -> dict[tuple[str, int], Array]:
             for _ in range(10 if rule == "random" else 1):
                 chosen = members[choose(rule, angles[members], k, rng)]
                 rest = np.setdiff1d(np.arange(len(angles)), chosen)
-                fit = jaxcal.identify(
-                    angles[chosen],
-                    reached[chosen],
-                    model=arm(),
-                    noise=NOISE,
-                    prior=common.tolerances(arm()),
-                )
+                tolerances = common.tolerances(arm())
+                fit = identified(angles[chosen], reached[chosen], tolerances)
                 error = distances(fit, angles[rest], reached[rest])
                 test = distances(fit, *tests)
                 rows.append((error.mean(), error.max(), test.mean()))
@@ -131,13 +137,7 @@ def priors(pools: int) -> dict[str, list[float]]:
             members = rng.permutation(len(angles))[:POOL]
             chosen = members[choose("I", angles[members], k, rng)]
             for name, prior in known.items():
-                fit = jaxcal.identify(
-                    angles[chosen],
-                    reached[chosen],
-                    model=arm(),
-                    noise=NOISE,
-                    prior=prior,
-                )
+                fit = identified(angles[chosen], reached[chosen], prior)
                 runs[name].append(float(distances(fit, *tests).mean()))
         for name, found in runs.items():
             errors[name].append(float(np.mean(found)))
@@ -157,16 +157,8 @@ def outliers(pools: int) -> dict[str, float]:
         direction = rng.normal(size=3)
         spoilt[rng.integers(12)] += 5.0 * direction / np.linalg.norm(direction)
         for loss, found in errors.items():
-            with warnings.catch_warnings():  # that the readings contradict each other
-                warnings.simplefilter("ignore", UserWarning)
-                fit = jaxcal.identify(
-                    angles[chosen],
-                    spoilt,
-                    model=arm(),
-                    noise=NOISE,
-                    prior=common.tolerances(arm()),
-                    loss=loss,
-                )
+            tolerances = common.tolerances(arm())
+            fit = identified(angles[chosen], spoilt, tolerances, loss)
             found.append(float(distances(fit, *tests).mean()))
     return {loss: float(np.mean(found)) for loss, found in errors.items()}
 
