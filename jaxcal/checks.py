@@ -22,6 +22,7 @@ __all__ = [
     "one_or_each",
     "require_finite",
     "require_kind",
+    "require_known",
     "require_none",
     "seconds",
     "share",
@@ -177,6 +178,16 @@ def one_of(argument: str, value: Any, choices: Sequence[str]) -> str:
             f"{argument} must be one of {', '.join(choices)}, got {value!r}"
         )
     return value
+
+
+def require_known(what: str, name: str, names: Sequence[str]) -> None:
+    """Refuse a name that is none of these: by the one most alike, if any is alike."""
+    if name not in names:
+        import difflib
+
+        like = difflib.get_close_matches(name, names, 1)
+        more = f"did you mean {like[0]}?" if like else f"there are {', '.join(names)}"
+        raise ValueError(f"there is no {what} {name!r}; {more}")
 
 
 def whole_number(argument: str, value: Any, least: int) -> int:

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from jaxcal.arguments import several
 from jaxcal.checks import one_of
-from jaxcal.models import Model, Recording, from_dict
-from jaxcal.models.linear import input_letters
-from jaxcal.models.model import as_model
+from jaxcal.models.model import Model, as_model
+from jaxcal.models.recording import Recording
 from jaxcal.tables import COMMANDS, Table
 
 if TYPE_CHECKING:
@@ -183,6 +182,8 @@ class ArmOptions:
         inputs = tuple(getattr(model, "inputs", ()))
         if not inputs:
             return table.commands(chosen, option, but)
+        from jaxcal.models.linear import input_letters
+
         letters = inputs == input_letters(len(inputs))
         if letters and table.headed and not {*inputs} & {*table.bare(COMMANDS)}:
             # x, y, z of a polynomial are places: the table's columns in their order.
@@ -329,6 +330,8 @@ def _read_model(path: str) -> Model:
             f"{path}: a model is needed, this is a calibration; commands that apply "
             "one are predict and command"
         )
+    from jaxcal.models import from_dict
+
     try:
         return from_dict(read)
     except ValueError as error:

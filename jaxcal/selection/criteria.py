@@ -100,6 +100,16 @@ class Criterion:
         criterion.offset, criterion.unit = offset, unit
         return criterion
 
+    @property
+    def each(self) -> Criterion:
+        """The criterion of each scenario."""
+        return self
+
+    @property
+    def efficiency_name(self) -> str:
+        """What a table calls the efficiency."""
+        return f"{self.name}-efficiency" if len(self.name) <= 2 else "efficiency"
+
     def rows(self, at: Coordinates) -> Array:
         """C (s, p) in the problem's coordinates, of full row rank."""
         return at.basis
@@ -297,6 +307,7 @@ class ScenarioCriterion:
     """
 
     word: str
+    efficiency_name = "efficiency"
     least: ClassVar[bool]  # the worst scenario counts
     of_efficiency: bool = False
     each: Criterion  # of the first scenario
