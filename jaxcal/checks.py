@@ -16,6 +16,7 @@ __all__ = [
     "axis_letter",
     "axis_names",
     "in_words",
+    "lasted",
     "levels",
     "numbers",
     "one_of",
@@ -52,6 +53,11 @@ def aligned(
         rows = [rows[0], ["-" * width for width in widths], *rows[1:]]
     formats = [f"{{:{sides[: i + 1][-1]}{width}}}" for i, width in enumerate(widths)]
     return ["  ".join(formats).format(*row).rstrip() for row in rows]
+
+
+def lasted(seconds: float) -> str:
+    """A time as one writes it: "35 ms", "2.1 s"."""
+    return f"{1e3 * seconds:.0f} ms" if seconds < 0.9995 else f"{seconds:.1f} s"
 
 
 def axis_letter(index: int, count: int) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from jaxcal.models.from_dict import from_dict
 from jaxcal.models.identifiability import identifiability
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior, ResolvedPrior
@@ -15,7 +16,6 @@ from jaxcal.models.uncertainty import Noise, Prior, ResolvedPrior
 if TYPE_CHECKING:
     from jaxcal.models.affine import Affine
     from jaxcal.models.differences import Differences
-    from jaxcal.models.from_dict import from_dict
     from jaxcal.models.from_jax import FromJax
     from jaxcal.models.function import FromFunction
     from jaxcal.models.identifiability import Direction, Identifiability
@@ -50,7 +50,6 @@ _HOME = {
     "Linear": "linear",
     "Polynomial": "linear",
     "Recording": "recording",
-    "from_dict": "from_dict",
 }
 
 

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import inspect
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, NamedTuple, Self
@@ -46,6 +47,7 @@ __all__ = [
     "ScenarioCriterion",
     "Worst",
     "criterion_of",
+    "offered",
     "positions",
 ]
 
@@ -451,6 +453,16 @@ class Worst(ScenarioCriterion):
 CRITERIA: dict[str, type[Criterion]] = {
     each.name: each for each in (D, A, I, E, Ds, As)
 }
+
+
+def offered() -> list[str]:
+    """Names in ``CRITERIA`` that a command line can ask for."""
+    return [
+        name
+        for name, kind in CRITERIA.items()
+        if kind.of_parameters or not inspect.signature(kind).parameters
+        or kind.of_region
+    ]  # fmt: skip
 
 
 def criterion_of(criterion: Any, region: Any, default: str) -> Criterion:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.checks import aligned, axis_names
+from jaxcal.checks import aligned, axis_names, lasted
 from jaxcal.information.blocks import rank_of_blocks
 from jaxcal.selection.problem import Problem
 
@@ -203,7 +203,7 @@ class Selection:
             f"{share:13} {self.efficiency:.6f}" + ("" if self.proven else " or more"),
             *(() if self.in_scenarios is None else self.in_scenarios.summary()),
             f"{'without one':13} {self._lost()}",
-            f"time          {1e3 * self.seconds:.3g} ms{extra}",
+            f"time          {lasted(self.seconds)}{extra}",
         ]
         return "\n".join(
             lines + ([f"reason        {self.reason}"] if self.reason else [])
