@@ -53,7 +53,7 @@ from jaxcal.selection.exchange.exchange import (
     greedy_indices,
 )
 from jaxcal.selection.policy import load_policy
-from jaxcal.selection.problem import Problem, values
+from jaxcal.selection.problem import Problem
 
 HIT = 1e-9  # of log det
 GROUPS = ("M < 100", "M 100 to 300", "M > 300")
@@ -102,7 +102,7 @@ def draw(rng: np.random.Generator, most: int = 1000) -> tuple[Problem, str]:
 
 
 def log_dets(problem: Problem, chosen: Indices) -> float:
-    return float(values(problem, chosen[None])[1][0])
+    return float(problem.values(chosen[None])[1][0])
 
 
 def cpu_seconds(call: Callable[[], Any], least: float = 0.004) -> float:

@@ -6,8 +6,9 @@ fields. ``Annotated[T, ...]`` says more of one: its help and, where the type doe
 tell, what stands for its value; two numbers are its range, a list its choices, a
 function makes the value of a text. An underscore at the end is no part of a name. A
 ``bool | None`` has a flag for yes and one for no. Options of a dataclass with a
-``TITLE`` stand under it in the help, and under its ``ABOUT``, if any; those of one that
-is ``RARE`` only in that of ``--help all``, which the docstring then names.
+``TITLE`` stand under it in the help, and under its ``ABOUT``, if any; ``RARE``, True or
+names of its fields, are those that only ``--help all`` shows. ``Was(name)`` is a name
+that an option had in 0.2: it works, and warns, until 0.4.
 """
 
 from __future__ import annotations
@@ -15,22 +16,26 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import difflib
 import inspect
 import io
 import logging
 import math
+import os
 import pathlib
 import re
 import sys
 import typing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
+from jaxcal import __version__
 from jaxcal.extras import typed
 
 __all__ = [
     "Numbers",
     "Parser",
+    "Was",
     "exit_code",
     "levels",
     "number_type",
@@ -38,6 +43,7 @@ __all__ = [
     "several",
     "told",
     "typed_line",
+    "unread",
     "values_of",
 ]
 
@@ -52,6 +58,11 @@ class Parser(argparse.ArgumentParser):
         fields.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         super().__init__(allow_abbrev=False, **fields)
         self.rare: dict[argparse.Action, str | None] = {}  # with its help
+        self.renamed: dict[str, str] = {}  # options by their old names
+        if self.add_help:
+            version = f"jaxcal {__version__}"
+            text = argparse.SUPPRESS if " " in self.prog else "print the version"
+            self.add_argument("--version", action="version", version=version, help=text)
 
     def of(self, function: Callable[..., Any]) -> Parser:
         """Itself, for the arguments of a function, or a dataclass called ``options``:
@@ -59,28 +70,82 @@ class Parser(argparse.ArgumentParser):
         self.set_defaults(function=function)
         groups: dict[type, Any] = {}
         arguments = sorted(_arguments(function), key=lambda one: bool(one[0]))
-        for owner, *option in arguments:
+        for owner, name, hint, *option in arguments:
             kind = owner and owner[1]
             if kind not in groups:
                 title = getattr(kind, "TITLE", None)
                 about = getattr(kind, "ABOUT", None)
                 groups[kind] = self.add_argument_group(title, about) if title else self
-            action = _add(groups[kind], *option)
-            if getattr(kind, "RARE", False):
+            action = _add(groups[kind], name, hint, *option)
+            self.renamed |= {
+                f"--{old.name}": action.option_strings[-1] for old in _olds(hint)
+            }
+            rare: Any = getattr(kind, "RARE", ())
+            if rare is True or (rare and name in rare):
                 self.rare[action], action.help = action.help, argparse.SUPPRESS
+        needed = [each.dest for each in self._actions if not each.option_strings]
+        needed += [
+            f"{each.option_strings[0]} {each.metavar}"
+            for each in self._actions
+            if each.required and each.option_strings
+        ]
+        self.usage = self.usage or " ".join(["%(prog)s", *needed, "[options]"])
         return self
+
+    def format_help(self) -> str:
+        hidden = [each for each in self.rare if each.help == argparse.SUPPRESS]
+        more = f"\n{len(hidden)} more options: --help all\n" if hidden else ""
+        return super().format_help() + more
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         words = sys.argv[1:] if args is None else [*args]
+        if words[:1] == ["help"] and self._subparsers is not None:
+            words = [*words[1:], "--help"]
         if words[-1:] == ["all"] and words[-2:-1] in (["-h"], ["--help"]):
             for action, text in self.rare.items():
                 action.help = text
-        return super().parse_known_args(args, namespace)
+        for place, word in enumerate(words):
+            old, equals, value = word.partition("=")
+            if new := self.renamed.get(old):
+                print(
+                    f"{self.prog}: {old} is {new} since jaxcal 0.3; the old name goes "
+                    "with 0.4",
+                    file=sys.stderr,
+                )
+                words[place] = new + equals + value
+        known, unknown = super().parse_known_args(words, namespace)
+        if self.exit_on_error and self._subparsers is None:
+            for flag in (word.partition("=")[0] for word in unknown):
+                if like := _nearest(flag, self._option_string_actions):
+                    self.error(f"there is no option {flag}; did you mean {like}?")
+        return known, unknown
 
     def error(self, message: str) -> NoReturn:
         if found := re.match(r"argument (?:.*/)?(--[\w-]+): expected one", message):
             message += f"; write {found[1]}=VALUE where it begins with a minus"
+        choice = r"argument (.+): invalid choice: '(.*)' \(choose from (.*)\)"
+        if found := re.match(choice, message):
+            if like := _nearest(found[2], re.findall(r"[^\s',]+", found[3])):
+                what = found[1].lower()
+                message = f"there is no {what} {found[2]!r}; did you mean {like}?"
         self.exit(2, f"{self.prog}: {message}; see --help\n")
+
+
+@dataclasses.dataclass(frozen=True)
+class Was:
+    """The name that an option had in jaxcal 0.2, without its dashes."""
+
+    name: str
+
+
+def _olds(hint: Any) -> Iterator[Was]:
+    """The old names that a type bears."""
+    yield from (each for each in getattr(hint, "__metadata__", ()) if type(each) is Was)
+
+
+def _nearest(name: str, names: Iterable[str]) -> str:
+    """The most alike of the names; "" where none is."""
+    return next(iter(difflib.get_close_matches(name, names, 1)), "")
 
 
 def values_of(args: argparse.Namespace) -> dict[str, Any]:
@@ -211,6 +276,12 @@ def refused(program: str, error: Exception) -> int:
         text = f"{error.filename}: {error.strerror}"
     print(f"{program}: {text}", file=sys.stderr)
     return 2
+
+
+def unread() -> int:
+    """0: the reader of a pipe, such as head, has left."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
 
 
 def exit_code(command: Callable[[], None], program: str, interrupted: str) -> int:

@@ -16,12 +16,14 @@ __all__ = [
     "axis_letter",
     "axis_names",
     "in_words",
+    "lasted",
     "levels",
     "numbers",
     "one_of",
     "one_or_each",
     "require_finite",
     "require_kind",
+    "require_known",
     "require_none",
     "seconds",
     "share",
@@ -51,6 +53,11 @@ def aligned(
         rows = [rows[0], ["-" * width for width in widths], *rows[1:]]
     formats = [f"{{:{sides[: i + 1][-1]}{width}}}" for i, width in enumerate(widths)]
     return ["  ".join(formats).format(*row).rstrip() for row in rows]
+
+
+def lasted(seconds: float) -> str:
+    """A time as one writes it: "35 ms", "2.1 s"."""
+    return f"{1e3 * seconds:.0f} ms" if seconds < 0.9995 else f"{seconds:.1f} s"
 
 
 def axis_letter(index: int, count: int) -> str:
@@ -177,6 +184,16 @@ def one_of(argument: str, value: Any, choices: Sequence[str]) -> str:
             f"{argument} must be one of {', '.join(choices)}, got {value!r}"
         )
     return value
+
+
+def require_known(what: str, name: str, names: Sequence[str]) -> None:
+    """Refuse a name that is none of these: by the one most alike, if any is alike."""
+    if name not in names:
+        import difflib
+
+        like = difflib.get_close_matches(name, names, 1)
+        more = f"did you mean {like[0]}?" if like else f"there are {', '.join(names)}"
+        raise ValueError(f"there is no {what} {name!r}; {more}")
 
 
 def whole_number(argument: str, value: Any, least: int) -> int:

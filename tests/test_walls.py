@@ -44,8 +44,8 @@ def tables(tmp_path):
 @pytest.mark.parametrize(
     ("words", "most"),
     [
-        (["select", "candidates.csv", "-k", "4"], 63),
-        (["identify", "measured.csv", "--out", "calibration.json"], 58),
+        (["select", "candidates.csv", "-k", "4"], 52),
+        (["identify", "measured.csv", "--out", "calibration.json"], 57),
         (["command", "calibration.json", "targets.csv"], 58),
         (["check", "calibration.json", "measured.csv"], 58),
     ],

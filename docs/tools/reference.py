@@ -15,7 +15,8 @@ ROOT = pathlib.Path(__file__).parents[2]
 
 def commands() -> str:
     """Every command of ``jaxcal`` and ``jaxcal-rig`` with its help."""
-    from jaxcal.commands.main import COMMANDS, main
+    from jaxcal.commands import main
+    from jaxcal.commands.program import COMMANDS
     from rig.commands import make_parser
 
     lines = ["# Commands", "", "What `--help` prints, from the parsers.", ""]

@@ -23,14 +23,13 @@ from jaxcal.checks import (
     array_of,
     axis_names,
     levels,
-    require_kind,
     require_none,
     table,
 )
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, recorded
 from jaxcal.models.recording import Recording
-from jaxcal.models.uncertainty import Noise, Prior
+from jaxcal.models.uncertainty import Noise, Prior, as_noise
 from jaxcal.models.verdict import CalibrationWarning
 from jaxcal.tables import (
     COMMANDS,
@@ -259,7 +258,7 @@ def _noise(
     num_outputs: int,
 ) -> tuple[Noise | None, bool]:
     """The noise as given, and whether that is at most a level of each output."""
-    require_kind("noise", noise, Noise)
+    noise = as_noise(noise)
     if not (common_noise is None or isinstance(common_noise, bool)):
         raise ValueError(f"common_noise must be True or False, got {common_noise!r}")
     if noise is not None and noise_std is not None:

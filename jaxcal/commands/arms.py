@@ -9,16 +9,15 @@ import os
 import pathlib
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arguments import several
 from jaxcal.checks import one_of
-from jaxcal.models import Model, Recording, from_dict
-from jaxcal.models.linear import input_letters
-from jaxcal.models.model import as_model
+from jaxcal.models.model import Model, as_model
+from jaxcal.models.recording import Recording
 from jaxcal.tables import COMMANDS, Table
 
 if TYPE_CHECKING:
@@ -50,6 +49,9 @@ def _of_joint(text: str) -> list[Any]:
 @dataclasses.dataclass
 class ArmOptions:
     """Links of an arm in a URDF file, its sensor, the unit of its columns."""
+
+    TITLE: ClassVar[str] = "of an arm, --model FILE.urdf"
+    RARE: ClassVar[Any] = {"base", "tip", "radians", "locked", "limits", "distance"}
 
     sensor: Annotated[
         str | None,
@@ -168,7 +170,6 @@ class ArmOptions:
         model: Any,
         table: Table,
         chosen: str | None = None,
-        option: str = "--columns",
         but: Sequence[str] = (),
     ) -> tuple[str, ...]:
         """The columns of the commands: those of the model's inputs where it has names.
@@ -176,24 +177,23 @@ class ArmOptions:
         Args:
             model: None for an affine one.
             table: whose columns they are.
-            chosen: by ``option``.
-            option: its name.
+            chosen: by --inputs.
             but: columns that hold something else.
         """
         inputs = tuple(getattr(model, "inputs", ()))
         if not inputs:
-            return table.commands(chosen, option, but)
+            return table.commands(chosen, but=but)
+        from jaxcal.models.linear import input_letters
+
         letters = inputs == input_letters(len(inputs))
         if letters and table.headed and not {*inputs} & {*table.bare(COMMANDS)}:
             # x, y, z of a polynomial are places: the table's columns in their order.
-            names = table.commands(chosen, option, but)
+            names = table.commands(chosen, but=but)
             if len(names) == len(inputs):
                 table.say(inputs, names, "in their order")
                 return names
         beside = but or getattr(getattr(model, "sensor", None), "outputs", ())
-        return table.named(
-            inputs, COMMANDS, chosen=chosen, option=option, others=beside
-        )
+        return table.named(inputs, COMMANDS, chosen=chosen, others=beside)
 
     def commands(
         self,
@@ -219,6 +219,9 @@ def _counted(text: str) -> list[int]:
 @dataclasses.dataclass
 class RecordingOptions:
     """Options of a bag or a LeRobot dataset in the place of a table."""
+
+    TITLE: ClassVar[str] = "of a recording of an arm"
+    RARE: ClassVar[bool] = True
 
     which: Annotated[
         list[int] | None,
@@ -318,7 +321,7 @@ def _read_model(path: str) -> Model:
         ValueError: naming the file and what is wrong in it.
     """
     try:
-        read = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
+        read = json.loads(pathlib.Path(path).read_text(encoding="utf-8-sig"))
     except ValueError:
         raise ValueError(
             f"{path}: a model must be a JSON file of its to_dict(), an arm's .urdf or "
@@ -329,6 +332,8 @@ def _read_model(path: str) -> Model:
             f"{path}: a model is needed, this is a calibration; commands that apply "
             "one are predict and command"
         )
+    from jaxcal.models import from_dict
+
     try:
         return from_dict(read)
     except ValueError as error:

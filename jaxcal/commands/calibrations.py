@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Sequence
-from typing import Annotated, Any, NamedTuple, cast
+from typing import Annotated, Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.arguments import Numbers, several
+from jaxcal.arguments import Numbers, Was, several
 from jaxcal.calibration import Calibration
 from jaxcal.calibration import identify as identified
 from jaxcal.commands.arms import (
@@ -46,6 +46,9 @@ ReportFolder = Annotated[
 @dataclasses.dataclass
 class ReportOptions:
     """The page of a calibration, and what it is compared with."""
+
+    TITLE: ClassVar[str] = "the page of a calibration"
+    RARE: ClassVar[Any] = {"against", "certificate", "at"}
 
     report: ReportFolder = ""
     against: Annotated[
@@ -92,6 +95,8 @@ class ReportOptions:
 @dataclasses.dataclass
 class SavedFiles:
     """What an identification is saved as."""
+
+    RARE: ClassVar[Any] = {"overwrite", "unproven", "repair", "servos_out"}
 
     out: Annotated[
         str,
@@ -294,7 +299,7 @@ def _arm_readings(
     elif outputs:
         raise ValueError(f"--outputs is of readings, contacts have none, got {outputs}")
     beside = (*columns, weights or "")
-    names = of_arm.columns(arm, table, inputs, "--inputs", beside)
+    names = of_arm.columns(arm, table, inputs, beside)
     commands = of_arm.commands(arm, table, names)
     measured = np.zeros((len(table), len(columns)))
     if not contacts:
@@ -312,9 +317,7 @@ def _readings(
 ) -> _Readings:
     """The columns that begin with u_ and y_, or those that were named."""
     columns = table.outputs(outputs)
-    names = of_arm.columns(
-        machine, table, inputs, "--inputs", (*columns, weights or "")
-    )
+    names = of_arm.columns(machine, table, inputs, (*columns, weights or ""))
     if both := sorted({*names} & {*columns}):
         raise ValueError(f"--inputs and --outputs must differ, both hold {both[0]}")
     return _Readings(table.columns(names), table.columns(columns), names, columns)
@@ -382,7 +385,7 @@ def predict(
     calibration: CalibrationPath,
     file: Annotated[str, "commands: CSV, or -"],
     *,
-    columns: Annotated[str | None, "columns of commands", "A,B"] = None,
+    inputs: Annotated[str | None, "columns of commands", "A,B", Was("columns")] = None,
     std: Annotated[bool, "add the standard error of each output"] = False,
     radians: Annotated[bool, "of an arm: joint columns are in radians"] = False,
     output: Output,
@@ -390,7 +393,7 @@ def predict(
     """Where a calibrated machine goes for given commands."""
     calibrated = Calibration.load(calibration)
     table = read_table(file)
-    _, commands = _commands_for(calibrated, table, columns)
+    _, commands = _commands_for(calibrated, table, inputs)
     if radians:
         commands = _in_degrees(calibrated, commands)
     calibrated.model.require_commands(commands)
@@ -405,7 +408,9 @@ def command(
     calibration: CalibrationPath,
     file: Annotated[str, "desired outputs: CSV, or -"],
     *,
-    columns: Annotated[str | None, "columns of desired outputs", "A,B"] = None,
+    outputs: Annotated[
+        str | None, "columns of desired outputs", "A,B", Was("columns")
+    ] = None,
     limits: Annotated[
         list[list[float]] | None,
         "lowest and highest command; once for all inputs or for each; inf for none",
@@ -424,7 +429,8 @@ def command(
     names = table.named(
         calibrated.output_names,
         MEASURED,
-        chosen=columns,
+        chosen=outputs,
+        option="--outputs",
         unit=unit,
         others=calibrated.input_names,
     )
@@ -441,7 +447,7 @@ def _commands_for(
     calibration: Calibration,
     table: Table,
     chosen: str | None = None,
-    option: str = "--columns",
+    option: str = "--inputs",
 ) -> tuple[tuple[str, ...], Array]:
     """The columns of the commands of a calibration in a table, and (N, n) they hold."""
     names = table.named(

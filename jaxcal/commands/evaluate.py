@@ -14,7 +14,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
-from jaxcal.arguments import Parser, refused, several, told, typed_line, values_of
+from jaxcal.arguments import (
+    Parser,
+    refused,
+    several,
+    told,
+    typed_line,
+    unread,
+    values_of,
+)
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_kept, require_writable_folder, write_text
 
@@ -227,6 +235,8 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
         how = "terminated" if terminated else "interrupted"
         print(f"{prog}: {how}, {kept}", file=sys.stderr)
         return EXIT_TERMINATED if terminated else EXIT_INTERRUPTED
+    except BrokenPipeError:
+        return unread()
     except (ValueError, OSError, MissingExtraError) as error:
         return refused(prog, error)
     finally:

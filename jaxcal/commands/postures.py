@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import pathlib
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,9 @@ _DRAWS = 10  # random choices that a plan is compared with
 @dataclasses.dataclass
 class ViewOptions:
     """A board, and how a camera sees it."""
+
+    TITLE: ClassVar[str] = "of --sensor board"
+    RARE: ClassVar[bool] = True
 
     camera: Annotated[
         list[float] | None,
@@ -71,6 +74,9 @@ class ViewOptions:
 @dataclasses.dataclass
 class RoomOptions:
     """What the arm stays away from."""
+
+    TITLE: ClassVar[str] = "what the arm stays away from"
+    RARE: ClassVar[bool] = True
 
     floor: Annotated[float | None, "height that no joint is below"] = None
     approach: Annotated[
@@ -124,6 +130,9 @@ def postures(
     beside what was reached, which shows where sockets, planes and boards are, too.
     Collisions are looked at as far as --floor, --approach and --clear say.
     """
+    if picture:
+        with needs("plots", "--picture"):
+            import matplotlib.figure  # noqa: F401 - told before the search
     reached = None if measured is None else read_table(measured)
     placed = issubclass(SENSORS[of_arm.kind], Landmarks)
     arm = of_arm.read(model, reached, near if placed else None)
@@ -166,8 +175,7 @@ def postures(
 
 def _draw(arm: SerialChain, plan: Array, path: pathlib.Path) -> None:
     """A picture of the arm at each posture of the plan."""
-    with needs("plots", "--picture"):
-        from matplotlib.figure import Figure
+    from matplotlib.figure import Figure
 
     from jaxcal.reports import plots
 

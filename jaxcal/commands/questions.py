@@ -1,4 +1,4 @@
-"""``jaxcal select``, ``score`` and ``plan``: questions to a table of candidates."""
+"""``jaxcal select`` and ``plan``: questions to a table of candidates."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.arguments import Numbers, levels, several
+from jaxcal.arguments import Numbers, Was, levels, several
 from jaxcal.commands.arms import ArmOptions, ModelPath
 from jaxcal.commands.tables import Output, TablePath
 from jaxcal.information.singular import require_excited
 from jaxcal.models import Affine, Noise
 from jaxcal.selection import Design, Selection, Worst
-from jaxcal.selection.criteria import CRITERIA
+from jaxcal.selection.criteria import CRITERIA, offered
 from jaxcal.tables import Table, read_table
 
-__all__ = ["plan", "score", "select"]
+__all__ = ["plan", "select"]
 
 Names = Annotated[list[str] | None, several(str, "names")]
 Rows = Annotated[list[int] | None, several(int, "whole numbers")]
@@ -27,14 +27,20 @@ Rows = Annotated[list[int] | None, several(int, "whole numbers")]
 class DesignOptions:
     """The problem that a table of candidates and these options describe."""
 
-    columns: Annotated[
+    RARE: ClassVar[Any] = {"num_outputs", "scenarios"}
+
+    inputs: Annotated[
         str | None,
         "columns of commands; u_... where there are any, else all numbers",
         "A,B",
+        Was("columns"),
     ] = None
     model: ModelPath = None
-    outputs: Annotated[
-        int | None, "number of outputs of y = A u + b; as many as commands", "M"
+    num_outputs: Annotated[
+        int | None,
+        "of y = A u + b; as many as commands when not given",
+        "M",
+        Was("outputs"),
     ] = None
     noise: Annotated[
         Numbers, "standard deviation of a measurement, or one for each output", "S"
@@ -48,13 +54,13 @@ class DesignOptions:
     def design(self, table: Table, of_arm: ArmOptions) -> Design:
         """The design of the candidates in a table."""
         model, mask = of_arm.machine(self.model, table), table.available()
-        names = of_arm.columns(model, table, self.columns)
+        names = of_arm.columns(model, table, self.inputs)
         candidates = of_arm.commands(model, table, names, mask)
-        if self.outputs is not None:
+        if self.num_outputs is not None:
             if model is not None:
                 rule = "must be left out with --model, which has them"
-                raise ValueError(f"--outputs {rule}")
-            model = Affine(len(names), self.outputs)
+                raise ValueError(f"--num-outputs {rule}")
+            model = Affine(len(names), self.num_outputs)
         if self.model is None:  # said here in the names of the columns
             used = candidates if mask is None else candidates[mask]
             distinct = f"rows ({len(np.unique(used, axis=0))} of them distinct)"
@@ -83,8 +89,10 @@ def _of_parameters(word: str) -> str:
 class CriterionOptions:
     """By which criterion."""
 
+    RARE: ClassVar[Any] = {"parameters", "worst"}
+
     criterion: Annotated[
-        str | None, "default D for affine models, else I", [*CRITERIA]
+        str | None, "default D for affine models, else I", offered()
     ] = None
     parameters: Annotated[
         Names, f"with {_of_parameters('and')}: the parameters of interest", "A,B"
@@ -113,30 +121,59 @@ class CriterionOptions:
 class MethodOptions:
     """Options of the methods of ``select``."""
 
+    TITLE: ClassVar[str] = "of the method"
+    RARE: ClassVar[bool] = True
+
     seed: Annotated[int | None, "of methods that draw at random; default 0", "S"] = None
     restarts: Annotated[int | None, "random starts of the exchange"] = None
     time_limit: Annotated[
-        float | None, "that auto and exact may take; default 10", "SECONDS"
+        float | None, "that auto, exact and the optimum may take; default 10", "SECONDS"
     ] = None
     best: Annotated[int | None, "with exact: prove the B best choices", "B"] = None
     least_efficiency: Annotated[
         float | None, "auto stops once this efficiency is proven; default 0.999"
     ] = None
-
-
-@dataclasses.dataclass
-class PolicyOptions:
-    """With method policy: which, and how it is decoded."""
-
-    RARE: ClassVar[bool] = True
-
-    checkpoint: Annotated[str | None, "a trained policy", "DIR"] = None
-    decoding: Annotated[
-        str | None, "with method policy: greedy, first, samples, exchange"
-    ] = None
+    checkpoint: Annotated[str | None, "with policy: a trained one", "DIR"] = None
+    decoding: Annotated[str | None, "with policy: greedy, first, samples, exchange"] = (
+        None
+    )
     num: Annotated[
         int | None, "tries of the decodings first and samples; default 16"
     ] = None
+
+
+@dataclasses.dataclass
+class ScoreOptions:
+    """A choice that was made elsewhere, judged in the place of one that is made."""
+
+    RARE: ClassVar[Any] = {"reference"}
+
+    score: Annotated[
+        str | None,
+        "judge this choice instead: rows counted from 0, or the table of --csv",
+        "ROWS|FILE",
+        Was("indices"),
+        Was("subset"),
+    ] = None
+    reference: Annotated[
+        Literal["bound", "exact"],
+        "what --score compares with: a bound, or the proven optimum",
+    ] = "bound"
+
+    def judged(
+        self, design: Design, table: Table, criterion: Any, options: dict[str, Any]
+    ) -> Selection:
+        """The choice, judged; ``options`` are those of methods that were given."""
+        if "time_limit" in options and self.reference != "exact":
+            raise ValueError("--time-limit is of --reference exact")
+        if others := sorted({*options} - {"time_limit"}):
+            flags = ", ".join(f"--{name.replace('_', '-')}" for name in others)
+            raise ValueError(f"--score judges a choice: leave out {flags}")
+        if set(self.score or "") <= set("0123456789, "):
+            rows = np.array(several(int, "whole numbers")(self.score or ""))
+        else:
+            rows = _rows_of(read_table(self.score), table)
+        return design.score(rows, criterion, reference=self.reference, **options)
 
 
 def select(
@@ -158,23 +195,28 @@ def select(
         bool, "move the chosen between the candidates, within the range of these"
     ] = False,
     of_criterion: CriterionOptions,
+    of_score: ScoreOptions,
     of_method: MethodOptions,
-    of_policy: PolicyOptions,
     output: Output,
 ) -> None:
-    """Choose the few rows of a table worth measuring.
+    """Choose the few rows of a table worth measuring, or judge a choice with --score.
 
     A column named available (0 or 1) says which rows may be chosen. Columns of text are
     kept as labels. Without --k the fewest rows that identify the model are chosen.
-    --help all has the options of --method policy too.
     """
     table = read_table(file)
-    given = vars(of_method) | vars(of_policy)
-    options = {name: x for name, x in given.items() if x is not None}
+    options = {name: x for name, x in vars(of_method).items() if x is not None}
     design, criterion = (
         of_design.design(table, of_arm),
         of_criterion.by(of_design.scenarios),
     )
+    if of_score.score is not None:
+        if k is not None or method != "auto" or between:
+            raise ValueError(
+                "--score judges a choice: leave out -k, --method, --between"
+            )
+        _show(of_score.judged(design, table, criterion, options), table, output)
+        return
     selection = design.select(k, criterion, method, **options)
     if not between:
         _show(selection, table, output)
@@ -188,46 +230,6 @@ def select(
     names = list(design.axes or ())
     if not output.written(names, refined.commands.tolist(), refined.to_dict()):
         print(refined)
-
-
-def score(
-    file: TablePath,
-    of_design: DesignOptions,
-    of_arm: ArmOptions,
-    of_criterion: CriterionOptions,
-    *,
-    indices: Annotated[Rows, "rows, counted from 0", "I,J"] = None,
-    subset: Annotated[str | None, "table that select --csv wrote", "FILE"] = None,
-    reference: Annotated[
-        Literal["bound", "exact"],
-        "what it is compared with: a bound, or the proven optimum",
-    ] = "bound",
-    time_limit: Annotated[
-        float | None, "that the search for the optimum may take", "SECONDS"
-    ] = None,
-    output: Output,
-) -> None:
-    """Judge a choice made elsewhere."""
-    table = read_table(file)
-    if time_limit is not None and reference != "exact":
-        raise ValueError("--time-limit is of --reference exact")
-    if (indices is None) == (subset is None):
-        raise ValueError("one of --indices and --subset must be given")
-    rows = np.array(indices)
-    if subset is not None:
-        if set(subset) <= set("0123456789, "):
-            raise ValueError(
-                f"--subset must be a file, got {subset!r}; rows by their numbers are "
-                f"--indices {subset}"
-            )
-        rows = _rows_of(read_table(subset), table)
-    selection = of_design.design(table, of_arm).score(
-        rows,
-        of_criterion.by(of_design.scenarios),
-        reference=reference,
-        time_limit=time_limit,
-    )
-    _show(selection, table, output)
 
 
 def plan(

@@ -50,7 +50,6 @@ from jaxcal.selection.problem import (
     ScenarioProblem,
     blocks_of,
     problem_of,
-    values,
 )
 from jaxcal.selection.result import Selection
 
@@ -171,9 +170,9 @@ def optimise(
     box = _limits(limits)
     model = as_model(model) if model is not None else Affine(len(box), len(box))
     pool = _drawn(box, _POOL, allowed, seed)
-    offer = CandidateSet.of_commands(
+    offer = CandidateSet(
         pool, model, prior, noise, measured, max_replicates=_POOL, scenarios=scenarios
-    )
+    ).checked()
     search = _Ascent(offer, box, allowed, k, criterion, region, seed, time_limit)
     return search.run(None, whole_number("starts", starts, 1))
 
@@ -1029,10 +1028,10 @@ class _Ascent:
         if len(self.members) > 1:
             assert offer.scenarios is not None
             scenarios = offer.scenarios.parameters, offer.scenarios.weights
-        beside = CandidateSet.of_commands(
+        beside = CandidateSet(
             np.concatenate([commands, pool]), offer.model, offer.prior, offer.noise,
             offer.measured, scenarios=scenarios,
-        )  # fmt: skip
+        ).checked()  # fmt: skip
         problem = problem_of(beside, self.k, self.asked, region)
-        value, log_det = values(problem, np.arange(self.k)[None])
+        value, log_det = problem.values(np.arange(self.k)[None])
         return problem, float(value[0]), float(log_det[0])

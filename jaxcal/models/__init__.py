@@ -8,18 +8,19 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from jaxcal.models.affine import Affine
 from jaxcal.models.from_dict import from_dict
-from jaxcal.models.identifiability import Direction, Identifiability, identifiability
-from jaxcal.models.linear import Linear, Polynomial
+from jaxcal.models.identifiability import identifiability
 from jaxcal.models.model import Model
-from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior, ResolvedPrior
 
 if TYPE_CHECKING:
+    from jaxcal.models.affine import Affine
     from jaxcal.models.differences import Differences
     from jaxcal.models.from_jax import FromJax
     from jaxcal.models.function import FromFunction
+    from jaxcal.models.identifiability import Direction, Identifiability
+    from jaxcal.models.linear import Linear, Polynomial
+    from jaxcal.models.recording import Recording
 
 __all__ = [
     "Affine",
@@ -40,16 +41,23 @@ __all__ = [
 ]
 
 _HOME = {
-    "Differences": "jaxcal.models.differences",
-    "FromFunction": "jaxcal.models.function",
-    "FromJax": "jaxcal.models.from_jax",
+    "Affine": "affine",
+    "Differences": "differences",
+    "Direction": "identifiability",
+    "FromFunction": "function",
+    "FromJax": "from_jax",
+    "Identifiability": "identifiability",
+    "Linear": "linear",
+    "Polynomial": "linear",
+    "Recording": "recording",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name.startswith("__"):  # asked of every module, as by inspect
         raise AttributeError(name)
-    home = importlib.import_module(_HOME.get(name, "jaxcal.arms"))
+    near = f"jaxcal.models.{_HOME.get(name)}"
+    home = importlib.import_module(near if name in _HOME else "jaxcal.arms")
     if name not in home.__all__:
         raise AttributeError(f"module 'jaxcal.models' has no attribute {name!r}")
     globals()[name] = value = getattr(home, name)

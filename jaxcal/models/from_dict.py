@@ -8,19 +8,22 @@ from typing import Any, cast
 from jaxcal.checks import one_of
 from jaxcal.extras import installed
 from jaxcal.models.affine import Affine
-from jaxcal.models.linear import Linear, Polynomial
 from jaxcal.models.model import Model
 
 __all__ = ["from_dict"]
 
 _GROUP = "jaxcal.models"  # entry points by which others, as jaxcal.arms, add kinds
-# What makes a model of each kind; its arguments are the keys of the file.
-_KINDS: dict[str, Callable[..., Model]] = {
-    "affine": Affine,
-    "linear": Linear,
-    "polynomial": Polynomial,
-}
+_KINDS = ("affine", "linear", "polynomial")
 _UNWRITTEN = ("function", "jax")  # kinds that hold a function
+
+
+def _maker(kind: str) -> Callable[..., Model]:
+    """What makes a model of a kind; its arguments are the keys of the file."""
+    if kind == "affine":
+        return Affine
+    from jaxcal.models.linear import Linear, Polynomial
+
+    return Linear if kind == "linear" else Polynomial
 
 
 def from_dict(data: Mapping[str, Any]) -> Model:
@@ -44,7 +47,7 @@ def from_dict(data: Mapping[str, Any]) -> Model:
         )
     if kind == "linear":  # a formula names its own
         fields.pop("terms", None)
-    make = others[kind].load() if kind in others else _KINDS[kind]
+    make = others[kind].load() if kind in others else _maker(kind)
     try:
         return cast("Model", make(**fields))
     except TypeError as error:

@@ -35,7 +35,7 @@ from jaxcal.models.model import (
 )
 from jaxcal.models.periods import checked_periods
 from jaxcal.models.runs import CommandLine, Runs
-from jaxcal.models.uncertainty import Noise, Prior
+from jaxcal.models.uncertainty import Noise, Prior, as_noise
 
 __all__ = ["FromFunction"]
 
@@ -120,7 +120,7 @@ class FromFunction(Model):
             f = CommandLine(f, (*self.inputs, *self.names), limit)
         elif timeout is not None:
             raise ValueError("timeout is of a program, and f is a function")
-        require_kind("noise", noise, Noise)
+        noise = as_noise(noise)
         require_kind("prior", prior, Prior)
         self._noise, self._prior, self._given_periods = noise, prior, periods
         if not isinstance(processes, Executor):

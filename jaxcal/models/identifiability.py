@@ -19,7 +19,7 @@ from jaxcal.models.model import (
     derivative,
     without_effect,
 )
-from jaxcal.models.uncertainty import Noise, Prior
+from jaxcal.models.uncertainty import Noise, Prior, as_noise
 
 __all__ = ["Direction", "Identifiability", "identifiability", "unknown"]
 
@@ -100,7 +100,7 @@ def identifiability(
     if not len(commands):
         raise ValueError("candidates must hold at least one row, got none")
     model = as_model(model)
-    require_kind("noise", noise, Noise)
+    noise = as_noise(noise)
     require_kind("prior", prior, Prior)
     resolved = None if prior is None else prior.resolve(model)
     mean = model.nominal if resolved is None else resolved.mean

@@ -22,8 +22,10 @@ from jaxcal.information.singular import flat
 from jaxcal.models.periods import within_half
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
-from jaxcal.models.verdict import Verdict, verdict
 from jaxcal.tables import COMMANDS, header_of, of_frame
+
+if TYPE_CHECKING:
+    from jaxcal.models.verdict import Verdict
 
 __all__ = [
     "ErrorGroups",
@@ -336,6 +338,8 @@ class Model(abc.ABC):
         Printed, the reasons and the next step; ``good`` if it may be used. A model
         that has an answer of its own returns a subclass of ``Verdict``.
         """
+        from jaxcal.models.verdict import verdict
+
         return verdict(fit)
 
     def of_chain(self, fit: Any, tip: str) -> dict[str, Any]:

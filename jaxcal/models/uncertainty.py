@@ -20,7 +20,7 @@ from jaxcal.checks import (
 )
 from jaxcal.information.singular import significant
 
-__all__ = ["Noise", "Prior", "ResolvedPrior"]
+__all__ = ["Noise", "Prior", "ResolvedPrior", "as_noise"]
 
 Array = NDArray[np.float64]
 PerParameter = ArrayLike | Mapping[str, float]
@@ -267,3 +267,19 @@ class Noise:
         """(n,) command_std, zero where it is not given."""
         given = 0.0 if self.command_std is None else self.command_std
         return one_or_each("command_std", given, n)
+
+
+def as_noise(noise: Any) -> Noise | None:
+    """A ``Noise`` as it is, its standard deviation made one, None where none is given.
+
+    Raises:
+        ValueError: it is neither.
+    """
+    if noise is None or isinstance(noise, Noise):
+        return noise
+    if np.asarray(noise).dtype.kind not in "iuf":
+        raise ValueError(
+            "noise must be a jaxcal.Noise or its standard deviation, got "
+            f"{type(noise).__name__}"
+        )
+    return Noise(noise)

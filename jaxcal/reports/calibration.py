@@ -68,11 +68,11 @@ SCHEMA: dict[str, Any] = {
 
 
 def leverage(calibration: Fit) -> Array:
-    """(N,) how many parameters each measurement determines by itself, of p in all."""
+    """(N, m) in [0, 1], how far each reading determines its own prediction."""
     noise = calibration.require_noise("leverage")
     slopes, covariance = calibration.linear(calibration.commands, misfit=False)
     spread = ((slopes @ covariance) * slopes).sum(axis=-1)
-    return np.asarray((spread / np.where(noise > 0.0, noise, np.inf) ** 2).sum(axis=1))
+    return np.asarray(spread / np.where(noise > 0.0, noise, np.inf) ** 2)
 
 
 def moved(calibration: Fit, before: Fit) -> list[dict[str, Any]]:
@@ -428,8 +428,10 @@ def _residual_table(calibration: Fit) -> pages.Table:
     head = ["row", *(f"residual {name}" for name in names), "weight"]
     columns = [*calibration.residuals.T, calibration.loss_weights]
     if calibration.noise_std is not None:
-        head += ["leverage", *(f"held-out {name}" for name in names)]
-        columns += [leverage(calibration), *left_out(calibration).T]
+        head += [
+            f"{what} {name}" for what in ("leverage", "held-out") for name in names
+        ]
+        columns += [*leverage(calibration).T, *left_out(calibration).T]
     rows = [
         [str(i), *(f"{value:.3g}" for value in row)]
         for i, row in enumerate(zip(*columns, strict=True))

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import inspect
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, NamedTuple, Self
@@ -46,6 +47,7 @@ __all__ = [
     "ScenarioCriterion",
     "Worst",
     "criterion_of",
+    "offered",
     "positions",
 ]
 
@@ -99,6 +101,16 @@ class Criterion:
         criterion.root, criterion.times = root, times
         criterion.offset, criterion.unit = offset, unit
         return criterion
+
+    @property
+    def each(self) -> Criterion:
+        """The criterion of each scenario."""
+        return self
+
+    @property
+    def efficiency_name(self) -> str:
+        """What a table calls the efficiency."""
+        return f"{self.name}-efficiency" if len(self.name) <= 2 else "efficiency"
 
     def rows(self, at: Coordinates) -> Array:
         """C (s, p) in the problem's coordinates, of full row rank."""
@@ -297,6 +309,7 @@ class ScenarioCriterion:
     """
 
     word: str
+    efficiency_name = "efficiency"
     least: ClassVar[bool]  # the worst scenario counts
     of_efficiency: bool = False
     each: Criterion  # of the first scenario
@@ -440,6 +453,16 @@ class Worst(ScenarioCriterion):
 CRITERIA: dict[str, type[Criterion]] = {
     each.name: each for each in (D, A, I, E, Ds, As)
 }
+
+
+def offered() -> list[str]:
+    """Names in ``CRITERIA`` that a command line can ask for."""
+    return [
+        name
+        for name, kind in CRITERIA.items()
+        if kind.of_parameters or not inspect.signature(kind).parameters
+        or kind.of_region
+    ]  # fmt: skip
 
 
 def criterion_of(criterion: Any, region: Any, default: str) -> Criterion:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import inspect
 import math
 import time
 from collections.abc import Sequence
@@ -12,23 +13,21 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import one_of, require_none, seconds
+from jaxcal.checks import one_of, require_known, require_none, seconds
 from jaxcal.deadline import Deadline
 from jaxcal.late import late
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.exact.exact import TIME_LIMIT, solve_exact
-from jaxcal.selection.in_scenarios import with_optima
 from jaxcal.selection.problem import (
     CandidateSet,
     Problem,
     Scenarios,
     Solution,
     problem_of,
-    values,
 )
 from jaxcal.selection.result import Selection, Subset
-from jaxcal.selection.solvers import SOLVERS, checked_options
+from jaxcal.selection.solvers import OPTIONS, SOLVERS, checked_options
 
 __all__ = ["Design", "select"]
 
@@ -45,21 +44,30 @@ class Design:
     Args:
         candidates: (M, n) commands that could be measured, in any unit; an array or a
             data frame, whose labels are kept. Rows that are not available may hold NaN.
+            None where blocks are given.
         model: of ``jaxcal.models``; ``y = A u + b``, with as many outputs as inputs,
             when not given.
         prior: a ``jaxcal.Prior`` of the model's parameters, its own default when not
-            given.
-        noise: a ``jaxcal.Noise``; when not given ``model.default_noise()`` where the
-            model has one (an arm), else of unit variance.
+            given; of blocks a (p, p) precision, nothing when not given.
+        noise: a ``jaxcal.Noise``, or its standard deviation; when not given
+            ``model.default_noise()`` where the model has one (an arm), else of unit
+            variance.
         measured: (N, n) commands measured already: their information is there, and
-            answers count the new ones.
+            answers count the new ones. Of blocks (N, q, p), of scenarios
+            (S, N, q, p).
         available: (M,) bool or 0 and 1, True where a candidate may be chosen; all by
             default.
         required: (r,) candidates that must be among the chosen.
         max_replicates: how often one candidate may be chosen; 1 keeps them distinct.
+        blocks: (M, q, p) instead of candidates and model; candidate i gives q readings,
+            ``y = B_i theta + noise`` with noise of unit variance unless ``noise`` is
+            given, and adds ``B_i.T @ B_i`` to the information. Or (S, M, q, p), those
+            of S scenarios.
+        commands: (M, n) of the blocks, for travel between them and for tables.
         scenarios: where the nominal is a guess, parameters that the choice is judged
             by as well: a whole number of draws from the prior (seeded), (S, p), or
-            ``(parameters, weights)``. A criterion is then ``jaxcal.Mean("D")``, as
+            ``(parameters, weights)``; of blocks (S, M, q, p) their weights (S,), of sum
+            1, equal when not given. A criterion is then ``jaxcal.Mean("D")``, as
             letters alone are, or ``jaxcal.Worst("D")``.
         names: (M,) names of the candidates, for the answers.
 
@@ -72,58 +80,41 @@ class Design:
 
     def __init__(
         self,
-        candidates: ArrayLike,
+        candidates: ArrayLike | None = None,
         model: Model | None = None,
-        prior: Prior | None = None,
-        noise: Noise | None = None,
+        prior: Prior | ArrayLike | None = None,
+        noise: Noise | ArrayLike | None = None,
         measured: ArrayLike | None = None,
         available: ArrayLike | None = None,
         required: ArrayLike | None = None,
         max_replicates: int = 1,
         *,
+        blocks: ArrayLike | None = None,
+        commands: ArrayLike | None = None,
         scenarios: Any = None,
         names: Sequence[str] | None = None,
     ) -> None:
-        self.candidate_set = CandidateSet.of_commands(
-            candidates, model, prior, noise, measured, available, scenarios=scenarios,
-            names=names, required=required, max_replicates=max_replicates,
-        )  # fmt: skip
+        if (candidates is None) == (blocks is None):
+            got = "neither" if blocks is None else "both"
+            raise ValueError(f"either candidates or blocks must be given, got {got}")
+        rows: Any = candidates if blocks is None else commands
+        labels: Any = names
+        self.candidate_set = CandidateSet(
+            rows, model, prior, noise, measured, available, required, max_replicates,
+            blocks, scenarios, labels,
+        ).checked()  # fmt: skip
 
     @classmethod
     def from_blocks(
         cls,
         blocks: ArrayLike,
         prior: ArrayLike | None = None,
-        noise: Noise | None = None,
-        measured: ArrayLike | None = None,
-        available: ArrayLike | None = None,
-        required: ArrayLike | None = None,
-        max_replicates: int = 1,
         *,
-        commands: ArrayLike | None = None,
-        names: Sequence[str] | None = None,
         weights: ArrayLike | None = None,
+        **rules: Any,
     ) -> Self:
-        """The problem of information blocks, of any model.
-
-        Args:
-            blocks: (M, q, p); candidate i gives q readings, ``y = B_i theta + noise``
-                with noise of unit variance, and adds ``B_i.T @ B_i`` to the
-                information. Or (S, M, q, p), those of S scenarios.
-            prior: (p, p) precision of what is known beforehand; nothing by default.
-            noise: of the readings, where it is not of unit variance.
-            measured: (N, q, p) blocks that were measured already, of scenarios
-                (S, N, q, p).
-            available, required, max_replicates, names: as for candidates.
-            commands: (M, n) of the candidates, for travel between them and for tables.
-            weights: (S,) of the scenarios, of sum 1; equal when not given.
-        """
-        design = object.__new__(cls)
-        design.candidate_set = CandidateSet.of_blocks(
-            blocks, prior, noise, measured, available, commands=commands, names=names,
-            weights=weights, required=required, max_replicates=max_replicates,
-        )  # fmt: skip
-        return design
+        """``Design(blocks=blocks, prior=prior, scenarios=weights, **rules)``."""
+        return cls(blocks=blocks, prior=prior, scenarios=weights, **rules)
 
     @property
     def candidates(self) -> Array | None:
@@ -231,7 +222,7 @@ class Design:
         """
         checked = checked_options(method, options)
         start = time.perf_counter()
-        problem = with_optima(self.problem(k, criterion, region))
+        problem = _with_optima(self.problem(k, criterion, region))
         solution = SOLVERS[method](problem, **checked)
         return self._judged(problem, solution, method, start)
 
@@ -259,11 +250,11 @@ class Design:
         limit = TIME_LIMIT if time_limit is None else seconds("time_limit", time_limit)
         start = time.perf_counter()
         subset = _whole_numbers(indices)
-        problem = with_optima(self._problem_with(subset, criterion))
+        problem = _with_optima(self._problem_with(subset, criterion))
         if reference == "bound":
             return self._judged(problem, Solution(subset), "score", start)
         optimum = solve_exact(problem, deadline=Deadline(limit))
-        value = float(values(problem, subset[None])[0][0])
+        value = float(problem.values(subset[None])[0][0])
         assert optimum.bound is not None
         near = abs(value - optimum.bound) <= _PROVEN * max(1.0, abs(optimum.bound))
         proven = optimum.proven and near
@@ -309,7 +300,7 @@ class Design:
         _require_allowed(problem, indices, method)
         log_det = solution.log_det
         if value is None or log_det is None:
-            value, log_det = (float(pair[0]) for pair in values(problem, indices[None]))
+            value, log_det = (float(pair[0]) for pair in problem.values(indices[None]))
         self._require_numbers(problem, indices, value, log_det, method)
         return Selection(
             indices=indices,
@@ -368,6 +359,15 @@ class Design:
         return ""
 
 
+def _with_optima(problem: Problem) -> Problem:
+    """With the optimum of each scenario, where the criterion compares by these."""
+    if (joint := problem.joint) is None or not joint.joined.of_efficiency:
+        return problem
+    from jaxcal.selection.in_scenarios import optima_of
+
+    return dataclasses.replace(joint, optima=optima_of(joint)[0])
+
+
 def _whole_numbers(indices: ArrayLike) -> Indices:
     """A subset (k,) as the caller gives it, k at least 1."""
     subset = np.asarray(indices)
@@ -404,7 +404,7 @@ def _alternatives(problem: Problem, solution: Solution) -> tuple[Subset, ...]:
     if len(solution.alternatives) < 2:
         return ()
     subsets = np.stack([indices for indices, _ in solution.alternatives])
-    pairs = np.stack(values(problem, subsets), axis=1).tolist()
+    pairs = np.stack(problem.values(subsets), axis=1).tolist()
     return tuple(Subset(i, *pair) for i, pair in zip(subsets, pairs, strict=True))
 
 
@@ -413,19 +413,9 @@ def select(
     k: int | None = None,
     method: str = "auto",
     *,
-    model: Model | None = None,
-    blocks: ArrayLike | None = None,
-    prior: Prior | ArrayLike | None = None,
-    noise: Noise | None = None,
     criterion: Any = None,
     region: ArrayLike | None = None,
-    measured: ArrayLike | None = None,
-    available: ArrayLike | None = None,
-    required: ArrayLike | None = None,
-    max_replicates: int = 1,
-    scenarios: Any = None,
-    names: Any = None,
-    **options: Any,
+    **given: Any,
 ) -> Selection:
     """Choose the k candidates whose measurements say most about the parameters.
 
@@ -435,13 +425,11 @@ def select(
         candidates: (M, n) commands that could be measured, or None with blocks.
         k: candidates to choose; the fewest that identify when not given.
         method: "auto", "exact", "exchange", "greedy", "random" or "policy".
-        blocks: (M, q, p), of scenarios (S, M, q, p), instead of candidates and model,
-            as in ``Design.from_blocks``; ``prior`` is then a (p, p) precision.
-        model, prior, noise, measured, available, required, max_replicates, scenarios,
-            names: of the problem, see ``Design``.
         criterion, region: what is best, see ``Design.select``.
-        options: seed, restarts, time_limit, best, least_efficiency, checkpoint,
-            decoding, num: those that the method reads, see ``Design.select``.
+        given: model, prior, noise, measured, available, required, max_replicates,
+            blocks, commands, scenarios, names: of the problem, see ``Design``; seed,
+            restarts, time_limit, best, least_efficiency, checkpoint, decoding, num:
+            those that the method reads, see ``Design.select``.
 
     Returns:
         The selection; never a singular one.
@@ -449,23 +437,12 @@ def select(
     Raises:
         ValueError: naming the argument, the rule and the value.
     """
-    rules: dict[str, Any] = {
-        "prior": prior, "noise": noise, "measured": measured, "available": available,
-        "required": required, "max_replicates": max_replicates, "names": names,
-    }  # fmt: skip
+    options = {name: given.pop(name) for name in OPTIONS if name in given}
+    for name in given:
+        require_known("argument", name, _ARGUMENTS)
     checked_options(method, options)  # before any work
-    if (candidates is None) == (blocks is None):
-        got = "neither" if blocks is None else "both"
-        raise ValueError(f"either candidates or blocks must be given, got {got}")
-    if candidates is not None:
-        design = Design(candidates, model, scenarios=scenarios, **rules)
-    elif scenarios is not None:
-        raise ValueError(
-            "scenarios must come with candidates; of blocks they are (S, M, q, p)"
-        )
-    elif model is not None:
-        raise ValueError("model must come with candidates, not with blocks")
-    else:
-        assert blocks is not None
-        design = Design.from_blocks(blocks, **rules)
+    design = Design(candidates, **given)
     return design.select(k, criterion, method, region=region, **options)
+
+
+_ARGUMENTS = (*inspect.signature(Design).parameters, "k", "method", *OPTIONS)

@@ -17,7 +17,7 @@ from jaxcal.deadline import Deadline
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.problem import Problem, ScenarioProblem
 
-__all__ = ["ScenarioTable", "in_scenarios", "with_optima"]
+__all__ = ["ScenarioTable", "in_scenarios", "optima_of"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -95,23 +95,16 @@ def _optimum(problem: Problem, limit: float) -> tuple[Indices, float, bool]:
     return solution.indices, solution.bound, solution.proven or share >= _ENOUGH
 
 
-def _optima(problem: ScenarioProblem) -> tuple[Array, NDArray[np.bool_]]:
+def optima_of(problem: ScenarioProblem) -> tuple[Array, NDArray[np.bool_]]:
     """(S,) values that no selection of a scenario betters, and which are proven."""
     limit = max(_LIMIT / len(problem.members), _LEAST_LIMIT)
     each = [_optimum(member, limit)[1:] for member in problem.members]
     return np.array([x for x, _ in each]), np.array([proven for _, proven in each])
 
 
-def with_optima(problem: Problem) -> Problem:
-    """The problem with what worst efficiencies are measured by, where they count."""
-    if not isinstance(problem, ScenarioProblem) or not problem.joined.of_efficiency:
-        return problem
-    return dataclasses.replace(problem, optima=_optima(problem)[0])
-
-
 def in_scenarios(problem: ScenarioProblem, indices: Indices) -> ScenarioTable:
     """A selection (k,) in each scenario."""
-    optima, proven = _optima(problem)
+    optima, proven = optima_of(problem)
     values = problem.scenario_values(indices[None])[0][:, 0]
     better = np.maximum if problem.joined.each.larger_is_better else np.minimum
     optima = better(optima, values)

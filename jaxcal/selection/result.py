@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.checks import aligned, axis_names
+from jaxcal.checks import aligned, axis_names, lasted
 from jaxcal.information.blocks import rank_of_blocks
-from jaxcal.information.criteria import Criteria, criteria
-from jaxcal.selection.problem import Problem, ScenarioProblem
+from jaxcal.selection.problem import Problem
 
 if TYPE_CHECKING:
+    from jaxcal.information.criteria import Criteria
     from jaxcal.selection.in_scenarios import ScenarioTable
 
 __all__ = ["BatchSelection", "Selection", "Subset"]
@@ -99,15 +99,17 @@ class Selection:
     @cached_property
     def in_scenarios(self) -> ScenarioTable | None:
         """The efficiency in each scenario; None where there is one only."""
-        if not isinstance(self.problem, ScenarioProblem):
+        if (joint := self.problem.joint) is None:
             return None
         from jaxcal.selection.in_scenarios import in_scenarios
 
-        return in_scenarios(self.problem, self.indices)
+        return in_scenarios(joint, self.indices)
 
     @cached_property
     def criteria(self) -> Criteria:
         """D, A, I, E, G and O1 to O5; I and G over the available candidates."""
+        from jaxcal.information.criteria import criteria
+
         problem = self.problem
         chosen, region = problem.raw[self.indices], problem.readings[problem.available]
         return criteria(chosen, problem.root, region, problem.multiplicity)
@@ -118,7 +120,7 @@ class Selection:
 
         Of scenarios the least over them.
         """
-        members = getattr(self.problem, "members", (self.problem,))
+        members = self.problem.members
         shares = [_shares_without(member, self.indices) for member in members]
         return np.asarray(np.min(shares, axis=0))
 
@@ -192,9 +194,7 @@ class Selection:
         count = int(self.problem.available.sum())
         side = "upper" if self.problem.criterion.larger_is_better else "lower"
         best = "proven optimal" if self.proven else f"{side} bound {self.bound:.6g}"
-        share = f"{self.criterion}-efficiency"
-        if len(share) > 13:
-            share = "efficiency"
+        share = self.problem.criterion.efficiency_name
         extra = "" if self.seed is None else f", seed {self.seed}"
         lines = [
             f"{len(self.indices)} of {count} candidates, method {self.method}",
@@ -203,7 +203,7 @@ class Selection:
             f"{share:13} {self.efficiency:.6f}" + ("" if self.proven else " or more"),
             *(() if self.in_scenarios is None else self.in_scenarios.summary()),
             f"{'without one':13} {self._lost()}",
-            f"time          {1e3 * self.seconds:.3g} ms{extra}",
+            f"time          {lasted(self.seconds)}{extra}",
         ]
         return "\n".join(
             lines + ([f"reason        {self.reason}"] if self.reason else [])

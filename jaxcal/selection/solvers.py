@@ -14,15 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.checks import one_of, seconds, share, whole_number
+from jaxcal.checks import one_of, require_known, seconds, share, whole_number
 from jaxcal.selection.exact import exact
 from jaxcal.selection.exchange import exchange
-from jaxcal.selection.problem import (
-    Problem,
-    ScenarioProblem,
-    Solution,
-    log_dets,
-)
+from jaxcal.selection.problem import Problem, Solution, log_dets
 
 __all__ = [
     "METHODS",
@@ -39,16 +34,11 @@ _TRIES = 200  # random selections, before the greedy one, where all are singular
 def solve_random(problem: Problem, *, seed: int | np.random.Generator) -> Solution:
     """The baseline of the paper: drawn uniformly, never singular, required first."""
     rng = np.random.default_rng(seed)
-    if isinstance(problem, ScenarioProblem):
-        for _ in range(_TRIES):  # none singular in any scenario
-            indices = random_indices([problem], rng)[0][0]
-            if np.isfinite(problem.log_det(indices)):
-                return Solution(indices, seed=seed if isinstance(seed, int) else None)
-        return exchange.solve_greedy(problem)
-    indices, values = random_indices([problem], rng)
-    log_det, number = float(values[0]), seed if isinstance(seed, int) else None
-    value = log_det if problem.criterion.name == "D" else None
-    return Solution(indices[0], value, log_det, seed=number)
+    for _ in range(_TRIES):  # none singular in any scenario
+        indices = random_indices([problem], rng)[0][0]
+        if np.isfinite(problem.log_det(indices)):
+            return Solution(indices, seed=seed if isinstance(seed, int) else None)
+    return exchange.solve_greedy(problem)
 
 
 def random_indices(
@@ -158,7 +148,7 @@ def checked_options(method: str, given: Mapping[str, Any]) -> dict[str, Any]:
     reads = _options(SOLVERS[method])
     checked = {name: OPTIONS[name][0] for name in reads if name in OPTIONS}
     for name, value in given.items():
-        one_of("the name of an option", name, tuple(OPTIONS))
+        require_known("option", name, tuple(OPTIONS))
         default, check = OPTIONS[name]
         if value is default or (type(value) is type(default) and value == default):
             continue

@@ -5,7 +5,7 @@ otherwise, is said in one line.
 """
 
 from jaxcal.tables.decisions import Decision
-from jaxcal.tables.files import parse, read_table
+from jaxcal.tables.files import csv_text, parse, read_table
 from jaxcal.tables.frames import (
     header_of,
     inputs_of,
@@ -16,7 +16,6 @@ from jaxcal.tables.frames import (
 )
 from jaxcal.tables.names import COMMANDS, MEASURED, columns_by_name
 from jaxcal.tables.table import Table
-from jaxcal.tables.text import csv_text
 
 __all__ = [
     "COMMANDS",

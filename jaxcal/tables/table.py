@@ -99,7 +99,7 @@ class Table:
         prefix: str,
         *,
         chosen: str | None = None,
-        option: str = "--columns",
+        option: str = "--inputs",
         unit: str = "",
         others: Collection[str] | None = None,
     ) -> tuple[str, ...]:
@@ -167,7 +167,7 @@ class Table:
     def commands(
         self,
         chosen: str | None,
-        option: str | None = "--columns",
+        option: str | None = "--inputs",
         but: Collection[str] = (),
     ) -> tuple[str, ...]:
         """Columns of commands: those chosen, else ``u_...``, else all but outputs.

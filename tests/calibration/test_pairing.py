@@ -18,7 +18,7 @@ import ur5
 import jaxcal
 from jaxcal.calibration.pairing.fit import fitted, log_evidence
 from jaxcal.calibration.pairing.table import Hypothesis, Table, shifted
-from jaxcal.commands.main import main
+from jaxcal.commands import main
 from jaxcal.models import Affine, FromFunction, Linear
 
 MATRIX = np.array([[1.02, 0.05, -0.03], [0.04, 0.97, 0.06], [-0.02, 0.03, 1.01]])

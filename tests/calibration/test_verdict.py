@@ -18,7 +18,7 @@ import pytest
 import jaxcal
 from jaxcal.arms.mistaken import mistaken_columns
 from jaxcal.arms.verdict import _Findings, _left_open, _parts
-from jaxcal.commands.main import main
+from jaxcal.commands import main
 from jaxcal.models import Chains, Gravity, Prior, Several, Socket
 
 from ..models.arms import ur5, ur5_data

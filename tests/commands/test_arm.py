@@ -9,8 +9,8 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from jaxcal.commands import main
 from jaxcal.commands.arms import RecordingOptions
-from jaxcal.commands.main import main
 from jaxcal.models import Board, Position, SerialChain, Servos, Socket, Wrench
 from jaxcal.selection import select
 

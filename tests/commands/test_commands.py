@@ -93,14 +93,69 @@ def test_select_for_people_and_machines(candidates, commands, capsys):
 def test_score_judges_what_select_wrote(tmp_path, candidates, capsys):
     out = str(tmp_path / "plan.csv")
     assert main(["select", candidates, "--method", "greedy", "--out", out]) == 0
-    subset = ["score", candidates, "--subset", out, "--reference", "exact", "--json"]
-    assert main(subset) == 0
+    asked = ["select", candidates, "--json", "--score"]
+    assert main([*asked, out, "--reference", "exact"]) == 0
     judged = json.loads(capsys.readouterr().out)
     chosen = ",".join(str(i) for i in judged["indices"])
-    assert main(["score", candidates, "--indices", chosen, "--json"]) == 0
+    assert main([*asked, chosen]) == 0
     again = json.loads(capsys.readouterr().out)
     assert judged["log_det"] == again["log_det"]
     assert 0.0 < judged["efficiency"] <= 1.0
+    assert main([*asked, chosen, "-k4", "--best=2"]) == 2
+
+
+def test_names_of_0_2_work_and_warn(candidates, capsys):
+    new = ["select", candidates, "--inputs", "pitch,yaw,roll", "--score", "0,5,9,3"]
+    assert main([*new, "--json"]) == 0
+    judged = json.loads(capsys.readouterr().out)
+    old = ["score", candidates, "--columns=pitch,yaw,roll", "--indices", "0,5,9,3"]
+    assert main([*old, "--json"]) == 0
+    out, warned = capsys.readouterr()
+    assert json.loads(out)["value"] == judged["value"]
+    assert [line.split(": ")[1].split(" since")[0] for line in warned.splitlines()] == [
+        "score is select --score",
+        "--columns is --inputs",
+        "--indices is --score",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "nearest"),
+    [
+        ("slect t.csv", "there is no command 'slect'; did you mean select?"),
+        ("select t.csv --metod exact", "no option --metod; did you mean --method?"),
+        ("select t.csv --criterion=As1", "did you mean As?"),
+        ("select t.csv --zzz", "unrecognized arguments: --zzz"),
+    ],
+)
+def test_what_is_mistyped_is_answered_with_the_nearest(words, nearest, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(words.split())
+    said = capsys.readouterr().err
+    assert ended.value.code == 2 and nearest in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", ["help", "help select", "select --help"])
+def test_help_is_asked_for_as_it_is_elsewhere(words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(words.split())
+    usage = capsys.readouterr().out.splitlines()[0]
+    assert ended.value.code == 0 and ("select" in words) == ("jaxcal select" in usage)
+
+
+@pytest.mark.parametrize("words", ["--version", "plan --version"])
+def test_every_command_has_a_version(words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(words.split())
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"jaxcal {jaxcal.__version__}\n"
+
+
+def test_a_closed_standard_output_is_one_line(candidates):
+    typed = f"{sys.executable} -m jaxcal select {candidates} >&-"
+    done = subprocess.run(typed, shell=True, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr == "jaxcal: standard output is closed\n"
 
 
 def test_plan_prints_a_table_and_the_rows(candidates, capsys):
@@ -137,8 +192,8 @@ def test_predict_and_command_are_inverse(calibration, tmp_path, commands, capsys
         (["select", "missing.csv"], "missing.csv"),
         (["select", "CANDIDATES", "-k", "3"], "k must be at least 4"),
         (["select", "CANDIDATES", "--method", "greedy", "--restarts", "3"], "restarts"),
-        (["select", "CANDIDATES", "--columns", "pitch,sway"], "no column 'sway'"),
-        (["score", "CANDIDATES", "--indices", "0,1,2,99"], "99"),
+        (["select", "CANDIDATES", "--inputs", "pitch,sway"], "no column 'sway'"),
+        (["select", "CANDIDATES", "--score", "0,1,2,99"], "99"),
         (["command", "CALIBRATION", "CANDIDATES", "--clip"], "--clip needs --limits"),
         (
             ["command", "CALIBRATION", "CANDIDATES", "--limits", "1"],
@@ -152,7 +207,7 @@ def test_bad_input_is_one_line_and_exit_2(
     names = {"CANDIDATES": candidates, "CALIBRATION": calibration}
     arguments = [names.get(argument, argument) for argument in arguments]
     if arguments[0] == "command":
-        arguments += ["--columns", "pitch,yaw,roll"]
+        arguments += ["--outputs", "pitch,yaw,roll"]
     assert main(arguments) == 2
     said = capsys.readouterr().err
     assert said.startswith(f"jaxcal {arguments[0]}: ")
@@ -208,7 +263,7 @@ def test_a_model_goes_through_every_command(tmp_path, arm, capsys):
     assert sorted(chosen["indices"]) == sorted(wanted.indices.tolist())
 
     rows_chosen = ",".join(str(i) for i in chosen["indices"])
-    judge = ["score", *flags, "--indices", rows_chosen, "--json"]
+    judge = ["select", *flags, "--score", rows_chosen, "--json"]
     assert main([*judge, "--criterion", "D"]) == 0
     assert json.loads(capsys.readouterr().out)["value"] == wanted.value
     assert main(judge) == 0  # by the variance of predictions, as select would
@@ -230,7 +285,7 @@ def test_a_model_goes_through_every_command(tmp_path, arm, capsys):
     reached = tmp_path / "y.csv"
     reached.write_text(text)
     inverse = ["command", out, str(reached), "--limits=0,100"]
-    assert main([*inverse, "--columns", "y_x,y_y,y_z"]) == 0
+    assert main([*inverse, "--outputs", "y_x,y_y,y_z"]) == 0
     back = parsed(capsys.readouterr().out)
     again = np.array([[float(v) for v in row.values()] for row in back])
     np.testing.assert_allclose(model.predict(again, truth), rows[:, 3:], atol=0.05)
@@ -259,10 +314,10 @@ def test_an_arm_is_read_from_urdf(tmp_path):
 
 
 def test_rare_options_are_in_the_help_that_asks_for_all(capsys):
-    words = ("--decoding", "--num", "--checkpoint")
+    words = ("--decoding", "--num", "--checkpoint", "--tip")
     for asked, shown in ((["--help"], False), (["--help", "all"], True)):
         with pytest.raises(SystemExit) as ended:
             main(["select", *asked])
         text = capsys.readouterr().out
-        assert ended.value.code == 0 and "--help all has the options" in text
+        assert ended.value.code == 0 and ("more options: --help all" in text) != shown
         assert all((f"  {word} " in text) == shown for word in words)

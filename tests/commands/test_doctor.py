@@ -7,7 +7,7 @@ import json
 
 import jaxcal
 from jaxcal.commands import main
-from jaxcal.commands.main import _required
+from jaxcal.commands.program import _required
 
 
 def test_it_names_versions_extras_and_devices(capsys):

@@ -175,22 +175,22 @@ def test_check_and_report_take_both_by_name(ask, tmp_path):
     code, _, said = ask("check noisy.json t.csv", alone)
     assert code == 2 and "both would be pitch, roll, yaw; begin their names" in said
     code, _, said = ask("check noisy.json t.csv", alone | {"u_roll": COMMANDED["yaw"]})
-    assert code == 2 and "--columns" not in said
+    assert code == 2 and "--inputs" not in said
 
 
 def test_columns_that_are_named_are_in_the_order_named(ask):
     table = {"a": REACHED["pitch"], "b": REACHED["roll"], "c": REACHED["yaw"]}
-    code, out, _ = ask("command c.json t.csv --columns a,c,b", table)
+    code, out, _ = ask("command c.json t.csv --outputs a,c,b", table)
     assert code == 0
     np.testing.assert_allclose(parsed(out)["u_roll"], COMMANDED["roll"], atol=1e-8)
     by_name = {axis: REACHED[axis] for axis in AXES}  # names count here too
-    code, out, _ = ask("command c.json t.csv --columns roll,pitch,yaw", by_name)
+    code, out, _ = ask("command c.json t.csv --outputs roll,pitch,yaw", by_name)
     np.testing.assert_allclose(parsed(out)["u_roll"], COMMANDED["roll"], atol=1e-8)
     half = {"a": REACHED["pitch"], "roll": REACHED["yaw"], "b": REACHED["roll"]}
-    code, _, said = ask("command c.json t.csv --columns a,roll,b", half)
+    code, _, said = ask("command c.json t.csv --outputs a,roll,b", half)
     assert code == 2
     assert "has 'b' in the place of 'y_roll', and 'roll' elsewhere" in said
-    assert ask("command c.json t.csv --columns a,a,b", half)[0] == 2
+    assert ask("command c.json t.csv --outputs a,a,b", half)[0] == 2
 
 
 def test_a_unit_in_the_name_must_be_the_calibrations(ask):
@@ -315,7 +315,7 @@ def test_a_constant_step_under_another_name_is_refused(ask, step, header, typed)
     what = "column 'zeit'" if header else "column 1"
     assert f"{what} goes up by {step:.4g} from row to row" in said
     chosen = "zeit,pitch,yaw" if header else "u_1,u_2,u_3"
-    assert ask(f"{typed}{noise} --columns {chosen}", text_of(table, header))[0] == 0
+    assert ask(f"{typed}{noise} --inputs {chosen}", text_of(table, header))[0] == 0
 
 
 def test_a_sweep_of_one_axis_is_one(ask):

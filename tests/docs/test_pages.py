@@ -128,7 +128,7 @@ def importable(name: str) -> bool:
 def parse(words: list[str]) -> None:
     """Refused by exit code 2 where a flag or a value is wrong."""
     from jaxcal.commands.evaluate import parser as evaluate_parser
-    from jaxcal.commands.main import _parser
+    from jaxcal.commands.program import _parser
     from jaxcal.commands.train_arguments import read as read_train
     from rig.commands import make_parser
 

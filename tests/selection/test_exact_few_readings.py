@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxcal.commands.main import main
+from jaxcal.commands import main
 from jaxcal.deadline import Deadline
 from jaxcal.selection import select
 from jaxcal.selection.criteria import CRITERIA, Criterion

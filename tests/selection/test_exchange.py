@@ -14,7 +14,6 @@ from jaxcal.selection.exchange.exchange import (
     exchange_from,
     exchange_indices,
 )
-from jaxcal.selection.problem import values
 
 
 def uniform(seed, m, n=3):
@@ -50,7 +49,7 @@ def test_no_single_swap_of_blocks_improves_the_result(name, q):
         swapped[position, :, position] = np.arange(150)
     twice = np.sort(swapped, axis=2)
     swapped = swapped[(np.diff(twice, axis=2) > 0).all(axis=2)]
-    found = values(problem, swapped)[0]
+    found = problem.values(swapped)[0]
     if problem.criterion.larger_is_better:
         assert found.max() <= best + 1e-8 * max(1.0, abs(best))
     else:

@@ -51,6 +51,19 @@ class Scenario(NamedTuple):
     prior: Array  # (p, p) precision
     criterion: Criterion
 
+    def search(self, upper: Indices, start: Indices, incumbents: Any) -> _KernelSearch:
+        """The kernel's search; ``upper`` (M,), ``start`` (M,) counts."""
+        root, scale, shift, largest = _near_one(*self, start, upper)
+        blocks, prior, criterion = self
+        useful = min(largest, _USEFUL.get(criterion.kind, np.inf))
+        search = compiled.kernel("jaxcal.selection.exact.branch_kernel").Search(
+            criterion.form, blocks, prior, root, start.sum(), largest_rank(blocks),
+            useful, *incumbents,
+        )  # fmt: skip
+        return _KernelSearch(
+            search, scale, shift, largest, blocks.size * blocks.shape[2]
+        )
+
 
 class JointScenarios(NamedTuple):
     """Several scenarios over the same candidates, and how their phi are joined."""
@@ -59,6 +72,44 @@ class JointScenarios(NamedTuple):
     criterion: ScenarioCriterion
     weights: Array  # (S,) of sum 1
     terms: tuple[Array, Array]  # (S,) scale and shift of phi
+
+    def search(self, upper: Indices, start: Indices, incumbents: Any) -> _KernelSearch:
+        """The search of the kernel in all scenarios; ``upper``, ``start`` (M,)."""
+        scenarios, criterion, weights, terms = self
+        kernel = compiled.kernel("jaxcal.selection.exact.branch_kernel")
+        near = [_near_one(*scenario, start, upper) for scenario in scenarios]
+        roots, units, origins, tops = zip(*near, strict=True)
+        scale, shift = terms
+        shift = shift + scale * origins
+        scale = scale * units
+        most = scale * tops + shift
+        largest = float(most.min() if criterion.least else weights @ most)
+        unit = 1.0
+        if criterion.kind != "det":  # values near 1
+            begun = [-1.0 if criterion.kind == "trace" else 1.0] * scale + shift
+            unit = float(
+                np.abs(begun).max() if criterion.least else weights @ np.abs(begun)
+            )
+            scale, shift, largest = scale / unit, shift / unit, largest / unit
+        useful = min(largest, _USEFUL.get(criterion.kind, np.inf))
+        k = start.sum()
+        packs = _packs(len(scenarios), scenarios[0].blocks)
+        members = [
+            kernel.Search(
+                scenario.criterion.form, scenario.blocks, scenario.prior, root, k,
+                largest_rank(scenario.blocks), useful, *_incumbents(1, len(start)),
+                True, packs,
+            )
+            for scenario, root in zip(scenarios, roots, strict=True)
+        ]  # fmt: skip
+        first = scenarios[0]
+        search = kernel.JointSearch(
+            first.criterion.form, first.blocks, first.prior, roots[0], k, 1, useful,
+            *incumbents,
+        )  # fmt: skip
+        search.join(members, weights, scale, shift, criterion.least)
+        work = len(scenarios) * first.blocks.size * first.blocks.shape[2]
+        return _KernelSearch(search, unit, 0.0, largest, work)
 
 
 class _KernelSearch(NamedTuple):
@@ -95,71 +146,13 @@ def branch_and_bound(
         root_only: stop at the bound of the relaxation.
     """
     incumbents = _incumbents(best, len(start))
-    if isinstance(judged_by, Scenario):
-        started = _search(judged_by, upper, start, incumbents)
-    else:
-        started = _joint_search(judged_by, upper, start, incumbents)
+    started = judged_by.search(upper, start, incumbents)
     counts = np.array([lower, upper, start], dtype=np.float64)
     good = (0.0, np.inf) if root_only else (0.0, -np.inf)
     if enough is not None:
         slope, shift = judged_by.criterion.enough(enough)
         good = slope, shift / started.scale
     return _searched(started, incumbents, counts, deadline, good, root_only)
-
-
-def _search(
-    scenario: Scenario, upper: Indices, start: Indices, incumbents: Any
-) -> _KernelSearch:
-    """The search of one scenario."""
-    root, scale, shift, largest = _near_one(*scenario, start, upper)
-    blocks, prior, criterion = scenario
-    useful = min(largest, _USEFUL.get(criterion.kind, np.inf))
-    search = compiled.kernel("jaxcal.selection.exact.branch_kernel").Search(
-        criterion.form, blocks, prior, root, start.sum(), largest_rank(blocks), useful,
-        *incumbents,
-    )  # fmt: skip
-    return _KernelSearch(search, scale, shift, largest, blocks.size * blocks.shape[2])
-
-
-def _joint_search(
-    joint: JointScenarios, upper: Indices, start: Indices, incumbents: Any
-) -> _KernelSearch:
-    """The search of several scenarios; ``upper`` (M,), ``start`` (M,) counts."""
-    scenarios, criterion, weights, terms = joint
-    kernel = compiled.kernel("jaxcal.selection.exact.branch_kernel")
-    near = [_near_one(*scenario, start, upper) for scenario in scenarios]
-    roots, units, origins, tops = zip(*near, strict=True)
-    scale, shift = terms
-    shift = shift + scale * origins
-    scale = scale * units
-    most = scale * tops + shift
-    largest = float(most.min() if criterion.least else weights @ most)
-    unit = 1.0
-    if criterion.kind != "det":  # values near 1
-        begun = [-1.0 if criterion.kind == "trace" else 1.0] * scale + shift
-        unit = float(
-            np.abs(begun).max() if criterion.least else weights @ np.abs(begun)
-        )
-        scale, shift, largest = scale / unit, shift / unit, largest / unit
-    useful = min(largest, _USEFUL.get(criterion.kind, np.inf))
-    k = start.sum()
-    packs = _packs(len(scenarios), scenarios[0].blocks)
-    members = [
-        kernel.Search(
-            scenario.criterion.form, scenario.blocks, scenario.prior, root, k,
-            largest_rank(scenario.blocks), useful, *_incumbents(1, len(start)), True,
-            packs,
-        )
-        for scenario, root in zip(scenarios, roots, strict=True)
-    ]  # fmt: skip
-    first = scenarios[0]
-    search = kernel.JointSearch(
-        first.criterion.form, first.blocks, first.prior, roots[0], k, 1, useful,
-        *incumbents,
-    )  # fmt: skip
-    search.join(members, weights, scale, shift, criterion.least)
-    work = len(scenarios) * first.blocks.size * first.blocks.shape[2]
-    return _KernelSearch(search, unit, 0.0, largest, work)
 
 
 def _packs(num_scenarios: int, blocks: Array) -> bool:

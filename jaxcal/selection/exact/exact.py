@@ -11,31 +11,22 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.deadline import NEVER, Deadline
-from jaxcal.selection.criteria import ScenarioCriterion
-from jaxcal.selection.exact.branch_and_bound import (
-    BranchResult,
-    JointScenarios,
-    Scenario,
-    branch_and_bound,
-)
 from jaxcal.selection.exact.volume import largest_volumes
 from jaxcal.selection.exchange.exchange import (
     default_restarts,
     exchange_indices,
     greedy_indices,
 )
-from jaxcal.selection.problem import (
-    Problem,
-    ScenarioProblem,
-    Solution,
-    values,
-)
+from jaxcal.selection.problem import Problem, Solution
+
+if TYPE_CHECKING:
+    from jaxcal.selection.exact.branch_and_bound import BranchResult
 
 __all__ = ["TIME_LIMIT", "relaxed", "solve", "solve_auto", "solve_exact", "upper_bound"]
 
@@ -96,7 +87,9 @@ def solve_auto(
     share = problem.criterion.efficiency(solution.value, solution.bound)
     method, reason = "exact", "the exact search proved this optimum"
     if not solution.proven:
-        at_least = f"{_efficiency_in_words(problem)} of at least {share:.6f}"
+        name = problem.criterion.efficiency_name
+        article = "an" if name[0] in "AEIe" else "a"
+        at_least = f"{article} {name} of at least {share:.6f}"
         request = f"{least_efficiency:g} was asked for"
         reason = (
             f"the exact search ran out of time after {limit:g} s with {at_least} "
@@ -107,17 +100,9 @@ def solve_auto(
     return dataclasses.replace(solution, method=method, reason=reason, **started)
 
 
-def _efficiency_in_words(problem: Problem) -> str:
-    """An efficiency by its criterion, "a D-efficiency"; of scenarios without it."""
-    if isinstance(problem.criterion, ScenarioCriterion):
-        return "an efficiency"
-    letter = problem.criterion.name
-    return f"{'an' if letter[0] in 'AEI' else 'a'} {letter}-efficiency"
-
-
 def _starts(problem: Problem) -> int:
     """Restarts of the exchange; E of several scenarios is as slow as its proof."""
-    if isinstance(problem, ScenarioProblem) and problem.joined.kind == "least":
+    if problem.joint is not None and problem.criterion.kind == "least":
         return default_restarts(problem)
     return STARTING_RESTARTS
 
@@ -207,15 +192,20 @@ def _branched(
     problem: Problem, keep: Indices, *rules: Any, **options: Any
 ) -> BranchResult:
     """Branch and bound over the candidates ``keep``, in all scenarios."""
-    if not isinstance(problem, ScenarioProblem):
-        alone = Scenario(problem.blocks[keep], problem.prior, problem.criterion)
-        return branch_and_bound(alone, *rules, **options)
+    from jaxcal.selection.exact.branch_and_bound import (
+        JointScenarios,
+        Scenario,
+        branch_and_bound,
+    )
+
     members = [
         Scenario(member.blocks[keep], member.prior, member.criterion)
         for member in problem.members
     ]
-    joint = JointScenarios(members, problem.joined, problem.weights, problem.terms())
-    return branch_and_bound(joint, *rules, **options)
+    judged_by: Scenario | JointScenarios = members[0]
+    if (joint := problem.joint) is not None:
+        judged_by = JointScenarios(members, joint.joined, joint.weights, joint.terms())
+    return branch_and_bound(judged_by, *rules, **options)
 
 
 def _pool(problem: Problem, hull: bool) -> Indices:
@@ -279,7 +269,7 @@ def _solution_of(
     ``phi`` is a bound on it from above; None where the first is proven.
     """
     chosen, criterion = np.array(subsets), problem.criterion
-    value, log_det = values(problem, chosen)
+    value, log_det = problem.values(chosen)
     order = np.argsort(-value if criterion.larger_is_better else value, kind="stable")
     order = order[:best]
     order = order[np.isfinite(log_det[order])]
@@ -332,8 +322,7 @@ def _groups(problem: Problem, merge: bool) -> tuple[Indices, Indices]:
     """
     keep = np.flatnonzero(problem.available)
     if merge:
-        members = getattr(problem, "members", (problem,))
-        raw = [member.raw[keep].reshape(len(keep), -1) for member in members]
+        raw = [member.raw[keep].reshape(len(keep), -1) for member in problem.members]
         flat = np.concatenate(raw, axis=1) if len(raw) > 1 else raw[0]
         total = np.sort(flat.sum(axis=1))
         if (total[1:] == total[:-1]).any():  # otherwise no two are equal

@@ -20,12 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal import compiled
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection.criteria import Criterion
-from jaxcal.selection.problem import (
-    Problem,
-    ScenarioProblem,
-    Solution,
-    values,
-)
+from jaxcal.selection.problem import Problem, ScenarioProblem, Solution
 
 __all__ = [
     "Climbs",
@@ -97,9 +92,8 @@ def default_restarts(problem: Problem) -> int:
     if problem.criterion.kind == "least":
         most = 100
     count, q, p = problem.blocks.shape
-    name, least = problem.criterion.name, 1.0
-    if isinstance(problem, ScenarioProblem):
-        name = problem.joined.each.name
+    name, least = problem.criterion.each.name, 1.0
+    if problem.joint is not None:
         count *= len(problem.members)
         least = 3.0  # a start from each share of the greedy ones
         if name == "E":  # a swap takes eigenvalues in every scenario
@@ -116,8 +110,8 @@ class Climbs:
         _, q, p = problem.blocks.shape
         self.share = _SHARE * min(1.0, problem.k * q / p) ** 6
         self._terms: tuple[tuple[Array, Array], ...] = ()  # of the swaps that raise E
-        if isinstance(problem, ScenarioProblem):
-            self._climber = self._joint(problem, seed)
+        if (joint := problem.joint) is not None:
+            self._climber = self._joint(joint, seed)
         else:
             self._climber = _climber(problem, seed)
         self.random_start = self._climber.random_start  # (k,), the required first
@@ -188,7 +182,7 @@ class Climbs:
         if not kept:
             return near[0]
         starts = np.array(list(kept.values()))
-        order = np.argsort(-values(problem, starts)[0])[:most]
+        order = np.argsort(-problem.values(starts)[0])[:most]
         more = [self.random_start() for _ in range(min(most, restarts - many))]
         climbed = [self.climbed(start, swaps=2) for start in (*starts[order], *more)]
         return max(climbed, key=lambda one: one[1])

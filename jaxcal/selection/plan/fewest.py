@@ -45,7 +45,7 @@ from jaxcal.selection.problem import (
     problem_of,
     shares_regressor,
 )
-from jaxcal.selection.problem.scenario_problem import joined_problem
+from jaxcal.selection.problem.problem import joined_problem
 from jaxcal.selection.solvers import checked_seed
 
 __all__ = ["Plan", "PlanRow", "plan"]

@@ -3,8 +3,12 @@
 from jaxcal.selection.problem.assembly import make_problems, problem_of
 from jaxcal.selection.problem.blocks import Blocks, blocks_of, shares_regressor
 from jaxcal.selection.problem.candidate_set import CandidateSet, DesignProtocol
-from jaxcal.selection.problem.problem import Problem, Solution, log_dets, values
-from jaxcal.selection.problem.scenario_problem import ScenarioProblem
+from jaxcal.selection.problem.problem import (
+    Problem,
+    ScenarioProblem,
+    Solution,
+    log_dets,
+)
 from jaxcal.selection.problem.scenarios import Scenarios
 
 __all__ = [
@@ -20,5 +24,4 @@ __all__ = [
     "make_problems",
     "problem_of",
     "shares_regressor",
-    "values",
 ]

@@ -34,7 +34,9 @@ from jaxcal.selection.criteria import (
     ScenarioCriterion,
     criterion_of,
 )
-from jaxcal.selection.problem.arrays import (
+from jaxcal.selection.problem.blocks import blocks_of
+from jaxcal.selection.problem.candidate_set import (
+    CandidateSet,
     check_available,
     filled,
     flatten_rounding,
@@ -42,10 +44,7 @@ from jaxcal.selection.problem.arrays import (
     rounding_of,
     usable_numbers,
 )
-from jaxcal.selection.problem.blocks import blocks_of
-from jaxcal.selection.problem.candidate_set import CandidateSet
-from jaxcal.selection.problem.problem import Problem
-from jaxcal.selection.problem.scenario_problem import joined_problem
+from jaxcal.selection.problem.problem import Problem, joined_problem
 
 __all__ = ["make_problems", "problem_of"]
 
@@ -72,23 +71,16 @@ def problem_of(
     joined = criterion if isinstance(criterion, ScenarioCriterion) else Mean(criterion)
     default = "I" if offer.model and not offer.model.multiplicity else "D"
     of_one = criterion_of(joined.criterion, region, default)
-    return _problem_of_scenarios(offer, k, of_one, joined)
-
-
-def _problem_of_scenarios(
-    offer: CandidateSet, k: int | None, criterion: Criterion, joined: ScenarioCriterion
-) -> Problem:
-    """The problem in all scenarios."""
     if offer.scenarios is None:
-        return _problem_of_one(offer, k, criterion)
+        return _problem_of_one(offer, k, of_one)
     members = []
     for s, alone in enumerate(offer.by_scenario()):
         try:
-            members.append(_problem_of_one(alone, k, criterion))
+            members.append(_problem_of_one(alone, k, of_one))
         except ValueError as error:
             raise ValueError(f"in scenario {s}: {error}") from None
     compared = offer.model is not None and len(members) > 1
-    nominal = _problem_of_one(offer, k, criterion) if compared else None
+    nominal = _problem_of_one(offer, k, of_one) if compared else None
     return joined_problem(members, offer.scenarios.weights, joined, nominal)
 
 

@@ -79,7 +79,7 @@ class _FixedBlocks(Blocks):
         assert offer.candidates is not None
         self._values, self.times = offer.candidates, offer.model.multiplicity
         if offer.noise is not None and offer.noise.std is not None:
-            self._std = float(offer.noise.std)  # type: ignore[arg-type]  # one number
+            self._std = float(offer.noise.std)
         self._blocks = self._of(self._values)
         self.names, self.root = (), np.zeros((0, self._blocks.shape[2]))
 

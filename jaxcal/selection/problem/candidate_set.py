@@ -7,23 +7,17 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import array_of, numbers, require_kind
+from jaxcal.checks import array_of, numbers, require_finite, require_kind
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, answered, as_model
-from jaxcal.models.uncertainty import Noise, Prior
-from jaxcal.selection.problem.arrays import (
-    check_available,
-    filled,
-    flatten_rounding,
-    rounding_of,
-    usable_numbers,
-)
+from jaxcal.models.uncertainty import Prior, as_noise
 from jaxcal.selection.problem.scenarios import Scenarios, checked_weights, scenarios_of
 from jaxcal.tables import (
     COMMANDS,
@@ -34,113 +28,108 @@ from jaxcal.tables import (
     table_of_frame,
 )
 
-__all__ = ["CandidateSet", "DesignProtocol"]
+__all__ = [
+    "CandidateSet",
+    "DesignProtocol",
+    "check_available",
+    "filled",
+    "flatten_rounding",
+    "one_array",
+    "rounding_of",
+    "usable_numbers",
+]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+_FILLED = ", none of them 0"
+_ROUNDED = 4.0  # units in the last place that short sums of rounded numbers are off by
+_NUMBERS = 2**21  # of 8 bytes; beyond 32 MiB glibc no longer follows
+
 
 @dataclasses.dataclass(eq=False, repr=False)
 class CandidateSet:
-    """Candidates of a model or blocks, with what is known of them and the rules."""
+    """Candidates of a model or blocks, with what is known of them and the rules.
 
-    model: Model | None  # None where blocks were given
-    candidates: Array | None  # (M, n) in the caller's unit; finite
-    blocks: Array | None  # (M, q, p), of S scenarios (M, S, q, p), where given
-    available: Mask  # (M,)
-    prior: Any  # a Prior, of blocks a (p, p) precision, as given
-    noise: Noise | None  # as given, or the model's own
-    measured: Any  # commands (N, n), or blocks (N, q, p), of scenarios (S, N, q, p)
-    required: Any  # candidates that must be chosen, as given
-    max_replicates: int  # how often one candidate may be chosen
+    The fields are as a caller of ``jaxcal.Design`` gives them, and as ``checked`` then
+    leaves them.
+    """
+
+    candidates: Any  # (M, n) commands in the caller's unit, finite; None: blocks alone
+    model: Any = None  # a Model; None where blocks are given
+    prior: Any = None  # a Prior, of blocks a (p, p) precision, as given
+    noise: Any = None  # a Noise, as given or the model's own
+    measured: Any = None  # commands (N, n), blocks (N, q, p), of scenarios (S, N, q, p)
+    available: Any = None  # (M,) bool
+    required: Any = None  # candidates that must be chosen, as given
+    max_replicates: int = 1  # how often one candidate may be chosen
+    blocks: Any = None  # (M, q, p), of S scenarios (M, S, q, p), where given
+    scenarios: Any = None  # a Scenarios; None: the nominal alone
     names: tuple[str, ...] | None = None  # (M,) of the candidates, the caller's own
     axes: tuple[str, ...] | None = None  # (n,) of the inputs, the caller's own
-    scenarios: Scenarios | None = None  # None: the nominal alone
     parameters: Array | None = None  # (p,) of one scenario; None: the nominal's
 
-    def __post_init__(self) -> None:
-        require_kind("noise", self.noise, Noise)
-        # Copies: the caller's arrays may change before the next question.
-        if self.measured is not None:
-            self.measured = numbers("measured", self.measured)
-        if self.required is not None:
-            self.required = copy.deepcopy(self.required)
-        if not (self.prior is None or isinstance(self.prior, Prior)):
-            self.prior = copy.deepcopy(self.prior)
+    def checked(self) -> Self:
+        """Itself, its fields checked and the caller's arrays copied.
 
-    @classmethod
-    def of_commands(
-        cls,
-        candidates: ArrayLike,
-        model: Model | None = None,
-        prior: Prior | None = None,
-        noise: Noise | None = None,
-        measured: ArrayLike | None = None,
-        available: ArrayLike | None = None,
-        *,
-        scenarios: Any = None,
-        names: Sequence[str] | None = None,
-        required: ArrayLike | None = None,
-        max_replicates: int = 1,
-    ) -> CandidateSet:
-        """Commands (M, n) of a model, see ``jaxcal.Design``."""
-        if model is not None:
-            model = as_model(model)
-        require_kind("prior", prior, Prior)
-        frame, axes = candidates, None
-        if header_of("candidates", candidates):
-            wanted, mask = (
-                getattr(model, "inputs", ()),
-                _available(candidates, available),
-            )
+        Raises:
+            ValueError: naming the argument, the rule and the value.
+        """
+        self.noise = as_noise(self.noise)
+        if self.blocks is None:
+            self._check_commands()
+        else:
+            self._check_blocks()
+        self.required = copy.deepcopy(self.required)
+        return self
+
+    def _check_commands(self) -> None:
+        """Commands (M, n) of a model, or a frame."""
+        if self.model is not None:
+            self.model = as_model(self.model)
+        require_kind("prior", self.prior, Prior)
+        given = self.candidates
+        if header_of("candidates", given):
+            wanted = getattr(self.model, "inputs", ())
+            mask = self.available = _available(given, self.available)
             if wanted:
-                axes = names_in("candidates", candidates, wanted, COMMANDS, ())
+                self.axes = names_in("candidates", given, wanted, COMMANDS, ())
             else:
-                axes = inputs_of("candidates", candidates)
-            candidates = of_frame("candidates", candidates, axes, COMMANDS, mask)
-            measured = of_frame("measured", measured, wanted or axes, COMMANDS)
-            available = mask
-        array = filled("candidates", candidates, "M", "n")
-        labels = _names_of_rows(frame, names, len(array))
-        if model is None:
-            model = Affine(array.shape[1], array.shape[1])
+                self.axes = inputs_of("candidates", given)
+            columns = wanted or self.axes
+            self.measured = of_frame("measured", self.measured, columns, COMMANDS)
+            self.candidates = of_frame("candidates", given, self.axes, COMMANDS, mask)
+        array = filled("candidates", self.candidates, "M", "n")
+        spacing = rounding_of(self.candidates)
+        self.names = _names_of_rows(given, self.names, len(array))
+        if self.model is None:
+            self.model = Affine(array.shape[1], array.shape[1])
+        model = self.model
         if model.multiplicity and array.shape[1] != model.num_inputs:
             raise ValueError(
                 f"candidates must have shape (M, {model.num_inputs}) for this model, "
                 f"got {array.shape}"
             )
-        mask = check_available(available, array.shape[:1])
-        made = cls(
-            model=model,
-            candidates=usable_numbers("candidates", array, mask),
-            blocks=None,
-            available=mask,
-            prior=prior,
-            noise=model.default_noise() if noise is None else noise,
-            measured=measured,
-            required=required,
-            max_replicates=max_replicates,
-            names=labels,
-            axes=axes,
-        )
-        if scenarios is not None:
-            made.scenarios = scenarios_of(scenarios, model, prior)
-        assert made.candidates is not None
+        self.available = check_available(self.available, array.shape[:1])
+        self.candidates = usable_numbers("candidates", array, self.available)
+        if self.noise is None:
+            self.noise = model.default_noise()
+        if self.measured is not None:
+            self.measured = numbers("measured", self.measured)
+        if self.scenarios is not None:
+            self.scenarios = scenarios_of(self.scenarios, model, self.prior)
         if model.multiplicity:  # which answers everywhere, by the commands themselves
-            spacing, rows = rounding_of(candidates), None
-            if made.measured is not None and made.measured.ndim == 2:
-                rows = made.measured[None, :, None]
-            flatten_rounding(
-                spacing, made.candidates[None, :, None], mask[None], rows, bias=True
-            )
+            rows = None
+            if self.measured is not None and self.measured.ndim == 2:
+                rows = self.measured[None, :, None]
+            mask = self.available[None]
+            flatten_rounding(spacing, array[None, :, None], mask, rows, bias=True)
         else:
-            made._leave_unanswered(model)
-        made.candidates.flags.writeable = False
-        return made
+            self._leave_unanswered(model)
+        self.candidates.flags.writeable = False
 
     def _leave_unanswered(self, model: Model) -> None:
         """Mask candidates for which the model fails; a warning names them."""
-        assert self.candidates is not None
         cases = [None if self.prior is None else self.prior.resolve(model).mean]
         if self.scenarios is not None and self.scenarios.parameters is not None:
             cases += list(self.scenarios.parameters)
@@ -156,63 +145,47 @@ class CandidateSet:
             kept = answered(model, asked, parameters, rows, self.names)
             self.available[rows[~kept]] = False
 
-    @classmethod
-    def of_blocks(
-        cls,
-        blocks: ArrayLike,
-        prior: ArrayLike | None = None,
-        noise: Noise | None = None,
-        measured: ArrayLike | None = None,
-        available: ArrayLike | None = None,
-        *,
-        commands: ArrayLike | None = None,
-        names: Sequence[str] | None = None,
-        weights: ArrayLike | None = None,
-        **rules: Any,
-    ) -> CandidateSet:
-        """Blocks (M, q, p) or (S, M, q, p), see ``jaxcal.Design.from_blocks``."""
-        if isinstance(prior, Prior):
+    def _check_blocks(self) -> None:
+        """Blocks (M, q, p) or (S, M, q, p), whose scenarios are (S,) weights."""
+        if self.model is not None:
+            raise ValueError("model must come with candidates, not with blocks")
+        if isinstance(self.prior, Prior):
             raise ValueError(
                 "prior must be a (p, p) precision with blocks, got a Prior"
             )
-        shape = ("S", "M", "q", "p") if np.ndim(blocks) == 4 else ("M", "q", "p")
-        array, scenarios = filled("blocks", blocks, *shape), None
-        mask = check_available(available, array.shape[-3:-2])
-        if array.ndim == 4:
-            scenarios = Scenarios(None, checked_weights(weights, len(array)))
+        joined = np.ndim(self.blocks) == 4
+        shape = ("S", "M", "q", "p") if joined else ("M", "q", "p")
+        array = filled("blocks", self.blocks, *shape)
+        spacing = rounding_of(self.blocks)
+        self.available = check_available(self.available, array.shape[-3:-2])
+        if joined:
+            weights = checked_weights(self.scenarios, len(array))
+            self.scenarios = Scenarios(None, weights)
             array = np.ascontiguousarray(np.moveaxis(array, 1, 0))
-        elif weights is not None:
+        elif self.scenarios is not None:
             raise ValueError("weights must come with blocks (S, M, q, p) of scenarios")
-        array = usable_numbers("blocks", array, mask)
-        if commands is not None:
+        self.blocks = array = usable_numbers("blocks", array, self.available)
+        self.prior = copy.deepcopy(self.prior)
+        if self.candidates is not None:
             rule = ", one for each block"
-            commands = array_of("commands", commands, len(array), "n", rule=rule)
+            commands = array_of("commands", self.candidates, len(array), "n", rule=rule)
             commands.flags.writeable = False
-        made = cls(
-            model=None,
-            candidates=commands,
-            blocks=array,
-            available=mask,
-            prior=prior,
-            noise=noise,
-            measured=measured,
-            names=_names_of_rows(array, names, len(array)),
-            scenarios=scenarios,
-            **rules,
-        )
-        seen = made.measured
-        if seen is not None and array.ndim == 4 and len(seen) != array.shape[1]:
-            raise ValueError(
-                "measured must have shape (S, N, q, p), blocks of every scenario, got "
-                f"{seen.shape}"
-            )
-        by_set = np.moveaxis(array, 1, 0) if array.ndim == 4 else array[None]
-        rows = seen[None] if seen is not None and array.ndim == 3 else seen
-        if rows is not None and rows.ndim != 4:
-            rows = None
-        usable = np.broadcast_to(mask, by_set.shape[:2])
-        flatten_rounding(rounding_of(blocks), by_set, usable, rows)
-        return made
+            self.candidates = commands
+        self.names = _names_of_rows(array, self.names, len(array))
+        if self.measured is not None:
+            self.measured = numbers("measured", self.measured)
+            if joined and len(self.measured) != array.shape[1]:
+                raise ValueError(
+                    "measured must have shape (S, N, q, p), blocks of every scenario, "
+                    f"got {self.measured.shape}"
+                )
+        by_set = np.moveaxis(array, 1, 0) if joined else array[None]
+        rows = self.measured
+        if rows is not None:
+            rows = rows if joined else rows[None]
+            rows = rows if rows.ndim == 4 else None
+        usable = np.broadcast_to(self.available, by_set.shape[:2])
+        flatten_rounding(spacing, by_set, usable, rows)
 
     def by_scenario(self) -> list[CandidateSet]:
         """The candidates in each scenario alone; where there are none, as they are."""
@@ -269,3 +242,125 @@ def _names_of_rows(
             f"of {', '.join(sorted({type(name).__name__ for name in labels}))}"
         )
     return labels
+
+
+def filled(name: str, values: ArrayLike, *letters: str) -> Array:
+    """``values`` as float64 with an axis for each letter, none of them empty."""
+    array = array_of(name, values, *letters, rule=_FILLED, finite=False)
+    if 0 in array.shape:
+        raise ValueError(
+            f"{name} must have shape ({', '.join(letters)}){_FILLED}, got {array.shape}"
+        )
+    return array
+
+
+@functools.cache
+def _keep_freed_pages() -> None:
+    """Let glibc's malloc keep the pages of freed arrays for the next problem.
+
+    It returns the top of its heap to the system where that is larger than twice the
+    largest array freed so far. A problem frees two such arrays at least, its blocks and
+    the whitened ones, so the next one waits for all of their pages again: 109 page
+    faults, .3 of .7 ms, with blocks (2000, 3, 6). An array of 16 MiB that is freed
+    raises the limit to 32 MiB; nothing is written to it, so it takes no memory. Other
+    allocators ignore it.
+    """
+    np.empty(_NUMBERS)
+
+
+def usable_numbers(name: str, array: Array, mask: Mask) -> Array:
+    """The array, finite where available; what is not elsewhere becomes zero in it."""
+    _keep_freed_pages()
+    finite = np.isfinite(array)
+    if not finite.all():
+        hidden = ~finite & ~mask.reshape(*mask.shape, *[1] * (array.ndim - mask.ndim))
+        array[hidden] = 0.0
+        require_finite(name, array)
+    return array
+
+
+def rounding_of(values: ArrayLike) -> float:
+    """Spacing at 1 of numbers that are coarser than double precision, else 0."""
+    kind = np.asarray(values).dtype
+    coarse = kind.kind == "f" and kind.itemsize < np.dtype(np.float64).itemsize
+    return float(np.finfo(kind).eps) if coarse else 0.0
+
+
+def flatten_rounding(
+    spacing: float,
+    candidates: Array,
+    usable: Mask,
+    measured: Array | None = None,
+    *,
+    bias: bool = False,
+) -> None:
+    """Put blocks that lie in a plane but for rounding to float32 into it, in place.
+
+    In double precision that rounding would pass for information: of a third column that
+    is the sum of two others in float32 a design would be made, and proven.
+
+    Args:
+        spacing: of the numbers that the caller gave, see ``rounding_of``; 0: nothing.
+        candidates: (S, M, q, p) of S sets; readings and columns of any unit.
+        usable: (S, M) which of them count.
+        measured: (S, N, q, p) known beforehand, put into the plane with them.
+        bias: a column of ones stands beside them, so the plane need not pass through 0.
+    """
+    if not spacing:
+        return
+    blocks, counted = candidates, usable
+    if measured is not None and measured.shape[2:] == candidates.shape[2:]:
+        blocks = np.concatenate([candidates, measured], axis=1)
+        always = np.ones(measured.shape[:2], dtype=np.bool_)
+        counted = np.concatenate([usable, always], axis=1)
+    counts = counted[..., None, None]
+    blocks = np.where(counts, blocks, 0.0)
+    scale = _sizes(blocks, (1, 3))
+    scale = scale * _sizes(blocks / scale, (1, 2))
+    unit = blocks / scale
+    middle = np.zeros((len(unit), 1, *unit.shape[2:]))
+    if bias:
+        number = np.maximum(counts.sum(axis=1, keepdims=True), 1)
+        middle = unit.sum(axis=1, keepdims=True) / number
+    rows = np.where(counts, unit - middle, 0.0).reshape(len(unit), -1, unit.shape[3])
+    left, size, right = np.linalg.svd(rows, full_matrices=False)
+    real = size > _ROUNDED * spacing * np.sqrt(rows[0].size)
+    num = candidates.shape[1]
+    for n in np.flatnonzero(~real.all(axis=1)):
+        flat = (left[n] * np.where(real[n], size[n], 0.0)) @ right[n]
+        flat = (flat.reshape(unit.shape[1:]) + middle[n]) * scale[n]
+        candidates[n][usable[n]] = flat[:num][usable[n]]
+        if measured is not None and len(flat) > num:
+            measured[n] = flat[num:]
+
+
+def _sizes(blocks: Array, axes: tuple[int, int]) -> Array:
+    """The largest of each reading or column, 1 where all are zero."""
+    largest = np.abs(blocks).max(axis=axes, initial=0.0, keepdims=True)
+    return np.where(largest > 0.0, largest, 1.0)
+
+
+def check_available(available: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
+    """(M,) or, of many sets, (B, M), as ``shape`` says."""
+    if available is None:
+        return np.ones(shape, dtype=np.bool_)
+    mask = one_array("available", available)
+    if mask.shape != shape:
+        raise ValueError(f"available must have shape {shape}, got {mask.shape}")
+    if mask.dtype.kind not in "biuf" or not np.isin(mask, (0, 1)).all():
+        wrong = mask[~np.isin(mask, (0, 1))] if mask.dtype.kind in "iuf" else mask
+        raise ValueError(
+            "available must hold True or 1 where a candidate may be chosen, else False "
+            f"or 0, got {wrong.flat[0]}"
+        )
+    return mask.astype(np.bool_)
+
+
+def one_array(name: str, values: ArrayLike) -> NDArray[np.generic]:
+    """A copy of ``values`` as an array of any kind."""
+    try:
+        return np.array(values)
+    except ValueError as error:
+        raise ValueError(
+            f"{name} must be one array, got {type(values).__name__} of mixed lengths"
+        ) from error

@@ -5,6 +5,10 @@ prior's precision, and with everything available measured at once the sum is the
 identity (see ``jaxcal.information.blocks``). A solver that reads nothing else picks
 the same candidates in pulses, degrees or [0, 1]. The criterion is carried into the same
 coordinates. Postures of the affine model are blocks [u, 1] that count once per output.
+
+Each of several scenarios is a problem of its own, in its own coordinates; they share
+what may be chosen. Sums and minima of concave functions are concave, so what proves a
+selection of one problem proves that of several.
 """
 
 from __future__ import annotations
@@ -21,8 +25,15 @@ from numpy.typing import NDArray
 from jaxcal.information.blocks import WhiteBlocks, rank_of_blocks
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model
+from jaxcal.selection.criteria import ScenarioCriterion
 
-__all__ = ["Problem", "Solution", "log_dets", "values"]
+__all__ = [
+    "Problem",
+    "ScenarioProblem",
+    "Solution",
+    "joined_problem",
+    "log_dets",
+]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -51,6 +62,16 @@ class Problem:
     root: Array  # (r, p) root of the caller's prior precision, with what was measured
     candidates: Array | None = None  # (M, n) in the caller's unit, where there are any
     model: Model | None = None  # what made blocks of the candidates
+
+    @property
+    def members(self) -> tuple[Problem, ...]:
+        """The problem of each scenario, itself where there is one."""
+        return (self,)
+
+    @property
+    def joint(self) -> ScenarioProblem | None:
+        """Itself, where there are several scenarios."""
+        return None
 
     @functools.cached_property
     def blocks(self) -> Array:
@@ -150,14 +171,124 @@ class Problem:
         return dataclasses.replace(self, k=k)
 
     def values(self, indices: Indices) -> tuple[Array, Array]:
-        """Reported value of the criterion, and log det S, of subsets (R, k)."""
-        return values_of_one(self, indices)
+        """(R,) reported value of the criterion, and log det S, of subsets (R, k)."""
+        raw = self.raw[indices]
+        log_det = rank_of_blocks(raw, self.root, self.white.size)[1]
+        log_det *= self.multiplicity
+        if self.criterion.name == "D":
+            return log_det, log_det
+        rows = self.blocks[indices].reshape(len(indices), -1, self.num_regressors)
+        phi = self.criterion.value(np.matrix_transpose(rows) @ rows + self.prior)
+        phi = np.where(np.isneginf(log_det), -np.inf, phi)
+        return np.asarray(self.criterion.reported(phi)), log_det
 
     def log_det(self, indices: Indices) -> float:
         """log det S of a subset, natural, in the caller's units; -inf if singular."""
         blocks = self.raw[np.asarray(indices)[None]]
         log_det = rank_of_blocks(blocks, self.root, self.white.size)[1][0]
         return self.multiplicity * float(log_det)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ScenarioProblem(Problem):
+    """Choose k candidates so that a joined criterion is best.
+
+    The attributes of a ``Problem`` are those of the first scenario.
+    """
+
+    members: tuple[Problem, ...] = ()  # (S,) the scenarios
+    weights: Array = dataclasses.field(default_factory=lambda: np.zeros(0))  # (S,)
+    optima: Array | None = None  # (S,) reported values, of a worst efficiency
+    nominal: Problem | None = None  # at the model's nominal, where there is a model
+
+    @property
+    def joint(self) -> Self:
+        return self
+
+    @property
+    def joined(self) -> ScenarioCriterion:
+        """The criterion."""
+        joined: ScenarioCriterion = self.criterion
+        return joined
+
+    def of_size(self, k: int) -> Self:
+        """This problem with k candidates to choose."""
+        members = tuple(member.of_size(k) for member in self.members)
+        nominal = None if self.nominal is None else self.nominal.of_size(k)
+        return dataclasses.replace(self, k=k, members=members, nominal=nominal)
+
+    def uncertainty(self, indices: Indices) -> float:
+        """The largest of the scenarios, see ``Problem.uncertainty``."""
+        return max(member.uncertainty(indices) for member in self.members)
+
+    def log_det(self, indices: Indices) -> float:
+        """Weighted mean of log det S over the scenarios; -inf if one is singular."""
+        return float(self.values(np.asarray(indices)[None])[1][0])
+
+    def scenario_values(self, indices: Indices) -> tuple[Array, Array]:
+        """(S, R) reported values and log det S of subsets (R, k) in each scenario."""
+        both = np.array([member.values(indices) for member in self.members])
+        return both[:, 0], both[:, 1]
+
+    def values(self, indices: Indices) -> tuple[Array, Array]:
+        """(R,) joined value, as reported, and mean log det S of subsets (R, k)."""
+        of_members, log_dets = self.scenario_values(indices)
+        regular = np.isfinite(log_dets).all(axis=0)
+        joined = self.joined
+        if joined.of_efficiency:
+            assert self.optima is not None
+            one, best = joined.each, self.optima
+            of_members = np.array(
+                [
+                    [one.efficiency(x, best[s]) if np.isfinite(x) else 0.0 for x in row]
+                    for s, row in enumerate(of_members)
+                ]
+            )
+        if joined.least:
+            value = of_members.min(0) if joined.larger_is_better else of_members.max(0)
+        else:
+            value = self.weights @ np.where(regular, of_members, 0.0)
+        worst = -np.inf if joined.larger_is_better else np.inf
+        log_det = self.weights @ np.where(regular, log_dets, 0.0)
+        return np.where(regular, value, worst), np.where(regular, log_det, -np.inf)
+
+    def terms(self) -> tuple[Array, Array]:
+        """(S,) scale and shift of ``ScenarioCriterion.terms``."""
+        criteria = [member.criterion for member in self.members]
+        return self.joined.terms(criteria, self.optima)
+
+
+def joined_problem(
+    members: Sequence[Problem],
+    weights: Array,
+    criterion: ScenarioCriterion,
+    nominal: Problem | None,
+) -> Problem:
+    """The problem of scenarios; where all are equal it is that of one.
+
+    Args:
+        members: (S,) problems that differ in blocks and prior only.
+        weights: (S,) positive, of sum 1.
+        criterion: as asked for.
+        nominal: the problem at the model's nominal, where there is a model.
+    """
+    first, k = members[0], max(member.k for member in members)
+    if all(
+        (member.raw == first.raw).all() and np.array_equal(member.root, first.root)
+        for member in members[1:]
+    ):
+        return first
+    # The fewest that identify in every scenario, where k was not given.
+    members = [one if one.k == k else one.of_size(k) for one in members]
+    fields = {f.name: getattr(members[0], f.name) for f in dataclasses.fields(Problem)}
+    fields["criterion"] = criterion.within(first.criterion)
+    weights = np.array(weights)
+    weights.flags.writeable = False
+    if nominal is not None and nominal.k != k:
+        nominal = nominal.of_size(k)
+    return ScenarioProblem(
+        **fields, members=tuple(members), weights=weights, nominal=nominal
+    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -182,21 +313,3 @@ def log_dets(problems: Sequence[Problem], indices: Indices) -> Array:
     raw = np.array([one.raw[i] for one, i in zip(problems, indices, strict=True)])
     first = problems[0]
     return first.multiplicity * rank_of_blocks(raw, first.root, first.white.size)[1]
-
-
-def values(problem: Problem, indices: Indices) -> tuple[Array, Array]:
-    """Reported value of the criterion, and log det S, of subsets (R, k): (R,) each."""
-    return problem.values(indices)
-
-
-def values_of_one(problem: Problem, indices: Indices) -> tuple[Array, Array]:
-    """Reported value of the criterion, and log det S, of subsets (R, k): (R,) each."""
-    log_det = rank_of_blocks(problem.raw[indices], problem.root, problem.white.size)[1]
-    log_det *= problem.multiplicity
-    criterion = problem.criterion
-    if criterion.name == "D":
-        return log_det, log_det
-    rows = problem.blocks[indices].reshape(len(indices), -1, problem.num_regressors)
-    phi = criterion.value(np.matrix_transpose(rows) @ rows + problem.prior)
-    value = criterion.reported(np.where(np.isneginf(log_det), -np.inf, phi))
-    return np.asarray(value), log_det

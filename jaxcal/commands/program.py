@@ -11,17 +11,16 @@ import sys
 import warnings
 from typing import Annotated
 
-from jaxcal.arguments import Parser, refused, told, values_of
+from jaxcal.arguments import Parser, refused, told, unread, values_of
 from jaxcal.checks import aligned
 from jaxcal.commands.tables import write_json
 from jaxcal.extras import MissingExtraError, install
 from jaxcal.files import require_kept
 
-__all__ = ["COMMANDS", "main"]
+__all__ = ["COMMANDS", "run"]
 
 _HERE = {  # command: one line of help, and the module with its flags and function
     "select": ("choose the few rows of a table worth measuring", "questions"),
-    "score": ("judge a choice made elsewhere", "questions"),
     "plan": ("how many measurements a wanted accuracy takes", "questions"),
     "postures": ("the postures of an arm to measure, in order", "postures"),
     "identify": (
@@ -36,7 +35,7 @@ _HERE = {  # command: one line of help, and the module with its flags and functi
     "command": ("what to command to reach given outputs", "calibrations"),
     "loop": ("measure in a closed loop that another program drives", "loops"),
     "example": ("files to try the commands with", "example"),
-    "doctor": ("versions and devices, for a bug report", "main"),
+    "doctor": ("versions and devices, for a bug report", "program"),
 }
 _WHOLE = {  # commands that parse their own arguments
     "train": ("train a policy (train.py)", "train"),
@@ -57,17 +56,23 @@ examples:
 Tables are CSV, with or without a header; - is standard input."""
 
 
-def main(argv: list[str] | None = None) -> int:
+def run(argv: list[str] | None = None) -> int:
     """Run one command.
 
     Returns:
         The exit code: 0, 1 where a calibration is not good, 2 where something given
         was wrong, 130 after Ctrl-C.
     """
-    words = sys.argv[1:] if argv is None else argv
+    words = [*(sys.argv[1:] if argv is None else argv)]
+    if sys.stdout is None:  # jaxcal ... >&-
+        return refused("jaxcal", ValueError("standard output is closed"))
     if words and words[0] in _WHOLE:
         module = importlib.import_module(f"jaxcal.commands.{words[0]}")
         return int(module.main(words[1:], prog=f"jaxcal {words[0]}"))
+    if words[:1] == ["score"]:
+        text = "score is select --score since jaxcal 0.3; the old name goes with 0.4"
+        print(f"jaxcal: {text}", file=sys.stderr)
+        words[0] = "select"
     arguments = _parser(words).parse_args(words)
     code = 0
     try:
@@ -81,8 +86,8 @@ def main(argv: list[str] | None = None) -> int:
             require_kept(vars(arguments))
             code = arguments.function(**values_of(arguments))
         sys.stdout.flush()
-    except BrokenPipeError:  # the reader of a pipe, such as head, has left
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:
+        return unread()
     except KeyboardInterrupt:
         print(f"jaxcal {arguments.command}: interrupted", file=sys.stderr)
         return 130
@@ -92,14 +97,11 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _parser(given: list[str]) -> Parser:
-    from jaxcal import __version__
-
     parser = Parser(
         prog="jaxcal",
         description="Which few measurements to make, and the calibration that follows.",
         epilog=_EPILOG,
     )
-    parser.add_argument("--version", action="version", version=f"jaxcal {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, (line, _) in (_HERE | _WHOLE).items():
         about = line[0].upper() + line[1:] + "."
