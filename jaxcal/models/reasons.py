@@ -113,8 +113,12 @@ def _undetermined(fit: Fit) -> Reason | None:
     if not fit.undetermined.any():
         return None
     names = ", ".join(fit.names[i] for i in np.flatnonzero(fit.undetermined))
+    plateau = ""
+    if not (fit.model.linear or fit.prior_precision.any()):
+        plateau = " The search may have ended on a plateau and not converged."
     return Reason(
-        f"Not determined, held near the prior's mean: {names}; see identifiability().",
+        f"Not determined, held near the prior's mean: {names}; see identifiability()."
+        + plateau,
         "measure rows that determine them: "
         "select(candidates, model=..., measured=commands)",
     )
