@@ -545,6 +545,8 @@ class FitSolution:
                 if problem.loss is None or gain > _LITTLE:
                     self._linearise()
                 return False
+            if gain <= self._blur():
+                return True
             if self.damping > 1e9:  # rounding is all that is left, or
                 slope = np.abs(rows.T @ right).max() / np.linalg.norm(right)
                 if slope > 1e-3 and not np.isfinite(after):
@@ -561,6 +563,16 @@ class FitSolution:
                 return True
             self.damping *= self.grow
             self.grow *= 2.0
+
+    def _blur(self) -> float:
+        """By how much the noise of the model itself may change the cost."""
+        noise = self.problem.model.rounding
+        if noise is None or self.problem.white.ndim > 2:
+            return 0.0
+        off = self.problem.white * noise / self.level
+        share = np.sqrt(self.weights)[:, None]
+        beside = np.linalg.norm(share**2 * off * self.white / self.level)
+        return float(4.0 * beside + 2.0 * np.linalg.norm(share * off) ** 2)
 
     def _widened(self, rows: Array, scale: Array) -> tuple[Array, Array]:
         """Rows and scale (F,) by the largest scale so far (Moré, 1978).

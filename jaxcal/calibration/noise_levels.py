@@ -176,12 +176,14 @@ def _smooth(
     log = np.log(mean) + 1.0 / freedom[seen]
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(30):
-            found = np.linalg.lstsq(root * basis[seen], root[:, 0] * log, rcond=None)[0]
-            along = basis[seen] @ found
+            weights = np.linalg.lstsq(root * basis[seen], root[:, 0] * log, rcond=None)[
+                0
+            ]
+            along = basis[seen] @ weights
             log = along + np.clip(mean * np.exp(-along) - 1.0, -1.0, 3.0)
             if not np.isfinite(log).all():
                 return None
-    profile = np.exp(0.5 * (basis @ found))
+    profile = np.exp(0.5 * (basis @ weights))
     says = f"a level that varies smoothly along the {q} readings"
     return _Levels(says, np.zeros(q, np.intp), profile, degree + 1)
 
