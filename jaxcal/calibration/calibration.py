@@ -73,6 +73,8 @@ class Calibration(Fit):
         )
         if self.noise_std is not None:
             source = "as given" if self.noise_known else "from the residuals"
+            if shared := self.provenance.get("noise_levels"):
+                source += f": {shared}"
             lines.append(f"noise std {in_words(self.noise_std)}{unit}, {source}")
             if self.dof < 0.5:
                 lines.append("no residual degree of freedom: the noise is not checked")
@@ -223,7 +225,10 @@ class Calibration(Fit):
             loss=self.loss,
             common_noise=None,
         )
-        origin = {k: v for k, v in self.provenance.items() if k != "prior"}
+        ours = ("prior", "noise_levels")
+        origin = {k: v for k, v in self.provenance.items() if k not in ours}
+        if shared := fields.pop("noise_levels"):
+            origin["noise_levels"] = shared
         if prior is not None and not prior.by_data:
             origin["prior"] = "stated"
         return dataclasses.replace(self, **fields, provenance=origin)

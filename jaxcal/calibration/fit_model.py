@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from jaxcal.calibration.least_squares import (
     solve,
 )
 from jaxcal.calibration.losses import LOSSES, constants
+from jaxcal.calibration.noise_levels import are_shared, pooled
 from jaxcal.calibration.prior_scales import (
     PriorScales,
     covariance_of_scales,
@@ -70,12 +72,13 @@ def fit_model(
     prior: Prior | None,
     noise: Noise | None,
     loss: str,
-    common_noise: bool | None,
+    common_noise: bool | Sequence[Any] | None,
     excited: tuple[str, ...] = (),
 ) -> dict[str, Any]:
     """The fields of a ``Calibration`` but names, units and provenance.
 
-    ``excited`` are names of commands that must vary in every direction.
+    With them ``noise_levels``, which readings share a level of noise, "" where each
+    has its own. ``excited`` are names of commands that must vary in every direction.
     """
     one_of("loss", loss, tuple(LOSSES))
     require_kind("prior", prior, Prior)
@@ -104,12 +107,14 @@ def fit_model(
         common_noise=common_noise,
         excited=excited,
     )
-    scales, misfit_factor = None, 1.0
+    scales, misfit_factor, shared = None, 1.0, ""
     if prior.by_data and scaled:
         if fitted.error_groups() is None or not exact:
             raise ValueError("Prior.sized() is of arms, without command_std")
         fit, misfit_factor = _solve_with_misfit(problem, with_misfit)
         solution, scales, problem = fit
+    elif _may_pool(problem, common_noise) and are_shared(problem):
+        problem, solution, shared = pooled(problem)
     else:
         solution = solve(problem)
     if common_noise is None and model.default_noise() is not None:
@@ -119,7 +124,14 @@ def fit_model(
         fields |= _widened(
             problem, solution, fields, scales, with_misfit, misfit_factor
         )
-    return fields | {"model": model, "loss": loss}
+    return fields | {"model": model, "loss": loss, "noise_levels": shared}
+
+
+def _may_pool(problem: FitProblem, common_noise: Any) -> bool:
+    """Whether the levels of noise are not known, and of nothing but the readings."""
+    if common_noise is not None or problem.noise_known or problem.command_std.any():
+        return False
+    return problem.model.default_noise() is None and not problem.model.multiplicity
 
 
 def _problem(
@@ -133,7 +145,7 @@ def _problem(
     noise: Noise,
     command_std: Array,
     loss: str,
-    common_noise: bool | None,
+    common_noise: bool | Sequence[Any] | None,
     excited: tuple[str, ...],
 ) -> tuple[FitProblem, Array | None]:
     """The problem of the measurements that count, the rows that are ``used``.
@@ -148,7 +160,9 @@ def _problem(
     white, reading_std, levels = _reading_noise(
         model, noise, weights, measured.shape[1]
     )
-    if common_noise or not exact:
+    if not (common_noise is None or isinstance(common_noise, bool)):
+        levels = np.unique(np.asarray(common_noise), return_inverse=True)[1]
+    elif common_noise or not exact:
         levels = 0 * levels
     elif common_noise is False:
         levels = np.arange(len(levels))

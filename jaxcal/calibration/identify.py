@@ -58,7 +58,7 @@ def identify(
     noise: Noise | None = None,
     noise_std: ArrayLike | None = None,
     weights: ArrayLike | None = None,
-    common_noise: bool | None = None,
+    common_noise: bool | Sequence[Any] | None = None,
     loss: str | None = None,
     input_names: Sequence[str] | None = None,
     output_names: Sequence[str] | None = None,
@@ -91,10 +91,13 @@ def identify(
         weights: (N,) a measurement of weight w has variance noise_std^2 / w (the number
             of readings averaged, say); 0 leaves it out. All 1 when not given.
         common_noise: estimate one noise level for all outputs (they must share a unit),
-            which has m times the degrees of freedom, or (False) one for each. When not
-            given: one for each, but of an arm one for positions and one for turns
-            unless the residuals contradict it (F test, 0.1 %), and one for all where
-            ``command_std`` is given.
+            which has m times the degrees of freedom, or (False) one for each, or one
+            for each group of (m,) labels. When not given: one for each, but of an arm
+            one for positions and one for turns unless the residuals contradict it (F
+            test, 0.1 %), and one for all where ``command_std`` is given. Where fewer
+            than 30 measurements have outputs that share parameters, as trajectories,
+            one for all, one that varies smoothly along the outputs, or one for each
+            group or output, whichever the residuals show; the summary says which.
         loss: "gaussian" is least squares; "student" (4 degrees of freedom, of a
             measurement as a whole) gives outliers little weight. "student" when not
             given, but least squares of an affine model without prior.
@@ -153,6 +156,8 @@ def identify(
         if mispaired is None:
             raise
         raise ValueError(f"{mispaired.reason}. As it stands: {error}") from None
+    if shared := fields.pop("noise_levels"):
+        about["provenance"]["noise_levels"] = shared
     if prior is not None and not prior.by_data:
         about["provenance"]["prior"] = "stated"
     calibration = Calibration(**fields, **about)
@@ -254,13 +259,18 @@ def _exact(calibration: Calibration) -> bool:
 def _noise(
     noise: Noise | None,
     noise_std: ArrayLike | None,
-    common_noise: bool | None,
+    common_noise: bool | Sequence[Any] | None,
     num_outputs: int,
 ) -> tuple[Noise | None, bool]:
     """The noise as given, and whether that is at most a level of each output."""
     noise = as_noise(noise)
     if not (common_noise is None or isinstance(common_noise, bool)):
-        raise ValueError(f"common_noise must be True or False, got {common_noise!r}")
+        labels = () if isinstance(common_noise, str) else np.atleast_1d(common_noise)
+        if np.shape(labels) != (num_outputs,):
+            raise ValueError(
+                f"common_noise must be True, False or a label for each of the "
+                f"{num_outputs} outputs, got {common_noise!r}"
+            )
     if noise is not None and noise_std is not None:
         raise ValueError("noise_std is short for noise: give one of them")
     plain = noise is None or _is_of_levels(noise)

@@ -45,6 +45,8 @@ _ONCE = 1e-3  # likewise, at which a single one is exact to 1e-8 or so
 _CLEAR = 1e8  # most by which directions differ that are determined without a doubt
 _LITTLE = 1e-6  # of a gain: a step of .001 standard deviations changes no derivative
 _TOUCHED = 4.0  # times the usual noise: most that is read of what is touched
+_AHEAD = 0.1  # of a step, where its curvature is looked for
+_BENT = 0.75  # curvature of a step, of its length, at most
 _LEAST_DAMPING = 1e-14  # keeps directions that nothing determines where they are
 
 
@@ -98,7 +100,8 @@ def solve(
 ) -> FitSolution:
     """The most probable parameters, from the prior's mean or from ``start``.
 
-    ``start`` is a solution of a problem that differs by prior, levels or loss alone.
+    ``start`` is a solution of a problem that differs by prior, whitening, levels or
+    loss alone.
     ``rough`` is to .1 standard deviations, the weights of the loss to .03, for what
     another fit begins at.
 
@@ -118,7 +121,8 @@ def solve(
         done = search.step()
         # Along a curved valley that the measurements hardly close, the search creeps.
         # A gain of 0.1 moves it by a third of a standard deviation, so more is asked.
-        creeps = len(evidence) > _PATIENCE and search.damping < 1e-3
+        long = len(evidence) > _PATIENCE and not search.whole
+        creeps = long and search.damping < 1e-3
         if creeps:
             gain = evidence[-_PATIENCE] - search.evidence
             asked = max(1e-3, 0.1 * (len(evidence) // 60))
@@ -193,6 +197,8 @@ class FitSolution:
     deleted: Array  # (N,) squared, from the fit without that measurement, in noise
     num_readings: int  # of a measurement, less its unknown commands
     freedom: Array  # (q,) residual degrees of freedom of each output
+    widest: Array | None = None  # (F,) largest columns of the system yet, at level 1
+    last_move: float = np.inf  # squared, of the step before in noise
     stale: bool = False  # the parameters have moved a little since the derivatives
     root: Array | None = None  # (F, F) of the covariance, where it is at hand
     _grown: tuple[Array, Array | None] | None = None  # of the last parameters
@@ -212,6 +218,9 @@ class FitSolution:
         self.num_readings = q - np.count_nonzero(self.command_root == 0.0)
         # From where another search ended, the derivatives are right far enough.
         self.damping, self.grow = 1e-3 if start is None else 1e-10, 2.0
+        # Least squares are searched to the last digit, along curves.
+        exact = not (problem.loss or len(self.command_root))
+        self.whole = exact and not (rough or problem.model.linear)
         self.basis: Array | None = None  # (F, r) directions of a linear model
         self.freedom = np.zeros(q)
         self._share(problem.levels)
@@ -252,6 +261,10 @@ class FitSolution:
         self.weights, self.level = start.weights, start.level
         self.facts, self.fact_rows = start.facts, start.fact_rows
         self.by_theta = start.by_theta
+        if start.problem.white is not self.problem.white:
+            self._take(start.residuals)
+            self.level = self._first_level()
+            self._linearise()
         if len(self.command_root):
             self.by_command = start.by_command
         if not self.problem.model.linear:
@@ -490,22 +503,37 @@ class FitSolution:
         cost = self.cost
         while True:
             rows, right, scale = self._system(self.damping)
+            if self.whole:
+                rows, scale = self._widened(rows, scale)
             # Of a model that is not linear the next step makes up for rounding.
             inverse, across = _factor(rows, self.damping, self.basis is None)
             self.solved = across if self.damping < 1e-9 else None
             step = inverse @ (across.T @ right)
             rest = rows @ step - right
             gain = float(right @ right - rest @ rest)
-            step = step / scale if self.basis is None else self.basis @ (step / scale)
-            if gain <= self.least + 1e-13 * cost:
+            last = gain <= self.least + 1e-13 * cost
+            if last and not self._still_falls(rows @ step):
                 return True
+            bent = 0.0
+            if self.whole and self.damping > 1e-12:
+                curve = inverse @ (across.T @ self._curve(step / scale, len(right)))
+                bent = 2.0 * float(np.linalg.norm(curve) / np.linalg.norm(step))
+                step = step + curve
+            step = step / scale if self.basis is None else self.basis @ (step / scale)
             theta = self._changed(step)
             commands = self._moved(step)
             residuals = self._off(commands, theta, finite=False)
             white = self.whitened(residuals[..., None], theta)[..., 0]
             facts, fact_rows = problem.model.facts(theta)
             after = self._cost(white, theta, commands, facts)
-            ratio = (cost - after) / gain if np.isfinite(after) else -1.0
+            if last:
+                ratio = 1.0
+                if not after <= cost * (1.0 + 1e-12) + 1e-12:
+                    return True
+            else:
+                ratio = (cost - after) / gain if np.isfinite(after) else -1.0
+            if bent > _BENT:
+                ratio = -1.0
             if ratio > 1e-4:
                 self.parameters, self.commands = theta, commands
                 self.residuals, self.white = residuals, white
@@ -517,6 +545,8 @@ class FitSolution:
                 if problem.loss is None or gain > _LITTLE:
                     self._linearise()
                 return False
+            if gain <= self._blur():
+                return True
             if self.damping > 1e9:  # rounding is all that is left, or
                 slope = np.abs(rows.T @ right).max() / np.linalg.norm(right)
                 if slope > 1e-3 and not np.isfinite(after):
@@ -533,6 +563,50 @@ class FitSolution:
                 return True
             self.damping *= self.grow
             self.grow *= 2.0
+
+    def _blur(self) -> float:
+        """By how much the noise of the model itself may change the cost."""
+        noise = self.problem.model.rounding
+        if noise is None or self.problem.white.ndim > 2:
+            return 0.0
+        off = self.problem.white * noise / self.level
+        share = np.sqrt(self.weights)[:, None]
+        beside = np.linalg.norm(share**2 * off * self.white / self.level)
+        return float(4.0 * beside + 2.0 * np.linalg.norm(share * off) ** 2)
+
+    def _widened(self, rows: Array, scale: Array) -> tuple[Array, Array]:
+        """Rows and scale (F,) by the largest scale so far (Moré, 1978).
+
+        A parameter that loses its effect would take ever longer steps.
+        """
+        size = float(np.exp(np.log(self.level).mean()))
+        wide = scale * size
+        if self.widest is not None:
+            wide = np.maximum(wide, self.widest)
+        self.widest = wide
+        wide = wide / size
+        return rows * (scale / wide), wide
+
+    def _still_falls(self, moved: Array) -> bool:
+        """Whether steps whose gain is rounding, by (R,) in noise, become shorter."""
+        before, self.last_move = self.last_move, float(moved @ moved)
+        return self.whole and 1e-16 < self.last_move < 0.5 * before
+
+    def _curve(self, step: Array, size: int) -> Array:
+        """(size,) half the residuals' second derivative along a step (F,).
+
+        Geodesic acceleration (Transtrum and Sethna, 2012): in a curved canyon the
+        step that follows the curve is far longer.
+        """
+        along = np.zeros(size)
+        theta = self._changed(_AHEAD * step)
+        off = self._off(self.commands, theta, finite=False)
+        white = self.whitened(off[..., None], theta)[..., 0]
+        bent = (self.white - white) / _AHEAD - self.by_theta @ step
+        bent = -bent / (_AHEAD * self.level) * np.sqrt(self.weights)[:, None]
+        if np.isfinite(bent).all():
+            along[: bent.size] = bent.ravel()
+        return along
 
     def settle(self, slack: float) -> bool:
         """Weights and levels that follow from the residuals; True where they stay.

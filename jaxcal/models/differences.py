@@ -1,7 +1,8 @@
 """Derivatives by finite differences whose steps are chosen by looking.
 
 Noise: the values at seven points so close together that f is a polynomial there; what
-their higher differences leave is the noise of f. Step: derivatives of fourth order at
+their higher differences leave is the noise of f. Values of few digits were printed: the
+unit of the last one is noise. Step: derivatives of fourth order at
 steps halved until noise is all that changes them. The step taken is the one where the
 change from one step to the next and what noise does to it are least together, or the
 shortest one where both are below 1e-8: the shorter a step, the fewer kinks of f it
@@ -31,7 +32,12 @@ Evaluate = Callable[[Array], Array]  # points (S, p) -> values (S, N, q), NaN: r
 
 _FIRST, _RUNGS = 0.25, 22  # of the scale, the largest step; halvings tried
 _EXACT = 1e-8  # share of a derivative: errors below it are as good as none
-_POINTS, _CLOSE = 7, 1e-7  # of the noise; of the scale, their distance
+_POINTS, _CLOSE = 7, (1e-7, 1e-5, 1e-3, 1e-2)  # of the noise; of the scale, distances
+_DIGITS = 12  # significant ones, up to which all readings show that they were printed
+_FAR = -4  # halvings of the largest step of an f whose noise is seen
+_SEEN = 1e-11  # of a reading, noise that is not rounding
+_JUMP = 4.0  # of the noise, that the largest of many changes may be
+_TWICE = 2.0  # standard deviations of noise that are stated as an error
 _EPS = float(np.finfo(np.float64).eps)
 
 
@@ -120,7 +126,9 @@ def look(
         periods: (q,) of readings that wrap.
     """
     noise, size = _noise(evaluate, at, scale, periods)
-    ladders = [_Ladder(evaluate, at, scale, j, periods, noise) for j in range(len(at))]
+    ladders = [
+        _Ladder(evaluate, at, scale, j, periods, noise, size) for j in range(len(at))
+    ]
     effects = [ladder.effect for ladder in ladders]
     largest = np.max(effects, axis=0, initial=0.0)  # (q,) by a change of the scale
     weights = 1.0 / np.where(largest > 0.0, largest, 1.0)
@@ -134,28 +142,46 @@ def look(
 def _noise(
     evaluate: Evaluate, at: Array, scale: Array, periods: Array | None
 ) -> tuple[Array, Array]:
-    """(q,) standard deviation of f's noise, and the largest reading."""
+    """(q,) standard deviation of f's noise, and the largest reading.
+
+    Where most of an output's values are alike, as those of a program that prints six
+    digits, points that are farther apart say more.
+    """
     least = 64.0 * _EPS * np.abs(at)
     along = np.where(np.arange(len(at)) % 2, -1.0, 1.0)
-    for close in (_CLOSE, 100.0 * _CLOSE, 1e4 * _CLOSE):
+    noise = size = np.zeros(0)
+    seen: list[Array] = []
+    for close in _CLOSE:
         step = np.maximum(close * scale, least) * along
         points = at + np.arange(_POINTS)[:, None] * step
         values = evaluate(points)
         if not np.isfinite(values).all():  # at the edge of what f takes
             values = evaluate(at - np.arange(_POINTS)[:, None] * step)
-        good = np.isfinite(values).all(axis=(0, 2))
-        values = values[:, good]
-        size = np.abs(values).max(axis=(0, 1), initial=0.0)
+        values = values[:, np.isfinite(values).all(axis=(0, 2))]
+        seen.append(values.reshape(-1, values.shape[-1]))
         off = within_half(values - values[:1], periods)
-        changes = np.diff(off, axis=0) != 0.0
-        if not changes.any() or changes.mean() > 0.5:
-            break  # else most values are alike: points that are farther apart say more
-    levels = []
-    table = off
+        moves = (np.diff(off, axis=0) != 0.0).mean(axis=(0, 1)) if off.size else 1.0
+        new = _of_differences(off)
+        if not len(noise):
+            noise, known = new, np.zeros(len(new), dtype=np.bool_)
+            size = np.abs(values).max(axis=(0, 1), initial=0.0)
+        noise = np.where(known, noise, new)
+        known = known | (moves > 0.5)
+        if known.all():
+            break
+    quantum = _printed(np.concatenate(seen))
+    return np.maximum(
+        np.maximum(noise, quantum / math.sqrt(12.0)), 0.25 * _EPS * size
+    ), size
+
+
+def _of_differences(off: Array) -> Array:
+    """(q,) noise of values (7, N, q) at points in a row, by their differences."""
+    levels, table = [], off
     for k in range(1, _POINTS):
         table = np.diff(table, axis=0)
         factor = math.factorial(k) ** 2 / math.factorial(2 * k)
-        square = (table**2).mean(axis=(0, 1)) if table.size else np.zeros(len(size))
+        square = (table**2).mean(axis=(0, 1)) if table.size else np.zeros(off.shape[2])
         levels.append(np.sqrt(factor * square))
     by_order = np.array(levels)  # (6, q)
     noise = by_order[-1].copy()
@@ -165,7 +191,33 @@ def _noise(
             if near.max() <= 4.0 * near.min():
                 noise[q] = near[0]
                 break
-    return np.maximum(noise, 0.25 * _EPS * size), size
+    return noise
+
+
+def _printed(values: Array) -> Array:
+    """(q,) unit of the last digit of values (R, q) that were printed, else 0.
+
+    Of the largest value; both significant digits and decimals are counted.
+    """
+    units = np.zeros(values.shape[1])
+    for q, column in enumerate(values.T):
+        shown = np.unique(np.abs(column[column != 0.0]))
+        if len(shown) < 2:  # a constant shows nothing
+            continue
+        last, digits = [], []
+        for value in shown.tolist():
+            power = f"{value:.16e}".split("e")[1]
+            for count in range(1, 18):
+                if float(f"{value:.{count - 1}e}") == value:
+                    break
+            digits.append(count)
+            last.append(int(power) + 1 - count)
+        most = max(digits)
+        if most > _DIGITS:
+            continue
+        top = math.floor(math.log10(shown[-1]))
+        units[q] = 10.0 ** max(top + 1 - most, min(last))
+    return units
 
 
 class _Ladder:
@@ -179,14 +231,18 @@ class _Ladder:
         j: int,
         periods: Array | None,
         noise: Array,
+        size: Array,
     ) -> None:
         self.scale, self.noise = float(scale[j]), noise
         least = 1e4 * _EPS * abs(at[j])
         self.side, self.rungs = "", []
+        # Rounded values jump where steps are short: the longest say most.
+        self.noisy = bool((noise > _SEEN * size).any())
+        first, most = (_FAR, _JUMP) if self.noisy else (0, 1.0)
         values: dict[float, Array] = {}
         for side, stencil in STENCILS.items():
             rungs: list[tuple[float, Array]] = []
-            for i in range(_RUNGS):
+            for i in range(first, _RUNGS):
                 step = _FIRST * self.scale * 2.0**-i
                 if step < least and rungs:
                     break
@@ -203,7 +259,7 @@ class _Ladder:
                 rungs.append((step, slope))
                 if len(rungs) > 1:
                     change = np.abs(rungs[-1][1] - rungs[-2][1]).max(axis=0)
-                    if (change <= stencil.amplifies * noise / step).all():
+                    if (change <= most * stencil.amplifies * noise / step).all():
                         break  # noise is all that changes
             if len(rungs) > 1:
                 self.side, self.rungs = side, rungs
@@ -216,19 +272,24 @@ class _Ladder:
         """(q,) of a change of the scale."""
         if not self.rungs:
             return np.zeros_like(self.noise)
-        return np.asarray(np.abs(self.rungs[-1][1]).max(axis=0) * self.scale)
+        return np.asarray(np.abs(self._surest).max(axis=0) * self.scale)
+
+    @property
+    def _surest(self) -> Array:
+        """(N, q) the derivative at the shortest step, of a noisy f at the longest."""
+        return self.rungs[0 if self.noisy else -1][1]
 
     def chosen(self, weights: Array) -> tuple[float, str, float]:
         """Step, side, and error as a share of the derivative (NaN: no effect)."""
         if not self.rungs:
             return 1e-3 * self.scale, self.side, np.inf
         amplifies = STENCILS[self.side].amplifies
-        size = float(np.sqrt(((self.rungs[-1][1] * weights) ** 2).mean()))
+        size = float(np.sqrt(((self._surest * weights) ** 2).mean()))
         best = (np.inf, *self.rungs[0])
         for (step, slope), (_, finer) in zip(self.rungs, self.rungs[1:], strict=False):
             change = float(np.sqrt((((slope - finer) * weights) ** 2).mean()))
             of_noise = float(np.sqrt(((self.noise * weights) ** 2).mean()))
-            error = change + amplifies * of_noise / step
+            error = change + _TWICE * amplifies * of_noise / step
             if error < max(best[0], _EXACT * size):
                 best = (error, step, slope)
         error, step, slope = best

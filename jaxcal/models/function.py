@@ -202,6 +202,14 @@ class FromFunction(Model):
         steps = self._steps.get("parameters")
         return 0.0 if steps is None else min(steps.error, 1.0)
 
+    @property
+    def rounding(self) -> Array | None:
+        """(q,) noise of f, where it is more than that of double precision."""
+        steps = self._steps.get("parameters")
+        if steps is None or not (steps.noise > 1e-11 * steps.size).any():
+            return None
+        return steps.noise
+
     def unanswered(
         self, commands: Array, parameters: ArrayLike | None = None
     ) -> dict[int, str]:

@@ -131,7 +131,7 @@ def identifiability(
         full = np.zeros((len(local), model.num_parameters))
         full[:, at] = local * scale
         full /= np.linalg.norm(full, axis=1, keepdims=True)
-        told = tuple(names[i] for i in np.flatnonzero(local.any(axis=0)))
+        told = tuple(names[i] for i in np.flatnonzero(local.any(axis=0))) or names
         same = np.allclose(np.abs(full[np.abs(full) > 0.0]), np.sqrt(0.5))
         directions.append(Direction(told, _in_words(told, same), full))
     rank = len(at) - sum(len(vectors) for vectors in null)

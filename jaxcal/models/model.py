@@ -211,6 +211,12 @@ class Model(abc.ABC):
         """Share by which derivatives are off where they are differences, else 0."""
         return 0.0
 
+    @property
+    def rounding(self) -> Array | None:
+        """(q,) standard deviation of the model's own noise, as of a program that
+        prints six digits; None where it is as exact as numbers are."""
+        return None
+
     def unanswered(
         self, commands: Array, parameters: ArrayLike | None = None
     ) -> dict[int, str]:

@@ -113,8 +113,12 @@ def _undetermined(fit: Fit) -> Reason | None:
     if not fit.undetermined.any():
         return None
     names = ", ".join(fit.names[i] for i in np.flatnonzero(fit.undetermined))
+    plateau = ""
+    if not (fit.model.linear or fit.prior_precision.any()):
+        plateau = " The search may have ended on a plateau and not converged."
     return Reason(
-        f"Not determined, held near the prior's mean: {names}; see identifiability().",
+        f"Not determined, held near the prior's mean: {names}; see identifiability()."
+        + plateau,
         "measure rows that determine them: "
         "select(candidates, model=..., measured=commands)",
     )
@@ -200,7 +204,11 @@ def _on_its_way(fit: Fit) -> Reason | None:
     pull = np.einsum("nqp,nq->p", rows, fit.loss_weights[:, None] * white)
     pull += fit.prior_precision * (fit.prior_mean - fit.estimate)
     step = float(np.sqrt(max(pull @ covariance @ pull, 0.0)))
-    if step < _STEP:
+    least = _STEP
+    if fit.model.rounding is not None:  # its own noise moves the end of a search
+        share = np.asarray(fit.model.rounding) / fit.noise_std
+        least = max(least, 3.0 * float(np.sqrt(len(pull))) * float(share.max()))
+    if step < least:
         return None
     return Reason(
         f"The fit has not converged: another step is {step:.2g} standard errors long.",

@@ -387,3 +387,46 @@ def test_a_fit_that_ends_where_f_fails_says_so():
     one = FromFunction(walled, [1.0], [0.1])
     with pytest.raises(ValueError, match="fails next to the parameters"):
         jaxcal.identify(U, 0.1 * U, model=one, noise_std=0.01)
+
+
+def printed(digits: int, size: float):
+    """f that prints so many digits, and its exact derivative (N, 2, 3)."""
+
+    def f(u, t):
+        a, b, c = t
+        exact = a * np.exp(-b * u[0]) + c * u[1], a * u[1] ** 2 + np.sin(b * u[0])
+        return [float(f"{size * y:.{digits}g}") for y in exact]
+
+    def slopes(u, t):
+        a, b, _ = t
+        x, z, none = u[:, 0], u[:, 1], np.zeros(len(u))
+        first = np.stack([np.exp(-b * x), -a * x * np.exp(-b * x), z], axis=-1)
+        second = np.stack([z**2, x * np.cos(b * x), none], axis=-1)
+        return size * np.stack([first, second], axis=1)
+
+    return f, slopes
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e6])
+@pytest.mark.parametrize("digits", [4, 6, 8])
+def test_a_program_that_prints_few_digits(digits, size, rng):
+    f, slopes = printed(digits, size)
+    nominal, true = np.array([1.3, 0.7, 0.9]), np.array([1.36, 0.65, 0.99])
+    commands = rng.uniform(0.2, 2.0, (40, 2))
+    model = FromFunction(f, nominal, quiet=True)
+    found, exact = model.jacobian(commands), slopes(commands, nominal)
+    off = np.sqrt(((found - exact) ** 2).mean(axis=(0, 1)) / (exact**2).mean((0, 1)))
+    chosen = model.differences(commands)
+    assert (off <= chosen.errors).all() and (off < 10.0 ** (2.5 - digits)).all()
+    # Readings of 1 to 10 sizes, of which the last digit is rounded.
+    unit = size * 10.0 ** (1 - digits)
+    assert (0.2 * unit < chosen.noise).all() and (chosen.noise < unit).all()
+    clean = np.array([f(u, true) for u in commands])
+    measured = clean + 0.003 * size * rng.normal(size=clean.shape)
+    fit = jaxcal.identify(commands, measured, model=model)
+    assert fit.verdict.good, fit.verdict
+    assert (np.abs(fit.parameters - true) < 4.0 * fit.standard_errors).all()
+    selection = jaxcal.select(commands, 6, model=model, criterion="D")
+    assert selection.proven == (digits > 4)
+    if digits == 4:
+        assert "derivatives are differences" in selection.reason

@@ -37,6 +37,7 @@ STARTING_RESTARTS = 30  # of the exchange: the search does the rest
 TIME_LIMIT = 10.0  # seconds of one search where none is given
 _BLOCKS_LIMIT = 2.0  # of auto: what is not proven by then often takes minutes
 
+_ROUGH = 1e-3  # share of a derivative, by which one that is a difference may be off
 TOLERATED = 1e-9  # share by which rounding may change what is called proven
 
 _CHEAP = 5_000_000  # subsets: the largest volume is found within milliseconds
@@ -303,7 +304,12 @@ def _proof(
     if phi is not None:
         better = max if criterion.larger_is_better else min
         bound = better(bound, float(criterion.reported(phi)))
-    unsure = problem.uncertainty(indices)
+    unsure, off = problem.uncertainty(indices), _off(problem)
+    if off > _ROUGH:
+        reason = (
+            f"not proven: the model's derivatives are differences, off by {off:.1g}"
+        )
+        return criterion.bettered(bound, min(2.0 * off, 1.0)), False, reason
     if unsure <= TOLERATED:
         return bound, phi is None, ""
     reason = ""
@@ -313,6 +319,11 @@ def _proof(
             f"may change the variances by a share of {unsure:.1g}"
         )
     return criterion.bettered(bound, unsure), False, reason
+
+
+def _off(problem: Problem) -> float:
+    """Share by which the model's derivatives are off, 0 where they are exact."""
+    return float(getattr(problem.model, "resolution", 0.0))
 
 
 def _groups(problem: Problem, merge: bool) -> tuple[Indices, Indices]:

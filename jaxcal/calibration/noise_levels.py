@@ -1,0 +1,196 @@
+"""How many levels of noise the readings of a measurement have, by evidence.
+
+A level for each of many readings, as of a trajectory, cannot be told from few
+measurements: their weights would be noise themselves. So one level, one that varies
+smoothly along the readings, one for each of a few groups and one for each reading are
+compared by Schwarz's criterion, on the squares that are left and their degrees of
+freedom; more than one level is taken where the evidence is strong (Kass and Raftery,
+1995). Parameters that move one reading alone are not touched by any of that.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.calibration.least_squares import FitProblem, FitSolution, solve
+from jaxcal.calibration.losses import constants
+from jaxcal.models.model import derivative
+
+__all__ = ["are_shared", "pooled"]
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+_FEW = 30  # measurements from which on a level of its own costs a reading nothing
+_STRONG = 6.0  # of Schwarz's criterion, for more than one level
+_DEGREES = 8  # at most, of a level that varies smoothly
+_TURNS = (2, 3, 4, 5, 6)  # readings taken in turn
+_ROUNDS = 4
+_SAME = 0.02  # of the logarithm of a profile, which would not change in another round
+_LEAST = 10.0  # degrees of freedom of a run of readings
+
+
+class _Levels(NamedTuple):
+    """Levels (q,) up to a common factor, or the groups (q,) that share one."""
+
+    says: str
+    groups: Rows
+    profile: Array | None
+    numbers: int  # that describe them
+
+
+def are_shared(problem: FitProblem) -> bool:
+    """Whether few measurements are of parameters that several readings share."""
+    if not 1 < len(problem.commands) < _FEW or len(problem.levels) < 2:
+        return False
+    slopes = derivative(problem.model, problem.commands, problem.mean)
+    moved = (slopes != 0.0).any(axis=0)
+    return bool((moved.sum(axis=0) > 1)[problem.free].any())
+
+
+def pooled(problem: FitProblem) -> tuple[FitProblem, FitSolution, str]:
+    """The fit with as many levels of noise as the readings tell, and which, in words.
+
+    Args:
+        problem: of independent readings, each with a level of its own.
+    """
+    q = len(problem.levels)
+    levels = _Levels(_one(q), np.zeros(q, np.intp), None, 1)
+    fitted = _with(problem, levels)
+    try:
+        solution = solve(fitted)
+    except ValueError:  # readings in other units may not converge together
+        return problem, solve(problem), _own(q)
+    for _ in range(_ROUNDS):
+        better = _best(*_squares(problem, fitted, solution))
+        if better.says == levels.says and _alike(better.profile, levels.profile):
+            break
+        levels, fitted = better, _with(problem, better)
+        solution = solve(fitted, solution)
+    return fitted, solution, levels.says
+
+
+def _alike(new: Array | None, old: Array | None) -> bool:
+    """Whether profiles differ by less than what they are known to."""
+    if new is None or old is None:
+        return new is old
+    return bool(np.abs(np.log(new / old)).max() < _SAME)
+
+
+def _with(problem: FitProblem, levels: _Levels) -> FitProblem:
+    if levels.profile is None:
+        return dataclasses.replace(problem, levels=levels.groups)
+    return dataclasses.replace(
+        problem,
+        levels=levels.groups,
+        white=problem.white / levels.profile,
+        reading_std=problem.reading_std * levels.profile,
+    )
+
+
+def _squares(
+    problem: FitProblem, fitted: FitProblem, solution: FitSolution
+) -> tuple[Array, Array]:
+    """(q,) sums of squares at level 1, and their degrees of freedom."""
+    white = solution.white * (problem.white / fitted.white)
+    square = solution.weights @ white**2
+    if problem.loss is not None:
+        square = square / constants(problem.loss, solution.num_readings)[0]
+    return square, np.maximum(solution.freedom, 0.0)
+
+
+def _best(square: Array, freedom: Array) -> _Levels:
+    """The levels of the best evidence."""
+    q, seen = len(square), freedom > 1e-6
+    square = np.maximum(square, 1e-26 * square.max() + 1e-300)
+    none = np.zeros(q, np.intp)
+
+    def evidence(levels: _Levels) -> float:
+        if levels.profile is None:
+            total = np.bincount(levels.groups[seen], freedom[seen], q)
+            log = np.log(np.bincount(levels.groups[seen], square[seen], q) + 1e-300)
+            log = (log - np.log(np.maximum(total, 1e-300)))[levels.groups]
+        else:
+            log = 2.0 * np.log(levels.profile)
+        fit = freedom * log + square * np.exp(-log)
+        cost = levels.numbers * np.log(freedom.sum())
+        return float(fit[seen].sum() + cost)
+
+    one = _Levels(_one(q), none, None, 1)
+    others = [_Levels(_own(q), np.arange(q), None, q)]
+    for turn in _TURNS:
+        if q % turn == 0 and q > turn:
+            says = f"one level for each of {turn} readings in turn"
+            others.append(_Levels(says, np.arange(q) % turn, None, turn))
+    if q >= 4:
+        others.append(_blocks(square, freedom, seen))
+    if q >= 2 * _DEGREES:
+        shapes = (_smooth(square, freedom, seen, k + 1) for k in range(_DEGREES))
+        others += [shape for shape in shapes if shape is not None]
+    best = min(others, key=evidence)
+    return best if evidence(best) + _STRONG < evidence(one) else one
+
+
+def _blocks(square: Array, freedom: Array, seen: NDArray[np.bool_]) -> _Levels:
+    """Readings one after another that share a level, halved while that gains."""
+    q, price = len(square), 2.0 * np.log(freedom.sum())
+    squares = np.append(0.0, np.where(seen, square, 0.0).cumsum())
+    freedoms = np.append(0.0, np.where(seen, freedom, 0.0).cumsum())
+
+    def fit(first: Any, last: Any) -> Array:
+        total = np.maximum(freedoms[last] - freedoms[first], 1e-300)
+        mean = np.maximum((squares[last] - squares[first]) / total, 1e-300)
+        return np.asarray(total * np.log(mean))
+
+    open_parts, ends = [(0, q)], [0, q]
+    while open_parts:
+        first, last = open_parts.pop()
+        cuts = np.arange(first + 1, last)
+        left, right = freedoms[cuts] - freedoms[first], freedoms[last] - freedoms[cuts]
+        cuts = cuts[np.minimum(left, right) >= _LEAST]
+        if not cuts.size:
+            continue
+        gains = fit(first, last) - fit(first, cuts) - fit(cuts, last)
+        cut = int(cuts[gains.argmax()])
+        if gains.max() > price:
+            ends.append(cut)
+            open_parts += [(first, cut), (cut, last)]
+    groups = np.searchsorted(np.sort(ends)[1:-1], np.arange(q), side="right")
+    count = len(ends) - 1
+    says = f"one level for each of {count} runs of readings"
+    return _Levels(says, groups.astype(np.intp), None, 2 * count - 1)
+
+
+def _smooth(
+    square: Array, freedom: Array, seen: NDArray[np.bool_], degree: int
+) -> _Levels | None:
+    """Levels whose logarithm is a polynomial along the readings, by Chebyshev's."""
+    q = len(square)
+    basis = np.polynomial.chebyshev.chebvander(np.linspace(-1.0, 1.0, q), degree)
+    root = np.sqrt(freedom[seen])[:, None]
+    mean = square[seen] / freedom[seen]
+    log = np.log(mean) + 1.0 / freedom[seen]
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(30):
+            weights = np.linalg.lstsq(root * basis[seen], root[:, 0] * log, rcond=None)[
+                0
+            ]
+            along = basis[seen] @ weights
+            log = along + np.clip(mean * np.exp(-along) - 1.0, -1.0, 3.0)
+            if not np.isfinite(log).all():
+                return None
+    profile = np.exp(0.5 * (basis @ weights))
+    says = f"a level that varies smoothly along the {q} readings"
+    return _Levels(says, np.zeros(q, np.intp), profile, degree + 1)
+
+
+def _one(q: int) -> str:
+    return f"one level for all {q} readings of a measurement"
+
+
+def _own(q: int) -> str:
+    return f"one level for each of the {q} readings"
