@@ -25,7 +25,13 @@ from jaxcal.arms.arguments import (
 from jaxcal.arms.arm import Arm
 from jaxcal.arms.sensors import Board, Pose, Position, Sensor, Several
 from jaxcal.checks import array_of, axis_names, in_words, numbers, one_of
-from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
+from jaxcal.models.model import (
+    ErrorGroups,
+    Model,
+    Quantity,
+    as_commands,
+    as_parameters,
+)
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
 
@@ -227,6 +233,41 @@ class SerialChain(Arm, Model):
         count on them where no prior is given, as what the parameters do not explain.
         """
         return self._bent
+
+    def with_effects(
+        self,
+        *,
+        compliance: Sequence[int] | None = None,
+        gears: Sequence[int] | None = None,
+        harmonics: Sequence[int] | None = None,
+    ) -> Self:
+        """This arm with these effects of joints, counted from 1, as of ``from_dh``."""
+        arm: dict[str, Any] = {}
+        if compliance is not None and not self.compliance:
+            arm["compliance"] = tuple(compliance)
+            arm["yields"] = np.zeros(len(arm["compliance"]))
+            usual = _usual_loads(len(self.joints), self.tool)
+            arm["loads"] = self.loads or tuple(
+                load(one, len(self.joints)) for one in usual
+            )
+        if gears is not None:
+            arm["gears"] = tuple(gears)
+        if harmonics is not None and not self.harmonics:
+            arm["harmonics"] = tuple(harmonics)
+            arm["waves"] = np.zeros((len(arm["harmonics"]), 4))
+        return dataclasses.replace(self, **arm)
+
+    def improved(self, fit: Any) -> Any:
+        """With what held-out readings ask for, where the noise explains too little."""
+        from jaxcal.arms.effects import chosen
+
+        return chosen(fit)
+
+    def unexplained(self, fit: Any, rows: Array) -> Array:
+        """Scatter that no noise explains, more beyond the range that was measured."""
+        from jaxcal.arms.effects import unexplained
+
+        return unexplained(fit, rows)
 
     @functools.cached_property
     def _bent(self) -> Self:  # kept, and what it keeps with it
@@ -796,6 +837,35 @@ class SerialChain(Arm, Model):
                 kind = joints_of(self.source["text"])[name].kind
             kinds.append(kind)
         return tuple("deg" if kind == "R" else "length" for kind in kinds)
+
+    def quantities(self, measured_unit: str) -> tuple[Quantity, ...]:
+        """What its sensor reads, in its units."""
+        return self.quantities_of(self.sensor, measured_unit)
+
+    def quantities_of(self, sensor: Sensor, measured_unit: str) -> tuple[Quantity, ...]:
+        """What one of its sensors reads, "length" where the unit of that is unknown."""
+        first, *others = sensor.quantities
+        if not others and first.points == 1 and not isinstance(self.sensor, Several):
+            first = first._replace(unit=measured_unit or first.unit)
+        length = self.length_unit(measured_unit) or "length"
+        return tuple(
+            quantity._replace(unit=quantity.unit.replace("length", length))
+            for quantity in (first, *others)
+        )
+
+    def length_unit(self, measured_unit: str) -> str:
+        """The unit of lengths: the readings' if they are some, a URDF file's, or ""."""
+        of_file = "m" if self.source is not None else ""
+        others = ("deg", "rad", "m/s", "g", "N", "p", "times")
+        return of_file if measured_unit.startswith(others) else measured_unit or of_file
+
+    def accuracy_units(self, measured_unit: str) -> tuple[str, ...]:
+        units = (
+            quantity.unit
+            for one in self.sensor.members
+            for quantity in self.quantities_of(one, measured_unit)
+        )
+        return tuple(dict.fromkeys(units))
 
     def own(self, i: int) -> slice:
         """Where what the sensor's member ``i`` has of its own is among the p."""

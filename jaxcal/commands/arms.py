@@ -61,6 +61,11 @@ class ArmOptions:
     tip: Annotated[list[str] | None, "of an arm, the link that is measured", "LINK"] = (
         None
     )
+    on_tip: Annotated[
+        str | None,
+        "of --sensor board, which is on the tip: camera (default), the other stands",
+        ["camera", "board"],
+    ] = None
     radians: Annotated[bool, "joint columns are in radians"] = False
     locked: Annotated[
         list[list[Any]] | None,
@@ -110,7 +115,7 @@ class ArmOptions:
 
     def _sensor(self, table: Table | None, places: Any) -> Sensor:
         """The sensor, with as many landmarks as are given or in the table."""
-        from jaxcal.arms.sensors import SENSORS, Landmarks, Socket
+        from jaxcal.arms.sensors import SENSORS, Board, Landmarks, Socket
 
         kinds = {name: kind for name, kind in SENSORS.items() if name != "several"}
         kind = kinds[one_of("--sensor", self.kind, tuple(kinds))]
@@ -126,6 +131,10 @@ class ArmOptions:
             elif table is not None and self.kind in table.names:
                 column = table.columns([self.kind])
                 landmarks["count"] = 1 + int(column.max(initial=0.0))
+        if self.on_tip is not None:
+            if kind is not Board:
+                raise ValueError("--on-tip is of --sensor board")
+            landmarks["moves"] = self.on_tip
         if self.distance:
             if kind is not Socket:
                 raise ValueError("--distance is of --sensor socket")

@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.arms.sensors.pose import rotation_vector_rate
+from jaxcal.arms.sensors.pose import Pose, rotation_vector_rate
 from jaxcal.arms.sensors.sensor import (
     BASE,
     HasNames,
@@ -19,12 +19,15 @@ from jaxcal.arms.sensors.sensor import (
     turns,
 )
 from jaxcal.checks import array_of, numbers, one_of
+from jaxcal.models.model import Quantity
 
 __all__ = ["Board"]
 
 Array = NDArray[np.float64]
 
 _FEW = 3  # views that find where a board stands and its tool
+_ONE_AXIS = 0.999  # of the largest singular value: turns about one axis, or none
+_STILL = 0.02  # radians, and of the longest way: no turn, no second direction
 _WRONG = 0.2  # views so far off, in radians and lengths of the arm, are read wrongly
 
 
@@ -161,6 +164,12 @@ class Board(Sensor):
         return tuple(f"{a}{i + 1}" for i in range(len(self.corners)) for a in "uv")
 
     @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        if self.corners is None:
+            return Pose.quantities
+        return (Quantity("pixels a corner", points=len(self.corners)),)
+
+    @property
     def nominal(self) -> Array:
         place = np.eye(4) if self.place is None else self.place
         return np.concatenate([place[:3, 3], np.zeros(3)])
@@ -254,8 +263,8 @@ class Board(Sensor):
                     raise ValueError(f"views of the board fit the arm only {how}")
         if not np.isfinite(off):
             raise ValueError(
-                "views must turn the tip about two axes at least: with these the board "
-                "and the camera cannot be told apart"
+                "views must turn the tip about two axes, or move it in two directions: "
+                "with these the board and the camera cannot be told apart"
             )
         towards = -np.einsum("nij,ni->nj", turn, shift)[:, 2]  # z of the camera, in it
         side = float(np.sign(np.median(towards)))
@@ -341,13 +350,20 @@ def _hand_and_eye(tip: Tip, turn: Array, shift: Array) -> tuple[float, Array, Ar
         # R_X = R_A' R_Z R_B, summed over the views, as a matrix on the nine of R_Z.
         mix = np.einsum("nki,nlj->ijkl", arm, turn[used]).reshape(9, 9)
         left, size, right = np.linalg.svd(mix)
-        if size[1] > 0.999 * size[0]:
-            return np.inf, place, new
-        tool, stand = (_nearest(v.reshape(3, 3)) for v in (left[:, 0], right[0]))
+        free = np.eye(3)  # directions of the tool's shift that the views show
+        if size[1] > _ONE_AXIS * size[0]:
+            found = _about_one_axis(arm, tip.position[used], turn[used], shift[used])
+            if found is None:
+                return np.inf, place, new
+            stand, free = found
+            tool = _nearest((np.matrix_transpose(arm) @ stand @ turn[used]).sum(axis=0))
+        else:
+            tool, stand = (_nearest(v.reshape(3, 3)) for v in (left[:, 0], right[0]))
         eye = np.broadcast_to(-np.eye(3), arm.shape)
-        rows = np.concatenate([arm, eye], axis=-1).reshape(-1, 6)
+        rows = np.concatenate([arm @ free, eye], axis=-1).reshape(3 * len(arm), -1)
         right_side = (shift @ stand.T - tip.position)[used].ravel()
         shifts = np.linalg.lstsq(rows, right_side, rcond=None)[0]
+        shifts = np.append(free @ shifts[:-3], shifts[-3:])
         new[:3, :3], new[:3, 3] = tool, shifts[:3]
         place[:3, :3], place[:3, 3] = stand, shifts[3:]
         apart = tip.rotation @ shifts[:3] + tip.position - shift @ stand.T - shifts[3:]
@@ -359,6 +375,49 @@ def _hand_and_eye(tip: Tip, turn: Array, shift: Array) -> tuple[float, Array, Ar
             break
         used = kept
     return float(np.median(off)), place, new
+
+
+def _about_one_axis(
+    arm: Array, position: Array, turn: Array, shift: Array
+) -> tuple[Array, Array] | None:
+    """The stand's rotation where the tip turns about one axis, as a SCARA's, or none.
+
+    How far the tip goes shows what its turns do not. None where it hardly moves.
+
+    Returns:
+        It, and directions (3, 2) in the tip's frame, (3, 0) without a turn, in which
+        views show where the tool is.
+    """
+    from scipy.spatial.transform import Rotation
+
+    vectors = Rotation.from_matrix(arm @ arm[0].T).as_rotvec()
+    seen = Rotation.from_matrix(turn @ turn[0].T).as_rotvec()
+    moved, ways = position - position.mean(axis=0), shift - shift.mean(axis=0)
+    spread = np.linalg.svd(moved, compute_uv=False)
+    axis = np.linalg.svd(vectors)[2][0]
+    angles = vectors @ axis
+    if np.abs(angles).max() < _STILL:
+        if spread[1] < _STILL * spread[0]:
+            return None
+        return _nearest(moved.T @ ways), np.zeros((3, 0))
+    from_axis = angles @ seen
+    from_axis /= np.linalg.norm(from_axis)
+    first = Rotation.align_vectors([axis], [from_axis])[0].as_matrix()
+    tip_axis = arm[0].T @ axis
+    across = np.linalg.svd(tip_axis[None])[2][1:].T
+    # Turned about the axis by an angle whose cosine and sine are two more unknowns.
+    there = shift @ first.T
+    flat = there - np.outer(there @ axis, axis)
+    aside = np.cross(axis, there)
+    eye = np.broadcast_to(-np.eye(3), arm.shape)
+    rows = [arm @ across, eye, -flat[..., None], -aside[..., None]]
+    right = np.outer(there @ axis, axis) - position
+    table = np.concatenate(rows, axis=-1).reshape(3 * len(arm), -1)
+    found, _, rank, _ = np.linalg.lstsq(table, right.ravel(), rcond=1e-6)
+    if rank < table.shape[1]:
+        return None
+    by = Rotation.from_rotvec(np.arctan2(found[-1], found[-2]) * axis)
+    return by.as_matrix() @ first, across
 
 
 def _inverse(turn: Array, shift: Array) -> tuple[Array, Array]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, numbers, whole_number
+from jaxcal.models.model import Quantity
 from jaxcal.models.periods import within_half
 
 __all__ = [
@@ -143,6 +144,11 @@ class Sensor(abc.ABC):
     @abc.abstractmethod
     def outputs(self) -> tuple[str, ...]:
         """q names of the readings."""
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """What it reads, by unit; "length" stands for the unit of the arm's lengths."""
+        return (Quantity("length" if self.lengths else self.first_unit),)
 
     @property
     def names(self) -> tuple[str, ...]:
