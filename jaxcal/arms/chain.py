@@ -22,7 +22,7 @@ from jaxcal.arms.arguments import (
     sensor_of,
     transform,
 )
-from jaxcal.arms.arm import Arm
+from jaxcal.arms.arm import Arm, apparent_length
 from jaxcal.arms.sensors import Board, Pose, Position, Sensor, Several
 from jaxcal.checks import array_of, axis_names, in_words, numbers, one_of
 from jaxcal.models.model import (
@@ -147,6 +147,14 @@ class SerialChain(Arm, Model):
         at_zero = np.zeros(n) if offset is None else array_of("offset", offset, n)
         sensor = sensor_of(sensor)
         end = transform("tool", tool)
+        if cancels := apparent_length(rows, end)[1]:
+            warnings.warn(
+                f"d{cancels} = {rows[cancels - 1, 2]:g} cancels with another length, "
+                "as in Universal Robots' own calibration of nearly parallel axes, and "
+                "is counted with it. A plain table, or from_ur_kinematics(file) of "
+                "their ROS description, has small lengths whose errors can be read",
+                stacklevel=2,
+            )
         if compliance is None:
             turning = [i + 1 for i in range(n) if joints[i] == "R"]
             compliance = turning if sensor.compliant else ()
@@ -215,6 +223,28 @@ class SerialChain(Arm, Model):
             joint = one_of("limits", name, tuple(arm["joint_names"]))
             arm["limits"][arm["joint_names"].index(joint)] = ends
         return cls.from_dh(**arm, sensor=sensor, **options)
+
+    @classmethod
+    def from_ur_kinematics(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        sensor: Sensor | None = None,
+        **options: Any,
+    ) -> Self:
+        """The arm of a kinematics file of Universal Robots' ROS description, in metres.
+
+        That which ``calibration.to_ur_kinematics`` writes; the base is the robot's, the
+        tip its flange.
+
+        Args:
+            path: the .yaml.
+            sensor: what the tip is measured with; Position() when not given.
+            options: of ``from_dh`` beside the table: ``tool``, ``base``, ``limits``.
+        """
+        from jaxcal.arms.files.urdf import read_ur_kinematics
+
+        return cls.from_dh(**(read_ur_kinematics(path) | options), sensor=sensor)
 
     def measured_with(self, sensor: Sensor) -> Self:
         """This arm with another sensor."""
@@ -412,7 +442,12 @@ class SerialChain(Arm, Model):
         for row, joint in far[:1]:
             name, column = self.joint_names[joint], -joints[:, joint]
             least, most = (low - slack)[joint], (high + slack)[joint]
-            if ((column >= least) & (column <= most)).all():
+            around = np.where(-column > 180.0, -column - 360.0, -column)
+            turning = units[joint] == "deg" and -column.min() >= 0.0
+            if turning and ((around >= least) & (around <= most)).all():
+                advice = f"{name} seems to be read in 0 to 360: subtract 360 from what "
+                advice += "is above 180."
+            elif ((column >= least) & (column <= most)).all():
                 advice = f"{name} seems reversed, all rows are within them with the "
                 advice += "other sign: negate that column."
             elif len(column) > 1 and not np.ptp(column):

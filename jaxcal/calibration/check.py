@@ -360,7 +360,7 @@ def _tolerances(
                 raise ValueError(f"tolerance must be positive, got {size}")
         return {unit: float(size) for unit, size in asked.items()}
     std = calibration.predict_std(where, new_measurement=True)
-    std = np.where(np.isfinite(std), std, calibration.noise_std)
+    std = np.where(np.isfinite(std), std, np.asarray(calibration.noise_std))
     return {
         quantity.unit: float(3.0 * np.sqrt((quantity.size(std) ** 2).mean()))
         for quantity in quantities

@@ -115,7 +115,7 @@ class ArmOptions:
 
     def _sensor(self, table: Table | None, places: Any) -> Sensor:
         """The sensor, with as many landmarks as are given or in the table."""
-        from jaxcal.arms.sensors import SENSORS, Board, Landmarks, Socket
+        from jaxcal.arms.sensors import SENSORS, Board, Landmarks, Several, Socket
 
         kinds = {name: kind for name, kind in SENSORS.items() if name != "several"}
         kind = kinds[one_of("--sensor", self.kind, tuple(kinds))]
@@ -143,6 +143,11 @@ class ArmOptions:
                 raise ValueError(
                     f"{table.source}: --distance needs a column 'socket', from 0"
                 )
+        if kind is Board and table is not None and "sensor" in table.names:
+            # Cameras that stand around one board on the tip, from 0.
+            count = 1 + int(table.columns(["sensor"]).max(initial=0.0))
+            boards = [Board("board", same_board=i > 0) for i in range(count)]
+            return Several(tuple(boards)) if count > 1 else boards[0]
         return kind(**landmarks)
 
     def of_recording(self, path: str | None, which: Sequence[int] | None) -> Any:

@@ -178,13 +178,18 @@ class SavedFiles:
             lines = [f"saved {self.out}"]
         if self.transform:
             parent, child = (self.frames or ",").split(",")
-            pose = calibration.to_transform(
-                self.transform,
-                child=child.strip() or None,
-                parent=parent.strip() or None,
-                force=self.overwrite,
-            )
-            lines.append(f"saved {self.transform}: {pose}")
+            count = len(calibration.model.sensor.members)
+            for camera in range(count):
+                stem, ending = os.path.splitext(self.transform)
+                number = f"_{camera}" if count > 1 else ""
+                pose = calibration.to_transform(
+                    f"{stem}{number}{ending}",
+                    child=child.strip() + number * bool(child.strip()) or None,
+                    parent=parent.strip() or None,
+                    camera=camera,
+                    force=self.overwrite,
+                )
+                lines.append(f"saved {stem}{number}{ending}: {pose}")
         if self.servos_out:
             steps = calibration.to_lerobot(
                 self.servos_out, str(servos), force=self.overwrite
@@ -339,7 +344,7 @@ def _arm_readings(
     weights: str | None,
 ) -> _Readings:
     """The columns named as the arm's joints and its sensor's; a contact has none."""
-    columns, contacts = arm.sensor.outputs, arm.sensor.zeros
+    columns, contacts = arm.sensor.outputs, arm.sensor.contacts
     if not contacts:
         columns = table.named(columns, MEASURED, chosen=outputs, option="--outputs")
     elif outputs:
@@ -409,7 +414,7 @@ def check(
     inputs, commands = _commands_for(calibrated, table, option="")
     if radians:
         commands = _in_degrees(calibrated, commands)
-    if getattr(getattr(calibrated.model, "sensor", None), "zeros", False):
+    if getattr(getattr(calibrated.model, "sensor", None), "contacts", False):
         measured = np.zeros((len(commands), calibrated.num_outputs))
     else:
         measured = _readings_for(calibrated, table, inputs)

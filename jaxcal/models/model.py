@@ -487,7 +487,9 @@ def recorded(model: Any, commands: Any, measured: Any) -> tuple[Any, Any, bool]:
             raise ValueError("model must be an arm where commands are a recording")
         commands, read = as_model(model).recorded(commands)
         measured = read if measured is None else measured
-    elif measured is None and getattr(getattr(model, "sensor", None), "zeros", False):
+    elif measured is None and getattr(
+        getattr(model, "sensor", None), "contacts", False
+    ):
         measured = np.zeros((len(commands), model.num_outputs))
     if measured is None and header_of("commands", commands):
         measured = commands  # a table of both, y_... what was measured

@@ -82,7 +82,7 @@ def left_out(fit: Fit) -> Array:
     return np.asarray(np.linalg.solve(root, white)[..., 0])
 
 
-def between_sessions(fit: Fit, labels: Array) -> Array:
+def between_sessions(fit: Fit, labels: NDArray[np.intp]) -> Array:
     """(m,) standard deviation of readings of another session, beyond what is expected.
 
     Each session is predicted from a fit of the others.

@@ -56,7 +56,10 @@ class StaticTransform(NamedTuple):
 
 
 def static_transform(
-    calibration: Calibration, child: str | None = None, parent: str | None = None
+    calibration: Calibration,
+    child: str | None = None,
+    parent: str | None = None,
+    camera: int = 0,
 ) -> StaticTransform:
     """Where a camera is, on the tip or beside the arm, for the arm as described.
 
@@ -69,27 +72,31 @@ def static_transform(
             picture, not a driver's camera_link); "camera_optical_frame" if not given.
         parent: name of the link that it is in; of a URDF file the tip link, or the base
             of a camera that stands, when not given.
+        camera: of several that see one board, its number.
 
     Raises:
         ValueError: the sensor is no ``Board``, or the unit of lengths is not known.
     """
     model = calibration.model
-    sensor = getattr(model, "sensor", None)
+    sensors = getattr(getattr(model, "sensor", None), "members", ())
+    sensor = sensors[camera] if 0 <= camera < len(sensors) else None
     if not isinstance(sensor, Board):
         raise ValueError("a static transform is of an arm with sensor=Board(...)")
     unit = model.length_unit(calibration.measured_unit)
     scale = _METRES[
         one_of("measured_unit, for a transform in metres,", unit, [*_METRES])
     ]
-    found = [*(f"tool {axis}" for axis in sensor.tool), *sensor.names]
+    tool = [f"tool {axis}" for axis in sensor.tool]
+    owns = [model.names[model.own(i)] for i in range(len(sensors))]
+    found = {*tool, *(name for own in owns for name in own)}
     held = tuple(name for name in model.names if name not in found)
     again = calibration.again(model, Prior(model.default_prior().std, fixed=held))
     theta, source = again.parameters, model.source
     if sensor.moves == "camera":
-        names = found[:6]
+        names = tool
         matrix = np.linalg.inv(_tip(model)) @ model.calibrated(theta).tool
     else:
-        names = found[6:]
+        names = list(owns[camera][:6])
         at = [model.names.index(name) for name in names]
         matrix = pose_matrix(theta[at])
         if sensor.place is not None:
@@ -127,6 +134,7 @@ def to_transform(
     *,
     child: str | None = None,
     parent: str | None = None,
+    camera: int = 0,
     force: bool = False,
 ) -> StaticTransform:
     """Write ``static_transform`` as what reads it.
@@ -138,6 +146,7 @@ def to_transform(
             file with the frame as a link and its fixed joint.
         child: as of ``static_transform``.
         parent: likewise.
+        camera: likewise.
         force: write over a file that is there.
 
     Raises:
@@ -146,7 +155,7 @@ def to_transform(
     """
     form = os.path.splitext(os.fspath(path))[1].lower()
     one_of("ending of the file", form, _FORMS)
-    pose = static_transform(calibration, child, parent)
+    pose = static_transform(calibration, child, parent, camera)
     save(_text(form, pose), path, force)
     return pose
 

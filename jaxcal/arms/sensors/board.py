@@ -62,6 +62,10 @@ class Board(Sensor):
             fisheye), by which a corner that is outside without it is known to be in
             the picture; none when not given. Corners are read as corrected by it
             already.
+        same_board: in ``Several``, this camera stands and sees the board that the first
+            of them sees, which is on the tip once.
+        intrinsics: of ``corners``, focal lengths and centre are unknowns too, known to
+            5 % and 2 % of the focal length; ``camera`` is where they begin.
     """
 
     moves: str = "camera"
@@ -71,11 +75,11 @@ class Board(Sensor):
     side: float = 0.0
     extent: tuple[float, float] = (0.0, 0.0)
     distortion: tuple[float, ...] = ()
+    same_board: bool = False
+    intrinsics: bool = False
 
     kind = "board"
     tool = ("x", "y", "z", "rx", "ry", "rz")
-    names = tuple(f"stand {axis}" for axis in tool)
-    units = ("length",) * 3 + ("deg",) * 3
     stands = True
     _seen: ClassVar[tuple[str, ...]] = tuple(f"seen {axis}" for axis in tool)
 
@@ -101,6 +105,10 @@ class Board(Sensor):
                 f"(width, height, fx, fy, cx, cy), got {self.camera!r}"
             )
         object.__setattr__(self, "camera", tuple(camera.tolist()))
+        if self.intrinsics and self.corners is None:
+            raise ValueError("intrinsics are of a board with corners")
+        if self.same_board and self.moves != "board":
+            raise ValueError('same_board is of a camera that stands: moves="board"')
         distortion = numbers("distortion", self.distortion)
         if distortion.shape not in ((0,), (4,), (5,)):
             raise ValueError(
@@ -108,6 +116,15 @@ class Board(Sensor):
                 f"{self.distortion!r}"
             )
         object.__setattr__(self, "distortion", tuple(distortion.tolist()))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        stand = tuple(f"stand {axis}" for axis in self.tool)
+        return (*stand, "fx", "fy", "cx", "cy") if self.intrinsics else stand
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return ("length",) * 3 + ("deg",) * 3 + ("pixels",) * (len(self.names) - 6)
 
     @property
     def lens(self) -> tuple[Array, Array]:
@@ -150,6 +167,10 @@ class Board(Sensor):
         return np.array([[x, y, 0.0] for x in (0.0, width) for y in (0.0, height)])
 
     @property
+    def mounted(self) -> bool:
+        return not self.same_board
+
+    @property
     def zeros(self) -> bool:  # type: ignore[override]  # of a pose
         return self.corners is None
 
@@ -172,7 +193,13 @@ class Board(Sensor):
     @property
     def nominal(self) -> Array:
         place = np.eye(4) if self.place is None else self.place
-        return np.concatenate([place[:3, 3], np.zeros(3)])
+        lens = self.camera[-4:] if self.intrinsics else ()
+        return np.concatenate([place[:3, 3], np.zeros(3), lens])
+
+    def prior_std(self, length: float) -> Array:
+        std = np.full(len(self.names), np.inf)
+        std[6:] = np.repeat([0.05, 0.02], 2)[: len(std) - 6] * self.camera[-4]
+        return std
 
     def usual_noise(self, length: float) -> ArrayLike:
         return [1e-3 * length] * 3 + [0.1] * 3 if self.corners is None else 0.3
@@ -184,7 +211,7 @@ class Board(Sensor):
         from scipy.spatial.transform import Rotation
 
         place = np.eye(3) if self.place is None else self.place[:3, :3]
-        turn, axes = turns(parameters[3:])
+        turn, axes = turns(parameters[3:6])
         stand, turn = turn @ place, np.radians(axes)  # of the stand, by its angles
         count, moved = len(inputs), tip.position - parameters[:3]
         # How the board shifts and turns in the camera, by the tip and by the stand.
@@ -212,15 +239,23 @@ class Board(Sensor):
         spokes = self.corners @ np.matrix_transpose(board)  # (N, C, 3)
         points = spokes + where[:, None]
         focal, centre = self.lens
+        if self.intrinsics:
+            focal, centre = parameters[6:8], parameters[8:]
         deep = np.where(points[..., 2:] != 0.0, points[..., 2:], np.nan)
-        pixels = focal * points[..., :2] / deep + centre
+        rays = points[..., :2] / deep
+        pixels = focal * rays + centre
         rate = np.zeros((*points.shape[:2], 2, 3))
         rate[..., [0, 1], [0, 1]] = focal / deep
-        rate[..., 2] = -focal * points[..., :2] / deep**2
+        rate[..., 2] = -focal * rays / deep
         motion = np.concatenate([rate, -rate @ hats(spokes)], axis=-1)
         motion = motion.reshape(count, -1, 6)
         values = pixels.reshape(count, -1)
-        return Reading(values, motion @ by_tip, motion @ by_own)
+        by_own = motion @ by_own
+        if self.intrinsics:
+            by_lens = np.zeros((*rays.shape, 4))
+            by_lens[..., [0, 1], [0, 1]], by_lens[..., [0, 1], [2, 3]] = rays, 1.0
+            by_own = np.concatenate([by_own, by_lens.reshape(count, -1, 4)], axis=-1)
+        return Reading(values, motion @ by_tip, by_own)
 
     def located(
         self, tip: Tip, inputs: Array, measured: Array | None

@@ -212,6 +212,16 @@ class Sensor(abc.ABC):
         """Things of which something is known and none of the rows (N, e) is."""
         return ()
 
+    @property
+    def mounted(self) -> bool:
+        """Whether in ``Several`` it has a place of its own on the tool."""
+        return True
+
+    @property
+    def contacts(self) -> bool:
+        """Whether all that is measured is zero."""
+        return all(one.zeros for one in self.members)
+
     # -- the sensors that it consists of: itself, but of Several -----------------------
 
     @property
