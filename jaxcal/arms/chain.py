@@ -1066,6 +1066,7 @@ class SerialChain(Arm, Model):
         length = self.length or np.inf  # axes of unknown stroke alone
         joint = [_LENGTH * length, _TWIST, _LENGTH * length, _ZERO, _TWIST]
         mounting = [_MOUNTING * length] * 3 + [_MOUNTING_ANGLE] * 3
+        tool = [self.sensor.members[0].mounting * length] * 3 + [_MOUNTING_ANGLE] * 3
         torque = length * sum(abs(weight) for _, weight, _ in self.loads)
         return Prior(
             [
@@ -1073,7 +1074,7 @@ class SerialChain(Arm, Model):
                 *[_GEAR] * len(self.gears),
                 *[_SAG / torque if torque else np.inf] * len(self.compliance),
                 *mounting,
-                *(mounting[i] for i in self._tool),
+                *(tool[i] for i in self._tool),
                 *self.sensor.prior_std(length),
                 *[_WAVE] * self.waves.size,
             ],

@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 
 from jaxcal.arms.effects import SCATTER, in_words, play_in_words, scatter
 from jaxcal.arms.mistaken import mistaken_columns
-from jaxcal.arms.sensors import Board, Landmarks, Pose, Position, Sensor, Socket
+from jaxcal.arms.sensors import (
+    Board,
+    Landmarks,
+    Pose,
+    Position,
+    Sensor,
+    Socket,
+    Wrench,
+)
 from jaxcal.arms.sensors.sensor import hats
 from jaxcal.information.singular import depends, significant
 from jaxcal.models import verdict as models
@@ -68,6 +76,7 @@ _LINK = 0.02  # of the arm's length: without a distance an arm shrinks to fit co
 _ZERO = 10.0  # degrees: no zero of a joint is set so badly
 _LOUD = 10.0  # times the usual noise
 _PLACED = 0.01  # of the arm's length: a camera known to that is found
+_SHOWN = 0.5  # of the prior's variance: less was removed, readings hardly show it
 _UNSHOWN = 0.5  # of the usual variance: so much is left, readings hardly show it
 _NO_WORSE = 2.0  # times the nominal error: an accurate arm that few readings bend
 _PLAIN = 0.01  # of the arm's length: columns as they should be are nearer than that
@@ -413,7 +422,8 @@ def _findings(
     )
     still, unused = _still(model, calibration.commands[used])
     reasons += moved_lines + exchanged + _far(calibration)
-    reasons += tip + other_arm + apart + still
+    reasons += tip + other_arm + apart + still + _kept(calibration)
+    reasons += _net_mass(calibration, parts)
     doubtful |= wrong or unused
     doubtful |= bool(contradicting or exchanged or other_arm or mistaken)
     return _Findings(
@@ -627,6 +637,35 @@ def _far(calibration: Fit) -> list[str]:
         "known: a wrong tip, file or unit?"
         for i in np.flatnonzero(off > _FAR)
     ]
+
+
+def _net_mass(calibration: Fit, parts: list[Part]) -> list[str]:
+    """What is weighed may be less than what hangs there, as a sentence."""
+    weighed = [part for part in parts if isinstance(part.sensor, Wrench)]
+    masses = [calibration.parameters[part.own][0] for part in weighed]
+    return [
+        f"mass {mass:.3g} kg is what the readings show: where the controller subtracts "
+        "a payload, the load less that one, which fits alike. Set its payload to zero, "
+        "or add what it subtracts."
+        for mass in masses
+    ]
+
+
+def _kept(calibration: Fit) -> list[str]:
+    """Shifts of the tool that contacts do not show, as a sentence."""
+    sensor, names = calibration.model.sensor.members[0], calibration.names
+    if not sensor.zeros or isinstance(sensor, Board):
+        return []
+    shown = dict(zip(names, np.asarray(calibration.from_data), strict=True))
+    kept = [name for name in names if name[:-1] == "tool " and shown[name] < _SHOWN]
+    return (
+        [
+            f"{', '.join(kept)}: not shown by these contacts, kept as described; "
+            "contacts with the tool turned other ways would show it."
+        ]
+        if kept
+        else []
+    )
 
 
 def _other_tip(calibration: Fit, model: Chain) -> tuple[list[str], bool]:

@@ -594,6 +594,8 @@ def test_how_a_wrench_is_mounted_is_found_and_its_mistakes_are_named():
     found = jaxcal.identify(joints, read, model=arm)
     own = dict(zip(found.names, found.parameters, strict=True))
     assert own["mass"] == pytest.approx(1.6, abs=0.05) and found.verdict.good
+    # A controller that subtracts an old payload leaves readings of what is left of it.
+    assert "is what the readings show: where the controller" in str(found.verdict)
     said = found.check(joints, read)
     assert [*said.tolerances] == ["N", "N length"]
     assert f"a change by {said.tolerance:.3g} N or " in str(said)
@@ -810,7 +812,7 @@ def test_a_flush_face_shows_more_than_a_probe():
     theta[:30] += 0.3 * rng.normal(size=30)
     table = [[0.0, 0.0, 1.0, -100.0]]
     true = ur5().calibrated(theta).measured_with(Flush(1, table))
-    joints = true.postures(30, near=table, seed=1)
+    joints = true.postures(30, near=table, seed=1, approach=(0, 0, -1, 30))
     assert np.abs(true.predict(joints)).max() < 1e-3
     errors = {}
     for sensor in (Plane(1, table), Flush(1, table)):
@@ -823,6 +825,12 @@ def test_a_flush_face_shows_more_than_a_probe():
         )
         assert found.verdict.explains
         errors[sensor.kind] = found.standard_errors[:30]
+        # Farther out along the normal and a plane that is farther away are the same.
+        why = next(
+            line for line in found.verdict.reasons if "kept as described" in line
+        )
+        at = found.names.index("tool z")
+        assert "tool z" in why and found.parameters[at] == pytest.approx(31.0, abs=1.0)
     # The same heights and more readings; the leans show alpha and beta.
     assert (errors["flush"] < 1.1 * errors["plane"]).all()
     assert errors["flush"][1] < 0.3 * errors["plane"][1]

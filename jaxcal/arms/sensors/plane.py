@@ -28,6 +28,7 @@ class Plane(Landmarks):
 
     kind = "plane"
     lengths = True
+    mounting = 0.004
     outputs = ("height",)
     zeros = True
     axes = ("tilt1", "tilt2", "offset")

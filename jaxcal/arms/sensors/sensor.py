@@ -131,6 +131,9 @@ class Sensor(abc.ABC):
     local: ClassVar[bool] = False  # of few places: harmonics are fitted if they gain
     stands: ClassVar[bool] = False  # what is read stands at a place that it finds
     needed: ClassVar[int] = 1  # readings that find a place
+    # How well the tool is known, by the arm's length: it may hang anywhere; 0.4 % where
+    # readings hardly show it and would put it anywhere.
+    mounting: ClassVar[float] = 0.1
     misfit: ClassVar[float] = 0.0  # what they leave, by the arm's length, in a choice
     # (q,) of readings that wrap, 360 of an angle in degrees, inf of the others.
     periods: ClassVar[tuple[float, ...] | None] = None
