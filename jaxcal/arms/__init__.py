@@ -9,6 +9,7 @@ from jaxcal.arms.files.servos import Servos
 from jaxcal.arms.sensors import (
     Board,
     Distance,
+    Flush,
     Gravity,
     Plane,
     Pose,
@@ -25,6 +26,7 @@ __all__ = [
     "Board",
     "Chains",
     "Distance",
+    "Flush",
     "Gravity",
     "Plane",
     "Pose",

@@ -15,7 +15,7 @@ from jaxcal.arms.sensors import Reading, Sensor, Tip
 from jaxcal.checks import array_of, numbers
 from jaxcal.models.model import as_commands
 
-__all__ = ["Arm", "Load"]
+__all__ = ["Arm", "Load", "apparent_length"]
 
 Array = NDArray[np.float64]
 Load = tuple[int, float, tuple[float, float, float]]  # link from 1, weight, its centre
@@ -25,6 +25,7 @@ Load = tuple[int, float, tuple[float, float, float]]  # link from 1, weight, its
 # 0, 1, 2, a shift along x, y, z, or 3, 4, 5, a turn about it, or 6 and on, a constant.
 _BASE, _ROW, _TOOL = (0, 1, 2, 3, 4, 5, 6), (0, 3, 2, 5, 4), (0, 1, 2, 7, 3, 4, 5)
 _STILL = 0.02  # of the arm's length: the way of a slide that shows no size
+_PARALLEL, _CANCELS = 0.2, 3.0  # sine; times as long as what is left: lengths cancel
 _MANY = 2_000  # postures: what is found of so many is not kept
 # Where a, alpha, d, theta and beta act among the five steps of a row.
 _ORDER = {"standard": (2, 3, 1, 0, 4), "modified": (0, 1, 4, 3, 2)}
@@ -70,9 +71,12 @@ class Arm:
 
     @functools.cached_property
     def length(self) -> float:
-        """Length of the links and the tool together; 0 where the table holds none."""
-        links = np.hypot(self.table[:, 0], self.table[:, 2]).sum()
-        return float(links + np.linalg.norm(self.tool[:3, 3]))
+        """Length of the links and the tool together; 0 where the table holds none.
+
+        Lengths along parallel axes that cancel, as in a table of Universal Robots' own
+        calibration, are counted together.
+        """
+        return apparent_length(self.table, self.tool)[0]
 
     @property
     def nominal(self) -> Array:
@@ -412,6 +416,23 @@ class Arm:
             rate += np.einsum("c,ijcn->ijn", force, bent)
         rate[:, self._revolute] = np.radians(rate[:, self._revolute])
         return rate
+
+
+def apparent_length(table: Array, tool: Array) -> tuple[float, int]:
+    """The length of links (n, 5) and a tool, and which row's ``d`` cancels with others.
+
+    Rows are counted from 1; 0 where none is out of all proportion.
+    """
+    rest = np.linalg.norm(tool[:3, 3])
+    plain = float(np.hypot(table[:, 0], table[:, 2]).sum() + rest)
+    along, between = table[:, 2].copy(), np.radians(table[:, 1])
+    for i in np.flatnonzero(np.abs(np.sin(between[:-1])) < _PARALLEL):
+        along[i + 1] += np.sign(np.cos(between[i])) * along[i]
+        along[i] = 0.0
+    together = float(np.hypot(table[:, 0], along).sum() + rest)
+    if plain < _CANCELS * together:
+        return plain, 0
+    return together, 1 + int(np.abs(table[:, 2]).argmax())
 
 
 def _cross(left: Array, right: Array) -> Array:

@@ -22,10 +22,16 @@ from jaxcal.arms.arguments import (
     sensor_of,
     transform,
 )
-from jaxcal.arms.arm import Arm
+from jaxcal.arms.arm import Arm, apparent_length
 from jaxcal.arms.sensors import Board, Pose, Position, Sensor, Several
 from jaxcal.checks import array_of, axis_names, in_words, numbers, one_of
-from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
+from jaxcal.models.model import (
+    ErrorGroups,
+    Model,
+    Quantity,
+    as_commands,
+    as_parameters,
+)
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
 
@@ -141,6 +147,14 @@ class SerialChain(Arm, Model):
         at_zero = np.zeros(n) if offset is None else array_of("offset", offset, n)
         sensor = sensor_of(sensor)
         end = transform("tool", tool)
+        if cancels := apparent_length(rows, end)[1]:
+            warnings.warn(
+                f"d{cancels} = {rows[cancels - 1, 2]:g} cancels with another length, "
+                "as in Universal Robots' own calibration of nearly parallel axes, and "
+                "is counted with it. A plain table, or from_ur_kinematics(file) of "
+                "their ROS description, has small lengths whose errors can be read",
+                stacklevel=2,
+            )
         if compliance is None:
             turning = [i + 1 for i in range(n) if joints[i] == "R"]
             compliance = turning if sensor.compliant else ()
@@ -210,6 +224,28 @@ class SerialChain(Arm, Model):
             arm["limits"][arm["joint_names"].index(joint)] = ends
         return cls.from_dh(**arm, sensor=sensor, **options)
 
+    @classmethod
+    def from_ur_kinematics(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        sensor: Sensor | None = None,
+        **options: Any,
+    ) -> Self:
+        """The arm of a kinematics file of Universal Robots' ROS description, in metres.
+
+        That which ``calibration.to_ur_kinematics`` writes; the base is the robot's, the
+        tip its flange.
+
+        Args:
+            path: the .yaml.
+            sensor: what the tip is measured with; Position() when not given.
+            options: of ``from_dh`` beside the table: ``tool``, ``base``, ``limits``.
+        """
+        from jaxcal.arms.files.urdf import read_ur_kinematics
+
+        return cls.from_dh(**(read_ur_kinematics(path) | options), sensor=sensor)
+
     def measured_with(self, sensor: Sensor) -> Self:
         """This arm with another sensor."""
         return dataclasses.replace(self, sensor=sensor)
@@ -227,6 +263,41 @@ class SerialChain(Arm, Model):
         count on them where no prior is given, as what the parameters do not explain.
         """
         return self._bent
+
+    def with_effects(
+        self,
+        *,
+        compliance: Sequence[int] | None = None,
+        gears: Sequence[int] | None = None,
+        harmonics: Sequence[int] | None = None,
+    ) -> Self:
+        """This arm with these effects of joints, counted from 1, as of ``from_dh``."""
+        arm: dict[str, Any] = {}
+        if compliance is not None and not self.compliance:
+            arm["compliance"] = tuple(compliance)
+            arm["yields"] = np.zeros(len(arm["compliance"]))
+            usual = _usual_loads(len(self.joints), self.tool)
+            arm["loads"] = self.loads or tuple(
+                load(one, len(self.joints)) for one in usual
+            )
+        if gears is not None:
+            arm["gears"] = tuple(gears)
+        if harmonics is not None and not self.harmonics:
+            arm["harmonics"] = tuple(harmonics)
+            arm["waves"] = np.zeros((len(arm["harmonics"]), 4))
+        return dataclasses.replace(self, **arm)
+
+    def improved(self, fit: Any) -> Any:
+        """With what held-out readings ask for, where the noise explains too little."""
+        from jaxcal.arms.effects import chosen
+
+        return chosen(fit)
+
+    def unexplained(self, fit: Any, rows: Array) -> Array:
+        """Scatter that no noise explains, more beyond the range that was measured."""
+        from jaxcal.arms.effects import unexplained
+
+        return unexplained(fit, rows)
 
     @functools.cached_property
     def _bent(self) -> Self:  # kept, and what it keeps with it
@@ -371,7 +442,12 @@ class SerialChain(Arm, Model):
         for row, joint in far[:1]:
             name, column = self.joint_names[joint], -joints[:, joint]
             least, most = (low - slack)[joint], (high + slack)[joint]
-            if ((column >= least) & (column <= most)).all():
+            around = np.where(-column > 180.0, -column - 360.0, -column)
+            turning = units[joint] == "deg" and -column.min() >= 0.0
+            if turning and ((around >= least) & (around <= most)).all():
+                advice = f"{name} seems to be read in 0 to 360: subtract 360 from what "
+                advice += "is above 180."
+            elif ((column >= least) & (column <= most)).all():
                 advice = f"{name} seems reversed, all rows are within them with the "
                 advice += "other sign: negate that column."
             elif len(column) > 1 and not np.ptp(column):
@@ -797,6 +873,35 @@ class SerialChain(Arm, Model):
             kinds.append(kind)
         return tuple("deg" if kind == "R" else "length" for kind in kinds)
 
+    def quantities(self, measured_unit: str) -> tuple[Quantity, ...]:
+        """What its sensor reads, in its units."""
+        return self.quantities_of(self.sensor, measured_unit)
+
+    def quantities_of(self, sensor: Sensor, measured_unit: str) -> tuple[Quantity, ...]:
+        """What one of its sensors reads, "length" where the unit of that is unknown."""
+        first, *others = sensor.quantities
+        if not others and first.points == 1 and not isinstance(self.sensor, Several):
+            first = first._replace(unit=measured_unit or first.unit)
+        length = self.length_unit(measured_unit) or "length"
+        return tuple(
+            quantity._replace(unit=quantity.unit.replace("length", length))
+            for quantity in (first, *others)
+        )
+
+    def length_unit(self, measured_unit: str) -> str:
+        """The unit of lengths: the readings' if they are some, a URDF file's, or ""."""
+        of_file = "m" if self.source is not None else ""
+        others = ("deg", "rad", "m/s", "g", "N", "p", "times")
+        return of_file if measured_unit.startswith(others) else measured_unit or of_file
+
+    def accuracy_units(self, measured_unit: str) -> tuple[str, ...]:
+        units = (
+            quantity.unit
+            for one in self.sensor.members
+            for quantity in self.quantities_of(one, measured_unit)
+        )
+        return tuple(dict.fromkeys(units))
+
     def own(self, i: int) -> slice:
         """Where what the sensor's member ``i`` has of its own is among the p."""
         at = self.sensor.own_of_members[i]
@@ -961,6 +1066,7 @@ class SerialChain(Arm, Model):
         length = self.length or np.inf  # axes of unknown stroke alone
         joint = [_LENGTH * length, _TWIST, _LENGTH * length, _ZERO, _TWIST]
         mounting = [_MOUNTING * length] * 3 + [_MOUNTING_ANGLE] * 3
+        tool = [self.sensor.members[0].mounting * length] * 3 + [_MOUNTING_ANGLE] * 3
         torque = length * sum(abs(weight) for _, weight, _ in self.loads)
         return Prior(
             [
@@ -968,7 +1074,7 @@ class SerialChain(Arm, Model):
                 *[_GEAR] * len(self.gears),
                 *[_SAG / torque if torque else np.inf] * len(self.compliance),
                 *mounting,
-                *(mounting[i] for i in self._tool),
+                *(tool[i] for i in self._tool),
                 *self.sensor.prior_std(length),
                 *[_WAVE] * self.waves.size,
             ],

@@ -301,6 +301,10 @@ class Chains(Model):
                 )
         return slopes
 
+    def accuracy_units(self, measured_unit: str) -> tuple[str, ...]:
+        units = (unit for arm in self.chains for unit in arm.accuracy_units(""))
+        return tuple(dict.fromkeys(units))
+
     def wrapped(self, off: Array, commands: Array) -> Array:
         off = off.copy()
         for k, arm, rows, arm_commands in self._parts(commands):

@@ -27,6 +27,7 @@ Chain = Any  # a SerialChain, whose module imports this one
 
 _NOMINAL = 0.1  # of its length: no arm is so far off, tip included, before it is fitted
 _APART = 0.2  # of it: what two sockets may seem to be off their distance
+_TURNED = 20.0  # degrees on the flange, from which no fit finds the tool
 _EDGE = 4.0  # times the noise of a corner, which is in the picture or next to it
 _OTHER_UNIT = 0.01  # of it: so far off and tenfold, a distance is in another unit
 
@@ -36,6 +37,13 @@ def require_readings(arm: Chain, commands: Array, measured: Array) -> None:
 
     Of a camera whose picture is known, corners outside of it.
     """
+    joints = commands[:, : arm.num_joints]
+    if len(joints) > 2 and (joints == joints[0]).all():
+        raise ValueError(
+            f"the joints are the same in all {len(joints)} rows: were they recorded?"
+        )
+    if isinstance(arm.sensor, Pose):
+        _require_tool(arm, commands, measured)
     if isinstance(arm.sensor, Board):
         _require_in_picture(arm.sensor, measured, arm.length or 1.0)
     if not isinstance(arm.sensor, Position | Pose):
@@ -50,6 +58,35 @@ def require_readings(arm: Chain, commands: Array, measured: Array) -> None:
             f"degrees: measured positions spread over {spread[0]:g}, those predicted "
             f"over {spread[1]:g}"
         )
+
+
+def _require_tool(arm: Chain, commands: Array, poses: Array) -> None:
+    """Refuse a tool frame that is turned on the flange, which no fit finds."""
+    nominal = arm.rotations(commands, np.zeros((len(commands), 3)))
+    read = arm.rotations(commands, poses[:, 3:])
+    on_tool = np.matrix_transpose(nominal) @ read
+    (turn, apart), (_, of_base) = (
+        _mean_turn(on_tool),
+        _mean_turn(read @ np.matrix_transpose(nominal)),
+    )
+    angle = float(np.linalg.norm(turn))
+    if angle > _TURNED and apart < min(angle, of_base) / 3.0:
+        raise ValueError(
+            f"poses fit a tool frame turned by {angle:.0f} degrees on the flange: "
+            "multiply the rotation of tool= from the right by that of the vector "
+            f"{in_words(turn.round() + 0.0)} in degrees, or give the tip link whose "
+            "axes the readings have"
+        )
+
+
+def _mean_turn(turns: Array) -> tuple[Array, float]:
+    """Mean of rotations (N, 3, 3) as a vector in degrees, and their median from it."""
+    from scipy.spatial.transform import Rotation
+
+    whole = Rotation.from_matrix(turns)
+    mean = whole.mean()
+    apart = np.degrees((mean.inv() * whole).magnitude())
+    return np.asarray(mean.as_rotvec(degrees=True)), float(np.median(apart))
 
 
 def _require_in_picture(board: Board, pixels: Array, length: float) -> None:

@@ -7,13 +7,23 @@ with predicted covariance S and noise R the residual r becomes ``R (R - S)^-1 r`
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.arms.effects import SCATTER, in_words, play_in_words, scatter
 from jaxcal.arms.mistaken import mistaken_columns
-from jaxcal.arms.sensors import Board, Landmarks, Pose, Position, Sensor, Socket
+from jaxcal.arms.sensors import (
+    Board,
+    Landmarks,
+    Pose,
+    Position,
+    Sensor,
+    Socket,
+    Wrench,
+)
 from jaxcal.arms.sensors.sensor import hats
 from jaxcal.information.singular import depends, significant
 from jaxcal.models import verdict as models
@@ -26,7 +36,16 @@ from jaxcal.models.reasons import (
 )
 from jaxcal.models.verdict import left_out
 
-__all__ = ["CLEAR_UP", "ArmVerdict", "Part", "other_distances", "verdict"]
+__all__ = [
+    "CLEAR_UP",
+    "ArmVerdict",
+    "HeldOut",
+    "Part",
+    "Place",
+    "other_distances",
+    "place_of",
+    "verdict",
+]
 
 Array = NDArray[np.float64]
 Chain = Any  # a Chain, whose module imports this one
@@ -39,7 +58,6 @@ _LOOK = (
 _MORE = "measure more postures: jaxcal postures --measured chooses them"
 CLEAR_UP = "fix the problems listed above, then run identify again"
 
-_SCATTER = 3.0  # times the sensor's usual noise: the model does not explain that
 _FAR = 4.0  # standard deviations of the prior
 _MOVED = 3.0  # times the scatter of a socket's contacts: it was moved
 _SHUFFLES = 400
@@ -58,9 +76,26 @@ _LINK = 0.02  # of the arm's length: without a distance an arm shrinks to fit co
 _ZERO = 10.0  # degrees: no zero of a joint is set so badly
 _LOUD = 10.0  # times the usual noise
 _PLACED = 0.01  # of the arm's length: a camera known to that is found
+_SHOWN = 0.5  # of the prior's variance: less was removed, readings hardly show it
+_UNSHOWN = 0.5  # of the usual variance: so much is left, readings hardly show it
 _NO_WORSE = 2.0  # times the nominal error: an accurate arm that few readings bend
 _PLAIN = 0.01  # of the arm's length: columns as they should be are nearer than that
 _DRAWN = 200  # postures anywhere within the limits
+
+
+@dataclasses.dataclass(frozen=True)
+class HeldOut:
+    """Mean errors of a measurement in one unit, of readings left out of the fit."""
+
+    of: str  # kind of the sensor, where there are several
+    unit: str  # "length": that of the arm, which is not known
+    held_out: float
+    interval: tuple[float, float]  # 95 % of that mean
+    nominal: float  # of the nominal machine
+
+    def says(self, value: float) -> str:
+        """A number of it in words."""
+        return f"{value:.3g} {'' if self.unit == 'length' else self.unit}".strip()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -78,34 +113,53 @@ class ArmVerdict(models.Verdict):
     explains: bool | None = None  # the scatter of the readings is what the noise can be
     helps: bool | None = None  # held-out errors are below those of the nominal machine
     clean: bool | None = None  # no reading contradicts the others or the description
-    held_out: float = np.nan  # mean held-out error of a measurement, in ``unit``
-    interval: tuple[float, float] = (np.nan, np.nan)  # 95 % of that mean
-    nominal: float = np.nan  # mean error of the nominal machine
+    errors: tuple[HeldOut, ...] = ()  # of each sensor and unit
     anywhere: float = np.nan  # standard deviation within the limits; NaN if not known
-    accuracy: float | None = None  # that was asked for
-    place: tuple[float, float] | None = None  # std of a camera's or board's on the tip
+    accuracy: Mapping[str, float] | None = None  # that was asked for, by unit
+    sessions: str = ""  # what is known of how they differ
+    place: Place | None = None  # of a camera or board on the tip
+    length_unit: str = ""
+
+    @property
+    def held_out(self) -> float:
+        """Mean held-out error of a measurement, in the first unit."""
+        return self.errors[0].held_out if self.errors else np.nan
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % of ``held_out``."""
+        return self.errors[0].interval if self.errors else (np.nan, np.nan)
+
+    @property
+    def nominal(self) -> float:
+        """Mean error of the nominal machine, in the first unit."""
+        return self.errors[0].nominal if self.errors else np.nan
 
     def lines(self) -> tuple[str, ...]:
         """The errors, and what speaks against the calibration."""
         if self.explains is None:
             return self.reasons
-        (low, high), unit = self.interval, f" {self.unit}" if self.unit else ""
+        length = f" {self.length_unit}" if self.length_unit else ""
         lines = [
-            f"Cross-validated error {self.held_out:.3g}{unit} (95 %: {low:.3g} to "
-            f"{high:.3g}); before calibration {self.nominal:.3g}{unit}."
+            f"Cross-validated error{f' of {one.of}' if one.of else ''} "
+            f"{one.says(one.held_out)} (95 %: {one.interval[0]:.3g} to "
+            f"{one.interval[1]:.3g}); before calibration {one.says(one.nominal)}."
+            for one in self.errors
         ]
         if np.isfinite(self.anywhere):
             lines.append(
-                f"Tip uncertainty over the workspace: {self.anywhere:.3g}{unit} (1 "
+                f"Tip uncertainty over the workspace: {self.anywhere:.3g}{length} (1 "
                 "sigma, base frame excluded)."
             )
         if self.place is not None:
             lines.append(
                 "Place of the camera or board on the tip: known to "
-                f"{self.place[0]:.2g} in length and {self.place[1]:.2g} deg (1 sigma)."
+                f"{self.place.says(length)} (1 sigma)."
             )
-        if self.accuracy is not None and not self.interval[1] <= self.accuracy:
-            lines.append(f"Not the accuracy you asked for, {self.accuracy:g}{unit}.")
+        lines += [self.sessions] if self.sessions else []
+        for one in _missed(self.errors, self.accuracy):
+            asked = one.says((self.accuracy or {})[one.unit])
+            lines.append(f"Not the accuracy you asked for, {asked}.")
         if not self.explains:
             lines.append("This model does not explain these readings by its noise.")
         if self.place is not None and not self.helps:
@@ -115,6 +169,14 @@ class ArmVerdict(models.Verdict):
         elif not self.helps:
             lines.append("It is no better than the nominal machine.")
         return (*lines, *self.reasons)
+
+
+def _missed(
+    errors: Sequence[HeldOut], accuracy: Mapping[str, float] | None
+) -> list[HeldOut]:
+    """Those that are not below the accuracy asked for."""
+    asked = accuracy or {}
+    return [one for one in errors if one.interval[1] > asked.get(one.unit, np.inf)]
 
 
 def verdict(calibration: Fit) -> ArmVerdict:
@@ -142,59 +204,101 @@ def verdict(calibration: Fit) -> ArmVerdict:
     commands, usual = calibration.commands[used], np.asarray(model.default_noise().std)
     measured = calibration.measured[used]
     parts = _parts(calibration, used)
-    errors = _errors(calibration, used, measured, usual, parts)
+    held_out, off = _errors(calibration, used, measured, parts)
+    errors = [
+        one
+        for part in parts
+        for one in _in_units(calibration, part, parts, held_out, off)
+    ]
+    helps = _helps(held_out[used] / usual, off[used] / usual)
     scatter = _scattered(calibration, usual, parts)
     explains = scatter is None
     mistaken = ""
-    if not explains and max(errors.of_parts) > _PLAIN * model.length:
+    if not explains and errors[0].nominal > _PLAIN * model.length:
         mistaken = mistaken_columns(model, commands, measured)
     findings = _findings(calibration, used, parts, scatter, mistaken)
     at, anywhere = _anywhere(calibration, model, parts)
-    nominal = errors.of_parts[at]
+    nominal = next(one.nominal for one in errors if one.of == _title(parts[at], parts))
     findings = _left_open(findings, parts, _in(calibration), anywhere, nominal)
     clean = not (findings.doubtful or (findings.moved and not explains))
-    place = _place_on_tip(calibration, model, parts)
+    place = None
+    if all(isinstance(part.sensor, Board) for part in parts):
+        place = place_of(calibration, [f"tool {axis}" for axis in Pose.tool])
+    reach = model.length or float(np.ptp(parts[0].points, axis=0).max())
+    reasons = findings.reasons
+    if place is not None and place.hidden:
+        reasons += (
+            f"{', '.join(place.hidden)}: not shown by these views, kept as described. "
+            "Views with the tip turned about another axis would show it, or measure it "
+            "and give tool=",
+        )
+    if not explains and not calibration.noise_known:
+        unit_of_first = "" if errors[0].unit == "length" else f" {errors[0].unit}"
+        reasons += tuple(in_words(calibration, unit_of_first))
+        reasons += tuple(play_in_words(calibration, unit_of_first))
     accuracy = calibration.provenance.get("accuracy")
+    if isinstance(accuracy, float):  # of a file of 0.2
+        accuracy = {errors[0].unit: accuracy}
     if accuracy is not None:
-        good = clean and errors.interval[1] <= accuracy
-    elif place is not None and place[0] < _PLACED * model.length and explains:
-        good = clean and errors.held_out < _NO_WORSE * errors.nominal
+        good = clean and not _missed(errors, accuracy)
+    elif place is not None and place.std[0] < _PLACED * reach and explains:
+        good = clean and helps.ratio < _NO_WORSE
     else:
-        enough = explains or errors.interval[1] < _LITTLE * errors.nominal
-        good = bool(clean and errors.helps and enough)
-    more = accuracy is not None or errors.helps is None
+        good = bool(clean and helps.helps and (explains or helps.most < _LITTLE))
+    more = accuracy is not None or helps.helps is None
     return ArmVerdict(
         good=good,
-        reasons=findings.reasons,
+        reasons=reasons,
         next_step=models.USE
         if good
         else _next_step(findings, scatter, calibration.noise_known, more),
         unit=unit,
         explains=explains,
-        helps=errors.helps,
+        helps=helps.helps,
         clean=clean,
-        held_out=errors.held_out,
-        interval=errors.interval,
-        nominal=errors.nominal,
+        errors=tuple(errors),
         anywhere=anywhere,
         accuracy=accuracy,
         place=place,
+        sessions=_sessions(calibration, errors[0]),
+        length_unit=model.length_unit(unit),
     )
 
 
-def _place_on_tip(
-    calibration: Fit, model: Chain, parts: list[Part]
-) -> tuple[float, float] | None:
-    """Standard deviations of where a camera or board is on the tip, length and degrees.
+class Place(NamedTuple):
+    """How well readings show where something is, of which nobody knew."""
 
-    Nobody knew it, however accurate the arm; None of other sensors.
+    std: tuple[float, float]  # of what they show, in length and degrees
+    hidden: tuple[str, ...]  # parameters that they do not show
+
+    def says(self, unit: str) -> str:
+        """Both in words; of what is not shown nothing."""
+        sizes = [f"{self.std[0]:.2g}{unit or ' in length'}", f"{self.std[1]:.2g} deg"]
+        turns = [name for name in self.hidden if name[-2] == "r"]
+        lost = [len(self.hidden) - len(turns) == 3, len(turns) == 3]
+        shown = [size for size, none in zip(sizes, lost, strict=True) if not none]
+        return " and ".join(shown) or "nothing"
+
+
+def place_of(calibration: Fit, names: Sequence[str]) -> Place:
+    """How well six shifts and turns are known.
+
+    Hidden are those in directions of which the readings leave half of what is usual of
+    a tool: along a SCARA's axes, and all shifts of a gantry, whose tool never turns.
     """
-    if not all(isinstance(part.sensor, Board) for part in parts):
-        return None
-    at = [model.names.index(f"tool {axis}") for axis in ("x", "y", "z")]
-    turns = [model.names.index(f"tool r{axis}") for axis in "xyz"]
-    variance = np.asarray(calibration.standard_errors) ** 2
-    return float(np.sqrt(variance[at].sum())), float(np.sqrt(variance[turns].sum()))
+    model = calibration.model
+    at = np.array([model.names.index(name) for name in names])
+    size = np.repeat([0.1 * (model.length or 1.0), 1.7], 3)
+    scaled = np.asarray(calibration.covariance)[np.ix_(at, at)] / np.outer(size, size)
+    lost = np.flatnonzero(calibration.undetermined[at])
+    scaled[lost, lost] += 1.0
+    square, axes = np.linalg.eigh(scaled)
+    vague = square > _UNSHOWN
+    shown = size[:, None] * axes[:, ~vague] * np.sqrt(square[~vague].clip(0.0))
+    hidden = (axes[:, vague] ** 2).sum(axis=1) > _UNSHOWN
+    std = np.sqrt((shown**2).sum(axis=1).reshape(2, 3).sum(axis=1))
+    named = tuple(np.array(names)[hidden].tolist())
+    return Place((float(std[0]), float(std[1])), named)
 
 
 class Part(NamedTuple):
@@ -225,6 +329,19 @@ class Part(NamedTuple):
         pairs = np.array(getattr(self.sensor, "distances", ())).reshape(-1, 4)[:, :2]
         labels = self.sensor.of_rows(self.columns)
         return np.asarray(np.isin(pairs, labels).all(axis=1))
+
+
+def _sessions(calibration: Fit, first: HeldOut) -> str:
+    """How sessions differ, in a sentence."""
+    of_sessions = calibration.provenance.get("sessions")
+    if of_sessions is None:
+        return (
+            "On another day, or mounted again, it may be off by more: unknown from one "
+            "session (sessions=, --session)."
+        )
+    quantity = calibration.model.quantities(calibration.measured_unit)[0]
+    size = first.says(float(quantity.size(calibration.session_std)))
+    return f"Another session differs by {size} (1 sigma), which predictions count."
 
 
 def _parts(calibration: Fit, used: NDArray[np.intp]) -> list[Part]:
@@ -305,7 +422,8 @@ def _findings(
     )
     still, unused = _still(model, calibration.commands[used])
     reasons += moved_lines + exchanged + _far(calibration)
-    reasons += tip + other_arm + apart + still
+    reasons += tip + other_arm + apart + still + _kept(calibration)
+    reasons += _net_mass(calibration, parts)
     doubtful |= wrong or unused
     doubtful |= bool(contradicting or exchanged or other_arm or mistaken)
     return _Findings(
@@ -417,68 +535,85 @@ def _next_step(
     return next(step for holds, step in steps if holds)
 
 
-class _Errors(NamedTuple):
-    """Mean errors of a measurement, readings of two units compared in noise."""
+class _Helps(NamedTuple):
+    """Held-out errors beside the nominal arm's, readings of two units in noise."""
 
-    held_out: float
-    half_width: float  # of the 95 % interval of ``held_out``
-    nominal: float
-    of_parts: list[float]  # ``nominal`` of each sensor, in its own unit
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95 % of ``held_out``."""
-        least = max(self.held_out - self.half_width, 0.0)
-        return least, self.held_out + self.half_width
+    ratio: float  # of the means
+    most: float  # upper end of its 95 % interval
 
     @property
     def helps(self) -> bool | None:
         """Whether held-out errors are below the nominal arm's; None where not sure."""
-        if self.held_out < self.nominal:
+        if self.ratio < 1.0:
             return True
-        return None if self.held_out - self.half_width < self.nominal else False
+        return None if 2.0 * self.ratio - self.most < 1.0 else False
+
+
+def _helps(held_out: Array, off: Array) -> _Helps:
+    """Of readings (K, q) in noise."""
+    mean, half_width = _mean(np.linalg.norm(held_out, axis=1))
+    nominal = float(np.linalg.norm(off, axis=1).mean()) or 1e-300
+    return _Helps(mean / nominal, (mean + half_width) / nominal)
+
+
+def _mean(errors: Array) -> tuple[float, float]:
+    """Mean of errors (K,), and the half-width of its 95 % interval."""
+    half_width = 1.96 * errors.std() / np.sqrt(max(len(errors) - 1, 1))
+    return float(errors.mean()), float(half_width)
 
 
 def _errors(
-    calibration: Fit,
-    used: NDArray[np.intp],
-    measured: Array,
-    usual: Array,
-    parts: list[Part],
-) -> _Errors:
-    """The errors held out and of the nominal arm, of the rows that are used."""
-    size, commands = usual / usual[0], calibration.commands[used]
-    held_out = np.linalg.norm(left_out(calibration)[used] / size, axis=1)
-    arm = calibration.model.located(commands, measured)
+    calibration: Fit, used: NDArray[np.intp], measured: Array, parts: list[Part]
+) -> tuple[Array, Array]:
+    """(N, q) errors held out, and those of the nominal arm of the rows ``used``."""
+    commands, model = calibration.commands[used], calibration.model
     off = np.zeros_like(calibration.residuals)
-    off[used] = measured - arm.predict(commands)
+    predicted = model.located(commands, measured).predict(commands)
+    off[used] = model.wrapped(measured - predicted, commands)
     for part in parts:  # a socket's place is no merit of either
         for rows in part.groups():
             off[rows] -= off[rows].mean(axis=0) if len(rows) else 0.0
-    far = np.linalg.norm(off / size, axis=1)
-    of_parts = [float(far[part.rows].mean() * part.scale[0]) for part in parts]
-    half_width = 1.96 * held_out.std() / np.sqrt(max(len(held_out) - 1, 1))
-    nominal = float(far[used].mean())
-    return _Errors(float(held_out.mean()), float(half_width), nominal, of_parts)
+    return left_out(calibration), off
+
+
+def _title(part: Part, parts: list[Part]) -> str:
+    """Name of a part, where there are others."""
+    return part.kind if len(parts) > 1 else ""
+
+
+def _in_units(
+    calibration: Fit, part: Part, parts: list[Part], held_out: Array, off: Array
+) -> list[HeldOut]:
+    """A part's mean errors, those of each unit by themselves."""
+    means = []
+    for quantity in calibration.model.quantities_of(
+        part.sensor, calibration.measured_unit
+    ):
+        of_part, of_nominal = (
+            quantity.size(errors[part.rows, : len(part.scale)] * part.scale)
+            for errors in (held_out, off)
+        )
+        mean, half = _mean(of_part)
+        interval = (max(mean - half, 0.0), mean + half)
+        nominal = float(of_nominal.mean())
+        means.append(
+            HeldOut(_title(part, parts), quantity.unit, mean, interval, nominal)
+        )
+    return means
 
 
 def _in(calibration: Fit) -> str:
-    """The unit of lengths after a number: that of the readings, where it is stated."""
-    of_lengths = not calibration.measured_unit.startswith(("deg", "rad", "m/s"))
-    return (
-        f" {calibration.measured_unit}"
-        if calibration.measured_unit and of_lengths
-        else ""
-    )
+    """The unit of lengths after a number, where it is known."""
+    unit = calibration.model.length_unit(calibration.measured_unit)
+    return f" {unit}" if unit else ""
 
 
 def _scattered(calibration: Fit, usual: Array, parts: list[Part]) -> Reason | None:
     """Readings that scatter by more than the noise explains."""
     if calibration.noise_known:
         return wrong_noise(calibration)
-    noise = np.asarray(calibration.noise_std)
-    times = float(np.sqrt(np.mean((noise / usual) ** 2)))
-    if times < _SCATTER:
+    noise, times = np.asarray(calibration.noise_std), scatter(calibration)
+    if times < SCATTER:
         return None
     largest = float(noise[(noise / usual).argmax()])
     unit = _in(calibration) if np.ptp(usual) == 0.0 else ""
@@ -502,6 +637,35 @@ def _far(calibration: Fit) -> list[str]:
         "known: a wrong tip, file or unit?"
         for i in np.flatnonzero(off > _FAR)
     ]
+
+
+def _net_mass(calibration: Fit, parts: list[Part]) -> list[str]:
+    """What is weighed may be less than what hangs there, as a sentence."""
+    weighed = [part for part in parts if isinstance(part.sensor, Wrench)]
+    masses = [calibration.parameters[part.own][0] for part in weighed]
+    return [
+        f"mass {mass:.3g} kg is what the readings show: where the controller subtracts "
+        "a payload, the load less that one, which fits alike. Set its payload to zero, "
+        "or add what it subtracts."
+        for mass in masses
+    ]
+
+
+def _kept(calibration: Fit) -> list[str]:
+    """Shifts of the tool that contacts do not show, as a sentence."""
+    sensor, names = calibration.model.sensor.members[0], calibration.names
+    if not sensor.zeros or isinstance(sensor, Board):
+        return []
+    shown = dict(zip(names, np.asarray(calibration.from_data), strict=True))
+    kept = [name for name in names if name[:-1] == "tool " and shown[name] < _SHOWN]
+    return (
+        [
+            f"{', '.join(kept)}: not shown by these contacts, kept as described; "
+            "contacts with the tool turned other ways would show it."
+        ]
+        if kept
+        else []
+    )
 
 
 def _other_tip(calibration: Fit, model: Chain) -> tuple[list[str], bool]:

@@ -154,6 +154,9 @@ class Calibration(Fit):
         """
         return self.model.write("urdf", path, self._for_file(), force=force)
 
+    static_transform = late("jaxcal.arms.files.transforms:static_transform")
+    to_transform = late("jaxcal.arms.files.transforms:to_transform")
+
     def to_dh(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write the DH table as CSV, corrected as ``to_urdf`` says."""
         self.model.write("dh", path, self._for_file(), force=force)
@@ -208,17 +211,24 @@ class Calibration(Fit):
             )
         return steps
 
-    def again(self, model: Any, prior: Prior | None) -> Calibration:
+    def again(
+        self,
+        model: Any,
+        prior: Prior | None,
+        rows: NDArray[np.bool_] | None = None,
+    ) -> Calibration:
         """The calibration of the same readings by another model of the machine.
 
         Args:
             model: it, of the same commands and readings.
             prior: of its parameters; that which ``identify`` takes when None.
+            rows: (N,) which of the readings; all when None.
         """
+        used = self.loss_weights > 0.0
         fields = fit_model(
             self.commands,
             self.measured,
-            (self.loss_weights > 0.0).astype(np.float64),
+            (used if rows is None else used & rows).astype(np.float64),
             model=model,
             prior=prior,
             noise=Noise(std=self.noise_std) if self.noise_known else None,

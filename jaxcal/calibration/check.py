@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.pairing import of_new_readings
-from jaxcal.checks import array_of, numbers, table, whole_number
+from jaxcal.checks import array_of, numbers, one_of, table, whole_number
 from jaxcal.information.blocks import without
 from jaxcal.models.model import recorded
 from jaxcal.models.recording import Recording
@@ -49,6 +49,7 @@ class Check:
     unseen: tuple[str, ...]  # parameters whose drift by ``tolerance`` could hide
     tolerance: float  # root mean square of the outputs' change that matters
     unit: str = ""  # of the tolerance, where the calibration or its sensor has one
+    tolerances: Mapping[str, float] = dataclasses.field(default_factory=dict)  # by unit
     slipped: str = ""  # what alone would explain it, and by how much
     enough: int = 0  # rows like these by which it could be told, about; 0 if not so
     blind: tuple[str, ...] = ()  # parameters that nothing placed anew shows
@@ -65,7 +66,9 @@ class Check:
         text = f"the calibration {self.says}"
         if self.says == "cannot be told":
             text = "whether the calibration holds cannot be told"
-        change = f"{self.tolerance:.3g} {self.unit}".strip()
+        tolerances = self.tolerances or {self.unit: self.tolerance}
+        changes = (f"{size:.3g} {unit}".strip() for unit, size in tolerances.items())
+        change = " or ".join(changes)
         text += (
             f" (p = {self.p_value:.3g}, false alarms 5 %); a change by {change} is "
             f"seen with {self.power:.0%} on average"
@@ -107,7 +110,7 @@ def check(
     commands: ArrayLike | Recording | str | os.PathLike[str],
     measured: ArrayLike | None = None,
     *,
-    tolerance: float | None = None,
+    tolerance: float | Mapping[str, float] | None = None,
     placed_anew: bool = False,
 ) -> Check:
     """Does the calibration still hold, by a few new measurements.
@@ -123,9 +126,10 @@ def check(
         measured: (N, m) readings there; contacts need none, nor does a recording that
             has them.
         tolerance: how far, root mean square over the calibration's commands, the
-            outputs may drift, in the unit of the first (an output of another noise
-            counts in noise). When not given three times the standard deviation of these
-            measurements: the noise and what the calibration does not know.
+            outputs may drift: a number in the unit of the first (lengths of a pose), or
+            of each unit, {"mm": 0.5, "deg": 0.1}. When not given three times the
+            standard deviation of these measurements: the noise and what the calibration
+            does not know.
         placed_anew: of an arm, what its sensor reads (sockets, planes, anchors, a
             board) stands elsewhere than at the calibration. What cannot be told from
             that, as the first joint's zero, is named (``blind``) and not judged.
@@ -150,9 +154,8 @@ def check(
     changes_of_slips = off.white @ ways
     p_value, p_slip = tests.p_values(off.of_level @ off.white**2, changes_of_slips**2)
     size = tests.smallest(signal, along)
-    if tolerance is None:
-        tolerance = _tolerance(calibration, commands)
-    change = _changes(calibration, calibration.commands, tolerance)
+    tolerances = _tolerances(calibration, commands, tolerance)
+    change = _changes(calibration, calibration.commands, tolerances)
     judged = free & np.isfinite(change)
     hidden = judged & (size > change)
     squares = change[judged] ** 2
@@ -173,15 +176,16 @@ def check(
     mispaired = None
     if says == "does not hold" and not placed_anew:
         mispaired = of_new_readings(calibration, commands, measured)
-    sensor = getattr(calibration.model, "sensor", None)
+    units = ["" if unit == "length" else unit for unit in tolerances]
     return Check(
         says=says,
         p_value=p_value,
         power=float(power),
         drift={names[i]: float(size[i]) for i in np.flatnonzero(free)},
         unseen=tuple(names[i] for i in np.flatnonzero(hidden)),
-        tolerance=tolerance,
-        unit=calibration.measured_unit or getattr(sensor, "first_unit", ""),
+        tolerance=next(iter(tolerances.values())),
+        unit=units[0],
+        tolerances=dict(zip(units, tolerances.values(), strict=True)),
         slipped=slipped,
         enough=int(np.ceil(enough)) if enough < _MANY else 0,
         blind=tuple(names[i] for i in np.flatnonzero(off.blind)),
@@ -342,33 +346,43 @@ def _postures(calibration: Fit, name: str, given: ArrayLike) -> Array:
     return rows
 
 
-def _scale(calibration: Fit) -> Array:
-    """(m,) of the outputs, in which they are compared: 1, or their usual noise."""
-    usual, ones = calibration.model.default_noise(), np.ones(calibration.num_outputs)
-    std = ones if usual is None else ones * np.asarray(usual.std)
-    return np.asarray(std / std[0])
+def _tolerances(
+    calibration: Fit, where: Array, given: float | Mapping[str, float] | None
+) -> dict[str, float]:
+    """By unit: as given, else three standard deviations of one at ``where`` (R, n)."""
+    quantities = calibration.model.quantities(calibration.measured_unit)
+    units = tuple(quantity.unit for quantity in quantities)
+    if given is not None:
+        asked = given if isinstance(given, Mapping) else {units[0]: given}
+        for unit, size in asked.items():
+            one_of("unit of tolerance", unit, units)
+            if not numbers("tolerance", size) > 0.0:
+                raise ValueError(f"tolerance must be positive, got {size}")
+        return {unit: float(size) for unit, size in asked.items()}
+    std = calibration.predict_std(where, new_measurement=True)
+    std = np.where(np.isfinite(std), std, np.asarray(calibration.noise_std))
+    return {
+        quantity.unit: float(3.0 * np.sqrt((quantity.size(std) ** 2).mean()))
+        for quantity in quantities
+    }
 
 
-def _tolerance(calibration: Fit, where: Array) -> float:
-    """Three standard deviations of a measurement at ``where`` (R, n)."""
-    std = calibration.predict_std(where, new_measurement=True) / _scale(calibration)
-    noise = np.asarray(calibration.noise_std) / _scale(calibration)
-    std = np.where(np.isfinite(std), std, noise)
-    return float(3.0 * np.sqrt((std**2).sum(axis=1).mean()))
-
-
-def _changes(calibration: Fit, where: Array, tolerance: float) -> Array:
+def _changes(calibration: Fit, where: Array, tolerances: Mapping[str, float]) -> Array:
     """(p,) what each parameter may change by, infinite where that is far.
 
-    Then the outputs at ``where`` (R, n) change by the tolerance, root mean square. Far
-    is ten standard deviations of the prior: no machine drifts so.
+    Then readings of one unit at ``where`` (R, n) change by its tolerance, root mean
+    square. Far is ten standard deviations of the prior: no machine drifts so.
     """
-    if not numbers("tolerance", tolerance) > 0.0:
-        raise ValueError(f"tolerance must be positive, got {tolerance}")
     slopes = np.asarray(calibration.model.jacobian(where, calibration.parameters))
-    slopes = slopes / _scale(calibration)[:, None]
+    by_parameter = slopes.transpose(0, 2, 1)  # (R, p, q)
     with np.errstate(divide="ignore"):
-        change = tolerance / np.sqrt((slopes**2).sum(axis=1).mean(axis=0))
+        changes = [
+            tolerances[quantity.unit]
+            / np.sqrt((quantity.size(by_parameter) ** 2).mean(axis=0))
+            for quantity in calibration.model.quantities(calibration.measured_unit)
+            if quantity.unit in tolerances
+        ]
+        change = np.min(changes, axis=0)
         most = _DRIFT / np.sqrt(calibration.prior_precision[: len(change)])
     return np.where(change > most, np.inf, change)
 
@@ -507,7 +521,7 @@ def verification(
     k: int,
     *,
     region: ArrayLike | None = None,
-    tolerance: float | None = None,
+    tolerance: float | Mapping[str, float] | None = None,
 ) -> NDArray[np.int64]:
     """The k of the candidates that show best that the calibration is wrong.
 
@@ -538,9 +552,7 @@ def verification(
     of_level = (levels == np.unique(levels)[:, None]).astype(np.float64)
     signal = (of_level @ white**2).transpose(0, 2, 1)  # (M, p, G) by a drift of one
     where = calibration.commands if region is None else table("region", region)
-    if tolerance is None:
-        tolerance = _tolerance(calibration, where)
-    change = _changes(calibration, where, tolerance)
+    change = _changes(calibration, where, _tolerances(calibration, where, tolerance))
     judged = (calibration.free[: len(change)] > 0.0) & np.isfinite(change)
     shifts = signal[:, judged] * change[judged, None] ** 2  # of one posture
     counts = of_level.sum(axis=1)

@@ -265,10 +265,19 @@ class Fit:
         variance = above_rounding(
             ((slopes @ covariance) * slopes).sum(axis=-1), slopes, covariance
         )
-        std = np.sqrt(variance + float(new_measurement) * noise**2)
+        more = self.model.unexplained(self, points.reshape(-1, self.num_inputs)) ** 2
+        least = noise**2 if new_measurement else 0.0
+        std = np.sqrt(variance + np.maximum(more, least) + self.session_std**2)
         if self.unidentified is not None:
             std = np.where(depends(slopes, self.unseen), np.inf, std)
         return std.reshape(*points.shape[:-1], self.num_outputs)
+
+    @property
+    def session_std(self) -> Array:
+        """(m,) standard deviation between sessions; 0 where ``identify`` was told of
+        one alone, though another day may differ."""
+        of_sessions = self.provenance.get("sessions", {"std": [0.0]})
+        return np.broadcast_to(np.array(of_sessions["std"]), (self.num_outputs,))
 
     # -- inside ------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import functools
 import hashlib
@@ -23,6 +24,7 @@ from jaxcal.checks import (
     array_of,
     axis_names,
     levels,
+    one_of,
     require_none,
     table,
 )
@@ -30,7 +32,7 @@ from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, recorded
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior, as_noise
-from jaxcal.models.verdict import CalibrationWarning
+from jaxcal.models.verdict import CalibrationWarning, between_sessions
 from jaxcal.tables import (
     COMMANDS,
     MEASURED,
@@ -65,7 +67,8 @@ def identify(
     command_unit: str = "",
     measured_unit: str = "",
     notes: Mapping[str, Any] | None = None,
-    accuracy: float | None = None,
+    accuracy: float | Mapping[str, float] | None = None,
+    sessions: ArrayLike | None = None,
 ) -> Calibration:
     """The parameters of ``y = f(u; theta)`` that the measurements make most probable.
 
@@ -107,9 +110,13 @@ def identify(
         command_unit: stored with the result.
         measured_unit: stored with the result.
         notes: anything JSON can hold, stored under ``provenance["notes"]``.
-        accuracy: held-out error that is enough, in the measured unit, which the verdict
-            of an arm judges by; stored in ``provenance``. When not given, by whether
-            the noise explains the readings, or the nominal machine is far worse.
+        accuracy: of an arm, the mean held-out error that is enough: of each unit that
+            is named, {"mm": 0.5, "deg": 0.1}; a number is of the first, lengths where
+            there are some. The verdict judges by it; stored in ``provenance``. When
+            not given, by whether the noise explains the readings, or the nominal
+            machine is far worse.
+        sessions: (N,) a label of each row, its day or mounting. What differs between
+            two or more is estimated by leaving out each, and counts in predictions.
 
     Returns:
         The calibration; its covariance is None where the noise is unknown: nothing was
@@ -125,9 +132,12 @@ def identify(
     )
     n, m = len(readings.input_names), len(readings.output_names)
     noise, plain_noise = _noise(noise, noise_std, common_noise, m)
-    about = _about(readings, command_unit, measured_unit, notes, accuracy)
+    about = _about(readings, command_unit, measured_unit, notes)
     model = _affine(n, m) if model is None else model
     model = require_fitting(model, readings.commands, readings.measured)
+    if accuracy is not None:
+        units = model.accuracy_units(measured_unit)
+        about["provenance"]["accuracy"] = _accuracy(accuracy, units)
     plain = prior is None and plain_noise and loss in (None, "gaussian")
     affine = isinstance(model, Affine)
     if plain and (affine or model.affine(model.nominal) is not None):
@@ -161,6 +171,10 @@ def identify(
     if prior is not None and not prior.by_data:
         about["provenance"]["prior"] = "stated"
     calibration = Calibration(**fields, **about)
+    if prior is None and plain_noise:
+        calibration = model.improved(calibration)
+    if sessions is not None:
+        calibration = _with_sessions(calibration, sessions)
     if not calibration.verdict.good and not _exact(calibration):
         warning = CalibrationWarning(str(calibration.verdict))
         warning.new = True
@@ -224,7 +238,6 @@ def _about(
     command_unit: str,
     measured_unit: str,
     notes: Mapping[str, Any] | None,
-    accuracy: float | None,
 ) -> dict[str, Any]:
     """The fields of a ``Calibration`` that say what it is of: names, units, origin."""
     units = {"command_unit": command_unit, "measured_unit": measured_unit}
@@ -234,16 +247,40 @@ def _about(
     provenance = _provenance(
         readings.commands, readings.measured, readings.weights, notes
     )
-    if accuracy is not None:
-        if not array_of("accuracy", accuracy) > 0.0:
-            raise ValueError(f"accuracy must be positive, got {accuracy}")
-        provenance["accuracy"] = float(accuracy)
     return {
         "input_names": readings.input_names,
         "output_names": readings.output_names,
         **units,
         "provenance": provenance,
     }
+
+
+def _with_sessions(calibration: Calibration, labels: ArrayLike) -> Calibration:
+    """The calibration with what differs between its sessions."""
+    names, which = np.unique(np.asarray(labels), return_inverse=True)
+    if np.shape(labels) != (len(calibration.commands),) or len(names) < 2:
+        raise ValueError(
+            f"sessions must be two or more labels, of {len(calibration.commands)} rows,"
+            f" got shape {np.shape(labels)} and {len(names)} labels"
+        )
+    std = between_sessions(calibration, which).tolist()
+    about = {"count": len(names), "std": std}
+    provenance = {**calibration.provenance, "sessions": about}
+    return dataclasses.replace(calibration, provenance=provenance)
+
+
+def _accuracy(
+    given: float | Mapping[str, float], units: tuple[str, ...]
+) -> dict[str, float]:
+    """The accuracy asked for, by the units of the model's readings."""
+    if not units:
+        raise ValueError("accuracy is of an arm")
+    asked = given if isinstance(given, Mapping) else {units[0]: given}
+    for unit, value in asked.items():
+        one_of("unit of accuracy", unit, units)
+        if not array_of("accuracy", value) > 0.0:
+            raise ValueError(f"accuracy must be positive, got {value}")
+    return {unit: float(value) for unit, value in asked.items()}
 
 
 # The model of most calibrations, whose names are then made once.

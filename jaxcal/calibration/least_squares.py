@@ -44,6 +44,7 @@ _CHOLESKY = 1e-6  # least pivot, of the largest, at which it is as exact as refl
 _ONCE = 1e-3  # likewise, at which a single one is exact to 1e-8 or so
 _CLEAR = 1e8  # most by which directions differ that are determined without a doubt
 _LITTLE = 1e-6  # of a gain: a step of .001 standard deviations changes no derivative
+_LARGER = 0.01  # of its logarithm: no machine is larger than described by more
 _TOUCHED = 4.0  # times the usual noise: most that is read of what is touched
 _AHEAD = 0.1  # of a step, where its curvature is looked for
 _BENT = 0.75  # curvature of a step, of its length, at most
@@ -71,16 +72,21 @@ class FitProblem:
     def growth(self, theta: Array) -> Array | None:
         """(N, 1) by which contacts' readings are as large as at the prior's mean.
 
-        None where all are as they are.
+        None where all are as they are. A machine that is larger by more has no merit of
+        it: a tool that grows without end would.
         """
         log = self.model.log_size(self.commands, theta)
         if log is None or self.first_log_size is None:
             return None
-        return np.exp(self._zeros * (log - self.first_log_size)[:, None])
+        larger = np.minimum(log - self.first_log_size, _LARGER)
+        return np.exp(self._zeros * larger[:, None])
 
     def growth_slopes(self, theta: Array) -> Array:
         """(N, F) derivative of the logarithm of ``growth``."""
         slopes = self.model.log_size_jacobian(self.commands, theta)
+        log = self.model.log_size(self.commands, theta)
+        if log is not None and self.first_log_size is not None:
+            slopes = slopes * (log - self.first_log_size < _LARGER)[:, None]
         return self._zeros * (slopes if self.free.all() else slopes[:, self.free])
 
     @functools.cached_property

@@ -63,6 +63,11 @@ class ArmOptions:
     tip: Annotated[list[str] | None, "of an arm, the link that is measured", "LINK"] = (
         None
     )
+    on_tip: Annotated[
+        str | None,
+        "of --sensor board, which is on the tip: camera (default), the other stands",
+        ["camera", "board"],
+    ] = None
     radians: Annotated[bool, "joint columns are in radians"] = False
     locked: Annotated[
         list[list[Any]] | None,
@@ -112,7 +117,7 @@ class ArmOptions:
 
     def _sensor(self, table: Table | None, places: Any) -> Sensor:
         """The sensor, with as many landmarks as are given or in the table."""
-        from jaxcal.arms.sensors import SENSORS, Landmarks, Socket
+        from jaxcal.arms.sensors import SENSORS, Board, Landmarks, Several, Socket
 
         kinds = {name: kind for name, kind in SENSORS.items() if name != "several"}
         kind = kinds[one_of("--sensor", self.kind, tuple(kinds))]
@@ -128,6 +133,10 @@ class ArmOptions:
             elif table is not None and self.kind in table.names:
                 column = table.columns([self.kind])
                 landmarks["count"] = 1 + int(column.max(initial=0.0))
+        if self.on_tip is not None:
+            if kind is not Board:
+                raise ValueError("--on-tip is of --sensor board")
+            landmarks["moves"] = self.on_tip
         if self.distance:
             if kind is not Socket:
                 raise ValueError("--distance is of --sensor socket")
@@ -136,6 +145,11 @@ class ArmOptions:
                 raise ValueError(
                     f"{table.source}: --distance needs a column 'socket', from 0"
                 )
+        if kind is Board and table is not None and "sensor" in table.names:
+            # Cameras that stand around one board on the tip, from 0.
+            count = 1 + int(table.columns(["sensor"]).max(initial=0.0))
+            boards = [Board("board", same_board=i > 0) for i in range(count)]
+            return Several(tuple(boards)) if count > 1 else boards[0]
         return kind(**landmarks)
 
     def of_recording(self, path: str | None, which: Sequence[int] | None) -> Any:

@@ -114,10 +114,28 @@ class SavedFiles:
         str, "write LeRobot's calibration, of --servos, with the zeros found", "FILE"
     ] = ""
 
+    transform: Annotated[
+        str,
+        "of --sensor board, write where the camera is, for the arm as described: a "
+        "TransformStamped (.yaml), ROS 2's static_transform_publisher (.sh, or .py to "
+        "launch it), or the .urdf with its link",
+        "FILE",
+    ] = ""
+    frames: Annotated[
+        str | None,
+        "of --transform, the link that the camera is in, the name of its optical frame",
+        "PARENT,CHILD",
+    ] = None
+
     @property
     def as_urdf(self) -> bool:
         """The arm's own file is written, corrected."""
         return self.out.lower().endswith(".urdf")
+
+    @property
+    def corrected(self) -> str:
+        """The file that a robot would go by, if one was asked for."""
+        return (self.out if self.as_urdf else self.servos_out) or self.transform
 
     def require(self, file: str, of_urdf: bool, servos: str | None) -> None:
         """Refuse files that cannot be written, or must not be, before the fit."""
@@ -126,10 +144,19 @@ class SavedFiles:
                 "one of --servos-out and --out FILE.urdf must be left out: either "
                 "corrects the zeros, both would twice"
             )
-        if self.unproven and not (self.servos_out or self.as_urdf):
-            raise ValueError("--unproven is of --out FILE.urdf and --servos-out")
-        if self.overwrite and not (self.servos_out or self.as_urdf):
-            raise ValueError("--overwrite is of --out FILE.urdf and --servos-out")
+        files = "--out FILE.urdf, --servos-out and --transform"
+        if self.unproven and not self.corrected:
+            raise ValueError(f"--unproven is of {files}")
+        if self.overwrite and not self.corrected:
+            raise ValueError(f"--overwrite is of {files}")
+        if self.frames is not None and not self.transform:
+            raise ValueError("--frames is of --transform FILE")
+        if len((self.frames or "a,b").split(",")) != 2:
+            raise ValueError(f"--frames must be PARENT,CHILD, got {self.frames}")
+        if self.transform and os.path.exists(self.transform) and not self.overwrite:
+            raise ValueError(
+                f"{self.transform} is there already; --overwrite writes over it"
+            )
         if self.servos_out and not servos:
             raise ValueError("--servos-out needs --servos, the file that it corrects")
         if servos and not (self.servos_out or is_recording(file)):
@@ -141,7 +168,7 @@ class SavedFiles:
 
     def written(self, calibration: Calibration, servos: str | None) -> list[str]:
         """Write the files that were asked for; a line of each."""
-        corrected = self.out if self.as_urdf else self.servos_out
+        corrected = self.corrected
         if corrected and not calibration.verdict.good and not self.unproven:
             raise ValueError(
                 f"{corrected} is not written: the calibration is not good, as said "
@@ -154,6 +181,20 @@ class SavedFiles:
         elif self.out:
             calibration.save(self.out)
             lines = [f"saved {self.out}"]
+        if self.transform:
+            parent, child = (self.frames or ",").split(",")
+            count = len(calibration.model.sensor.members)
+            for camera in range(count):
+                stem, ending = os.path.splitext(self.transform)
+                number = f"_{camera}" if count > 1 else ""
+                pose = calibration.to_transform(
+                    f"{stem}{number}{ending}",
+                    child=child.strip() + number * bool(child.strip()) or None,
+                    parent=parent.strip() or None,
+                    camera=camera,
+                    force=self.overwrite,
+                )
+                lines.append(f"saved {stem}{number}{ending}: {pose}")
         if self.servos_out:
             steps = calibration.to_lerobot(
                 self.servos_out, str(servos), force=self.overwrite
@@ -161,6 +202,14 @@ class SavedFiles:
             moved = ", ".join(f"{name} {step:+d}" for name, step in steps.items())
             lines.append(f"saved {self.servos_out}, steps: {moved}")
         return lines
+
+
+def _by_unit(text: str) -> float | dict[str, float]:
+    """A number, or numbers of units: mm=0.5,deg=0.1."""
+    if "=" not in text:
+        return float(text)
+    pairs = (part.rpartition("=") for part in text.split(","))
+    return {unit.strip(): float(value) for unit, _, value in pairs}
 
 
 def identify(
@@ -181,8 +230,14 @@ def identify(
     command_unit: Annotated[str, "of the commands, stored and printed", "UNIT"] = "",
     measured_unit: Annotated[str, "of the readings, stored and printed", "UNIT"] = "",
     accuracy: Annotated[
-        float | None,
-        "of an arm, the held-out error that is enough, in the measured unit",
+        Any,
+        "of an arm, the held-out error that is enough: 0.002 in the first unit (of "
+        "lengths, where there are some), or m=0.002,deg=0.1",
+        _by_unit,
+        "A",
+    ] = None,
+    session: Annotated[
+        str | None, "column that labels the session (day, mounting) of each row", "S"
     ] = None,
     json: Annotated[bool, "print JSON"] = False,
 ) -> int:
@@ -222,6 +277,7 @@ def identify(
         command_unit=command_unit,
         measured_unit=measured_unit,
         accuracy=accuracy,
+        sessions=table.columns([session])[:, 0] if session else None,
     )
     lines = saved.written(calibration, recording.servos)
     if saved.repair:
@@ -293,7 +349,7 @@ def _arm_readings(
     weights: str | None,
 ) -> _Readings:
     """The columns named as the arm's joints and its sensor's; a contact has none."""
-    columns, contacts = arm.sensor.outputs, arm.sensor.zeros
+    columns, contacts = arm.sensor.outputs, arm.sensor.contacts
     if not contacts:
         columns = table.named(columns, MEASURED, chosen=outputs, option="--outputs")
     elif outputs:
@@ -332,8 +388,10 @@ def check(
     *,
     recording: RecordingOptions,
     tolerance: Annotated[
-        float | None,
-        "drift of the outputs that matters; default three times the noise",
+        Any,
+        "drift of the outputs that matters, a number or m=0.002,deg=0.1; default three "
+        "times the noise",
+        _by_unit,
         "T",
     ] = None,
     placed_anew: Annotated[
@@ -359,7 +417,7 @@ def check(
     inputs, commands = _commands_for(calibrated, table, option="")
     if radians:
         commands = _in_degrees(calibrated, commands)
-    if getattr(getattr(calibrated.model, "sensor", None), "zeros", False):
+    if getattr(getattr(calibrated.model, "sensor", None), "contacts", False):
         measured = np.zeros((len(commands), calibrated.num_outputs))
     else:
         measured = _readings_for(calibrated, table, inputs)

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ErrorGroups",
     "Model",
+    "Quantity",
     "answered",
     "as_commands",
     "as_model",
@@ -54,6 +55,18 @@ class ErrorGroups(NamedTuple):
     members: NDArray[np.int64]  # (p,) the group of each parameter from 0, -1 of none
     medians: Array  # (G,) of the factor of each group, before measuring
     spreads: Array  # (G,) the factor that is one standard deviation of it
+
+
+class Quantity(NamedTuple):
+    """Readings of one unit, whose error is one number."""
+
+    unit: str
+    columns: slice = slice(None)  # of the readings
+    points: int = 1  # whose root mean square it is, as a board's corners
+
+    def size(self, off: Array) -> Array:
+        """(...) how large differences of readings (..., q) are in this unit."""
+        return np.linalg.norm(off[..., self.columns], axis=-1) / np.sqrt(self.points)
 
 
 class Model(abc.ABC):
@@ -133,6 +146,14 @@ class Model(abc.ABC):
     def units_for(self, command_unit: str, measured_unit: str) -> tuple[str, ...]:
         """p units of the parameters, "" where not known, for these of the commands."""
         return tuple(getattr(self, "units", ("",) * len(self.names)))
+
+    def quantities(self, measured_unit: str) -> tuple[Quantity, ...]:
+        """What the readings are of, each with its unit: one where all share it."""
+        return (Quantity(measured_unit),)
+
+    def accuracy_units(self, measured_unit: str) -> tuple[str, ...]:
+        """Units in which ``identify`` may be asked for an accuracy; () of none."""
+        return ()
 
     def meanings(self, inputs: Sequence[str], outputs: Sequence[str]) -> list[str]:
         """p meanings of the parameters in a summary; [] where the names tell."""
@@ -306,6 +327,15 @@ class Model(abc.ABC):
         """This model with more parameters, which come last: what the others leave."""
         return self
 
+    def improved(self, fit: Any) -> Any:
+        """A ``jaxcal.Calibration`` by default prior and noise, or a better one."""
+        return fit
+
+    def unexplained(self, fit: Any, rows: Array) -> Array:
+        """(N, q) standard deviations of predictions at ``rows`` by what neither
+        parameters nor the sensor's noise explain."""
+        return np.zeros((len(rows), self.num_outputs))
+
     # -- a calibrated machine ----------------------------------------------------------
 
     @property
@@ -467,7 +497,9 @@ def recorded(model: Any, commands: Any, measured: Any) -> tuple[Any, Any, bool]:
             raise ValueError("model must be an arm where commands are a recording")
         commands, read = as_model(model).recorded(commands)
         measured = read if measured is None else measured
-    elif measured is None and getattr(getattr(model, "sensor", None), "zeros", False):
+    elif measured is None and getattr(
+        getattr(model, "sensor", None), "contacts", False
+    ):
         measured = np.zeros((len(commands), model.num_outputs))
     if measured is None and header_of("commands", commands):
         measured = commands  # a table of both, y_... what was measured

@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from jaxcal.models.reasons import RULES, computed, never_measured, not_invertible
 
-__all__ = ["USE", "CalibrationWarning", "Verdict", "left_out", "verdict"]
+__all__ = [
+    "USE",
+    "CalibrationWarning",
+    "Verdict",
+    "between_sessions",
+    "left_out",
+    "verdict",
+]
 
 Array = NDArray[np.float64]
 Fit = Any  # a jaxcal.Calibration, whose package imports this one
@@ -73,6 +80,38 @@ def left_out(fit: Fit) -> Array:
     turned = np.matrix_transpose(vectors) / np.maximum(values, 0.02)[..., None]
     white = vectors @ turned @ root @ fit.residuals[..., None]
     return np.asarray(np.linalg.solve(root, white)[..., 0])
+
+
+def between_sessions(fit: Fit, labels: NDArray[np.intp]) -> Array:
+    """(m,) standard deviation of readings of another session, beyond what is expected.
+
+    Each session is predicted from a fit of the others.
+
+    Args:
+        fit: a calibration with an estimate or a statement of the noise.
+        labels: (N,) the session of each measurement.
+
+    Raises:
+        ValueError: there is no session whose others determine the model.
+    """
+    square, expected = [], []
+    for label in np.unique(labels):
+        try:
+            trial = fit.again(fit.model, fit.stated_prior, labels != label)
+        except ValueError:
+            continue
+        rows = (labels == label) & (fit.loss_weights > 0.0)
+        if trial.noise_std is not None and rows.any():
+            commands = fit.commands[rows]
+            off = fit.model.wrapped(
+                fit.measured[rows] - trial.predict(commands), commands
+            )
+            square.append(off**2)
+            expected.append(trial.predict_std(commands, new_measurement=True) ** 2)
+    if not square:
+        raise ValueError("sessions must leave a fit without one of them")
+    excess = np.vstack(square).mean(axis=0) - np.vstack(expected).mean(axis=0)
+    return np.sqrt(excess.clip(0.0))
 
 
 def verdict(fit: Fit) -> Verdict:

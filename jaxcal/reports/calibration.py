@@ -21,6 +21,7 @@ from jaxcal.calibration.check import Check
 from jaxcal.calibration.fit import Fit
 from jaxcal.extras import needs
 from jaxcal.files import atomic_write
+from jaxcal.models.model import Quantity
 from jaxcal.models.verdict import left_out
 from jaxcal.reports import page as pages
 from jaxcal.reports.budget import Budget, Source, budget
@@ -32,7 +33,6 @@ Array = NDArray[np.float64]
 Calibration = Any  # a jaxcal.Calibration, whose module imports this one
 
 _NAMED = 8  # columns beyond which no name is written
-_IN_UNIT = ("residual_rms", "held_out_mean", "nominal_mean", "check_tolerance")
 
 SCHEMA: dict[str, Any] = {
     "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -222,26 +222,42 @@ def _numbers(calibration: Fit, check: Check | None) -> dict[str, Any]:
         "measurements": calibration.num_measurements,
         "parameters": len(calibration.names),
         "degrees_of_freedom": float(calibration.dof),
-        "residual_rms": float(np.sqrt(np.mean(calibration.residuals**2))),
         "lack_of_fit_p": lack,
     }
-    if calibration.noise_std is not None:
-        off = np.linalg.norm(left_out(calibration), axis=1)
-        numbers["held_out_mean"] = float(off.mean())
-    nominal = _nominal_errors(calibration)
-    if nominal is not None:
-        numbers["nominal_mean"] = float(np.linalg.norm(nominal, axis=1).mean())
+    held_out = None if calibration.noise_std is None else left_out(calibration)
+    errors = {
+        "residual_rms": calibration.residuals,
+        "held_out_mean": held_out,
+        "nominal_mean": _nominal_errors(calibration),
+    }
+    for name, off in errors.items():
+        for in_unit, quantity in _named(calibration, name):
+            if off is not None and name == "residual_rms":
+                square = np.mean(off[:, quantity.columns] ** 2)
+                numbers[in_unit] = float(np.sqrt(square))
+            elif off is not None:
+                numbers[in_unit] = float(quantity.size(off).mean())
     if check is not None:
         numbers |= {
             "check_says": check.says,
             "check_p": check.p_value,
             "check_power": check.power,
-            "check_tolerance": check.tolerance,
+        }
+        tolerances = check.tolerances.values()
+        names = _named(calibration, "check_tolerance")
+        numbers |= {
+            name: size for (name, _), size in zip(names, tolerances, strict=False)
         }
     return {
         name: value if value is None or isinstance(value, str | int) else float(value)
         for name, value in numbers.items()
     }
+
+
+def _named(calibration: Fit, name: str) -> list[tuple[str, Quantity]]:
+    """Names of a number in each unit of the readings, the first without one."""
+    quantities = calibration.model.quantities(calibration.measured_unit)
+    return [(f"{name}_{q.unit}" if i else name, q) for i, q in enumerate(quantities)]
 
 
 def _nominal_errors(calibration: Fit) -> Array | None:
@@ -295,9 +311,18 @@ def _verdict_section(calibration: Fit, document: Mapping[str, Any]) -> pages.Sec
     word = "good" if good else "not good"
     if document["of"] == "check":
         word = str(numbers["check_says"])
-    unit = f" {calibration.measured_unit}" if calibration.measured_unit else ""
+    units = {
+        name: "" if quantity.unit == "length" else quantity.unit
+        for of_errors in (
+            "residual_rms",
+            "held_out_mean",
+            "nominal_mean",
+            "check_tolerance",
+        )
+        for name, quantity in _named(calibration, of_errors)
+    }
     rows = [
-        [name.replace("_", " "), _text(value) + (unit if name in _IN_UNIT else "")]
+        [name.replace("_", " "), f"{_text(value)} {units.get(name, '')}".strip()]
         for name, value in numbers.items()
         if value is not None
     ]

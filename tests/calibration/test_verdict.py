@@ -72,7 +72,8 @@ def test_a_socket_that_was_moved_is_named():
     moved = [why for why in verdict.reasons if "moved" in why]
     assert len(moved) == 1
     said = re.fullmatch(
-        r"socket 0 seems to have moved by (\S+) between measurements 6 and 7", moved[0]
+        r"socket 0 seems to have moved by (\S+) m between measurements 6 and 7",
+        moved[0],
     )
     assert float(said[1]) == pytest.approx(0.011, rel=0.05)
 
@@ -248,7 +249,7 @@ def test_another_tip_within_the_prior_is_named(name, off):
     commands = np.column_stack(place)
     found = jaxcal.identify(commands, np.zeros((62, 3)), model=arm)
     said = [why for why in found.verdict.reasons if "is it another tip?" in why]
-    far = float(re.match(r"the tip is (\S+) from where", said[0])[1])
+    far = float(re.match(r"the tip is (\S+) m from where", said[0])[1])
     assert len(said) == 1 and far == pytest.approx(0.01, rel=0.05)
     clean = _fit(name, *place).verdict
     assert not [why for why in clean.reasons if "another tip" in why]

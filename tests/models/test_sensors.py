@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from jaxcal.arms.sensors import SENSORS, Reading
+from jaxcal.arms.sensors import SENSORS, Flush, Reading
 from jaxcal.models import (
     Board,
     Distance,
@@ -45,7 +45,7 @@ MOUNT = _matrix(Rotation.random(rng=RNG), [30.0, -20.0, 50.0])
 
 def _board(moves, tip, row, own):
     stand = _matrix(None, own[:3])
-    for axis, angle in zip("xyz", own[3:], strict=True):
+    for axis, angle in zip("xyz", own[3:6], strict=True):
         stand = stand @ _matrix(Rotation.from_euler(axis, angle, degrees=True))
     stand = stand @ _matrix(Rotation.from_matrix(PLACE[:3, :3]))
     first, second = (tip, stand) if moves == "camera" else (stand, tip)
@@ -63,6 +63,18 @@ def _plane(tip, row, own):
     second = np.cross(normal, first)
     leaning = normal + np.radians(tilt1) * first + np.radians(tilt2) * second
     return [leaning / np.linalg.norm(leaning) @ tip[:3, 3] - offset]
+
+
+def _flush(tip, row, own):
+    """The height, and the x and y of the normal in the tip's frame, as degrees."""
+    lifted = tip.copy()
+    step = 1.0  # the height is linear
+    heights = [_plane(tip, row, own)[0]]
+    for axis in tip[:3, :2].T:  # how the height changes along the face
+        lifted[:3, 3] = tip[:3, 3] + step * axis
+        rise = (_plane(lifted, row, own)[0] - heights[0]) / step
+        heights.append(np.degrees(rise))
+    return heights
 
 
 def _distance(tip, row, own):
@@ -85,9 +97,8 @@ def _pixels(moves, tip, own):
     nowhere = np.zeros(6)
     x, y, z, *turn = _board(moves, tip, nowhere, own)
     turn = Rotation.from_rotvec(turn, degrees=True).as_matrix()
-    inside = np.array(
-        [[CAMERA[0], 0.0, CAMERA[2]], [0.0, CAMERA[1], CAMERA[3]], [0, 0, 1]]
-    )
+    fx, fy, cx, cy = own[6:] if len(own) > 6 else CAMERA
+    inside = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0, 0, 1]])
     found = []
     for corner in CORNERS:
         u, v, w = inside @ (turn @ corner + [x, y, z])
@@ -104,6 +115,7 @@ CASES = {
         lambda tip, row, own: tip[:3, 3] - own.reshape(2, 3)[int(row[0])],
     ),
     "plane": (Plane(2, PLANES), WHICH, _plane),
+    "flush": (Flush(2, PLANES), WHICH, _flush),
     "distance": (Distance(2, ANCHORS), WHICH, _distance),
     "gravity": (
         Gravity(up=(0.1, 0.0, 1.0)),
@@ -127,6 +139,11 @@ CASES = {
         Board("camera", PLACE, CORNERS, CAMERA),
         np.zeros((6, 0)),
         lambda tip, row, own: _pixels("camera", tip, own),
+    ),
+    "pixels of a lens that is not known": (
+        Board("board", PLACE, CORNERS, CAMERA, intrinsics=True),
+        np.zeros((6, 0)),
+        lambda tip, row, own: _pixels("board", tip, own),
     ),
     "pixels from afar": (
         Board("board", PLACE, CORNERS, CAMERA),
@@ -577,8 +594,11 @@ def test_how_a_wrench_is_mounted_is_found_and_its_mistakes_are_named():
     found = jaxcal.identify(joints, read, model=arm)
     own = dict(zip(found.names, found.parameters, strict=True))
     assert own["mass"] == pytest.approx(1.6, abs=0.05) and found.verdict.good
+    # A controller that subtracts an old payload leaves readings of what is left of it.
+    assert "is what the readings show: where the controller" in str(found.verdict)
     said = found.check(joints, read)
-    assert f"a change by {said.tolerance:.3g} N is seen" in str(said)
+    assert [*said.tolerances] == ["N", "N length"]
+    assert f"a change by {said.tolerance:.3g} N or " in str(said)
     turn = found.arm.tool[:3, :3].T @ MOUNT[:3, :3]
     assert np.degrees(Rotation.from_matrix(turn).magnitude()) < 2.0
     with pytest.raises(ValueError, match="negate forces and torques") as told:
@@ -736,3 +756,83 @@ def test_views_that_hardly_turn_are_of_no_other_convention():
             told.append(str(error))
     assert told
     assert all("about two axes at least" in each for each in told)
+
+
+def test_cameras_that_see_one_board_share_where_it_is():
+    """Two cameras stand; the board is on the tip once, and their lenses are found."""
+    lens = (800.0, 820.0, 320.0, 240.0)
+    boards = [
+        Board("board", None, CORNERS, lens, intrinsics=True, same_board=i > 0)
+        for i in range(2)
+    ]
+    arm = ur5(sensor=Several(tuple(boards)))
+    apart = ur5(
+        sensor=Several((boards[0], dataclasses.replace(boards[1], same_board=False)))
+    )
+    assert len(apart.names) - len(arm.names) == 6
+    with pytest.raises(ValueError, match="same_board"):
+        Several((Board("camera"), boards[1]))
+    rng = np.random.default_rng(0)
+    tip = ur5()
+    home = np.array([10, -75, 95, -110, -90, 20])
+    joints = home + rng.uniform(-25, 25, (24, 6))
+    middle = tip.predict(joints).mean(axis=0)
+    seen, places = [], []
+    for side in (-1.0, 1.0):  # at 700 mm, looking at the tip
+        ahead = np.array([0.3 * side, 0.4, -1.0])
+        ahead /= np.linalg.norm(ahead)
+        across = np.cross(ahead, [0.0, 1.0, 0.0])
+        across /= np.linalg.norm(across)
+        place = np.eye(4)
+        place[:3, :3] = np.column_stack([across, np.cross(ahead, across), ahead])
+        place[:3, 3] = middle - 700.0 * ahead
+        places.append(place)
+        true = (830.0, 790.0, 330.0, 235.0)
+        exact = ur5(sensor=Board("board", place, CORNERS, true))
+        seen.append(exact.predict(joints) + rng.normal(0.0, 0.3, (24, 12)))
+    commands, measured = arm.together((joints, seen[0]), (joints, seen[1]))
+    found = jaxcal.identify(commands, measured, model=arm, measured_unit="mm")
+    values = dict(zip(found.names, found.parameters, strict=True))
+    errors = dict(zip(found.names, found.standard_errors, strict=True))
+    for name, value in zip(("fx", "fy", "cx", "cy"), true, strict=True):
+        for i in range(2):
+            key = f"board {i}: {name}"
+            assert abs(values[key] - value) < 4.0 * errors[key] < 40.0
+    for camera, place in enumerate(places):
+        pose = found.static_transform(camera=camera)
+        off = 1e3 * pose.matrix[:3, 3] - place[:3, 3]
+        assert np.linalg.norm(off) < 4e3 * pose.std[0] < 100.0
+    assert [one.unit for one in found.verdict.errors] == ["pixels a corner"] * 2
+
+
+def test_a_flush_face_shows_more_than_a_probe():
+    """Of an arm with errors, twenty flush contacts against twenty touches."""
+    rng = np.random.default_rng(0)
+    theta = ur5().nominal.copy()
+    theta[:30] += 0.3 * rng.normal(size=30)
+    table = [[0.0, 0.0, 1.0, -100.0]]
+    true = ur5().calibrated(theta).measured_with(Flush(1, table))
+    joints = true.postures(30, near=table, seed=1, approach=(0, 0, -1, 30))
+    assert np.abs(true.predict(joints)).max() < 1e-3
+    errors = {}
+    for sensor in (Plane(1, table), Flush(1, table)):
+        model = ur5(sensor=sensor)
+        noise = np.asarray(model.default_noise().std) * np.ones(len(sensor.outputs))
+        prior = dataclasses.replace(model.default_prior(), by_data=False)
+        read = rng.normal(size=(30, len(noise))) * noise
+        found = jaxcal.identify(
+            joints, read, model=model, prior=prior, noise_std=noise, loss="gaussian"
+        )
+        assert found.verdict.explains
+        errors[sensor.kind] = found.standard_errors[:30]
+        # Farther out along the normal and a plane that is farther away are the same.
+        why = next(
+            line for line in found.verdict.reasons if "kept as described" in line
+        )
+        at = found.names.index("tool z")
+        assert "tool z" in why and found.parameters[at] == pytest.approx(31.0, abs=1.0)
+    # The same heights and more readings; the leans show alpha and beta.
+    assert (errors["flush"] < 1.1 * errors["plane"]).all()
+    assert errors["flush"][1] < 0.3 * errors["plane"][1]
+    again = SENSORS["flush"].from_dict(Flush(1, table).to_dict())
+    assert again.count == 1 and again.kind == "flush"

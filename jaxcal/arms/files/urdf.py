@@ -25,6 +25,7 @@ __all__ = [
     "led",
     "links_of",
     "moved",
+    "read_ur_kinematics",
     "read_urdf",
     "row_matrix",
     "table_of",
@@ -354,6 +355,44 @@ def table_of(
         "limits": np.array(limits),
         "source": source,
     }
+
+
+_UR = {  # sections of Universal Robots' file, and the joints that they are of
+    "shoulder": "shoulder_pan_joint",
+    "upper_arm": "shoulder_lift_joint",
+    "forearm": "elbow_joint",
+    "wrist_1": "wrist_1_joint",
+    "wrist_2": "wrist_2_joint",
+    "wrist_3": "wrist_3_joint",
+}
+
+
+def read_ur_kinematics(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Arguments of ``from_dh``, of Universal Robots' kinematics file."""
+    text = pathlib.Path(path).read_text(encoding="utf-8")
+    poses: dict[str, dict[str, float]] = {}
+    for line in text.splitlines():
+        key, _, value = line.partition("#")[0].strip().partition(":")
+        if key in _UR:
+            poses[key] = {}
+        elif poses and key in ("x", "y", "z", "roll", "pitch", "yaw"):
+            poses[[*poses][-1]][key] = float(value)
+    chain = []
+    for link, name in _UR.items():
+        if len(poses.get(link, ())) != 6:
+            raise ValueError(
+                f"{os.fspath(path)}: {link} must have x, y, z, roll, pitch, yaw, as in "
+                "the kinematics file of Universal Robots' ROS description"
+            )
+        origin, pose = np.eye(4), poses[link]
+        angles = [pose[angle] for angle in ("roll", "pitch", "yaw")]
+        origin[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
+        origin[:3, 3] = [pose[axis] for axis in "xyz"]
+        axis, ends = np.array([0.0, 0.0, 1.0]), (-2.0 * np.pi, 2.0 * np.pi)
+        joint = Joint(name, "R", "", link, origin, axis, None, ends)
+        chain.append((joint, True))
+    joints = {joint.name: joint for joint, _ in chain}
+    return table_of(chain, joints, {}, {}) | {"source": None}
 
 
 def turn_of_z(axis: Array) -> Array:

@@ -34,7 +34,7 @@ from jaxcal.files import atomic_write
 if TYPE_CHECKING:
     from jaxcal.arms.arm import Arm
 
-__all__ = ["save", "urdf_text", "written"]
+__all__ = ["fixed_joint", "pose_words", "save", "urdf_text", "with_origins", "written"]
 
 Array = NDArray[np.float64]
 
@@ -113,16 +113,21 @@ def urdf_text(chains: Sequence[tuple[Arm, Arm]]) -> tuple[str, list[str]]:
         name = f"{tip}_calibrated"
         while name in links or f"{name}_joint" in joints:  # a file calibrated before
             name += "_again"
-        numbers, quoted = _pose(extra), quoteattr(name)
-        more += (
-            f"  <link name={quoted}/>\n"
-            f'  <joint name={quoteattr(f"{name}_joint")} type="fixed">\n'
-            f"    <parent link={quoteattr(tip)}/>\n    <child link={quoted}/>\n"
-            f'    <origin xyz="{numbers["xyz"]}" rpy="{numbers["rpy"]}"/>\n'
-            "  </joint>\n"
-        )
+        more += fixed_joint(tip, name, extra)
         tips.append(name)
-    return _with_origins(text, origins, more), tips
+    return with_origins(text, origins, more), tips
+
+
+def fixed_joint(parent: str, child: str, matrix: Array) -> str:
+    """A link and the joint that fixes it in another, as a URDF file has them."""
+    numbers, link = pose_words(matrix), quoteattr(child)
+    return (
+        f"  <link name={link}/>\n"
+        f'  <joint name={quoteattr(f"{child}_joint")} type="fixed">\n'
+        f"    <parent link={quoteattr(parent)}/>\n    <child link={link}/>\n"
+        f'    <origin xyz="{numbers["xyz"]}" rpy="{numbers["rpy"]}"/>\n'
+        "  </joint>\n"
+    )
 
 
 def _dh_text(calibrated: Arm) -> str:
@@ -198,7 +203,7 @@ def _ur_text(nominal: Arm, calibrated: Arm) -> str:
             before = row_matrix(row * [1.0, 1.0, 0.0, 0.0, 1.0])
     lines = ["kinematics:"]
     for name, frame, zero in zip(_UR, frames, nominal.offset, strict=True):
-        pose = _pose(frame @ row_matrix(np.array([0.0, 0.0, 0.0, zero, 0.0])))
+        pose = pose_words(frame @ row_matrix(np.array([0.0, 0.0, 0.0, zero, 0.0])))
         values = [*pose["xyz"].split(), *pose["rpy"].split()]
         lines.append(f"  {name}:")
         for key, value in zip(
@@ -276,7 +281,7 @@ def _product(gap: list[_Part]) -> Array:
     return matrix
 
 
-def _pose(matrix: Array) -> dict[str, str]:
+def pose_words(matrix: Array) -> dict[str, str]:
     """xyz and rpy as URDF files have them; exact near the poles of the angles too."""
     turn = matrix[:3, :3]
     yaw = np.arctan2(turn[1, 0], turn[0, 0])
@@ -291,7 +296,7 @@ def _pose(matrix: Array) -> dict[str, str]:
     return {"xyz": words[0], "rpy": words[1]}
 
 
-def _with_origins(text: str, origins: Mapping[str, Array], more: str = "") -> str:
+def with_origins(text: str, origins: Mapping[str, Array], more: str = "") -> str:
     """``text`` with other origins of some joints and ``more`` at the robot's end."""
     data = text.encode("utf-8", "surrogateescape")
     if b"\0" in data:
@@ -303,7 +308,7 @@ def _with_origins(text: str, origins: Mapping[str, Array], more: str = "") -> st
     more = more.replace("\n", newline)
     edits = [(last, last, more.encode(encoding, "xmlcharrefreplace"))]
     for name, matrix in origins.items():
-        pose = _pose(matrix)
+        pose = pose_words(matrix)
         joint, origin = places[name]
         if origin is None:
             tag = f'{newline}    <origin xyz="{pose["xyz"]}" rpy="{pose["rpy"]}"/>'

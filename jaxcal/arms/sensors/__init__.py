@@ -3,7 +3,7 @@
 from jaxcal.arms.sensors.board import Board
 from jaxcal.arms.sensors.distance import Distance
 from jaxcal.arms.sensors.gravity import Gravity
-from jaxcal.arms.sensors.plane import Plane
+from jaxcal.arms.sensors.plane import Flush, Plane
 from jaxcal.arms.sensors.pose import Pose
 from jaxcal.arms.sensors.position import Position
 from jaxcal.arms.sensors.sensor import Landmarks, Reading, Sensor, Tip, hats
@@ -15,6 +15,7 @@ __all__ = [
     "SENSORS",
     "Board",
     "Distance",
+    "Flush",
     "Gravity",
     "Landmarks",
     "Placed",
@@ -40,6 +41,7 @@ SENSORS: dict[str, type[Sensor]] = {
         Pose,
         Socket,
         Plane,
+        Flush,
         Distance,
         Gravity,
         Wrench,

@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.arms.sensors.pose import rotation_vector_rate
+from jaxcal.arms.sensors.pose import Pose, rotation_vector_rate
 from jaxcal.arms.sensors.sensor import (
     BASE,
     HasNames,
@@ -19,12 +19,15 @@ from jaxcal.arms.sensors.sensor import (
     turns,
 )
 from jaxcal.checks import array_of, numbers, one_of
+from jaxcal.models.model import Quantity
 
 __all__ = ["Board"]
 
 Array = NDArray[np.float64]
 
 _FEW = 3  # views that find where a board stands and its tool
+_ONE_AXIS = 0.999  # of the largest singular value: turns about one axis, or none
+_STILL = 0.02  # radians, and of the longest way: no turn, no second direction
 _WRONG = 0.2  # views so far off, in radians and lengths of the arm, are read wrongly
 
 
@@ -59,6 +62,10 @@ class Board(Sensor):
             fisheye), by which a corner that is outside without it is known to be in
             the picture; none when not given. Corners are read as corrected by it
             already.
+        same_board: in ``Several``, this camera stands and sees the board that the first
+            of them sees, which is on the tip once.
+        intrinsics: of ``corners``, focal lengths and centre are unknowns too, known to
+            5 % and 2 % of the focal length; ``camera`` is where they begin.
     """
 
     moves: str = "camera"
@@ -68,11 +75,11 @@ class Board(Sensor):
     side: float = 0.0
     extent: tuple[float, float] = (0.0, 0.0)
     distortion: tuple[float, ...] = ()
+    same_board: bool = False
+    intrinsics: bool = False
 
     kind = "board"
     tool = ("x", "y", "z", "rx", "ry", "rz")
-    names = tuple(f"stand {axis}" for axis in tool)
-    units = ("length",) * 3 + ("deg",) * 3
     stands = True
     _seen: ClassVar[tuple[str, ...]] = tuple(f"seen {axis}" for axis in tool)
 
@@ -98,6 +105,10 @@ class Board(Sensor):
                 f"(width, height, fx, fy, cx, cy), got {self.camera!r}"
             )
         object.__setattr__(self, "camera", tuple(camera.tolist()))
+        if self.intrinsics and self.corners is None:
+            raise ValueError("intrinsics are of a board with corners")
+        if self.same_board and self.moves != "board":
+            raise ValueError('same_board is of a camera that stands: moves="board"')
         distortion = numbers("distortion", self.distortion)
         if distortion.shape not in ((0,), (4,), (5,)):
             raise ValueError(
@@ -105,6 +116,15 @@ class Board(Sensor):
                 f"{self.distortion!r}"
             )
         object.__setattr__(self, "distortion", tuple(distortion.tolist()))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        stand = tuple(f"stand {axis}" for axis in self.tool)
+        return (*stand, "fx", "fy", "cx", "cy") if self.intrinsics else stand
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return ("length",) * 3 + ("deg",) * 3 + ("pixels",) * (len(self.names) - 6)
 
     @property
     def lens(self) -> tuple[Array, Array]:
@@ -147,6 +167,10 @@ class Board(Sensor):
         return np.array([[x, y, 0.0] for x in (0.0, width) for y in (0.0, height)])
 
     @property
+    def mounted(self) -> bool:
+        return not self.same_board
+
+    @property
     def zeros(self) -> bool:  # type: ignore[override]  # of a pose
         return self.corners is None
 
@@ -161,9 +185,21 @@ class Board(Sensor):
         return tuple(f"{a}{i + 1}" for i in range(len(self.corners)) for a in "uv")
 
     @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        if self.corners is None:
+            return Pose.quantities
+        return (Quantity("pixels a corner", points=len(self.corners)),)
+
+    @property
     def nominal(self) -> Array:
         place = np.eye(4) if self.place is None else self.place
-        return np.concatenate([place[:3, 3], np.zeros(3)])
+        lens = self.camera[-4:] if self.intrinsics else ()
+        return np.concatenate([place[:3, 3], np.zeros(3), lens])
+
+    def prior_std(self, length: float) -> Array:
+        std = np.full(len(self.names), np.inf)
+        std[6:] = np.repeat([0.05, 0.02], 2)[: len(std) - 6] * self.camera[-4]
+        return std
 
     def usual_noise(self, length: float) -> ArrayLike:
         return [1e-3 * length] * 3 + [0.1] * 3 if self.corners is None else 0.3
@@ -175,7 +211,7 @@ class Board(Sensor):
         from scipy.spatial.transform import Rotation
 
         place = np.eye(3) if self.place is None else self.place[:3, :3]
-        turn, axes = turns(parameters[3:])
+        turn, axes = turns(parameters[3:6])
         stand, turn = turn @ place, np.radians(axes)  # of the stand, by its angles
         count, moved = len(inputs), tip.position - parameters[:3]
         # How the board shifts and turns in the camera, by the tip and by the stand.
@@ -203,15 +239,23 @@ class Board(Sensor):
         spokes = self.corners @ np.matrix_transpose(board)  # (N, C, 3)
         points = spokes + where[:, None]
         focal, centre = self.lens
+        if self.intrinsics:
+            focal, centre = parameters[6:8], parameters[8:]
         deep = np.where(points[..., 2:] != 0.0, points[..., 2:], np.nan)
-        pixels = focal * points[..., :2] / deep + centre
+        rays = points[..., :2] / deep
+        pixels = focal * rays + centre
         rate = np.zeros((*points.shape[:2], 2, 3))
         rate[..., [0, 1], [0, 1]] = focal / deep
-        rate[..., 2] = -focal * points[..., :2] / deep**2
+        rate[..., 2] = -focal * rays / deep
         motion = np.concatenate([rate, -rate @ hats(spokes)], axis=-1)
         motion = motion.reshape(count, -1, 6)
         values = pixels.reshape(count, -1)
-        return Reading(values, motion @ by_tip, motion @ by_own)
+        by_own = motion @ by_own
+        if self.intrinsics:
+            by_lens = np.zeros((*rays.shape, 4))
+            by_lens[..., [0, 1], [0, 1]], by_lens[..., [0, 1], [2, 3]] = rays, 1.0
+            by_own = np.concatenate([by_own, by_lens.reshape(count, -1, 4)], axis=-1)
+        return Reading(values, motion @ by_tip, by_own)
 
     def located(
         self, tip: Tip, inputs: Array, measured: Array | None
@@ -254,8 +298,8 @@ class Board(Sensor):
                     raise ValueError(f"views of the board fit the arm only {how}")
         if not np.isfinite(off):
             raise ValueError(
-                "views must turn the tip about two axes at least: with these the board "
-                "and the camera cannot be told apart"
+                "views must turn the tip about two axes, or move it in two directions: "
+                "with these the board and the camera cannot be told apart"
             )
         towards = -np.einsum("nij,ni->nj", turn, shift)[:, 2]  # z of the camera, in it
         side = float(np.sign(np.median(towards)))
@@ -341,13 +385,20 @@ def _hand_and_eye(tip: Tip, turn: Array, shift: Array) -> tuple[float, Array, Ar
         # R_X = R_A' R_Z R_B, summed over the views, as a matrix on the nine of R_Z.
         mix = np.einsum("nki,nlj->ijkl", arm, turn[used]).reshape(9, 9)
         left, size, right = np.linalg.svd(mix)
-        if size[1] > 0.999 * size[0]:
-            return np.inf, place, new
-        tool, stand = (_nearest(v.reshape(3, 3)) for v in (left[:, 0], right[0]))
+        free = np.eye(3)  # directions of the tool's shift that the views show
+        if size[1] > _ONE_AXIS * size[0]:
+            found = _about_one_axis(arm, tip.position[used], turn[used], shift[used])
+            if found is None:
+                return np.inf, place, new
+            stand, free = found
+            tool = _nearest((np.matrix_transpose(arm) @ stand @ turn[used]).sum(axis=0))
+        else:
+            tool, stand = (_nearest(v.reshape(3, 3)) for v in (left[:, 0], right[0]))
         eye = np.broadcast_to(-np.eye(3), arm.shape)
-        rows = np.concatenate([arm, eye], axis=-1).reshape(-1, 6)
+        rows = np.concatenate([arm @ free, eye], axis=-1).reshape(3 * len(arm), -1)
         right_side = (shift @ stand.T - tip.position)[used].ravel()
         shifts = np.linalg.lstsq(rows, right_side, rcond=None)[0]
+        shifts = np.append(free @ shifts[:-3], shifts[-3:])
         new[:3, :3], new[:3, 3] = tool, shifts[:3]
         place[:3, :3], place[:3, 3] = stand, shifts[3:]
         apart = tip.rotation @ shifts[:3] + tip.position - shift @ stand.T - shifts[3:]
@@ -359,6 +410,49 @@ def _hand_and_eye(tip: Tip, turn: Array, shift: Array) -> tuple[float, Array, Ar
             break
         used = kept
     return float(np.median(off)), place, new
+
+
+def _about_one_axis(
+    arm: Array, position: Array, turn: Array, shift: Array
+) -> tuple[Array, Array] | None:
+    """The stand's rotation where the tip turns about one axis, as a SCARA's, or none.
+
+    How far the tip goes shows what its turns do not. None where it hardly moves.
+
+    Returns:
+        It, and directions (3, 2) in the tip's frame, (3, 0) without a turn, in which
+        views show where the tool is.
+    """
+    from scipy.spatial.transform import Rotation
+
+    vectors = Rotation.from_matrix(arm @ arm[0].T).as_rotvec()
+    seen = Rotation.from_matrix(turn @ turn[0].T).as_rotvec()
+    moved, ways = position - position.mean(axis=0), shift - shift.mean(axis=0)
+    spread = np.linalg.svd(moved, compute_uv=False)
+    axis = np.linalg.svd(vectors)[2][0]
+    angles = vectors @ axis
+    if np.abs(angles).max() < _STILL:
+        if spread[1] < _STILL * spread[0]:
+            return None
+        return _nearest(moved.T @ ways), np.zeros((3, 0))
+    from_axis = angles @ seen
+    from_axis /= np.linalg.norm(from_axis)
+    first = Rotation.align_vectors([axis], [from_axis])[0].as_matrix()
+    tip_axis = arm[0].T @ axis
+    across = np.linalg.svd(tip_axis[None])[2][1:].T
+    # Turned about the axis by an angle whose cosine and sine are two more unknowns.
+    there = shift @ first.T
+    flat = there - np.outer(there @ axis, axis)
+    aside = np.cross(axis, there)
+    eye = np.broadcast_to(-np.eye(3), arm.shape)
+    rows = [arm @ across, eye, -flat[..., None], -aside[..., None]]
+    right = np.outer(there @ axis, axis) - position
+    table = np.concatenate(rows, axis=-1).reshape(3 * len(arm), -1)
+    found, _, rank, _ = np.linalg.lstsq(table, right.ravel(), rcond=1e-6)
+    if rank < table.shape[1]:
+        return None
+    by = Rotation.from_rotvec(np.arctan2(found[-1], found[-2]) * axis)
+    return by.as_matrix() @ first, across
 
 
 def _inverse(turn: Array, shift: Array) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.arms.sensors.sensor import HasNames, Reading, Sensor, Tip, hats
 from jaxcal.checks import in_words, numbers
+from jaxcal.models.model import Quantity
 
 __all__ = ["Gravity"]
 
@@ -49,6 +50,10 @@ class Gravity(Sensor):
         if not numbers("magnitude", self.magnitude) > 0.0:
             raise ValueError(f"magnitude must be positive, got {self.magnitude}")
         object.__setattr__(self, "up", tuple((up / np.linalg.norm(up)).tolist()))
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        return (Quantity("g" if self.magnitude == 1.0 else "m/s^2"),)
 
     @property
     def nominal(self) -> Array:

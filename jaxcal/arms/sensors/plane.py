@@ -8,9 +8,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.arms.sensors.sensor import Landmarks, Reading, Tip
+from jaxcal.arms.sensors.sensor import Landmarks, Reading, Tip, hats
+from jaxcal.models.model import Quantity
 
-__all__ = ["Plane"]
+__all__ = ["Flush", "Plane"]
 
 Array = NDArray[np.float64]
 
@@ -27,6 +28,7 @@ class Plane(Landmarks):
 
     kind = "plane"
     lengths = True
+    mounting = 0.004
     outputs = ("height",)
     zeros = True
     axes = ("tilt1", "tilt2", "offset")
@@ -59,29 +61,25 @@ class Plane(Landmarks):
         return 1e-4 * length
 
     def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
-        which, points = self.of_rows(inputs), tip.position
+        unit, by_tilt = self._normals(inputs, parameters)
+        points = tip.position
+        offset = parameters.reshape(-1, 3)[self.of_rows(inputs), 2]
+        by_tip = np.hstack([unit, np.zeros_like(unit)])[:, None]
+        by_tilts = (points[:, None] @ by_tilt)[:, 0]
+        by_one = np.column_stack([by_tilts, -np.ones(len(points))])[:, None]
+        values = ((unit * points).sum(axis=1) - offset)[:, None]
+        return Reading(values, by_tip, self.spread(self.of_rows(inputs), by_one))
+
+    def _normals(self, inputs: Array, parameters: Array) -> tuple[Array, Array]:
+        """(N, 3) unit normals of the rows' planes, (N, 3, 2) by both tilts."""
+        which = self.of_rows(inputs)
         normals = self._rows()[which, :3]
-        first, second = _across(normals)
-        tilt1, tilt2, offset = parameters.reshape(-1, 3)[which].T
-        leaning = (
-            np.radians(tilt1)[:, None] * first + np.radians(tilt2)[:, None] * second
-        )
-        long = normals + leaning
+        across = np.radians(np.stack(_across(normals), axis=-1))  # (N, 3, 2)
+        long = normals + (across @ parameters.reshape(-1, 3)[which, :2, None])[..., 0]
         size = np.linalg.norm(long, axis=1, keepdims=True)
         unit = long / size
-        height = (unit * points).sum(axis=1)
-        by_tip = np.hstack([unit, np.zeros_like(unit)])[:, None]
-        level = (points - height[:, None] * unit) / size  # by the normal
-        by_one = np.stack(
-            [
-                np.radians((level * first).sum(axis=1)),
-                np.radians((level * second).sum(axis=1)),
-                -np.ones(len(points)),
-            ],
-            axis=1,
-        )[:, None]
-        values = (height - offset)[:, None]
-        return Reading(values, by_tip, self.spread(which, by_one))
+        along = unit[:, None] @ across
+        return unit, (across - unit[..., None] * along) / size[..., None]
 
     def located(
         self, tip: Tip, inputs: Array, measured: Array | None
@@ -99,6 +97,40 @@ class Plane(Landmarks):
             normal = normal * (np.sign(normal[np.abs(normal).argmax()]) or 1.0)
             rows[i] = [*normal, normal @ middle]
         return dataclasses.replace(self, places=rows), None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Flush(Plane):
+    """Three zeros: a flat face at the tip lies flush on its plane.
+
+    Height of the tip above the plane, and how far the face's normal, the tip's z axis
+    of either sign, leans from the plane's, in degrees. A turn about it, ``tool rz``, is
+    not shown and held, as ``base`` is. Noise 0.01 % of the arm's length, 0.1 degrees.
+    """
+
+    kind = "flush"
+    lengths = False
+    tool = ("x", "y", "z", "rx", "ry")
+    outputs = ("height", "lean x", "lean y")  # type: ignore[assignment]  # of three
+    quantities = (Quantity("length", slice(1)), Quantity("deg", slice(1, 3)))
+
+    def usual_noise(self, length: float) -> ArrayLike:
+        return [1e-4 * length, 0.1, 0.1]
+
+    def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
+        height = super().read(tip, inputs, parameters)
+        unit, by_tilt = self._normals(inputs, parameters)
+        back = np.degrees(np.matrix_transpose(tip.rotation)[:, :2])  # (N, 2, 3)
+        by_tip = np.zeros((len(unit), 2, 6))
+        by_tip[..., 3:] = back @ hats(unit)
+        by_one = np.zeros((len(unit), 2, 3))
+        by_one[..., :2] = back @ by_tilt
+        by_own = self.spread(self.of_rows(inputs), by_one)
+        return Reading(
+            np.hstack([height.values, (back @ unit[..., None])[..., 0]]),
+            np.concatenate([height.by_tip, by_tip], axis=1),
+            np.concatenate([height.by_own, by_own], axis=1),
+        )
 
 
 def _across(normals: Array) -> tuple[Array, Array]:

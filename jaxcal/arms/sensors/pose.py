@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.arms.sensors.sensor import Reading, Sensor, Tip, hats
+from jaxcal.models.model import Quantity
 
 __all__ = ["Pose", "rotation_vector_rate"]
 
@@ -25,6 +26,7 @@ class Pose(Sensor):
     kind = "pose"
     tool = ("x", "y", "z", "rx", "ry", "rz")
     outputs = tool
+    quantities = (Quantity("length", slice(3)), Quantity("deg", slice(3, 6)))
 
     def usual_noise(self, length: float) -> ArrayLike:
         return [1e-4 * length] * 3 + [float(np.degrees(1e-4))] * 3

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, numbers, whole_number
+from jaxcal.models.model import Quantity
 from jaxcal.models.periods import within_half
 
 __all__ = [
@@ -130,6 +131,9 @@ class Sensor(abc.ABC):
     local: ClassVar[bool] = False  # of few places: harmonics are fitted if they gain
     stands: ClassVar[bool] = False  # what is read stands at a place that it finds
     needed: ClassVar[int] = 1  # readings that find a place
+    # How well the tool is known, by the arm's length: it may hang anywhere; 0.4 % where
+    # readings hardly show it and would put it anywhere.
+    mounting: ClassVar[float] = 0.1
     misfit: ClassVar[float] = 0.0  # what they leave, by the arm's length, in a choice
     # (q,) of readings that wrap, 360 of an angle in degrees, inf of the others.
     periods: ClassVar[tuple[float, ...] | None] = None
@@ -143,6 +147,11 @@ class Sensor(abc.ABC):
     @abc.abstractmethod
     def outputs(self) -> tuple[str, ...]:
         """q names of the readings."""
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """What it reads, by unit; "length" stands for the unit of the arm's lengths."""
+        return (Quantity("length" if self.lengths else self.first_unit),)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -205,6 +214,16 @@ class Sensor(abc.ABC):
     def lacking(self, inputs: Array) -> tuple[int, ...]:
         """Things of which something is known and none of the rows (N, e) is."""
         return ()
+
+    @property
+    def mounted(self) -> bool:
+        """Whether in ``Several`` it has a place of its own on the tool."""
+        return True
+
+    @property
+    def contacts(self) -> bool:
+        """Whether all that is measured is zero."""
+        return all(one.zeros for one in self.members)
 
     # -- the sensors that it consists of: itself, but of Several -----------------------
 

@@ -58,6 +58,9 @@ class Several(Sensor):
         if self.mounts is not None:
             frames = array_of("mounts", self.mounts, len(given) - 1, 4, 4)
         object.__setattr__(self, "mounts", frames)
+        for one in given[1:]:
+            if not one.mounted and getattr(given[0], "moves", "") != "board":
+                raise ValueError('same_board needs a first sensor Board("board")')
 
     @property
     def tool(self) -> tuple[str, ...]:  # type: ignore[override]  # the first one's
@@ -87,7 +90,7 @@ class Several(Sensor):
         named = []
         for i, one in enumerate(self.sensors):
             title = one.kind if kinds.count(one.kind) == 1 else f"{one.kind} {i}"
-            for axis in one.tool if i else ():
+            for axis in self._axes(i):
                 named.append(
                     (f"{title} tool {axis}", "deg" if "r" in axis else "length")
                 )
@@ -104,9 +107,13 @@ class Several(Sensor):
         ]
         return np.concatenate(parts)
 
+    def _axes(self, i: int) -> tuple[str, ...]:
+        """Unknown shifts and turns of sensor ``i`` on the tool, where it is mounted."""
+        return self.sensors[i].tool if i and self.sensors[i].mounted else ()
+
     def _mounting(self, i: int) -> Array:
         """Nominal shifts, and turns of zero, of where sensor ``i`` is on the tool."""
-        if not i:
+        if not self._axes(i):
             return np.zeros(0)
         shift = np.asarray(self.mounts)[i - 1, :3, 3]
         whole = dict(zip(_MOUNTING, [*shift, 0.0, 0.0, 0.0], strict=True))
@@ -116,7 +123,7 @@ class Several(Sensor):
         mounting = {"r": 1.7, "": 0.1 * length}  # as the tool's
         parts: list[float] = []
         for i, one in enumerate(self.sensors):
-            parts += [mounting[axis[:-1]] for axis in (one.tool if i else ())]
+            parts += [mounting[axis[:-1]] for axis in self._axes(i)]
             parts += one.prior_std(length).tolist()
         return np.array(parts)
 
@@ -140,7 +147,7 @@ class Several(Sensor):
     def _tip(self, i: int, tip: Tip, rows: NDArray[np.intp], given: Array) -> Tip:
         """The place of sensor ``i`` at its rows, its mounting as ``given``."""
         tip = tip.at(rows)
-        if not i:
+        if not self._axes(i):
             return tip
         shift, turn, _ = self._mount(i, given)
         turned = np.einsum("jcn,jk->kcn", tip.frame[:3], turn)
@@ -160,7 +167,7 @@ class Several(Sensor):
         values = np.zeros((count, q))
         by_tip, by_own = np.zeros((count, q, 6)), np.zeros((count, q, len(parameters)))
         for i, one, rows, columns in self.parts(inputs):
-            size = len(one.tool) if i else 0
+            size = len(self._axes(i))
             last = first + size + len(one.names)
             mount, width = parameters[first : first + size], len(one.outputs)
             reading = one.read(
@@ -170,7 +177,7 @@ class Several(Sensor):
             values[rows, :width] = reading.values / scale[:, 0]
             scaled = reading.by_tip / scale
             by_own[rows, :width, first + size : last] = reading.by_own / scale
-            if i:
+            if size:
                 shift, _, axes = self._mount(i, mount)
                 rotation = tip.rotation[rows]
                 moves, turned = scaled[..., :3] @ rotation, scaled[..., 3:] @ rotation
@@ -201,9 +208,9 @@ class Several(Sensor):
             if len(part.columns):
                 placed, new = placed.located(part.tip, part.columns, part.measured)
             sensors.append(placed)
-            if new is not None and i:
+            if new is not None and self._axes(i):
                 mounts[i - 1] = mounts[i - 1] @ new
-            elif new is not None:  # the others stay where they are
+            elif new is not None and not i:  # the others stay where they are
                 tool, mounts = new, np.linalg.inv(new) @ mounts
         return dataclasses.replace(self, sensors=tuple(sensors), mounts=mounts), tool
 
@@ -215,7 +222,7 @@ class Several(Sensor):
     def own_of_members(self) -> tuple[slice, ...]:
         first, slices = 0, []
         for i, one in enumerate(self.sensors):
-            first += len(one.tool) if i else 0
+            first += len(self._axes(i))
             slices.append(slice(first, first + len(one.names)))
             first += len(one.names)
         return tuple(slices)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.arms.sensors.sensor import HasNames, Reading, Sensor, Tip, hats
 from jaxcal.checks import array_of, in_words, numbers
+from jaxcal.models.model import Quantity
 
 __all__ = ["Wrench"]
 
@@ -64,6 +65,7 @@ class Wrench(Sensor):
         *("mass", "centre x", "centre y", "centre z"),
         *(f"zero {output}" for output in outputs),
     )
+    quantities = (Quantity("N", slice(3)), Quantity("N length", slice(3, 6)))
     units = ("kg", *["length"] * 3, *["N"] * 3, *["N length"] * 3)
 
     def __post_init__(self) -> None:

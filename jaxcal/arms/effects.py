@@ -1,0 +1,238 @@
+"""What else an arm does than its description says, chosen by held-out readings.
+
+Where the noise does not explain the scatter: wider tolerances, joints that yield, gears
+and their harmonics are fitted too, and what helps most with readings that were left out
+is kept. Play is looked for, and said.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.models.uncertainty import Prior
+from jaxcal.models.verdict import left_out
+
+__all__ = [
+    "SCATTER",
+    "chosen",
+    "in_words",
+    "play_in_words",
+    "scatter",
+    "unexplained",
+]
+
+Array = NDArray[np.float64]
+Fit = Any  # a jaxcal.Calibration, whose package imports this one
+Chain = Any  # a SerialChain, whose module imports this one
+
+SCATTER = 3.0  # times the sensor's usual noise: the model does not explain that
+# Times the tolerances of the default prior: lengths, turns of the axes, zeros of the
+# joints, which are set by hand, and what else joints do.
+_LENGTHS, _TURNS, _ZEROS, _EFFECTS = 2.0, 3.0, 6.0, 4.0
+_AS_IT_IS = "as described"
+_BETTER = 0.95  # of the held-out error: less is no reason for more parameters
+_ENOUGH = 12  # measurements
+_PLAY = 0.9  # of the error: what is left of it without a joint's play
+_NARROW, _SHORT = 20.0, 0.1  # degrees, of the arm's length: a range is no less
+_BEYOND = 3.0  # times the scatter, a whole range beyond what was measured
+_REPEATS = 3  # readings of postures that were repeated tell their noise
+_SURE = 3.0  # standard errors of a play
+
+
+def scatter(fit: Fit) -> float:
+    """Noise that was found, as a multiple of the sensor's usual one."""
+    usual = np.asarray(fit.model.default_noise().std)
+    return float(np.sqrt(np.mean((np.asarray(fit.noise_std) / usual) ** 2)))
+
+
+def chosen(fit: Fit) -> Fit:
+    """The calibration, or one with the effects that held-out readings ask for.
+
+    Left as it is: of a noise or prior that was stated, a scatter that the noise
+    explains, contacts at few places, and fewer than 12 measurements.
+    """
+    model = fit.model
+    stated = fit.noise_std is None or fit.noise_known or "prior" in fit.provenance
+    few = fit.num_measurements < max(_ENOUGH, len(model.joint_names) + 6)
+    if stated or few or not model.fits_misfit or scatter(fit) < SCATTER:
+        return fit
+    before, trials = _held_out(fit), {}
+    for words, other, prior in _alternatives(model):
+        try:
+            trial = fit.again(other, prior)
+            if trial.noise_std is not None:
+                trials[words] = trial, _held_out(trial)
+        except ValueError:  # it does not converge
+            continue
+    if not trials:
+        return fit
+    best = min((off for _, off in trials.values()), key=np.mean)
+    # The least that is added: more must be better beyond chance.
+    name = next(n for n, (_, off) in trials.items() if not _surely(off, best))
+    found, off = trials[name]
+    if not (_surely(before, off) and off.mean() < _BETTER * before.mean()):
+        name, found = _AS_IT_IS, fit
+    errors = {n: float(off.mean()) for n, (_, off) in trials.items()}
+    effects = {"chosen": name, "held_out": {_AS_IT_IS: float(before.mean())} | errors}
+    origin = {**fit.provenance, "effects": effects}
+    if found is not fit:
+        origin["prior"] = "stated"
+    return dataclasses.replace(found, provenance=origin)
+
+
+def _surely(errors: Array, less: Array) -> bool:
+    """Whether errors are larger than others by more than a standard error."""
+    gain = errors - less
+    return bool(gain.mean() > gain.std() / np.sqrt(len(gain)))
+
+
+def _held_out(fit: Fit) -> Array:
+    """(K,) held-out errors of the measurements, in the first unit."""
+    used = fit.loss_weights > 0.0
+    usual = np.asarray(fit.model.default_noise().std)
+    off = left_out(fit)[used] * usual[0] / usual
+    first = fit.model.quantities(fit.measured_unit)[0]
+    if len(fit.model.quantities(fit.measured_unit)) == 1:
+        return np.asarray(first.size(off))
+    return np.asarray(np.linalg.norm(off, axis=1))
+
+
+def _alternatives(model: Chain) -> Iterator[tuple[str, Chain, Prior]]:
+    """Effects in words, the arm with them, and its prior."""
+    turning = [i + 1 for i, kind in enumerate(model.joints) if kind == "R"]
+    more = {
+        "compliance": model.compliance or turning,
+        "gears": model.gears or range(1, len(model.joints) + 1),
+        "harmonics": turning,
+    }
+    for names in (
+        (),
+        ("compliance",),
+        ("harmonics",),
+        ("compliance", "harmonics"),
+        ("compliance", "gears", "harmonics"),
+    ):
+        other = model.with_effects(**{name: more[name] for name in names})
+        prior = other.default_prior()
+        std = np.array(prior.std, dtype=np.float64)
+        table = std[: other.table.size].reshape(-1, 5)
+        table *= [_LENGTHS, _TURNS, _LENGTHS, _ZEROS, _TURNS]
+        for i, name in enumerate(other.names):
+            if (
+                name.startswith(("compliance", "gear"))
+                or " sin" in name
+                or " cos" in name
+            ):
+                std[i] *= _EFFECTS
+        words = ", ".join(names) or "wider tolerances"
+        yield words, other, Prior(std, fixed=prior.fixed)
+
+
+def in_words(fit: Fit, unit: str) -> list[str]:
+    """What was tried, and what it brought."""
+    tried = fit.provenance.get("effects")
+    if not tried:
+        return []
+    before = tried["held_out"][_AS_IT_IS]
+    others = ", ".join(
+        f"{name} {error:.3g}"
+        for name, error in tried["held_out"].items()
+        if name not in (_AS_IT_IS, tried["chosen"])
+    )
+    if tried["chosen"] == _AS_IT_IS:
+        return [
+            f"Tried by held-out error, none helps: {others}{unit}; as described "
+            f"{before:.3g}{unit}."
+        ]
+    after = tried["held_out"][tried["chosen"]]
+    return [
+        f"Fitted besides, by held-out error: {tried['chosen']}, which cut it from "
+        f"{before:.3g} to {after:.3g}{unit} (with {others})."
+    ]
+
+
+def play_in_words(fit: Fit, unit: str) -> list[str]:
+    """Joints whose residuals follow the side that they came from, as a sentence.
+
+    Rows are taken to be in the order of measuring.
+    """
+    model, commands = fit.model, fit.commands
+    zeros = [name for name in model.slips if name.startswith("theta")]
+    at = [model.names.index(name) for name in zeros]
+    joints = model._moves(commands)
+    side = np.sign(np.diff(joints, axis=0, prepend=joints[:1]))
+    side = side[:, [int(name[5:]) - 1 for name in zeros]]
+    if len(commands) < _ENOUGH + len(at) or not at:
+        return []
+    slopes = model.jacobian(commands, fit.parameters)[..., at] * side[:, None]
+    noise = np.asarray(fit.noise_std)
+    rows = (slopes / noise[:, None]).reshape(-1, len(at))
+    size = np.linalg.norm(rows, axis=0)
+    seen = size > 1e-6 * size.max(initial=1e-300)
+    rows, right = rows[:, seen], (fit.residuals / noise).ravel()
+    inverse = np.linalg.pinv(rows.T @ rows)
+    play, share = (
+        inverse @ rows.T @ right,
+        np.einsum("ri,ij,rj->r", rows, inverse, rows),
+    )
+    errors = ((right - rows @ play) / (1.0 - share)).reshape(-1, len(noise))
+    before = np.linalg.norm(fit.residuals / noise, axis=1).mean()
+    left = np.linalg.norm(errors, axis=1).mean() / before
+    sure = np.abs(play) > _SURE * np.sqrt(inverse.diagonal())
+    if left > _PLAY or not sure.any():
+        return []
+    names = np.array(zeros)[seen][sure]
+    sizes = ", ".join(
+        f"{name} {2.0 * abs(each):.2g} deg"
+        for name, each in zip(names, play[sure], strict=True)
+    )
+    return [
+        f"Residuals follow the side that joints came from (play: {sizes}): always "
+        "coming from one side (arm.from_one_side) would cut the scatter by "
+        f"{1.0 - left:.0%}."
+    ]
+
+
+def unexplained(fit: Fit, rows: Array) -> Array:
+    """(N, q) standard deviations of an arm's predictions at commands ``rows`` (N, n).
+
+    A noise that was estimated and is more than three times the sensor's usual one is
+    taken for errors of the arm, which its predictions have too; where postures were
+    repeated, what these scatter by is noise. It grows with how far a joint is beyond
+    the range that was measured.
+    """
+    if fit.noise_std is None or fit.noise_known or scatter(fit) < SCATTER:
+        return np.zeros((len(rows), fit.num_outputs))
+    variance = np.asarray(fit.noise_std) ** 2 - _of_readings(fit)
+    columns, used = fit.model.num_joints, fit.loss_weights > 0.0
+    measured = fit.commands[used, :columns]
+    low, high = measured.min(axis=0), measured.max(axis=0)
+    turning = np.array(fit.model.command_units) == "deg"
+    width = np.maximum(
+        high - low, np.where(turning, _NARROW, _SHORT * fit.model.length)
+    )
+    joints = rows[:, :columns]
+    beyond = np.maximum(low - joints, joints - high).clip(0.0) / width
+    times = 1.0 + (_BEYOND * np.linalg.norm(beyond, axis=1)) ** 2
+    return np.sqrt(times[:, None] * variance.clip(0.0))
+
+
+def _of_readings(fit: Fit) -> Array:
+    """(q,) variance of a reading: of repeated postures, else the sensor's usual one."""
+    usual = np.broadcast_to(np.asarray(fit.model.default_noise().std), fit.num_outputs)
+    used = fit.loss_weights > 0.0
+    near = np.round(fit.commands[used], 2)
+    _, which, counts = np.unique(near, axis=0, return_inverse=True, return_counts=True)
+    freedom = len(near) - len(counts)
+    if freedom < _REPEATS:
+        return np.asarray(usual**2)
+    off = fit.residuals[used]
+    sums = np.zeros((len(counts), off.shape[1]))
+    np.add.at(sums, which.ravel(), off)
+    off = off - (sums / counts[:, None])[which.ravel()]
+    return np.asarray((off**2).sum(axis=0) / freedom)

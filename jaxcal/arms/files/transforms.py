@@ -1,0 +1,205 @@
+"""Where a camera or board is, as ROS reads it: a static transform or a URDF joint."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.arms.arguments import pose_matrix
+from jaxcal.arms.files.urdf import joints_of, links_of, table_of, walk
+from jaxcal.arms.files.write import fixed_joint, save, with_origins
+from jaxcal.arms.sensors import Board
+from jaxcal.arms.verdict import place_of
+from jaxcal.checks import one_of
+from jaxcal.models.uncertainty import Prior
+
+__all__ = ["StaticTransform", "static_transform", "to_transform"]
+
+Array = NDArray[np.float64]
+Calibration = Any  # a jaxcal.Calibration of an arm with a board
+
+_FORMS = (".yaml", ".yml", ".sh", ".py", ".urdf")
+_METRES = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
+
+
+class StaticTransform(NamedTuple):
+    """The pose of a camera or board in a link of the arm that is used as described."""
+
+    parent: str
+    child: str
+    matrix: Array  # (4, 4), in metres
+    std: tuple[float, float]  # of its place in metres, and of its turn in degrees
+    hidden: tuple[str, ...]  # what the views do not show, as described
+    held_out: str  # error of views left out, the arm as described
+    source: Any  # of the arm
+
+    @property
+    def quaternion(self) -> Array:
+        """(4,) x, y, z, w."""
+        from scipy.spatial.transform import Rotation
+
+        return np.asarray(Rotation.from_matrix(self.matrix[:3, :3]).as_quat())
+
+    def __str__(self) -> str:
+        place = ", ".join(f"{x:.5f}" for x in self.matrix[:3, 3])
+        turn = ", ".join(f"{x:.5f}" for x in self.quaternion)
+        lost = ", ".join(self.hidden)
+        beside = f" but for {lost}, which the views do not show" if lost else ""
+        return (
+            f"{self.child} in {self.parent}: translation {place} m, quaternion (x, y, "
+            f"z, w) {turn}; known to {1e3 * self.std[0]:.2g} mm and {self.std[1]:.2g} "
+            f"deg (1 sigma){beside}; with the arm as described {self.held_out}"
+        )
+
+
+def static_transform(
+    calibration: Calibration,
+    child: str | None = None,
+    parent: str | None = None,
+    camera: int = 0,
+) -> StaticTransform:
+    """Where a camera is, on the tip or beside the arm, for the arm as described.
+
+    It is fitted again with the arm held as its description has it, which is what a
+    controller goes by: beside a corrected arm the camera is the tip of ``to_urdf``.
+
+    Args:
+        calibration: of an arm with ``Board``.
+        child: name of the camera's optical frame (z ahead, x to the right in the
+            picture, not a driver's camera_link); "camera_optical_frame" if not given.
+        parent: name of the link that it is in; of a URDF file the tip link, or the base
+            of a camera that stands, when not given.
+        camera: of several that see one board, its number.
+
+    Raises:
+        ValueError: the sensor is no ``Board``, or the unit of lengths is not known.
+    """
+    model = calibration.model
+    sensors = getattr(getattr(model, "sensor", None), "members", ())
+    sensor = sensors[camera] if 0 <= camera < len(sensors) else None
+    if not isinstance(sensor, Board):
+        raise ValueError("a static transform is of an arm with sensor=Board(...)")
+    unit = model.length_unit(calibration.measured_unit)
+    scale = _METRES[
+        one_of("measured_unit, for a transform in metres,", unit, [*_METRES])
+    ]
+    tool = [f"tool {axis}" for axis in sensor.tool]
+    owns = [model.names[model.own(i)] for i in range(len(sensors))]
+    found = {*tool, *(name for own in owns for name in own)}
+    held = tuple(name for name in model.names if name not in found)
+    again = calibration.again(model, Prior(model.default_prior().std, fixed=held))
+    theta, source = again.parameters, model.source
+    if sensor.moves == "camera":
+        names = tool
+        matrix = np.linalg.inv(_tip(model)) @ model.calibrated(theta).tool
+    else:
+        names = list(owns[camera][:6])
+        at = [model.names.index(name) for name in names]
+        matrix = pose_matrix(theta[at])
+        if sensor.place is not None:
+            matrix[:3, :3] = matrix[:3, :3] @ sensor.place[:3, :3]
+    matrix[:3, 3] *= scale
+    # The arm's own errors are no noise of the views: the whole fit knows them.
+    places = [place_of(fit, names) for fit in (again, calibration)]
+    std = np.max([place.std for place in places], axis=0) * [scale, 1.0]
+    off = " and ".join(one.says(one.held_out) for one in again.verdict.errors)
+    end = "tip" if sensor.moves == "camera" else "base"
+    return StaticTransform(
+        parent or (source[end] if source else end),
+        child or "camera_optical_frame",
+        matrix,
+        (float(std[0]), float(std[1])),
+        places[0].hidden,
+        f"views left out are off by {off}",
+        source,
+    )
+
+
+def _tip(model: Any) -> Array:
+    """(4, 4) of the tip link in the last joint's frame, as described."""
+    if model.source is None:
+        return np.eye(4)
+    source = dict(model.source)
+    joints, locked = joints_of(source["text"]), source["locked"]
+    chain = list(walk(source["text"], source["base"], source["tip"], locked))
+    return np.asarray(table_of(chain, joints, locked, source)["tool"])
+
+
+def to_transform(
+    calibration: Calibration,
+    path: str | os.PathLike[str],
+    *,
+    child: str | None = None,
+    parent: str | None = None,
+    camera: int = 0,
+    force: bool = False,
+) -> StaticTransform:
+    """Write ``static_transform`` as what reads it.
+
+    Args:
+        calibration: of an arm with ``Board``.
+        path: .yaml, a geometry_msgs/TransformStamped; .sh, a call of ROS 2's
+            static_transform_publisher; .py, a launch file of that; .urdf, the arm's own
+            file with the frame as a link and its fixed joint.
+        child: as of ``static_transform``.
+        parent: likewise.
+        camera: likewise.
+        force: write over a file that is there.
+
+    Raises:
+        ValueError: as of ``static_transform``; .urdf of an arm of no file.
+        FileExistsError: there is a file and ``force`` is not given.
+    """
+    form = os.path.splitext(os.fspath(path))[1].lower()
+    one_of("ending of the file", form, _FORMS)
+    pose = static_transform(calibration, child, parent, camera)
+    save(_text(form, pose), path, force)
+    return pose
+
+
+def _text(form: str, pose: StaticTransform) -> str:
+    if form == ".urdf":
+        return _urdf(pose)
+    numbers = [*pose.matrix[:3, 3].tolist(), *pose.quaternion.tolist()]
+    keys = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    values = {key: repr(float(x)) for key, x in zip(keys, numbers, strict=True)}
+    if form in (".yaml", ".yml"):
+        shift = ", ".join(f"{key}: {values[key]}" for key in keys[:3])
+        turn = ", ".join(f"{key[1]}: {values[key]}" for key in keys[3:])
+        return (
+            f"# {pose}\nheader: {{frame_id: {pose.parent}}}\n"
+            f"child_frame_id: {pose.child}\n"
+            f"transform:\n  translation: {{{shift}}}\n  rotation: {{{turn}}}\n"
+        )
+    words = [word for key in keys for word in (f"--{key}", values[key])]
+    words += ["--frame-id", pose.parent, "--child-frame-id", pose.child]
+    if form == ".sh":
+        call = " ".join(words)
+        return f"# {pose}\nros2 run tf2_ros static_transform_publisher {call}\n"
+    return (
+        f"# {pose}\nfrom launch import LaunchDescription\n"
+        "from launch_ros.actions import Node\n\n\n"
+        "def generate_launch_description():\n"
+        f"    arguments = {words!r}\n"
+        "    node = Node(\n"
+        '        package="tf2_ros",\n'
+        '        executable="static_transform_publisher",\n'
+        "        arguments=arguments,\n"
+        "    )\n"
+        "    return LaunchDescription([node])\n"
+    )
+
+
+def _urdf(pose: StaticTransform) -> str:
+    if pose.source is None:
+        raise ValueError("the arm must come from a URDF file: SerialChain.from_urdf")
+    text = pose.source["text"]
+    one_of("parent", pose.parent, links_of(text))
+    if pose.child in links_of(text):
+        raise ValueError(
+            f"link {pose.child} is in the file already: name another child"
+        )
+    return with_origins(text, {}, fixed_joint(pose.parent, pose.child, pose.matrix))
