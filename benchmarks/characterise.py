@@ -28,8 +28,8 @@ import numpy as np
 from benchmarks.sequential.sequence import optimise
 from benchmarks.tasks.breakaway import Cautious, breakaway
 from examples.tasks.backlash import backlash, dead_zone
-from jaxcal.adaptive.estimates import estimates
 from jaxcal.adaptive.grid import GridBelief, GridTask
+from jaxcal.adaptive.loop import estimates
 from jaxcal.adaptive.rules import Gain, Random
 
 ENOUGH_DEG = 0.02

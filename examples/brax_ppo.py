@@ -3,35 +3,27 @@
 from __future__ import annotations
 
 import numpy as np
-from brax.training.agents.ppo import train as ppo
 
 from jaxcal.adaptive import GridTask
 from jaxcal.adaptive.brax_env import SequentialEnv
-from jaxcal.learning.brax import SelectionEnv, brax_networks, repaired, wrap_fresh
+from jaxcal.learning.brax import SelectionEnv, train
 from jaxcal.learning.environments.selection import SelectionConfig
 
 
-def train(env, length: int, steps: int = 200_000, **more):
-    """Metrics of evaluations before and after: ``eval/episode_reward``."""
-    seen: list[float] = []
+def rewards(env, length: int, steps: int) -> list[float]:
+    """Mean rewards of episodes, before and after a training."""
+    reached: list[float] = []
 
     def progress(steps: int, found: dict) -> None:
-        seen.append(float(found["eval/episode_reward"]))
+        reached.append(float(found["eval/episode_reward"]))
 
-    with repaired():
-        ppo.train(
-            environment=env, network_factory=brax_networks(env), wrap_env_fn=wrap_fresh,
-            num_timesteps=steps, episode_length=length, unroll_length=length,
-            num_envs=256, batch_size=64, num_minibatches=16, num_updates_per_batch=4,
-            discounting=1.0, learning_rate=1e-3, num_evals=2, num_eval_envs=256,
-            progress_fn=progress, **more,
-        )  # fmt: skip
-    return seen
+    train(env, length, num_timesteps=steps, num_evals=2, progress_fn=progress)
+    return reached
 
 
 def postures(steps: int = 200_000) -> list[float]:
     """Choose 4 of 50 postures; reward log det S / 10."""
-    return train(SelectionEnv(SelectionConfig()), 4, steps)
+    return rewards(SelectionEnv(SelectionConfig()), 4, steps)
 
 
 def ladder(rungs: int = 24) -> GridTask:
@@ -50,7 +42,7 @@ def ladder(rungs: int = 24) -> GridTask:
 def task(steps: int = 100_000) -> list[float]:
     """Sessions on a ladder of one's own; reward in nats."""
     made = ladder()
-    return train(SequentialEnv(made), made.horizon, steps)
+    return rewards(SequentialEnv(made), made.horizon, steps)
 
 
 if __name__ == "__main__":

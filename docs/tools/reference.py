@@ -113,7 +113,7 @@ def _text(default: Any) -> str:
 
 
 def _presets() -> str:
-    from jaxcal.learning.settings import settings_of
+    from jaxcal.learning.config import settings_of
     from jaxcal.learning.training import presets
 
     known = {name: presets.load(name) for name in presets.names()}

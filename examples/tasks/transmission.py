@@ -9,9 +9,9 @@ a posture depends on the belief.
 from __future__ import annotations
 
 import numpy as np
+from scipy import special
 
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.tasks.readings import Bins
 from jaxcal.adaptive.tasks.registry import Entry
 
 __all__ = ["ENTRY", "transmission_error"]
@@ -64,11 +64,13 @@ def transmission_error(
     frequency, amplitude, phase = theta.T[:, None]
     mean = amplitude * np.sin(2.0 * np.pi * frequency * at[:, None] + phase)
     highest = float(np.max(amplitudes)) + 2.0 * sigma
+    edges = np.linspace(-highest, highest, num_bins + 1)[1:-1]
+    below = special.ndtr((edges[None, :, None] - mean[:, None]) / sigma)
     here = np.append(at, 0.0)
     return GridTask.make(
         theta,
         at,
-        Bins(-highest, highest, num_bins).likelihood(mean, sigma),
+        np.diff(below, axis=1, prepend=0.0, append=1.0),
         travel=measure_s + travel_s * np.abs(here[:, None] - at),
         uses=1,
         num_uses=measurements,

@@ -6,13 +6,15 @@ what it costs; a belief is what is known; a decider picks what comes next.
 ``compare`` try deciders on thousands of sessions.
 """
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from jaxcal.extras import needs
 
-with needs("policy", "jaxcal.adaptive"):
+if TYPE_CHECKING:
     from jaxcal.adaptive.episodes import compare, play
-    from jaxcal.adaptive.estimates import estimates
     from jaxcal.adaptive.grid import GridBelief, GridTask
-    from jaxcal.adaptive.loop import Loop, next_measurement, run
+    from jaxcal.adaptive.loop import Loop, estimates, next_measurement, run
     from jaxcal.adaptive.particles import ParticleBelief, ParticleTask
 
 __all__ = [
@@ -27,3 +29,18 @@ __all__ = [
     "play",
     "run",
 ]
+
+_HOME = {
+    **dict.fromkeys(("compare", "play"), "episodes"),
+    **dict.fromkeys(("GridBelief", "GridTask"), "grid"),
+    **dict.fromkeys(("Loop", "estimates", "next_measurement", "run"), "loop"),
+    **dict.fromkeys(("ParticleBelief", "ParticleTask"), "particles"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'jaxcal.adaptive' has no attribute {name!r}")
+    with needs("policy", "jaxcal.adaptive"):
+        home = importlib.import_module(f"jaxcal.adaptive.{_HOME[name]}")
+    return getattr(home, name)

@@ -9,7 +9,7 @@ from typing import Any
 
 from jaxcal.adaptive.environment import TaskEnv
 from jaxcal.adaptive.rules import SHARES, Rule
-from jaxcal.learning.environments.brax_env import EpisodeEnv
+from jaxcal.learning.brax import EpisodeEnv
 
 __all__ = ["SequentialEnv"]
 

@@ -18,17 +18,14 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import socket
 from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 
-from jaxcal.adaptive.estimates import estimates
-from jaxcal.adaptive.loop import Loop
+from jaxcal.adaptive.loop import Loop, estimates
 
-__all__ = ["answers", "listen"]
+__all__ = ["answers"]
 
 _FIELDS = {
     "suggest": set(),
@@ -51,39 +48,6 @@ def answers(loop: Loop, lines: Iterable[str]) -> Iterator[str]:
             except ValueError as error:
                 answer = {"error": " ".join(str(error).split())}
             yield json.dumps(answer, allow_nan=False) + "\n"
-
-
-def listen(loop: Loop, path: str | os.PathLike[str]) -> None:
-    """Answer on a local socket, one connection after the other, until interrupted.
-
-    Args:
-        loop: the session.
-        path: of the socket; removed at the end. One without a listener is replaced.
-
-    Raises:
-        ValueError: another process answers there.
-        OSError: there can be no socket at ``path``.
-    """
-    name = os.fspath(path)
-    with socket.socket(socket.AF_UNIX) as server:
-        if os.path.exists(name):
-            with socket.socket(socket.AF_UNIX) as other:
-                if other.connect_ex(name) == 0:
-                    raise ValueError(f"{name}: another session answers there")
-            os.unlink(name)
-        server.bind(name)
-        try:
-            server.listen(1)
-            while True:
-                connection, _ = server.accept()
-                with connection, connection.makefile("r", encoding="utf-8") as file:
-                    try:  # a buffer would be flushed again where it is closed
-                        for answer in answers(loop, file):
-                            connection.sendall(answer.encode())
-                    except (BrokenPipeError, ConnectionResetError):
-                        continue
-        finally:
-            os.unlink(name)
 
 
 def _answer(loop: Loop, line: str) -> dict[str, Any]:

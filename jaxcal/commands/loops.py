@@ -17,7 +17,6 @@ def loop(
     journal: Annotated[
         Path | None, "record of the session; a session that is in it goes on"
     ] = None,
-    socket: Annotated[Path | None, "answer on a local socket, not on a pipe"] = None,
     with_: Annotated[tuple[str, ...], "options of the task", "OPTION=VALUE"] = (),
     seconds: Annotated[
         float | None, "time budget; the task's if not given", (0.0,)
@@ -42,13 +41,11 @@ def loop(
     """
     with needs("policy", "loop"):
         from jaxcal.adaptive.loop import Loop
-        from jaxcal.adaptive.protocol import answers, listen
+        from jaxcal.adaptive.protocol import answers
         from jaxcal.adaptive.tasks import registry
     entry = registry.load(task)
     made = entry.make(**registry.options_from(entry, with_))
     with Loop(made, journal=journal, seconds=seconds, uses=uses, seed=seed) as session:
-        if socket is not None:
-            listen(session, socket)
         for answer in answers(session, iter(sys.stdin.readline, "")):
             sys.stdout.write(answer)
             sys.stdout.flush()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime
+import functools
 import math
 import pathlib
 import signal
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from jaxcal.adaptive.tasks.registry import Entry
     from jaxcal.commands.train_arguments import TrainOptions
     from jaxcal.learning.environments.task import GivenCandidates
-    from jaxcal.learning.training.config import TrainConfig
+    from jaxcal.learning.training.presets import TrainConfig
     from jaxcal.learning.training.run import Report
 
 __all__ = ["main"]
@@ -65,7 +66,6 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
 def _run(arguments: TrainOptions, prog: str) -> int:
     """Train, say how it went; of several processes the first speaks for all."""
     from jaxcal.commands.train_arguments import preset_of
-    from jaxcal.learning.runtime import devices
 
     named = pathlib.Path(arguments.task or preset_of(arguments)).stem
     out = pathlib.Path(arguments.out or f"runs/{named}")
@@ -73,10 +73,17 @@ def _run(arguments: TrainOptions, prog: str) -> int:
         arguments.task = _task_held(out)
     if arguments.export and not arguments.export.endswith(".npz"):
         raise ValueError(f"--export must be a file NAME.npz, got {arguments.export}")
+    configuration = _task_configuration if arguments.task else _configuration
+    configure = functools.partial(configuration, arguments, out)
+    config: Any = None
+    later = arguments.task, arguments.resume, arguments.sweep, "jax" in sys.modules
+    if not any((*later, arguments.values.get("num_seeds"))):
+        config = configure()  # what is wrong is said before JAX is loaded
+    from jaxcal.learning.runtime import devices
+
     if (runs := _num_runs(arguments, out)) > 1:
         devices.a_device_for_each_core(runs)
-    configuration = _task_configuration if arguments.task else _configuration
-    config: Any = devices.on_first(lambda: configuration(arguments, out))
+    config = devices.on_first(configure) if config is None else config
     with _stop_on_signals() as stop:
         if arguments.trainer == "brax":
             from jaxcal.learning.training import brax_ppo
@@ -247,7 +254,7 @@ def _configuration_of(
 ) -> TrainConfig:
     """The configuration of a run to go on with, on the same candidates."""
     from jaxcal.learning.training import checkpoint
-    from jaxcal.learning.training.config import TrainConfig
+    from jaxcal.learning.training.presets import TrainConfig
 
     config = TrainConfig.from_meta(checkpoint.read_meta(out)[1])
     held = config.tasks[0].given
@@ -294,7 +301,7 @@ def _task_configuration(arguments: TrainOptions, out: pathlib.Path) -> PolicyCon
     from jaxcal.adaptive.policy.config import PolicyConfig
     from jaxcal.adaptive.tasks import registry
     from jaxcal.commands.train_arguments import TASK_PARTS, given_flags
-    from jaxcal.learning.settings import settings_of
+    from jaxcal.learning.config import settings_of
     from jaxcal.learning.training import checkpoint
 
     assert arguments.task is not None  # it is what this function is for

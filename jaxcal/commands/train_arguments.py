@@ -12,15 +12,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
-from jaxcal.adaptive.tasks import registry
 from jaxcal.arguments import Parser, number_type, typed_line, values_of
 from jaxcal.commands.pools import holds_sets, read_pool
-from jaxcal.learning.config import TRACED, StreamsConfig
+from jaxcal.learning.config import TRACED, Setting, StreamsConfig, settings_of
 from jaxcal.learning.environments.task import GivenCandidates
 from jaxcal.learning.runtime import processes
-from jaxcal.learning.settings import Setting, settings_of
 from jaxcal.learning.training import presets
-from jaxcal.learning.training.config import TrainConfig
+from jaxcal.learning.training.presets import TrainConfig
 
 __all__ = [
     "TASK_PARTS",
@@ -187,19 +185,22 @@ def asked(
 
 def read(prog: str, argv: Sequence[str]) -> TrainOptions:
     """The command line; ``prog`` is what was typed, "train.py" or "jaxcal train"."""
+    asks = {"-h", "--help"} & set(argv)  # else tasks are not loaded, nor JAX with them
     parser = Parser(
         prog=prog,
         usage="%(prog)s [--preset NAME | --task NAME] [--out DIR] [flags below]",
         description="Train a policy, and save it with all it needs: one that selects "
         "postures, or with --task one that picks the next measurement. Without flags: "
         "our network on geometric features; --preset paper is the paper's, on the 210 "
-        "numbers of its observation.",
+        "numbers of its observation, --preset observation ours on these, by PPO alone.",
         epilog=_EPILOG.format(
             program=typed_line(prog),
             evaluate=typed_line(prog.replace("train", "evaluate")),
             presets=_abouts(),
             tasks=_tasks(),
-        ),
+        )
+        if asks
+        else None,
     ).of(asked)
     return asked(**values_of(parser.parse_args(argv)))
 
@@ -242,6 +243,8 @@ def _abouts() -> str:
 
 
 def _tasks() -> str:
+    from jaxcal.adaptive.tasks import registry
+
     return "\n".join(
         f"  {name:9} {registry.load(name).about}" for name in registry.names()
     )

@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax
 import numpy as np
 
-from jaxcal.learning.training.config import TrainConfig
 from jaxcal.learning.training.postures import Validation
+from jaxcal.learning.training.presets import TrainConfig
 from jaxcal.selection import exact_batch, exchange_batch
 
 __all__ = ["fixed_validation", "teacher"]

@@ -65,7 +65,10 @@ def write_report(
         blocks += _drawn(draw(evaluation), files, prefix and f"{prefix}_")
         sections.append(Section(shown.heading, blocks))
     if runs:
-        sections.append(Section("Training", _drawn(_training(runs), files)))
+        from jaxcal.evaluation.training_figure import training_curves
+
+        curves = {"training_curves": training_curves({run.name: run for run in runs})}
+        sections.append(Section("Training", _drawn(curves, files)))
     made_with = ", ".join(f"{name} {v}" for name, v in versions().items())
     page = Page(
         evaluations[0].title,
@@ -94,17 +97,6 @@ def file_prefixes(names: Sequence[str]) -> list[str]:
         name if prefixes.count(name) == 1 else f"{name}-{number}"
         for number, name in enumerate(prefixes, start=1)
     ]
-
-
-def _training(runs: Sequence[pathlib.Path]) -> dict[str, Any]:
-    """Figures of training runs."""
-    from jaxcal.evaluation.training_figure import training_curves, training_diagnostics
-
-    folders = {run.name: run for run in runs}
-    curves = {"training_curves": training_curves(folders)}
-    if (diagnostics := training_diagnostics(folders)) is not None:
-        curves["training_diagnostics"] = diagnostics
-    return curves
 
 
 def _drawn(

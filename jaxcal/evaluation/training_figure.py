@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 from jaxcal.reports.plots.style import COLOURS, panels
 from jaxcal.tables import read_table
 
-__all__ = ["last_rewards", "read_metrics", "training_curves", "training_diagnostics"]
+__all__ = ["last_rewards", "read_metrics", "training_curves"]
 
 Array = NDArray[np.float64]
 
@@ -77,47 +77,6 @@ def training_curves(runs: Mapping[str, pathlib.Path]) -> Figure:
     place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.2)}
     smooth.legend(fontsize=8, frameon=False, ncols=3, **place)
     return figure
-
-
-_DIAGNOSTICS = {  # column of metrics.csv, and what its panel is called
-    "explained_variance": "share of the returns' variance explained",
-    "clip_fraction": "share of ratios beyond the clipping",
-    "kl_after": "KL from the policy that played, after the update",
-    "grad_norm": "norm of the gradient before clipping",
-}
-
-
-def training_diagnostics(runs: Mapping[str, pathlib.Path]) -> Figure | None:
-    """Whether the updates of training runs were sound, from their ``metrics.csv``.
-
-    A panel for each: the explained variance, which rises towards 1; the clip fraction,
-    which stays below about .3; the KL after the last epoch, which stays below about
-    .05; and the norm of the gradient.
-
-    Returns:
-        None where no run has any of these columns.
-
-    Raises:
-        OSError, ValueError: as of ``training_curves``.
-    """
-    figure, axes = panels((12.0, 3.2), shape=(1, len(_DIAGNOSTICS)))
-    drawn = False
-    for number, (name, folder) in enumerate(runs.items()):
-        metrics = read_metrics(folder / "metrics.csv")
-        for panel, column in zip(axes, _DIAGNOSTICS, strict=True):
-            values = metrics.get(column)
-            if values is None or not np.isfinite(values).any():
-                continue  # of an older version, or of a run that imitates
-            x = metrics["episodes"] / 1000.0
-            panel.plot(x, values, color=COLOURS[number % 6], linewidth=0.8, label=name)
-            drawn = True
-    for panel, title in zip(axes, _DIAGNOSTICS.values(), strict=True):
-        panel.set_title(title, fontsize=8)
-        panel.set(xlabel="training episodes (thousands)")
-    axes[0].set_ylim(top=1.0)
-    if len(runs) > 1 and drawn:
-        axes[0].legend(fontsize=8, frameon=False)
-    return figure if drawn else None
 
 
 def read_metrics(path: pathlib.Path) -> dict[str, Array]:

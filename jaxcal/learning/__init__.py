@@ -14,13 +14,17 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxcal.learning.brax import brax_networks, repaired
+    from jaxcal.learning.brax import (
+        SelectionEnv,
+        brax_networks,
+        repaired,
+        wrap_fresh,
+    )
     from jaxcal.learning.config import EpisodesConfig, StreamsConfig
     from jaxcal.learning.core.network import Network, mask_logits
     from jaxcal.learning.core.postures import Episode, Postures
     from jaxcal.learning.core.ppo import Learner
     from jaxcal.learning.core.streams import Environment, Step, Streams
-    from jaxcal.learning.environments.brax_env import SelectionEnv, wrap_fresh
     from jaxcal.learning.environments.functional import FunctionalEnv, PosturesEnv
     from jaxcal.learning.environments.selection import (
         SelectionConfig,
@@ -32,7 +36,7 @@ if TYPE_CHECKING:
     )
     from jaxcal.learning.environments.task import Task
     from jaxcal.learning.policies.networks import NetworkConfig
-    from jaxcal.learning.training.config import TrainConfig
+    from jaxcal.learning.training.presets import TrainConfig
     from jaxcal.learning.training.presets import load as preset
 
 __all__ = [
@@ -66,21 +70,19 @@ __all__ = [
 ]
 
 _HOME = {
-    "brax": ("brax_networks", "repaired"),
+    "brax": ("SelectionEnv", "brax_networks", "repaired", "wrap_fresh"),
     "config": ("EpisodesConfig", "StreamsConfig"),
     "core.network": ("Network", "mask_logits"),
     "core.postures": ("Episode", "Postures"),
     "core.ppo": ("Learner",),
     "core.streams": ("Environment", "Step", "Streams"),
-    "environments.brax_env": ("SelectionEnv", "wrap_fresh"),
     "environments.functional": ("FunctionalEnv", "PosturesEnv"),
     "environments.selection": (
         *("SelectionConfig", "SelectionState", "observe", "reset", "start", "step"),
     ),
     "environments.task": ("Task",),
     "policies.networks": ("NetworkConfig",),
-    "training.config": ("TrainConfig",),
-    "training.presets": ("preset",),
+    "training.presets": ("TrainConfig", "preset"),
 }
 
 
@@ -127,7 +129,7 @@ def make_train(config: Any) -> Any:
         from jaxcal.learning.training import presets
 
         return ppo.make_train(presets.load(config))
-    if all(hasattr(config, name) for name in ("config", "gather", "loss")):
+    if all(hasattr(config, name) for name in ("config", "rollout", "loss")):
         return ppo.make_train(SimpleNamespace(ppo=config.config, learners=(config,)))
     if not all(hasattr(config, name) for name in ("ppo", "learners")):
         raise ValueError(

@@ -1,17 +1,11 @@
-"""What brax's own trainers need to train on jaxcal's environments; this loads brax.
+"""Episodes as ``brax.envs.base.Env``, and what brax's trainers need; this loads brax.
 
-    from brax.training.agents.ppo import train as ppo
-    from jaxcal.learning.brax import brax_networks, repaired, wrap_fresh
-
-    with repaired():
-        act, params, metrics = ppo.train(
-            environment=env, network_factory=brax_networks(env),
-            wrap_env_fn=wrap_fresh, episode_length=4, unroll_length=4, ...
-        )
-
+``train`` is the call of brax's PPO, for ``train.py --trainer brax`` and for scripts.
 ``env`` is a ``SelectionEnv`` of postures, or a ``SequentialEnv`` of a task from
 ``jaxcal.adaptive.brax_env``. Masked options are never sampled: the network masks them
-from what is observed.
+from what is observed. ``done`` is 1 on the last step: an episode ends, it is never cut
+off, so brax's ``truncation`` stays 0. brax's own ``AutoResetWrapper`` replays the first
+episode; ``wrap_fresh`` draws a new one every time.
 """
 
 from __future__ import annotations
@@ -25,13 +19,119 @@ from unittest import mock
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from brax.envs.base import Env, State, Wrapper
+from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 from brax.training import distribution
+from brax.training.agents.ppo import train as brax_train
 from brax.training.agents.ppo.networks import PPONetworks
 from brax.training.networks import FeedForwardNetwork
 
-from jaxcal.learning.environments.brax_env import EpisodeEnv, SelectionEnv, wrap_fresh
+from jaxcal.learning.environments.functional import FunctionalEnv, PosturesEnv
+from jaxcal.learning.environments.selection import CandidateSource, SelectionConfig
+from jaxcal.learning.policies.networks import NetworkConfig
 
-__all__ = ["SelectionEnv", "brax_networks", "repaired", "wrap_fresh"]
+__all__ = [
+    "EpisodeEnv",
+    "SelectionEnv",
+    "brax_networks",
+    "repaired",
+    "train",
+    "wrap_fresh",
+]
+
+
+class EpisodeEnv(Env):
+    """Episodes of ``env`` as a brax environment; brax's wrappers make the batch."""
+
+    backend = "jaxcal"
+
+    def __init__(self, env: FunctionalEnv) -> None:
+        self.functional = env
+
+    def reset(self, rng: jax.Array) -> State:
+        """A new episode; ``rng`` is a legacy uint32 key, which brax's wrappers need."""
+        episode, zero = self.functional.begin(rng), jnp.zeros(())
+        return State(
+            pipeline_state=episode,
+            obs=self.functional.observation(episode),
+            reward=zero,
+            done=zero,
+            metrics={self.functional.metric: zero},
+            info={},
+        )
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Take one step."""
+        env = self.functional
+        after, reward, done, metric = env.advance(state.pipeline_state, action)
+        return state.replace(
+            pipeline_state=after,
+            obs=env.observation(after),
+            reward=reward,
+            done=done.astype(jnp.float32),
+            metrics=state.metrics | {env.metric: metric},
+        )
+
+    @property
+    def observation_size(self) -> int:
+        return self.functional.observation_size
+
+    @property
+    def action_size(self) -> int:
+        return self.functional.num_actions
+
+
+class SelectionEnv(EpisodeEnv):
+    """Postures; arguments as of ``PosturesEnv``."""
+
+    def __init__(
+        self,
+        config: SelectionConfig | None = None,
+        draw: CandidateSource | None = None,
+        net: NetworkConfig | None = None,
+    ) -> None:
+        super().__init__(PosturesEnv(config, draw, net))
+
+
+class _FreshReset(Wrapper):
+    """After ``done``, a new episode from the key that the old one carried."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        steps = jnp.where(state.done > 0, 0.0, state.info["steps"])
+        state.info.update(steps=steps)
+        state = self.env.step(state.replace(done=jnp.zeros_like(state.done)), action)
+
+        def renewed(state: State) -> State:
+            fresh = self.env.reset(state.pipeline_state.key)
+
+            def where_done(new: jax.Array, old: jax.Array) -> jax.Array:
+                shape = (*state.done.shape, *(1,) * (old.ndim - state.done.ndim))
+                return jnp.where(state.done.reshape(shape) > 0, new, old)
+
+            new, old = ((s.pipeline_state, s.obs) for s in (fresh, state))
+            episode, obs = jax.tree.map(where_done, new, old)
+            return state.replace(pipeline_state=episode, obs=obs)
+
+        # Episodes of one length end together, so all steps but their last skip this.
+        return jax.lax.cond(jnp.any(state.done > 0), renewed, lambda s: s, state)
+
+
+def wrap_fresh(
+    env: Env,
+    episode_length: int = 1000,
+    action_repeat: int = 1,
+    randomization_fn: Any = None,
+) -> Wrapper:
+    """The ``wrap_env_fn`` for brax's trainers: a new episode after every ``done``.
+
+    Args:
+        env: one episode.
+        episode_length, action_repeat: as brax passes them.
+        randomization_fn: must be None; there is no physical system to randomise.
+    """
+    if randomization_fn is not None:
+        raise ValueError("randomization_fn must be None: there is no system to vary")
+    return _FreshReset(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
 
 
 class _MaskedCategorical(distribution.ParametricDistribution):
@@ -100,3 +200,19 @@ def repaired() -> Iterator[None]:
     put = mock.patch.object(jax, "device_put_replicated", _replicated, create=True)
     with put, jax.numpy_rank_promotion("allow"):
         yield
+
+
+def train(env: EpisodeEnv, length: int, **arguments: Any) -> Any:
+    """brax's PPO on episodes of ``length`` decisions: what its ``train`` returns.
+
+    ``arguments`` of ``brax.training.agents.ppo.train`` go before those here, of which
+    brax's own defaults would not do: its discount is .9, its unrolls cut episodes.
+    """
+    usual: dict[str, Any] = dict(
+        environment=env, wrap_env_fn=wrap_fresh, network_factory=brax_networks(env),
+        episode_length=length, unroll_length=length, discounting=1.0,
+        learning_rate=1e-3, num_envs=256, num_eval_envs=256, batch_size=64,
+        num_minibatches=16, num_updates_per_batch=4, normalize_observations=False,
+    )  # fmt: skip
+    with repaired():
+        return brax_train.train(**usual | arguments)

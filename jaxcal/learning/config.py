@@ -1,24 +1,107 @@
-"""Hyperparameters of a training: of PPO, and how much an update plays."""
+"""Hyperparameters of a training: of PPO, how much an update plays, sizes of an episode.
+
+And what the fields of a configuration are: a default, the line that explains it, and
+its checks. Nothing here loads JAX, so that flags are read before.
+"""
 
 from __future__ import annotations
 
 import abc
 import dataclasses
+import importlib
+import importlib.util
 import itertools
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
-
-from jaxcal.learning.settings import require, setting
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
 
 __all__ = [
+    "SHAPES",
     "TRACED",
     "EpisodesConfig",
     "PPOConfig",
     "RunConfig",
+    "SelectionConfig",
+    "Setting",
     "StreamsConfig",
     "Sweep",
+    "named",
+    "path_of",
+    "require",
     "runs_of",
+    "setting",
+    "settings_of",
 ]
+
+SHAPES = ("uniform", "gaussian", "sphere", "clustered", "grid", "cluster_uniform")
+"""Shapes of a cloud of candidates, see ``environments.scenarios``."""
+
+_OWN = "jaxcal.own "  # before the path of a file, in the name of its module
+
+
+class Setting(NamedTuple):
+    """One field of a configuration, as a command shows it."""
+
+    name: str
+    kind: type  # bool, int, float or str
+    help: str
+
+
+def setting(default: Any, help: str) -> Any:
+    """A dataclass field with a default and a line of help; commands print the line."""
+    return dataclasses.field(default=default, metadata={"help": help})
+
+
+def settings_of(config: type) -> Iterator[Setting]:
+    """The fields of a configuration class that were made by ``setting``."""
+    kinds: dict[Any, Any] = {kind.__name__: kind for kind in (bool, int, float, str)}
+    for field in dataclasses.fields(config):
+        if "help" in field.metadata:
+            kind = kinds.get(field.type, field.type)  # written as text, mostly
+            yield Setting(field.name, kind, field.metadata["help"])
+
+
+def require(config: Any, rule: str, holds: Callable[[Any], bool], *names: str) -> None:
+    """Refuse a configuration in which one of the named fields breaks a rule.
+
+    Raises:
+        ValueError: naming the field, the rule and the value.
+    """
+    for name in names:
+        value = getattr(config, name)
+        if not holds(value):
+            raise ValueError(f"{name} must be {rule}, got {value}")
+
+
+def path_of(thing: type) -> str:
+    """``module:Name`` or ``file.py:Name`` of a class, by which ``named`` finds it."""
+    return f"{thing.__module__.removeprefix(_OWN)}:{thing.__qualname__}"
+
+
+def named(path: str) -> Any:
+    """What ``module:Name`` or ``file.py:Name`` names.
+
+    Raises:
+        ValueError: there is no such module or file, or no such name in it.
+    """
+    place, _, name = path.rpartition(":")
+    try:
+        if place.endswith(".py"):
+            spec = importlib.util.spec_from_file_location(f"{_OWN}{place}", place)
+            assert spec is not None and spec.loader is not None  # it is a Python file
+            module = sys.modules.get(spec.name)
+            if module is None:
+                module = importlib.util.module_from_spec(spec)
+                sys.modules[spec.name] = module  # dataclasses look up the module there
+                spec.loader.exec_module(module)
+        else:
+            module = importlib.import_module(place)
+        return getattr(module, name)
+    except (ImportError, AttributeError, OSError) as error:
+        raise ValueError(
+            f"{path} must be MODULE:NAME or FILE.py:NAME that is there: {error}"
+        ) from error
+
 
 TRACED = (
     "learning_rate", "final_learning_rate", "clip_range", "value_coefficient",
@@ -239,3 +322,37 @@ class RunConfig(abc.ABC):
         sweep = tuple((name, tuple(values)) for name, values in meta.get("sweep", ()))
         own = {name: meta[name] for name in ("seed", "num_seeds")}
         return own | {"sweep": sweep}
+
+
+@dataclasses.dataclass(frozen=True)
+class SelectionConfig:
+    """Sizes and reward of an episode."""
+
+    num_candidates: int = setting(50, "postures offered per episode")
+    num_selected: int = setting(4, "postures chosen; num_inputs + 1 identify the model")
+    num_inputs: int = setting(3, "commanded axes")
+    num_outputs: int = setting(3, "measured axes; they multiply the log-determinant")
+    reward_scale: float = setting(
+        0.1, "reward per unit of log det S (the paper's 1/10)"
+    )
+    reward_gain: bool = setting(
+        False, "pay the increase of log det S; on where num_selected > num_inputs + 1"
+    )
+
+    def __post_init__(self) -> None:
+        require(self, "at least 1", lambda v: v >= 1, "num_inputs", "num_outputs")
+        least, end = self.num_regressors, self.num_candidates
+        require(
+            self, f"in [{least}, {end})", lambda v: least <= v < end, "num_selected"
+        )
+        require(self, "positive", lambda v: v > 0, "reward_scale")
+
+    @property
+    def num_regressors(self) -> int:
+        """p = n + 1, the fewest postures that identify the model."""
+        return self.num_inputs + 1
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the paper's observation: 210 for 50 candidates, 3 inputs."""
+        return (self.num_inputs + 1) * self.num_candidates + 2 * self.num_inputs + 4

@@ -14,7 +14,7 @@ from __future__ import annotations
 from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.training.config import TrainConfig
+from jaxcal.learning.training.presets import TrainConfig
 
 __all__ = ["OBSERVATION", "PAPER"]
 
@@ -45,7 +45,7 @@ PAPER = TrainConfig(
 OBSERVATION = TrainConfig(
     preset="observation",
     about="the paper's 210 numbers, a network of products, PPO alone from nothing",
-    network=NetworkConfig(kind="observation", decoder_rounds=2),
+    network=NetworkConfig(kind="observation", decoder_rounds=2, mirrored=True),
     ppo=EpisodesConfig(
         num_episodes=10_000_000,
         episodes_per_update=1024,

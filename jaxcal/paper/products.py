@@ -9,9 +9,13 @@ says what each part brings.
 
 from __future__ import annotations
 
+import itertools
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcal.learning.core.network import mask_logits
 from jaxcal.learning.policies.networks import NetworkConfig
@@ -46,12 +50,42 @@ class ProductNetwork(Observing):
         x = (features.poses - 0.5) * _SCALE
         return jnp.concatenate([x, jnp.ones_like(x[..., :1])], -1)
 
-    @nn.compact
     def decode(
         self, memory: jax.Array, decision: Decision
     ) -> tuple[jax.Array, jax.Array]:
-        """Score the next choice: (..., M) masked logits and (...,) value."""
+        """Score the next choice: (..., M) masked logits and (...,) value.
+
+        ``mirrored``: the network chooses from each of the 2^n mirror images of the set,
+        from the beginning; what most of them chose alike has the largest logits. Where
+        no image chose what is chosen already, the mean probability decides.
+        """
         x, available = memory, decision.available
+        value = jnp.zeros(available.shape[:-1])
+        if not self.config.mirrored:
+            return self._logits(x, available), value
+        p = x.shape[-1]
+        signs = np.array([(*s, 1) for s in itertools.product((1, -1), repeat=p - 1)])
+        signs = signs.reshape(-1, *(1,) * (x.ndim - 1), p)
+        images = x[None] * signs.astype(x.dtype)
+        now = jnp.broadcast_to(available, (len(signs), *available.shape))
+        mean = nn.softmax(self._logits(images, now)).mean(0)
+        own, weights = self.clone(parent=None), self.variables
+
+        def choose(free: jax.Array, _: None) -> tuple[jax.Array, None]:
+            logits: Any = own.apply(weights, images, free, method="_logits")
+            return free & (jax.nn.one_hot(logits.argmax(-1), free.shape[-1]) == 0), None
+
+        free, _ = jax.lax.scan(choose, jnp.ones_like(now), length=p)
+        alike = (free[:, None] == free[None]).all(-1).sum(1)  # (2^n, ...) images
+        fits = (available[None] | ~free).all(-1)  # chose what is chosen already
+        votes = jnp.where(fits, (alike / len(signs)) ** 4, 0.0)[..., None] * ~free
+        return mask_logits(
+            jnp.log(votes.sum(0) + 1e-6 * mean + 1e-30), available
+        ), value
+
+    @nn.compact
+    def _logits(self, x: jax.Array, available: jax.Array) -> jax.Array:
+        """(..., M) masked logits."""
         width, rounds, p = self.config.width, self.config.decoder_rounds, x.shape[-1]
         free = available.astype(x.dtype)
         number = free.sum(-1, keepdims=True)
@@ -84,7 +118,7 @@ class ProductNetwork(Observing):
         even = nn.initializers.constant(0.2 / size)
         linear = now @ self.param("linear", even, (p, size))
         logits = logits[..., 0] + (below * linear).sum(-1)
-        return mask_logits(logits, available), jnp.zeros(available.shape[:-1])
+        return mask_logits(logits, available)
 
     def _chosen(
         self, x: jax.Array, available: jax.Array, step: jax.Array

@@ -25,9 +25,11 @@ states, and judge its claims one by one. Writes into --out:
   figures/*.png, *.svg  each figure
   data/*.csv            what each figure is drawn from
 
-The policy is the one that ships (checkpoints/default). Training curves are read from
---studies, where python -m studies.paper.training_runs puts them; without them the
-report says so. The same seed gives the same numbers on the same machine.
+The policy is the agent that PPO trained on the paper's 210 numbers
+(checkpoints/paper.npz); beside it, named so, the default that ships, trained by
+imitation. Every exhibit says which it shows. Training curves are read from --studies,
+where python -m studies.paper.training_runs puts them; without them the report says so.
+The same seed gives the same numbers on the same machine.
 """
 _EPILOG = """\
 examples:
@@ -43,12 +45,12 @@ examples:
 """
 _PARTS = (  # modules of exhibits, in the order in which they are computed
     *("training", "calibration", "selection", "variance", "tables"),
-    *("accuracy", "ellipsoids", "recalibration"),
+    *("accuracy", "recalibration"),
 )
 _ORDER = (  # of the exhibits, that of the paper
     *("robot", "table_1", "figure_1", "table_2", "table_3", "rank", "reward_range"),
     *("figure_2_paper", "figure_2", "figure_3", "gap_to_optimum", "figure_4"),
-    *("figure_5", "ellipsoids", "figure_6", "figure_7", "figure_8", "figure_9"),
+    *("figure_5", "figure_6", "figure_7", "figure_8", "figure_9"),
     *("four_or_fifty", "number_of_postures", "figure_10", "figure_10_recorded"),
     "euler_orders",
 )

@@ -3,7 +3,8 @@
 A run folder is large and not in version control. What a report needs of it is small and
 goes to a folder of its own: ``metrics.csv`` (the trainer's columns, at most
 ``MAX_ROWS`` rows), ``last_rewards.npy`` (rewards of the last 1,000 episodes) and
-``summary.json`` (configuration, episodes, wall time, and how good the policy is).
+``summary.json`` (preset, configuration, versions, episodes, wall time, and how good the
+policy is).
 """
 
 from __future__ import annotations
@@ -102,13 +103,13 @@ def _summary(run: pathlib.Path) -> dict[str, Any]:
     row = measured.summary(measured.results[0])
     progress = policy.meta["progress"]
     return {
-        "seed": policy.meta["seed"],
+        **{name: policy.meta[name] for name in ("preset", "seed", "versions")},
+        "configuration": {name: policy.meta[name] for name in ("ppo", "network")},
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(policy.params)),
         "episodes": progress["episodes"],
         "planned_episodes": policy.meta["ppo"]["num_episodes"],
         "seconds": float(progress["seconds"]),
         "device": progress["device"],
-        "versions": policy.meta["versions"],
         "dataset2": {
             "episodes": data.num_episodes,
             "ratio_to_exact": row["ratio_to_exact"],

@@ -5,16 +5,14 @@ import pathlib
 import jax
 import numpy as np
 import pytest
-from tasks.backlash import backlash, backlash_bins, dead_zone, dead_zone_bins
+from tasks.backlash import Bins, backlash, backlash_bins, dead_zone, dead_zone_bins
 from tasks.transmission import transmission_error
 
 from jaxcal.adaptive.episodes import compare, play
-from jaxcal.adaptive.estimates import estimates
 from jaxcal.adaptive.grid import GridBelief
-from jaxcal.adaptive.loop import next_measurement, run
+from jaxcal.adaptive.loop import estimates, next_measurement, run
 from jaxcal.adaptive.rules import Gain, Random
 from jaxcal.adaptive.tasks import registry
-from jaxcal.adaptive.tasks.readings import Bins
 
 TASKS = pathlib.Path(__file__).parents[2] / "examples" / "tasks"
 SMALL = {"cells": 10, "offset_cells": 4, "bin_width": 0.1, "outliers": 0.0}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxcal.adaptive import ParticleTask, next_measurement, run
-from jaxcal.adaptive.estimates import estimates
+from jaxcal.adaptive.loop import estimates
 from jaxcal.models import FromJax, Linear, Noise, Polynomial, Prior
 
 AT = np.linspace(-1.0, 1.0, 5)[:, None]

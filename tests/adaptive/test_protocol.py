@@ -1,12 +1,9 @@
 """JSON lines between a session and another program, killed and started again."""
 
 import json
-import os
 import signal
-import socket
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -139,25 +136,3 @@ def test_a_killed_program_goes_on_from_its_journal(file, task, tmp_path):
                 assert ask(program, sent) == {"number": number + 1}
             program.send_signal(signal.SIGKILL)
     assert seen == whole
-
-
-@pytest.mark.slow
-def test_a_local_socket_answers_one_program_after_the_other(file, tmp_path):
-    path = tmp_path / "loop.socket"
-    with start(file, "--socket", path) as program:
-        end = time.monotonic() + 120.0
-        while not path.exists() and time.monotonic() < end:
-            time.sleep(0.05)
-        with socket.socket(socket.AF_UNIX) as gone:  # before its answers are there
-            gone.connect(os.fspath(path))
-            gone.sendall(b'{"do": "state"}\n' * 3)
-        for number in range(2):
-            with socket.socket(socket.AF_UNIX) as mine:
-                mine.connect(os.fspath(path))
-                with mine.makefile("rw", encoding="utf-8") as stream:
-                    stream.write('{"do": "observed", "outcome": 1, "design": 3}\n')
-                    stream.flush()
-                    assert json.loads(stream.readline()) == {"number": number + 1}
-        program.send_signal(signal.SIGINT)
-        assert program.wait(60) == 130
-    assert not path.exists()

@@ -198,7 +198,7 @@ def test_commands_run_a_task_of_particles(tmp_path, capsys):
 def test_brax_plays_a_task_of_particles():
     pytest.importorskip("brax")
     from jaxcal.adaptive.brax_env import SequentialEnv
-    from jaxcal.learning.environments.brax_env import wrap_fresh
+    from jaxcal.learning.brax import wrap_fresh
 
     task = counts()
     with jax.numpy_rank_promotion("allow"):

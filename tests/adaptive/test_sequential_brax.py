@@ -9,7 +9,7 @@ from jaxcal.adaptive.tasks.knee import STATE_RULE, knee
 
 pytest.importorskip("brax")
 from jaxcal.adaptive.brax_env import SequentialEnv
-from jaxcal.learning.environments.brax_env import wrap_fresh
+from jaxcal.learning.brax import wrap_fresh
 
 SMALL = {"cells": 4, "sigma": 0.05, "seconds": (5.0, 9.0)}
 

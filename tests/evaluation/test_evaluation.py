@@ -28,7 +28,7 @@ from jaxcal.evaluation.report import (
     text_table,
     write_report,
 )
-from jaxcal.evaluation.training_figure import training_curves, training_diagnostics
+from jaxcal.evaluation.training_figure import training_curves
 from jaxcal.information.regression import regression_matrix
 from jaxcal.models import Affine
 from jaxcal.paper.datasets.datasets import make_dataset
@@ -510,23 +510,6 @@ def test_labels_of_a_long_run_are_not_cut_off(tmp_path: pathlib.Path) -> None:
     figure = training_curves({"run": tmp_path})
     figure.suptitle("Training of the paper's network", fontsize=10)
     assert texts_outside(figure) == []
-
-
-def test_diagnostics_are_the_columns_that_the_trainer_wrote(
-    tmp_path: pathlib.Path,
-) -> None:
-    """Also where updates that imitate left some of them empty."""
-    metrics(tmp_path)
-    assert training_diagnostics({"run": tmp_path}) is None
-    names = ("explained_variance", "clip_fraction", "kl_after", "grad_norm")
-    values = np.random.default_rng(0).random((20, 4))
-    lines = ["episodes,reward_mean," + ",".join(names), "64,0.1,,,,"]
-    lines += [f"{64 * i},0.1," + ",".join(map(str, v)) for i, v in enumerate(values, 2)]
-    (tmp_path / "metrics.csv").write_text("\n".join(lines) + "\n")
-    figure = training_diagnostics({"run": tmp_path})
-    assert figure is not None and texts_outside(figure) == []
-    for axes, column in zip(figure.axes, values.T, strict=True):
-        np.testing.assert_allclose(axes.lines[0].get_ydata()[1:], column)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from jaxcal.learning.environments import selection as environment
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.training import checkpoint, presets
 
-brax_env = pytest.importorskip("jaxcal.learning.environments.brax_env")
+brax_env = pytest.importorskip("jaxcal.learning.brax")
 
 
 def test_the_adapter_plays_the_same_episode():

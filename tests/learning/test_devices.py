@@ -79,7 +79,7 @@ params = learner.init(jax.random.key(0))
 
 def play(params, data, mesh):
     keys = jax.random.split(jax.random.wrap_key_data(data), config.rows_per_update)
-    return learner.gather(params, ppo.placed(learner.begin(keys), mesh, "sets"))[0]
+    return learner.rollout(params, ppo.placed(learner.begin(keys), mesh, "sets"))[0]
 
 data = jax.random.key_data(jax.random.key(1))
 with jax.disable_jit():
@@ -240,7 +240,8 @@ def test_devices_exchange_gradients_and_no_experience() -> None:
                 for shape in re.findall(r"\\[([0-9,]*)\\]", line)
             ]
             out[f"numbers on {number}"] = sum(sizes)
-        rows = jax.eval_shape(lambda s: learner.gather(s.params, s.playing)[0], state)
+        play = lambda s: learner.rollout(s.params, s.rollout_state)[0]
+        rows = jax.eval_shape(play, state)
         out["experience"] = sum(leaf.size for leaf in jax.tree.leaves(rows))
         out["params"] = sum(leaf.size for leaf in jax.tree.leaves(begun.params))
         """,

@@ -222,23 +222,6 @@ def test_an_incomplete_job_is_refused_in_one_line(
     assert done.stderr.startswith(f"{command}: ") and says in done.stderr
 
 
-def test_a_slurm_task_takes_its_own_gpus() -> None:
-    # One task for each GPU: JAX's rule. One for a machine, or one GPU shown: all seen.
-    base = {"SLURM_PROCID": "1", "SLURM_LOCALID": "1"}
-    eight = base | {"CUDA_VISIBLE_DEVICES": "0,1,2,3,4,5,6,7"}
-    assert processes.local_device_ids({}) is None
-    assert processes.local_device_ids(base) is None
-    many = eight | {"SLURM_STEP_TASKS_PER_NODE": "8(x2)"}
-    assert processes.local_device_ids(many) is None
-    one = eight | {"SLURM_STEP_TASKS_PER_NODE": "1(x2)"}
-    assert processes.local_device_ids(one) == list(range(8))
-    shown = base | {
-        "CUDA_VISIBLE_DEVICES": "3",
-        "SLURM_STEP_TASKS_PER_NODE": "8(x2)",
-    }
-    assert processes.local_device_ids(shown) == [0]
-
-
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
     """The loss curve of one process: eight updates."""
@@ -321,7 +304,7 @@ from jaxcal.learning.training import postures as training
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.training.config import TrainConfig
+from jaxcal.learning.training.presets import TrainConfig
 
 CONFIG = TrainConfig(
     network=NetworkConfig(width=8, encoder_rounds=1, close_up=True),

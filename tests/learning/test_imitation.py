@@ -20,7 +20,7 @@ from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training import imitation
 from jaxcal.learning.training import postures as training
-from jaxcal.learning.training.config import TrainConfig
+from jaxcal.learning.training.presets import TrainConfig
 from jaxcal.learning.training.run import updates
 
 PPO = EpisodesConfig(
@@ -121,7 +121,7 @@ def test_lessons_share_no_key_with_the_weights_and_the_updates():
 def measured(params, lesson):
     learner = imitation.Imitation(LEARNER)
     keys = jax.random.split(jax.random.key(0), len(lesson.best))
-    attempt, _, _ = learner.gather(params, learner.begin(keys, lesson), lesson)
+    attempt, _, _ = learner.rollout(params, learner.begin(keys, lesson), lesson)
     return learner.loss(params, attempt, jnp.int32(0))
 
 

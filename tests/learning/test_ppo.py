@@ -25,7 +25,7 @@ from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.training.config import TrainConfig
+from jaxcal.learning.training.presets import TrainConfig
 from jaxcal.learning.training.run import Recipe, run, updates
 from jaxcal.selection import exact_batch
 
@@ -42,9 +42,9 @@ TINY = EpisodesConfig(
 def episodes(config, rewards, values):
     """Advantages of complete episodes (T, ...): the value after the last is 0."""
     rewards, values = jnp.asarray(rewards), jnp.asarray(values)
-    following = jnp.concatenate([values[1:], jnp.zeros_like(values[:1])])
-    goes_on = jnp.ones_like(values).at[-1].set(0.0)
-    return ppo.advantages(config, rewards, values, following, goes_on)
+    next_value = jnp.concatenate([values[1:], jnp.zeros_like(values[:1])])
+    continues = jnp.ones_like(values).at[-1].set(0.0)
+    return ppo.advantages(config, rewards, values, next_value, continues)
 
 
 def test_advantages_are_those_of_the_definition(rng):
@@ -68,13 +68,13 @@ def test_an_advantage_ends_with_its_session_and_counts_what_follows_by_its_chanc
     """A session of two choices, then one of another: by hand, lambda 0.5."""
     config = StreamsConfig(gae_lambda=0.5)
     chance, others = jnp.array([0.25, 0.5, 1.0]), jnp.array([3.0, 8.0, 0.0])
-    goes_on, after = jnp.array([1.0, 0.0, 1.0]), jnp.array([20.0, 30.0, 40.0])
+    continues, after = jnp.array([1.0, 0.0, 1.0]), jnp.array([20.0, 30.0, 40.0])
     found = ppo.advantages(
         config,
         jnp.array([1.0, 2.0, 4.0]),
         jnp.array([10.0, 20.0, 30.0]),
-        chance * goes_on * after + others,
-        goes_on,
+        chance * continues * after + others,
+        continues,
     )
     last = 4.0 + 40.0 - 30.0  # cut: closed by the last value
     second = 2.0 + 8.0 - 20.0  # this outcome ended the session, another would not
@@ -93,7 +93,7 @@ def test_the_loss_is_that_of_the_definition(rng):
     before, advantage = -np.abs(rng.normal(size=shape)) - 1.0, rng.normal(size=shape)
     assert (abs(value - target) > 3.0).any() and (abs(value - target) < 3.0).any()
     batch = ppo.Batch(
-        seen=None,
+        observations=None,
         action=jnp.asarray(action),
         log_prob=jnp.asarray(before),
         advantage=jnp.asarray(advantage),
@@ -216,7 +216,7 @@ def test_the_first_minibatch_sees_the_probabilities_that_played(kind, n, k):
     @jax.jit
     def play(params):
         keys = jax.random.split(jax.random.key(1), config.rows_per_update)
-        return learner.gather(params, learner.begin(keys))[0]
+        return learner.rollout(params, learner.begin(keys))[0]
 
     played = play(params)
     _, metrics = jax.jit(learner.loss)(params, played, jnp.int32(0))

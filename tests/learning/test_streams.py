@@ -48,7 +48,7 @@ class Late:
             [state.made / self.horizon, jnp.ones(()), jax.random.uniform(key)]
         )
 
-    def step(self, task, state, seen, action, key):
+    def step(self, task, state, observation, action, key):
         pays = (state.made >= self.pays_from) * action * task
         after = Walk(
             state.made + 1.0, state.sum + action, jax.random.split(state.key)[0]
@@ -80,21 +80,21 @@ def streams(config=SHORT, **environment):
 
 
 PLAYED = streams(dataclasses.replace(SHORT, gae_lambda=0.0, decisions_per_update=32))
-play = jax.jit(PLAYED.gather)  # op by op it would be hundreds of programs
+play = jax.jit(PLAYED.rollout)  # op by op it would be hundreds of programs
 
 
 @pytest.mark.slow
 def test_two_updates_of_a_length_play_what_one_of_twice_the_length_does():
     short = PLAYED
-    long = short.having(
+    long = short.with_config(
         dataclasses.replace(short.config, stream_length=16, decisions_per_update=64)
     )
     params = short.init(jax.random.key(0), 1.0)
     begun = short.begin(jax.random.split(jax.random.key(1), 4), 1.0)
     first, middle, _ = play(params, begun, 1.0)
     second, end, _ = play(params, middle, 1.0)
-    whole, last, _ = jax.jit(long.gather)(params, begun, 1.0)
-    for name in ("seen", "action", "log_prob", "target"):
+    whole, last, _ = jax.jit(long.rollout)(params, begun, 1.0)
+    for name in ("observations", "action", "log_prob", "target"):
         parts = [getattr(batch, name) for batch in (first, second)]
         np.testing.assert_allclose(
             np.concatenate(parts, axis=1), getattr(whole, name), atol=1e-6
@@ -106,10 +106,10 @@ def test_two_updates_of_a_length_play_what_one_of_twice_the_length_does():
 def test_metrics_are_means_over_the_sessions_that_ended():
     """By hand from the actions: 13 decisions a session, 8 of them an update."""
     params = PLAYED.init(jax.random.key(0), 1.0)
-    playing = PLAYED.begin(jax.random.split(jax.random.key(1), 4), 1.0)
+    rollout_state = PLAYED.begin(jax.random.split(jax.random.key(1), 4), 1.0)
     actions, found = [], []
     for _ in range(4):
-        batch, playing, metrics = play(params, playing, 1.0)
+        batch, rollout_state, metrics = play(params, rollout_state, 1.0)
         actions.append(np.asarray(batch.action))
         found.append({name: float(value) for name, value in metrics.items()})
     played = np.concatenate(actions, axis=1)
@@ -156,8 +156,8 @@ def test_a_run_resumes_bit_for_bit_in_the_middle_of_sessions(tmp_path):
             resume=last > 1,
             num_updates=last,
         )
-    assert len(whole.playing) == 2
-    assert {float(x) for x in whole.playing[0].choices} == {16.0 - 13.0}
+    assert len(whole.rollout_state) == 2
+    assert {float(x) for x in whole.rollout_state[0].choices} == {16.0 - 13.0}
     state, _ = checkpoint.restore(tmp_path / "parts", whole, "probe")
     for other in (parts, state):
         for a, b in zip(leaves(whole), leaves(other), strict=True):
@@ -187,8 +187,8 @@ def test_one_bad_batch_is_skipped_and_the_run_goes_on(tmp_path):
     class Once(Late):
         """Pays nan in the sessions of one update."""
 
-        def step(self, task, state, seen, action, key):
-            step = super().step(task, state, seen, action, key)
+        def step(self, task, state, observation, action, key):
+            step = super().step(task, state, observation, action, key)
             bad = jax.random.uniform(key) < task
             return step.replace(reward=jnp.where(bad, jnp.nan, step.reward))
 

@@ -32,8 +32,8 @@ from jaxcal.learning.runtime import weights
 from jaxcal.learning.training import checkpoint, presets, room, run
 from jaxcal.learning.training import postures as training
 from jaxcal.learning.training.checkpoint import CheckpointError
-from jaxcal.learning.training.config import TrainConfig
 from jaxcal.learning.training.postures import Validation
+from jaxcal.learning.training.presets import TrainConfig
 from jaxcal.learning.training.run import updates
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -249,7 +249,7 @@ def test_a_save_writes_nothing_twice(finished):
     assert {path.name for path in step.iterdir() if path.is_dir()} == {
         *("policy", "state", "meta")
     }
-    rows = dataclasses.replace(state, playing=())  # and a key for each row
+    rows = dataclasses.replace(state, rollout_state=())  # and a key for each row
     held = sum(leaf.nbytes for leaf in jax.tree.leaves(rows))
     weights = sum(leaf.nbytes for leaf in jax.tree.leaves(state.average))
     assert held < 4 * weights + 100

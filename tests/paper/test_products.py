@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
+import itertools
 import pathlib
 
 import jax
@@ -15,12 +17,15 @@ from jaxcal.learning.core.network import decode, encode, initial
 from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments import selection
 from jaxcal.learning.environments.task import Task
+from jaxcal.learning.policies import scorer
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.training import checkpoint
 from jaxcal.paper.preset import OBSERVATION
 
 TASK = Task()
-NETWORK = build(OBSERVATION.network)
+PLAIN = dataclasses.replace(OBSERVATION.network, mirrored=False)
+NETWORK = build(PLAIN)  # as it is trained
 
 SHIPPED = pathlib.Path(__file__).parents[2] / "checkpoints" / "paper.npz"
 
@@ -78,6 +83,29 @@ def test_the_order_of_the_candidates_does_not_matter(params, chosen) -> None:
     )
 
 
+def test_the_shipped_agent_chooses_what_most_mirror_images_choose():
+    """Against the plain network on one image after the other, counted in numpy."""
+    policy = checkpoint.load(SHIPPED)
+    assert policy.network.config.mirrored
+    plain = build(PLAIN)
+    rng = np.random.default_rng(3)
+    sets, everything = rng.random((6, 50, 3)), np.ones((6, 50), bool)
+    found = []
+    for signs in itertools.product((1.0, -1.0), repeat=3):
+        image = 0.5 + np.array(signs) * (sets - 0.5)
+        picks = scorer.choose(plain, policy.params, image, everything, k=4)
+        found.append(np.sort(picks, axis=1))
+    chosen = np.sort(
+        scorer.choose(policy.network, policy.params, sets, everything, k=4), axis=1
+    )
+    for row, own in enumerate(chosen):
+        count = collections.Counter(tuple(picks[row]) for picks in found)
+        assert count[tuple(own)] == max(count.values())
+    mirror = sets * [1.0, -1.0, 1.0] + [0.0, 1.0, 0.0]
+    again = scorer.choose(policy.network, policy.params, mirror, everything, k=4)
+    np.testing.assert_array_equal(np.sort(again, axis=1), chosen)
+
+
 def test_another_number_of_inputs_and_candidates_runs() -> None:
     network = build(NetworkConfig(kind="observation", decoder_rounds=1, width=8))
     weights = initial(network, jax.random.key(0), 12, 2, 3)
@@ -91,9 +119,9 @@ def test_episodes_of_a_row_part_in_one_state_and_go_on_greedily(given) -> None:
     learner = Postures(ppo, Task(num_given=given), build(small))
     weights = learner.init(jax.random.key(0))
     keys = jax.random.split(jax.random.key(1), ppo.rows_per_update)
-    rows, _, metrics = jax.jit(learner.gather)(weights, learner.begin(keys))
+    rows, _, metrics = jax.jit(learner.rollout)(weights, learner.begin(keys))
     assert rows.action.shape == (8, 1, 16)
-    free = np.asarray(rows.seen.decisions.available)
+    free = np.asarray(rows.observations.decisions.available)
     assert free.shape == (8, 1, 50)
     assert (free.sum(-1) == 50 - given).all()
     actions = np.asarray(rows.action[:, 0])

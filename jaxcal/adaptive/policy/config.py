@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from jaxcal.adaptive import rules
-from jaxcal.adaptive.policy.network import Correction
-from jaxcal.adaptive.policy.sessions import Sessions
-from jaxcal.adaptive.rules import Rule
-from jaxcal.learning.config import RunConfig, StreamsConfig
-from jaxcal.learning.core.streams import Streams
-from jaxcal.learning.settings import require, setting
+from jaxcal.learning.config import RunConfig, StreamsConfig, require, setting
+
+if TYPE_CHECKING:
+    from jaxcal.adaptive.rules import Rule
+    from jaxcal.learning.core.streams import Streams
 
 __all__ = ["PPO", "PolicyConfig"]
-
-_RULES: tuple[type[Rule], ...] = (rules.Priced, rules.Shares, rules.StateRule)
 
 PPO = StreamsConfig(
     num_epochs=4,
@@ -47,8 +43,8 @@ class PolicyConfig(RunConfig):
     def __post_init__(self) -> None:
         require(self, "at least 1", lambda v: v >= 1, "per_group", "width")
         super().__post_init__()
-        if not isinstance(self.base, _RULES):
-            known = ", ".join(rule.__name__ for rule in _RULES)
+        known = ", ".join(_rules())
+        if not isinstance(self.base, tuple(_rules().values())):
             raise ValueError(
                 f"base must be one of {known}, got {type(self.base).__name__}"
             )
@@ -56,6 +52,10 @@ class PolicyConfig(RunConfig):
     @property
     def learners(self) -> tuple[Streams, ...]:
         """One learner: other options are other arrays of the same program."""
+        from jaxcal.adaptive.policy.network import Correction
+        from jaxcal.adaptive.policy.sessions import Sessions
+        from jaxcal.learning.core.streams import Streams
+
         return (Streams(self.ppo, Sessions(self.per_group), Correction(self.width)),)
 
     def as_meta(self) -> dict[str, Any]:
@@ -75,8 +75,7 @@ class PolicyConfig(RunConfig):
     def from_meta(meta: Mapping[str, Any]) -> PolicyConfig:
         """The configuration that a checkpoint was trained with."""
         constants = dict(meta["base"])
-        kinds = {rule.__name__: rule for rule in _RULES}
-        base = kinds[constants.pop("rule")](**constants)
+        base = _rules()[constants.pop("rule")](**constants)
         return PolicyConfig(
             task=meta["task"],
             base=base,
@@ -88,3 +87,9 @@ class PolicyConfig(RunConfig):
             **RunConfig.held_in(meta),
             **meta["network"],
         )
+
+
+def _rules() -> dict[str, type[Rule]]:
+    from jaxcal.adaptive.rules import Priced, Shares, StateRule
+
+    return {rule.__name__: rule for rule in (Priced, Shares, StateRule)}

@@ -48,18 +48,20 @@ class Sessions:
 
     def observe(self, task: Exercise, state: State, key: jax.Array) -> Shortlist:
         """The shortlist."""
-        key_options, key_seen = jax.random.split(key)
+        key_options, key_observe = jax.random.split(key)
         belief, session = state.belief, state.session
         options = task.task.options(belief, session, key_options)
         return shortlist_of(
-            *(task.task, belief, session, options, key_seen), task.base, self.per_group
+            *(task.task, belief, session, options, key_observe),
+            task.base,
+            self.per_group,
         )
 
     def step(
         self,
         task: Exercise,
         state: State,
-        seen: Shortlist,
+        observation: Shortlist,
         action: jax.Array,
         key: jax.Array,
     ) -> Step:
@@ -70,7 +72,7 @@ class Sessions:
         """
         made, belief = task.task, state.belief
         key_outcome, key_update, key_gain = jax.random.split(key, 3)
-        design = jax.tree.map(lambda leaf: leaf[action], seen.designs)
+        design = jax.tree.map(lambda leaf: leaf[action], observation.designs)
         outcome = made.measure(state.truth, design, key_outcome)
         outcomes, chance = outcome[None], jnp.ones(1)
         happened = jnp.int32(0)

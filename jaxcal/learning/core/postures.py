@@ -122,7 +122,7 @@ class Postures:
         m, n = jax.eval_shape(self.task.reset, key).candidates.shape
         return initial(self.network, key, m, n, self.task.num_decisions)
 
-    def having(self, config: EpisodesConfig) -> Postures:
+    def with_config(self, config: EpisodesConfig) -> Postures:
         """This learner with another configuration."""
         return dataclasses.replace(self, config=config)
 
@@ -130,8 +130,8 @@ class Postures:
         """(B, 2) uint32, data of the keys of the rows, of which (B,) are the first."""
         return jax.random.key_data(keys)
 
-    def gather(
-        self, params: Any, playing: jax.Array
+    def rollout(
+        self, params: Any, rollout_state: jax.Array
     ) -> tuple[Batch, jax.Array, Metrics]:
         """Play ``episodes_per_set`` episodes on a fresh set in each row.
 
@@ -140,7 +140,9 @@ class Postures:
             metrics: scalars, and ``rewards`` (B G,).
         """
         split = jax.vmap(lambda key: jax.random.split(key, 3))
-        keys = split(jax.random.wrap_key_data(playing))  # set, actions, next update
+        keys = split(
+            jax.random.wrap_key_data(rollout_state)
+        )  # set, actions, next update
         m = jax.eval_shape(self.task.reset, keys[0, 0]).available.shape[0]
         held = _at_once(self.config.episodes_per_set, m)  # episodes of a row at a time
         rows = _at_once(len(keys), m, held)
@@ -162,20 +164,24 @@ class Postures:
         )
 
     def loss(
-        self, params: Any, experience: Batch, done: jax.Array
+        self, params: Any, experience: Batch, update_index: jax.Array
     ) -> tuple[jax.Array, Metrics]:
         """PPO loss of whole episodes."""
         score = jax.vmap(functools.partial(self._score, params))
-        return surrogate(self.config, *score(experience.seen), experience, done)
+        return surrogate(
+            self.config, *score(experience.observations), experience, update_index
+        )
 
-    def _score(self, params: Any, seen: RowInputs) -> tuple[jax.Array, jax.Array]:
+    def _score(
+        self, params: Any, observations: RowInputs
+    ) -> tuple[jax.Array, jax.Array]:
         """(T, G, M) logits and (T, G) values in reward units of a row's decisions.
 
         The set is encoded once, and so is the first decision.
         """
-        memory = encode(self.network, params, seen.features)
+        memory = encode(self.network, params, observations.features)
         decide = functools.partial(decode, self.network, params, memory)
-        scored = jax.vmap(decide)(seen.decisions)
+        scored = jax.vmap(decide)(observations.decisions)
         episodes = self.config.episodes_per_set
 
         def of_each(x: jax.Array) -> jax.Array:
@@ -257,13 +263,13 @@ class Postures:
         if len(noise) > 1:
             # One program for all; the last choices, by the look-ahead, teach nothing.
             now = jnp.arange(given + 1, task.num_decisions), noise[1:]
-            state, (seen, record) = jax.lax.scan(decide, state, now)
-            seen = jax.tree.map(lambda leaf: leaf[: max(learned - 1, 0)], seen)
-            decisions = jax.tree.map(_followed, decisions, seen)
+            state, (others, record) = jax.lax.scan(decide, state, now)
+            others = jax.tree.map(lambda leaf: leaf[: max(learned - 1, 0)], others)
+            decisions = jax.tree.map(_followed, decisions, others)
             played = jax.tree.map(lambda *x: jnp.concatenate(x), played, record)
         advantage, target = self._advantages_and_targets(played)
         batch = Batch(
-            seen=RowInputs(features, decisions),
+            observations=RowInputs(features, decisions),
             action=played["action"][:learned],
             log_prob=played["log_prob"][:learned],
             advantage=advantage[:learned],
@@ -279,9 +285,11 @@ class Postures:
         """
         # The baseline is the predicted total minus what was received before.
         rest = played["value"] - played["paid"]
-        following = jnp.concatenate([rest[1:], jnp.zeros_like(rest[:1])])
-        goes_on = jnp.ones_like(rest).at[-1].set(0.0)
-        advantage = advantages(self.config, played["reward"], rest, following, goes_on)
+        next_value = jnp.concatenate([rest[1:], jnp.zeros_like(rest[:1])])
+        continues = jnp.ones_like(rest).at[-1].set(0.0)
+        advantage = advantages(
+            self.config, played["reward"], rest, next_value, continues
+        )
         target = advantage + played["value"]
         others = self.config.episodes_per_set - 1
         if others:

@@ -62,7 +62,7 @@ class Learner(Protocol):
     def __hash__(self) -> int:
         """Hashable, as a static argument of ``jit``."""
 
-    def having(self, config: Any) -> Learner:
+    def with_config(self, config: Any) -> Learner:
         """This learner with a configuration of which ``TRACED`` may be arrays."""
 
     def init(self, key: jax.Array, *given: Any) -> Any:
@@ -71,26 +71,26 @@ class Learner(Protocol):
     def begin(self, keys: jax.Array, *given: Any) -> Any:
         """What goes on from update to update, of rows that begin with keys (B,)."""
 
-    def gather(
-        self, params: Any, playing: Any, *given: Any
+    def rollout(
+        self, params: Any, rollout_state: Any, *given: Any
     ) -> tuple[Any, Any, Metrics]:
-        """Play a row of experience for each of ``playing``, leaves (B, ...).
+        """Play a row of experience for each of ``rollout_state``, leaves (B, ...).
 
         Returns:
             Rows, leaves (B, ...); what goes on from there; metrics.
         """
 
     def loss(
-        self, params: Any, experience: Any, done: jax.Array
+        self, params: Any, experience: Any, update_index: jax.Array
     ) -> tuple[jax.Array, Metrics]:
-        """Mean loss and metrics of rows of experience, after ``done`` updates."""
+        """Mean loss and metrics of rows of experience, after so many updates."""
 
 
 @struct.dataclass
 class Batch:
     """Experience that PPO learns from: B rows of T decisions (of several episodes)."""
 
-    seen: Any  # leaves (B, ...): what the learner scores
+    observations: Any  # leaves (B, ...): what the learner scores
     action: jax.Array  # (B, T, ...) int32
     log_prob: jax.Array  # (B, T, ...) of the action when it was taken
     advantage: jax.Array  # (B, T, ...)
@@ -101,8 +101,8 @@ def advantages(
     config: PPOConfig,
     reward: jax.Array,
     value: jax.Array,
-    following: jax.Array,
-    goes_on: jax.Array,
+    next_value: jax.Array,
+    continues: jax.Array,
 ) -> jax.Array:
     """(T, ...) generalised advantage estimates.
 
@@ -113,18 +113,18 @@ def advantages(
         config: discount and lambda.
         reward: (T, ...) of each decision.
         value: (T, ...) before each decision.
-        following: (T, ...) value expected after it, 0 where an episode ends.
-        goes_on: (T, ...) 0 where an episode ends with the decision, else 1.
+        next_value: (T, ...) value expected after it, 0 where an episode ends.
+        continues: (T, ...) 0 where an episode ends with the decision, else 1.
     """
-    deltas = reward + config.discount * following - value
+    deltas = reward + config.discount * next_value - value
 
     def back(later: jax.Array, now: Any) -> tuple[jax.Array, jax.Array]:
-        delta, goes_on = now
-        advantage = delta + config.discount * config.gae_lambda * goes_on * later
+        delta, continues = now
+        advantage = delta + config.discount * config.gae_lambda * continues * later
         return advantage, advantage
 
     start = jnp.zeros_like(deltas[0])
-    return jax.lax.scan(back, start, (deltas, goes_on), reverse=True)[1]
+    return jax.lax.scan(back, start, (deltas, continues), reverse=True)[1]
 
 
 def normalised(config: PPOConfig, batch: Batch) -> Batch:
@@ -148,7 +148,7 @@ def surrogate(
     logits: jax.Array,
     value: jax.Array,
     batch: Batch,
-    done: jax.Array,
+    update_index: jax.Array,
 ) -> tuple[jax.Array, Metrics]:
     """Clipped surrogate, the value's error and an entropy bonus.
 
@@ -158,7 +158,7 @@ def surrogate(
             minimum or -inf.
         value: (B, T, ...) reward units.
         batch: what was played.
-        done: () updates made; the entropy bonus follows it.
+        update_index: () updates made; the entropy bonus follows it.
     """
     log_probs = jax.nn.log_softmax(jnp.maximum(logits, _LEAST))
     taken = jnp.take_along_axis(log_probs, batch.action[..., None], axis=-1)[..., 0]
@@ -176,7 +176,7 @@ def surrogate(
         "kl": (ratio - 1.0 - log_ratio).mean(),
         "clip_fraction": (jnp.abs(ratio - 1.0) > config.clip_range).mean(),
     }
-    share = jnp.minimum(done / config.num_updates, 1.0)
+    share = jnp.minimum(update_index / config.num_updates, 1.0)
     bonus = (1.0 - share) * config.entropy_start + share * config.entropy_end
     loss = metrics["policy_loss"] + config.value_coefficient * metrics["value_loss"]
     return loss - bonus * metrics["entropy"], metrics
@@ -191,7 +191,7 @@ class TrainState:
     opt_state: Any  # of Adam, whose moments (P,) are of all parameters
     key: jax.Array  # (2,) uint32, data of the PRNG key of the next update
     num_updates: jax.Array  # () int32, updates made
-    playing: Any = ()  # leaves (B, ...): what the learner goes on from
+    rollout_state: Any = ()  # leaves (B, ...): what the learner goes on from
     values: Metrics = struct.field(default_factory=dict)  # () of names in ``TRACED``
 
 
@@ -216,14 +216,14 @@ def begin(
         opt_state=optimiser(config).init(ravel_pytree(params)[0]),
         key=jax.random.key_data(key_updates),
         num_updates=jnp.zeros((), jnp.int32),
-        playing=learner.begin(
+        rollout_state=learner.begin(
             jax.random.split(key_rows, config.rows_per_update), *given
         ),
         values={name: jnp.asarray(value, float) for name, value in values.items()},
     )
 
 
-def _having(config: PPOConfig, values: Metrics) -> PPOConfig:
+def _with_values(config: PPOConfig, values: Metrics) -> PPOConfig:
     """The configuration with other values, unchecked: they may be traced."""
     changed = copy.copy(config)
     for name, value in values.items():
@@ -352,12 +352,14 @@ def make_update(
     blocks = 1 if mesh is None else mesh.size
 
     def update(before: TrainState, *given: Any) -> tuple[TrainState, Metrics]:
-        ppo = _having(config, before.values)
-        trained = learner.having(ppo)
+        ppo = _with_values(config, before.values)
+        trained = learner.with_config(ppo)
         key = jax.random.wrap_key_data(before.key)
         key, key_epochs = jax.random.split(key)
-        playing = placed(before.playing, mesh, "sets")
-        rows, playing, played = trained.gather(before.params, playing, *given)
+        rollout_state = placed(before.rollout_state, mesh, "sets")
+        rows, rollout_state, played = trained.rollout(
+            before.params, rollout_state, *given
+        )
         per_block = len(jax.tree.leaves(rows)[0]) // blocks
 
         def cut(leaf: jax.Array) -> jax.Array:  # (blocks, per_block, ...)
@@ -399,13 +401,15 @@ def make_update(
             jax.lax.cond(fine, lambda: state, lambda: before),
             key=jax.random.key_data(key),
             num_updates=before.num_updates + 1,
-            playing=playing,
+            rollout_state=rollout_state,
         )
-        playing = placed(after.playing, mesh, "sets")
+        rollout_state = placed(after.rollout_state, mesh, "sets")
         skipped = jnp.where(fine, 0.0, 1.0)
         metrics = played | losses | {"learning_rate": rate, "skipped": skipped}
-        after, metrics = placed((dataclasses.replace(after, playing=()), metrics), mesh)
-        return dataclasses.replace(after, playing=playing), metrics
+        after, metrics = placed(
+            (dataclasses.replace(after, rollout_state=()), metrics), mesh
+        )
+        return dataclasses.replace(after, rollout_state=rollout_state), metrics
 
     return update
 

@@ -65,9 +65,9 @@ class Environment(Protocol):
         """Inputs of the network: a tree of arrays, which includes the options."""
 
     def step(
-        self, task: Any, state: Any, seen: Any, action: jax.Array, key: jax.Array
+        self, task: Any, state: Any, observation: Any, action: jax.Array, key: jax.Array
     ) -> Step:
-        """Take the option with index ``action``, () int32, of those in ``seen``."""
+        """Take the option with index ``action``, () int32, of those observed."""
 
 
 @struct.dataclass
@@ -88,7 +88,7 @@ class Streams:
     environment: Environment
     network: nn.Module  # of what is observed: masked logits (..., A), values (...)
 
-    def having(self, config: StreamsConfig) -> Streams:
+    def with_config(self, config: StreamsConfig) -> Streams:
         """This learner with another configuration."""
         return dataclasses.replace(self, config=config)
 
@@ -107,29 +107,29 @@ class Streams:
 
         return jax.vmap(one)(keys)
 
-    def gather(
-        self, params: Any, playing: Stream, task: Any
+    def rollout(
+        self, params: Any, rollout_state: Stream, task: Any
     ) -> tuple[Batch, Stream, Metrics]:
         """Play ``stream_length`` further decisions of each stream.
 
         The metrics are means over the sessions that ended in them; NaN where none did.
         """
         play = jax.vmap(self._play, in_axes=(None, 0, None))
-        batch, value, playing, ended = play(params, playing, task)
+        batch, value, rollout_state, ended = play(params, rollout_state, task)
         over, reward, choices = (x.sum() for x in ended)
         metrics = {
             "reward_mean": reward / over,
             "choices": choices / over,
             "explained_variance": explained_variance(batch.target, value),
         }
-        return normalised(self.config, batch), playing, metrics
+        return normalised(self.config, batch), rollout_state, metrics
 
     def loss(
-        self, params: Any, experience: Batch, done: jax.Array
+        self, params: Any, experience: Batch, update_index: jax.Array
     ) -> tuple[jax.Array, Metrics]:
         """PPO loss of some streams."""
-        logits, value = cast(Any, self.network.apply(params, experience.seen))
-        return surrogate(self.config, logits, value, experience, done)
+        logits, value = cast(Any, self.network.apply(params, experience.observations))
+        return surrogate(self.config, logits, value, experience, update_index)
 
     def _play(
         self, params: Any, stream: Stream, task: Any
@@ -139,17 +139,17 @@ class Streams:
         environment = self.environment
 
         def score(state: Any, key: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
-            seen = environment.observe(task, state, key)
-            return seen, *cast(Any, self.network.apply(params, seen))
+            observation = environment.observe(task, state, key)
+            return observation, *cast(Any, self.network.apply(params, observation))
 
         def keys_of(stream: Stream) -> jax.Array:
             return jax.random.split(jax.random.wrap_key_data(stream.key), 5)
 
         def decide(stream: Stream, _: None) -> tuple[Stream, dict[str, Any]]:
-            key_seen, key_action, key_step, key_reset, key = keys_of(stream)
-            seen, logits, value = score(stream.state, key_seen)
+            key_observe, key_action, key_step, key_reset, key = keys_of(stream)
+            observation, logits, value = score(stream.state, key_observe)
             action = jax.random.categorical(key_action, logits).astype(jnp.int32)
-            step = environment.step(task, stream.state, seen, action, key_step)
+            step = environment.step(task, stream.state, observation, action, key_step)
             happened, number = step.happened, len(step.chance)
 
             # The drawn state is valued at the next decision, only the others here.
@@ -157,7 +157,7 @@ class Streams:
             if number > 1:
                 elsewhere = (happened + jnp.arange(1, number)) % number
                 states = jax.tree.map(lambda leaf: leaf[elsewhere], step.states)
-                values = jax.vmap(score, (0, None))(states, key_seen)[2]
+                values = jax.vmap(score, (0, None))(states, key_observe)[2]
                 values = jnp.where(step.ended[elsewhere], 0.0, values)
                 others = step.chance[elsewhere] @ values
             ended = step.ended[happened]
@@ -174,7 +174,7 @@ class Streams:
                 choices=(1.0 - over) * choices,
             )
             return after, {
-                "seen": seen,
+                "observation": observation,
                 "action": action,
                 "log_prob": jax.nn.log_softmax(logits)[action],
                 "value": value,
@@ -187,12 +187,12 @@ class Streams:
         stream, row = jax.lax.scan(decide, stream, length=self.config.stream_length)
         # A stream is cut where it may: the value of where it goes on follows.
         last = score(stream.state, keys_of(stream)[0])[2]
-        value, goes_on = row["value"], 1.0 - row["ended"][0]
+        value, continues = row["value"], 1.0 - row["ended"][0]
         then = jnp.concatenate([value[1:], last[None]])
-        following = row["chance"] * goes_on * then + row["others"]
-        advantage = advantages(self.config, row["reward"], value, following, goes_on)
+        next_value = row["chance"] * continues * then + row["others"]
+        advantage = advantages(self.config, row["reward"], value, next_value, continues)
         batch = Batch(
-            seen=row["seen"],
+            observations=row["observation"],
             action=row["action"],
             log_prob=row["log_prob"],
             advantage=advantage,

@@ -15,12 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxcal.learning.config import SHAPES
 from jaxcal.learning.environments import randomness
 from jaxcal.learning.environments.selection import CandidateSource, SelectionConfig
 
 __all__ = ["SHAPES", "given", "mixture"]
-
-SHAPES = ("uniform", "gaussian", "sphere", "clustered", "grid", "cluster_uniform")
 
 
 def given(

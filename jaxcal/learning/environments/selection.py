@@ -23,9 +23,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxcal.learning.config import SelectionConfig
 from jaxcal.learning.environments import randomness
 from jaxcal.learning.environments.observation import context_features
-from jaxcal.learning.settings import require, setting
 from jaxcal.learning.small_matrices import log_det_gram, picked
 
 __all__ = [
@@ -41,40 +41,6 @@ __all__ = [
 
 CandidateSource = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
 """key -> (M, n) candidates and (M,) bool available."""
-
-
-@dataclasses.dataclass(frozen=True)
-class SelectionConfig:
-    """Sizes and reward of an episode."""
-
-    num_candidates: int = setting(50, "postures offered per episode")
-    num_selected: int = setting(4, "postures chosen; num_inputs + 1 identify the model")
-    num_inputs: int = setting(3, "commanded axes")
-    num_outputs: int = setting(3, "measured axes; they multiply the log-determinant")
-    reward_scale: float = setting(
-        0.1, "reward per unit of log det S (the paper's 1/10)"
-    )
-    reward_gain: bool = setting(
-        False, "pay the increase of log det S; on where num_selected > num_inputs + 1"
-    )
-
-    def __post_init__(self) -> None:
-        require(self, "at least 1", lambda v: v >= 1, "num_inputs", "num_outputs")
-        least, end = self.num_regressors, self.num_candidates
-        require(
-            self, f"in [{least}, {end})", lambda v: least <= v < end, "num_selected"
-        )
-        require(self, "positive", lambda v: v > 0, "reward_scale")
-
-    @property
-    def num_regressors(self) -> int:
-        """p = n + 1, the fewest postures that identify the model."""
-        return self.num_inputs + 1
-
-    @property
-    def observation_size(self) -> int:
-        """Length of the paper's observation: 210 for 50 candidates, 3 inputs."""
-        return (self.num_inputs + 1) * self.num_candidates + 2 * self.num_inputs + 4
 
 
 @struct.dataclass

@@ -1,7 +1,7 @@
 """Task of a training: the selection environment and where its candidates come from.
 
 ``Task`` implements ``core.postures.Episode``, which PPO plays. Another environment is
-another class with these methods.
+another class with these methods. JAX is loaded when one is played.
 """
 
 from __future__ import annotations
@@ -9,18 +9,16 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from dataclasses import field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
-from jaxcal.learning.environments import scenarios, selection
-from jaxcal.learning.environments.selection import (
-    CandidateSource,
-    SelectionConfig,
-    SelectionState,
-)
-from jaxcal.learning.settings import named, path_of, require
+from jaxcal.learning.config import SelectionConfig, named, path_of, require
+
+if TYPE_CHECKING:
+    import jax
+
+    from jaxcal.learning.environments.selection import CandidateSource, SelectionState
 
 __all__ = ["GivenCandidates", "Task"]
 
@@ -59,6 +57,8 @@ class GivenCandidates:
                 f"this run was trained on {self.name}: give the file again with "
                 "--candidates"
             )
+        from jaxcal.learning.environments import scenarios
+
         return scenarios.given(config, self.values, self.available)
 
 
@@ -70,7 +70,7 @@ class Task:
     """
 
     environment: SelectionConfig = field(default_factory=SelectionConfig)
-    shapes: tuple[str, ...] = ("uniform",)  # see scenarios.SHAPES
+    shapes: tuple[str, ...] = ("uniform",)  # of config.SHAPES
     masked: float = 0.0  # greatest share of candidates masked
     num_given: int = 0  # choices before the one that is learned, with explore_once
     random_starts: float = 0.0  # share of imitated episodes begun with random choices
@@ -89,6 +89,8 @@ class Task:
         """key -> (M, n) candidates and (M,) available."""
         if self.given is not None:
             return self.given.source(self.environment)
+        from jaxcal.learning.environments import scenarios
+
         return scenarios.mixture(self.environment, self.shapes, self.masked)
 
     @property
@@ -103,12 +105,16 @@ class Task:
 
     def reset(self, key: jax.Array) -> SelectionState:
         """A new episode with fresh candidates."""
+        from jaxcal.learning.environments import selection
+
         return selection.reset(key, self.environment, self.draw)
 
     def step(
         self, state: SelectionState, action: jax.Array
     ) -> tuple[SelectionState, jax.Array, jax.Array]:
         """Choose one posture: the next state, () reward, () bool done."""
+        from jaxcal.learning.environments import selection
+
         return selection.step(state, action, self.environment)
 
     def paid(self, state: SelectionState) -> jax.Array:

@@ -6,10 +6,10 @@ import dataclasses
 from typing import Any
 
 from jaxcal.extras import installed
+from jaxcal.learning.config import named
 from jaxcal.learning.core.network import Network
 from jaxcal.learning.policies.compact import CompactNetwork
 from jaxcal.learning.policies.networks import GROUP, NetworkConfig
-from jaxcal.learning.settings import named
 
 __all__ = ["build"]
 

@@ -15,7 +15,7 @@ import dataclasses
 from typing import Any
 
 from jaxcal.extras import installed
-from jaxcal.learning.settings import path_of, require, setting
+from jaxcal.learning.config import path_of, require, setting
 
 __all__ = ["GROUP", "NetworkConfig"]
 
@@ -40,6 +40,10 @@ class NetworkConfig:
         0.0, "initial weight of the look-ahead; at 4 training begins at its rule"
     )
     initial_actor: float = setting(0.1, "scale of the learned score before learning")
+    mirrored: bool = setting(
+        False,
+        "of observation: choose by the mean over a set's mirror images",
+    )
 
     def __post_init__(self) -> None:
         kind: Any = self.kind

@@ -25,7 +25,6 @@ __all__ = [
     "Job",
     "collective",
     "expected",
-    "local_device_ids",
     "run_job",
 ]
 
@@ -87,26 +86,6 @@ def _cluster(environ: Mapping[str, str]) -> bool:
         return True
     # The slice of a Cloud TPU machine is in its metadata, which only JAX reads.
     return any(map(os.path.exists, ("/dev/accel0", "/dev/vfio/0")))
-
-
-def local_device_ids(environ: Mapping[str, str] = os.environ) -> list[int] | None:
-    """Which of the GPUs that a SLURM task sees are its own; None leaves it to JAX.
-
-    JAX gives the i-th task of a machine the i-th GPU. That is wrong where SLURM already
-    shows each task only its own (``--gpus-per-task``), and where one task has a whole
-    machine.
-    """
-    visible = environ.get("CUDA_VISIBLE_DEVICES", "")
-    if not visible or "SLURM_PROCID" not in environ:
-        return None
-    number = len(visible.split(","))
-    tasks = environ.get("SLURM_STEP_TASKS_PER_NODE", "")
-    shown_alone = number == 1 or re.fullmatch(r"1(\(x\d+\))?", tasks)
-    return (
-        list(range(number))
-        if shown_alone and "JAX_LOCAL_DEVICE_IDS" not in environ
-        else None
-    )
 
 
 def run_job(
@@ -183,7 +162,6 @@ def _connect(job: Job) -> None:
             job.coordinator,
             job.num_processes,
             job.process_id,
-            local_device_ids=local_device_ids(),
             initialization_timeout=_CONNECT_SECONDS,
             heartbeat_timeout_seconds=HEARTBEAT_SECONDS,
             shutdown_timeout_seconds=_LEAVE_SECONDS,

@@ -13,15 +13,13 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 import jax
-from brax.training.agents.ppo import train as brax_train
 
-from jaxcal.learning.brax import brax_networks, repaired, wrap_fresh
-from jaxcal.learning.environments.brax_env import SelectionEnv
+from jaxcal.learning import brax
+from jaxcal.learning.config import settings_of
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.settings import settings_of
 from jaxcal.learning.training import checkpoint
-from jaxcal.learning.training.config import TrainConfig
+from jaxcal.learning.training.presets import TrainConfig
 
 __all__ = ["adapted", "network_params", "require_read", "train"]
 
@@ -33,10 +31,6 @@ _READ = {  # fields of PPOConfig that brax is given: brax's names
     "clip_range": "clipping_epsilon",
     "max_grad_norm": "max_grad_norm",
 }
-_FIXED = dict(
-    num_envs=256, num_eval_envs=256, batch_size=64, num_minibatches=16,
-    num_updates_per_batch=4, normalize_observations=False, num_evals=10,
-)  # fmt: skip
 
 
 def adapted(config: TrainConfig) -> TrainConfig:
@@ -78,9 +72,8 @@ def train(
     task, episodes = config.tasks[0], config.ppo.num_episodes
     env, length = task.environment, task.environment.num_selected
     read = {name: getattr(config.ppo, name) for name in _READ}
-    given = _FIXED | {_READ[name]: value for name, value in read.items()}
-    given |= {"num_timesteps": episodes * length, "seed": config.seed}
-    given |= {"episode_length": length, "unroll_length": length, **more}
+    given = {_READ[name]: value for name, value in read.items()} | {"num_evals": 10}
+    given |= {"num_timesteps": episodes * length, "seed": config.seed, **more}
     begun = time.perf_counter()
 
     def progress(steps: int, metrics: dict[str, Any]) -> None:
@@ -88,15 +81,8 @@ def train(
         say(f"{steps:10,d} decisions  {seconds:7.1f} s  mean log det S {log_det:.3f}")
 
     say("brax is compiling (about half a minute) ...")
-    environment = SelectionEnv(env, task.draw, config.network)
-    with repaired():
-        _, params, _ = brax_train.train(
-            environment=environment,
-            wrap_env_fn=wrap_fresh,
-            network_factory=brax_networks(environment),
-            progress_fn=progress,
-            **given,
-        )
+    environment = brax.SelectionEnv(env, task.draw, config.network)
+    _, params, _ = brax.train(environment, length, progress_fn=progress, **given)
     meta = config.as_meta() | {
         "network": {"kind": config.network.kind, "width": config.network.width},
         "ppo": read | {"num_episodes": episodes},

@@ -128,12 +128,13 @@ def save(
 
 def _rest(state: TrainState) -> dict[str, Any]:
     """Leaves of a state other than the averaged weights; of typed keys their data."""
-    names = ("params", "opt_state", "key", "num_updates", "playing", "values")
+    names = ("params", "opt_state", "key", "num_updates", "rollout_state", "values")
 
     def plain(leaf: Any) -> Any:
         return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
     held = {name: jax.tree.map(plain, getattr(state, name)) for name in names}
+    held["playing"] = held.pop("rollout_state")  # its name in files
     return {name: tree for name, tree in held.items() if jax.tree.leaves(tree)}
 
 
@@ -362,5 +363,7 @@ def _restored(
             return leaf
         return jax.random.wrap_key_data(leaf, impl=jax.random.key_impl(like))
 
-    rest["playing"] = jax.tree.map(typed, rest["playing"], fresh.playing)
+    rest["rollout_state"] = jax.tree.map(
+        typed, rest.pop("playing"), fresh.rollout_state
+    )
     return TrainState(average=average, **rest), meta

@@ -116,9 +116,9 @@ class Imitation:
 
     postures: Postures
 
-    def having(self, config: EpisodesConfig) -> Imitation:
+    def with_config(self, config: EpisodesConfig) -> Imitation:
         """This learner with another configuration."""
-        return Imitation(self.postures.having(config))
+        return Imitation(self.postures.with_config(config))
 
     def init(self, key: jax.Array, lesson: Lesson) -> Any:
         """Parameters before training."""
@@ -128,8 +128,8 @@ class Imitation:
         """A state as of ``postures``; a lesson reads none of it."""
         return self.postures.begin(keys)
 
-    def gather(
-        self, params: Any, playing: Any, lesson: Lesson
+    def rollout(
+        self, params: Any, rollout_state: Any, lesson: Lesson
     ) -> tuple[Attempt, Any, Metrics]:
         """Play the lesson: each choice is the policy's likeliest wanted posture."""
         task, network = self.postures.task, self.postures.network
@@ -162,10 +162,10 @@ class Imitation:
             weight=counted / jnp.maximum(counted.mean(), 1e-6),
             best=lesson.best,
         )
-        return attempt, playing, {}
+        return attempt, rollout_state, {}
 
     def loss(
-        self, params: Any, experience: Attempt, done: jax.Array
+        self, params: Any, experience: Attempt, update_index: jax.Array
     ) -> tuple[jax.Array, Metrics]:
         """Cross-entropy to the wanted postures, and the value's error.
 

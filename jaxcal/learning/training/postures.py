@@ -13,9 +13,10 @@ import numpy as np
 from jaxcal.learning.core.network import Network
 from jaxcal.learning.core.ppo import Learner, TrainState
 from jaxcal.learning.policies import scorer
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.runtime import devices
 from jaxcal.learning.training import checkpoint, imitation
-from jaxcal.learning.training.config import TrainConfig
+from jaxcal.learning.training.presets import TrainConfig
 from jaxcal.learning.training.room import require_room
 from jaxcal.learning.training.run import Recipe, run
 
@@ -87,7 +88,7 @@ def train(
     rows = config.ppo.rows_per_minibatch
     mesh = devices.make_mesh(rows, num_devices, config.num_runs)
     learners = config.learners
-    network, k = learners[0].network, config.tasks[0].num_decisions
+    network, k = build(config.network), config.tasks[0].num_decisions
     last = config.ppo.num_updates if num_updates is None else num_updates
     imitated = min(config.num_imitated, last)
     _require_lessons(config, network, teacher, imitated)

@@ -1,22 +1,84 @@
-"""Named configurations, and how single values of one are changed."""
+"""Configuration of a training of postures, those with names, and changes of one."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from dataclasses import field
+from typing import TYPE_CHECKING, Any
 
 from jaxcal.extras import installed
-from jaxcal.learning.config import EpisodesConfig
-from jaxcal.learning.environments.scenarios import SHAPES
-from jaxcal.learning.environments.selection import SelectionConfig
+from jaxcal.learning.config import (
+    SHAPES,
+    EpisodesConfig,
+    RunConfig,
+    SelectionConfig,
+    require,
+    setting,
+    settings_of,
+)
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.settings import settings_of
-from jaxcal.learning.training.config import TrainConfig
 
-__all__ = ["PARTS", "field_names", "load", "names", "with_values"]
+if TYPE_CHECKING:
+    from jaxcal.learning.core.postures import Postures
+
+__all__ = ["PARTS", "TrainConfig", "field_names", "load", "names", "with_values"]
 
 _GROUP = "jaxcal.presets"  # entry points: the presets of installed packages
+
+_PLAIN = ("preset", "imitation")  # fields that JSON holds as is
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig(RunConfig):
+    """Network, optimisation and tasks of a run that trains on postures."""
+
+    preset: str = "compact"
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    ppo: EpisodesConfig = field(default_factory=EpisodesConfig)
+    tasks: tuple[Task, ...] = field(default=(Task(),))  # update u: tasks[u % len]
+    imitation: float = setting(
+        0.0, "share of the updates, from the first on, that imitate the solvers"
+    )
+    about: str = ""  # one line for --help, of a preset
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self, "in [0, 1]", lambda v: 0.0 <= v <= 1.0, "imitation")
+
+    @property
+    def num_imitated(self) -> int:
+        """Updates that imitate, before the others."""
+        return round(self.imitation * self.ppo.num_updates)
+
+    @property
+    def learners(self) -> tuple[Postures, ...]:
+        """Learners of the tasks; update u trains number u modulo theirs."""
+        from jaxcal.learning.core.postures import Postures
+        from jaxcal.learning.policies.build import build
+
+        network = build(dataclasses.replace(self.network, mirrored=False))
+        return tuple(Postures(self.ppo, task, network) for task in self.tasks)
+
+    def as_meta(self) -> dict[str, Any]:
+        """Plain JSON values; ``from_meta`` reads them back."""
+        return super().as_meta() | {
+            **{name: getattr(self, name) for name in _PLAIN},
+            "network": dataclasses.asdict(self.network),
+            "tasks": [task.as_meta() for task in self.tasks],
+        }
+
+    @staticmethod
+    def from_meta(meta: dict[str, Any]) -> TrainConfig:
+        """The configuration a checkpoint was trained with."""
+        return TrainConfig(
+            **{name: meta[name] for name in _PLAIN},
+            **RunConfig.held_in(meta),
+            network=NetworkConfig(**meta["network"]),
+            ppo=EpisodesConfig(**meta["ppo"]),
+            tasks=tuple(Task.from_meta(task) for task in meta["tasks"]),
+        )
+
 
 _COMPACT = TrainConfig(
     preset="compact",

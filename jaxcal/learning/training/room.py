@@ -69,4 +69,4 @@ def require_room(recipe: Recipe, mesh: Mesh | None) -> None:
 def _one(recipe: Recipe) -> Any:
     """The state as one call has it: with what goes on of one learner."""
     state = recipe.init()
-    return dataclasses.replace(state, playing=state.playing[0])
+    return dataclasses.replace(state, rollout_state=state.rollout_state[0])

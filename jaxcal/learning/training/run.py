@@ -77,7 +77,7 @@ class Recipe:
     def init(self) -> TrainState:
         """The state before the first update, from seeds and swept values alone.
 
-        ``playing`` is a tuple: what goes on with each of ``given``.
+        ``rollout_state`` is a tuple: what goes on with each of ``given``.
         """
 
         def begin(key: jax.Array, values: dict[str, jax.Array]) -> TrainState:
@@ -85,8 +85,8 @@ class Recipe:
             states = [
                 _begun(ppo, learner, key, *given, **values) for given in self.given
             ]
-            playing = tuple(state.playing for state in states)
-            return dataclasses.replace(states[0], playing=playing)
+            rollout_state = tuple(state.rollout_state for state in states)
+            return dataclasses.replace(states[0], rollout_state=rollout_state)
 
         keys = jnp.stack([jax.random.key(run["seed"]) for run in self.runs])
         swept = [name for name, _ in self.config.sweep]
@@ -244,11 +244,11 @@ def _run(
     done = int(np.max(devices.local(state.num_updates)))
     seeds = len(recipe.runs) if len(recipe.runs) > 1 else 0
     count, timed, broken = 1, False, ""
-    held = list(state.playing)
+    held = list(state.rollout_state)
     in_row = np.zeros((len(held), len(recipe.runs)), int)  # updates skipped
 
     def whole(state: TrainState) -> TrainState:
-        return dataclasses.replace(state, playing=tuple(held))
+        return dataclasses.replace(state, rollout_state=tuple(held))
 
     with contextlib.ExitStack() as stack:
         recorder = None
@@ -268,12 +268,12 @@ def _run(
                 at_most = 1  # the next update has another program or other arrays
             count = min(count, at_most, last - done)
             update = updates(recipe.config.ppo, learner, mesh, at_most, seeds)
-            state = dataclasses.replace(state, playing=held[which])
+            state = dataclasses.replace(state, rollout_state=held[which])
             with collective():
                 state, metrics = update(state, np.int32(count), *given)
                 # One transfer for all that these updates measured.
                 rows = jax.device_get(devices.local(metrics))
-            held[which] = state.playing
+            held[which] = state.rollout_state
             first, done = done, done + count
             for number in range(count):
                 fine = np.ravel(rows["skipped"][number]) == 0.0

@@ -25,7 +25,7 @@ from studies.paper.exhibits.exhibit import Exhibit, from_rows, judge
 from studies.paper.exhibits.intervals import (
     mean_interval,
     median_interval,
-    paired,
+    ratio_interval,
     share_interval,
 )
 from studies.paper.exhibits.study import Study, commands_deg
@@ -76,12 +76,12 @@ def _four_or_fifty(study: Study) -> Exhibit:
             curves[scenario].append(entry)
             if strength == main:
                 resamples = settings.size("resamples")
-                pair = paired(four, fifty, settings.rng(8, which), resamples)
+                rng = settings.rng(8, which)
+                ratio = ratio_interval(np.mean, four, fifty, rng, resamples)
                 numbers[scenario] = entry | {
                     "median_four_deg": float(np.median(four)),
                     "median_fifty_deg": float(np.median(fifty)),
-                    "paired": pair,
-                    "ratio_of_means": pair.ratio_of_means,
+                    "ratio_of_means": ratio,
                 }
     z = regressors(commands)
     numbers["mean_prediction_variance"] = {
@@ -137,7 +137,7 @@ def _recorded(study: Study) -> dict[str, Any]:
 
     four, fifty = across("policy"), across("all 50")
     rng, resamples = study.settings.rng(8, 9), study.settings.size("resamples")
-    ratio = paired(four, fifty, rng, resamples).ratio_of_means
+    ratio = ratio_interval(np.mean, four, fifty, rng, resamples)
     return _means(four, fifty) | {"ratio_of_means": ratio}
 
 

@@ -77,7 +77,7 @@ def _recalibration(found: Found) -> Iterator[Claim]:
     exhibit = found["figure_10"]
     for key, reading in (
         ("random_x0_against_x_star", "X_0 from random postures (caption)"),
-        ("policy_x0_against_x_star", "X_0 from the policy's postures (text)"),
+        ("policy_x0_against_x_star", "X_0 from PPO's postures (text)"),
     ):
         ratio = exhibit.numbers["error_of_second_over_first"][key]
         words = {"reading": reading, "ratio": ratio}

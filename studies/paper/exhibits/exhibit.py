@@ -26,6 +26,7 @@ class Exhibit:
 
     key: str  # of its files: "figure_1"
     title: str
+    policy: str = ""  # which policies it shows, and how they were trained
     caption: str = ""  # what is drawn, sample sizes, what the intervals are
     paper: str = ""  # what the paper states, in our words
     ours: str = ""
@@ -44,17 +45,15 @@ class Exhibit:
         The texts cite the exhibit's numbers and the ``words``.
         """
         known = {**fields.get("numbers", {}), **words}
-        return cls(**{"key": section, **_filled(_texts()[section], known), **fields})
+        texts = _of_exhibit(section)
+        return cls(**{"key": section, **_filled(texts, known), **fields})
 
     @classmethod
     def missing(cls, section: str, **numbers: Any) -> Exhibit:
         """An exhibit whose kept runs are not there: how to make them."""
-        held = _texts()[section]
-        texts = {
-            "title": held["title"],
-            "paper": held["paper"],
-            "ours": held["missing"],
-        }
+        held = _of_exhibit(section)
+        texts = {name: held[name] for name in ("title", "paper")}
+        texts["ours"] = held["missing"]
         filled = _filled(texts, numbers)
         return cls(section, verdict="not comparable", numbers=numbers, **filled)
 
@@ -98,6 +97,12 @@ class Claim:
 def _texts() -> dict[str, Any]:
     path = pathlib.Path(__file__).parent / "texts.toml"
     return tomllib.loads(path.read_text(encoding="utf-8"))
+
+
+def _of_exhibit(section: str) -> dict[str, str]:
+    """The texts of a section, with its policies in words."""
+    texts = _texts()[section]
+    return texts | {"policy": _texts()["policies"][texts.get("policy", "none")]}
 
 
 def _filled(texts: Mapping[str, str], known: Mapping[str, Any]) -> dict[str, Any]:

@@ -84,30 +84,12 @@ def bootstrap_interval(
     return Interval(value, float(ends.low), float(ends.high), count)
 
 
-@dataclasses.dataclass(frozen=True)
-class Paired:
-    """One method against another on the same episodes."""
-
-    difference: Interval  # mean of a - b
-    a_lower: Interval  # share of episodes in which a is the smaller
-    ratio_of_means: Interval  # mean a / mean b
-    ratio_of_medians: Interval
-
-
-def paired(
-    a: ArrayLike, b: ArrayLike, rng: np.random.Generator, resamples: int = 2_000
-) -> Paired:
-    """Compare two values per episode, (E,) each, on the same episodes."""
-    first, second = np.asarray(a, np.float64), np.asarray(b, np.float64)
-    if first.shape != second.shape or first.ndim != 1:
-        raise ValueError(
-            f"a and b must hold the same episodes, got {first.shape}, {second.shape}"
-        )
-    ratios = [
-        bootstrap_interval(
-            lambda x, y, of=of: of(x) / of(y), (first, second), rng, resamples
-        )
-        for of in (np.mean, np.median)
-    ]
-    lower = share_interval(first < second)
-    return Paired(mean_interval(first - second), lower, *ratios)
+def ratio_interval(
+    of: Callable[..., Any],
+    a: NDArray[Any],
+    b: NDArray[Any],
+    rng: np.random.Generator,
+    resamples: int = 2_000,
+) -> Interval:
+    """``of(a) / of(b)``, such as of means, of (E,) values on the same episodes."""
+    return bootstrap_interval(lambda x, y: of(x) / of(y), (a, b), rng, resamples)

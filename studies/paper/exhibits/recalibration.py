@@ -30,8 +30,12 @@ from jaxcal.reports.plots.style import (
 from jaxcal.selection import exact_batch
 from studies.paper.exhibits.devices import Device, pick, rms
 from studies.paper.exhibits.exhibit import Exhibit, by_axis, from_rows, judge
-from studies.paper.exhibits.intervals import median_interval, paired, share_interval
-from studies.paper.exhibits.study import Study
+from studies.paper.exhibits.intervals import (
+    median_interval,
+    ratio_interval,
+    share_interval,
+)
+from studies.paper.exhibits.study import Study, choose
 
 Array = NDArray[np.float64]
 
@@ -51,7 +55,7 @@ TRACED = 6  # sessions drawn point by point
 _LOOKS = {
     "measured": ("measured", BLACK, "-", ""),
     "x0_random": ("X$_0$, random postures", GREY, ":", "x"),
-    "x0_policy": ("X$_0$, policy's postures", COLOURS[1], "--", "s"),
+    "x0_policy": ("X$_0$, PPO's postures", COLOURS[1], "--", "s"),
     "x_star": ("X$_*$", COLOURS[0], "-", "o"),
 }
 
@@ -91,12 +95,13 @@ def _drifting(study: Study) -> Exhibit:
         key: np.delete(e, key[1], axis=1).mean(axis=1) for key, e in error.items()
     }
     ratios = {
-        name: paired(
+        name: ratio_interval(
+            np.median,
             after[second],
             after[first],
             settings.rng(21, index),
             settings.size("resamples"),
-        ).ratio_of_medians
+        )
         for index, (name, (first, second)) in enumerate(COMPARED.items())
     }
     age = from_rows(
@@ -152,9 +157,7 @@ def _choose(choice: str, sets: Array, rng: np.random.Generator) -> NDArray[np.in
         return np.argsort(rng.random(sets.shape[:2]), axis=1)[:, :4]
     if choice == "det-maximal":
         return exact_batch(sets, 4).indices
-    from jaxcal.selection.policy import select_batch
-
-    return np.asarray(select_batch(sets, 4), dtype=np.int64)
+    return choose(sets)
 
 
 def _by_age(columns: dict[str, Any]) -> Figure:
@@ -188,8 +191,6 @@ def _by_age(columns: dict[str, Any]) -> Figure:
 
 def _recorded(study: Study) -> Exhibit:
     """Each calibration predicts eight postures of every other episode."""
-    from jaxcal.selection.policy import select_batch
-
     settings = study.settings
     rng = settings.rng(22)
     (u0,), (y0,) = study.measured("dataset5")
@@ -197,7 +198,7 @@ def _recorded(study: Study) -> Exhibit:
     repeats = settings.size("random_draws")
     picks = np.argsort(rng.random((repeats, len(u0))), axis=1)[:, :4]
     best = int(np.argmax(study.evaluation("dataset4").reference))
-    policy = np.asarray(select_batch(study.dataset("dataset5").candidates, 4))[0]
+    (policy,) = choose(study.dataset("dataset5").candidates)
     others = np.delete(np.arange(len(u1)), best)
     # Postures that X_* was identified from are not predicted.
     own = u1[best][study.result("dataset4", "exact").indices[best, 0]]
@@ -223,12 +224,13 @@ def _recorded(study: Study) -> Exhibit:
     first = slice(TRACED)
     trace = _trace_columns(others[first] + 1, tested[first], seen[first], shown)
     ratio = {
-        name: paired(
+        name: ratio_interval(
+            np.median,
             error["x_star"],
             error[name],
             settings.rng(23, i),
             settings.size("resamples"),
-        ).ratio_of_medians
+        )
         for i, name in enumerate(("x0_policy", "x0_random"))
     }
     caution = " The largest determinant alone does not single one out."

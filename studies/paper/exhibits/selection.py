@@ -1,4 +1,4 @@
-"""Figures 3, 4, 7, 8: det S of what the policy chooses, random and the optimum."""
+"""Figures 3, 4, 7, 8: det S of what PPO's policy chooses, random and the optimum."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def _gap(study: Study, name: str) -> Exhibit:
     evaluation = study.evaluation(name)
     columns = _by_episode(evaluation)
     numbers: dict[str, Any] = {"proven_share": float(evaluation.proven.mean())}
-    for method in ("policy", "greedy"):
+    for method in ("policy", "default", "greedy"):
         log_det = study.result(name, method).log_det[:, 0]
         ratio = np.exp(np.minimum(log_det - evaluation.reference, 0.0))
         columns[f"ratio_{method}"] = ratio
@@ -157,7 +157,7 @@ def _gap(study: Study, name: str) -> Exhibit:
 
 
 def _gap_per_episode(columns: dict[str, Array], name: str) -> Figure:
-    """det S / det S* of policy and greedy in each episode."""
+    """det S / det S* of PPO's policy and greedy in each episode."""
     title = f"Gap to the proven optimum, episode by episode: {name}, 4 of 50"
     figure, axes = panels((8.0, 3.6), title)
     axes.axhline(1.0, color=BLACK, linewidth=0.8, label="proven optimum")
@@ -169,7 +169,7 @@ def _gap_per_episode(columns: dict[str, Array], name: str) -> Figure:
         look: dict[str, Any] = {"marker": marker, "markersize": size, "color": colour}
         look |= {"linestyle": "none", "markerfacecolor": fill, "markeredgewidth": 0.8}
         values = columns["episode"][shown], columns[f"ratio_{method}"][shown]
-        axes.plot(*values, label=method, **look)
+        axes.plot(*values, label={"policy": "PPO"}.get(method, method), **look)
     total = len(columns["episode"])
     part = "" if total <= shown.stop else f", first {shown.stop} of {total:,}"
     axes.set(xlabel=f"episode{part}", ylabel="det S / det S*", ylim=(0.0, 1.05))

@@ -16,7 +16,10 @@ from jaxcal.paper.datasets import make_dataset
 
 Array = NDArray[np.float64]
 
-METHODS = ("policy", "random", "greedy", "exact")
+METHODS = ("policy", "default", "random", "greedy", "exact")
+PPO = pathlib.Path(__file__).resolve().parents[3] / "checkpoints" / "paper.npz"
+"""The policy of every exhibit: PPO alone trained it, on the paper's 210 numbers"""
+_LABELS = {"policy": "PPO", "default": "default, by imitation"}
 STUDIES = pathlib.Path(__file__).resolve().parents[1] / "kept"
 """Where the repository keeps training runs"""
 
@@ -73,6 +76,14 @@ _SIZES = {  # of a whole report, of a quick one
 }
 
 
+def choose(candidates: Array) -> NDArray[np.int64]:
+    """(E, 4) chosen of (E, M, 3) by the agent that PPO trained."""
+    from jaxcal.selection.policy import select_batch
+
+    chosen = select_batch(candidates, 4, checkpoint=str(PPO))
+    return np.asarray(chosen, dtype=np.int64)
+
+
 def commands_deg(dataset: Dataset) -> Array:
     """(E, M, n) commands in the ranges' unit: degrees, for the paper's datasets."""
     if dataset.ranges is None:
@@ -112,14 +123,22 @@ class Study:
     def evaluation(self, name: str) -> PostureEvaluation:
         """Four postures by every method, judged against the proven optimum."""
         if name not in self._evaluations:
-            self._evaluations[name] = evaluate(
+            found = evaluate(
                 self.dataset(name),
                 4,
-                METHODS,
+                [method for method in METHODS if method != "default"],
+                (str(PPO), None),
                 random_draws=self.settings.size("random_draws"),
                 seed=self.settings.seed,
                 progress=lambda task, *n: self.progress(f"{name}: {task}", *n),
             )
+            results = tuple(
+                dataclasses.replace(
+                    result, method=method, label=_LABELS.get(method, result.label)
+                )
+                for result, method in zip(found.results, METHODS, strict=True)
+            )
+            self._evaluations[name] = dataclasses.replace(found, results=results)
         return self._evaluations[name]
 
     def result(self, name: str, method: str) -> PostureResult:

@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 CLAIMED = 200_000  # episodes within which the paper's training converges
 _SUMMARY = (  # what is read of a run's summary.json
     *("seed", "episodes", "planned_episodes", "seconds", "parameters"),
-    "dataset2",
+    *("versions", "dataset2"),
 )
 
 
@@ -44,6 +44,12 @@ class Run:
     summary: dict[str, Any]
     rewards: Array  # of the last episodes
     rewards_are: str  # in words
+
+    @property
+    def made(self) -> str:
+        """What it was made with, in words."""
+        held = self.summary["versions"]
+        return f"Made with jaxcal {held['jaxcal']}, jax {held['jax']}."
 
     @property
     def finished(self) -> bool:
@@ -153,6 +159,7 @@ def _seeds(runs: list[Run], paper: list[Run]) -> Exhibit:
         {
             "range": " to ".join(f"{end:,}" for end in ends),
             "caution": _caution(runs),
+            "made": runs[0].made,
         },
         verdict=_converges(runs, flat),
         figures={"figure_2_seeds": _curves(shown, columns)},
@@ -220,7 +227,7 @@ def _paper(runs: list[Run]) -> Exhibit:
     return Exhibit.from_texts(
         "figure_2_paper",
         {
-            **{"took": took, "rewards_are": run.rewards_are},
+            **{"took": took, "rewards_are": run.rewards_are, "made": run.made},
             **{"hours": held["seconds"] / 3600, "good": held["dataset2"]},
         },
         verdict=_converges([run], [flat]),

@@ -85,7 +85,8 @@ def _variance(study: Study, name: str, key: str, title: str) -> Exhibit:
         for m, label, colour, marker in (
             ("random", "random", GREY, "x"),
             ("greedy", "greedy", COLOURS[1], "s"),
-            ("policy", "policy", COLOURS[0], "o"),
+            ("policy", "PPO", COLOURS[0], "o"),
+            ("default", "default, by imitation", COLOURS[3], "D"),
             ("exact", "exact", BLACK, "*"),
             ("all 50", "all 50 postures", COLOURS[2], "^"),
         )
@@ -98,6 +99,7 @@ def _variance(study: Study, name: str, key: str, title: str) -> Exhibit:
     words: dict[str, float] = {
         "middle": np.median(ratio), "least": ratio.min(), "most": ratio.max(),
         "lower": lower, "fifty": np.median(fifty[0]),
+        "imitated": np.median(table["default/policy"][0]),
     }  # fmt: skip
     return Exhibit.from_texts(
         "variance",
