@@ -42,7 +42,6 @@ class Bus:
     host: str = ""
     port: int = 502
     device: str = ""
-    interface: str = "socketcan"
     baudrate: int = 115200
     parity: str = "N"
     stopbits: int = 1

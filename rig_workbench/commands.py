@@ -45,14 +45,12 @@ def setup(
     axes: Annotated[
         str, "NAME:KIND,... with a KIND of X, Y, Z (a phone's), deg or mm"
     ] = "",
-    drives: Annotated[str, "their map: grbl, marlin, cia402, FILE.toml, ..."] = "",
+    drives: Annotated[str, "their map, of one's own: FILE.toml"] = "",
     readings: Annotated[
         str, "numbers, not a phone: tcp:HOST:PORT, listen:PORT, serial:DEVICE, ..."
     ] = "",
     urdf: Annotated[str, "of an arm, whose joints are the axes"] = "",
-    example: Annotated[
-        Literal["turntable", "gimbal", "stage", "servos"], "these for a device"
-    ]
+    example: Annotated[Literal["turntable", "gimbal", "stage"], "these for a device"]
     | None = None,
     set: Annotated[list[str], "KEY=VALUE of the new rig.toml"] | None = None,
 ) -> int:

@@ -167,8 +167,8 @@ class DriveMap(Section):
 
     schema_: Literal[1] = key("version of this schema", alias="schema")
     drive: str = key(
-        "kind of its drives: modbus, gcode, cia402, or the class of one's own as "
-        "`FILE.py:CLASS`, relative to the map, or `MODULE:CLASS`", "modbus",
+        "kind of its drives: modbus, or the class of one's own as `FILE.py:CLASS`, "
+        "relative to the map, or `MODULE:CLASS`", "modbus",
     )  # fmt: skip
     name: str = key("name of the map", min_length=1)
     title: str = key("drives it is for", min_length=1)

@@ -25,12 +25,11 @@ class BusSettings(Section):
 
     transport: Literal["tcp", "rtu_tcp", "rtu", "serial", "can"] = key(
         "rtu: Modbus on a serial port; tcp: Modbus TCP; rtu_tcp: RTU frames over TCP; "
-        "serial: lines of text on a serial port; can: a CAN bus"
+        "serial, can: a line of drives of one's own"
     )
     host: str = key("address of a tcp or rtu_tcp bus", "")
     port: int = key("TCP port of a tcp or rtu_tcp bus", 502, 1, 65535)
     device: str = key("serial port; channel of a CAN bus, such as can0", "")
-    interface: str = key("of python-can, of a CAN bus", "socketcan")
     baudrate: int = key("of a serial port or a CAN bus", 115200, 1200, 3_000_000)
     parity: Literal["N", "E", "O"] = key("of an rtu bus", "N")
     stopbits: int = key("of an rtu bus", 1, 1, 2)

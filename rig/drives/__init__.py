@@ -1,7 +1,7 @@
 """What moves: drives on their line, by the kind that each axis's map names.
 
-``line`` and ``drive`` are what motion and stop ask; ``modbus``, ``gcode`` and
-``cia402`` are kinds. A kind of one's own is a class that a map names.
+``line`` and ``drive`` are what motion and stop ask; ``modbus`` is a kind. A kind of
+one's own is a class that a map names; ``examples/drives`` has two.
 """
 
 from __future__ import annotations
@@ -20,11 +20,7 @@ if TYPE_CHECKING:
     from rig.config.maps import DriveMap
     from rig.config.settings import BusSettings
 
-KINDS = {
-    "modbus": "rig.drives.modbus:ModbusDrive",
-    "gcode": "rig.drives.gcode:GCodeDrive",
-    "cia402": "rig.drives.cia402:Cia402Drive",
-}
+KINDS = {"modbus": "rig.drives.modbus:ModbusDrive"}
 
 
 def kind_of(drive_map: DriveMap) -> type[Drive]:
@@ -48,8 +44,8 @@ def kind_of(drive_map: DriveMap) -> type[Drive]:
     except Exception as error:  # whatever the import of foreign code raises
         raise Refused(
             f"the map {drive_map.name} names drive = {drive_map.drive!r}, which cannot "
-            f"be loaded: {type(error).__name__}: {error}. It must be one of "
-            f"{', '.join(KINDS)}, FILE.py:CLASS or MODULE:CLASS"
+            f"be loaded: {type(error).__name__}: {error}. It must be modbus, "
+            "FILE.py:CLASS or MODULE:CLASS"
         ) from None
     return drive_type
 

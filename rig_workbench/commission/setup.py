@@ -71,11 +71,8 @@ EXAMPLES: dict[str, dict[str, Any]] = {  # of --example
     "turntable": {"axes": {"table": "Z"}},
     "gimbal": {"axes": {"pan": "Z", "tilt": "X"}},
     "stage": {
-        "axes": {"x": "mm", "y": "mm", "z": "mm"}, "drives": "grbl",
-        "bus": "serial:/dev/ttyUSB0,115200", "readings": "serial:/dev/ttyUSB1,9600",
-    },
-    "servos": {
-        "axes": {"pan": "Z", "tilt": "X"}, "drives": "cia402", "bus": "can:can0,500000",
+        "axes": {"x": "mm", "y": "mm", "z": "mm"},
+        "readings": "serial:/dev/ttyUSB1,9600",
     },
 }  # fmt: skip
 
