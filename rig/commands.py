@@ -355,6 +355,10 @@ def check(file: ConfigPath | None = None, *, config: ConfigPath | None = None) -
             f"{axis.pulses_per_deg:.3f} pulses per {axis.unit_name}, "
             f"{axis.min_pulses}..{axis.max_pulses} pulses"
         )
+    if loaded.imu is not None:
+        from rig.readings.stream import StreamParser
+
+        print(f"  phone ({loaded.imu.format}): {StreamParser(loaded.imu).taken_for}")
     print(f"  heartbeat {loaded.heartbeat_s:.3g} s")
     return EXIT_OK
 

@@ -40,7 +40,9 @@ def setup(
     *,
     bus: BusName = "",
     units: Units = 16,
-    imu: Annotated[str, "APP[:PORT]: hyperimu, sensorlogger or lines"] = "",
+    imu: Annotated[
+        str, "APP[:PORT]: hyperimu, sensorlogger, sensorlog, json or lines"
+    ] = "",
     home: Annotated[Literal["here", "drive"], "how"] = "here",
     axes: Annotated[
         str, "NAME:KIND,... with a KIND of X, Y, Z (a phone's), deg or mm"

@@ -8,8 +8,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from rig.config.axis import Range
+from rig.config.maps import ReadFunction, bits_rules
 from rig.config.schema import Section, advanced, key
-from rig.registers import Kind, registers_of
+from rig.registers import Kind, Value
 from rig.stop_config import NETWORK, where_of
 
 Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
@@ -57,9 +58,12 @@ def _by_format(hyperimu: Any, other: Any) -> Callable[[dict[str, Any]], Any]:
 class ImuSettings(Section):
     """The phone's stream."""
 
-    format: Literal["hyperimu", "lines", "sensorlogger"] = key("app of the phone")
-    transport: Literal["listen", "connect"] = key(
-        "listen: the phone connects to this computer", "listen"
+    format: Literal["hyperimu", "lines", "sensorlog", "json", "sensorlogger"] = key(
+        "app of the phone; sensorlog: lines under a header, json: an object a line"
+    )
+    transport: Literal["listen", "connect", "udp"] = key(
+        "listen: the phone connects to this computer; udp: it sends datagrams here",
+        "listen",
     )
     host: str = key(
         "listen: this computer's address; connect: the phone's", "127.0.0.1"
@@ -75,9 +79,13 @@ class ImuSettings(Section):
         "of x, y, z, w, in place of angles", None
     )
     stamp_column: int = advanced(
-        "of the phone's clock in ms; -1: none", "-1; hyperimu: 0", -1, 200,
+        "of the phone's clock; -1: none", "-1; hyperimu: 0", -1, 200,
         by=_by_format(0, -1),
     )  # fmt: skip
+    stamp_unit: Literal["s", "ms", "us", "ns"] | None = advanced(
+        "of the phone's clock; absent: told by the first stamp, else ms (json: ns)",
+        None,
+    )
     column_count: int = advanced(
         "a line of another width is refused; 0: as the first line", 0, 0, 200
     )
@@ -131,17 +139,20 @@ class ImuSettings(Section):
             yield f"separator: must be one character that no number has, got {got}"
 
 
-class ReadingRegister(Section):
+class ReadingRegister(Section, Value):
     """A value of a Modbus device that measures."""
 
     unit: int = key("Modbus unit id", 1, 0, 255)
     address: int = key("of the register, from 0", ..., 0, 0xFFFF)
     type: Kind = key("of its value", "i32")
-    word_order: Literal["big", "little"] = key("of 32-bit pairs", "big")
+    word_order: Literal["big", "little"] = key("big: high word first", "big")
+    function: ReadFunction = key(
+        "3 holding or 4 input registers, 1 coils, 2 discrete inputs", 3
+    )
+    bits: int = key("of function 1 or 2; 0: 16 for a register of type", 0, 0, 64)
 
-    @property
-    def count(self) -> int:
-        return registers_of(self.type)
+    def broken_rules(self) -> Iterator[str]:
+        yield from bits_rules(self)
 
 
 class ReadingsSettings(Section):

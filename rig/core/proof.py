@@ -106,7 +106,7 @@ def unit_proved(imu: ImuSettings | ReadingsSettings, attitude: Array) -> bool:
     """
     if (
         isinstance(imu, ReadingsSettings)
-        or imu.format == "sensorlogger"
+        or imu.format in ("sensorlogger", "sensorlog", "json")
         or imu.quaternion_columns
         or imu.unit == "rad"
     ):

@@ -93,6 +93,10 @@ class Line:
         """Whether what a unit acknowledged last was perhaps not acknowledged."""
         return False
 
+    def answers_for_nobody(self) -> bool:
+        """Whether a unit answers that there is not: then its drives are one."""
+        return False
+
     # Of all of them
 
     def open(self) -> Line:

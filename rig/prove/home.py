@@ -188,4 +188,9 @@ def identity(drives: list[Drive]) -> dict[str, dict[str, int | str]]:
                 "`jaxcal-rig scan`"
             )
         identities[axis.name] = drive.lasting(values)
+    if len(drives) > 1 and drives[0].line.answers_for_nobody():
+        raise Refused(
+            f"{drives[0].line.settings.where} answers for every unit id: the drives "
+            "cannot be told apart. Set the gateway so that it looks at the id"
+        )
     return identities

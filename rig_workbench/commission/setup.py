@@ -25,7 +25,7 @@ from rig.sessions import SimulatedDevice
 from rig_workbench.commission.connections import look_at_phone
 from rig_workbench.model import joint_names
 
-FORMATS = ["hyperimu", "sensorlogger", "lines"]
+FORMATS = ["hyperimu", "sensorlogger", "sensorlog", "json", "lines"]
 UNITS = 16
 SAFETY = (
     "Research software, not a medical device. Confirm: no patient is attached, no "
