@@ -145,6 +145,7 @@ def refit(
     signs: Annotated[tuple[int, int, int], "imu.signs", (-1, 1)] | None = None,
     mounting: Annotated[Angles, "imu.mounting_deg: Z, Y, X", CIRCLE] | None = None,
     factors: Annotated[list[float], "readings.factors", _numbers] | None = None,
+    factory: Annotated[str, "of its [model], a program that is run"] = "",
 ) -> int:
     """identify a recorded calibration anew"""
     from rig.sessions import recorded, records_of
@@ -153,6 +154,12 @@ def refit(
     then, start = recorded(run)
     if start["mode"] != "calibrate":
         raise Refused(f"{run} is a {start['mode']} run; refit takes a calibration")
+    model = then.model.factory if then.model else ""
+    if model != factory:
+        raise Refused(
+            f"{run} names [model] factory = {model!r}, a program that refit would run"
+            + (f": give --factory {model}" if model else f", not {factory!r}")
+        )
     values = {
         "mechanism.order": order,
         "imu.order": imu_order,

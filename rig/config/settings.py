@@ -115,6 +115,30 @@ class ImuSettings(Section):
     stale_s: float = key("older than this while moving: stop", 0.4, 0.02, 10)
     max_jump_deg: float = advanced("between two readings", 20.0, 0.1, 180)
 
+    @property
+    def by_quaternion(self) -> bool:
+        """Whether it sends quaternions, which have no unit, order or signs."""
+        of_format = self.format in ("sensorlogger", "sensorlog", "json")
+        return of_format or self.quaternion_columns is not None
+
+    def fields(self, stamp_unit: str = "") -> str:
+        """What the fields of a record are taken for, in words; ``stamp_unit`` of its
+        time, where that is known."""
+        stamp_unit = stamp_unit or self.stamp_unit or "a unit that the first one tells"
+        time_in = f"the time in {stamp_unit}"
+        if self.format in ("json", "sensorlogger"):
+            return f"the quaternion x, y, z, w of an orientation; {time_in}"
+        if self.format == "sensorlog":
+            return "a quaternion and its time, by the names in the app's header"
+        stamp = f"column {self.stamp_column} {time_in}"
+        stamp = stamp if self.stamp_column >= 0 else "no time"
+        if self.quaternion_columns:
+            columns = [*self.quaternion_columns]
+            return f"columns {columns} a quaternion x, y, z, w; {stamp}"
+        turns = zip(self.columns, str(self.order), self.signs, strict=True)
+        angles = ", ".join(f"{c} about {'-' * (g < 0)}{axis}" for c, axis, g in turns)
+        return f"columns {angles} (in this order), in {self.unit}; {stamp}"
+
     def broken_rules(self) -> Iterator[str]:
         for address in self.allow:
             try:

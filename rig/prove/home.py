@@ -180,12 +180,12 @@ def identity(drives: list[Drive]) -> dict[str, dict[str, int | str]]:
         except BusError as error:
             raise Refused(
                 f"{axis.name} (unit {axis.unit}) does not answer as {axis.map.name} "
-                f"does: {error}. Run `jaxcal-rig scan`"
+                f"does: {error}. Run `jaxcal-rig check scan`"
             ) from None
         if fault := drive.foreign(values):
             raise Refused(
                 f"{axis.name} (unit {axis.unit}) is no {axis.map.name}: {fault}. Run "
-                "`jaxcal-rig scan`"
+                "`jaxcal-rig check scan`"
             )
         identities[axis.name] = drive.lasting(values)
     if len(drives) > 1 and drives[0].line.answers_for_nobody():

@@ -213,23 +213,11 @@ class StreamParser:
     @property
     def taken_for(self) -> str:
         """What the fields of a record are taken for, in words."""
-        s = self._settings
         units = {value: name for name, value in UNITS_S.items()}
-        unit = s.stamp_unit or "a unit that the first one tells"
-        time_in = f"in {units[self._unit_s] if self._unit_s else unit}"
-        if s.format in ("json", "sensorlogger"):
-            return f"the quaternion x, y, z, w of an orientation, and a time {time_in}"
+        unit = "" if self._unit_s is None else units[self._unit_s]
         if self._named:
             return f"by the header: {self._named}, x y z w of a quaternion and its time"
-        if s.format == "sensorlog":
-            return "quaternion and its time, by the names in the app's header"
-        stamp = f"column {self._stamp_column} the time {time_in}"
-        stamp = stamp if self._stamp_column >= 0 else "no time"
-        if self._quaternion:
-            return f"columns {[*self._quaternion]} a quaternion x, y, z, w; {stamp}"
-        pairs = zip(s.columns, str(s.order), s.signs, strict=True)
-        angles = ", ".join(f"{c} about {'-' * (g < 0)}{axis}" for c, axis, g in pairs)
-        return f"columns {angles} (in this order), in {s.unit}; {stamp}"
+        return self._settings.fields(unit)
 
     def _check_width(self, fields: list[str], used: set[int]) -> None:
         width, whole = len(fields), max(self._width or 0, max(used) + 1)

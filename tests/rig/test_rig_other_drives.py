@@ -288,7 +288,9 @@ def test_what_a_class_lacks_is_named_before_anything_moves(tmp_path, capsys, met
     (tmp_path / "mine.py").write_text(OWN.replace(method, method + "_"))
     (tmp_path / "mine.toml").write_text(MAP)
     (tmp_path / "rig.toml").write_text(stage_text(SERIAL.format("x"), "mine.toml", 1))
-    assert main(["check", str(tmp_path / "rig.toml")]) == 2
+    assert main(["check", str(tmp_path / "rig.toml")]) == 0
+    assert "NOT run, and so not checked: mine.py:Mine" in capsys.readouterr().out
+    assert main(["check", str(tmp_path / "rig.toml"), "--run", "mine.py:Mine"]) == 2
     told = capsys.readouterr().err
     assert f" {method.split()[-1]}" in told.replace("Mine.", " ") and "mine.py" in told
 
