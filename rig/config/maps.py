@@ -215,34 +215,21 @@ class DriveMap(Section):
         """The folder that the file of a class is relative to."""
         return self._folder
 
+    # What a map may have, and where it is.
+
     @property
     def register_units(self) -> Units | None:
         """Units of registers for speed and acceleration, where there are any."""
-        return None
+        return getattr(self, "units", None)
 
     def place_of(self, name: str) -> tuple[int, Kind] | None:
         """Register of a value of a move, and its type, where there is one."""
-        return None
+        frames = getattr(self, "move", None)
+        return frames.place_of(name) if frames else None
 
-    @property
-    def watches_line(self) -> bool:
-        """Whether the drive stops after a silence of the line that can be set."""
-        return False
-
-    @property
-    def mirrors_limits(self) -> bool:
-        """Whether the drive takes the soft limits too."""
-        return False
-
-    @property
-    def homes(self) -> bool:
-        """Whether the drive has a homing of its own."""
-        return False
-
-    @property
-    def tells_homed(self) -> bool:
-        """Whether the drive says that it is homed."""
-        return False
+    def has(self, table: str) -> bool:
+        """Whether there is a table, such as ``comm_timeout``, ``limits``, ``home``."""
+        return getattr(self, table, None) is not None
 
     @property
     def digest(self) -> str:
@@ -310,29 +297,6 @@ class RegisterMap(DriveMap):
     homed: Predicate | None = key(
         "bits of the status word that are on from homing until the power fails", None
     )
-
-    @property
-    def register_units(self) -> Units:
-        return self.units
-
-    def place_of(self, name: str) -> tuple[int, Kind] | None:
-        return self.move.place_of(name)
-
-    @property
-    def watches_line(self) -> bool:
-        return self.comm_timeout is not None
-
-    @property
-    def mirrors_limits(self) -> bool:
-        return self.limits is not None
-
-    @property
-    def homes(self) -> bool:
-        return self.home is not None
-
-    @property
-    def tells_homed(self) -> bool:
-        return self.homed is not None
 
     @property
     def home_place(self) -> tuple[int, str] | None:

@@ -11,7 +11,7 @@ import importlib.util
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from rig.drives.drive import ABSTRACT, Drive
+from rig.drives.drive import Drive
 from rig.drives.line import Line
 from rig.faults import Refused
 
@@ -58,13 +58,9 @@ def _require_drive(drive_type: Any) -> None:
     line_type = getattr(drive_type, "line_type", None)
     if not isinstance(line_type, type) or not issubclass(line_type, Line):
         raise TypeError(f"{name}.line_type must be a subclass of rig.drives.Line")
-    for kind, base, methods in (
-        (drive_type, Drive, ABSTRACT),
-        (line_type, Line, ("connect", "close")),
-    ):
-        for method in methods:
-            if getattr(kind, method) is getattr(base, method):
-                raise TypeError(f"{kind.__name__} must define {method}")
+    for kind in (drive_type, line_type):
+        for method in sorted(kind.__abstractmethods__):
+            raise TypeError(f"{kind.__name__} must define {method}")
 
 
 def make_drives(

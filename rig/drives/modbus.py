@@ -406,31 +406,18 @@ class ModbusDrive(Drive):
     axis: Axis
     line: Bus
 
+    def __init__(self, line: Bus, axis: Axis) -> None:
+        has = {name for name, table in vars(axis.map).items() if table is not None}
+        self.can_reset, self.can_home = "alarm_reset" in has, "home" in has
+        self.can_set_zero, self.tells_homed = "set_zero" in has, "homed" in has
+        self.counts_from_home = axis.map.home_place is not None  # type: ignore[attr-defined]  # of Modbus
+        super().__init__(line, axis)
+
     @property
     def map(self) -> RegisterMap:
         """The registers of its family."""
         found: Any = self.axis.map  # or what a stop could read of one
         return found
-
-    @property
-    def counts_from_home(self) -> bool:  # type: ignore[override]  # of the map
-        return self.map.home_place is not None
-
-    @property
-    def can_reset(self) -> bool:  # type: ignore[override]  # of the map
-        return self.map.alarm_reset is not None
-
-    @property
-    def can_home(self) -> bool:  # type: ignore[override]  # of the map
-        return self.map.home is not None
-
-    @property
-    def can_set_zero(self) -> bool:  # type: ignore[override]  # of the map
-        return self.map.set_zero is not None
-
-    @property
-    def tells_homed(self) -> bool:  # type: ignore[override]  # of the map
-        return self.map.homed is not None
 
     @property
     def says_homed(self) -> bool:  # type: ignore[override]  # of the status word

@@ -90,5 +90,7 @@ def unchecked(
         axis.name
         for axis in config.axes
         if axis.name in unseen
-        and not (axis.map.tells_homed or axis.map.absolute_encoder or axis.name in told)
+        and not (
+            axis.map.has("homed") or axis.map.absolute_encoder or axis.name in told
+        )
     ]

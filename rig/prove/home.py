@@ -35,7 +35,7 @@ def unlimited(config: RigConfig) -> RigConfig:
 
 def can_home(config: RigConfig) -> bool:
     """Whether every drive has a homing of its own."""
-    return all(axis.map.homes for axis in config.axes)
+    return all(axis.map.has("home") for axis in config.axes)
 
 
 def home(run: Run, device: Device, config: RigConfig, here: bool) -> None:

@@ -135,7 +135,7 @@ def go_home(site: Site, here: bool) -> int:
     """Make the counts mean a place: HOMED."""
     names = [axis.name for axis in site.config.axes]
     if not here and not can_home(site.config):
-        without = {a.map.name for a in site.config.axes if not a.map.homes}
+        without = {a.map.name for a in site.config.axes if not a.map.has("home")}
         raise Refused(
             f"the map {', '.join(sorted(without))} has no homing. Put the device into "
             "its home posture, then run `jaxcal-rig setup home --here`"
