@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import re
 import signal
 import sys
 from collections.abc import Sequence
 
 if sys.argv[1:2] == ["stop"]:  # nothing may keep it from the drives
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that is closed meanwhile
-
-NUMBER = re.compile(r"[-+.0-9]+(?:[eE][-+]?[0-9]+)?")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -22,14 +19,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 2
-    argv = _ordered(sys.argv[1:] if argv is None else argv)
+    argv = sys.argv[1:] if argv is None else list(argv)
     if argv[:1] == ["stop"] and not {"-h", "--help"} & {*argv}:
         from rig import stopping
 
         return stopping.main(argv[1:])
     from jaxcal.arguments import values_of
     from jaxcal.files import require_kept
-    from rig.commands import make_parser
+    from rig.commands import make_parser, resolved
     from rig.faults import (
         EXIT_BAD_INPUT,
         EXIT_FAULT,
@@ -39,10 +36,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     from rig.parts import require
 
+    argv, notes = resolved(argv)
     command, code = argv[0] if argv else None, EXIT_BAD_INPUT
     try:
+        for note in notes:
+            print(f"jaxcal-rig: {note}", file=sys.stderr)
         args = make_parser(command).parse_args(argv)
-        require(args.command)
+        require(args.command, getattr(args, "simulate", False))
         require_kept(vars(args))
         code = args.function(**values_of(args))
         return code
@@ -56,18 +56,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(error, JournalError) and command == "resume":
             return EXIT_BAD_INPUT
         return EXIT_FAULT if isinstance(error, RuntimeError) else code
-
-
-def _ordered(argv: Sequence[str]) -> list[str]:
-    """The numbers of ``goto --to`` last: they are as many as the device measures, and
-    would take the calibration behind them for one more."""
-    words = list(argv)
-    if words[:1] != ["goto"] or "--to" not in words:
-        return words
-    begin = end = words.index("--to") + 1
-    while end < len(words) and NUMBER.fullmatch(words[end]):
-        end += 1
-    return [*words[: begin - 1], *words[end:], *words[begin - 1 : end]]
 
 
 if __name__ == "__main__":

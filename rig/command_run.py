@@ -18,7 +18,7 @@ from rig.signals import Signals
 
 ONE_SPEED = (
     "the stop was proved at one speed alone, by an earlier version: the axes move "
-    "slowly near their limits. `jaxcal-rig axes` proves it at two"
+    "slowly near their limits. `jaxcal-rig setup axes` proves it at two"
 )
 
 

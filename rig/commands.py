@@ -5,16 +5,18 @@ Each loads what it needs. All of them, of other packages too, are entry points.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import dataclasses
 import pathlib
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from jaxcal.arguments import Parser
 from jaxcal.extras import MissingExtraError
 from rig.faults import EXIT_FAULT, EXIT_OK, Refused
-from rig.parts import COMMANDS, offered, part
+from rig.parts import COMMANDS, PLACES, STEPS, offered, part
 
 if TYPE_CHECKING:
     from rig.config import RigConfig
@@ -35,6 +37,7 @@ Saved = Annotated[Path, "its file, or its run's folder"]
 ConfigPath = Annotated[Path, "default: rig.toml here"]
 Faults = Annotated[list[str], "inject KIND[@PHASE][,count=N]...; list: names them"]
 Postures = Annotated[int, "postures"]
+Programs = Annotated[list[str], "programs that the file names, and that are to be run"]
 Units = Annotated[int, "ids 1 to N are asked", (1, 247)]
 BusName = Annotated[
     str,
@@ -63,6 +66,10 @@ class Simulation:
     gearing: Annotated[int, "pulses per turn, in the drives"] | None = None
     lost_origin: Annotated[float, "degrees the counts are off", (-90, 90)] = 0.0
     realistic: Annotated[bool, "slow replies and enabling, jitter, watchdog"] = False
+
+
+SIMULATOR = {field.name for field in dataclasses.fields(Simulation)} | {"fault"}
+SIMULATOR_FLAGS = {f"--{name.replace('_', '-')}" for name in SIMULATOR}
 
 
 @dataclasses.dataclass
@@ -336,27 +343,47 @@ def stop(*, config: ConfigPath | None = None) -> int:
     return stopping.stop_device(config or FILE, config is not None)
 
 
-def check(file: ConfigPath | None = None, *, config: ConfigPath | None = None) -> int:
+def check(
+    file: ConfigPath | None = None,
+    *,
+    config: ConfigPath | None = None,
+    run: Programs | None = None,
+) -> int:
     """check a configuration and list every fault"""
     from rig.config import load_config
     from rig.drives import make_drives
 
     path = config or file or FILE
     loaded = load_config(path)
-    if loaded.model is not None:
+    left = not_asked_for(loaded, run)
+    if loaded.model is not None and loaded.model.factory not in left:
         from rig.device_model import model_of  # numpy: half of this command's time
 
         model_of(loaded)
-    make_drives(loaded.bus, loaded.axes)
+    if not {axis.map.drive for axis in loaded.axes} & {*left}:
+        make_drives(loaded.bus, loaded.axes)
     print(f"{path}: valid")
+    for name in left:
+        print(f"  NOT run, and so not checked: {name}, a program that it names. "
+              f"With --run {name} it is")  # fmt: skip
     for axis in loaded.axes:
         print(
             f"  {axis.name}: unit {axis.unit}, {axis.map.name}, "
             f"{axis.pulses_per_deg:.3f} pulses per {axis.unit_name}, "
             f"{axis.min_pulses}..{axis.max_pulses} pulses"
         )
+    if loaded.imu is not None:
+        print(f"  phone ({loaded.imu.format}): {loaded.imu.fields()}")
     print(f"  heartbeat {loaded.heartbeat_s:.3g} s")
     return EXIT_OK
+
+
+def not_asked_for(config: RigConfig, run: list[str] | None) -> list[str]:
+    """Programs that a file names, a model's and of drives of one's own, and that were
+    not asked for by name: a folder that somebody sent may hold anything."""
+    named = [config.model.factory] if config.model and config.model.factory else []
+    named += [axis.map.drive for axis in config.axes if axis.map.drive != "modbus"]
+    return [name for name in dict.fromkeys(named) if name not in (run or ())]
 
 
 def example(name: Annotated[str, "without it they are listed"] | None = None) -> int:
@@ -365,6 +392,51 @@ def example(name: Annotated[str, "without it they are listed"] | None = None) ->
 
     print((example_text(name) if name else "\n".join(example_names())).strip())
     return EXIT_OK
+
+
+NUMBER = re.compile(r"[-+.0-9]+(?:[eE][-+]?[0-9]+)?")
+NUMBERS = re.compile(rf"{NUMBER.pattern}(?:,{NUMBER.pattern})*,?")
+UNTIL = "works until 0.4"
+
+
+def resolved(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Words as the parsers of commands know them, and what to say of old names.
+
+    ``setup home`` is the command ``home``, ``simulate calibrate`` is ``calibrate
+    --simulate``.
+    """
+    words, notes = [*argv], []
+    if simulated := words[:1] == ["simulate"] and words[1:2] and words[1][:1] != "-":
+        del words[0]
+    name, step = (*words, "", "")[:2]
+    if step in STEPS.get(name, ()):
+        del words[0]
+    elif name in PLACES:
+        notes.append(f"{name} is now `jaxcal-rig {PLACES[name]} {name}`; this {UNTIL}")
+    flags = {word.partition("=")[0] for word in words[1:]} & SIMULATOR_FLAGS
+    if simulated:
+        words.insert(1, "--simulate")
+    elif flags and name != "simulate":
+        given = " ".join([*words[:1], *sorted(flags)])
+        notes.append(f"type `jaxcal-rig simulate {given} ...`; without it this {UNTIL}")
+    return _ordered(words), notes
+
+
+def _ordered(words: list[str]) -> list[str]:
+    """The numbers of ``goto --to`` by themselves and last: they are as many as the
+    device measures, and would take the calibration behind them for one more."""
+    if words[:1] != ["goto"]:
+        return words
+    for place, word in enumerate(words):
+        if word.startswith("--to="):
+            words = [*words[:place], "--to", word[5:], *words[place + 1 :]]
+    if "--to" not in words:
+        return words
+    begin = end = words.index("--to") + 1
+    while end < len(words) and NUMBERS.fullmatch(words[end]):
+        end += 1
+    numbers = ",".join(words[begin:end]).split(",")
+    return [*words[: begin - 1], *words[end:], "--to", *filter(None, numbers)]
 
 
 EPILOG = """\
@@ -377,11 +449,20 @@ emergency stop is required.
 """
 
 
+class RigParser(Parser):
+    """Takes ``setup home`` and ``simulate calibrate``."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        if self.prog == "jaxcal-rig" and args is not None:
+            args, _ = resolved(args)
+        return super().parse_known_args(args, namespace)
+
+
 def make_parser(only: str | None = None) -> Parser:
     """The parser of every command; with the options of one alone it is made quicker."""
     about = "Calibrate a device of one to six axes: its drives, and what measures them."
     about += " Begin with `setup`."
-    parser = Parser(prog="jaxcal-rig", description=about, epilog=EPILOG)
+    parser = RigParser(prog="jaxcal-rig", description=about, epilog=EPILOG)
     added = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     absent: dict[str, str] = {}
     if only in (names := offered(COMMANDS)):
@@ -390,7 +471,15 @@ def make_parser(only: str | None = None) -> Parser:
         functions = _loaded(names, absent)
     for function in functions:
         name, text = function.__name__, function.__doc__
-        added.add_parser(name, help=text, description=text).of(function)
+        place = PLACES.get(name)
+        told = {} if place else {"help": text}  # a step is listed in its place's help
+        more = f"\n\nby themselves: {', '.join(STEPS[name])}" if name in STEPS else ""
+        prog = " ".join(filter(None, ("jaxcal-rig", place, name)))
+        command = added.add_parser(name, prog=prog, description=text + more, **told)
+        command.of(function)
+        for action in command._actions if name != "simulate" else ():
+            if action.dest in SIMULATOR:
+                command.rare[action], action.help = action.help, argparse.SUPPRESS
     for name, text in absent.items():
         added.add_parser(name, help=text)
     return parser

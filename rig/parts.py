@@ -12,6 +12,11 @@ from typing import Any
 
 from jaxcal.extras import MissingExtraError, install, installed, needs
 
+STEPS = {  # commands that are typed after another one
+    "setup": ("home", "axes", "zero", "jog", "characterise"),
+    "check": ("ports", "scan", "imu", "identify"),
+}
+PLACES = {step: place for place, steps in STEPS.items() for step in steps}
 COMMANDS, PARTS = "jaxcal_rig.commands", "jaxcal_rig.parts"
 NEEDED = {  # by an extra; looked for before any port opens, quicker than importing
     "rig": ("pydantic", "serial", "tomlkit"),
@@ -44,19 +49,26 @@ def part(name: str, purpose: str, group: str = PARTS) -> Any:
         return point.load()
 
 
-def require(command: str) -> None:
+def require(command: str, simulated: bool = False) -> None:
     """Refuse a command of which a package is not installed.
 
+    Args:
+        command: its name.
+        simulated: its device is, which needs the simulator.
+
     Raises:
-        MissingExtraError: in one line, with the command that installs it.
+        MissingExtraError: in one line, with what installs all that is missing.
     """
     module = offered(COMMANDS)[command].module
-    extra = _extra_of(module)
-    for name in (module.partition(".")[0], *NEEDED[extra]):
-        if importlib.util.find_spec(name) is None:
-            raise MissingExtraError(
-                f"{command} needs {name}, which is not installed: {install(extra)}"
-            )
+    extra = "workbench" if simulated else _extra_of(module)
+    needed = (module.partition(".")[0], *NEEDED[extra])
+    if lacking := [name for name in needed if importlib.util.find_spec(name) is None]:
+        what = f"{command}{' --simulate' * simulated}"
+        verb = "are" if len(lacking) > 1 else "is"
+        raise MissingExtraError(
+            f"{what} needs {', '.join(lacking)}, which {verb} not installed: "
+            f"{install(extra)}"
+        )
 
 
 def _extra_of(module: str) -> str:

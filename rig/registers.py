@@ -10,8 +10,13 @@ import struct
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-Kind = Literal["u16", "i16", "u32", "i32"]
-FORMATS: dict[Kind, str] = {"u16": ">H", "i16": ">h", "u32": ">I", "i32": ">i"}
+Kind = Literal["u16", "i16", "u32", "i32", "u48", "i48", "u64", "i64", "f32", "f64"]
+FORMATS: tuple[Kind, ...] = (
+    "u16", "i16", "u32", "i32", "u48", "i48", "u64", "i64", "f32", "f64",
+)  # fmt: skip
+REGISTERS = (3, 4)  # functions that read registers; 1 and 2 read bits
+FLOATS = {"f32": ">f", "f64": ">d"}
+COIL_ON = 0xFF00  # as function 5 writes it
 VALUES = ("position", "speed", "accel", "decel", "timeout", "min", "max", "home")
 LOWEST, HIGHEST = -(2**31), 2**31 - 1  # of a position
 FLAGS = ("enabled", "done", "moving", "fault")
@@ -24,25 +29,33 @@ class Word(NamedTuple):
     kind: Kind = "u16"
 
 
-def encode(value: int, kind: Kind, word_order: str) -> list[int]:
+def encode(value: float, kind: Kind, word_order: str) -> list[int]:
     """Registers of a value; ValueError where it does not fit the type."""
     try:
-        data = struct.pack(FORMATS[kind], value)
-    except struct.error:
+        if kind in FLOATS:
+            data = struct.pack(FLOATS[kind], value)
+        else:
+            size, signed = 2 * registers_of(kind), kind[0] == "i"
+            data = round(value).to_bytes(size, "big", signed=signed)
+    except (OverflowError, ValueError):
         raise ValueError(f"{value} does not fit {kind}") from None
     words = list(struct.unpack(f">{len(data) // 2}H", data))
     return words if word_order == "big" else words[::-1]
 
 
-def decode(words: list[int], kind: Kind, word_order: str) -> int:
-    """Value of one or two registers."""
+def decode(words: list[int], kind: Kind, word_order: str) -> float:
+    """Value of registers: a whole number, but of f32 and f64."""
     ordered = words if word_order == "big" else words[::-1]
-    return struct.unpack(FORMATS[kind], struct.pack(f">{len(words)}H", *ordered))[0]
+    data = struct.pack(f">{len(words)}H", *ordered)
+    if kind in FLOATS:
+        value: float = struct.unpack(FLOATS[kind], data)[0]
+        return value
+    return int.from_bytes(data, "big", signed=kind[0] == "i")
 
 
 def registers_of(kind: Kind) -> int:
     """Registers that a type takes."""
-    return struct.calcsize(FORMATS[kind]) // 2
+    return int(kind[1:]) // 16
 
 
 def word_of(word: Any) -> Word:
@@ -77,15 +90,30 @@ class Table:
 
 
 class Value(Table):
-    """A value to read: one or two registers."""
+    """A value to read: registers by function 3 or 4, or bits by 1 or 2."""
 
     if TYPE_CHECKING:
         address: int
         type: Kind
+        function: Literal[1, 2, 3, 4]
+        bits: int  # 0: as many as the registers have
 
     @property
     def count(self) -> int:
         return registers_of(self.type)
+
+    @property
+    def quantity(self) -> int:
+        """Registers, or bits, that are asked for."""
+        whole = self.count if self.function in REGISTERS else 16 * self.count
+        return self.bits or whole
+
+
+class Place(Value):
+    """A position, in counts once it is multiplied by ``counts``."""
+
+    if TYPE_CHECKING:
+        counts: float
 
 
 class Bits(Table):
@@ -117,19 +145,19 @@ class Frame(Table):
     if TYPE_CHECKING:
         address: int
         words: tuple[Word, ...]
-        function: Literal[6, 16]
+        function: Literal[5, 6, 16]
 
     @property
     def count(self) -> int:
         return registers_in(self.words)
 
-    def registers(self, word_order: str, **values: int) -> list[int]:
+    def registers(self, word_order: str, **values: float) -> list[int]:
         """What the frame holds, with the values that its words name."""
         found = []
         for value, kind in self.words:
             number = values[value] if isinstance(value, str) else value
             found += encode(number, kind, word_order)
-        return found
+        return [COIL_ON * bool(n) for n in found] if self.function == 5 else found
 
     def places(self) -> Iterator[tuple[int, Word]]:
         """Every word with its address."""

@@ -17,7 +17,17 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
-from rig.registers import FLAGS, FORMATS, Bits, Flags, Frame, Frames, Value, word_of
+from rig.registers import (
+    FLAGS,
+    FORMATS,
+    Bits,
+    Flags,
+    Frame,
+    Frames,
+    Place,
+    Value,
+    word_of,
+)
 from rig.registers import registers_in as count_of
 
 MAP_FOLDER = pathlib.Path(__file__).parent / "maps"
@@ -42,7 +52,6 @@ class Bus:
     host: str = ""
     port: int = 502
     device: str = ""
-    interface: str = "socketcan"
     baudrate: int = 115200
     parity: str = "N"
     stopbits: int = 1
@@ -222,7 +231,9 @@ def _frames(table: Any) -> Frames | None:
         frames = []
         for row in rows:
             words = tuple(word_of(word) for word in row["words"])
-            function = 6 if count_of(words) == 1 and row.get("function") != 16 else 16
+            function = row.get("function")
+            if count_of(words) > 1 or function not in (5, 6, 16):
+                function = 6 if count_of(words) == 1 else 16
             address = int(_number(row["address"], 0, 0, 0xFFFF, "address", []))
             frames.append(Frame(address=address, words=words, function=function))
     except (KeyError, TypeError, ValueError):
@@ -234,7 +245,15 @@ def _value(table: Any, kind: str) -> Value | None:
     if not isinstance(table, dict) or type(table.get("address")) is not int:
         return None
     kind = str(table.get("type", kind))
-    return Value(address=table["address"], type=kind) if kind in FORMATS else None
+    if kind not in FORMATS:
+        return None
+    function, bits = table.get("function"), table.get("bits")
+    return Place(
+        address=table["address"], type=kind,
+        function=function if function in range(1, 5) else 3,
+        bits=bits if bits in range(65) else 0,
+        counts=_number(table.get("counts", 1.0), 1.0, 1e-12, 1e12, "counts", []),
+    )  # fmt: skip
 
 
 def _bits(table: Any) -> Bits | None:

@@ -40,19 +40,19 @@ def setup(
     *,
     bus: BusName = "",
     units: Units = 16,
-    imu: Annotated[str, "APP[:PORT]: hyperimu, sensorlogger or lines"] = "",
+    imu: Annotated[
+        str, "APP[:PORT]: hyperimu, sensorlogger, sensorlog, json or lines"
+    ] = "",
     home: Annotated[Literal["here", "drive"], "how"] = "here",
     axes: Annotated[
         str, "NAME:KIND,... with a KIND of X, Y, Z (a phone's), deg or mm"
     ] = "",
-    drives: Annotated[str, "their map: grbl, marlin, cia402, FILE.toml, ..."] = "",
+    drives: Annotated[str, "their map, of one's own: FILE.toml"] = "",
     readings: Annotated[
         str, "numbers, not a phone: tcp:HOST:PORT, listen:PORT, serial:DEVICE, ..."
     ] = "",
     urdf: Annotated[str, "of an arm, whose joints are the axes"] = "",
-    example: Annotated[
-        Literal["turntable", "gimbal", "stage", "servos"], "these for a device"
-    ]
+    example: Annotated[Literal["turntable", "gimbal", "stage"], "these for a device"]
     | None = None,
     set: Annotated[list[str], "KEY=VALUE of the new rig.toml"] | None = None,
 ) -> int:
@@ -145,6 +145,7 @@ def refit(
     signs: Annotated[tuple[int, int, int], "imu.signs", (-1, 1)] | None = None,
     mounting: Annotated[Angles, "imu.mounting_deg: Z, Y, X", CIRCLE] | None = None,
     factors: Annotated[list[float], "readings.factors", _numbers] | None = None,
+    factory: Annotated[str, "of its [model], a program that is run"] = "",
 ) -> int:
     """identify a recorded calibration anew"""
     from rig.sessions import recorded, records_of
@@ -153,6 +154,12 @@ def refit(
     then, start = recorded(run)
     if start["mode"] != "calibrate":
         raise Refused(f"{run} is a {start['mode']} run; refit takes a calibration")
+    model = then.model.factory if then.model else ""
+    if model != factory:
+        raise Refused(
+            f"{run} names [model] factory = {model!r}, a program that refit would run"
+            + (f": give --factory {model}" if model else f", not {factory!r}")
+        )
     values = {
         "mechanism.order": order,
         "imu.order": imu_order,

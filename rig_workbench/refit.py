@@ -126,7 +126,7 @@ def _changed(then: RigConfig, wanted: dict[str, Any]) -> dict[str, list[Any]]:
         old, new = described[table][key], json.loads(json.dumps(value))
         if old != new:
             changed[name] = [old, value]
-    quaternions = imu and (imu.format == "sensorlogger" or imu.quaternion_columns)
+    quaternions = imu and imu.by_quaternion
     for name in changed.keys() & {"imu.order", "imu.signs"} if quaternions else ():
         raise Refused(
             f"{name} cannot be changed to {changed[name][1]}: this phone sent "

@@ -26,7 +26,7 @@ SHOWN = (960, 600)
 LOADING = 6.0  # seconds until the scene is drawn
 FEWEST, MOST = 12, 24  # frames
 SECONDS = 0.5  # between two frames
-SESSION = ("calibrate", "--simulate", "--arm", "--zero", "--live", "--speedup", "0.1")
+SESSION = ("simulate", "calibrate", "--arm", "--zero", "--live", "--speedup", "0.1")
 
 
 def browser(scheme: str) -> Any:

@@ -234,6 +234,6 @@ class Axis(Scale):
             self.motion_counts()
         except ValueError as error:
             yield str(error)
-        if self.comm_timeout_s is not None and not self.map.watches_line:
+        if self.comm_timeout_s is not None and not self.map.has("comm_timeout"):
             lack = f"the map {self.map.name} has no register for it"
             yield f"comm_timeout_s: {lack}; leave it out and use the maker's tool"

@@ -249,7 +249,7 @@ class RigConfig(Section):
         return {
             axis.name: axis.comm_timeout_s or default
             for axis in self.axes
-            if axis.map.watches_line
+            if axis.map.has("comm_timeout")
         }
 
     @property
@@ -385,7 +385,7 @@ class RigConfig(Section):
         if axis.comm_timeout_s is not None and axis.comm_timeout_s <= slowest:
             least = f"bus.timeout_s x (read_retries + 1) = {slowest:g} s"
             yield f"{at}.comm_timeout_s: must exceed {least}"
-        if motion.mirror_limits and not axis.map.mirrors_limits:
+        if motion.mirror_limits and not axis.map.has("limits"):
             lack = f"the map {axis.map.name} of {axis.name} has no limit registers"
             yield f"motion.mirror_limits: {lack}"
         if low >= high:

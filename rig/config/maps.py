@@ -45,17 +45,37 @@ Names = Annotated[
 ]
 
 
+ReadFunction = Literal[1, 2, 3, 4]
+
+
 class Read(Section, registers.Value):
-    """A value to read: one or two registers."""
+    """A value to read: registers, or bits."""
 
     address: Register
     type: Kind = "u16"
+    function: ReadFunction = key(
+        "3 holding or 4 input registers, 1 coils, 2 discrete inputs", 3
+    )
+    bits: int = key("of function 1 or 2; 0: 16 for a register of type", 0, 0, 64)
+
+    def broken_rules(self) -> Iterator[str]:
+        yield from bits_rules(self)
 
 
-class Position(Read):
+def bits_rules(read: Any) -> Iterator[str]:
+    """What is wrong with the type of bits, or with their number."""
+    registers_read = read.function in registers.REGISTERS
+    if registers_read and read.bits:
+        yield f"bits: are read by function 1 or 2, got function {read.function}"
+    elif not registers_read and (read.type[0] != "u" or read.bits > 16 * read.count):
+        yield f"type: must be u16, u32, u48 or u64 and hold the bits, got {read.type}"
+
+
+class Position(Read, registers.Place):
     """The drive's own position in pulses."""
 
     type: Kind = "i32"
+    counts: float = key("pulses for 1 of what the registers hold", 1.0, 1e-12, 1e12)
 
 
 class Alarm(Read):
@@ -84,10 +104,12 @@ class StatusWord(Read, registers.Flags):
     enabled: Predicate | None = None  # where no bit says it, the drive always is
 
     def broken_rules(self) -> Iterator[str]:
+        yield from super().broken_rules()
+        width = self.bits or 16 * self.count
         for name in FLAGS:
             bits = getattr(self, name)
-            if bits and max((*bits.set, *bits.clear)) >= 16 * self.count:
-                yield f"{name}: must name bits 0..{16 * self.count - 1} of {self.type}"
+            if bits and max((*bits.set, *bits.clear)) >= width:
+                yield f"{name}: must name bits 0..{width - 1} of {self.type}"
 
 
 class Write(Section, registers.Frame):
@@ -95,13 +117,13 @@ class Write(Section, registers.Frame):
 
     address: Register
     words: Annotated[tuple[FrameWord, ...], Field(min_length=1)]
-    function: Literal[6, 16] = Field(
+    function: Literal[5, 6, 16] = Field(
         default_factory=lambda made: 6 if registers_in(made["words"]) == 1 else 16
     )
 
     def broken_rules(self) -> Iterator[str]:
-        if self.function == 6 and self.count != 1:
-            yield "function: must be 16, or 6 for one register"
+        if self.function != 16 and self.count != 1:
+            yield "function: must be 16, or 6 for one register, or 5 for one coil"
         if self.count > 123 or self.address + self.count > 0x10000:
             yield f"words: {self.count} registers from {self.address} do not fit"
 
@@ -167,8 +189,8 @@ class DriveMap(Section):
 
     schema_: Literal[1] = key("version of this schema", alias="schema")
     drive: str = key(
-        "kind of its drives: modbus, gcode, cia402, or the class of one's own as "
-        "`FILE.py:CLASS`, relative to the map, or `MODULE:CLASS`", "modbus",
+        "kind of its drives: modbus, or the class of one's own as `FILE.py:CLASS`, "
+        "relative to the map, or `MODULE:CLASS`", "modbus",
     )  # fmt: skip
     name: str = key("name of the map", min_length=1)
     title: str = key("drives it is for", min_length=1)
@@ -193,34 +215,21 @@ class DriveMap(Section):
         """The folder that the file of a class is relative to."""
         return self._folder
 
+    # What a map may have, and where it is.
+
     @property
     def register_units(self) -> Units | None:
         """Units of registers for speed and acceleration, where there are any."""
-        return None
+        return getattr(self, "units", None)
 
     def place_of(self, name: str) -> tuple[int, Kind] | None:
         """Register of a value of a move, and its type, where there is one."""
-        return None
+        frames = getattr(self, "move", None)
+        return frames.place_of(name) if frames else None
 
-    @property
-    def watches_line(self) -> bool:
-        """Whether the drive stops after a silence of the line that can be set."""
-        return False
-
-    @property
-    def mirrors_limits(self) -> bool:
-        """Whether the drive takes the soft limits too."""
-        return False
-
-    @property
-    def homes(self) -> bool:
-        """Whether the drive has a homing of its own."""
-        return False
-
-    @property
-    def tells_homed(self) -> bool:
-        """Whether the drive says that it is homed."""
-        return False
+    def has(self, table: str) -> bool:
+        """Whether there is a table, such as ``comm_timeout``, ``limits``, ``home``."""
+        return getattr(self, table, None) is not None
 
     @property
     def digest(self) -> str:
@@ -288,29 +297,6 @@ class RegisterMap(DriveMap):
     homed: Predicate | None = key(
         "bits of the status word that are on from homing until the power fails", None
     )
-
-    @property
-    def register_units(self) -> Units:
-        return self.units
-
-    def place_of(self, name: str) -> tuple[int, Kind] | None:
-        return self.move.place_of(name)
-
-    @property
-    def watches_line(self) -> bool:
-        return self.comm_timeout is not None
-
-    @property
-    def mirrors_limits(self) -> bool:
-        return self.limits is not None
-
-    @property
-    def homes(self) -> bool:
-        return self.home is not None
-
-    @property
-    def tells_homed(self) -> bool:
-        return self.homed is not None
 
     @property
     def home_place(self) -> tuple[int, str] | None:

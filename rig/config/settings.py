@@ -8,8 +8,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from rig.config.axis import Range
+from rig.config.maps import ReadFunction, bits_rules
 from rig.config.schema import Section, advanced, key
-from rig.registers import Kind, registers_of
+from rig.registers import Kind, Value
 from rig.stop_config import NETWORK, where_of
 
 Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
@@ -25,12 +26,11 @@ class BusSettings(Section):
 
     transport: Literal["tcp", "rtu_tcp", "rtu", "serial", "can"] = key(
         "rtu: Modbus on a serial port; tcp: Modbus TCP; rtu_tcp: RTU frames over TCP; "
-        "serial: lines of text on a serial port; can: a CAN bus"
+        "serial, can: a line of drives of one's own"
     )
     host: str = key("address of a tcp or rtu_tcp bus", "")
     port: int = key("TCP port of a tcp or rtu_tcp bus", 502, 1, 65535)
     device: str = key("serial port; channel of a CAN bus, such as can0", "")
-    interface: str = key("of python-can, of a CAN bus", "socketcan")
     baudrate: int = key("of a serial port or a CAN bus", 115200, 1200, 3_000_000)
     parity: Literal["N", "E", "O"] = key("of an rtu bus", "N")
     stopbits: int = key("of an rtu bus", 1, 1, 2)
@@ -58,9 +58,12 @@ def _by_format(hyperimu: Any, other: Any) -> Callable[[dict[str, Any]], Any]:
 class ImuSettings(Section):
     """The phone's stream."""
 
-    format: Literal["hyperimu", "lines", "sensorlogger"] = key("app of the phone")
-    transport: Literal["listen", "connect"] = key(
-        "listen: the phone connects to this computer", "listen"
+    format: Literal["hyperimu", "lines", "sensorlog", "json", "sensorlogger"] = key(
+        "app of the phone; sensorlog: lines under a header, json: an object a line"
+    )
+    transport: Literal["listen", "connect", "udp"] = key(
+        "listen: the phone connects to this computer; udp: it sends datagrams here",
+        "listen",
     )
     host: str = key(
         "listen: this computer's address; connect: the phone's", "127.0.0.1"
@@ -76,9 +79,13 @@ class ImuSettings(Section):
         "of x, y, z, w, in place of angles", None
     )
     stamp_column: int = advanced(
-        "of the phone's clock in ms; -1: none", "-1; hyperimu: 0", -1, 200,
+        "of the phone's clock; -1: none", "-1; hyperimu: 0", -1, 200,
         by=_by_format(0, -1),
     )  # fmt: skip
+    stamp_unit: Literal["s", "ms", "us", "ns"] | None = advanced(
+        "of the phone's clock; absent: told by the first stamp, else ms (json: ns)",
+        None,
+    )
     column_count: int = advanced(
         "a line of another width is refused; 0: as the first line", 0, 0, 200
     )
@@ -108,6 +115,30 @@ class ImuSettings(Section):
     stale_s: float = key("older than this while moving: stop", 0.4, 0.02, 10)
     max_jump_deg: float = advanced("between two readings", 20.0, 0.1, 180)
 
+    @property
+    def by_quaternion(self) -> bool:
+        """Whether it sends quaternions, which have no unit, order or signs."""
+        of_format = self.format in ("sensorlogger", "sensorlog", "json")
+        return of_format or self.quaternion_columns is not None
+
+    def fields(self, stamp_unit: str = "") -> str:
+        """What the fields of a record are taken for, in words; ``stamp_unit`` of its
+        time, where that is known."""
+        stamp_unit = stamp_unit or self.stamp_unit or "a unit that the first one tells"
+        time_in = f"the time in {stamp_unit}"
+        if self.format in ("json", "sensorlogger"):
+            return f"the quaternion x, y, z, w of an orientation; {time_in}"
+        if self.format == "sensorlog":
+            return "a quaternion and its time, by the names in the app's header"
+        stamp = f"column {self.stamp_column} {time_in}"
+        stamp = stamp if self.stamp_column >= 0 else "no time"
+        if self.quaternion_columns:
+            columns = [*self.quaternion_columns]
+            return f"columns {columns} a quaternion x, y, z, w; {stamp}"
+        turns = zip(self.columns, str(self.order), self.signs, strict=True)
+        angles = ", ".join(f"{c} about {'-' * (g < 0)}{axis}" for c, axis, g in turns)
+        return f"columns {angles} (in this order), in {self.unit}; {stamp}"
+
     def broken_rules(self) -> Iterator[str]:
         for address in self.allow:
             try:
@@ -132,17 +163,20 @@ class ImuSettings(Section):
             yield f"separator: must be one character that no number has, got {got}"
 
 
-class ReadingRegister(Section):
+class ReadingRegister(Section, Value):
     """A value of a Modbus device that measures."""
 
     unit: int = key("Modbus unit id", 1, 0, 255)
     address: int = key("of the register, from 0", ..., 0, 0xFFFF)
     type: Kind = key("of its value", "i32")
-    word_order: Literal["big", "little"] = key("of 32-bit pairs", "big")
+    word_order: Literal["big", "little"] = key("big: high word first", "big")
+    function: ReadFunction = key(
+        "3 holding or 4 input registers, 1 coils, 2 discrete inputs", 3
+    )
+    bits: int = key("of function 1 or 2; 0: 16 for a register of type", 0, 0, 64)
 
-    @property
-    def count(self) -> int:
-        return registers_of(self.type)
+    def broken_rules(self) -> Iterator[str]:
+        yield from bits_rules(self)
 
 
 class ReadingsSettings(Section):

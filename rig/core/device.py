@@ -24,16 +24,25 @@ from rig.core.stop_distance import stop_distances
 from rig.drives import Drive, make_drives
 from rig.drives.drive import Status
 from rig.drives.line import BusError
-from rig.faults import LimitError, MotionFault, Requests, StopRequested
+from rig.faults import (
+    LimitError,
+    MotionFault,
+    PauseRequested,
+    Requests,
+    StopRequested,
+)
 from rig.journal import SIGN_CHECKED, DeviceRecord, Record, RunFolder
 from rig.readings import make_source
-from rig.readings.attitude import Array
+from rig.readings.attitude import Array, Reading
 from rig.readings.geometry import Frame, geometry_of
+from rig.readings.source import ReadingError
 
 LOOK_S = 0.002  # between two looks for a reading
 OVERDUE_S = 0.3  # of a stop that was asked for and that no loop has answered
 TELLS = 0.03  # least of the singular values, of the largest: by so little an axis tells
 TICK_S = 0.05  # of the heartbeat
+PATIENCE_S = 60.0  # with a stream that pauses while nothing moves
+SLEPT_S = 1.0  # by which the clock that runs on in a computer's sleep is ahead
 
 
 class Pace(NamedTuple):
@@ -104,8 +113,19 @@ class Heartbeat(threading.Thread):
             self.join(2.0)
 
     def run(self) -> None:
+        ahead = clock_ahead_s()
         while not self._closing.wait(TICK_S):
             silence = time.monotonic() - self._fed
+            slept_s, ahead = clock_ahead_s() - ahead, clock_ahead_s()
+            if slept_s > SLEPT_S:
+                text = f"this computer slept for {slept_s:.0f} s"
+                if self._moving:
+                    self._stopper.stop(
+                        f"{text} while the device moved, unseen. Switch its power "
+                        "saving off"
+                    )
+                    return
+                self._stopper.tell(text)
             if not self._stopper.reason and (late := self._requests.overdue(OVERDUE_S)):
                 self._stopper.stop(f"{late}, which the session did not answer")
                 return
@@ -122,6 +142,12 @@ class Heartbeat(threading.Thread):
                     with contextlib.suppress(BusError, StopRequested):
                         drive.status(retries=0)
                 self._fed = time.monotonic()
+
+
+def clock_ahead_s() -> float:
+    """Seconds that this computer has slept since it was started, where it says so."""
+    clock = getattr(time, "CLOCK_BOOTTIME", None)
+    return 0.0 if clock is None else time.clock_gettime(clock) - time.monotonic()
 
 
 class LineWatch:
@@ -247,6 +273,7 @@ class Device:
         self.armed = self.pausing = False
         self.moves = 0  # frames that moved a drive
         self.arrived = 0.0  # monotonic time of the last arrival
+        self.paused_s = 0.0  # that streams have paused, in all
         self.meanwhile: Callable[[], None] = lambda: None  # at every poll of a move
         self.zero: Posture | None = None  # once it is taken,
         self.frame: Frame | None = None  # and what the phone reads against it
@@ -298,7 +325,7 @@ class Device:
         if not axis.min_pulses - slack <= status.position <= axis.max_pulses + slack:
             raise MotionFault(
                 f"{axis.name} stands at {status.position} pulses, outside its limits "
-                f"{axis.min_pulses}..{axis.max_pulses}. Run `jaxcal-rig home`"
+                f"{axis.min_pulses}..{axis.max_pulses}. Run `jaxcal-rig setup home`"
             )
 
     def check_untouched(self, here: Pulses) -> None:
@@ -350,15 +377,44 @@ class Device:
         return [drive.sound() for drive in self.drives]
 
     def attitude(self, since: float = 0.0) -> Array:
-        """A reading, (3, 3) of a phone, measured at or after a monotonic time.
+        """A reading, (3, 3) of a phone, measured at or after a monotonic time, of a
+        device that stands: a stream that pauses is waited for.
 
         Raises:
-            ReadingError: it is stale. StopRequested: a stop was asked for meanwhile.
+            PauseRequested: it does not come back. StopRequested: a stop was asked for.
         """
-        while (reading := self.imu.latest()).time < since:
+        while (reading := self.await_stream()).time < since:
             self.guard()
             time.sleep(LOOK_S)
         return reading.value
+
+    def await_stream(self) -> Reading:
+        """The newest reading, once it is fresh, while nothing moves.
+
+        A phone that saves power holds its Wi-Fi now and then; ``paused_s`` counts it.
+
+        Raises:
+            PauseRequested: not within PATIENCE_S. MotionFault: a drive moves, or is in
+                alarm. StopRequested: a stop was asked for.
+        """
+        begun = time.monotonic()
+        while True:
+            try:
+                reading = self.imu.latest()
+                break
+            except ReadingError as error:
+                if time.monotonic() - begun > PATIENCE_S:
+                    text = f"{error}. The device stood meanwhile"
+                    raise PauseRequested(text) from None
+            self.guard()
+            if any(status.moving for status in self.statuses()):
+                raise MotionFault("a drive moves while the readings pause")
+            time.sleep(self.config.motion.poll_s)
+        if (waited_s := time.monotonic() - begun) > LOOK_S:
+            self.paused_s += waited_s
+            text = f"{self.imu.whose}'s stream paused for {waited_s:.1f} s more"
+            self.emit("note", text=f"{text}; the device stood meanwhile")
+        return reading
 
     def moved(self, change: Array, middle: Array) -> Array | None:
         """(n,) by which the axes moved, of an (m,) change of what is measured.

@@ -99,4 +99,4 @@ def _compare(device: Device, j: int, turn: Array, then: Array, noise: float) -> 
             )
     if fault:
         device.record.void(SIGN_CHECKED, fault)
-        raise MotionFault(f"{fault}. Correct it, then run `jaxcal-rig axes`")
+        raise MotionFault(f"{fault}. Correct it, then run `jaxcal-rig setup axes`")

@@ -50,7 +50,7 @@ def measure(standing: Arrival, samples: int | None = None) -> dict[str, Any]:
     """
     device, target = standing.device, standing.posture.pulses
     settle = device.config.settle
-    deadline = time.monotonic() + settle.timeout_s
+    deadline = time.monotonic() - device.paused_s + settle.timeout_s
     readings: list[Reading] = []
     while not readings:  # the stream paused, or what was read was not quiet
         device.emit("phase", phase="settling")
@@ -91,13 +91,15 @@ def _settled(device: Device, deadline: float) -> list[Status]:
     settle, since = device.config.settle, time.monotonic()
     while True:
         device.guard()
+        paused_s = device.paused_s
+        device.await_stream()
         statuses = device.statuses()
         now = time.monotonic()
-        if any(status.moving for status in statuses):
+        if device.paused_s > paused_s or any(status.moving for status in statuses):
             since = now
         if not (reason := _unquiet(device, device.imu.since(since), now)):
             return statuses
-        if now > deadline:
+        if now - device.paused_s > deadline:
             raise MotionFault(
                 f"the device did not settle in {settle.timeout_s:g} s: {reason}"
             )
@@ -136,8 +138,8 @@ def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
             return (
                 f"{names[worst]} reads {values[worst]:.3f} {unit} (settle.{what} = "
                 f"{limit:g}). Either something still shakes, or the limit is below "
-                f"{device.imu.whose}'s noise: `jaxcal-rig imu` shows that; raise the "
-                "key above it"
+                f"{device.imu.whose}'s noise: `jaxcal-rig check imu` shows that; raise "
+                "the key above it"
             )
     return ""
 
@@ -188,7 +190,7 @@ def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
         raise MotionFault(
             f"the IMU reads {names[worst]} {abs(apart[worst]):.1f} deg away from "
             f"the command (limit {DISAGREEMENT_DEG:g}). Check the zero posture, then "
-            "run `jaxcal-rig axes`"
+            "run `jaxcal-rig setup axes`"
         )
     way = commanded - last.commanded
     asked = np.abs(way)

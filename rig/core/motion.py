@@ -12,10 +12,12 @@ from rig.core.device import Device, Pace, Posture, approach, check_plan
 from rig.drives.drive import START_S, STILL_COUNTS, Drive, Status
 from rig.drives.line import BusError
 from rig.faults import EndedShort, MotionFault, Unreachable
+from rig.readings.attitude import Array
 
 DEADLINE_FACTOR, DEADLINE_SLACK_S = 2.0, 2.0  # of a move's computed time, and more
 FOLLOWING_DEG = 3.0  # a drive may leave its way by
-TOO_FAST = 1.6  # times the speed that is asked for: more is a fault
+TOO_FAST = 1.6  # times the speed that is asked for: more is a fault, but of a crawl:
+LEAST_TURNS_S, LEAST_DEG_S = 0.05, 5.0  # motor, joint: many drives begin at 2 rpm
 SPAN_S = 0.5  # over which a speed is taken, or from the start of the move
 LAG_S = 0.1  # of the phone behind a move that is longer than those before
 
@@ -50,7 +52,7 @@ def move(device: Device, posture: Posture) -> Arrival:
 def _piece(device: Device, goal: Pulses, label: str) -> bool:
     """Go as far to a goal as the proof allows, and look; whether it is reached."""
     proof, config = device.proof, device.config
-    connection, attitude = device.imu.connections, device.attitude(device.arrived)
+    connection, attitude = _look(device)
     starts = device.statuses()
     here = tuple(start.position for start in starts)
     device.check_untouched(here)
@@ -87,6 +89,15 @@ def _piece(device: Device, goal: Pulses, label: str) -> bool:
     if proof.grows(here, end) and connection == device.imu.connections:
         proof.saw(here, end, device.attitude(device.arrived + LAG_S))
     return end == goal
+
+
+def _look(device: Device) -> tuple[int, Array]:
+    """Connection of the phone, and a reading over it since the device arrived."""
+    while True:
+        connection = device.imu.connections
+        attitude = device.attitude(device.arrived)
+        if connection == device.imu.connections:
+            return connection, attitude
 
 
 def _send(device: Device, drive: Drive, start: Status, pulses: int) -> None:
@@ -226,7 +237,8 @@ def _check_speed(device: Device, axis: Axis, seen: list[Status]) -> None:
     before, way = device.paces.get(axis.name), ways[0][0]
     if before is None or way > before.way_deg:
         device.paces[axis.name] = Pace(way, asked, speed)
-    if speed > TOO_FAST * asked and not device.simulated:
+    slowest = min(LEAST_TURNS_S / axis.turns_per_deg, LEAST_DEG_S)
+    if speed > max(TOO_FAST * asked, slowest) and not device.simulated:
         raise MotionFault(
             f"{axis.name} moves at {speed:.3g} {axis.unit_name}/s or faster, and was "
             f"told to move at {asked:.3g}: the drive does not take its speed. Check "
@@ -251,5 +263,5 @@ def _check_attitude(device: Device, connection: int) -> None:
             raise MotionFault(
                 f"the IMU reads {axis.name} at {angle:.2f} deg, outside its "
                 f"envelope {low:.1f}..{high:.1f}. Check the zero posture and that the "
-                "phone is fixed, then run `jaxcal-rig axes`"
+                "phone is fixed, then run `jaxcal-rig setup axes`"
             )

@@ -104,12 +104,7 @@ def unit_proved(imu: ImuSettings | ReadingsSettings, attitude: Array) -> bool:
     are proved. A number over 2 pi is no angle in radians. Degrees that are read as
     radians turn 57.3 times too far, which the first move shows.
     """
-    if (
-        isinstance(imu, ReadingsSettings)
-        or imu.format == "sensorlogger"
-        or imu.quaternion_columns
-        or imu.unit == "rad"
-    ):
+    if isinstance(imu, ReadingsSettings) or imu.by_quaternion or imu.unit == "rad":
         return True
     sent = matrix_to_euler(attitude, str(imu.order))
     return bool(np.abs(sent).max() > LARGEST_RAD)
@@ -344,7 +339,7 @@ class Proof:
                 f"{reach.axis.name} {geometry.changed} {turned_deg:.2f} "
                 f"{geometry.unit} in a move that {geometry.again} {expected:.2f} when "
                 "`axes` looked: its drive, its setting or its gearbox was exchanged. "
-                "Correct it, then run `jaxcal-rig axes`"
+                "Correct it, then run `jaxcal-rig setup axes`"
             )
 
 

@@ -204,6 +204,10 @@ class Stopper:
             self._emit("stayed", went_on=words, units=units)
             return self.results
 
+    def tell(self, text: str) -> None:
+        """Note something that stops nothing."""
+        self._emit("note", text=text)
+
     def check(self) -> None:
         """Raise StopRequested where a stop has latched."""
         if self.reason:

@@ -1,7 +1,7 @@
 """What moves: drives on their line, by the kind that each axis's map names.
 
-``line`` and ``drive`` are what motion and stop ask; ``modbus``, ``gcode`` and
-``cia402`` are kinds. A kind of one's own is a class that a map names.
+``line`` and ``drive`` are what motion and stop ask; ``modbus`` is a kind. A kind of
+one's own is a class that a map names; ``examples/drives`` has two.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import importlib.util
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from rig.drives.drive import ABSTRACT, Drive
+from rig.drives.drive import Drive
 from rig.drives.line import Line
 from rig.faults import Refused
 
@@ -20,11 +20,7 @@ if TYPE_CHECKING:
     from rig.config.maps import DriveMap
     from rig.config.settings import BusSettings
 
-KINDS = {
-    "modbus": "rig.drives.modbus:ModbusDrive",
-    "gcode": "rig.drives.gcode:GCodeDrive",
-    "cia402": "rig.drives.cia402:Cia402Drive",
-}
+KINDS = {"modbus": "rig.drives.modbus:ModbusDrive"}
 
 
 def kind_of(drive_map: DriveMap) -> type[Drive]:
@@ -48,8 +44,8 @@ def kind_of(drive_map: DriveMap) -> type[Drive]:
     except Exception as error:  # whatever the import of foreign code raises
         raise Refused(
             f"the map {drive_map.name} names drive = {drive_map.drive!r}, which cannot "
-            f"be loaded: {type(error).__name__}: {error}. It must be one of "
-            f"{', '.join(KINDS)}, FILE.py:CLASS or MODULE:CLASS"
+            f"be loaded: {type(error).__name__}: {error}. It must be modbus, "
+            "FILE.py:CLASS or MODULE:CLASS"
         ) from None
     return drive_type
 
@@ -62,13 +58,9 @@ def _require_drive(drive_type: Any) -> None:
     line_type = getattr(drive_type, "line_type", None)
     if not isinstance(line_type, type) or not issubclass(line_type, Line):
         raise TypeError(f"{name}.line_type must be a subclass of rig.drives.Line")
-    for kind, base, methods in (
-        (drive_type, Drive, ABSTRACT),
-        (line_type, Line, ("connect", "close")),
-    ):
-        for method in methods:
-            if getattr(kind, method) is getattr(base, method):
-                raise TypeError(f"{kind.__name__} must define {method}")
+    for kind in (drive_type, line_type):
+        for method in sorted(kind.__abstractmethods__):
+            raise TypeError(f"{kind.__name__} must define {method}")
 
 
 def make_drives(

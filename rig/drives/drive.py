@@ -7,6 +7,7 @@ are the drive's own; pulses are counts from its origin.
 
 from __future__ import annotations
 
+import abc
 import contextlib
 import dataclasses
 import time
@@ -24,11 +25,6 @@ START_S = 0.2  # a drive that has taken a move shows it within this time
 STILL_COUNTS = 2  # between two readings of a position that flickers by one count
 LOOKS = 4  # for two readings that agree
 HOME = 2**30  # a count that no drive shows when it is switched on
-
-# Methods that every kind of drive defines.
-ABSTRACT = ("ids", "arm", "position", "move", "standing", "stop", "alarm")
-_OWN = "every kind of drive defines this itself; Drive only declares it"
-_WATCH = "a drive that watches its line defines this itself"
 
 
 class Look(NamedTuple):
@@ -56,7 +52,7 @@ class Status:
     fault: bool
 
 
-class Drive:
+class Drive(abc.ABC):
     """One axis's drive on its line."""
 
     line_type: ClassVar[type[Line]]
@@ -73,18 +69,19 @@ class Drive:
 
     # Of a kind of drive: what it must know. BusError where there is no valid reply.
 
+    @abc.abstractmethod
     def ids(self) -> dict[str, int | str]:
         """What tells this drive from another, and does not change."""
-        raise NotImplementedError(_OWN)  # abstract
 
+    @abc.abstractmethod
     def arm(self) -> None:
         """Switch its power stage on, where it is off."""
-        raise NotImplementedError(_OWN)  # abstract
 
+    @abc.abstractmethod
     def position(self) -> int:
         """The drive's count, by its encoder or of the steps it has made."""
-        raise NotImplementedError(_OWN)  # abstract
 
+    @abc.abstractmethod
     def move(self, count: int, speed: float, accel: float) -> None:
         """Start an absolute move, and return.
 
@@ -94,19 +91,18 @@ class Drive:
             count: where to.
             speed, accel: counts a second, and a second squared; no faster.
         """
-        raise NotImplementedError(_OWN)  # abstract
 
+    @abc.abstractmethod
     def standing(self) -> bool:
         """Whether its last move has ended, at its target or not."""
-        raise NotImplementedError(_OWN)  # abstract
 
+    @abc.abstractmethod
     def stop(self) -> None:
         """Stop as fast as it may, with its torque on; to be sent at any time."""
-        raise NotImplementedError(_OWN)  # abstract
 
+    @abc.abstractmethod
     def alarm(self) -> str:
         """The fault that it is in, in words; empty where there is none."""
-        raise NotImplementedError(_OWN)  # abstract
 
     # What it may know besides
 
@@ -152,15 +148,15 @@ class Drive:
 
     def watch(self) -> int:
         """The line's timeout as the drive's register holds it, where it has one."""
-        raise NotImplementedError(_WATCH)  # abstract
+        raise NotImplementedError  # asked where the map has comm_timeout
 
     def set_watch(self, counts: int) -> None:
         """Set the register of the timeout of the line."""
-        raise NotImplementedError(_WATCH)  # abstract
+        raise NotImplementedError  # asked where the map has comm_timeout
 
     def watch_counts(self, seconds: float) -> int:
         """The timeout's register for so many seconds, or for a little more."""
-        raise NotImplementedError(_WATCH)  # abstract
+        raise NotImplementedError  # asked where the map has comm_timeout
 
     def lasting(self, ids: dict[str, int | str]) -> dict[str, int | str]:
         """The ids of a drive that do not change."""

@@ -6,6 +6,7 @@ A kind of line says how a request is sent and answered; see docs/rig/drives.md.
 
 from __future__ import annotations
 
+import abc
 import contextlib
 import threading
 import time
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
     from rig.config.settings import BusSettings
 
 QUICK_S = 0.05  # for a reply to a stop in its first round, besides the frames' time
-
-_OWN = "every kind of line defines this itself; Line only declares it"
 
 
 class BusError(Fault):
@@ -49,7 +48,7 @@ class Refusal(BusError):
         super().__init__(text, "See its manual, and what the axis's map says of it")
 
 
-class Line:
+class Line(abc.ABC):
     """One line with any number of units; safe to use from several threads."""
 
     transports: ClassVar[tuple[str, ...]] = ()  # of [bus] that it can be
@@ -74,13 +73,13 @@ class Line:
 
     # Of a kind of line
 
+    @abc.abstractmethod
     def connect(self) -> None:
         """Open the port, unless it is open; OSError or BusError where it cannot be."""
-        raise NotImplementedError(_OWN)  # abstract
 
+    @abc.abstractmethod
     def close(self) -> None:
         """Close the port; opening it again is possible."""
-        raise NotImplementedError(_OWN)  # abstract
 
     def stops_at_once(self, drives: Sequence[Any]) -> bool:
         """Whether one frame stops all of these."""
@@ -91,6 +90,10 @@ class Line:
 
     def doubts(self, unit: int) -> bool:
         """Whether what a unit acknowledged last was perhaps not acknowledged."""
+        return False
+
+    def answers_for_nobody(self) -> bool:
+        """Whether a unit answers that there is not: then its drives are one."""
         return False
 
     # Of all of them

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 from rig.drives.drive import Drive, Look
 from rig.drives.line import BusError, Line
-from rig.drives.wire import Wire
-from rig.registers import HIGHEST, LOWEST, Frames, Value, decode
+from rig.drives.wire import LATER, Wire
+from rig.registers import HIGHEST, LOWEST, REGISTERS, Frames, Value, decode
 
 if TYPE_CHECKING:
     from rig.config.axis import Axis
@@ -40,6 +40,8 @@ OUT_OF_REACH = (2, 3)  # of the target of a move
 FRAME_BITS = 2 * 24 * 11  # of a stop and its reply on a serial line, at most
 PROBES = 6  # questions of another length to a unit whose replies come late
 LATEST_S = 10.0  # no gateway keeps a reply for so long
+LISTEN_S = 2.0  # for a late reply of a unit that has never answered
+NOBODY = 250  # a number that no unit has
 
 
 class Rejected(BusError):
@@ -72,10 +74,11 @@ class Bus(Line):
             settings, (settings.transport != "tcp" and silence_s) or 0.0, emit
         )
         self._quiet_until = 0.0
-        # Of a unit: registers in each reply that may still come, 0 of a write, and
-        # when it was asked; and an address that was read well.
-        self._owed: dict[int, list[tuple[int, float]]] = {}
-        self._readable: dict[int, int] = {}
+        # Of a unit: function and bytes of each reply that may still come, and when it
+        # was asked; and a function and an address that were read well.
+        self._owed: dict[int, list[tuple[int, int, float]]] = {}
+        self._readable: dict[int, tuple[int, int]] = {}
+        self.listen_s = LISTEN_S
         self._client: Wire | None = None
         self._spare: Wire | None = None  # a second connection, of a stop
         self._doubted: set[int] = set()  # whose acknowledgement may be an echo
@@ -103,6 +106,26 @@ class Bus(Line):
     def echoes(self) -> bool:
         """Whether the adapter was seen to send back what it is sent."""
         return self._client is not None and bool(self._client.echo)
+
+    @property
+    def late(self) -> set[int]:
+        """Units whose replies came after their time."""
+        return set() if self._client is None else self._client.late
+
+    def answers_for_nobody(self) -> bool:
+        """Whether a server answers for a unit that is none: then for every one."""
+        if self.settings.transport == "rtu":
+            return False
+        listen_s, self.listen_s = self.listen_s, 0.0
+        try:
+            function, address = next(iter(self._readable.values()), (3, 0))
+            self.read(NOBODY, function, address, 1, 0)
+        except BusError:
+            return False
+        finally:
+            self.listen_s = listen_s
+            self._owed.pop(NOBODY, None)
+        return True
 
     @property
     def noise(self) -> str:
@@ -134,29 +157,69 @@ class Bus(Line):
     def read_words(
         self, unit: int, address: int, count: int, retries: int | None = None
     ) -> list[int]:
-        """Read holding registers, with as many more tries as configured or given.
+        """Read holding registers; as ``read``."""
+        return words_of(self.read(unit, 3, address, count, retries))
+
+    def read(
+        self,
+        unit: int,
+        function: int,
+        address: int,
+        quantity: int,
+        retries: int | None = None,
+    ) -> bytes:
+        """Read registers, or bits, with as many more tries as configured or given.
+
+        Args:
+            unit: that is asked.
+            function: 3 holding or 4 input registers, 1 coils, 2 discrete inputs.
+            address: of the first.
+            quantity: of registers, or of bits.
+            retries: after the first try.
+
+        Returns:
+            The data of the reply: two bytes a register; bits from the lowest up.
 
         Raises:
             BusError: no valid reply after all tries.
             Rejected: the drive answered with an exception, every time.
         """
         tries = 1 + (self.settings.read_retries if retries is None else retries)
+        size, what = data_size(function, quantity), "registers"
         for tries_left in reversed(range(tries)):
             try:
-                self._catch_up(unit, address)
-                words = self._read(unit, address, count)
-                if len(words) == count:
-                    self._readable[unit] = address
-                    return words
+                self._catch_up(unit, (function, address))
+                data = self._read(unit, function, address, quantity)
+                if len(data) == size:
+                    if function in REGISTERS or unit not in self._readable:
+                        self._readable[unit] = function, address
+                    return data
+                what = "registers" if function in REGISTERS else "bits"
                 raise BusError(
-                    f"unit {unit}: asked for {count} registers at 0x{address:04X}, "
-                    f"got {len(words)}"
+                    f"unit {unit}: asked for {quantity} {what} at 0x{address:04X}, got "
+                    f"{len(data)} bytes"
                 )
             except BusError as error:
                 if not tries_left:
+                    self._tell_late(unit, error)
                     error.args = (f"{error}, tried {tries} times",)
                     raise
         raise AssertionError("unreachable")
+
+    def _tell_late(self, unit: int, error: BusError) -> None:
+        """Of a unit that has never answered: whether its reply comes after its time.
+
+        Nothing was moved over this line then, so there is time to wait for it.
+        """
+        if self._urgent or unit in self._readable or error.refused or error.lost:
+            return
+        if unit not in self.silent or self._client is None or not self.listen_s:
+            return
+        with self._lock, contextlib.suppress(OSError, BusError):
+            if self._client.listen(unit, self.listen_s):
+                late = f"late by over {self._timeout_s:g} s: raise bus.timeout_s"
+                error.args = (f"unit {unit}: no valid reply ({late})",)
+                error.advice = LATER
 
     def write(self, unit: int, address: int, function: int, words: list[int]) -> None:
         """Write registers once. Never retried: a lost reply may hide a started move.
@@ -173,27 +236,28 @@ class Bus(Line):
         if function == 16:
             head += struct.pack(">H", len(words))
             data = bytes([len(data)]) + data
-        unsure = function == 6 and (self._client is None or self._client.echo is None)
+        unsure = function != 16 and (self._client is None or self._client.echo is None)
         reply = self._exchange(function, unit, head + data, address, owed=0)
         (self._doubted.add if unsure else self._doubted.discard)(unit)
         if reply != (head if function == 16 else head + data):
-            self._resynchronise(unit, 0)
+            self._resynchronise(unit, function, 0)
             raise BusError(f"unit {unit}: the reply to a write does not echo it")
 
-    def _read(self, unit: int, address: int, count: int) -> list[int]:
-        """The registers of one reply, of any number."""
-        request = struct.pack(">HH", address, count)
-        reply = self._exchange(3, unit, request, address, owed=count)
-        if not reply or len(reply) != 1 + reply[0] or reply[0] % 2:
-            self._resynchronise(unit, count)
+    def _read(self, unit: int, function: int, address: int, quantity: int) -> bytes:
+        """The data of one reply, of any length."""
+        request = struct.pack(">HH", address, quantity)
+        size = data_size(function, quantity)
+        reply = self._exchange(function, unit, request, address, owed=size)
+        odd = function in REGISTERS and reply and reply[0] % 2
+        if not reply or len(reply) != 1 + reply[0] or odd:
+            self._resynchronise(unit, function, size)
             raise BusError(f"unit {unit}: the reply to a read has no whole registers")
-        words = [*struct.unpack(f">{reply[0] // 2}H", reply[1:])]
         # Another length: an earlier request's reply; this one's may follow.
-        if len(words) != count:
-            self._resynchronise(unit, count)
-        return words
+        if len(reply) != 1 + size:
+            self._resynchronise(unit, function, size)
+        return reply[1:]
 
-    def _catch_up(self, unit: int, address: int | None) -> None:
+    def _catch_up(self, unit: int, place: tuple[int, int] | None) -> None:
         """Be sure that no earlier reply of a unit on an RTU line is still to come.
 
         A unit answers in order: once it has answered a question whose reply has a
@@ -202,31 +266,37 @@ class Bus(Line):
         Raises:
             BusError: it is silent, or what it says is always the answer to another.
         """
-        address = self._readable.get(unit, address)
-        if address is None:
+        place = self._readable.get(unit, place)
+        if place is None:
             return
+        function, address = place
         for _ in range(PROBES):
             recent = time.monotonic() - LATEST_S
-            owed = [one for one in self._owed.get(unit, []) if one[1] > recent]
+            owed = [each for each in self._owed.get(unit, []) if each[2] > recent]
             self._owed[unit] = owed
             if not owed:
                 return
-            lengths = [length for length, _ in owed]
-            count = next(n for n in range(1, 99) if n not in lengths)
+            sizes = [size if asked == function else 0 for asked, size, _ in owed]
+            each = 1 if function in REGISTERS else 8
+            quantity = next(
+                n for n in range(each, 99 * each, each)
+                if data_size(function, n) not in sizes
+            )  # fmt: skip
             try:
-                received = len(self._read(unit, address, count))
+                received = len(self._read(unit, function, address, quantity))
             except Rejected:  # or the oldest was answered like this
                 del owed[0]
-                owed.append((count, time.monotonic()))
+                size = data_size(function, quantity)
+                owed.append((function, size, time.monotonic()))
                 continue
-            if received == count:
+            if received == data_size(function, quantity):
                 owed.clear()
-            elif received in lengths:
-                del owed[: lengths.index(received) + 1]
+            elif received in sizes:
+                del owed[: sizes.index(received) + 1]
+                self.late.add(unit)
         if self._owed.get(unit):
             raise BusError(
-                f"unit {unit}: its replies come too late to be told apart",
-                "Raise bus.timeout_s",
+                f"unit {unit}: its replies come too late to be told apart", LATER
             )
 
     def broadcast(self, address: int, function: int, words: list[int]) -> None:
@@ -245,7 +315,7 @@ class Bus(Line):
         """The data of the reply to one request.
 
         Where none is valid, the line is emptied before BusError is raised; a reply of
-        ``owed`` registers may still come.
+        ``owed`` bytes may still come.
         """
         with self._lock:
             if not self._urgent:
@@ -260,7 +330,7 @@ class Bus(Line):
                 if refused and (len(reply) != 2 or not reply[1]):
                     raise BusError(f"unit {unit}: the refusal holds no code")
             except BusError:
-                self._resynchronise(unit, owed)
+                self._resynchronise(unit, function, owed)
                 raise
             code = reply[1] if refused else 0
             if code not in GATEWAY_CODES:
@@ -297,12 +367,13 @@ class Bus(Line):
             self._spare.open()
             self._client, self._spare = self._spare, self._client
 
-    def _resynchronise(self, unit: int, owed: int) -> None:
-        """Empty an RTU line; a reply of ``owed`` registers may still come."""
+    def _resynchronise(self, unit: int, function: int, owed: int) -> None:
+        """Empty an RTU line; a reply of ``owed`` bytes may still come."""
         with self._lock:
             if self._client is None or self.settings.transport == "tcp":
                 return
-            self._owed.setdefault(unit, []).append((owed, time.monotonic()))
+            owing = self._owed.setdefault(unit, [])
+            owing.append((function, owed, time.monotonic()))
             gap = max(0.02, 20 * 11.0 / self.settings.baudrate, self.silence_s)
             end = time.monotonic() + 2 * self._timeout_s
             try:
@@ -335,31 +406,18 @@ class ModbusDrive(Drive):
     axis: Axis
     line: Bus
 
+    def __init__(self, line: Bus, axis: Axis) -> None:
+        has = {name for name, table in vars(axis.map).items() if table is not None}
+        self.can_reset, self.can_home = "alarm_reset" in has, "home" in has
+        self.can_set_zero, self.tells_homed = "set_zero" in has, "homed" in has
+        self.counts_from_home = axis.map.home_place is not None  # type: ignore[attr-defined]  # of Modbus
+        super().__init__(line, axis)
+
     @property
     def map(self) -> RegisterMap:
         """The registers of its family."""
         found: Any = self.axis.map  # or what a stop could read of one
         return found
-
-    @property
-    def counts_from_home(self) -> bool:  # type: ignore[override]  # of the map
-        return self.map.home_place is not None
-
-    @property
-    def can_reset(self) -> bool:  # type: ignore[override]  # of the map
-        return self.map.alarm_reset is not None
-
-    @property
-    def can_home(self) -> bool:  # type: ignore[override]  # of the map
-        return self.map.home is not None
-
-    @property
-    def can_set_zero(self) -> bool:  # type: ignore[override]  # of the map
-        return self.map.set_zero is not None
-
-    @property
-    def tells_homed(self) -> bool:  # type: ignore[override]  # of the map
-        return self.map.homed is not None
 
     @property
     def says_homed(self) -> bool:  # type: ignore[override]  # of the status word
@@ -413,7 +471,8 @@ class ModbusDrive(Drive):
 
     def move(self, count: int, speed: float, accel: float) -> None:
         """Every frame is sent exactly once; speed and ramps as registers hold them."""
-        self.write(self.map.move, position=count, **self.axis.motion_counts())
+        place = count / self.map.position.counts
+        self.write(self.map.move, position=place, **self.axis.motion_counts())
 
     def stop(self) -> None:
         """Quick stop; torque stays on."""
@@ -423,7 +482,8 @@ class ModbusDrive(Drive):
         self.write(self.map.alarm_reset)
 
     def hold(self, pulses: int) -> None:
-        self.write(self.map.hold, position=pulses + self.origin)
+        counts = self.map.position.counts
+        self.write(self.map.hold, position=(pulses + self.origin) / counts)
 
     def held(self) -> int | None:
         """The target register as it reads, None where it cannot be read."""
@@ -456,7 +516,7 @@ class ModbusDrive(Drive):
         watch = self.map.comm_timeout
         assert watch is not None  # the map has one, or it is not asked
         place = watch.place_of("timeout") or (watch.write[0].address, "u16")
-        return self.read(Value(address=place[0], type=place[1]))
+        return self.read(Value(address=place[0], type=place[1], function=3, bits=0))
 
     def set_watch(self, counts: int) -> None:
         self.write(self.map.comm_timeout, timeout=counts)
@@ -465,7 +525,7 @@ class ModbusDrive(Drive):
         assert self.map.comm_timeout is not None
         return max(1, math.ceil(seconds * self.map.comm_timeout.per_s - 1e-9))
 
-    def write(self, table: Frames | None, **values: int) -> None:
+    def write(self, table: Frames | None, **values: float) -> None:
         """Send the frames of one of the map's tables; none where the map lacks it.
 
         What moves the drive, or stops it, is sent once; the rest may be written twice,
@@ -482,15 +542,21 @@ class ModbusDrive(Drive):
                 if not tries_left or error.refused:
                     raise
 
-    def _write(self, table: Frames | None, values: dict[str, int]) -> None:
+    def _write(self, table: Frames | None, values: dict[str, float]) -> None:
         for frame in table.write if table else ():
             words = frame.registers(self.map.word_order, **values)
             self.line.write(self.axis.unit, frame.address, frame.function, words)
 
     def read(self, read: Value, retries: int | None = None) -> int:
-        """The value of one or two registers."""
+        """A value of the map as a whole number, a position in counts."""
         order = self.map.word_order
-        return decoded(self.line, read, self.axis.unit, order, retries)
+        value = decoded(self.line, read, self.axis.unit, order, retries)
+        if not math.isfinite(value):
+            unit = self.axis.unit
+            raise BusError(
+                f"unit {unit}: 0x{read.address:04X} holds no number, {value}"
+            )
+        return round(value * getattr(read, "counts", 1))
 
 
 def decoded(
@@ -499,7 +565,19 @@ def decoded(
     unit: int,
     word_order: str,
     retries: int | None = None,
-) -> int:
-    """The value of one or two registers of a unit."""
-    words = bus.read_words(unit, read.address, read.count, retries)
-    return decode(words, read.type, word_order)
+) -> float:
+    """The value of registers, or bits, of a unit."""
+    data = bus.read(unit, read.function, read.address, read.quantity, retries)
+    if read.function not in REGISTERS:
+        return int.from_bytes(data, "little") & (1 << read.quantity) - 1
+    return decode(words_of(data), read.type, word_order)
+
+
+def data_size(function: int, quantity: int) -> int:
+    """Bytes of so many registers, or bits."""
+    return 2 * quantity if function in REGISTERS else (quantity + 7) // 8
+
+
+def words_of(data: bytes) -> list[int]:
+    """The registers of a reply."""
+    return [*struct.unpack(f">{len(data) // 2}H", data)]

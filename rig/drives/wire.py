@@ -24,11 +24,12 @@ if TYPE_CHECKING:
     from rig.config.settings import BusSettings
 
 HEX_BYTES = 32  # shown of what came
-SIZES = {6: 8, 16: 8, 0x83: 5, 0x86: 5, 0x90: 5}  # of RTU replies; of 3 it says its own
+READS, WRITES = (1, 2, 3, 4), (5, 6, 15, 16)  # functions
 FILLERS = (0x00, 0xFF)  # bytes that a converter puts before a reply
 MOST_UNANSWERED = 3  # of one request, which is then waited for and not sent again
 OWED_S = 10.0  # no gateway keeps a reply for so long
 OLDEST = 4096  # requests since that of a late reply; other numbers are none
+LATER = "Raise bus.timeout_s"
 UNACKNOWLEDGED_MS = 5000  # until a connection whose peer is gone is given up
 
 
@@ -46,7 +47,9 @@ def rtu_reply(came: bytes, unit: int, function: int) -> bytes | None:
     """The PDU of the first whole reply in what came; None where there is none yet."""
     for start in range(len(came) - 4):
         if came[start] == unit and came[start + 1] & 0x7F == function:
-            size = SIZES.get(came[start + 1], 5 + came[start + 2])
+            refused = came[start + 1] & 0x80
+            size = 8 if function in WRITES else 5 + came[start + 2]
+            size = 5 if refused else size
             frame = came[start : start + size]
             if len(frame) == size and crc16(frame[:-2]) == frame[-2:]:
                 return frame[1:-2]
@@ -66,6 +69,8 @@ class Wire:
         self._number = time.time_ns() & 0xFFFF
         self._asked = b""  # the last request, without a number,
         self._unanswered: dict[int, float] = {}  # numbers, and when they were sent
+        self._missed: dict[int, int] = {}  # units of RTU that owe a reply: its function
+        self.late: set[int] = set()  # units whose reply came after its time
         self._accepted: set[int] = set()  # those of the last request
         self._came = b""  # over TCP, and not looked at yet
         self.noise = ""  # what came last that was no reply, in hex
@@ -120,6 +125,7 @@ class Wire:
     ) -> bytes:
         self.open()
         came = self.pending()
+        self._look_for_late(came)
         self.open()  # the peer may have closed it meanwhile
         if self._numbered:
             self._came += came
@@ -141,21 +147,54 @@ class Wire:
             else:
                 reply = self._reply_beside_echo(came, frame)
             if reply is not None:
+                self._look_for_late(came)
                 return reply
             if wait_s <= 0.0:
                 if self.echo and came.startswith(frame):
                     came = came[len(frame) :]
-                raise BusError(
-                    f"unit {unit}: no valid reply ({self._why(came, late, timeout_s)})"
-                )
+                self._look_for_late(came)
+                if not self._numbered:
+                    self._missed[unit] = pdu[0]
+                if late:
+                    self.late.add(unit)
+                is_late, begun = unit in self.late, bytes([unit, pdu[0]])
+                why = self._why(came, timeout_s, is_late, begun)
+                error = BusError(f"unit {unit}: no valid reply ({why})")
+                error.advice = LATER if is_late else error.advice
+                raise error
         return b""
 
-    def _why(self, came: bytes, late: int, timeout_s: float) -> str:
+    def _look_for_late(self, came: bytes) -> None:
+        """Note units of RTU whose reply is in what came after its time."""
+        for unit, function in list(self._missed.items()) if came else ():
+            if rtu_reply(came, unit, function) is not None:
+                self.late.add(unit)
+                del self._missed[unit]
+
+    def listen(self, unit: int, seconds: float) -> bool:
+        """Wait for a reply of a unit after its time; whether one came."""
+        end, came = time.monotonic() + seconds, b""
+        while unit not in self.late and time.monotonic() < end:
+            data = self._read(max(0.0, end - time.monotonic()))
+            came += data
+            if not self._numbered:
+                self._look_for_late(came)
+                continue
+            self._came += data
+            if self._numbered_reply(unit)[0] is not None:
+                self.late.add(unit)
+        return unit in self.late
+
+    def _why(
+        self, came: bytes, timeout_s: float, late: bool = False, begun: bytes = b"\0"
+    ) -> str:
         """Why there is no reply, by all that came."""
         if late:
             return f"late by over {timeout_s:g} s, as others were: raise bus.timeout_s"
         if not came:
             return f"silent for {timeout_s:g} s"
+        if not self._numbered and came.startswith(begun):
+            return f"not whole after {timeout_s:g} s: raise bus.timeout_s"
         more = f" ... {len(came)} bytes" if len(came) > HEX_BYTES else ""
         self.noise = came[:HEX_BYTES].hex(" ") + more
         return f"what came is no reply: {self.noise}"
@@ -188,7 +227,7 @@ class Wire:
             age = self._number - number & 0xFFFF
             if protocol or not 3 <= size <= 254 or age > OLDEST:
                 if self._came[0] not in FILLERS:  # no frame begins anywhere here
-                    text = self._why(self._came, 0, 0.0)
+                    text = self._why(self._came, 0.0)
                     self.close()
                     raise BusError(f"unit {unit}: no valid reply ({text})")
                 self._came = self._came[1:]
@@ -207,14 +246,15 @@ class Wire:
         return None, late
 
     def _reply_beside_echo(self, came: bytes, request: bytes) -> bytes | None:
-        """The reply of an RTU line. That to function 6 repeats its request."""
+        """The reply of an RTU line. That to function 5 or 6 repeats its request."""
         begin, unit, function = came.find(request), request[0], request[1]
-        if begin >= 0 and (function != 6 or self.echo):
+        alike = function in (5, 6)
+        if begin >= 0 and (not alike or self.echo):
             self.echo, came = True, came[begin + len(request) :]
-        elif function == 6 and self.echo:
+        elif alike and self.echo:
             return None
         reply = rtu_reply(came, unit, function)
-        if reply is not None and function == 3 and self.echo is None:
+        if reply is not None and function in READS and self.echo is None:
             self.echo = False
         return reply
 

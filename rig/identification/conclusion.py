@@ -202,6 +202,6 @@ def check_matrix(config: RigConfig, matrix: ArrayLike) -> list[str]:
             )
     if faults:
         raise MotionFault(
-            f"no calibration is saved: {'; '.join(faults)}. Run `jaxcal-rig axes`"
+            f"no calibration is saved: {'; '.join(faults)}. Run `jaxcal-rig setup axes`"
         )
     return warnings

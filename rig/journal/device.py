@@ -26,11 +26,11 @@ IDENTIFIED, HOMED = "IDENTIFIED", "HOMED"
 SIGN_CHECKED, STOP_PROVED, ZEROED = "SIGN_CHECKED", "STOP_PROVED", "ZEROED"
 STATES = (IDENTIFIED, HOMED, SIGN_CHECKED, STOP_PROVED, ZEROED)
 COMMANDS = {
-    IDENTIFIED: "scan",
-    HOMED: "home",
-    SIGN_CHECKED: "axes",
-    STOP_PROVED: "axes",
-    ZEROED: "zero",
+    IDENTIFIED: "check scan",
+    HOMED: "setup home",
+    SIGN_CHECKED: "setup axes",
+    STOP_PROVED: "setup axes",
+    ZEROED: "setup zero",
 }  # that reach a state
 
 

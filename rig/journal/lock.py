@@ -240,7 +240,7 @@ def _identity(settings: BusSettings) -> str:
     if settings.transport in ("rtu", "serial"):
         return os.path.realpath(settings.device)
     if settings.transport == "can":
-        return f"{settings.interface}:{settings.device}"
+        return settings.device
     try:
         entries = socket.getaddrinfo(
             settings.host, settings.port, type=socket.SOCK_STREAM

@@ -44,7 +44,7 @@ def goto(run: Run, calibration: Any, to: Sequence[float]) -> int:
             run.say(
                 f"NOT CHECKED: whether {', '.join(names)} was moved while without "
                 "power. The drive does not tell, and the phone does not see a turn "
-                "about the vertical. If in doubt: jaxcal-rig home"
+                "about the vertical. If in doubt: jaxcal-rig setup home"
             )
     record = run.postures().get("goto")
     if record is None:
@@ -90,5 +90,7 @@ def unchecked(
         axis.name
         for axis in config.axes
         if axis.name in unseen
-        and not (axis.map.tells_homed or axis.map.absolute_encoder or axis.name in told)
+        and not (
+            axis.map.has("homed") or axis.map.absolute_encoder or axis.name in told
+        )
     ]

@@ -46,7 +46,7 @@ NEAR_UNIT = (0.3, 2.0)
 UNPROVED_FACTOR = 2.0  # by which a gearing is corrected on the phone's word alone
 BY_PLATE = (
     "Nothing was corrected. Set pulses_per_rev and reduction as the drives and the "
-    "gearboxes' plates say, then run `jaxcal-rig axes` again"
+    "gearboxes' plates say, then run `jaxcal-rig setup axes` again"
 )
 DIGITS = 4  # of a reduction that was measured
 OF_DRIVE = ("unit", "map", "pulses_per_rev", "comm_timeout_s")  # go with the cable
@@ -266,7 +266,7 @@ def find(
         raise MotionFault(
             "the axes are mirrored, and the phone is too noisy to tell whether a "
             "direction is wrong or imu.signs. Raise settle.samples, then run "
-            "`jaxcal-rig axes` again"
+            "`jaxcal-rig setup axes` again"
         )
     turned = float(np.linalg.norm(turn(told, mounting)))
     return Findings(joints, signs * size, mounting, turned, order)
@@ -306,7 +306,7 @@ def _placed(
         raise MotionFault(
             f"unit {unit} turns the phone about an axis more than 45 deg from every "
             "joint's, so the phone is not placed as imu.mounting_deg says. Correct "
-            "that roughly, then run `jaxcal-rig axes` again"
+            "that roughly, then run `jaxcal-rig setup axes` again"
         )
     goal, turned = expected[:, joints] * signs, told @ axes
     if len(joints) == 1:  # the least turn that fits it

@@ -149,7 +149,7 @@ def _room_deg(axis: Axis, pulses: int) -> float:
         raise Refused(
             f"{axis.name} stands {room + ROOM_DEG:.1f} deg from a limit; the check "
             f"moves it {REACH_DEG:g} deg either way. Move it inwards: "
-            f"jaxcal-rig jog {axis.name} DEG"
+            f"jaxcal-rig setup jog {axis.name} DEG"
         )
     return room
 

@@ -35,7 +35,7 @@ def unlimited(config: RigConfig) -> RigConfig:
 
 def can_home(config: RigConfig) -> bool:
     """Whether every drive has a homing of its own."""
-    return all(axis.map.homes for axis in config.axes)
+    return all(axis.map.has("home") for axis in config.axes)
 
 
 def home(run: Run, device: Device, config: RigConfig, here: bool) -> None:
@@ -180,12 +180,17 @@ def identity(drives: list[Drive]) -> dict[str, dict[str, int | str]]:
         except BusError as error:
             raise Refused(
                 f"{axis.name} (unit {axis.unit}) does not answer as {axis.map.name} "
-                f"does: {error}. Run `jaxcal-rig scan`"
+                f"does: {error}. Run `jaxcal-rig check scan`"
             ) from None
         if fault := drive.foreign(values):
             raise Refused(
                 f"{axis.name} (unit {axis.unit}) is no {axis.map.name}: {fault}. Run "
-                "`jaxcal-rig scan`"
+                "`jaxcal-rig check scan`"
             )
         identities[axis.name] = drive.lasting(values)
+    if len(drives) > 1 and drives[0].line.answers_for_nobody():
+        raise Refused(
+            f"{drives[0].line.settings.where} answers for every unit id: the drives "
+            "cannot be told apart. Set the gateway so that it looks at the id"
+        )
     return identities

@@ -13,7 +13,7 @@ from rig.config.maps import DriveMap, RegisterMap, available_maps, load_map
 from rig.config.schema import ConfigError, parse
 from rig.config.settings import BusSettings
 from rig.drives.line import BusError
-from rig.drives.modbus import Bus, ModbusDrive, Rejected
+from rig.drives.modbus import NOBODY, Bus, ModbusDrive, Rejected
 from rig.journal import BusLock
 
 # For each absent unit, three times; a drive answers within 25 ms at 9600 baud.
@@ -104,13 +104,28 @@ def scan(
     answers: list[Answer] = []
     silence_s = max(family.inter_frame_s for family in families)
     with BusLock(settings).acquire("scan"), Bus(short, silence_s) as bus:
+        bus.listen_s = 0.0  # or each absent unit takes as long
         for unit in range(1, units + 1):
             if answer := _ask(bus, unit, families):
                 answers.append(answer)
                 say(str(answer))
             if unit % 10 == 0 or unit == units:
                 say(f"  {unit} of {units} units asked")
-        echo, noise = bus.echoes, bus.noise
+        for_all = len(answers) == units and bus.answers_for_nobody()
+        echo, noise, late = bus.echoes, bus.noise, sorted(bus.late)
+    if for_all:
+        del answers[1:]
+        say(
+            f"{settings.where} answers for every unit id, also {NOBODY}, which no unit "
+            "has: one device, or a gateway that does not look at the id. One unit is "
+            "counted"
+        )
+    if late:
+        names = ", ".join(map(str, late))
+        say(
+            f"units {names} answer late, after {short.timeout_s:g} s: raise "
+            "bus.timeout_s"
+        )
     if echo and not settings.echo:
         say("the adapter sends back what it is sent: set bus.echo = true")
     if not answers:

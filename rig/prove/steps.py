@@ -28,6 +28,7 @@ from rig.journal import (
 )
 from rig.journal.lock import BusLock
 from rig.outputs.console import listen
+from rig.parts import PLACES
 from rig.prove.axis_check import Change
 from rig.prove.axis_moves import check_axes
 from rig.prove.home import can_home, home, identity, unlimited
@@ -68,6 +69,8 @@ class Site:
         """A command about this device, to be typed."""
         where = "" if self.path is None else f" --config {os.path.relpath(self.path)}"
         # A simulated device is gone with its command; another is made as rig.toml says.
+        place = PLACES.get(words.split()[0])
+        words = f"{place} {words}" if place else words
         return f"jaxcal-rig {words}{' --simulate' * self.full_speed}{where}"
 
     @contextlib.contextmanager
@@ -132,10 +135,10 @@ def go_home(site: Site, here: bool) -> int:
     """Make the counts mean a place: HOMED."""
     names = [axis.name for axis in site.config.axes]
     if not here and not can_home(site.config):
-        without = {a.map.name for a in site.config.axes if not a.map.homes}
+        without = {a.map.name for a in site.config.axes if not a.map.has("home")}
         raise Refused(
             f"the map {', '.join(sorted(without))} has no homing. Put the device into "
-            "its home posture, then run `jaxcal-rig home --here`"
+            "its home posture, then run `jaxcal-rig setup home --here`"
         )
     what = "nothing moves; where the device stands becomes the origin of its counts"
     if not here:

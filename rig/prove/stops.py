@@ -390,7 +390,7 @@ def _reset_alarms(run: Run, device: Device, name: str) -> None:
         ):
             raise MotionFault(
                 f"{drive.axis.name} stays in alarm after {name}: {drive.alarm()}. "
-                "Reset it, then run `jaxcal-rig axes` again"
+                "Reset it, then run `jaxcal-rig setup axes` again"
             )
         run.say(f"  {drive.axis.name}: its alarm after {name} was reset")
         if not drive.bring(drive.arm, lambda status: status.enabled).enabled:

@@ -41,64 +41,89 @@ class Frame(Protocol):
         """(..., m) of what is measured, of readings as they are; zero at the zero."""
 
 
-class Geometry(Protocol):
-    """What readings are."""
+@dataclasses.dataclass(frozen=True)
+class Offset:
+    """Numbers less those at the zero posture."""
 
-    scale: float
-    told: str  # how far it moved, in words before the figure
-    changed: str  # the same of an axis that moved it,
-    again: str  # and once that is said
-    unit: str  # of that figure
-    of_joints: bool  # what is measured are angles of the joints, by the axes' names
+    zero: Array  # (m,)
+
+    def angles(self, readings: ArrayLike) -> Array:
+        return np.asarray(readings, dtype=np.float64) - self.zero
+
+
+class Geometry:
+    """What readings are: (m,) vectors here, whose ways are their differences."""
+
+    told = "the readings changed by"  # how far it moved, in words before the figure
+    changed = "changed the readings by"  # the same of an axis that moved it,
+    again = "changed them by"  # and once that is said
+    of_joints = False  # what is measured are angles of the joints, by the axes' names
+
+    def __init__(self, scale: float, unit: str = "") -> None:
+        self.scale, self.unit = scale, unit  # and of the figure
 
     def apart(self, first: ArrayLike, second: ArrayLike) -> float:
         """How far one reading is from another."""
+        return float(np.linalg.norm(np.subtract(second, first)))
 
     def too_far(self, way: float, most: float) -> str:
         """A sentence that what is read moved further than it may."""
+        return (
+            f"the readings changed by {way:.3g} in a move that may change them by "
+            f"{most:.3g}. Check pulses_per_rev, reduction and lead_mm, and the sensor"
+        )
 
     def way(self, first: Array, second: Array) -> Array:
         """(3,) or (m,) from one reading to another, as the first one sees it."""
+        return second - first
 
     def mean(self, readings: Sequence[Array]) -> Array:
         """The mean of several readings."""
+        return np.mean(readings, axis=0)
 
     def frame(self, zero: Array) -> Frame:
         """What is measured where ``zero`` was read at the zero posture."""
+        return Offset(zero)
 
     def aligned(self, then: Array, now: Array) -> Array:
         """``now`` without what readings do not tell, such as a phone's heading, as near
         to ``then`` as that can be."""
+        return now
 
     def unseen(self, zero: Array) -> list[str]:
         """Names of the axes of which a move at the zero posture cannot be seen."""
+        return []
 
     def outputs(self, reading: Array, measured: Array) -> Array:
         """(m,) what a model predicts, of a reading and what it is against the zero."""
+        return reading
 
     def raw(self, readings: Sequence[Reading]) -> dict[str, Any]:
         """Every single reading, for the journal."""
+        return {"readings": [reading.value.tolist() for reading in readings]}
 
     def drift(self, readings: Array, minutes: Array) -> Array:
         """Rate per minute of readings of one posture, by a straight line."""
+        return _slope(readings, minutes)
 
     def without(self, reading: Array, rate: ArrayLike, minutes: float) -> Array:
         """A reading without what drifted since."""
+        return reading - minutes * np.asarray(rate)
 
 
-class Attitudes:
+class Attitudes(Geometry):
     """(3, 3) matrices, phone to its world; ways are rotation vectors in degrees."""
 
-    scale = 1.0
     told = "the phone turned"
-    changed, again, unit = "turned the phone by", "turned it by", "deg"
+    changed, again = "turned the phone by", "turned it by"
     of_joints = True
 
     def __init__(self, config: RigConfig) -> None:
+        super().__init__(1.0, "deg")
         self._config = config
 
     apart = staticmethod(angle_between_deg)
-    mean = staticmethod(mean_rotation)
+    mean = staticmethod(mean_rotation)  # type: ignore[assignment]  # has no self
     raw = staticmethod(raw_fields)
 
     def too_far(self, way: float, most: float) -> str:
@@ -179,63 +204,6 @@ class Upright(Attitudes):
         return self.frame(reading).of(reading)
 
 
-@dataclasses.dataclass(frozen=True)
-class Offset:
-    """Numbers less those at the zero posture."""
-
-    zero: Array  # (m,)
-
-    def angles(self, readings: ArrayLike) -> Array:
-        return np.asarray(readings, dtype=np.float64) - self.zero
-
-
-class Numbers:
-    """(m,) vectors; ways are their differences."""
-
-    told = "the readings changed by"
-    changed, again = "changed the readings by", "changed them by"
-    of_joints = False
-
-    def __init__(self, scale: float, unit: str = "") -> None:
-        self.scale, self.unit = scale, unit
-
-    def apart(self, first: ArrayLike, second: ArrayLike) -> float:
-        return float(np.linalg.norm(np.subtract(second, first)))
-
-    def too_far(self, way: float, most: float) -> str:
-        return (
-            f"the readings changed by {way:.3g} in a move that may change them by "
-            f"{most:.3g}. Check pulses_per_rev, reduction and lead_mm, and the sensor"
-        )
-
-    def way(self, first: Array, second: Array) -> Array:
-        return second - first
-
-    def mean(self, readings: Sequence[Array]) -> Array:
-        return np.mean(readings, axis=0)
-
-    def frame(self, zero: Array) -> Frame:
-        return Offset(zero)
-
-    def aligned(self, then: Array, now: Array) -> Array:
-        return now
-
-    def unseen(self, zero: Array) -> list[str]:
-        return []
-
-    def outputs(self, reading: Array, measured: Array) -> Array:
-        return reading
-
-    def raw(self, readings: Sequence[Reading]) -> dict[str, Any]:
-        return {"readings": [reading.value.tolist() for reading in readings]}
-
-    def drift(self, readings: Array, minutes: Array) -> Array:
-        return _slope(readings, minutes)
-
-    def without(self, reading: Array, rate: ArrayLike, minutes: float) -> Array:
-        return reading - minutes * np.asarray(rate)
-
-
 def _slope(values: Array, minutes: Array) -> Array:
     away = minutes - minutes.mean()
     return away @ values / max(float(away @ away), 1e-12)
@@ -245,4 +213,4 @@ def geometry_of(config: RigConfig) -> Geometry:
     """The geometry of a device's readings."""
     if config.readings is None:
         return Upright(config) if config.is_arm else Attitudes(config)
-    return Numbers(config.readings.scale, config.readings.unit)
+    return Geometry(config.readings.scale, config.readings.unit)

@@ -66,6 +66,16 @@ class Imu(Source):
         return f"{self.settings.host}:{self.port}"
 
     @property
+    def first(self) -> str:
+        """The first record that was used, as it came; empty before that."""
+        return self._parser.first
+
+    @property
+    def taken_for(self) -> str:
+        """What its fields are taken for, in words."""
+        return self._parser.taken_for
+
+    @property
     def refused(self) -> list[str]:
         return self._receiver.refused if self._receiver else []
 

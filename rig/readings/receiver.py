@@ -7,6 +7,7 @@ import asyncio
 import contextlib
 import dataclasses
 import http
+import re
 import socket
 import threading
 import time
@@ -78,6 +79,10 @@ class Receiver:
         self._listener: socket.socket | None = None
         if s.transport == "listen":
             self._listener = socket.create_server((s.host, s.port), backlog=BACKLOG)
+        elif s.transport == "udp":
+            self._listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._listener.bind((s.host, s.port))
+        if self._listener is not None:
             self._listener.setblocking(False)
             self.port = self._listener.getsockname()[1]
         self._thread = threading.Thread(
@@ -107,10 +112,27 @@ class Receiver:
         return False
 
     async def _run(self) -> None:
-        way = self._accept(self._listener) if self._listener else self._connect()
+        if self._listener is None:
+            way = self._connect()
+        elif self._settings.transport == "udp":
+            way = self._datagrams(self._listener)
+        else:
+            way = self._accept(self._listener)
         receiving = asyncio.create_task(way)  # which ends with this
         while not (self._closing.is_set() or receiving.done()):
             await asyncio.sleep(LOOK_S)
+
+    async def _datagrams(self, listener: socket.socket) -> None:
+        """Lines of datagrams, each of them whole."""
+        loop = asyncio.get_running_loop()
+        self._imu.begin()
+        with listener:
+            while True:
+                data, (address, *_) = await loop.sock_recvfrom(listener, 65536)
+                lines = [line for line in re.split(rb"[\r\n]+", data) if line]
+                if self._admits(address) and lines:
+                    if self._imu.take_lines(lines, time.monotonic()):
+                        self.phone = address
 
     async def _connect(self) -> None:
         s = self._settings

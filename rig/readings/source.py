@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import itertools
 import threading
 import time
@@ -16,15 +17,12 @@ from rig.readings.attitude import Array, Reading
 
 RING = 8192  # readings kept: over half a minute at 200 Hz
 
-_OWN = "every source of readings defines this itself; Source only declares it"
-_TURN = "a source of attitudes defines this itself; numbers have no world to turn"
-
 
 class ReadingError(Fault):
     """Readings are stale, their line is closed, or they are not to be trusted."""
 
 
-class Source:
+class Source(abc.ABC):
     """Readings, now and over the last seconds.
 
     A kind opens its port, receives on a thread of its own, and gives each accepted
@@ -55,18 +53,18 @@ class Source:
 
     # Of a kind
 
+    @abc.abstractmethod
     def open(self) -> Any:
         """Begin to receive; ReadingError where the port cannot be opened."""
-        raise NotImplementedError(_OWN)  # abstract
 
+    @abc.abstractmethod
     def close(self) -> None:
         """Stop receiving and close the port."""
-        raise NotImplementedError(_OWN)  # abstract
 
     @property
+    @abc.abstractmethod
     def where(self) -> str:
         """Where it is heard, in words."""
-        raise NotImplementedError(_OWN)  # abstract
 
     @property
     def port(self) -> int:
@@ -80,7 +78,7 @@ class Source:
 
     def turn(self, world: Array) -> None:
         """Turn all readings, those that were received too; of attitudes alone."""
-        raise NotImplementedError(_TURN)  # abstract
+        raise NotImplementedError  # numbers have no world to turn
 
     def store(self, readings: list[Reading]) -> bool:
         """Keep what was accepted, under the lock; whether anything was."""

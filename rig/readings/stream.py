@@ -10,7 +10,9 @@ from __future__ import annotations
 import json
 import math
 import re
+import time
 from collections import Counter, deque
+from collections.abc import Iterator
 from typing import Any
 
 from scipy.spatial.transform import Rotation
@@ -18,10 +20,13 @@ from scipy.spatial.transform import Rotation
 from rig.config.settings import ImuSettings
 from rig.readings.attitude import Array, Reading, angle_between_deg, euler_to_matrix
 
-MAX_LINE = 1024  # bytes; a phone's line has under 200
+MAX_LINE = 8192  # bytes; SensorLog's header has under 3000, other lines under 1000
 MAX_BODY = 1 << 20  # bytes of one pushed message
-NUMBER = re.compile(r"[+-]?[0-9]{1,15}(?:\.[0-9]{1,17})?(?:[eE][+-]?[0-9]{1,2})?")
-TOKEN = re.compile(r"[-+.:0-9A-Za-z_]{0,64}")
+NUMBER = re.compile(r"[+-]?[0-9]{1,20}(?:\.[0-9]{1,17})?(?:[eE][+-]?[0-9]{1,2})?")
+TOKEN = re.compile(r"[-+.:0-9A-Za-z_ ()/]{0,64}")  # a date has a blank
+UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of stamps
+DAY_S = 86400.0  # a phone's clock is no further off
+QUATERNION = ("quaternion{}", "quat{}", "q{}", "rotationvector{}")  # ends of names
 REJOIN = 5  # readings in a row that agree with each other after a jump
 ODD_STAMPS = 50  # stamps in a row out of line that mean the phone's clock was set
 AHEAD_S = 1.0  # a stamp so far ahead of the clock is torn, not early
@@ -46,13 +51,19 @@ class LineSplitter:
         self._tail = parts.pop()
         lines = []
         for part in parts:
-            if self._skip or len(part) > MAX_LINE:
-                self._skip = False
-            elif part:
+            whole = not self._skip or _is_header(part) or part[:1] + part[-1:] == b"{}"
+            self._skip = False
+            if part and whole and len(part) <= MAX_LINE:
                 lines.append(part)
         if len(self._tail) > MAX_LINE:
             self._tail, self._skip = b"", True
         return lines
+
+
+def _is_header(line: bytes) -> bool:
+    """Whether it is a line of names, which is whole whatever came before."""
+    fields = re.split(r"[,;\t|]", line.decode("utf-8", "replace"))
+    return len(fields) > 2 and all(re.match(r"\s*[A-Za-z]{2}", f) for f in fields)
 
 
 def _number(text: str) -> float:
@@ -67,6 +78,11 @@ class StreamParser:
     def __init__(self, settings: ImuSettings) -> None:
         self._settings = settings
         self._width = settings.column_count or None
+        self._stamp_column = settings.stamp_column
+        self._quaternion = settings.quaternion_columns
+        self._named = ""  # columns by their names, where a header came
+        self._unit_s: float | None = None  # of a stamp, once one came
+        self.first = ""  # record that was used, as it came
         self.counts: Counter[str] = Counter()
         self.foreign = False  # the last message was of another device
         self._device: Any = None  # deviceId of the phone that is heard
@@ -84,7 +100,18 @@ class StreamParser:
 
     def lines(self, lines: list[bytes], now: float) -> list[Reading]:
         """Readings of CSV lines that arrived at ``now`` (monotonic s)."""
-        return self._accept(lines, self._line, now)
+        if self._settings.format != "json":
+            return self._accept(lines, self._line, now)
+        found: list[Any] = []
+        for line in lines:
+            try:
+                told = [*_orientations(json.loads(line))]
+            except (ValueError, RecursionError):
+                self.counts["not JSON"] += 1
+                continue
+            self.counts["without a rotation vector or quaternion"] += not told
+            found += told
+        return self._accept(found, self._orientation, now)
 
     def body(self, body: bytes, now: float) -> list[Reading]:
         """Readings of one message Sensor Logger pushed; ``foreign`` says that it is
@@ -119,6 +146,8 @@ class StreamParser:
                 time = self._time(stamp, now)
                 self._gate(matrix)
                 readings.append(Reading(time, matrix))
+                text = record.decode() if isinstance(record, bytes) else record
+                self.first = self.first or str(text)
             except _Dropped as reason:
                 self.counts[str(reason)] += 1
         self.counts["accepted"] += len(readings)
@@ -128,26 +157,74 @@ class StreamParser:
         """Seconds on the phone's clock, and (3, 3) phone to its world."""
         s = self._settings
         try:
-            text = line.decode("ascii").strip(" \t\0")
+            text = line.decode("utf-8").strip(" \t\0")
         except UnicodeDecodeError:
             raise _Dropped("not text") from None
         fields = [field.strip(" \t") for field in text.split(s.separator)]
         if fields[-1] == "" and len(fields) > 1:
             fields.pop()
-        used = set(s.quaternion_columns or s.columns)
-        if s.stamp_column >= 0:
-            used.add(s.stamp_column)
+        if s.format == "sensorlog" and _is_header(line):
+            self._take_header(fields)
+            raise _Dropped("a header")
+        if s.format == "sensorlog" and not self._quaternion:
+            raise _Dropped("before the header, which the app sends when it begins")
         if not all(TOKEN.fullmatch(field) for field in fields):
-            raise _Dropped("garbage")
+            comma = s.separator != "," and re.search(r"\d,\d", text)
+            raise _Dropped("decimal commas" if comma else "garbage")
+        used = set(self._quaternion or s.columns)
+        if self._stamp_column >= 0:
+            used.add(self._stamp_column)
         self._check_width(fields, used)
         values = {column: _number(fields[column]) for column in used}
-        stamp = values[s.stamp_column] / 1000.0 if s.stamp_column >= 0 else None
-        if s.quaternion_columns:
-            return stamp, _quaternion([values[c] for c in s.quaternion_columns])
+        stamp = None
+        if self._stamp_column >= 0:
+            stamp = self._seconds(values[self._stamp_column], s.stamp_unit or "ms")
+        if self._quaternion:
+            return stamp, _quaternion([values[c] for c in self._quaternion])
         return stamp, self._euler([values[c] for c in s.columns])
 
+    def _take_header(self, fields: list[str]) -> None:
+        """Find the columns of the quaternion, and of its time in seconds, by name."""
+        names = [re.sub(r"[^a-z]", "", f.partition("(")[0].lower()) for f in fields]
+        for end in QUATERNION:
+            ends = [end.format(letter) for letter in "xyzw"]
+            found = [[i for i, n in enumerate(names) if n.endswith(e)] for e in ends]
+            if all(len(columns) == 1 for columns in found):
+                x, y, z, w = (columns[0] for columns in found)
+                self._quaternion, self._width = (x, y, z, w), len(fields)
+                starts = [n.startswith("motiontimestamp") for n in names]
+                stamps = [i for i, found_there in enumerate(starts) if found_there]
+                self._stamp_column = stamps[0] if stamps else -1
+                self._unit_s = 1.0 if stamps else None
+                used = [*self._quaternion, *stamps[:1]]
+                self._named = ", ".join(f"{fields[i]} (column {i})" for i in used)
+                return
+
+    def _seconds(self, stamp: float, unit: str) -> float:
+        """Of a stamp: in the unit in which the first one is the present time, within a
+        day; else in that which is configured, or usual for the app."""
+        if self._unit_s is None:
+            now = time.time()
+            units = [u for u in UNITS_S.values() if abs(stamp * u - now) < DAY_S]
+            told = self._settings.stamp_unit
+            self._unit_s = UNITS_S[unit] if told or not units else units[0]
+        return stamp * self._unit_s
+
+    @property
+    def taken_for(self) -> str:
+        """What the fields of a record are taken for, in words."""
+        units = {value: name for name, value in UNITS_S.items()}
+        unit = "" if self._unit_s is None else units[self._unit_s]
+        if self._named:
+            return f"by the header: {self._named}, x y z w of a quaternion and its time"
+        return self._settings.fields(unit)
+
     def _check_width(self, fields: list[str], used: set[int]) -> None:
-        width = len(fields)
+        width, whole = len(fields), max(self._width or 0, max(used) + 1)
+        if width in (2 * whole - 1, 2 * whole) and self._settings.separator == ",":
+            fractions = fields[1 + width % 2 :: 2]
+            if all(map(str.isdecimal, fractions)) and "." not in "".join(fields):
+                raise _Dropped("decimal commas")
         if self._width is None and width > max(used):
             for column in used:
                 _number(fields[column])
@@ -173,10 +250,22 @@ class StreamParser:
         stamp = entry.get("time")
         try:
             numbers = [float(values[key]) for key in ("qx", "qy", "qz", "qw")]
-            seconds = None if stamp is None else float(stamp) * 1e-9
+            seconds = None if stamp is None else self._seconds(float(stamp), "ns")
         except (KeyError, TypeError, ValueError, OverflowError):
             raise _Dropped("no quaternion") from None
         return seconds, _quaternion(numbers)
+
+    def _orientation(self, told: tuple[Any, list[Any]]) -> tuple[float | None, Array]:
+        """Stamp and numbers of a JSON object."""
+        stamp, numbers = told
+        try:
+            values = [float(value) for value in numbers[:4]]
+            seconds = None if stamp is None else self._seconds(float(stamp), "ns")
+        except (TypeError, ValueError, OverflowError):
+            raise _Dropped("not a number") from None
+        if len(values) == 3:  # Android's: the fourth follows from these
+            values.append(math.sqrt(max(0.0, 1.0 - math.fsum(v * v for v in values))))
+        return seconds, _quaternion(values)
 
     def _time(self, stamp: float | None, now: float) -> float:
         """When the phone measured, on the computer's clock.
@@ -214,8 +303,33 @@ class StreamParser:
         self._last = matrix
 
 
+def _orientations(data: Any) -> Iterator[tuple[Any, list[Any]]]:
+    """Stamp and numbers, x y z and mostly w, of each orientation in what an app sent:
+    ``{"rotationVector": {"timestamp": .., "value": [..]}}``, ``{"type":
+    "android.sensor.rotation_vector", "values": [..]}``, ``{"name": "orientation",
+    "values": {"qx": ..}}``, alone, in a list or as a ``payload``."""
+    if isinstance(data, list):
+        for each in data:
+            yield from _orientations(each)
+    if not isinstance(data, dict):
+        return
+    values = data.get("values", data.get("value", data))
+    stamp = data.get("timestamp", data.get("time"))
+    kind = re.sub("[^a-z]", "", str(data.get("type", data.get("name", ""))).lower())
+    if isinstance(values, dict) and values.keys() >= {"qx", "qy", "qz", "qw"}:
+        yield stamp, [values[key] for key in ("qx", "qy", "qz", "qw")]
+    elif isinstance(values, list) and kind.endswith("rotationvector"):
+        yield stamp, values
+    else:
+        for name, inner in data.items():
+            if name == "payload":
+                yield from _orientations(inner)
+            elif isinstance(inner, dict):
+                yield from _orientations({"name": name, **inner})
+
+
 def _quaternion(values: list[float]) -> Array:
-    if not all(math.isfinite(value) for value in values):
+    if len(values) != 4 or not all(math.isfinite(value) for value in values):
         raise _Dropped("not a number")
     if not 0.98 <= math.fsum(value * value for value in values) <= 1.02:
         raise _Dropped("a quaternion that is not of length one")

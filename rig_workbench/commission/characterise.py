@@ -75,7 +75,7 @@ class Probe:
             raise Refused(
                 f"{self.name} stands at {here:.2f} deg, between its limits {low:g} and "
                 f"{high:g}; {up:g} deg of room upwards and {down:g} downwards are "
-                f"needed. Move it: jaxcal-rig jog {self.name} DEG"
+                f"needed. Move it: jaxcal-rig setup jog {self.name} DEG"
             )
         self.count = 0  # measurements
         self._base = device.attitude()  # (3, 3) that readings are from
@@ -134,7 +134,7 @@ class Probe:
             raise MotionFault(
                 f"{self.name} was moved by {deg:g} and {self.geometry.told} "
                 f"{self._rate * deg:.3f} {self.geometry.unit}. Check the axes first: "
-                "jaxcal-rig axes"
+                "jaxcal-rig setup axes"
             )
         first = self.read(down[0]) - self.read(up[0])
         if first > 0.9 * MOST_DEG:

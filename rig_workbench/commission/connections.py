@@ -14,9 +14,11 @@ from rig.core.session import STREAM_WAIT_S
 from rig.prove.steps import Site
 from rig.readings import make_source
 from rig.readings.geometry import Attitudes, Geometry, geometry_of
+from rig.readings.phone import Imu
 from rig.readings.source import Source
 
 WATCH_S = 5.0
+SHOWN = 300  # letters of a record
 LOOK_S = 1.0
 # Below these a session's settle window would hardly ever fill.
 SLOW_HZ, LONG_GAP_S = 5.0, 0.3
@@ -39,6 +41,8 @@ def look_at_phone(site: Site, seconds: float = WATCH_S) -> str:
             listener({"event": "listening", "port": imu.port})
         geometry = geometry_of(config)
         watch(imu, geometry, seconds, STREAM_WAIT_S, site.say)
+        if isinstance(imu, Imu):
+            site.say(f"  it sends {imu.first[:SHOWN]}\n  taken for {imu.taken_for}")
         return imu.sender
 
 

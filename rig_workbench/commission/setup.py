@@ -25,7 +25,7 @@ from rig.sessions import SimulatedDevice
 from rig_workbench.commission.connections import look_at_phone
 from rig_workbench.model import joint_names
 
-FORMATS = ["hyperimu", "sensorlogger", "lines"]
+FORMATS = ["hyperimu", "sensorlogger", "sensorlog", "json", "lines"]
 UNITS = 16
 SAFETY = (
     "Research software, not a medical device. Confirm: no patient is attached, no "
@@ -71,11 +71,8 @@ EXAMPLES: dict[str, dict[str, Any]] = {  # of --example
     "turntable": {"axes": {"table": "Z"}},
     "gimbal": {"axes": {"pan": "Z", "tilt": "X"}},
     "stage": {
-        "axes": {"x": "mm", "y": "mm", "z": "mm"}, "drives": "grbl",
-        "bus": "serial:/dev/ttyUSB0,115200", "readings": "serial:/dev/ttyUSB1,9600",
-    },
-    "servos": {
-        "axes": {"pan": "Z", "tilt": "X"}, "drives": "cia402", "bus": "can:can0,500000",
+        "axes": {"x": "mm", "y": "mm", "z": "mm"},
+        "readings": "serial:/dev/ttyUSB1,9600",
     },
 }  # fmt: skip
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 import pathlib
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -27,6 +28,7 @@ from rig.readings.attitude import Array
 
 NUMBERS = ("matrix", "offset_deg", "min_deg", "max_deg", "pulses_per_deg", "min_pulses",
            "max_pulses")  # fmt: skip
+NAME = re.compile("[a-z][a-z0-9_]{0,39}")
 
 
 def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
@@ -53,6 +55,9 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
     config = records[0]["config"]  # of the run, also where it was refitted
     names, outputs = names_of(config)
     axis_unit, output_unit = units_of(config)
+    for name in (*names, *outputs):
+        if not NAME.fullmatch(name):  # the folder may be somebody else's
+            raise Refused(f"{folder}: {name!r} is no name of an axis or of a reading")
     of_name = {axis["name"]: axis for axis in config["axes"]}
     axes = [of_name[name] for name in names]
     scales = [Scale.of(axis) for axis in axes]
@@ -158,8 +163,13 @@ def _origin(inverse: dict[str, Any]) -> list[str]:
         *(f"  {key} = {json.dumps(value)}" for key, value in inverse["device"].items()),
         *(f"WARNING: {text}" for text in inverse["warnings"]),
     ]
-    kept = ("".join(c if " " <= c <= "~" else "?" for c in line) for line in lines)
-    return [line.replace("*", "#").replace("\\", "/") for line in kept]
+    return [*map(_comment, lines)]
+
+
+def _comment(text: str) -> str:
+    """A text as one line that ends no comment, and begins none, in any language."""
+    kept = "".join(c if " " <= c <= "~" else "?" for c in text)
+    return kept.replace("*", "#").replace("\\", "/").replace("//", "/ /")
 
 
 def _code(name: str, inverse: dict[str, Any]) -> str:
@@ -174,7 +184,8 @@ def _code(name: str, inverse: dict[str, Any]) -> str:
     environment.filters |= {"c": _c, "real": _real, "reals": _reals}
     bits = ", ".join(str(1 << i) for i in range(len(inverse["axes"])))
     template = environment.get_template(name)
-    return template.render(**inverse, bits=bits, origin=_origin(inverse))
+    told = {unit: _comment(inverse[unit]) for unit in ("axis_unit", "output_unit")}
+    return template.render(**inverse | told, bits=bits, origin=_origin(inverse))
 
 
 def _c(value: Any) -> str:

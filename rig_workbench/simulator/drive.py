@@ -246,7 +246,7 @@ class SimDrive:
             return 0
         address, kind = place
         words = [self._registers[address + i] for i in range(registers_of(kind))]
-        return decode(words, kind, self.map.word_order)
+        return round(decode(words, kind, self.map.word_order))
 
     def _ignores_stop(self, broadcast: bool) -> bool:
         self.stops.append(time.monotonic())

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from jaxcal.arms.files.urdf import joints_of
-from jaxcal.commands.main import main
+from jaxcal.commands import main
 from jaxcal.models import Board, SerialChain
 from tests.models.arms import CONTACTS
 

@@ -1,4 +1,9 @@
-"""Nodes of CiA 402 on python-can's virtual bus, by python-canopen's own server."""
+"""Nodes of CiA 402 on python-can's virtual bus, by python-canopen's own server.
+
+As drives do, a node enables its power stage in NMT state "operational" alone, and what
+a halt does depends on its mode: one without a mode obeys none. Objects that the
+standards call optional may be absent (``without``).
+"""
 
 import math
 import threading
@@ -8,22 +13,24 @@ import canopen
 
 STEP_S = 0.002
 TYPES = {  # of objects: CANopen's data types
-    0x6040: 6, 0x6041: 6, 0x603F: 6, 0x605D: 3, 0x6060: 2, 0x6064: 4, 0x607A: 4,
-    0x6081: 7, 0x6083: 7, 0x6084: 7,
+    0x6040: 6, 0x6041: 6, 0x603F: 6, 0x605D: 3, 0x6060: 2, 0x6061: 2, 0x6064: 4,
+    0x607A: 4, 0x6081: 7, 0x6083: 7, 0x6084: 7, 0x1017: 6,
 }  # fmt: skip
 
 
 class Node:
     """One drive: its state machine, and a ramp to its target."""
 
-    def __init__(self, network, unit):
+    def __init__(self, network, unit, without=()):
         od = canopen.ObjectDictionary()
         for index, kind in TYPES.items():
+            if index in without:
+                continue
             entry = canopen.objectdictionary.ODVariable(f"o{index:x}", index)
             entry.data_type, entry.access_type, entry.default = kind, "rw", 0
             od.add_object(entry)
         record = canopen.objectdictionary.ODRecord("identity", 0x1018)
-        for sub in (1, 2, 4):
+        for sub in {1, 2, 4} - set(without):
             entry = canopen.objectdictionary.ODVariable(f"s{sub}", 0x1018, sub)
             entry.data_type, entry.access_type, entry.default = 7, "ro", unit * 10 + sub
             record.add_member(entry)
@@ -33,11 +40,12 @@ class Node:
         self.node.add_write_callback(self._written)
         self.node.add_read_callback(self._read)
         self.position = self.velocity = 0.0
-        self.target, self.state, self.word = 0, 0x40, 0
+        self.target, self.state, self.word, self.mode = 0, 0x40, 0, 0
         self.reached, self.taken, self.halted = True, False, False
         self.fault, self.faults, self.speed = 0, set(), 1.0
         self.values = {}
         self._lock, self._now = threading.RLock(), time.monotonic()
+        self.node.nmt.state = "PRE-OPERATIONAL"
 
     def advance(self):
         now = time.monotonic()
@@ -80,6 +88,8 @@ class Node:
                 return self.target
             if index == 0x603F:
                 return self.fault
+            if index == 0x6061:
+                return self.mode
             if index == 0x6041:
                 word = 0x08 if self.fault else self.state
                 return word | self.reached << 10 | self.taken << 12
@@ -92,6 +102,8 @@ class Node:
             self.values[index] = value
             if index == 0x607A:
                 self.next = value
+            if index == 0x6060:
+                self.mode = value
             if index == 0x6040:
                 self._control(value)
 
@@ -101,9 +113,11 @@ class Node:
             self.fault, self.state = 0, 0x40
         steps = {0x06: (0x40, 0x21), 0x07: (0x21, 0x23), 0x0F: (0x23, 0x27)}
         before, after = steps.get(word & 0x0F, (None, None))
-        if self.state == before and not self.fault:
+        operational = self.node.nmt.state == "OPERATIONAL"
+        if self.state == before and not self.fault and operational:
             self.state = after
-        if "deaf" not in self.faults or not word & 0x100:
+        obeys = "deaf" not in self.faults and self.mode
+        if obeys or not word & 0x100:
             self.halted = bool(word & 0x100)
         if (
             not self.halted
@@ -120,12 +134,13 @@ class Node:
 class Nodes:
     """Two of them on a channel."""
 
-    def __init__(self, channel, units=(1, 2)):
+    def __init__(self, channel, units=(1, 2), without=()):
         self._network, self._channel, self._units = canopen.Network(), channel, units
+        self._without = without
 
     def __enter__(self):
         self._network.connect(interface="virtual", channel=self._channel)
-        self.nodes = [Node(self._network, unit) for unit in self._units]
+        self.nodes = [Node(self._network, unit, self._without) for unit in self._units]
         return self
 
     def __exit__(self, *_):

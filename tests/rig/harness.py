@@ -21,7 +21,7 @@ from rig.command_run import Run, run_safely
 from rig.config import RigConfig, parse_config
 from rig.config.config import EXAMPLES
 from rig.config.maps import RegisterMap, available_maps, load_map
-from rig.core import motion, stop
+from rig.core import device, motion, stop
 from rig.journal import (
     HOMED,
     IDENTIFIED,
@@ -47,6 +47,7 @@ AS_OF_A_DEVICE = (
 )  # as sessions of a device have them
 # A simulated drive stands within 0.1 s; for a dead one the whole time is waited.
 stop.VERIFY_S = 0.6
+device.PATIENCE_S = 2.0  # with a phone that is gone
 stop.stand_s = lambda drives: 0.05
 motion.TOO_FAST *= 3.0  # as fast as the simulated drives are
 

@@ -18,6 +18,8 @@ from other_drives import stage_text
 from rig.config import parse_config
 from rig.drives import make_drives
 
+DRIVES = pathlib.Path(__file__).parents[2] / "examples" / "drives"
+MARLIN = str(DRIVES / "marlin.toml")
 PRINTER = """
 import os, select, tempfile, threading, tty
 from octoprint.plugins import virtual_printer
@@ -67,7 +69,7 @@ def main(python):
         try:
             channel = printer.stdout.readline().strip()
             bus = f'transport = "serial"\ndevice = "{channel}"'
-            config = parse_config(stage_text(bus, "marlin", 1, 100))
+            config = parse_config(stage_text(bus, MARLIN, 1, 100))
             line, (x, y) = make_drives(config.bus, config.axes)
             x._scale = y._scale = 100.0  # counts for a millimetre, as this one counts
             with line:

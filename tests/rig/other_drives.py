@@ -57,7 +57,9 @@ def sensed(places, noise=0.002):
     def numbers():
         return MATRIX @ (np.array(places()) * gain) + BIAS + rng.normal(0, noise, 2)
 
-    config = parse_config(stage_text('transport = "serial"\ndevice = "x"', "grbl", 0))
+    config = parse_config(
+        stage_text('transport = "rtu"\ndevice = "x"', "leadshine_pr", 0)
+    )
     sensor = SimSensor(config.readings, numbers, FaultInjector(), 200.0)
     try:
         yield sensor.start(0), gain

@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import pathlib
+import re
 import shlex
 import signal
 import subprocess
@@ -23,7 +24,7 @@ from harness import (
 
 import jaxcal
 from rig.__main__ import main
-from rig.commands import make_parser
+from rig.commands import make_parser, resolved
 from rig.journal import read_journal
 from rig_workbench.simulator import Truth, parse_fault
 
@@ -212,6 +213,64 @@ def test_the_commands_of_the_readme_parse():
         make_parser().parse_args(words)
 
 
+@pytest.mark.parametrize(
+    ("typed", "known", "note"),
+    [
+        ("setup home --here", "home --here", ""),
+        ("home --here", "home --here", "home is now `jaxcal-rig setup home`"),
+        ("check scan --units 3", "scan --units 3", ""),
+        ("check rig.toml", "check rig.toml", ""),
+        ("simulate", "simulate", ""),
+        ("simulate --noise 1", "simulate --noise 1", ""),
+        ("simulate calibrate --noise 1", "calibrate --simulate --noise 1", ""),
+        ("simulate setup axes", "axes --simulate", ""),
+        (
+            "calibrate --simulate --noise=1", "calibrate --simulate --noise=1",
+            "type `jaxcal-rig simulate calibrate --noise ...`",
+        ),
+        ("goto run --to 1,-2.5,3 --arm", "goto run --arm --to 1 -2.5 3", ""),
+        ("goto --to=1,2,3 run", "goto run --to 1 2 3", ""),
+        ("goto --to 1 2 3 run", "goto run --to 1 2 3", ""),
+    ],
+)  # fmt: skip
+def test_words_are_taken_as_commands_and_old_ones_are_told(typed, known, note):
+    words, notes = resolved(typed.split())
+    assert words == known.split()
+    assert bool(notes) == bool(note) and note in "".join(notes)
+
+
+def test_the_first_screen_has_about_a_dozen_commands(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    listed = re.findall(r"^    ([a-z]+)\b", capsys.readouterr().out, re.M)
+    assert 10 <= len(listed) <= 15
+    assert not {"home", "axes", "zero", "jog", "ports", "scan", "imu"} & {*listed}
+    for words in (["setup", "home"], ["check", "imu"]):
+        with pytest.raises(SystemExit):
+            main([*words, "--help"])
+        assert f"usage: jaxcal-rig {' '.join(words)}" in capsys.readouterr().out
+
+
+def test_options_of_the_simulator_are_listed_under_simulate_alone(capsys):
+    for words, listed in (["simulate"], True), (["calibrate"], False):
+        with pytest.raises(SystemExit):
+            main([*words, "--help"])
+        assert ("--backlash" in capsys.readouterr().out) == listed
+
+
+def test_what_a_simulated_session_lacks_is_named_at_once(monkeypatch, capsys):
+    """It asked for the extra rig, and once that was there for workbench."""
+    find = importlib.util.find_spec
+    gone = {"pydantic", "serial", "tomlkit", "jinja2"}
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name in gone else find(name)
+    )
+    assert main(["calibrate", "--simulate"]) == 2
+    told = capsys.readouterr().err
+    assert "calibrate --simulate needs pydantic, serial, tomlkit, jinja2" in told
+    assert "workbench" in told and told.count("\n") == 1
+
+
 def test_check_takes_its_file_with_and_without_config(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["example", "leadshine_pr"]) == 0
@@ -233,8 +292,8 @@ def test_a_missing_package_is_one_line_with_the_command_that_installs_it(
     path.write_text(fast_text({"port = 5020": "port = 1"}))
     calibrate = ["calibrate", "--simulate", "--out", str(tmp_path)]
     for missing, words, extra in (
-        ("serial", calibrate, "rig"),
-        ("pydantic", calibrate, "rig"),
+        ("serial", calibrate, "workbench"),
+        ("pydantic", ["calibrate", "--out", str(tmp_path)], "rig"),
         ("jinja2", ["report", str(tmp_path)], "workbench"),
     ):
         real = importlib.util.find_spec

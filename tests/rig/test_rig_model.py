@@ -1,6 +1,7 @@
 """Devices with a ``[model]``: an arm by its URDF and a phone, and functions."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from jaxcal.models import Gravity, SerialChain
 from rig.__main__ import main
 from rig.config import ConfigError, parse_config
 from rig.journal import SIGN_CHECKED, STOP_PROVED, DeviceRecord
+from rig.journal.run_folder import SCHEMA
 from rig_workbench.model import model_of
 from rig_workbench.simulator import Truth, parse_fault
 
@@ -161,3 +163,30 @@ def test_wrong_models_of_arms_are_refused(old, new, told):
 def test_wrong_functions_are_refused(tmp_path, factory, told):
     with pytest.raises(ConfigError, match=told):
         model_of(parse_config(stage_text(tmp_path, factory), tmp_path))
+
+
+def test_check_and_refit_run_no_program_that_was_not_asked_for(tmp_path, capsys):
+    """A folder that somebody sent may hold any."""
+    text = stage_text(tmp_path)
+    (tmp_path / "bent.py").write_text(
+        "import pathlib\npathlib.Path(__file__).with_name('ran').touch()\n" + BENT
+    )
+    path = tmp_path / "rig.toml"
+    path.write_text(text)
+    assert main(["check", str(path)]) == 0
+    assert "NOT run, and so not checked: bent.py:function" in capsys.readouterr().out
+    run = tmp_path / "calibrate-1"
+    run.mkdir()
+    shutil.copy(path, run)
+    start = {
+        "seq": 0, "event": "start", "schema": SCHEMA, "mode": "calibrate",
+        "maps_from": str(tmp_path), "inputs": {}, "simulated": None,
+    }  # fmt: skip
+    (run / "journal.jsonl").write_text(json.dumps(start) + "\n")
+    for given in ([], ["--factory", "other.py:it"]):
+        assert main(["refit", str(run), *given]) == 2
+        told = capsys.readouterr().err
+        assert "a program that refit would run: give --factory bent.py:function" in told
+    assert not (tmp_path / "ran").exists()
+    assert main(["check", str(path), "--run", "bent.py:function"]) == 0
+    assert (tmp_path / "ran").exists()

@@ -311,15 +311,19 @@ def test_a_creeping_device_never_settles():
         ("stuck_axis,axis=yaw@moving", "yaw does not follow"),
         ("alarm,axis=roll", "roll: alarm 0x30. .* go on with --reset-alarms"),
         ("sto,axis=yaw", "power stage of yaw was switched off while armed"),
-        ("imu_gap", "s old"),
+        ("imu_gap@moving", "s old"),
         ("dead_drive,axis=pitch", "no valid reply"),
     ],
 )
 def test_trouble_on_the_way_is_noticed(fault, error):
-    with bench(fast_config(HASTY)) as motion:
-        motion.sim.faults.add(parse_fault(fault.partition("@")[0]))
-        if fault == "imu_gap":
-            time.sleep(motion.config.imu.stale_s)
+    slow = {"speedup": 0.02} if fault == "imu_gap@moving" else {}
+    with bench(fast_config(HASTY), **slow) as motion:
+        if slow:
+            motion.device.meanwhile = lambda: motion.sim.faults.add(
+                parse_fault("imu_gap")
+            )
+        else:
+            motion.sim.faults.add(parse_fault(fault.partition("@")[0]))
         motion.sim.enter("moving")
         with pytest.raises(Exception, match=error):
             motion.move_to(motion.config.to_pulses([10, 10, 10]), "x")
@@ -337,19 +341,19 @@ def test_a_power_stage_that_is_switched_off_at_rest_ends_what_is_measured():
             motion.measure(motion.device.positions())
 
 
-@pytest.mark.parametrize(("counts", "fast"), [(2, False), (20, True)])
+@pytest.mark.parametrize(("counts", "fast"), [(2, False), (20, False), (60, True)])
 def test_a_count_that_jumps_is_no_speed(counts, fast, monkeypatch):
     """A stepper of 1,000 counts a turn: its first move is of one or two."""
     monkeypatch.setattr(moving, "TOO_FAST", 1.6)
     config = SimpleNamespace(name="stepper")
     axis = SimpleNamespace(
         name="x", unit_name="mm", map=config, drive_motion=(0.002, 0.02),
-        to_deg=lambda count: count / 1000.0,
+        to_deg=lambda count: count / 1000.0, turns_per_deg=1.0,
     )  # fmt: skip
     device = SimpleNamespace(simulated=False, paces={})
     seen = [SimpleNamespace(position=0, asked=0.0, time=0.01),
             SimpleNamespace(position=counts, asked=0.5, time=0.51)]  # fmt: skip
-    told = pytest.raises(MotionFault, match=r"moves at 0\.0353 mm/s or faster")
+    told = pytest.raises(MotionFault, match=r"moves at 0\.114 mm/s or faster")
     with told if fast else contextlib.nullcontext():
         moving._check_speed(device, axis, seen)
 

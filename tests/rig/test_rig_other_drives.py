@@ -1,7 +1,8 @@
-"""Drives of other kinds than Modbus: the same code proves the same of them."""
+"""The drives of examples/drives: the same code proves the same of them."""
 
 import contextlib
 import json
+import pathlib
 import sys
 import time
 import types
@@ -22,19 +23,25 @@ from rig.journal import SIGN_CHECKED, STOP_PROVED
 from rig.prove import steps
 
 KINDS = ("grbl", "marlin", "cia402")
-CAN = 'transport = "can"\ninterface = "virtual"\ndevice = "{}"'
+DRIVES = pathlib.Path(__file__).parents[2] / "examples" / "drives"
+CAN = 'transport = "can"\ndevice = "virtual:{}"'
 SERIAL = 'transport = "serial"\ndevice = "{}"'
 
 
 def device(kind, channel="rig"):
     """A simulated controller of a kind, how its bus is reached, counts a millimetre."""
     if kind == "cia402":
-        pytest.importorskip("canopen", reason="the extra canopen is not installed")
+        pytest.importorskip("canopen", reason="canopen is not installed")
         from can_nodes import Nodes
 
         return Nodes(channel), lambda made: CAN.format(channel), 1000
     counts = 1000 if kind == "grbl" else 80
     return Controller(kind), lambda made: SERIAL.format(made.device), counts
+
+
+def family(kind):
+    """The map of a kind of drive."""
+    return str(DRIVES / f"{kind}.toml")
 
 
 def until(holds, seconds=3.0):
@@ -49,7 +56,7 @@ def test_each_line_of_gcode_has_an_answer_of_its_own():
     made, bus, counts = device("marlin")
     made.faults |= {"one_line", "late"}
     with made:
-        config = parse_config(stage_text(bus(made), "marlin", 1, counts))
+        config = parse_config(stage_text(bus(made), family("marlin"), 1, counts))
         line, (x, _) = make_drives(config.bus, config.axes)
         with line:
             x.look(0)
@@ -63,7 +70,7 @@ def test_each_line_of_gcode_has_an_answer_of_its_own():
 def test_a_drive_moves_stops_and_says_what_it_is(kind):
     made, bus, counts = device(kind, "quick")
     with made:
-        config = parse_config(stage_text(bus(made), kind, 1, counts))
+        config = parse_config(stage_text(bus(made), family(kind), 1, counts))
         line, drives = make_drives(config.bus, config.axes)
         with line:
             x, y = drives
@@ -94,7 +101,7 @@ def test_a_drive_moves_stops_and_says_what_it_is(kind):
 
 def test_a_refused_target_is_told_from_a_silent_controller():
     with Controller("grbl") as made:
-        text = stage_text(SERIAL.format(made.device), "grbl", 1)
+        text = stage_text(SERIAL.format(made.device), family("grbl"), 1)
         config = parse_config(text.replace("max_mm = 20", "max_mm = 200"))
         line, (x, _) = make_drives(config.bus, config.axes)
         with line:
@@ -105,6 +112,109 @@ def test_a_refused_target_is_told_from_a_silent_controller():
             with pytest.raises(BusError) as told:
                 x.move(1000, 1000, 1000)
             assert not told.value.refused and x.took(1000, x.status(), 2)
+
+
+def grbl_of(made, **changes):
+    text = stage_text(SERIAL.format(made.device), family("grbl"), 1, **changes)
+    config = parse_config(text)
+    return make_drives(config.bus, config.axes)
+
+
+def test_a_board_that_its_ports_opening_resets_is_waited_for_and_reset_once():
+    with Controller("grbl") as made:
+        for _ in range(2):  # its control line is left up, so that it keeps its place
+            line, (x, _) = grbl_of(made)
+            with line:
+                assert x.ids()["firmware"].startswith("[VER:1.1h")
+                x.go(x.status().position + 500)
+                until(lambda x=x: x.status().done)
+        assert made.resets == 1 and made.places()[0] == pytest.approx(1.0)
+        made.hang_up()  # as another program leaves it
+        until(lambda: not made._high)
+        line, (x, _) = grbl_of(made)
+        with line:
+            assert x.status().position == 0 and made.resets == 2
+
+
+def test_a_board_that_is_not_reset_is_not_waited_for():
+    with Controller("grbl") as made:
+        made.faults.add("no_reset")
+        line, (x, _) = grbl_of(made)
+        begun = time.monotonic()
+        with line:
+            assert x.status().done
+        assert time.monotonic() - begun < 2.0 and not made.resets
+
+
+def test_a_stop_at_rest_leaves_nothing_that_holds_or_goes_on():
+    with Controller("grbl") as made:
+        line, (x, _) = grbl_of(made)
+        with line:
+            x.stop()
+            assert made.state == "Idle" and x.status().done
+            x.go(1000)
+            until(lambda: x.status().done)
+            assert made.places()[0] == pytest.approx(1.0)
+
+
+def test_what_another_program_runs_is_held_and_then_ended_where_it_stands():
+    with Controller("grbl") as made:
+        line, (x, _) = grbl_of(made)
+        with line:
+            x.status()
+            made.run("X", 50.0, 20.0)
+            made.run("X", 0.0, 20.0)
+            assert x.status().moving
+            x.stop()
+            until(lambda: not x.status().moving)
+            assert made.state == "Hold:0" and not x.status().enabled
+            stood = x.steady().position
+            x.hold(stood)
+            assert made.state == "Idle" and not made.queue and not made.alarm
+            assert x.steady().position == stood and x.status().enabled
+
+
+def test_the_slowest_feed_is_the_controllers():
+    """GRBL raises a slower one, which its jogs must not ask for."""
+    with Controller("grbl") as made:
+        line, (x, _) = grbl_of(made)
+        with line:
+            x.move(100, 1.0, 1000.0)
+            assert made.queue[0][2] == pytest.approx(1 / 60)
+            x.stop()
+
+
+def test_objects_that_a_canopen_drive_may_lack_are_left_out():
+    pytest.importorskip("canopen", reason="canopen is not installed")
+    from can_nodes import Nodes
+
+    with Nodes("lean", without=(2, 4, 0x6083, 0x6061, 0x605D)) as made:
+        text = stage_text(CAN.format("lean"), family("cia402"), 1)
+        config = parse_config(text)
+        line, (x, _) = make_drives(config.bus, config.axes)
+        with line:
+            assert x.ids() == {"vendor": 11}
+            assert x.bring(x.arm, lambda status: status.enabled).enabled
+            x.go(2000)
+            until(lambda: x.status().done)
+            assert made.places()[0] == pytest.approx(2.0, abs=1e-3)
+
+
+def test_a_canopen_node_is_started_and_its_mode_is_set_before_it_is_halted():
+    pytest.importorskip("canopen", reason="canopen is not installed")
+    from can_nodes import Nodes
+
+    with Nodes("fresh") as made:
+        config = parse_config(stage_text(CAN.format("fresh"), family("cia402"), 1))
+        line, (x, _) = make_drives(config.bus, config.axes)
+        node, seen = made.nodes[0], []
+        control = node._control
+        node._control = lambda word: (seen.append((node.mode, word)), control(word))
+        with line:
+            assert not x.status().enabled
+            assert x.bring(x.arm, lambda status: status.enabled).enabled
+            assert node.node.nmt.state == "OPERATIONAL"
+        assert seen and all(mode == 1 for mode, word in seen if word & 0x100)
 
 
 OWN = """
@@ -178,14 +288,16 @@ def test_what_a_class_lacks_is_named_before_anything_moves(tmp_path, capsys, met
     (tmp_path / "mine.py").write_text(OWN.replace(method, method + "_"))
     (tmp_path / "mine.toml").write_text(MAP)
     (tmp_path / "rig.toml").write_text(stage_text(SERIAL.format("x"), "mine.toml", 1))
-    assert main(["check", str(tmp_path / "rig.toml")]) == 2
+    assert main(["check", str(tmp_path / "rig.toml")]) == 0
+    assert "NOT run, and so not checked: mine.py:Mine" in capsys.readouterr().out
+    assert main(["check", str(tmp_path / "rig.toml"), "--run", "mine.py:Mine"]) == 2
     told = capsys.readouterr().err
     assert f" {method.split()[-1]}" in told.replace("Mine.", " ") and "mine.py" in told
 
 
 def test_drives_of_two_lines_and_of_another_bus_are_refused():
-    config = parse_config(stage_text(SERIAL.format("x"), "grbl", 1))
-    other = parse_config(stage_text(CAN.format("x"), "cia402", 1))
+    config = parse_config(stage_text(SERIAL.format("x"), family("grbl"), 1))
+    other = parse_config(stage_text(CAN.format("x"), family("cia402"), 1))
     with pytest.raises(Refused, match="share a line"):
         make_drives(config.bus, [config.axes[0], other.axes[1]])
     with pytest.raises(Refused, match=r"bus\.transport: must be serial"):
@@ -195,7 +307,7 @@ def test_drives_of_two_lines_and_of_another_bus_are_refused():
 def test_a_missing_extra_is_named(monkeypatch):
     for module in ("can", "canopen"):
         monkeypatch.setitem(sys.modules, module, None)
-    config = parse_config(stage_text(CAN.format("x"), "cia402", 1))
+    config = parse_config(stage_text(CAN.format("x"), family("cia402"), 1))
     line, _ = make_drives(config.bus, config.axes)
     with pytest.raises(Refused, match=r"need can, which is not installed: .*canopen"):
         line.open()
@@ -209,7 +321,9 @@ def stage(request, tmp_path_factory):
     folder, said = tmp_path_factory.mktemp(request.param), []
     made, bus, counts = device(request.param, f"stage {request.param}")
     with made, sensed(made.places) as (port, gain):
-        config = parse_config(stage_text(bus(made), request.param, port, counts))
+        config = parse_config(
+            stage_text(bus(made), family(request.param), port, counts)
+        )
         place = place_of(config, folder, said)
         steps.show_identity(place)
         assert steps.go_home(place, here=True) == 0, said
@@ -234,7 +348,7 @@ def back(stage):
     made = stage.made
     with getattr(made, "_lock", contextlib.nullcontext()):
         if isinstance(made, Controller):
-            made.at, made.queue, made.held = dict.fromkeys("XY", 0.0), [], False
+            made.at, made.queue = dict.fromkeys("XY", 0.0), []
     for node in getattr(made, "nodes", ()):
         with node._lock:
             node.position = node.velocity = 0.0

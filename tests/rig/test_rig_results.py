@@ -32,6 +32,7 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from rig.__main__ import main
 from rig.config import AXIS_NAMES, parse_config
+from rig.faults import Refused
 from rig.journal import read_journal
 from rig.outputs.messages import numbers
 from rig_workbench.outputs import trend
@@ -493,6 +494,28 @@ def test_no_name_of_a_run_or_a_map_ends_a_comment(inverse):
         comment = LANGUAGES[name](nasty).partition("*/" if name == "c" else "\n*)")[0]
         assert "x;" in comment.splitlines()[-1] and wild not in comment
     pytest.importorskip("yaml").safe_load(LANGUAGES["ros"](nasty))
+
+
+@pytest.mark.parametrize(
+    ("language", "comment"), [("c", r"/\*.*?\*/"), ("st", r"\(\*.*?\*\)")]
+)
+def test_no_unit_ends_a_comment(inverse, language, comment):
+    """A unit is a text of rig.toml, and it stands in comments."""
+    wild = "mm */ int evil; /* *) evil := 1; (*"
+    nasty = inverse | {"output_unit": wild, "axis_unit": wild}
+    text = LANGUAGES[language](nasty)
+    left = re.sub(comment, "", text, flags=re.DOTALL)
+    plain = re.sub(comment, "", LANGUAGES[language](inverse), flags=re.DOTALL)
+    assert "evil" in text and left == plain
+
+
+def test_a_name_that_is_no_name_is_refused(finished):
+    """The journal may be of a folder that somebody sent."""
+    records = read_journal(finished / "journal.jsonl")
+    config = json.loads(json.dumps(records[0]["config"]))
+    config["axes"][0]["name"] = "pitch; int evil"
+    with pytest.raises(Refused, match="'pitch; int evil' is no name"):
+        load_inverse(finished, [records[0] | {"config": config}, *records[1:]])
 
 
 def test_export_writes_over_no_record_that_it_reads(run, capsys):

@@ -144,7 +144,6 @@ OPTIONS = {"bus": "", "imu": "", "axes": "", "example": "", "readings": ""}
     [
         ({"example": "turntable"}, ["rotation"], "hyperimu"),
         ({"example": "gimbal", "imu": "lines:2055"}, ["rotation"] * 2, "lines"),
-        ({"example": "servos"}, ["rotation"] * 2, "hyperimu"),
         ({"example": "stage"}, ["translation"] * 3, "serial"),
         (
             {"axes": "x:mm,turn:deg", "readings": "modbus:10.0.0.9"},
@@ -247,7 +246,7 @@ def test_a_simulated_check_of_the_axes_corrects_no_file(at, capsys):
 
 def test_limits_of_a_translation_are_asked_for_in_its_unit_and_written(tmp_path):
     path, said = tmp_path / "rig.toml", []
-    path.write_text(stage_text('transport = "serial"\ndevice = "x"', "grbl", 1))
+    path.write_text(stage_text('transport = "rtu"\ndevice = "x"', "leadshine_pr", 1))
     answers = iter(["-15", "", "", "20"])
     ask = Operator(read=lambda prompt: said.append(prompt) or next(answers))
     site = types.SimpleNamespace(

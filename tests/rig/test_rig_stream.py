@@ -89,7 +89,7 @@ def test_a_line_may_write_every_angle_in_0_to_360():
 def test_a_decimal_comma_is_a_wrong_number_of_columns_not_another_angle():
     readings, parser = feed(HYPER, "17,10,5,1,5,2,5")
     assert readings == []
-    assert parser.counts["not of 4 columns"] == 1
+    assert parser.counts["decimal commas"] == 1
 
 
 def test_changed_columns_are_dropped_for_good():
@@ -447,3 +447,159 @@ def test_connections_that_send_nothing_are_short(monkeypatch):
     with Imu(changed(PLAIN, port=0)) as imu, connect(imu) as idle:
         with contextlib.suppress(ConnectionError):
             assert idle.recv(64) == b""
+
+
+# Apps, by what they were seen to send
+
+SENSORLOG_HEADER = (
+    "loggingTime(txt),accelerometerAccelerationX(G),motionTimestamp_sinceReboot(s),"
+    "motionYaw(rad),motionAttitudeReferenceFrame(txt),motionQuaternionX(R),"
+    "motionQuaternionY(R),motionQuaternionZ(R),motionQuaternionW(R),"
+    "motionMagneticFieldX(µT),motionHeading(°)"
+)
+
+
+def sensorlog_line(quaternion, seconds):
+    numbers = ",".join(f"{value:.6f}" for value in quaternion)
+    return (
+        f"2026-11-27 19:05:11.{int(1000 * seconds) % 1000:03d} +0100,-0.01,"
+        f"{90211.5 + seconds:.3f},0.5,XArbitraryCorrectedZVertical,{numbers},"
+        "-12.5,271.2"
+    )
+
+
+SENSORLOG = changed(HYPER, format="sensorlog", stamp_column=-1, column_count=0)
+TURNED = Rotation.from_euler("ZYX", [30.0, -10.0, 5.0], degrees=True)
+
+
+def test_sensorlogs_lines_are_read_by_the_names_of_its_header():
+    """A date with a blank, text in other columns, and letters that ASCII lacks."""
+    stream = "\n".join(
+        [
+            SENSORLOG_HEADER,
+            *(sensorlog_line(TURNED.as_quat(), n / 50) for n in range(5)),
+            "",
+        ]
+    ).encode()
+    parser, splitter = StreamParser(SENSORLOG), LineSplitter()
+    readings = []
+    for n, line in enumerate(splitter.feed(stream)):
+        readings += parser.lines([line], 100.0 + n / 50)
+    assert len(readings) == 5 and parser.counts["accepted"] == 5
+    assert angle_between_deg(readings[0].value, TURNED.as_matrix()) < 1e-3
+    times = np.diff([reading.time for reading in readings])
+    np.testing.assert_allclose(times, 0.02, atol=2e-3)
+    assert "motionQuaternionX(R) (column 5)" in parser.taken_for
+
+
+def test_a_line_of_names_that_was_moved_is_followed():
+    """Columns change with the app's settings; a header comes before they do."""
+    names = SENSORLOG_HEADER.split(",")
+    values = sensorlog_line(TURNED.as_quat(), 0.0).split(",")
+    order = np.random.default_rng(0).permutation(len(names))
+    lines = [",".join(row[i] for i in order) for row in (names, values)]
+    readings, _ = feed(SENSORLOG, *lines)
+    assert angle_between_deg(readings[0].value, TURNED.as_matrix()) < 1e-3
+
+
+def test_sensorlog_without_its_header_is_named():
+    readings, parser = feed(SENSORLOG, sensorlog_line(TURNED.as_quat(), 0.0))
+    assert not readings
+    assert parser.counts["before the header, which the app sends when it begins"] == 1
+
+
+JSON = changed(HYPER, format="json", stamp_column=-1, column_count=0)
+X, Y, Z, W = (float(value) for value in TURNED.as_quat())
+SHAPES = {
+    "SensorStreamer": {
+        "accelerometer": {"timestamp": 1, "value": [0.1, 0.2, 9.8]},
+        "rotationVector": {"timestamp": 52_000_000_000, "value": [X, Y, Z]},
+    },
+    "SensaGram": {
+        "type": "android.sensor.game_rotation_vector", "timestamp": 52_000_000_000,
+        "values": [X, Y, Z, W, -1.0],
+    },
+    "Sensor Logger": {
+        "messageId": 1, "payload": [
+            {"name": "accelerometer", "time": 3, "values": {"x": 1, "y": 2, "z": 3}},
+            {"name": "orientation", "time": 52_000_000_000,
+             "values": {"qx": X, "qy": Y, "qz": Z, "qw": W, "yaw": 1.0}},
+        ],
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("app", SHAPES)
+def test_json_lines_of_apps_are_attitudes(app):
+    readings, parser = feed(JSON, json.dumps(SHAPES[app]))
+    assert len(readings) == 1
+    assert angle_between_deg(readings[0].value, TURNED.as_matrix()) < 1e-6
+    assert parser.first and "quaternion" in parser.taken_for
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("{", "not JSON"),
+        ('{"accelerometer": {"value": [1, 2, 3]}}', "without a rotation vector"),
+        ('{"rotationVector": {"value": [1, 2, null]}}', "not a number"),
+        ('{"rotationVector": {"value": [3, 2, 1, 0]}}', "not of length one"),
+        ("[" * 5000, "not JSON"),
+    ],
+)
+def test_json_that_is_no_orientation_is_dropped_by_name(text, reason):
+    readings, parser = feed(JSON, text)
+    assert not readings and any(reason in name for name in parser.counts)
+
+
+def test_datagrams_are_heard_from_one_phone():
+    settings = changed(JSON, transport="udp", port=0, max_jump_deg=180.0)
+    line = json.dumps(SHAPES["SensorStreamer"]).encode()
+    with Imu(settings) as imu, contextlib.ExitStack() as stack:
+        first, other = (
+            stack.enter_context(socket.socket(type=socket.SOCK_DGRAM)) for _ in "ab"
+        )
+        other.bind(("127.0.0.2", 0))
+        first.sendto(line, ("127.0.0.1", imu.port))
+        reading = imu.wait_for_stream(3.0)
+        assert angle_between_deg(reading.value, TURNED.as_matrix()) < 1e-6
+        other.sendto(line, ("127.0.0.1", imu.port))
+        end = time.monotonic() + 3.0
+        while not imu.refused and time.monotonic() < end:
+            time.sleep(0.01)
+        assert imu.sender == "127.0.0.1" and imu.refused == ["127.0.0.2"]
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+def test_the_unit_of_a_unix_stamp_is_told_by_the_first(unit):
+    per_s = {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9}[unit]
+    parser, now, times = StreamParser(changed(HYPER, column_count=0)), time.time(), []
+    for n in range(3):
+        stamp = f"{(now + n / 10) * per_s:.{3 * (unit == 's')}f}"
+        (reading,) = parser.lines([f"{stamp},10.5,1.5,2.5".encode()], 100.0 + n / 10)
+        times.append(reading.time)
+    np.testing.assert_allclose(times, [100, 100.1, 100.2], atol=2e-3)
+
+
+def test_a_stamp_of_an_uptime_has_the_unit_that_is_configured():
+    parser = StreamParser(changed(HYPER, stamp_unit="s"))
+    readings = [
+        reading
+        for n in range(3)
+        for reading in parser.lines([f"{500 + n},10.5,1.5,2.5".encode()], 100.0 + n)
+    ]
+    assert [reading.time for reading in readings] == [100.0, 101.0, 102.0]
+
+
+@pytest.mark.parametrize(
+    ("settings", "line"),
+    [
+        (PLAIN, "10,5,1,5,2,5"),
+        (changed(PLAIN, column_count=0), "10,5,-1,5,2,25"),
+        (HYPER, "1700000000000,350,5,-10,25,5,125"),
+        (changed(PLAIN, separator=";"), "10,5;1,5;2,5"),
+    ],
+)
+def test_decimal_commas_are_refused_by_name(settings, line):
+    readings, parser = feed(settings, line)
+    assert not readings and parser.counts["decimal commas"] == 1

@@ -180,7 +180,7 @@ def test_drives_that_are_not_where_they_were_left_have_lost_their_place(
     assert "yaw: it stands at" in said[-1] and "1.40 deg from" in said[-1]
     again = DeviceRecord.load(record.path)
     assert again.state(HOMED) is None and again.state(IDENTIFIED) is not None
-    assert "`jaxcal-rig home`" in again.missing(config)
+    assert "`jaxcal-rig setup home`" in again.missing(config)
 
 
 def test_with_zero_confirmed_the_pulses_tell_a_lost_origin(calibrated, tmp_path):
@@ -406,7 +406,7 @@ def test_sessions_need_the_states_and_say_which_command_reaches_them(
         assert code == 2
         error = capsys.readouterr().err
         assert f"not {lost}: the cable was cut" in error
-        assert "`jaxcal-rig axes`" in error and "cannot open" not in error
+        assert "`jaxcal-rig setup axes`" in error and "cannot open" not in error
     assert not (tmp_path / "runs").exists()
 
 
@@ -437,7 +437,7 @@ def test_after_a_lost_place_the_way_on_begins_with_home(tmp_path):
     run = make_run(config, tmp_path, "collect", [].append, record=record)
     assert run.to_go_on == f"jaxcal-rig resume {tmp_path}"
     record.void(HOMED, "yaw went into alarm")
-    assert "`jaxcal-rig home`, then `jaxcal-rig axes`" in run.to_go_on
+    assert "`jaxcal-rig setup home`, then `jaxcal-rig setup axes`" in run.to_go_on
     assert run.to_go_on.endswith(f"Then jaxcal-rig resume {tmp_path}")
     run.journal.close()
 

@@ -1,7 +1,8 @@
 """Servo drives of CANopen by CiA 402, in profile position mode, over python-canopen.
 
-Install the extra ``canopen``. ``[bus]`` has ``transport = "can"``, the channel as
-``device``, python-can's ``interface`` and the bit rate as ``baudrate``; ``unit`` is the
+A worked example of docs/rig/drives.md: ``pip install canopen``. ``[bus]`` has
+``transport = "can"``, python-can's ``INTERFACE:CHANNEL`` as ``device`` (the interface
+is socketcan where there is none) and the bit rate as ``baudrate``; ``unit`` is the
 node. A count is the drive's position unit (0x6064).
 """
 
@@ -11,12 +12,12 @@ import contextlib
 import time
 from typing import Any
 
-from jaxcal.extras import install
-from rig.drives.drive import Drive, Look
-from rig.drives.line import BusError, Line, Refusal
+from rig.drives import Drive, Line
+from rig.drives.drive import Look
+from rig.drives.line import BusError, Refusal
 from rig.faults import Refused
 
-CONTROL, STATUS, ERROR, MODE = 0x6040, 0x6041, 0x603F, 0x6060
+CONTROL, STATUS, ERROR, MODE, MODE_SHOWN = 0x6040, 0x6041, 0x603F, 0x6060, 0x6061
 POSITION, TARGET, SPEED, ACCEL, DECEL = 0x6064, 0x607A, 0x6081, 0x6083, 0x6084
 IDENTITY, AT_HALT, PER_TURN = 0x1018, 0x605D, 0x608F
 SIZES = {MODE: 1, CONTROL: 2, AT_HALT: 2}  # bytes of what is written; else 4
@@ -25,6 +26,7 @@ NEW, AT_ONCE = 0x10, 0x20  # bits of the control word: a new target, taken at on
 FAULT, REACHED, TAKEN = 0x08, 0x400, 0x1000  # bits of the status word
 POWER, ENABLED = 0x6F, 0x27  # mask and value of "operation enabled"
 PROFILE_POSITION = 1
+NMT_START = 1
 RAMP_DOWN = 1  # at a halt, and stay enabled
 OUT_OF_RANGE = range(0x06090030, 0x06090033)  # SDO aborts of a value
 STEP_S, STEPS = 0.01, 20  # of the state machine, and of a target that is taken
@@ -44,16 +46,25 @@ class CanLine(Line):
             except ModuleNotFoundError as error:
                 raise Refused(
                     f"drives on CANopen need {error.name}, which is not installed: "
-                    f"{install('canopen')}"
+                    "pip install canopen"
                 ) from None
             s, network = self.settings, canopen.Network()
+            interface, _, channel = s.device.rpartition(":")
             try:
                 network.connect(
-                    interface=s.interface, channel=s.device, bitrate=s.baudrate
+                    interface=interface or "socketcan",
+                    channel=channel,
+                    bitrate=s.baudrate,
                 )
             except (can.CanError, ValueError, ImportError) as error:
                 raise BusError(f"cannot open {s.where}: {error}") from None
             self._network = network
+
+    def start(self, unit: int) -> None:
+        """Tell a node to leave "pre-operational", in which many enable no power stage.
+        No node answers."""
+        with self.exchange(unit):
+            self._network.send_message(0, [NMT_START, unit])
 
     def close(self) -> None:
         with self._lock:
@@ -97,9 +108,12 @@ class Cia402Drive(Drive):
     can_reset = True
 
     def ids(self) -> dict[str, int | str]:
-        names = {"vendor": 1, "product": 2, "serial": 4}
-        unit = self.axis.unit
-        return {n: self.line.read(unit, IDENTITY, sub) for n, sub in names.items()}
+        """The vendor, and of product and serial number those that it has."""
+        unit, known = self.axis.unit, {}
+        for name, sub in {"vendor": 1, "product": 2, "serial": 4}.items():
+            with contextlib.suppress(Refusal):
+                known[name] = self.line.read(unit, IDENTITY, sub)
+        return known
 
     def _word(self) -> int:
         return self.line.read(self.axis.unit, STATUS)
@@ -108,14 +122,26 @@ class Cia402Drive(Drive):
         self.line.write(self.axis.unit, CONTROL, word)
 
     def arm(self) -> None:
-        """Through the states of the power stage, halted: no old target is gone on "
-        "to."""
-        self.line.write(self.axis.unit, MODE, PROFILE_POSITION)
+        """Through the states of the power stage, halted: no old target is gone on to.
+        What a halt does depends on the mode, so that comes first."""
+        self.line.start(self.axis.unit)
+        self._set_mode()
         with contextlib.suppress(Refusal):  # a drive that ramps down anyway
             self.line.write(self.axis.unit, AT_HALT, RAMP_DOWN)
         for word in (SHUT_DOWN, SWITCH_ON, ENABLE):
             self._control(word | HALT)
             time.sleep(STEP_S)
+
+    def _set_mode(self) -> None:
+        """Profile position, and wait until the drive says so."""
+        unit = self.axis.unit
+        self.line.write(unit, MODE, PROFILE_POSITION)
+        with contextlib.suppress(Refusal):  # a drive that does not say so
+            for _ in range(STEPS):
+                if self.line.read(unit, MODE_SHOWN) == PROFILE_POSITION:
+                    return
+                time.sleep(STEP_S)
+            raise BusError(f"unit {unit} does not take profile position mode")
 
     def look(self, retries: int) -> Look:
         for left in reversed(range(1 + retries)):
@@ -149,9 +175,11 @@ class Cia402Drive(Drive):
         """The new target and the end of a halt are one word, so that none goes on to an
         old target; the bit is taken back once the drive has taken it."""
         unit, line = self.axis.unit, self.line
+        self._set_mode()
         line.write(unit, SPEED, max(1, int(speed)))
-        line.write(unit, ACCEL, max(1, int(accel)))
-        line.write(unit, DECEL, max(1, int(accel)))
+        for ramp in (ACCEL, DECEL):
+            with contextlib.suppress(Refusal):  # its own, where it takes none
+                line.write(unit, ramp, max(1, int(accel)))
         line.write(unit, TARGET, count)
         self._control(ENABLE | NEW | AT_ONCE)
         for _ in range(STEPS):
