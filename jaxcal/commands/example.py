@@ -30,7 +30,7 @@ _AXES = ["0 0 1", "0 1 0", "0 1 0", "1 0 0"]
 
 
 def example(
-    which: Annotated[Literal["table", "arm", "device"], "what is calibrated"],
+    kind: Annotated[Literal["table", "arm", "device"], "what is calibrated"],
     *,
     folder: Annotated[Path, "where the files go"] = Path(),
 ) -> None:
@@ -39,7 +39,7 @@ def example(
     Readings are those of a simulated machine whose errors are known. A file that exists
     is not replaced.
     """
-    files = {"table": _table, "arm": _arm, "device": _device}[which]()
+    files = {"table": _table, "arm": _arm, "device": _device}[kind]()
     for name in files:
         if (folder / name).exists():
             raise ValueError(f"{folder / name} exists: name another --folder")
@@ -47,7 +47,7 @@ def example(
     for name, text in files.items():
         write_text(folder / name, text)
     print(f"wrote {', '.join(files)}; now type")
-    print({"table": _TABLE, "arm": _ARM, "device": _DEVICE}[which])
+    print({"table": _TABLE, "arm": _ARM, "device": _DEVICE}[kind])
 
 
 def _csv(header: str, rows: Array) -> str:
