@@ -47,6 +47,8 @@ class Calibration(Fit):
     check = check
     budget = late("jaxcal.reports.budget:budget")
     report = late("jaxcal.reports.calibration:report")
+    plot = late("jaxcal.reports.shown:plot_calibration")
+    _repr_html_ = late("jaxcal.reports.shown:as_html")
     verification = verification
     to_dict = to_dict
     save = save

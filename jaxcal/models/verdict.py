@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.late import late
 from jaxcal.models.reasons import RULES, computed, never_measured, not_invertible
 
 __all__ = [
@@ -53,6 +54,8 @@ class Verdict:
     def __str__(self) -> str:
         word = "good" if self.good else "not good"
         return "\n".join([*self.lines(), f"{word}; next: {self.next_step}"])
+
+    _repr_html_ = late("jaxcal.reports.shown:as_html")
 
 
 class CalibrationWarning(UserWarning):

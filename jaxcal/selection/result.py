@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from jaxcal.checks import aligned, axis_names, lasted
 from jaxcal.information.blocks import rank_of_blocks
+from jaxcal.late import late
 from jaxcal.selection.problem import Problem
 
 if TYPE_CHECKING:
@@ -210,6 +211,8 @@ class Selection:
         )
 
     __repr__ = __str__
+    plot = late("jaxcal.reports.shown:plot_selection")
+    _repr_html_ = late("jaxcal.reports.shown:as_html")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, levels, one_of, whole_number
 from jaxcal.information.blocks import largest_rank
+from jaxcal.late import late
 from jaxcal.models.uncertainty import Noise
 from jaxcal.selection.criteria import Mean, positions
 from jaxcal.selection.exchange.exchange import greedy_indices
@@ -108,6 +109,9 @@ class Plan:
 
     def __str__(self) -> str:
         return self.table()
+
+    plot = late("jaxcal.reports.shown:plot_plan")
+    _repr_html_ = late("jaxcal.reports.shown:as_html")
 
     def table(self) -> str:
         """K against accuracy, a line each, of the output that is furthest from it."""
