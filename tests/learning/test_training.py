@@ -21,8 +21,7 @@ import pytest
 
 from jaxcal.commands import train as command
 from jaxcal.commands import train_arguments
-from jaxcal.learning import settings
-from jaxcal.learning.config import EpisodesConfig
+from jaxcal.learning.config import EpisodesConfig, named
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import GivenCandidates, Task
 from jaxcal.learning.policies.build import build
@@ -384,7 +383,7 @@ def test_a_network_and_a_task_may_be_in_a_file(tmp_path):
     options = train_arguments.read("train.py", ["--kind", f"{file}:Net"])
     config = presets.with_values(CONFIG, options.values)
     assert build(config.network).extra == 5
-    own = settings.named(f"{file}:Own")(SelectionConfig(8, 3, 2, 2), price=3.0)
+    own = named(f"{file}:Own")(SelectionConfig(8, 3, 2, 2), price=3.0)
     assert Task.from_meta(json.loads(json.dumps(own.as_meta()))) == own
     with pytest.raises(ValueError, match=r"mine.py:Nat must be .*FILE.py:NAME that is"):
         build(NetworkConfig(kind=f"{file}:Nat"))

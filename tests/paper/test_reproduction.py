@@ -88,6 +88,24 @@ def test_every_figure_of_the_paper_is_there(
     assert tables == {path.name for path in (report / "data").iterdir()}
 
 
+def test_every_exhibit_says_which_policy_it_shows_and_how_it_was_trained(
+    report: pathlib.Path, document: dict[str, Any]
+) -> None:
+    told = {key: each["policy"] for key, each in document["exhibits"].items()}
+    for key in (
+        "figure_3",
+        "figure_4",
+        "figure_7",
+        "figure_8",
+        "figure_9",
+        "figure_10",
+    ):
+        assert "paper.npz" in told[key] and "PPO alone" in told[key], key
+    assert "imitation" in told["figure_3"] and told["robot"] == "Policy: none."
+    chosen = table(report, "figure_3_log_det_s")  # two policies, not one twice
+    assert (chosen["log_det_s_policy"] != chosen["log_det_s_default"]).any()
+
+
 def test_the_page_is_one_file_that_opens_offline(
     report: pathlib.Path, document: dict[str, Any]
 ) -> None:
