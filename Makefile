@@ -11,6 +11,8 @@ TRAINS := $(VENV)/.trains
 READY := $(VENV)/.ready
 PIP := $(BIN)/python -m pip install --quiet --no-compile
 install = { $(BIN)/uv pip install --quiet --python $(VENV) $(1) || $(PIP) $(1); }
+new_enough = test -n "$(PYTHON)" && $(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	{ echo "jaxcal needs Python 3.11 or newer, got $(PYTHON): make PYTHON=/path/to/python3.11"; exit 2; }
 KERNELS := hatch_build.py $(shell find jaxcal -name '*kernel.py' -o -name '*.pxd')
 
 # XLA's flags for quick compiling, asked of what is installed when a recipe runs. Newer
@@ -27,7 +29,7 @@ help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
 
 $(TRAINS): pyproject.toml constraints.txt $(KERNELS)
-	@test -n "$(PYTHON)" || { echo "jaxcal needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 2; }
+	@$(new_enough)
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) -c constraints.txt uv
 	$(call install,-c constraints.txt -e '.[policy]')
@@ -107,7 +109,7 @@ format: $(READY) ## let ruff rewrite what it can
 
 # The peers live in an environment of their own, so that they constrain nobody else.
 $(BENCH)/.ready: pyproject.toml constraints.txt constraints-bench.txt
-	@test -n "$(PYTHON)" || { echo "jaxcal needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 2; }
+	@$(new_enough)
 	$(PYTHON) -m venv $(BENCH)
 	$(BENCH)/bin/python -m pip install --quiet -c constraints.txt -c constraints-bench.txt -e '.[all,dev,bench]'
 	@touch $@

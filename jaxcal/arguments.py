@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
-import difflib
 import inspect
 import io
 import logging
@@ -26,10 +25,10 @@ import pathlib
 import re
 import sys
 import typing
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
-from jaxcal import __version__
+from jaxcal.checks import nearest
 from jaxcal.extras import typed
 
 __all__ = [
@@ -39,6 +38,7 @@ __all__ = [
     "exit_code",
     "levels",
     "number_type",
+    "outdated",
     "refused",
     "several",
     "told",
@@ -60,7 +60,7 @@ class Parser(argparse.ArgumentParser):
         self.rare: dict[argparse.Action, str | None] = {}  # with its help
         self.renamed: dict[str, str] = {}  # options by their old names
         if self.add_help:
-            version = f"jaxcal {__version__}"
+            version = f"jaxcal {sys.modules['jaxcal'].__version__}"
             text = argparse.SUPPRESS if " " in self.prog else "print the version"
             self.add_argument("--version", action="version", version=version, help=text)
 
@@ -77,24 +77,23 @@ class Parser(argparse.ArgumentParser):
                 about = getattr(kind, "ABOUT", None)
                 groups[kind] = self.add_argument_group(title, about) if title else self
             action = _add(groups[kind], name, hint, *option)
-            self.renamed |= {
-                f"--{old.name}": action.option_strings[-1] for old in _olds(hint)
-            }
+            for old in getattr(hint, "__metadata__", ()):
+                if isinstance(old, Was):
+                    self.renamed[f"--{old.name}"] = action.option_strings[-1]
             rare: Any = getattr(kind, "RARE", ())
             if rare is True or (rare and name in rare):
                 self.rare[action], action.help = action.help, argparse.SUPPRESS
-        needed = [each.dest for each in self._actions if not each.option_strings]
-        needed += [
-            f"{each.option_strings[0]} {each.metavar}"
-            for each in self._actions
-            if each.required and each.option_strings
+        needed = [
+            " ".join([*action.option_strings[:1], str(action.metavar or action.dest)])
+            for action in self._actions
+            if action.required or not action.option_strings
         ]
         self.usage = self.usage or " ".join(["%(prog)s", *needed, "[options]"])
         return self
 
     def format_help(self) -> str:
-        hidden = [each for each in self.rare if each.help == argparse.SUPPRESS]
-        more = f"\n{len(hidden)} more options: --help all\n" if hidden else ""
+        hidden = sum(each.help == argparse.SUPPRESS for each in self.rare)
+        more = f"\n{hidden} more options: --help all\n" if hidden else ""
         return super().format_help() + more
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
@@ -105,27 +104,23 @@ class Parser(argparse.ArgumentParser):
             for action, text in self.rare.items():
                 action.help = text
         for place, word in enumerate(words):
-            old, equals, value = word.partition("=")
+            old, *value = word.split("=", 1)
             if new := self.renamed.get(old):
-                print(
-                    f"{self.prog}: {old} is {new} since jaxcal 0.3; the old name goes "
-                    "with 0.4",
-                    file=sys.stderr,
-                )
-                words[place] = new + equals + value
-        known, unknown = super().parse_known_args(words, namespace)
+                outdated(self.prog, old, new)
+                words[place] = "=".join([new, *value])
+        parsed, unknown = super().parse_known_args(words, namespace)
         if self.exit_on_error and self._subparsers is None:
             for flag in (word.partition("=")[0] for word in unknown):
-                if like := _nearest(flag, self._option_string_actions):
+                if like := nearest(flag, self._option_string_actions):
                     self.error(f"there is no option {flag}; did you mean {like}?")
-        return known, unknown
+        return parsed, unknown
 
     def error(self, message: str) -> NoReturn:
         if found := re.match(r"argument (?:.*/)?(--[\w-]+): expected one", message):
             message += f"; write {found[1]}=VALUE where it begins with a minus"
         choice = r"argument (.+): invalid choice: '(.*)' \(choose from (.*)\)"
         if found := re.match(choice, message):
-            if like := _nearest(found[2], re.findall(r"[^\s',]+", found[3])):
+            if like := nearest(found[2], re.findall(r"[^\s',]+", found[3])):
                 what = found[1].lower()
                 message = f"there is no {what} {found[2]!r}; did you mean {like}?"
         self.exit(2, f"{self.prog}: {message}; see --help\n")
@@ -136,16 +131,6 @@ class Was:
     """The name that an option had in jaxcal 0.2, without its dashes."""
 
     name: str
-
-
-def _olds(hint: Any) -> Iterator[Was]:
-    """The old names that a type bears."""
-    yield from (each for each in getattr(hint, "__metadata__", ()) if type(each) is Was)
-
-
-def _nearest(name: str, names: Iterable[str]) -> str:
-    """The most alike of the names; "" where none is."""
-    return next(iter(difflib.get_close_matches(name, names, 1)), "")
 
 
 def values_of(args: argparse.Namespace) -> dict[str, Any]:
@@ -276,6 +261,12 @@ def refused(program: str, error: Exception) -> int:
         text = f"{error.filename}: {error.strerror}"
     print(f"{program}: {text}", file=sys.stderr)
     return 2
+
+
+def outdated(program: str, old: str, new: str) -> None:
+    """A line on standard error about a name that 0.2 had."""
+    text = f"{old} is {new} since jaxcal 0.3; the old name goes with 0.4"
+    print(f"{program}: {text}", file=sys.stderr)
 
 
 def unread() -> int:

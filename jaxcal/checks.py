@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ __all__ = [
     "in_words",
     "lasted",
     "levels",
+    "nearest",
     "numbers",
     "one_of",
     "one_or_each",
@@ -186,13 +187,18 @@ def one_of(argument: str, value: Any, choices: Sequence[str]) -> str:
     return value
 
 
+def nearest(name: str, names: Iterable[str]) -> str:
+    """The most alike of the names; "" where none is."""
+    import difflib
+
+    return next(iter(difflib.get_close_matches(name, names, 1)), "")
+
+
 def require_known(what: str, name: str, names: Sequence[str]) -> None:
     """Refuse a name that is none of these: by the one most alike, if any is alike."""
     if name not in names:
-        import difflib
-
-        like = difflib.get_close_matches(name, names, 1)
-        more = f"did you mean {like[0]}?" if like else f"there are {', '.join(names)}"
+        like = nearest(name, names)
+        more = f"did you mean {like}?" if like else f"there are {', '.join(names)}"
         raise ValueError(f"there is no {what} {name!r}; {more}")
 
 

@@ -29,6 +29,16 @@ hypothesis.settings.register_profile("new", deadline=None)
 hypothesis.settings.load_profile("same")
 
 
+# Folders of tests in which a warning that no test expects is an error; wanted: all.
+MENDED = ("commands",)
+
+
+def pytest_collection_modifyitems(items):
+    for folder in {item.getparent(pytest.Module).parent for item in items}:
+        if folder.path.name in MENDED:
+            folder.add_marker(pytest.mark.filterwarnings("error"))
+
+
 @pytest.fixture(autouse=True, scope="module")
 def few_programs():
     """Compiled programs hold memory maps, of which Linux allows 65,530 a process: one

@@ -21,13 +21,14 @@ from benchmarks.harness import ROOT, Budget, Line, Row, Verdict
 from benchmarks.peers import figaroh
 from jaxcal import identify, select
 from jaxcal.models import Noise, SerialChain
-from jaxcal.selection import Design, Problem
+from jaxcal.selection import Design
 from jaxcal.selection.exact import branch_and_bound as search
 from jaxcal.selection.exchange.exchange import (
     default_restarts,
     exchange_indices,
     greedy_indices,
 )
+from jaxcal.selection.problem import Problem
 
 NAME = "blocks"
 TITLE = "Poses of a measured UR5, and FIGAROH's rule"

@@ -11,7 +11,7 @@ import sys
 import warnings
 from typing import Annotated
 
-from jaxcal.arguments import Parser, refused, told, unread, values_of
+from jaxcal.arguments import Parser, outdated, refused, told, unread, values_of
 from jaxcal.checks import aligned
 from jaxcal.commands.tables import write_json
 from jaxcal.extras import MissingExtraError, install
@@ -70,8 +70,7 @@ def run(argv: list[str] | None = None) -> int:
         module = importlib.import_module(f"jaxcal.commands.{words[0]}")
         return int(module.main(words[1:], prog=f"jaxcal {words[0]}"))
     if words[:1] == ["score"]:
-        text = "score is select --score since jaxcal 0.3; the old name goes with 0.4"
-        print(f"jaxcal: {text}", file=sys.stderr)
+        outdated("jaxcal", "score", "select --score")
         words[0] = "select"
     arguments = _parser(words).parse_args(words)
     code = 0

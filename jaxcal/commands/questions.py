@@ -12,7 +12,7 @@ from jaxcal.arguments import Numbers, Was, levels, several
 from jaxcal.commands.arms import ArmOptions, ModelPath
 from jaxcal.commands.tables import Output, TablePath
 from jaxcal.information.singular import require_excited
-from jaxcal.models import Affine, Noise
+from jaxcal.models import Affine
 from jaxcal.selection import Design, Selection, Worst
 from jaxcal.selection.criteria import CRITERIA, offered
 from jaxcal.tables import Table, read_table
@@ -68,7 +68,7 @@ class DesignOptions:
         design = Design(
             candidates,
             model,
-            noise=None if self.noise is None else Noise(_one_or_all(self.noise)),
+            noise=None if self.noise is None else _one_or_all(self.noise),
             available=mask,
             required=self.required,
             max_replicates=self.replicates,
@@ -206,10 +206,8 @@ def select(
     """
     table = read_table(file)
     options = {name: x for name, x in vars(of_method).items() if x is not None}
-    design, criterion = (
-        of_design.design(table, of_arm),
-        of_criterion.by(of_design.scenarios),
-    )
+    design = of_design.design(table, of_arm)
+    criterion = of_criterion.by(of_design.scenarios)
     if of_score.score is not None:
         if k is not None or method != "auto" or between:
             raise ValueError(

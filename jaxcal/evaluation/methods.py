@@ -22,6 +22,7 @@ from jaxcal.evaluation.parameters import estimate_parameters
 from jaxcal.evaluation.postures import PostureEvaluation, PostureResult
 from jaxcal.information.regression import log_det_gram
 from jaxcal.models.affine import Affine
+from jaxcal.selection.problem import make_problems
 
 __all__ = [
     "BASELINES",
@@ -132,7 +133,7 @@ def evaluate(
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
     try:
-        selection.make_problems(dataset.candidates, k, available=dataset.available)
+        make_problems(dataset.candidates, k, available=dataset.available)
     except ValueError as error:
         raise ValueError(f"{dataset.name}: {error}") from None
     run = _Run(dataset, k, num, seed, progress or (lambda *_: None))

@@ -8,19 +8,18 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from jaxcal.models.affine import Affine
 from jaxcal.models.from_dict import from_dict
-from jaxcal.models.identifiability import identifiability
+from jaxcal.models.identifiability import Direction, Identifiability, identifiability
 from jaxcal.models.model import Model
+from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior, ResolvedPrior
 
 if TYPE_CHECKING:
-    from jaxcal.models.affine import Affine
     from jaxcal.models.differences import Differences
     from jaxcal.models.from_jax import FromJax
     from jaxcal.models.function import FromFunction
-    from jaxcal.models.identifiability import Direction, Identifiability
     from jaxcal.models.linear import Linear, Polynomial
-    from jaxcal.models.recording import Recording
 
 __all__ = [
     "Affine",
@@ -41,15 +40,11 @@ __all__ = [
 ]
 
 _HOME = {
-    "Affine": "affine",
     "Differences": "differences",
-    "Direction": "identifiability",
     "FromFunction": "function",
     "FromJax": "from_jax",
-    "Identifiability": "identifiability",
     "Linear": "linear",
     "Polynomial": "linear",
-    "Recording": "recording",
 }
 
 

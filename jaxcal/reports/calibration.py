@@ -12,7 +12,7 @@ import json
 import os
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,10 +27,12 @@ from jaxcal.reports import page as pages
 from jaxcal.reports.budget import Budget, Source, budget
 from jaxcal.tables import COMMANDS, MEASURED
 
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration
+
 __all__ = ["SCHEMA", "moved", "report"]
 
 Array = NDArray[np.float64]
-Calibration = Any  # a jaxcal.Calibration, whose module imports this one
 
 _NAMED = 8  # columns beyond which no name is written
 

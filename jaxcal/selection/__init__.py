@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaxcal.selection.criteria import As, Ds, I, Mean, Worst
 from jaxcal.selection.design import Design, select
-from jaxcal.selection.problem import Problem, make_problems
-from jaxcal.selection.result import BatchSelection, Selection, Subset
-from jaxcal.selection.solvers import METHODS
+from jaxcal.selection.result import Selection
 
 if TYPE_CHECKING:
     from jaxcal.selection.batch import (
@@ -20,21 +18,16 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
-    "METHODS",
     "As",
-    "BatchSelection",
     "Design",
     "Ds",
     "I",
     "Mean",
-    "Problem",
     "Selection",
-    "Subset",
     "Worst",
     "exact_batch",
     "exchange_batch",
     "greedy_batch",
-    "make_problems",
     "random_batch",
     "select",
 ]

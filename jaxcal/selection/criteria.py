@@ -262,11 +262,7 @@ class I(Criterion):  # noqa: E742 - the criterion's own name in the literature
 
 
 class _SubsetCriterion(Criterion):
-    """A criterion of the parameters of interest; the others are nuisance.
-
-    Args:
-        parameters: their names or indices, at least one.
-    """
+    """A criterion of the parameters of interest."""
 
     by_name = of_parameters = True
 

@@ -11,13 +11,13 @@ from questions import criteria, make_problem, score
 import jaxcal
 from jaxcal.models import Affine
 from jaxcal.selection import (
-    METHODS,
     exact_batch,
     exchange_batch,
     greedy_batch,
     random_batch,
     select,
 )
+from jaxcal.selection.solvers import METHODS
 
 SOLVERS = ("random", "greedy", "exchange", "exact")
 BATCHES = (random_batch, greedy_batch, exchange_batch, exact_batch)

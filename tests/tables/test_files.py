@@ -181,7 +181,8 @@ def test_rows_whose_names_begin_with_a_hash_stay():
 
 
 def test_lines_are_those_of_the_file():
-    table = parse("t.csv", b"# a\na,b\nmm,mm\n# c\n1,2\n\n3,nan\n")
+    with pytest.warns(UserWarning, match="line 3 is read as units"):
+        table = parse("t.csv", b"# a\na,b\nmm,mm\n# c\n1,2\n\n3,nan\n")
     assert table.lines == (5, 7)
     with pytest.raises(ValueError, match="line 7, column 'b'"):
         table.columns(["b"])

@@ -21,7 +21,8 @@ def test_csv_keeps_names_numbers_and_text(tmp_path):
     assert table.names == ("a", "b")
     assert table.labels == {"pose": ["left", "right"]}
     np.testing.assert_array_equal(table.values, [[1, 2.5], [3, -400]])
-    assert table.commands(None) == ("a", "b")
+    with pytest.warns(UserWarning, match="'pose' is read as label"):
+        assert table.commands(None) == ("a", "b")
     np.testing.assert_array_equal(table.columns(["b", "a"]), [[2.5, 1], [-400, 3]])
 
 

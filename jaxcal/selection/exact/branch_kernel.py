@@ -49,6 +49,7 @@ from __future__ import annotations
 
 import cython
 import numpy as np
+from cython import address, cast, declare
 from cython.cimports.jaxcal.information.linear_algebra import (
     add,
     cholesky,
@@ -69,31 +70,31 @@ __all__ = ["JointSearch", "Search"]
 
 _KINDS = {"det": DET, "subset": SUBSET, "trace": TRACE, "least": LEAST}
 # Sharper forms of DET and TRACE, which compiled functions read.
-_RANK = cython.declare(cython.int, 4)
-_RANK_TRACE = cython.declare(cython.int, 5)
+_RANK = declare(cython.int, 4)
+_RANK_TRACE = declare(cython.int, 5)
 # Of several scenarios: their mean, and what is smoothed, their least or a mean of E.
-_JOINT = cython.declare(cython.int, 6)
-_SMOOTHED = cython.declare(cython.int, 7)
+_JOINT = declare(cython.int, 6)
+_SMOOTHED = declare(cython.int, 7)
 
-_EPS = cython.declare(cython.double, 2.0**-52)
-_SAMPLED = cython.declare(cython.Py_ssize_t, 8)  # scenarios that curvature is of
-_FAINT = cython.declare(cython.double, 1e-3)  # of an equal share: it does not count
-_UNSEEN = cython.declare(cython.double, 1e-12)  # a share of the mixture left out
+_EPS = declare(cython.double, 2.0**-52)
+_SAMPLED = declare(cython.Py_ssize_t, 8)  # scenarios that curvature is of
+_FAINT = declare(cython.double, 1e-3)  # of an equal share: it does not count
+_UNSEEN = declare(cython.double, 1e-12)  # a share of the mixture left out
 
-_SOLVED = cython.declare(cython.double, 1e-11)  # a bound this near the value is solved
-_CLOSE = cython.declare(cython.double, 0.05)  # share of the way to the goal left open
-_MAX_STEPS = cython.declare(cython.int, 80)
-_LATEST = cython.declare(cython.int, 30)  # steps to a useful bound, time or not
-_FRACTIONAL = cython.declare(cython.int, 400)  # counts that a Newton step moves at most
-_RIDGE = cython.declare(cython.double, 1e-10)  # share of the largest curvature
-_ROUNDING = cython.declare(cython.double, 1e-12)  # of a count that is whole
-_TUNES = cython.declare(cython.int, 2)  # of mu of RANK_TRACE in one node
+_SOLVED = declare(cython.double, 1e-11)  # a bound this near the value is solved
+_CLOSE = declare(cython.double, 0.05)  # share of the way to the goal left open
+_MAX_STEPS = declare(cython.int, 80)
+_LATEST = declare(cython.int, 30)  # steps to a useful bound, time or not
+_FRACTIONAL = declare(cython.int, 400)  # counts that a Newton step moves at most
+_RIDGE = declare(cython.double, 1e-10)  # share of the largest curvature
+_ROUNDING = declare(cython.double, 1e-12)  # of a count that is whole
+_TUNES = declare(cython.int, 2)  # of mu of RANK_TRACE in one node
 # b of E at first, where phi is about 1, and at most
-_SMOOTHING = cython.declare(cython.double, 30.0)
-_SHARPEST = cython.declare(cython.double, 1e5)
-_TAKEN = cython.declare(cython.double, 1e-6)  # of a reading, in what eigenvectors take
-_WHOLE = cython.declare(cython.double, 1e-9)  # a count this near a whole number is it
-_SAME = cython.declare(cython.double, 1e-7)  # apart in value, selections are two
+_SMOOTHING = declare(cython.double, 30.0)
+_SHARPEST = declare(cython.double, 1e5)
+_TAKEN = declare(cython.double, 1e-6)  # of a reading, in what eigenvectors take
+_WHOLE = declare(cython.double, 1e-9)  # a count this near a whole number is it
+_SAME = declare(cython.double, 1e-7)  # apart in value, selections are two
 
 
 class Search:
@@ -132,11 +133,11 @@ class Search:
         self.open = np.empty(self.count, dtype=np.intp)
         self.side = np.empty(self.most_moved, dtype=np.intc)
         self.room = np.zeros(self._lay_out(cython.NULL))
-        self._lay_out(cython.address(self.room[0]))
+        self._lay_out(address(self.room[0]))
         given: cython.double[::1] = np.concatenate(
             [blocks.ravel(), prior.ravel(), root.ravel()]
         )
-        copy(self.blocks, cython.address(given[0]), given.shape[0])
+        copy(self.blocks, address(given[0]), given.shape[0])
         i: cython.Py_ssize_t
         for i in range(self.count if self.packs else 0):
             block = self.blocks + i * self.q * self.p
@@ -147,7 +148,7 @@ class Search:
 
     def _lay_out(self, room):
         """Share the room out, and how many numbers that takes; of NULL only that."""
-        at, first = cython.address(room), room
+        at, first = address(room), room
         p, m, square = self.p, self.most_moved, self.p * self.p
         wide: cython.Py_ssize_t = m * self.q
         crossed = max(wide * wide, m * p * (p + 1) // 2)
@@ -374,7 +375,7 @@ class Search:
         self.smoothing = _SMOOTHING
         for i in range(self.count):
             to_choose -= low[i]
-        self.places = cython.cast(cython.int, to_choose) * self.rank
+        self.places = cast(cython.int, to_choose) * self.rank
         sharper: cython.bint = self.kind == DET or self.kind == TRACE
         if not sharper or self.places >= self.p or self.places == 0:
             return self.kind
@@ -437,7 +438,7 @@ class Search:
                 taken -= line[a] * dot(self.inverse + a * p, line, p)
             allowed -= taken
             if allowed < _TAKEN * self.places:
-                return cython.cast(cython.int, p - 1 - d)
+                return cast(cython.int, p - 1 - d)
         return -1
 
     # --- a Newton step --------------------------------------------------------------
@@ -756,7 +757,7 @@ class Search:
             sharpest = min(sharpest, bound)
             if bound <= goal or step == _MAX_STEPS - 1:
                 break
-            over: cython.bint = late(cython.address(self.watch))
+            over: cython.bint = late(address(self.watch))
             if over and (step >= _LATEST or sharpest <= self.useful):
                 break
             solved: cython.bint = bound - value <= max(_SOLVED, share * (value - goal))
@@ -849,7 +850,7 @@ class Search:
             best[place], self.order[place] = best[place - 1], self.order[place - 1]
             place -= 1
         best[place], self.order[place] = value, row
-        copy(cython.address(self.best_counts[row, 0]), counts, self.count)
+        copy(address(self.best_counts[row, 0]), counts, self.count)
 
     def offer(
         self,
@@ -865,7 +866,7 @@ class Search:
             seconds: after which no more swaps are offered.
         """
         self.watch = begin(seconds)
-        chosen = cython.address(counts[0])
+        chosen = address(counts[0])
         self._offer(chosen)
         i: cython.Py_ssize_t
         j: cython.Py_ssize_t
@@ -874,7 +875,7 @@ class Search:
                 continue
             for j in range(self.count):
                 if i != j and counts[j] < high[j]:
-                    if late(cython.address(self.watch)):
+                    if late(address(self.watch)):
                         return
                     counts[i] -= 1.0
                     counts[j] += 1.0
@@ -1052,11 +1053,11 @@ class Search:
                             pick = r
                     enough = max(bounds[pick], values[0])
                     going = done < tries or enough > slope * values[0] + shift
-                if not going or (done and late(cython.address(self.watch))):
+                if not going or (done and late(address(self.watch))):
                     going = False
                     break
                 parent = bounds[pick]
-                copy(low, cython.address(nodes[pick, 0, 0]), 3 * m)
+                copy(low, address(nodes[pick, 0, 0]), 3 * m)
                 size -= 1
                 if pick != size:
                     nodes[pick, :, :] = nodes[size]
@@ -1065,15 +1066,13 @@ class Search:
                     continue
                 done += 1
                 share = 0.0 if parent == INFINITY else _CLOSE
-                branch = self._process(
-                    low, high, c, slack, share, cython.address(bound)
-                )
+                branch = self._process(low, high, c, slack, share, address(bound))
                 if branch < 0:
                     continue
                 split = floor(c[branch] + _WHOLE)
                 split = min(max(split, low[branch]), high[branch] - 1.0)
                 for side in range(2):
-                    begun = cython.address(nodes[size, 0, 0])
+                    begun = address(nodes[size, 0, 0])
                     copy(begun, low, 3 * m)
                     bounds[size] = min(bound, parent)
                     begun[(1 - side) * m + branch] = split + side
@@ -1106,19 +1105,15 @@ class JointSearch(Search):
             member.picked, member.turned = self.picked, self.turned
             member.crossed, member.bent = self.crossed, self.bent
             member.curvature = self.face
-            self.addresses[s] = cython.cast(
-                cython.Py_ssize_t, cython.cast(cython.p_void, member)
-            )
-        self.members = cython.cast(
-            cython.pointer(cython.p_void), cython.address(self.addresses[0])
-        )
+            self.addresses[s] = cast(cython.Py_ssize_t, cast(cython.p_void, member))
+        self.members = cast(cython.pointer(cython.p_void), address(self.addresses[0]))
 
     def _kind_of(self, low):
         smoothed: cython.bint = self.least_counts
         self.smoothing = _SMOOTHING
         for s in range(self.addresses.shape[0]):
-            kind: cython.int = cython.cast(Search, self.members[s])._kind_of(low)
-            cython.cast(Search, self.members[s]).now = kind
+            kind: cython.int = cast(Search, self.members[s])._kind_of(low)
+            cast(Search, self.members[s]).now = kind
             if kind == LEAST:
                 smoothed = True
         return _SMOOTHED if smoothed else _JOINT
@@ -1126,13 +1121,13 @@ class JointSearch(Search):
     def _at(self, kind, low, c):
         size = self.p * self.p
         for s in range(self.addresses.shape[0]):
-            cython.cast(Search, self.members[s])._sum(
-                low, c, cython.NULL, cython.cast(Search, self.members[s]).rest
+            cast(Search, self.members[s])._sum(
+                low, c, cython.NULL, cast(Search, self.members[s]).rest
             )
             gram, fixed, rest = (
-                cython.cast(Search, self.members[s]).gram,
-                cython.cast(Search, self.members[s]).known,
-                cython.cast(Search, self.members[s]).rest,
+                cast(Search, self.members[s]).gram,
+                cast(Search, self.members[s]).known,
+                cast(Search, self.members[s]).rest,
             )
             for a in range(size):
                 gram[a] = fixed[a] + rest[a]
@@ -1141,14 +1136,12 @@ class JointSearch(Search):
     def _worth(self, counts):
         self.smoothing = INFINITY
         for s in range(self.addresses.shape[0]):
-            cython.cast(Search, self.members[s]).now = cython.cast(
-                Search, self.members[s]
-            ).kind
-            cython.cast(Search, self.members[s])._sum(
+            cast(Search, self.members[s]).now = cast(Search, self.members[s]).kind
+            cast(Search, self.members[s])._sum(
                 cython.NULL,
                 counts,
-                cython.cast(Search, self.members[s]).prior,
-                cython.cast(Search, self.members[s]).gram,
+                cast(Search, self.members[s]).prior,
+                cast(Search, self.members[s]).gram,
             )
         return self._evaluate(_JOINT)
 
@@ -1158,16 +1151,15 @@ class JointSearch(Search):
         value: cython.double = 0.0
         total: cython.double = 0.0
         for s in range(self.addresses.shape[0]):
-            cython.cast(Search, self.members[s]).smoothing = self.smoothing
-            value = cython.cast(Search, self.members[s])._evaluate(
-                cython.cast(Search, self.members[s]).now
+            cast(Search, self.members[s]).smoothing = self.smoothing
+            value = cast(Search, self.members[s])._evaluate(
+                cast(Search, self.members[s]).now
             )
             if not value > -INFINITY:
                 return -INFINITY
             self.worth[s] = self.scale[s] * value + self.shift[s]
             self.bases[s] = (
-                self.scale[s] * cython.cast(Search, self.members[s]).base
-                + self.shift[s]
+                self.scale[s] * cast(Search, self.members[s]).base + self.shift[s]
             )
             lowest = min(lowest, self.worth[s])
         for s in range(self.addresses.shape[0]):
@@ -1200,9 +1192,9 @@ class JointSearch(Search):
         for s in range(self.addresses.shape[0]):
             share = self.mixture[s] * self.scale[s]
             if share > 0.0:
-                cython.cast(Search, self.members[s]).opened = self.opened
-                cython.cast(Search, self.members[s])._leverages()
-                one = cython.cast(Search, self.members[s]).leverage
+                cast(Search, self.members[s]).opened = self.opened
+                cast(Search, self.members[s])._leverages()
+                one = cast(Search, self.members[s]).leverage
                 for o in range(self.opened):
                     self.leverage[self.open[o]] += share * one[self.open[o]]
 
@@ -1235,15 +1227,15 @@ class JointSearch(Search):
         for s in range(count):
             share = self.mixture[s] * self.scale[s]
             if self.sample[s]:
-                cython.cast(Search, self.members[s])._hessian(
-                    cython.cast(Search, self.members[s]).now, m
+                cast(Search, self.members[s])._hessian(
+                    cast(Search, self.members[s]).now, m
                 )
                 for a in range(m * m):
                     out[a] += share * whole / sampled * one[a]
             if not self.least_counts or not share > 0.0:
                 continue
             weight = self.smoothing * self.mixture[s]
-            leverage, ends = cython.cast(Search, self.members[s]).leverage, self.ends
+            leverage, ends = cast(Search, self.members[s]).leverage, self.ends
             for i in range(m):
                 c = self.which[i]
                 ends[i] = self.scale[s] * leverage[c] - self.leverage[c]

@@ -38,6 +38,7 @@ from __future__ import annotations
 
 import cython
 import numpy as np
+from cython import address, cast, declare
 from cython.cimports.jaxcal.information.linear_algebra import (
     add,
     cholesky,
@@ -57,21 +58,21 @@ __all__ = ["Climber", "JointClimber"]
 
 _KINDS = {"det": DET, "subset": SUBSET, "trace": TRACE}
 
-_IMPROVES = cython.declare(cython.double, 1e-11)  # by which a swap must raise phi
-_MOST_SWAPS = cython.declare(cython.int, 100)  # of each place, where a few are usual
-_RIDGE = cython.declare(cython.double, 1e-6)  # to climb from a singular start
+_IMPROVES = declare(cython.double, 1e-11)  # by which a swap must raise phi
+_MOST_SWAPS = declare(cython.int, 100)  # of each place, where a few are usual
+_RIDGE = declare(cython.double, 1e-6)  # to climb from a singular start
 # Fall of the largest D_jj after which updated ones have lost digits.
-_CANCELLED = cython.declare(cython.double, 1e-3)
-_LIFTS = cython.declare(cython.double, 1e-9)  # share by which a swap must raise E
+_CANCELLED = declare(cython.double, 1e-3)
+_LIFTS = declare(cython.double, 1e-9)  # share by which a swap must raise E
 # Added to what is left of E, so that its bounds are true where that is singular.
-_SLIGHT = cython.declare(cython.double, 1e-10)
-_TRIED = cython.declare(cython.int, 3)  # by E in a place, in all of several scenarios
-_PATIENCE = cython.declare(cython.int, 16)  # groups between two looks at the clock
+_SLIGHT = declare(cython.double, 1e-10)
+_TRIED = declare(cython.int, 3)  # by E in a place, in all of several scenarios
+_PATIENCE = declare(cython.int, 16)  # groups between two looks at the clock
 
 
 def _weigh(into, weights, rows, count):
     """``into = weights @ rows``, of (count,) and (count, WIDE)."""
-    total = cython.declare(cython.double[16])  # kept in registers
+    total = declare(cython.double[16])  # kept in registers
     for b in range(WIDE // 16):
         for j in range(16):
             total[j] = 0.0
@@ -85,7 +86,7 @@ def _weigh(into, weights, rows, count):
 
 def _dots(into, left, right, count):
     """``into_j = left_j @ right_j``, of (count, WIDE) both."""
-    total = cython.declare(cython.double[16])
+    total = declare(cython.double[16])
     for b in range(WIDE // 16):
         for j in range(16):
             total[j] = 0.0
@@ -163,7 +164,7 @@ def _lower(grown, left, right, rows, q):
 
 def _largest(values):
     """The largest of (WIDE,), by halves: compilers know how to compare vectors."""
-    half = cython.declare(cython.double[32])
+    half = declare(cython.double[32])
     for j in range(32):
         half[j] = values[j] if values[j] > values[j + 32] else values[j + 32]
     for j in range(16):
@@ -176,7 +177,7 @@ def _largest(values):
 
 def _best_of(gain, closed, most):
     """Which of a group has the largest ``gain - closed`` above ``most``; -1: none."""
-    open_ = cython.declare(cython.double[64])
+    open_ = declare(cython.double[64])
     for j in range(WIDE):
         open_[j] = gain[j] - closed[j]
     top = _largest(open_)
@@ -284,7 +285,7 @@ class Choice:
         if self.looked < _PATIENCE:
             return 0
         self.looked = 0
-        return late(cython.address(self.watch))
+        return late(address(self.watch))
 
     # --- greedy and exchange --------------------------------------------------------
 
@@ -352,7 +353,7 @@ class Choice:
         for i in range(self.tried.shape[0]):
             self.tried[i] = -1
         while since < k - self.fixed and swaps < _MOST_SWAPS * k:
-            if late(cython.address(self.watch)) if least else self._late():
+            if late(address(self.watch)) if least else self._late():
                 break
             at, out, after = position, self.chosen[position], value
             since += 1
@@ -362,7 +363,7 @@ class Choice:
             self.tried[out] = swaps
             rise = _IMPROVES * max(1.0, fabs(value))
             if least:
-                best = self._strongest(at, cython.address(after))
+                best = self._strongest(at, address(after))
             else:
                 best = self._replacement(out, value, rise)
             if best < 0:
@@ -451,7 +452,7 @@ class Climber(Choice):
             self.chosen[r] = required[r]
         self.whole = np.empty(3 + 5 * p, dtype=np.intc)
         self.room = np.zeros(self._lay_out(cython.NULL))
-        self._lay_out(cython.address(self.room[0]))
+        self._lay_out(address(self.room[0]))
         for i in range(count):
             for r in range(q):
                 for a in range(p):
@@ -459,7 +460,7 @@ class Climber(Choice):
                     self.columns[at] = self.blocks[i, r, a]
         for i in range(count, self.groups * WIDE):
             self.closed[i] = INFINITY
-        add(self.metric, 1.0, cython.address(self.root[0, 0]), self.s, p)
+        add(self.metric, 1.0, address(self.root[0, 0]), self.s, p)
         # Any seed is a good start of a xorshift generator but zero.
         self.state = (seed * 2685821657736338717 + 88172645463325252) % 2**64 or 1
         for _ in range(8):
@@ -467,7 +468,7 @@ class Climber(Choice):
 
     def _lay_out(self, room):
         """Share the room out, and how many numbers that takes; of NULL only that."""
-        at, first = cython.address(room), room
+        at, first = address(room), room
         q, p, s, wide = self.q, self.p, self.s, self.groups * WIDE
         self.columns = take(at, q * p * wide)
         self.grown = take(at, 2 * self.groups * self.size)
@@ -522,12 +523,12 @@ class Climber(Choice):
                 self.times[self.chosen[c]] += 1
         for i in range(count):
             if self.times[i] > 0:
-                add(self.gram, self.times[i], cython.address(self.blocks[i, 0, 0]),
+                add(self.gram, self.times[i], address(self.blocks[i, 0, 0]),
                     self.q, self.p)  # fmt: skip
 
     def _add(self, i):
         """Add candidate i to ``gram``."""
-        add(self.gram, 1.0, cython.address(self.blocks[i, 0, 0]), self.q, self.p)
+        add(self.gram, 1.0, address(self.blocks[i, 0, 0]), self.q, self.p)
 
     def _evaluate(self, size, trial):
         """phi of the first ``size`` chosen, summed from their blocks; fills V and X."""
@@ -538,7 +539,7 @@ class Climber(Choice):
             return value
         other = into + p * p
         value = covariance(
-            self.kind == SUBSET, cython.address(self.root[0, 0]), into, self.s, p,
+            self.kind == SUBSET, address(self.root[0, 0]), into, self.s, p,
             self.half, self.solved, self.small, self.other, self.lower, other,
         )  # fmt: skip
         for a in range(p * p if self.kind == SUBSET else 0):
@@ -618,9 +619,9 @@ class Climber(Choice):
         peak = self.tallest
         updates: cython.bint = 2 * p > 5 * r
         if updates:
-            copy(changed, cython.address(self.blocks[came, 0, 0]), q * p)
+            copy(changed, address(self.blocks[came, 0, 0]), q * p)
             if went >= 0:
-                copy(changed + q * p, cython.address(self.blocks[went, 0, 0]), q * p)
+                copy(changed + q * p, address(self.blocks[went, 0, 0]), q * p)
             for m in range(self.parts):
                 tall, middle = self.tall + 2 * m * q * p, self.middle + 4 * m * q * q
                 multiply(False, False, r, p, p, changed, self.now + m * p * p, tall)
@@ -713,7 +714,7 @@ class Climber(Choice):
         q, p = self.q, self.p
         g, e = out // WIDE, out % WIDE
         for m in range(self.parts):
-            multiply(False, False, q, p, p, cython.address(self.blocks[out, 0, 0]),
+            multiply(False, False, q, p, p, address(self.blocks[out, 0, 0]),
                      self.now + m * p * p, self.tall + 2 * m * q * p)  # fmt: skip
             for a in range(q * q):
                 self.at_out[m * q * q + a] = self.grown[
@@ -768,7 +769,7 @@ class Climber(Choice):
     def _least(self, vectors):
         """E of ``gram``; C V and, where wanted, eigenvectors of C V C.T are there."""
         p, inverse = self.p, self.now
-        root = cython.address(self.root[0, 0])
+        root = address(self.root[0, 0])
         if not factor(self.gram, inverse, self.lower, p) > -INFINITY:
             return -INFINITY
         multiply(False, False, p, p, p, root, inverse, self.half)
@@ -874,16 +875,12 @@ class JointClimber(Choice):
         self.counts, self.tried, self.chosen = lead.counts, lead.tried, lead.chosen
         self.closed, self.state = lead.closed, lead.state
         self.ahead = np.zeros(self.groups * WIDE)
-        self.sweep = lead.groups * cython.cast(cython.int, count)
+        self.sweep = lead.groups * cast(cython.int, count)
         for s in range(count):
             member: Climber = self.climbers[s]
             member.chosen = self.chosen
-            self.addresses[s] = cython.cast(
-                cython.Py_ssize_t, cython.cast(cython.p_void, member)
-            )
-        self.members = cython.cast(
-            cython.pointer(cython.p_void), cython.address(self.addresses[0])
-        )
+            self.addresses[s] = cast(cython.Py_ssize_t, cast(cython.p_void, member))
+        self.members = cast(cython.pointer(cython.p_void), address(self.addresses[0]))
 
     def weigh(self, scale, shift):
         """Let phi of the scenarios count as ``scale phi + shift``, (S,) both."""
@@ -902,7 +899,7 @@ class JointClimber(Choice):
 
     def _set_known(self, share, ridge):
         for s in range(self.addresses.shape[0]):
-            cython.cast(Climber, self.members[s])._set_known(share, ridge)
+            cast(Climber, self.members[s])._set_known(share, ridge)
 
     def _join(self, phi):
         """The mean, or the least, of (S,) phi."""
@@ -917,7 +914,7 @@ class JointClimber(Choice):
     def _evaluate(self, size, trial):
         """The joined phi of the first ``size`` chosen; fills V and X of each."""
         for s in range(self.addresses.shape[0]):
-            value = cython.cast(Climber, self.members[s])._evaluate(size, trial)
+            value = cast(Climber, self.members[s])._evaluate(size, trial)
             if not value > -INFINITY:
                 return -INFINITY
             value = self.scale[s] * value + self.shift[s]
@@ -926,29 +923,29 @@ class JointClimber(Choice):
             else:
                 self.phi[s] = value
         phi = self.after if trial else self.phi
-        return self._join(cython.address(phi[0]))
+        return self._join(address(phi[0]))
 
     def _refresh(self):
         for s in range(self.addresses.shape[0]):
-            cython.cast(Climber, self.members[s])._refresh()
+            cast(Climber, self.members[s])._refresh()
 
     def _carry(self, came, went):
         """After a swap, or where ``went`` is -1 one more, judged by ``_evaluate``."""
         for s in range(self.addresses.shape[0]):
             self.phi[s] = self.after[s]
-            cython.cast(Climber, self.members[s])._carry(came, went)
+            cast(Climber, self.members[s])._carry(came, went)
 
     def _totals(self, c, swaps):
         """The joined phi with each of a group, alone or in the place that is left."""
-        total = cython.address(self.total[0])
+        total = address(self.total[0])
         for j in range(WIDE):
             total[j] = INFINITY if self.least else 0.0
         for s in range(self.addresses.shape[0]):
-            kind = cython.cast(Climber, self.members[s]).kind
-            gain = cython.cast(Climber, self.members[s]).alone + c * WIDE
+            kind = cast(Climber, self.members[s]).kind
+            gain = cast(Climber, self.members[s]).alone + c * WIDE
             if swaps:
-                cython.cast(Climber, self.members[s])._swaps(c)
-                gain = cython.cast(Climber, self.members[s]).gain
+                cast(Climber, self.members[s])._swaps(c)
+                gain = cast(Climber, self.members[s]).gain
             scale, phi, weight = self.scale[s], self.phi[s], self.weights[s]
             for j in range(WIDE):
                 rise: cython.double = gain[j]
@@ -967,14 +964,14 @@ class JointClimber(Choice):
     def _replacement(self, out, value, rise):
         """The candidate that raises the joined phi most in place of ``out``."""
         for s in range(self.addresses.shape[0]):
-            cython.cast(Climber, self.members[s])._take_out(out)
+            cast(Climber, self.members[s])._take_out(out)
         best = self._best(True, value + rise)
         return -1 if best == out else best
 
     def _best(self, swaps, most):
         """Which candidate gives the largest joined phi above ``most``; -1: none."""
         best: cython.Py_ssize_t = -1
-        total = cython.address(self.total[0])
+        total = address(self.total[0])
         for c in range(self.groups):
             self._totals(c, swaps)
             j = _best_of(total, self.closed + c * WIDE, most)
@@ -987,23 +984,23 @@ class JointClimber(Choice):
     def _least_of_chosen(self):
         """The joined E of the chosen; -inf where a scenario is singular."""
         for s in range(self.addresses.shape[0]):
-            value = cython.cast(Climber, self.members[s])._least_of_chosen()
+            value = cast(Climber, self.members[s])._least_of_chosen()
             if not value > -INFINITY:
                 return -INFINITY
             self.after[s] = self.scale[s] * value + self.shift[s]
-        return self._join(cython.address(self.after[0]))
+        return self._join(address(self.after[0]))
 
     def _strongest(self, at, least):
         """The candidate of the largest joined E in place ``at``; -1: none over it."""
         lift = max(_LIFTS * fabs(least[0]), _IMPROVES * max(1.0, fabs(least[0])))
         least[0] += lift
         groups = self.groups
-        bounds = cython.cast(Climber, self.members[0]).bounds
-        tops = cython.cast(Climber, self.members[0]).tops
+        bounds = cast(Climber, self.members[0]).bounds
+        tops = cast(Climber, self.members[0]).tops
         for s in range(self.addresses.shape[0]):
-            if not cython.cast(Climber, self.members[s])._bound_without(at):
+            if not cast(Climber, self.members[s])._bound_without(at):
                 return -1
-            bound = cython.cast(Climber, self.members[s]).bounds
+            bound = cast(Climber, self.members[s]).bounds
             scale, shift, weight = self.scale[s], self.shift[s], self.weights[s]
             for i in range(groups * WIDE):
                 value: cython.double = scale * bound[i] + shift
@@ -1021,7 +1018,7 @@ class JointClimber(Choice):
             tops[2 * c] = _largest(bounds + c * WIDE)
         best: cython.Py_ssize_t = -1
         for _ in range(_TRIED):
-            e = cython.cast(Climber, self.members[0])._next(least[0])
+            e = cast(Climber, self.members[0])._next(least[0])
             if e < 0:
                 return best
             if self._betters(e, least):
@@ -1037,19 +1034,18 @@ class JointClimber(Choice):
         for s in range(self.addresses.shape[0]):
             if not self.least:
                 ahead = (
-                    self.scale[s] * cython.cast(Climber, self.members[s]).bounds[e]
+                    self.scale[s] * cast(Climber, self.members[s]).bounds[e]
                     + self.shift[s]
                 )
                 total += self.weights[s] * (self.ahead[e] if s == 0 else ahead)
         for s in range(self.addresses.shape[0]):
             copy(
-                cython.cast(Climber, self.members[s]).gram,
-                cython.cast(Climber, self.members[s]).rest,
-                cython.cast(Climber, self.members[s]).p
-                * cython.cast(Climber, self.members[s]).p,
+                cast(Climber, self.members[s]).gram,
+                cast(Climber, self.members[s]).rest,
+                cast(Climber, self.members[s]).p * cast(Climber, self.members[s]).p,
             )
-            cython.cast(Climber, self.members[s])._add(e)
-            value = cython.cast(Climber, self.members[s])._least(False)
+            cast(Climber, self.members[s])._add(e)
+            value = cast(Climber, self.members[s])._least(False)
             if not value > -INFINITY:
                 return False
             value = self.scale[s] * value + self.shift[s]
@@ -1057,7 +1053,7 @@ class JointClimber(Choice):
                 total = min(total, value)
             else:
                 ahead = (
-                    self.scale[s] * cython.cast(Climber, self.members[s]).bounds[e]
+                    self.scale[s] * cast(Climber, self.members[s]).bounds[e]
                     + self.shift[s]
                 )
                 total += self.weights[s] * (
