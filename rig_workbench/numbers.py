@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from rig.config.settings import BusSettings, ReadingsSettings
-from rig.drives.modbus import Bus, decoded
+from rig.drives.bus import Bus
+from rig.drives.modbus import decoded
 from rig.readings.attitude import Array, Reading
 from rig.readings.source import ReadingError, Source
 

@@ -12,8 +12,9 @@ from rig.config.axis import Axis
 from rig.config.maps import DriveMap, RegisterMap, available_maps, load_map
 from rig.config.schema import ConfigError, parse
 from rig.config.settings import BusSettings
+from rig.drives.bus import NOBODY, Bus, Rejected
 from rig.drives.line import BusError
-from rig.drives.modbus import NOBODY, Bus, ModbusDrive, Rejected
+from rig.drives.modbus import ModbusDrive
 from rig.journal import BusLock
 
 # For each absent unit, three times; a drive answers within 25 ms at 9600 baud.

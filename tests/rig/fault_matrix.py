@@ -46,7 +46,8 @@ from harness import (
 from rig.command_run import Run
 from rig.config import RigConfig, parse_config
 from rig.core import motion
-from rig.drives.modbus import Bus, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.modbus import ModbusDrive
 from rig.faults import Refused
 from rig.journal import (
     HOMED,

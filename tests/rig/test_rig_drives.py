@@ -20,7 +20,9 @@ from rig.config import ConfigError, parse_config
 from rig.config.maps import load_map
 from rig.config.settings import BusSettings
 from rig.core.stop import stop_all
-from rig.drives.modbus import Bus, BusError, ModbusDrive, Rejected
+from rig.drives.bus import Bus, Rejected
+from rig.drives.line import BusError
+from rig.drives.modbus import ModbusDrive
 from rig.drives.wire import crc16
 from rig_workbench.simulator import parse_fault
 

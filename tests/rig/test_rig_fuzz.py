@@ -16,7 +16,8 @@ from harness import changed, fast_config
 from scipy.spatial.transform import Rotation
 
 from rig.config.settings import BusSettings
-from rig.drives.modbus import Bus, BusError
+from rig.drives.bus import Bus
+from rig.drives.line import BusError
 from rig.drives.wire import Wire, crc16
 from rig.readings.stream import MAX_LINE, LineSplitter, StreamParser
 

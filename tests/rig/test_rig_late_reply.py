@@ -11,7 +11,9 @@ import time
 import pytest
 from harness import changed, fast_config, simulator
 
-from rig.drives.modbus import Bus, BusError, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.line import BusError
+from rig.drives.modbus import ModbusDrive
 from rig_workbench.simulator import parse_fault
 from rig_workbench.simulator.drive import DriveException
 

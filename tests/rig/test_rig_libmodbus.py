@@ -25,7 +25,9 @@ from rig.__main__ import main
 from rig.config import parse_config
 from rig.config.settings import BusSettings
 from rig.core.stop import stop_all
-from rig.drives.modbus import Bus, BusError, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.line import BusError
+from rig.drives.modbus import ModbusDrive
 
 SOURCE = pathlib.Path(__file__).with_name("libmodbus_slave.c")
 MATRIX = np.array([[0.95, 0.03, -0.02], [0.01, 1.04, 0.02], [-0.015, 0.01, 0.9]])

@@ -19,7 +19,9 @@ from rig.config import ConfigError
 from rig.config.axis import Axis
 from rig.config.maps import load_map, parse_map
 from rig.config.settings import BusSettings, ReadingRegister
-from rig.drives.modbus import Bus, BusError, ModbusDrive, decoded
+from rig.drives.bus import Bus
+from rig.drives.line import BusError
+from rig.drives.modbus import ModbusDrive, decoded
 from rig.prove import scan as scanning
 from rig.stop_config import map_of
 

@@ -17,7 +17,8 @@ from rig.__main__ import main
 from rig.config import ConfigError, parse_config
 from rig.config.maps import load_map
 from rig.core.record_check import check_drives
-from rig.drives.modbus import Bus, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.modbus import ModbusDrive
 from rig.identification.conclusion import conclude
 from rig.journal import HOMED, STOP_PROVED, Journal, lock
 from rig.journal.lock import BusLock

@@ -23,7 +23,9 @@ from rig.config import load_config
 from rig.config.settings import BusSettings
 from rig.core import stop as core_stop
 from rig.core.stop import stop_all
-from rig.drives.modbus import Bus, BusError, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.line import BusError
+from rig.drives.modbus import ModbusDrive
 from rig.drives.wire import crc16, rtu_reply
 from rig.journal import lock
 from rig.journal.lock import BusLock
@@ -151,7 +153,8 @@ HOLDS = """
 import sys, time
 from rig.config import load_config
 from rig.config.settings import BusSettings
-from rig.drives.modbus import Bus, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.modbus import ModbusDrive
 from rig.journal.lock import BusLock
 config = load_config(sys.argv[1])
 lock = BusLock(config.bus).acquire("calibrate")
