@@ -20,7 +20,14 @@ from rig.prove import steps
 from rig.prove.home import can_home
 from rig.prove.operator import Operator
 from rig.prove.rig_toml import edit, set_values
-from rig.prove.scan import Answer, parse_bus, scan, serial_lines
+from rig.prove.scan import (
+    OF_BUS,
+    OF_OTHERS,
+    Answer,
+    parse_bus,
+    scan,
+    serial_lines,
+)
 from rig.sessions import SimulatedDevice
 from rig_workbench.commission.connections import look_at_phone
 from rig_workbench.model import joint_names
@@ -61,11 +68,6 @@ OF_READINGS = {  # keys of [readings]
     "udp": ("port",),
     "serial": ("device", "baudrate"),
     "modbus": ("host", "port"),
-}
-OF_LINE = {  # keys of [bus]
-    "rtu": ("device", "baudrate", "parity", "stopbits", "bytesize"),
-    "serial": ("device", "baudrate"),
-    "can": ("device", "baudrate"),
 }
 EXAMPLES: dict[str, dict[str, Any]] = {  # of --example
     "turntable": {"axes": {"table": "Z"}},
@@ -259,7 +261,7 @@ def new_text(
     """
     import jinja2
 
-    keys = OF_LINE.get(bus.transport, ("host", "port")) + ("echo",) * bus.echo
+    keys = (OF_BUS | OF_OTHERS)[bus.transport] + ("echo",) * bus.echo
     text = pathlib.Path(__file__).with_name("new.toml.j2").read_text(encoding="utf-8")
     template = jinja2.Template(
         text,
