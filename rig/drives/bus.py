@@ -113,14 +113,12 @@ class Bus(Line):
         """Whether a server answers for a unit that is none: then for every one."""
         if self.settings.transport == "rtu":
             return False
-        listen_s, self.listen_s = self.listen_s, 0.0
         try:
             function, address = next(iter(self._readable.values()), (3, 0))
             self.read(NOBODY, function, address, 1, 0)
         except BusError:
             return False
         finally:
-            self.listen_s = listen_s
             self._owed.pop(NOBODY, None)
         return True
 
@@ -150,12 +148,6 @@ class Bus(Line):
             for frame in family.stop.write:
                 words = frame.registers(family.word_order)
                 self.broadcast(frame.address, frame.function, words)
-
-    def read_words(
-        self, unit: int, address: int, count: int, retries: int | None = None
-    ) -> list[int]:
-        """Read holding registers; as ``read``."""
-        return words_of(self.read(unit, 3, address, count, retries))
 
     def read(
         self,
@@ -210,7 +202,7 @@ class Bus(Line):
         """
         if self._urgent or unit in self._readable or error.refused or error.lost:
             return
-        if unit not in self.silent or self._client is None or not self.listen_s:
+        if unit not in self.silent or unit == NOBODY or self._client is None:
             return
         with self._lock, contextlib.suppress(OSError, BusError):
             if self._client.listen(unit, self.listen_s):

@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxcal.extras import install
 from jaxcal.reports.page import Code, Figure, Page, Section, Table, Text, write_page
-from rig.journal import JOURNAL, Record, is_written, measured_postures
+from rig.journal.run_folder import JOURNAL, Record, is_written, measured_postures
 from rig.outputs.messages import choice_text, numbers
 from rig.outputs.run_state import PostureState, RunState
 from rig_workbench.outputs.view import headline, trouble, verdict

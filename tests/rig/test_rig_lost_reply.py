@@ -25,7 +25,7 @@ from rig.drives.bus import Bus
 from rig.drives.line import BusError
 from rig.drives.modbus import ModbusDrive
 from rig.faults import MotionFault, StopRequested
-from rig.journal import read_journal
+from rig.journal.run_folder import read_journal
 from rig_workbench.simulator import Truth, parse_fault
 
 # Time enough for a busy computer: a reply that is late is one lost reply more.

@@ -33,7 +33,7 @@ import jaxcal
 from rig.__main__ import main
 from rig.config import AXIS_NAMES, parse_config
 from rig.faults import Refused
-from rig.journal import read_journal
+from rig.journal.run_folder import read_journal
 from rig.outputs.messages import numbers
 from rig_workbench.outputs import trend
 from rig_workbench.outputs.export import LANGUAGES, follow, load_inverse
