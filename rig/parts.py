@@ -65,7 +65,7 @@ def require(command: str, simulated: bool = False) -> None:
     if lacking := [name for name in needed if importlib.util.find_spec(name) is None]:
         raise MissingExtraError(
             f"{command}{' --simulate' * simulated} needs {', '.join(lacking)}, which "
-            f"this installation lacks: {install(extra)}"
+            f"is not installed: {install(extra)}"
         )
 
 
