@@ -12,8 +12,9 @@ from rig.core.device import Device
 from rig.core.record_check import ZeroRecord, check_drives
 from rig.core.session import Beside, Check, open_device, take_zero
 from rig.device_model import model_of
-from rig.faults import EXIT_FAULT, PlanOnly, Refused, ending
-from rig.journal import STOP_PROVED, DeviceRecord, JournalError, Record, RunFolder
+from rig.faults import EXIT_FAULT, JournalError, PlanOnly, Refused, ending
+from rig.journal.device import STOP_PROVED, DeviceRecord
+from rig.journal.run_folder import Record, RunFolder
 from rig.signals import Signals
 
 ONE_SPEED = (

@@ -207,7 +207,7 @@ def _step(given: Step, state: str, name: str, *options: Any) -> int:
 @contextlib.contextmanager
 def place(given: DeviceOptions, state: str = "") -> Iterator[Site]:
     """The device that a command is about, which has reached a state."""
-    from rig.journal import DeviceRecord
+    from rig.journal.device import DeviceRecord
     from rig.prove import steps
 
     config, operator = given.load(), steps.Operator(getattr(given, "yes", False), say)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from rig.config import RigConfig
-from rig.journal import Record
+from rig.journal.run_folder import Record
 from rig.parts import part
 from rig.readings.attitude import Array
 

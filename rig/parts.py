@@ -63,11 +63,9 @@ def require(command: str, simulated: bool = False) -> None:
     extra = "workbench" if simulated else _extra_of(module)
     needed = (module.partition(".")[0], *NEEDED[extra])
     if lacking := [name for name in needed if importlib.util.find_spec(name) is None]:
-        what = f"{command}{' --simulate' * simulated}"
-        verb = "are" if len(lacking) > 1 else "is"
         raise MissingExtraError(
-            f"{what} needs {', '.join(lacking)}, which {verb} not installed: "
-            f"{install(extra)}"
+            f"{command}{' --simulate' * simulated} needs {', '.join(lacking)}, which "
+            f"is not installed: {install(extra)}"
         )
 
 

@@ -12,18 +12,10 @@ from rig import pages
 from rig.command_run import Run, run_safely
 from rig.config import RigConfig, load_config, parse_config
 from rig.core.record_check import ZeroRecord
-from rig.faults import Refused
-from rig.journal import (
-    JOURNAL,
-    STOP_PROVED,
-    BusLock,
-    DeviceRecord,
-    JournalError,
-    Record,
-    new_run_folder,
-    read_journal,
-)
-from rig.journal.run_folder import SCHEMA
+from rig.faults import JournalError, Refused
+from rig.journal.device import STOP_PROVED, DeviceRecord
+from rig.journal.lock import BusLock
+from rig.journal.run_folder import JOURNAL, SCHEMA, Record, new_run_folder, read_journal
 from rig.outputs.console import listen
 from rig.procedures import calibrate, verify
 from rig.procedures.collect import collect

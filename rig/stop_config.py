@@ -17,17 +17,7 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
-from rig.registers import (
-    FLAGS,
-    FORMATS,
-    Bits,
-    Flags,
-    Frame,
-    Frames,
-    Place,
-    Value,
-    word_of,
-)
+from rig.registers import FLAGS, FORMATS, Bits, Flags, Frame, Frames, Place, word_of
 from rig.registers import registers_in as count_of
 
 MAP_FOLDER = pathlib.Path(__file__).parent / "maps"
@@ -241,7 +231,7 @@ def _frames(table: Any) -> Frames | None:
     return Frames(write=tuple(frames)) if frames else None
 
 
-def _value(table: Any, kind: str) -> Value | None:
+def _value(table: Any, kind: str) -> Place | None:
     if not isinstance(table, dict) or type(table.get("address")) is not int:
         return None
     kind = str(table.get("type", kind))
@@ -257,17 +247,11 @@ def _value(table: Any, kind: str) -> Value | None:
 
 
 def _bits(table: Any) -> Bits | None:
-    lists = (
-        [table.get(name) for name in ("set", "clear")]
-        if _rows(table) == [table]
-        else []
-    )
-    bits = [
-        tuple(bit for bit in numbers if type(bit) is int)
-        if type(numbers) is list
-        else ()
-        for numbers in lists
-    ]
+    if not isinstance(table, dict):
+        return None
+    lists: list[Any] = [table.get(name) for name in ("set", "clear")]
+    lists = [numbers if type(numbers) is list else [] for numbers in lists]
+    bits = [tuple(bit for bit in numbers if type(bit) is int) for numbers in lists]
     return Bits(set=bits[0], clear=bits[1]) if any(bits) else None
 
 

@@ -52,12 +52,10 @@ def setup(
         str, "numbers, not a phone: tcp:HOST:PORT, listen:PORT, serial:DEVICE, ..."
     ] = "",
     urdf: Annotated[str, "of an arm, whose joints are the axes"] = "",
-    example: Annotated[Literal["turntable", "gimbal", "stage"], "these for a device"]
-    | None = None,
     set: Annotated[list[str], "KEY=VALUE of the new rig.toml"] | None = None,
 ) -> int:
     """from cables to a device that may be calibrated; writes rig.toml"""
-    from rig.journal import DeviceRecord
+    from rig.journal.device import DeviceRecord
     from rig.prove import steps
     from rig_workbench.commission import setup as wizard
 
@@ -65,12 +63,12 @@ def setup(
     values = dict(map(wizard.setting, set or ()))
     asked = wizard.asked(
         bus=bus, imu=imu, units=units, values=values, home=home, axes=axes,
-        drives=drives, readings=readings, model=urdf, example=example or "",
+        drives=drives, readings=readings, model=urdf,
     )  # fmt: skip
-    if given.simulate and (axes or drives or readings or urdf or example):
+    if given.simulate and (axes or drives or readings or urdf):
         raise Refused(
             "--simulate commissions the simulator's own device: leave out --axes, "
-            "--drives, --readings, --urdf and --example"
+            "--drives, --readings and --urdf"
         )
     with contextlib.ExitStack() as stack:
         if given.simulate:
@@ -120,7 +118,7 @@ def watch(
     from socket import socket as Socket
 
     from jaxcal.extras import needs
-    from rig.journal import JOURNAL
+    from rig.journal.run_folder import JOURNAL
     from rig.pages import listen
 
     if socket is None and not (run / JOURNAL).is_file():

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from rig.config.settings import BusSettings, ReadingsSettings
-from rig.drives.modbus import Bus, decoded
+from rig.drives.bus import Bus
+from rig.drives.modbus import decoded
 from rig.readings.attitude import Array, Reading
 from rig.readings.source import ReadingError, Source
 
@@ -32,8 +33,6 @@ REJOIN = 5  # readings in a row near each other after a jump
 class Sensor(Source):
     """Numbers as they come in, on one thread."""
 
-    whose = "the sensor"
-
     def __init__(
         self,
         settings: ReadingsSettings,
@@ -42,7 +41,6 @@ class Sensor(Source):
         super().__init__(settings.stale_s, report)
         self.settings: ReadingsSettings = settings
         self.connections = 1  # numbers are the same whoever connects again
-        self.sender = ""  # address that is heard
         self._port = settings.port
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sensor", daemon=True)
@@ -69,9 +67,8 @@ class Sensor(Source):
                 self._socket.bind((s.host, s.port))
         except OSError as error:
             raise ReadingError(
-                f"cannot open {self.where} for readings: {error.strerror or error}. "
-                "End "
-                "the program that uses it, or change readings.host and readings.port"
+                f"cannot open {self.where}: {error.strerror or error}. End the program "
+                "that uses it, or change readings.host and readings.port"
             ) from None
         if self._socket is not None:
             self._socket.settimeout(LOOK_S)
@@ -101,10 +98,7 @@ class Sensor(Source):
         with contextlib.ExitStack() as stack:
             read, write = self._connected(stack)
             request = self.settings.request.encode().decode("unicode_escape").encode()
-            tail, skip = (
-                b"",
-                not request,
-            )  # the first may be the end of one begun before
+            tail, skip = b"", not request  # the first may be the end of another line
             while not self._closing.is_set():
                 if request:
                     write(request)
@@ -143,10 +137,8 @@ class Sensor(Source):
                     if self._closing.is_set():
                         raise
         else:
-            connection, address = (
-                socket.create_connection((s.host, s.port), 1.0),
-                s.host,
-            )
+            address = s.host
+            connection = socket.create_connection((address, s.port), 1.0)
         stack.enter_context(connection)
         connection.settimeout(LOOK_S)
         if not self._hears(address):

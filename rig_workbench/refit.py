@@ -19,7 +19,7 @@ from jaxcal.files import write_text
 from rig.config import RigConfig, parse_config
 from rig.faults import EXIT_OK, MotionFault, Refused
 from rig.identification.conclusion import check_matrix, conclude
-from rig.journal import Record, RunFolder, measured_postures, new_run_folder
+from rig.journal.run_folder import Record, RunFolder, measured_postures, new_run_folder
 from rig.outputs.results import save_result
 from rig.prove.rig_toml import set_values
 from rig.readings.attitude import (

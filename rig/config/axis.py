@@ -213,10 +213,8 @@ class Axis(Scale):
         """Speed in deg/s and acceleration in deg/s^2 that the drive is told."""
         if (units := self.map.register_units) is None:
             return self.speed_deg_s, self.accel_deg_s2
-        (per_speed, per_accel), counts = (
-            self._counts_per_deg(units),
-            self.motion_counts(),
-        )
+        per_speed, per_accel = self._counts_per_deg(units)
+        counts = self.motion_counts()
         accel = counts["accel"] / per_accel
         if units.accel == "s_per_rev_per_s":
             accel = per_accel / counts["accel"]

@@ -24,8 +24,6 @@ from pydantic import (
 from rig import registers
 from rig.config.schema import Section, key, parse, read_text
 from rig.registers import FLAGS, Kind, Word, registers_in, word_of
-from rig.registers import decode as decode
-from rig.registers import encode as encode
 
 MAP_FOLDER = pathlib.Path(__file__).parent.parent / "maps"
 
@@ -45,30 +43,23 @@ Names = Annotated[
 ]
 
 
-ReadFunction = Literal[1, 2, 3, 4]
-
-
 class Read(Section, registers.Value):
     """A value to read: registers, or bits."""
 
     address: Register
     type: Kind = "u16"
-    function: ReadFunction = key(
+    function: Literal[1, 2, 3, 4] = key(
         "3 holding or 4 input registers, 1 coils, 2 discrete inputs", 3
     )
     bits: int = key("of function 1 or 2; 0: 16 for a register of type", 0, 0, 64)
 
     def broken_rules(self) -> Iterator[str]:
-        yield from bits_rules(self)
-
-
-def bits_rules(read: Any) -> Iterator[str]:
-    """What is wrong with the type of bits, or with their number."""
-    registers_read = read.function in registers.REGISTERS
-    if registers_read and read.bits:
-        yield f"bits: are read by function 1 or 2, got function {read.function}"
-    elif not registers_read and (read.type[0] != "u" or read.bits > 16 * read.count):
-        yield f"type: must be u16, u32, u48 or u64 and hold the bits, got {read.type}"
+        of_registers = self.function in registers.REGISTERS
+        if of_registers and self.bits:
+            yield f"bits: are read by function 1 or 2, got function {self.function}"
+        elif not of_registers and (self.type[0] != "u" or self.bits > 16 * self.count):
+            must = "u16, u32, u48 or u64 and hold the bits"
+            yield f"type: must be {must}, got {self.type}"
 
 
 class Position(Read, registers.Place):
@@ -214,8 +205,6 @@ class DriveMap(Section):
     def folder(self) -> pathlib.Path:
         """The folder that the file of a class is relative to."""
         return self._folder
-
-    # What a map may have, and where it is.
 
     @property
     def register_units(self) -> Units | None:

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from rig.config.axis import Range
-from rig.config.maps import ReadFunction, bits_rules
+from rig.config.maps import Read
 from rig.config.schema import Section, advanced, key
-from rig.registers import Kind, Value
+from rig.registers import Kind
 from rig.stop_config import NETWORK, where_of
 
 Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
@@ -163,20 +163,12 @@ class ImuSettings(Section):
             yield f"separator: must be one character that no number has, got {got}"
 
 
-class ReadingRegister(Section, Value):
+class ReadingRegister(Read):
     """A value of a Modbus device that measures."""
 
     unit: int = key("Modbus unit id", 1, 0, 255)
-    address: int = key("of the register, from 0", ..., 0, 0xFFFF)
     type: Kind = key("of its value", "i32")
     word_order: Literal["big", "little"] = key("big: high word first", "big")
-    function: ReadFunction = key(
-        "3 holding or 4 input registers, 1 coils, 2 discrete inputs", 3
-    )
-    bits: int = key("of function 1 or 2; 0: 16 for a register of type", 0, 0, 64)
-
-    def broken_rules(self) -> Iterator[str]:
-        yield from bits_rules(self)
 
 
 class ReadingsSettings(Section):
@@ -188,10 +180,8 @@ class ReadingsSettings(Section):
     )
     unit: str = key("of all of them", "mm", min_length=1)
     transport: Literal["tcp", "listen", "udp", "serial", "modbus"] = key(
-        "tcp: lines of a sensor at host and port; listen: it connects to this "
-        "computer; "
-        "udp: it sends datagrams here; serial: lines on a serial port; modbus: "
-        "registers"
+        "tcp: lines of a sensor at host and port; listen: it connects here; udp: it "
+        "sends datagrams here; serial: lines on a serial port; modbus: registers"
     )
     host: str = key("tcp, modbus: the sensor's; else this computer's", "127.0.0.1")
     port: int = key("TCP or UDP port at host", 502, 0, 65535)

@@ -31,7 +31,8 @@ from rig.faults import (
     Requests,
     StopRequested,
 )
-from rig.journal import SIGN_CHECKED, DeviceRecord, Record, RunFolder
+from rig.journal.device import SIGN_CHECKED, DeviceRecord
+from rig.journal.run_folder import Record, RunFolder
 from rig.readings import make_source
 from rig.readings.attitude import Array, Reading
 from rig.readings.geometry import Frame, geometry_of

@@ -14,7 +14,7 @@ from rig.core.measure import measure
 from rig.core.motion import move
 from rig.core.proof import Turns, slopes
 from rig.faults import MotionFault, TurnedTooFar
-from rig.journal import SIGN_CHECKED
+from rig.journal.device import SIGN_CHECKED
 from rig.readings.attitude import Array
 
 SHOWN_DEG = 3.0  # that each axis is moved, from a third of it to the whole

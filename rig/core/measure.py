@@ -18,9 +18,7 @@ from rig.readings.geometry import Frame
 DISAGREEMENT_DEG = 45.0  # between IMU and command at a posture, at most
 FOLLOW_MIN_DEG = 3.0  # a commanded change this large must be seen by the IMU
 FOLLOW_SHARE = 0.1  # at least this share of it
-FOLLOW_MODEL = (
-    0.6  # of what the axis that changes most changes: by so much a model errs
-)
+FOLLOW_MODEL = 0.6  # of what the axis that changes most changes: a model's error
 FOLLOW_LEADING = 0.3  # of axes that move at least this share of the largest move
 
 

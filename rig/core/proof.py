@@ -28,7 +28,7 @@ from rig.config.axis import Axis, Pulses
 from rig.config.settings import ImuSettings, ReadingsSettings
 from rig.core.stop_distance import StopDistance
 from rig.faults import MotionFault, TurnedTooFar
-from rig.journal import SIGN_CHECKED, DeviceRecord
+from rig.journal.device import SIGN_CHECKED, DeviceRecord
 from rig.readings.attitude import Array, matrix_to_euler
 from rig.readings.geometry import Geometry
 from rig.readings.source import Source

@@ -20,7 +20,7 @@ from rig.config.config import differences
 from rig.drives import Drive
 from rig.drives.line import BusError
 from rig.faults import MotionFault, Refused
-from rig.journal import HOMED, IDENTIFIED, DeviceRecord
+from rig.journal.device import HOMED, IDENTIFIED, DeviceRecord
 from rig.readings.attitude import Array
 from rig.readings.geometry import geometry_of
 

@@ -34,7 +34,9 @@ from rig.faults import (
     Unreachable,
     ending,
 )
-from rig.journal import ZEROED, BusLock, DeviceRecord, Record, RunFolder
+from rig.journal.device import ZEROED, DeviceRecord
+from rig.journal.lock import BusLock
+from rig.journal.run_folder import Record, RunFolder
 from rig.readings.attitude import Array, angle_between_deg
 from rig.readings.geometry import Attitudes
 from rig.readings.source import ReadingError

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rig.journal import STOP_PROVED, DeviceRecord
+from rig.journal.device import STOP_PROVED, DeviceRecord
 
 if TYPE_CHECKING:
     from rig.config.axis import Axis

@@ -18,7 +18,7 @@ from rig.identification.fit_affine import (
     pairs,
     uncertainty,
 )
-from rig.journal import Record, measured_postures
+from rig.journal.run_folder import Record, measured_postures
 from rig.outputs.messages import recalibrate
 from rig.readings.attitude import ORDERS, frame_at
 from rig.readings.geometry import Attitudes, geometry_of

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rig.journal import Record
+from rig.journal.run_folder import Record
 from rig.readings.geometry import Geometry
 
 SIGNIFICANT = 3.0  # standard deviations, of a drift

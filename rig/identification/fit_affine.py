@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special
 
 from rig.config import RigConfig
-from rig.journal import Record
+from rig.journal.run_folder import Record
 from rig.readings.attitude import Array
 
 

@@ -134,15 +134,9 @@ class DeviceRecord:
             return lost["reason"] if lost else "it never was"
         then, now = state["fingerprint"], _fingerprint(name, config)
         if name in (IDENTIFIED, HOMED):  # pulses: no gearing, direction or phone in it
-            drives = (".unit", ".map")
-            then, now = (
-                {
-                    key: value
-                    for key, value in fingerprint.items()
-                    if key.endswith(drives)
-                }
-                for fingerprint in (then, now)
-            )
+            ends = (".unit", ".map")
+            then = {key: then[key] for key in then if key.endswith(ends)}
+            now = {key: now[key] for key in now if key.endswith(ends)}
         changed = differences(then, now)
         return f"edited since: {'; '.join(changed)}" if changed else None
 

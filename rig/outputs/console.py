@@ -9,7 +9,7 @@ import numpy as np
 
 from rig.command_run import Run
 from rig.config import RigConfig
-from rig.journal import Record
+from rig.journal.run_folder import Record
 from rig.outputs.messages import choice_text, event_lines, numbers
 from rig.outputs.run_state import RunState
 from rig.outputs.telemetry import telemetry

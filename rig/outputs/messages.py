@@ -13,7 +13,7 @@ import numpy as np
 
 from rig.config import AXIS_NAMES
 from rig.core.stop import UnitStop
-from rig.journal import Record
+from rig.journal.run_folder import Record
 
 NUMBERS = {2: "two", 4: "four", 6: "six", 12: "twelve"}
 UNITS = {"deg": "degrees", "mm": "millimetres"}
@@ -150,8 +150,7 @@ def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
     std = zip(outputs, summary["noise_std_deg"], strict=True)
     lines.append(
         f"  noise of one posture {', '.join(f'{n} {v:.4f}' for n, v in std)} {unit}, "
-        "from "
-        f"{summary['basis']} ({summary['dof']} degrees of freedom each)"
+        f"from {summary['basis']} ({summary['dof']} degrees of freedom each)"
     )
     if "after" in summary:
         lines.append(f"held-out {error_text(summary, unit)}")

@@ -8,7 +8,7 @@ from typing import Any
 
 from jaxcal.extras import MissingExtraError
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE
-from rig.journal import Record, RunFolder
+from rig.journal.run_folder import Record, RunFolder
 from rig.outputs.messages import recalibrate, summary_lines
 from rig.pages import REPORT, write_report
 

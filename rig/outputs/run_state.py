@@ -12,7 +12,7 @@ from typing import Any
 
 from rig.config.axis import Scale
 from rig.config.config import names_of, units_of
-from rig.journal import Record
+from rig.journal.run_folder import Record
 from rig.outputs.messages import ENDS, event_lines
 
 Degrees = list[float]  # in the order of the axes, or of what is measured
@@ -68,9 +68,7 @@ class RunState:
     pausing: bool = False  # a pause was asked for
     current: str | None = None  # name of the posture being visited
     target: Degrees | None = None  # commanded last
-    postures: dict[str, PostureState] = dataclasses.field(
-        default_factory=dict
-    )  # to visit
+    postures: dict[str, PostureState] = dataclasses.field(default_factory=dict)
     candidates: list[Degrees] = dataclasses.field(default_factory=list)
     drift: list[tuple[float, Degrees]] = dataclasses.field(default_factory=list)
     stop: Record | None = None

@@ -14,7 +14,7 @@ from rig.core.session import visit
 from rig.faults import MotionFault
 from rig.identification.conclusion import check_matrix, conclude
 from rig.identification.fit_affine import identify_affine
-from rig.journal import SIGN_CHECKED
+from rig.journal.device import SIGN_CHECKED
 from rig.outputs.console import plan_lines
 from rig.outputs.results import save_result
 from rig.outputs.run_state import roles_of

@@ -401,9 +401,8 @@ def require_gearing(
         if register is None and max(ratio, 1.0 / ratio) > UNPROVED_FACTOR:
             raise MotionFault(
                 f"{_seen(config, ratios)}, and the drive of {axis.name} has no "
-                "register that "
-                "says its pulses for a turn, so it is not known what is wrong. "
-                f"{BY_PLATE}"
+                "register that says its pulses for a turn, so it is not known what is "
+                f"wrong. {BY_PLATE}"
             )
 
 
@@ -437,10 +436,8 @@ def proposals(
             if name == "pulses_per_rev" and told[drive] not in (None, new):
                 new, reason = told[drive], f"unit {source.unit} says so itself"
             edits[name] = old, new, reason
-        rate, pulses = (
-            findings.deg_per_pulse[drive],
-            told[drive] or source.pulses_per_rev,
-        )
+        rate = findings.deg_per_pulse[drive]
+        pulses = told[drive] or source.pulses_per_rev
         reason = f"positive pulses turn it the {_way(rate)} way"
         edits["direction"] = axis.direction, 1 if rate > 0 else -1, reason
         geared = axis.model_copy(update={"pulses_per_rev": pulses})

@@ -10,7 +10,7 @@ from rig.core.device import Device, Posture
 from rig.core.motion import move
 from rig.core.proof import FIRST_MOTOR_DEG, slopes, unit_proved
 from rig.faults import MotionFault, Refused
-from rig.journal import SIGN_CHECKED
+from rig.journal.device import SIGN_CHECKED
 from rig.prove.axis_check import (
     CLEAR,
     Change,

@@ -11,7 +11,7 @@ from rig.core.proof import NOISE_DEG
 from rig.drives.drive import HOME, Drive
 from rig.drives.line import BusError
 from rig.faults import MotionFault, Refused
-from rig.journal import HOMED
+from rig.journal.device import HOMED
 from rig.readings.attitude import Array, Reading
 
 NO_LIMIT_DEG = 1e9

@@ -12,9 +12,10 @@ from rig.config.axis import Axis
 from rig.config.maps import DriveMap, RegisterMap, available_maps, load_map
 from rig.config.schema import ConfigError, parse
 from rig.config.settings import BusSettings
+from rig.drives.bus import NOBODY, Bus, Rejected
 from rig.drives.line import BusError
-from rig.drives.modbus import NOBODY, Bus, ModbusDrive, Rejected
-from rig.journal import BusLock
+from rig.drives.modbus import ModbusDrive
+from rig.journal.lock import BusLock
 
 # For each absent unit, three times; a drive answers within 25 ms at 9600 baud.
 SCAN_TIMEOUT_S, RETRIES = 0.2, 2
@@ -24,7 +25,7 @@ OF_BUS = {
     "rtu_tcp": ("host", "port"),
     "rtu": ("device", "baudrate", "parity", "bytesize", "stopbits"),
 }
-OF_OTHERS = {"serial": ("device", "baudrate"), "can": ("device", "baudrate")}
+OF_LINE = OF_BUS | dict.fromkeys(("serial", "can"), ("device", "baudrate"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +58,7 @@ def parse_bus(text: str) -> BusSettings:
         ConfigError: not such a text, or settings that cannot be.
     """
     transport, _, rest = text.partition(":")
-    names = (OF_BUS | OF_OTHERS).get(transport, ())
+    names = OF_LINE.get(transport, ())
     words = re.split(":" if "host" in names else ",", rest)
     if not names or len(words) > len(names) or not all(words):
         kinds = "tcp:HOST[:PORT], rtu_tcp:HOST[:PORT], serial:DEVICE[,BAUD], "

@@ -18,15 +18,9 @@ from rig.core.proof import ALLOWED_DEG, slowed
 from rig.core.record_check import check_drives
 from rig.drives import Drive, make_drives
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
-from rig.journal import (
-    HOMED,
-    IDENTIFIED,
-    STATES,
-    DeviceRecord,
-    Record,
-    new_run_folder,
-)
+from rig.journal.device import HOMED, IDENTIFIED, STATES, DeviceRecord
 from rig.journal.lock import BusLock
+from rig.journal.run_folder import Record, new_run_folder
 from rig.outputs.console import listen
 from rig.parts import PLACES
 from rig.prove.axis_check import Change

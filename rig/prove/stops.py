@@ -29,7 +29,7 @@ from rig.core.stop_distance import BY_UNITS, FASTER, StopDistance, stop_distance
 from rig.drives import Drive
 from rig.drives.drive import STILL_COUNTS, Status
 from rig.faults import MotionFault
-from rig.journal import STOP_PROVED
+from rig.journal.device import STOP_PROVED
 
 REACH_DEG = 3.0  # either side
 ADD_UP = 3.0  # axes: more move less far

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from rig.config.config import RigConfig
 from rig.readings.attitude import (
     Array,
+    AttitudeFrame,
     Reading,
     angle_between_deg,
     euler_to_matrix,
@@ -28,17 +29,6 @@ from rig.readings.attitude import (
 
 RADIAN = 180.0 / np.pi  # a direction's length, so that a turn of it is in degrees
 UNSEEN_DEG = 15.0  # an axis this near to the vertical hardly changes the tilt
-
-
-class Frame(Protocol):
-    """What is measured against a zero posture."""
-
-    @property
-    def zero(self) -> Array:
-        """The reading there."""
-
-    def angles(self, readings: ArrayLike) -> Array:
-        """(..., m) of what is measured, of readings as they are; zero at the zero."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,6 +192,10 @@ class Upright(Attitudes):
 
     def outputs(self, reading: Array, measured: Array) -> Array:
         return self.frame(reading).of(reading)
+
+
+# What is measured against a zero posture: (..., m), zero at the zero.
+Frame = AttitudeFrame | Up | Offset
 
 
 def _slope(values: Array, minutes: Array) -> Array:

@@ -228,10 +228,8 @@ class Receiver:
                 if foreign:
                     why = "another device than before sends from there"
                     self.refuse(connection.address, why)
-                admitted, self.phone = (
-                    not foreign,
-                    connection.address if used else self.phone,
-                )
+                admitted = not foreign
+                self.phone = connection.address if used else self.phone
             code = 200 if admitted else 403
         stays = admitted and fields.get("connection") != "close"
         connection.writer.write(_answer(code, stays))

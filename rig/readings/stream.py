@@ -120,11 +120,7 @@ class StreamParser:
         try:
             message = json.loads(body)
             device, session = message.get("deviceId"), message.get("sessionId")
-            entries = [
-                entry
-                for entry in message["payload"]
-                if isinstance(entry, dict) and entry.get("name") == "orientation"
-            ]
+            entries = [*_orientations({"payload": message["payload"]})]
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
             self.counts["not a Sensor Logger message"] += 1
             return []
@@ -132,7 +128,7 @@ class StreamParser:
             self.foreign = True
             self.counts["of another device"] += 1
             return []
-        readings = self._accept(entries, self._entry, now)
+        readings = self._accept(entries, self._orientation, now)
         if readings:
             self.sessions += not self.sessions or session != self._session
             self._device, self._session = device, session
@@ -242,18 +238,6 @@ class StreamParser:
             raise _Dropped("an angle no rotation has")
         signed = [v * sign for v, sign in zip(degrees, s.signs, strict=True)]
         return euler_to_matrix(signed, str(s.order))
-
-    def _entry(self, entry: dict[str, Any]) -> tuple[float | None, Array]:
-        values = entry.get("values")
-        if not isinstance(values, dict):
-            values = entry
-        stamp = entry.get("time")
-        try:
-            numbers = [float(values[key]) for key in ("qx", "qy", "qz", "qw")]
-            seconds = None if stamp is None else self._seconds(float(stamp), "ns")
-        except (KeyError, TypeError, ValueError, OverflowError):
-            raise _Dropped("no quaternion") from None
-        return seconds, _quaternion(numbers)
 
     def _orientation(self, told: tuple[Any, list[Any]]) -> tuple[float | None, Array]:
         """Stamp and numbers of a JSON object."""

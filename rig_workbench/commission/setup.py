@@ -15,12 +15,12 @@ from rig.config import RigConfig, load_config, parse_config
 from rig.config.axis import DEFAULT_ROTATES as DEFAULT_AXES
 from rig.config.settings import BusSettings
 from rig.faults import EXIT_OK, Refused
-from rig.journal import HOMED, IDENTIFIED, STOP_PROVED, ZEROED
+from rig.journal.device import HOMED, IDENTIFIED, STOP_PROVED, ZEROED
 from rig.prove import steps
 from rig.prove.home import can_home
 from rig.prove.operator import Operator
 from rig.prove.rig_toml import edit, set_values
-from rig.prove.scan import Answer, parse_bus, scan, serial_lines
+from rig.prove.scan import OF_LINE, Answer, parse_bus, scan, serial_lines
 from rig.sessions import SimulatedDevice
 from rig_workbench.commission.connections import look_at_phone
 from rig_workbench.model import joint_names
@@ -62,19 +62,6 @@ OF_READINGS = {  # keys of [readings]
     "serial": ("device", "baudrate"),
     "modbus": ("host", "port"),
 }
-OF_LINE = {  # keys of [bus]
-    "rtu": ("device", "baudrate", "parity", "stopbits", "bytesize"),
-    "serial": ("device", "baudrate"),
-    "can": ("device", "baudrate"),
-}
-EXAMPLES: dict[str, dict[str, Any]] = {  # of --example
-    "turntable": {"axes": {"table": "Z"}},
-    "gimbal": {"axes": {"pan": "Z", "tilt": "X"}},
-    "stage": {
-        "axes": {"x": "mm", "y": "mm", "z": "mm"},
-        "readings": "serial:/dev/ttyUSB1,9600",
-    },
-}  # fmt: skip
 
 
 def axis_kinds(text: str) -> dict[str, str]:
@@ -92,14 +79,13 @@ def axis_kinds(text: str) -> dict[str, str]:
     return kinds
 
 
-def asked(*, axes: str, example: str, **given: Any) -> SetupOptions:
-    """What the command line says, where it says nothing as of the example.
+def asked(*, axes: str, **given: Any) -> SetupOptions:
+    """What the command line says.
 
     Raises:
         Refused: an option is not what it must be.
     """
-    options = dict(EXAMPLES.get(example, {}))
-    options |= {name: value for name, value in given.items() if value}
+    options = {name: value for name, value in given.items() if value}
     if axes:
         try:
             options["axes"] = axis_kinds(axes)
@@ -259,7 +245,7 @@ def new_text(
     """
     import jinja2
 
-    keys = OF_LINE.get(bus.transport, ("host", "port")) + ("echo",) * bus.echo
+    keys = OF_LINE[bus.transport] + ("echo",) * bus.echo
     text = pathlib.Path(__file__).with_name("new.toml.j2").read_text(encoding="utf-8")
     template = jinja2.Template(
         text,

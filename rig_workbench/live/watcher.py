@@ -15,7 +15,7 @@ from typing import Any
 
 from rig.core.stop import UnitStop
 from rig.faults import Refused
-from rig.journal import JOURNAL, Record, is_written
+from rig.journal.run_folder import JOURNAL, Record, is_written
 from rig.outputs.run_state import RunState
 from rig.outputs.telemetry import PERIOD_S, TELEMETRY
 from rig.signals import PAUSE

@@ -22,7 +22,7 @@ import numpy as np
 from rig.config.axis import Scale
 from rig.config.config import names_of, units_of
 from rig.faults import Refused
-from rig.journal import Record
+from rig.journal.run_folder import Record
 from rig.outputs.messages import recalibrate
 from rig.readings.attitude import Array
 

@@ -17,12 +17,9 @@ import numpy as np
 
 from jaxcal.extras import install
 from jaxcal.reports.page import Code, Figure, Page, Section, Table, Text, write_page
-from rig.journal import JOURNAL, Record, is_written, measured_postures
-from rig.outputs.messages import (
-    choice_text,
-    numbers,
-)
-from rig.outputs.run_state import RunState
+from rig.journal.run_folder import JOURNAL, Record, is_written, measured_postures
+from rig.outputs.messages import choice_text, numbers
+from rig.outputs.run_state import PostureState, RunState
 from rig_workbench.outputs.view import headline, trouble, verdict
 
 FOOTER = (
@@ -66,7 +63,12 @@ def _result(state: RunState, summary: Record) -> list[Section]:
     if choice := summary.get("choice"):
         lines.append(f"chosen by {choice_text(choice)}. {choice['note']}")
     warned = ("WARNING", "RECALIBRATE")
-    parts: list[Any] = [
+    outputs, parts = summary.get("outputs", state.names[1]), list[Any]()
+    if "A" in summary:  # the lines of the matrix are a table here
+        begin = next(i for i, line in enumerate(lines) if line.startswith("y = A u"))
+        title, lines = lines[begin], lines[:begin] + lines[begin + 1 + len(outputs) :]
+        parts.append(_matrix(summary, outputs, title.rstrip(":")))
+    parts += [
         Text(Code(line), "warning" if line.startswith(warned) else "") for line in lines
     ]
     if "before" in summary:
@@ -75,8 +77,7 @@ def _result(state: RunState, summary: Record) -> list[Section]:
             shown = {"as designed": "before", "calibrated": "prediction"}
         errors = {t: summary[key]["each"] for t, key in shown.items() if key in summary}
         alt = f"held-out errors in {state.unit}, {' and '.join(errors)}"
-        names = summary.get("outputs", state.names[1])
-        draw = functools.partial(draw_errors, names=names, unit=state.unit)
+        draw = functools.partial(draw_errors, names=outputs, unit=state.unit)
         parts.append(drawn(draw, errors, (9, 3.4), alt))
     if rms := summary.get("orders", {}).get("rms"):
         rows = [[order, f"{left:.4f}"] for order, left in rms.items()]
@@ -91,6 +92,18 @@ def _result(state: RunState, summary: Record) -> list[Section]:
     return sections
 
 
+def _matrix(summary: Record, outputs: Sequence[str], title: str) -> Table:
+    """A and b, each with its half-width."""
+    rows = [
+        [name, *(f"{value:.5f} ± {wide:.5f}" for value, wide in zip(a, w, strict=True))]
+        for name, a, w in zip(
+            outputs, np.column_stack([summary["A"], summary["b"]]), summary["ci95"],
+            strict=True,
+        )
+    ]  # fmt: skip
+    return Table(["", *(f"u {name}" for name in summary["axes"]), "b"], rows, title)
+
+
 def _measured(state: RunState, records: list[Record]) -> Section:
     """Every posture measured so far."""
     postures = list(measured_postures(records).values())
@@ -100,7 +113,7 @@ def _measured(state: RunState, records: list[Record]) -> Section:
         return Section("Postures", [f"Nothing was {what}."])
     rows = [
         [
-            r["name"], numbers(r["commanded_deg"], 0, 3),
+            PostureState(r["name"]).title, numbers(r["commanded_deg"], 0, 3),
             numbers(r["measured_deg"], 0, 3), numbers(r["std_deg"], 0, 4),
         ]
         for r in postures[:MOST_ROWS]

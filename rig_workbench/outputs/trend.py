@@ -12,7 +12,8 @@ import numpy as np
 
 from jaxcal.checks import aligned
 from jaxcal.reports.page import Badge, Block, Page, Section, Table, Text, write_page
-from rig.journal import JournalError, Record, read_journal
+from rig.faults import JournalError
+from rig.journal.run_folder import Record, read_journal
 from rig.outputs.messages import held_out, recalibrate
 from rig_workbench.outputs.report import draw_parameters, drawn
 

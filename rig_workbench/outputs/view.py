@@ -14,13 +14,8 @@ from rig.outputs.messages import (
     prediction_text,
     summary_lines,
 )
-from rig.outputs.run_state import (
-    ACTIVE,
-    SESSIONS,
-    PostureState,
-    Record,
-    RunState,
-)
+from rig.outputs.run_state import ACTIVE, SESSIONS, PostureState, Record, RunState
+from rig.parts import PLACES
 
 SHOWN = 40  # rows of a long queue
 STALE_S = 1.0
@@ -79,6 +74,7 @@ def trouble(state: RunState, running: bool, folder: str) -> list[str]:
     """Faults and stops in plain words, and what to do."""
     lines, ended, stop = [], state.ended, state.stop
     typed = state.start.get("arguments") or [state.mode]
+    typed = [PLACES[typed[0]], *typed] if typed[0] in PLACES else typed
     typed = ["resume", folder] if state.mode in SESSIONS else typed
     go_on = (ended or {}).get("go_on", f"jaxcal-rig {shlex.join(typed)}")
     go_on = f"To go on: {go_on}"

@@ -20,12 +20,20 @@ from rig_workbench.simulator.sender import Sender
 
 INTRUSION_S = 0.15  # that another sender is heard, where it is let
 BATCH = 5  # readings that Sensor Logger pushes at once
+HEADER = b"loggingTime(txt)" + b"".join(b",motionQuaternion%c(R)" % c for c in b"XYZW")
+SAMPLED = "2026-11-27 19:05:11.000 +0000"
 
 
 def format_line(
     settings: ImuSettings, matrix: Array, stamp_s: float, order: str
 ) -> str:
     """One line as the configured app would send it, without its end."""
+    if settings.format in ("json", "sensorlog"):
+        numbers = Rotation.from_matrix(matrix).as_quat(canonical=True)
+        if settings.format == "sensorlog":
+            return ",".join([SAMPLED, *(f"{value:.9f}" for value in numbers)])
+        told = {"timestamp": round(1e9 * stamp_s), "value": numbers.tolist()}
+        return json.dumps({"rotationVector": told})
     columns: tuple[int, ...] = settings.quaternion_columns or settings.columns
     if settings.quaternion_columns:
         numbers, digits = Rotation.from_matrix(matrix).as_quat(), 9
@@ -73,8 +81,11 @@ class Phone(Sender):
         held = b""
         next_time = time.monotonic()
         with connection:
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if self.settings.transport != "udp":
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection.settimeout(1.0)
+            if self.settings.format == "sensorlog":
+                connection.sendall(HEADER + b"\r\n")
             while not self._closing.is_set() and not self._take("imu_disconnect"):
                 if self._take("imu_second_sender"):
                     connection.close()
@@ -108,6 +119,8 @@ class Phone(Sender):
         if self._take("imu_radians"):
             s = s.model_copy(update={"unit": "rad"})
         fields = format_line(s, self._frozen, time.time(), order).split(s.separator)
+        if s.format in ("json", "sensorlog"):  # faults of columns are of others
+            return self._garbled(s.separator.join(fields).encode() + b"\r\n")
         if self._take("imu_nan"):
             fields[(s.quaternion_columns or s.columns)[0]] = "NaN"
         if self._take("imu_columns"):

@@ -46,7 +46,11 @@ class Sender:
             self._listener.close()
 
     def connected(self) -> socket.socket:
-        """A connection to the rig over TCP, whoever of the two listens."""
+        """A connection to the rig, whoever of the two listens."""
+        if self.settings.transport == "udp":
+            made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            made.connect(("127.0.0.1", self._port))
+            return made
         if self._listener is not None:
             return self._listener.accept()[0]
         return socket.create_connection(("127.0.0.1", self._port), timeout=1.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import time
 from collections.abc import Callable
 
@@ -29,21 +28,13 @@ class SimSensor(Sender):
         self._frozen = b""
 
     def send(self) -> None:
-        if self.settings.transport == "udp":
-            connection = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            connection.connect(("127.0.0.1", self._port))
-        else:
-            connection = self.connected()
-        with connection:
-            self._send(connection)
-
-    def _send(self, connection: socket.socket) -> None:
         due = time.monotonic()
-        while not self._closing.is_set() and not self._take("imu_disconnect"):
-            if not self._take("imu_gap"):
-                connection.sendall(self._line())
-            due += self._period
-            self._closing.wait(max(0.0, due - time.monotonic()))
+        with self.connected() as connection:
+            while not self._closing.is_set() and not self._take("imu_disconnect"):
+                if not self._take("imu_gap"):
+                    connection.sendall(self._line())
+                due += self._period
+                self._closing.wait(max(0.0, due - time.monotonic()))
 
     def _line(self) -> bytes:
         if not self._frozen or not self._take("imu_frozen"):

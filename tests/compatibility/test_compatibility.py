@@ -41,7 +41,7 @@ def test_a_checkpoint_chooses_as_it_did(folder, answers):
 
 
 def test_the_calibration_and_the_journal_of_a_run_are_read(folder):
-    from rig.journal import read_journal
+    from rig.journal.run_folder import read_journal
 
     found = jaxcal.Calibration.load(folder / "run" / "calibration.json")
     np.testing.assert_allclose(np.diag(found.matrix), [0.43, 0.71, 0.87], atol=0.01)

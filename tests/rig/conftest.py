@@ -6,7 +6,7 @@ from harness import prove_stops
 
 from rig.config import load_config
 from rig.core import proof
-from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
+from rig.journal.device import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
 from rig.prove import stops
 from rig_workbench.commission import connections
 

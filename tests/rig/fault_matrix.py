@@ -46,16 +46,17 @@ from harness import (
 from rig.command_run import Run
 from rig.config import RigConfig, parse_config
 from rig.core import motion
-from rig.drives.modbus import Bus, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.modbus import ModbusDrive
 from rig.faults import Refused
-from rig.journal import (
+from rig.journal.device import (
     HOMED,
     IDENTIFIED,
     SIGN_CHECKED,
     STOP_PROVED,
     DeviceRecord,
-    read_journal,
 )
+from rig.journal.run_folder import read_journal
 from rig.prove.operator import Operator
 from rig.prove.steps import Site, go_home, show_identity
 from rig.prove.steps import axes as check_the_axes

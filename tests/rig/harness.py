@@ -22,16 +22,16 @@ from rig.config import RigConfig, parse_config
 from rig.config.config import EXAMPLES
 from rig.config.maps import RegisterMap, available_maps, load_map
 from rig.core import device, motion, stop
-from rig.journal import (
+from rig.drives.bus import words_of
+from rig.journal.device import (
     HOMED,
     IDENTIFIED,
-    JOURNAL,
     SIGN_CHECKED,
     STOP_PROVED,
     DeviceRecord,
-    read_journal,
 )
 from rig.journal.lock import BusLock
+from rig.journal.run_folder import JOURNAL, read_journal
 from rig.outputs import results
 from rig.outputs.console import listen
 from rig.procedures.calibrate import calibrate
@@ -83,6 +83,11 @@ QUIET = ["--rate", "250", "--noise", "0.005"]
 HASTY = {"timeout_s = 0.5": "timeout_s = 0.08", "stale_s = 1.0": "stale_s = 0.25"}
 UNSETTLED = {"timeout_s = 3": "timeout_s = 1.2"}  # where it is not to settle
 SESSION = '\n[session]\nmethod = "exact"\nverify_postures = 1\n'
+
+
+def read_words(bus, unit, address, count, retries=None):
+    """Holding registers, as numbers."""
+    return words_of(bus.read(unit, 3, address, count, retries))
 
 
 def fast_text(changes: dict[str, str] | None = None, session: str = SESSION) -> str:

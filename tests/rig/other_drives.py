@@ -6,7 +6,7 @@ import numpy as np
 from harness import SESSION, fast_text
 
 from rig.config import parse_config
-from rig.journal import DeviceRecord
+from rig.journal.device import DeviceRecord
 from rig.prove import steps
 from rig.prove.operator import Operator
 from rig_workbench.simulator.faults import FaultInjector

@@ -17,7 +17,8 @@ from harness import (
 import jaxcal
 from rig.__main__ import main
 from rig.config import ConfigError, parse_config
-from rig.journal import SIGN_CHECKED, STOP_PROVED, DeviceRecord, read_journal
+from rig.journal.device import SIGN_CHECKED, STOP_PROVED, DeviceRecord
+from rig.journal.run_folder import read_journal
 from rig_workbench.outputs.export import load_inverse
 from rig_workbench.simulator import Truth
 

@@ -13,7 +13,7 @@ from fault_matrix import _free_port
 from harness import Simulator, commissioned, fast_config, fast_text, simulator
 
 from rig.config import AXIS_NAMES
-from rig.journal import read_journal
+from rig.journal.run_folder import read_journal
 from rig.prove import steps
 from rig.prove.operator import Operator
 from rig_workbench.commission import characterise

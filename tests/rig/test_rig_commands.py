@@ -25,7 +25,7 @@ from harness import (
 import jaxcal
 from rig.__main__ import main
 from rig.commands import make_parser, resolved
-from rig.journal import read_journal
+from rig.journal.run_folder import read_journal
 from rig_workbench.simulator import Truth, parse_fault
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])

@@ -14,7 +14,7 @@ from rig.__main__ import main
 from rig.config import load_config
 from rig.core.record_check import check_drives
 from rig.faults import Refused
-from rig.journal import HOMED, SIGN_CHECKED, ZEROED, DeviceRecord
+from rig.journal.device import HOMED, SIGN_CHECKED, ZEROED, DeviceRecord
 from rig.prove import home, steps
 from rig.prove.operator import Operator
 from rig.prove.rig_toml import edit

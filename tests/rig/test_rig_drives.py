@@ -11,7 +11,15 @@ import threading
 import time
 
 import pytest
-from harness import HASTY, MODBUS_MAPS, changed, fast_config, fast_text, simulator
+from harness import (
+    HASTY,
+    MODBUS_MAPS,
+    changed,
+    fast_config,
+    fast_text,
+    read_words,
+    simulator,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 from recorder import Recorder, axis_with, rtu_over_tcp
@@ -20,7 +28,9 @@ from rig.config import ConfigError, parse_config
 from rig.config.maps import load_map
 from rig.config.settings import BusSettings
 from rig.core.stop import stop_all
-from rig.drives.modbus import Bus, BusError, ModbusDrive, Rejected
+from rig.drives.bus import Bus, Rejected
+from rig.drives.line import BusError
+from rig.drives.modbus import ModbusDrive
 from rig.drives.wire import crc16
 from rig_workbench.simulator import parse_fault
 
@@ -167,7 +177,7 @@ def test_exception_replies_are_errors_with_their_name():
             ModbusDrive(bus, config.axes[0]).go(5000)
         assert caught.value.code == 3
         with pytest.raises(Rejected, match="illegal address"):
-            bus.read_words(1, 0x7777, 1)
+            read_words(bus, 1, 0x7777, 1)
 
 
 def test_a_late_reply_is_never_taken_for_the_next_one(recorder):
@@ -185,7 +195,7 @@ def test_a_late_reply_is_never_taken_for_the_next_one(recorder):
     peer = recorder(answer)
     with Bus(rtu_over_tcp(peer.port)) as bus:
         for address in (11, 22, 33, 44):
-            assert bus.read_words(1, address, 1) == [address]
+            assert read_words(bus, 1, address, 1) == [address]
 
 
 def test_replies_of_another_unit_function_or_length_are_refused(recorder):
@@ -203,7 +213,7 @@ def test_replies_of_another_unit_function_or_length_are_refused(recorder):
         peer = recorder(answer)
         with Bus(rtu_over_tcp(peer.port, retries=0)) as bus:
             with pytest.raises(BusError):
-                bus.read_words(1, 0, 1)
+                read_words(bus, 1, 0, 1)
 
 
 def test_silence_between_frames_is_kept(recorder):
@@ -217,7 +227,7 @@ def test_silence_between_frames_is_kept(recorder):
     peer = recorder(answer)
     with Bus(rtu_over_tcp(peer.port), silence_s=0.03) as bus:
         for _ in range(4):
-            bus.read_words(1, 0, 1)
+            read_words(bus, 1, 0, 1)
     gaps = [b - a for a, b in itertools.pairwise(times)]
     assert min(gaps) >= 0.03
 
@@ -316,12 +326,12 @@ def test_against_pymodbus_own_server_on_tcp():
         axis = changed(axis_with("generic"), unit=1)
         with Bus(settings) as bus:
             bus.write(1, 10, 16, [0xFFFE, 0xEE8F, 3])
-            assert bus.read_words(1, 10, 3) == [0xFFFE, 0xEE8F, 3]
+            assert read_words(bus, 1, 10, 3) == [0xFFFE, 0xEE8F, 3]
             bus.write(1, 20, 6, [77])
-            assert bus.read_words(1, 20, 1) == [77]
+            assert read_words(bus, 1, 20, 1) == [77]
             ModbusDrive(bus, axis).go(-321)
-            assert bus.read_words(1, 0x20, 2) == [0xFFFF, 0x10000 - 321]
-            assert bus.read_words(1, 0x28, 1) == [1]
+            assert read_words(bus, 1, 0x20, 2) == [0xFFFF, 0x10000 - 321]
+            assert read_words(bus, 1, 0x28, 1) == [1]
 
 
 def test_only_one_file_opens_a_drive_port():

@@ -12,11 +12,12 @@ import resource
 
 import numpy as np
 import pytest
-from harness import changed, fast_config
+from harness import changed, fast_config, read_words
 from scipy.spatial.transform import Rotation
 
 from rig.config.settings import BusSettings
-from rig.drives.modbus import Bus, BusError
+from rig.drives.bus import Bus
+from rig.drives.line import BusError
 from rig.drives.wire import Wire, crc16
 from rig.readings.stream import MAX_LINE, LineSplitter, StreamParser
 
@@ -212,7 +213,7 @@ def test_mutated_modbus_replies(framer, count):
                 expected = body
                 writes += 1
             else:
-                got = bus.read_words(unit, address, len(words))
+                got = read_words(bus, unit, address, len(words))
                 expected = bytes([unit, 3, len(data)])
                 expected += b"".join(word.to_bytes(2, "big") for word in got)
                 reads += 1

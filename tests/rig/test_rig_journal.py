@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from rig.faults import StopRequested
-from rig.journal import Journal, JournalError, read_journal
+from rig.faults import JournalError, StopRequested
+from rig.journal.run_folder import Journal, read_journal
 
 
 def test_records_survive_and_are_numbered(tmp_path):
@@ -100,7 +100,7 @@ def test_a_signal_during_a_write_leaves_whole_lines(tmp_path, monkeypatch):
 def test_sigkill_at_any_moment_leaves_a_readable_journal(tmp_path):
     program = (
         "import pathlib, sys\n"
-        "from rig.journal import Journal\n"
+        "from rig.journal.run_folder import Journal\n"
         "j = Journal(pathlib.Path(sys.argv[1]))\n"
         "print('ready', flush=True)\n"
         "n = len(j.records)\n"

@@ -9,9 +9,11 @@ import contextlib
 import time
 
 import pytest
-from harness import changed, fast_config, simulator
+from harness import changed, fast_config, read_words, simulator
 
-from rig.drives.modbus import Bus, BusError, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.line import BusError
+from rig.drives.modbus import ModbusDrive
 from rig_workbench.simulator import parse_fault
 from rig_workbench.simulator.drive import DriveException
 
@@ -41,9 +43,9 @@ def position_after_a_late_status(line, late_s):
     delay = TIMEOUT_S + late_s
     sim.faults.add(parse_fault(f"delayed_reply,count=1,axis=pitch,seconds={delay}"))
     with contextlib.suppress(BusError):
-        bus.read_words(unit, status.address, status.count, retries=0)
+        read_words(bus, unit, status.address, status.count, retries=0)
     with contextlib.suppress(BusError):  # no answer is an answer; a wrong one is not
-        return bus.read_words(unit, PLACE_AT, 2, retries=0)
+        return read_words(bus, unit, PLACE_AT, 2, retries=0)
     return PLACE_WORDS
 
 
@@ -66,11 +68,11 @@ def test_every_reply_of_a_slow_unit_is_its_own_or_none(line):
     end = time.monotonic() + 3.0
     while time.monotonic() < end:
         try:
-            assert bus.read_words(drive.axis.unit, PLACE_AT, 2) == PLACE_WORDS
+            assert read_words(bus, drive.axis.unit, PLACE_AT, 2) == PLACE_WORDS
         except BusError:
             pass
         try:
-            assert bus.read_words(drive.axis.unit, 0x007E, 2) == [0, word]
+            assert read_words(bus, drive.axis.unit, 0x007E, 2) == [0, word]
         except BusError:
             pass
     sim.repair()
@@ -129,9 +131,9 @@ def test_nothing_is_sent_while_a_serial_line_is_not_quiet():
     with simulator(config, transport="rtu") as sim:
         sim.drives[0].position = PLACE
         with Bus(changed(sim.start().bus, timeout_s=5.0, read_retries=1)) as bus:
-            assert bus.read_words(1, PLACE_AT, 2) == PLACE_WORDS
+            assert read_words(bus, 1, PLACE_AT, 2) == PLACE_WORDS
             port = bus._client.socket = Talking(bus._client.socket, 3)
-            assert bus.read_words(1, PLACE_AT, 2) == PLACE_WORDS
+            assert read_words(bus, 1, PLACE_AT, 2) == PLACE_WORDS
     first, *others = port.sent_into
     assert first == 3 and others and not any(others)
 
@@ -147,6 +149,6 @@ def test_a_lost_reply_over_a_network_leaves_the_connection(transport):
         with Bus(settings) as bus:
             first = bus._client.socket
             with pytest.raises(BusError):
-                bus.read_words(1, PLACE_AT, 2)
-            assert bus.read_words(1, PLACE_AT, 2, retries=9) == PLACE_WORDS
+                read_words(bus, 1, PLACE_AT, 2)
+            assert read_words(bus, 1, PLACE_AT, 2, retries=9) == PLACE_WORDS
             assert bus._client.socket is first and first.fileno() >= 0

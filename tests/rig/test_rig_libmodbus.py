@@ -18,14 +18,16 @@ import tty
 import numpy as np
 import pytest
 from fault_matrix import _free_port
-from harness import commissioned, fast_text
+from harness import commissioned, fast_text, read_words
 from scipy.spatial.transform import Rotation
 
 from rig.__main__ import main
 from rig.config import parse_config
 from rig.config.settings import BusSettings
 from rig.core.stop import stop_all
-from rig.drives.modbus import Bus, BusError, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.line import BusError
+from rig.drives.modbus import ModbusDrive
 
 SOURCE = pathlib.Path(__file__).with_name("libmodbus_slave.c")
 MATRIX = np.array([[0.95, 0.03, -0.02], [0.01, 1.04, 0.02], [-0.015, 0.01, 0.9]])
@@ -224,7 +226,7 @@ def test_one_drive_over_rtu_on_a_pseudo_terminal(program):
             (result,) = stop_all([drive])
             assert result.acknowledged and result.standing
             with pytest.raises(BusError):
-                bus.read_words(2, 0, 1)  # no such unit: silence
+                read_words(bus, 2, 0, 1)  # no such unit: silence
             eventually(lambda: slave.moves == [(1, -4321)] and slave.stops == [1])
     finally:
         closing.set()

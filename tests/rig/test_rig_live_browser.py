@@ -22,7 +22,7 @@ import pytest
 from harness import changed, fast_text, simulator
 
 from rig.config import parse_config
-from rig.journal import read_journal
+from rig.journal.run_folder import read_journal
 from rig_workbench import live
 from rig_workbench.live import draw
 

@@ -15,8 +15,7 @@ import pytest
 
 from rig import pages
 from rig.faults import Refused
-from rig.journal import Journal
-from rig.journal.run_folder import SCHEMA
+from rig.journal.run_folder import SCHEMA, Journal
 from rig.signals import PAUSE
 from rig_workbench.live.watcher import Watcher
 from rig_workbench.outputs import view

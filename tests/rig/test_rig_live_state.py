@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rig.config import parse_config
-from rig.journal import Journal, is_written, read_journal
+from rig.journal.run_folder import Journal, is_written, read_journal
 from rig.outputs.run_state import RunState
 from rig_workbench import live
 from rig_workbench.live import charts

@@ -21,9 +21,11 @@ from test_rig_motion import bench
 from rig.config import ConfigError, parse_config
 from rig.config.maps import MAP_FOLDER, RegisterMap
 from rig.config.schema import parse
-from rig.drives.modbus import Bus, BusError, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.line import BusError
+from rig.drives.modbus import ModbusDrive
 from rig.faults import MotionFault, StopRequested
-from rig.journal import read_journal
+from rig.journal.run_folder import read_journal
 from rig_workbench.simulator import Truth, parse_fault
 
 # Time enough for a busy computer: a reply that is late is one lost reply more.

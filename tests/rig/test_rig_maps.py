@@ -8,7 +8,8 @@ shares nothing with the one that is tested.
 import pytest
 from recorder import Recorder, axis_with, rtu_over_tcp
 
-from rig.drives.modbus import Bus, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.modbus import ModbusDrive
 from rig.drives.wire import crc16
 
 

@@ -20,7 +20,7 @@ import jaxcal
 from jaxcal.models import Gravity, SerialChain
 from rig.__main__ import main
 from rig.config import ConfigError, parse_config
-from rig.journal import SIGN_CHECKED, STOP_PROVED, DeviceRecord
+from rig.journal.device import SIGN_CHECKED, STOP_PROVED, DeviceRecord
 from rig.journal.run_folder import SCHEMA
 from rig_workbench.model import model_of
 from rig_workbench.simulator import Truth, parse_fault

@@ -9,7 +9,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from harness import HASTY, UNSETTLED, WATCHED, fast_config, fast_text, simulator
+from harness import (
+    HASTY,
+    UNSETTLED,
+    WATCHED,
+    fast_config,
+    fast_text,
+    read_words,
+    simulator,
+)
 
 from rig.config import parse_config
 from rig.core import measure as measuring
@@ -145,7 +153,7 @@ def test_soft_limits_are_mirrored_in_drives_that_have_them():
                "[motion]": "[motion]\nmirror_limits = true"}  # fmt: skip
     with bench(parse_config(fast_text(changes))) as motion:
         axis = motion.config.axes[0]
-        words = motion.device.line.read_words(axis.unit, 0x2C, 4)
+        words = read_words(motion.device.line, axis.unit, 0x2C, 4)
         low, high = (a << 16 | b for a, b in (words[:2], words[2:]))
         assert (low - 2**32, high) == (axis.min_pulses, axis.max_pulses)
 
@@ -156,7 +164,7 @@ def test_before_home_is_set_the_drives_own_limits_leave_it_room():
                "[motion]": "[motion]\nmirror_limits = true"}  # fmt: skip
     with bench(unlimited(parse_config(fast_text(changes)))) as motion:
         unit = motion.config.axes[0].unit
-        words = motion.device.line.read_words(unit, 0x2C, 4)
+        words = read_words(motion.device.line, unit, 0x2C, 4)
         low, high = (a << 16 | b for a, b in (words[:2], words[2:]))
         assert low - 2**32 <= 0 < HOME <= high
 

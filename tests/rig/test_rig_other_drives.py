@@ -19,7 +19,7 @@ from rig.config import parse_config
 from rig.drives import make_drives
 from rig.drives.line import BusError, Refusal
 from rig.faults import LimitError, Refused
-from rig.journal import SIGN_CHECKED, STOP_PROVED
+from rig.journal.device import SIGN_CHECKED, STOP_PROVED
 from rig.prove import steps
 
 KINDS = ("grbl", "marlin", "cia402")

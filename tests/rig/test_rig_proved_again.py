@@ -17,14 +17,14 @@ from rig.__main__ import main
 from rig.command_run import Run
 from rig.config import load_config
 from rig.core import motion, stop
-from rig.journal import (
+from rig.journal.device import (
     HOMED,
     IDENTIFIED,
     SIGN_CHECKED,
     STOP_PROVED,
     DeviceRecord,
-    read_journal,
 )
+from rig.journal.run_folder import read_journal
 from rig_workbench.simulator import parse_fault
 
 

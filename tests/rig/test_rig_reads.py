@@ -14,12 +14,15 @@ import time
 import tty
 
 import pytest
+from harness import read_words
 
 from rig.config import ConfigError
 from rig.config.axis import Axis
 from rig.config.maps import load_map, parse_map
 from rig.config.settings import BusSettings, ReadingRegister
-from rig.drives.modbus import Bus, BusError, ModbusDrive, decoded
+from rig.drives.bus import Bus
+from rig.drives.line import BusError
+from rig.drives.modbus import ModbusDrive, decoded
 from rig.prove import scan as scanning
 from rig.stop_config import map_of
 
@@ -251,10 +254,10 @@ def test_a_reply_that_comes_late_is_told_as_late(transport):
     server.tables[3] = {0: 5}
     with server.on(transport, timeout_s=0.1) as settings, Bus(settings) as bus:
         with pytest.raises(BusError, match=r"late by over 0.1 s.*raise bus.timeout_s"):
-            bus.read_words(1, 0, 1)
+            read_words(bus, 1, 0, 1)
     server._closing.clear()
     with server.on(transport, timeout_s=0.9) as settings, Bus(settings) as bus:
-        assert bus.read_words(1, 0, 1) == [5]
+        assert read_words(bus, 1, 0, 1) == [5]
 
 
 def test_a_silent_unit_is_not_told_as_late():
@@ -262,7 +265,7 @@ def test_a_silent_unit_is_not_told_as_late():
         with Bus(settings) as bus:
             bus.listen_s = 0.2
             with pytest.raises(BusError, match=r"silent for 0.05 s"):
-                bus.read_words(1, 0, 1)
+                read_words(bus, 1, 0, 1)
 
 
 @pytest.mark.parametrize("transport", LINES)
@@ -271,7 +274,7 @@ def test_pauses_between_bytes_longer_than_the_gap_of_frames_are_accepted(transpo
     server = Server(pause_s=0.01)
     server.tables[3] = {0: 5, 1: 6}
     with server.on(transport, timeout_s=0.5) as settings, Bus(settings) as bus:
-        assert bus.read_words(1, 0, 2) == [5, 6]
+        assert read_words(bus, 1, 0, 2) == [5, 6]
         bus.write(1, 0, 16, [1, 2])
         assert len(server.written) == 1
 
@@ -282,7 +285,7 @@ def test_a_reply_that_is_cut_by_the_timeout_is_told_as_such():
     with server.on("rtu", timeout_s=0.2) as settings, Bus(settings) as bus:
         bus.listen_s = 0.0
         with pytest.raises(BusError, match=r"not whole after 0.2 s: raise bus.timeout"):
-            bus.read_words(1, 0, 8)
+            read_words(bus, 1, 0, 8)
 
 
 def test_scan_names_a_server_that_answers_for_every_unit_and_late_ones(monkeypatch):

@@ -15,7 +15,7 @@ from harness import (
 )
 
 from rig.command_run import run_safely
-from rig.journal import read_journal
+from rig.journal.run_folder import read_journal
 from rig.procedures.collect import collect
 from rig_workbench.simulator import Truth, parse_fault
 

@@ -8,7 +8,7 @@ from harness import fast_config
 from rig.config import parse_config
 from rig.config.config import differences
 from rig.faults import Refused
-from rig.journal import (
+from rig.journal.device import (
     HOMED,
     IDENTIFIED,
     SIGN_CHECKED,

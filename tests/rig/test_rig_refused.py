@@ -17,10 +17,13 @@ from rig.__main__ import main
 from rig.config import ConfigError, parse_config
 from rig.config.maps import load_map
 from rig.core.record_check import check_drives
-from rig.drives.modbus import Bus, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.modbus import ModbusDrive
 from rig.identification.conclusion import conclude
-from rig.journal import HOMED, STOP_PROVED, Journal, lock
+from rig.journal import lock
+from rig.journal.device import HOMED, STOP_PROVED
 from rig.journal.lock import BusLock
+from rig.journal.run_folder import Journal
 from rig.procedures.collect import collect
 
 BAD = '\n[session]\nmethod = "exact"\nverify_postures = 1\nverify_limit_deg = 0.001\n'

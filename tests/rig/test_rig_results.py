@@ -33,7 +33,7 @@ import jaxcal
 from rig.__main__ import main
 from rig.config import AXIS_NAMES, parse_config
 from rig.faults import Refused
-from rig.journal import read_journal
+from rig.journal.run_folder import read_journal
 from rig.outputs.messages import numbers
 from rig_workbench.outputs import trend
 from rig_workbench.outputs.export import LANGUAGES, follow, load_inverse
@@ -239,6 +239,12 @@ def test_a_report_says_what_there_is_of_an_unfinished_run(run, finished, kept):
         assert "y = A u + b" not in page
     else:
         assert "Done: recalibrate" in page and "session.verify_limit_deg" in page
+        text = re.sub(r"<[^>]*>", "|", page)
+        assert re.search(r"\|posture \d+\|", text) and "select:" not in text
+        assert re.search(r"\|u pitch\|+\s*\|*u yaw\|", text)
+        summary = json.loads((run / "summary.json").read_text())
+        cell = f"{summary['A'][2][1]:.5f} ± {summary['ci95'][2][1]:.5f}"
+        assert f"|{cell}|" in text
     own = (finished / "report.html").read_text()  # written before the last record
     assert "All is measured" in own and "killed" not in own
     measured = sum('"event":"posture"' in line for line in lines[:kept])

@@ -33,7 +33,7 @@ from rig.command_run import run_safely
 from rig.config import parse_config
 from rig.faults import Refused
 from rig.identification.conclusion import order_residuals
-from rig.journal import read_journal
+from rig.journal.run_folder import read_journal
 from rig.procedures.calibrate import calibrate
 from rig.procedures.collect import collect
 from rig.procedures.plan import choose, draw_candidates
@@ -408,7 +408,7 @@ def test_without_matplotlib_the_report_says_that_figures_are_missing(
 
 
 def test_run_folders_are_never_reused(tmp_path):
-    from rig.journal import new_run_folder
+    from rig.journal.run_folder import new_run_folder
 
     folders = {new_run_folder(tmp_path, "calibrate") for _ in range(5)}
     assert len(folders) == 5

@@ -17,7 +17,7 @@ from rig.__main__ import main
 from rig.config import load_config, parse_config
 from rig.config.config import EXAMPLES
 from rig.faults import Refused
-from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED, DeviceRecord
+from rig.journal.device import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED, DeviceRecord
 from rig.prove import steps
 from rig.prove.operator import Operator
 from rig.prove.scan import Answer
@@ -136,15 +136,18 @@ def test_setup_asks_with_defaults_and_moves_nothing_without_a_yes(at):
     assert all(re.search(r"(\[.+\]|go on): $", question) for question in asked)
 
 
-OPTIONS = {"bus": "", "imu": "", "axes": "", "example": "", "readings": ""}
+OPTIONS = {"bus": "", "imu": "", "axes": "", "readings": ""}
 
 
 @pytest.mark.parametrize(
     "options, kinds, told",
     [
-        ({"example": "turntable"}, ["rotation"], "hyperimu"),
-        ({"example": "gimbal", "imu": "lines:2055"}, ["rotation"] * 2, "lines"),
-        ({"example": "stage"}, ["translation"] * 3, "serial"),
+        ({"axes": "table:Z"}, ["rotation"], "hyperimu"),
+        ({"axes": "pan:Z,tilt:X", "imu": "lines:2055"}, ["rotation"] * 2, "lines"),
+        (
+            {"axes": "x:mm,y:mm,z:mm", "readings": "serial:/dev/ttyUSB1,9600"},
+            ["translation"] * 3, "serial",
+        ),
         (
             {"axes": "x:mm,turn:deg", "readings": "modbus:10.0.0.9"},
             ["translation", "rotation"], "modbus",

@@ -9,7 +9,8 @@ from harness import Simulator, fast_config, fast_text
 
 from rig.commands import make_parser
 from rig.config import parse_config
-from rig.drives.modbus import Bus, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.modbus import ModbusDrive
 from rig_workbench.simulator import Truth, truth_of
 from rig_workbench.simulator.drive import COMM_ALARM, SimDrive
 

@@ -26,7 +26,9 @@ from rig.__main__ import main
 from rig.command_run import run_safely
 from rig.config import load_config
 from rig.core.stop import UnitStop, stop_all
-from rig.drives.modbus import Bus, BusError, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.line import BusError
+from rig.drives.modbus import ModbusDrive
 from rig.faults import StopRequested
 from rig.journal import lock
 from rig.journal.lock import BusLock, read_armed

@@ -18,7 +18,8 @@ from rig.config import load_config
 from rig.config.config import EXAMPLES
 from rig.config.maps import MAP_FOLDER, available_maps, load_map
 from rig.core import stop as core_stop
-from rig.drives.modbus import Bus, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.modbus import ModbusDrive
 from rig.journal import lock
 from rig.journal.lock import BusLock
 from rig.registers import FLAGS
@@ -268,8 +269,8 @@ HEAVY = {"numpy", "scipy", "jax", "pydantic", "pydantic_core", "pymodbus", "jinj
 MAY = {  # all of rig and jaxcal that a stop over a network may load
     "jaxcal", "jaxcal.compiled", "jaxcal.jsonlines", "jaxcal.moved", "rig",
     "rig.__main__", "rig.core", "rig.core.stop", "rig.drives", "rig.drives.drive",
-    "rig.drives.line",
-    "rig.drives.modbus", "rig.drives.wire", "rig.faults", "rig.journal",
+    "rig.drives.line", "rig.drives.bus", "rig.drives.modbus", "rig.drives.wire",
+    "rig.faults", "rig.journal",
     "rig.journal.lock", "rig.registers", "rig.signals", "rig.stop_config",
     "rig.stopping",
 }  # fmt: skip

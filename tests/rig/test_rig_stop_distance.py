@@ -14,7 +14,7 @@ from test_rig_motion import bench
 
 from rig.__main__ import main
 from rig.core.stop_distance import BY_UNITS, StopDistance, stop_distances
-from rig.journal import STOP_PROVED, DeviceRecord
+from rig.journal.device import STOP_PROVED, DeviceRecord
 from rig_workbench.simulator import Truth
 from rig_workbench.simulator import drive as sim_drive
 

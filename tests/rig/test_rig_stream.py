@@ -16,6 +16,8 @@ from rig.readings import receiver
 from rig.readings.attitude import angle_between_deg, euler_to_matrix, matrix_to_euler
 from rig.readings.phone import Imu, ReadingError
 from rig.readings.stream import MAX_LINE, LineSplitter, StreamParser
+from rig_workbench.simulator.faults import FaultInjector
+from rig_workbench.simulator.phone import Phone
 
 HYPER = changed(fast_config().imu, max_jump_deg=180.0, host="127.0.0.1")
 PLAIN = changed(
@@ -603,3 +605,30 @@ def test_a_stamp_of_an_uptime_has_the_unit_that_is_configured():
 def test_decimal_commas_are_refused_by_name(settings, line):
     readings, parser = feed(settings, line)
     assert not readings and parser.counts["decimal commas"] == 1
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"format": "json", "transport": "udp"},
+        {"format": "json", "transport": "connect"},
+        {"format": "sensorlog"},
+    ],
+)
+def test_the_simulated_phone_sends_what_apps_do(changes):
+    settings = changed(
+        fast_config().imu, host="127.0.0.1", port=0, stamp_column=-1, column_count=0,
+        **changes,
+    )  # fmt: skip
+    phone = Phone(settings, TURNED.as_matrix, FaultInjector(), 100.0)
+    try:
+        if settings.transport == "connect":
+            settings = changed(settings, port=phone.start(0))
+        with Imu(settings) as imu:
+            if settings.transport != "connect":
+                phone.start(imu.port)
+            reading = imu.wait_for_stream(5.0)
+            assert angle_between_deg(reading.value, TURNED.as_matrix()) < 1e-4
+            assert not imu.counts.get("garbage")
+    finally:
+        phone.close()

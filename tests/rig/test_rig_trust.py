@@ -29,15 +29,15 @@ from rig.config import example_text, parse_config
 from rig.core.record_check import ZeroRecord, check_zero, moved
 from rig.faults import MotionFault, Refused
 from rig.identification.conclusion import check_matrix
-from rig.journal import (
+from rig.journal.device import (
     HOMED,
     IDENTIFIED,
     SIGN_CHECKED,
     STOP_PROVED,
     ZEROED,
     DeviceRecord,
-    read_journal,
 )
+from rig.journal.run_folder import read_journal
 from rig.procedures.collect import collect
 from rig.procedures.goto import unchecked
 from rig.procedures.verify import load_calibration, verify

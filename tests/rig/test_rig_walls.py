@@ -5,7 +5,7 @@ from harness import prove_stops
 from loaded import modules_of, required_apart
 
 from rig.config import load_config
-from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
+from rig.journal.device import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
 
 _RIG = """
 from rig.__main__ import main

@@ -13,11 +13,11 @@ from test_rig_motion import bench
 from rig.command_run import Run
 from rig.config import load_config
 from rig.config.config import EXAMPLES
-from rig.config.maps import decode
 from rig.core import stop
 from rig.core.device import timeouts_left
 from rig.faults import MotionFault
-from rig.journal import read_journal
+from rig.journal.run_folder import read_journal
+from rig.registers import decode
 from rig_workbench.simulator import Truth, parse_fault
 
 WATCHED = {'map = "leadshine_pr"': 'map = "generic"'}

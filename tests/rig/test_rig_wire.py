@@ -16,14 +16,16 @@ import time
 import tty
 
 import pytest
-from harness import changed, fast_config, fast_text, simulator
+from harness import changed, fast_config, fast_text, read_words, simulator
 
 from rig.__main__ import main
 from rig.config import load_config
 from rig.config.settings import BusSettings
 from rig.core import stop as core_stop
 from rig.core.stop import stop_all
-from rig.drives.modbus import Bus, BusError, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.line import BusError
+from rig.drives.modbus import ModbusDrive
 from rig.drives.wire import crc16, rtu_reply
 from rig.journal import lock
 from rig.journal.lock import BusLock
@@ -151,7 +153,8 @@ HOLDS = """
 import sys, time
 from rig.config import load_config
 from rig.config.settings import BusSettings
-from rig.drives.modbus import Bus, ModbusDrive
+from rig.drives.bus import Bus
+from rig.drives.modbus import ModbusDrive
 from rig.journal.lock import BusLock
 config = load_config(sys.argv[1])
 lock = BusLock(config.bus).acquire("calibrate")
@@ -323,7 +326,7 @@ def test_bytes_that_are_no_reply_are_shown(network):
         assert any("no unit answers, but bytes came" in line and "11 22 33" in line
                    for line in said)  # fmt: skip
         with Bus(settings) as bus, pytest.raises(BusError, match="01 11 22 33"):
-            bus.read_words(1, 0, 1)
+            read_words(bus, 1, 0, 1)
 
 
 def test_rtu_frames_on_a_port_of_modbus_tcp_are_shown():
@@ -332,7 +335,7 @@ def test_rtu_frames_on_a_port_of_modbus_tcp_are_shown():
         sim.server._take = lambda fd, *_: bytes(os.write(fd, b"\x01\x03\x02ab\x99"))
         with Bus(settings) as bus:
             with pytest.raises(BusError, match="01 03 02 61 62 99"):
-                bus.read_words(1, 0, 1)
+                read_words(bus, 1, 0, 1)
 
 
 def test_a_reply_is_found_among_other_bytes_and_nowhere_else():
