@@ -32,6 +32,7 @@ __all__ = [
     "default_restarts",
     "exchange_from",
     "exchange_indices",
+    "fewest_regular",
     "greedy_indices",
     "solve",
     "solve_greedy",
@@ -240,6 +241,21 @@ def exchange_indices(
             "but every start was singular"
         )
     return chosen
+
+
+def fewest_regular(problem: Problem) -> Problem:
+    """The problem with the fewest to choose that identify in every scenario.
+
+    One scenario alone needs ``problem.k``; none of them may hold all of several.
+    """
+    if not isinstance(problem, ScenarioProblem):
+        return problem
+    most = int(problem.upper.sum())
+    for k in range(problem.k, min(most, len(problem.members) * problem.k) + 1):
+        trial = problem.of_size(k)
+        if Climbs(trial, 0).best_of(1)[1] > -np.inf:
+            return trial
+    return problem
 
 
 def exchange_from(problem: Problem, indices: ArrayLike) -> Indices:

@@ -80,7 +80,8 @@ def _problem_of_scenarios(
 ) -> Problem:
     """The problem in all scenarios."""
     if offer.scenarios is None:
-        return _problem_of_one(offer, k, criterion)
+        one = _problem_of_one(offer, k, criterion)
+        return joined_problem([one], np.ones(1), joined, None)
     members = []
     for s, alone in enumerate(offer.by_scenario()):
         try:
