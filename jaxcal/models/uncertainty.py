@@ -158,7 +158,7 @@ class Noise:
         return Noise(std, covariance, self.command_std)
 
     def typical(self, rows: NDArray[np.bool_]) -> Noise:
-        """The same for all, in root mean square over the ``rows`` (N,) that count."""
+        """Noise that does not differ by row: in root mean square over ``rows`` (N,)."""
         std, covariance = self.std, self.covariance
         if std is not None and np.ndim(std) == 2:
             std = np.sqrt((np.asarray(std)[rows] ** 2).mean(axis=0))

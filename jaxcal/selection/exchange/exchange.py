@@ -12,8 +12,6 @@ still because two are equal.
 
 from __future__ import annotations
 
-import dataclasses
-import itertools
 from typing import Any
 
 import numpy as np
@@ -54,8 +52,6 @@ _WORK = {"D": 24e6, "E": 48e6, "other": 12e6}
 _SHARE = 0.2
 _FURTHER = (1.0, 0.03)
 _RANK_FIRST = 1e-7  # every direction that nothing is known of outweighs the rest
-_RIDGE = 1e-8  # of the information of a mean candidate
-_ENDS = 3  # inputs of which either end is tried
 _MENDING = 10  # random starts where all greedy ones are singular
 
 _CLIMBS = 2.5e5  # k p^3 of the climbs of E in one call, from each kind of start
@@ -76,8 +72,9 @@ def solve_greedy(problem: Problem) -> Solution:
 def greedy_indices(problem: Problem) -> Indices:
     """(k,) candidates in the order picked, the required ones first.
 
-    The best of a few: from small ridges, the largest gain first; and with gains that
-    count a share of what the candidates not chosen yet will give. Swaps mend a singular
+    Gains count a share of what the candidates not chosen yet will give; for D it is the
+    better of that and of plain gains from a small ridge in the coordinates where all
+    candidates together say as much of every direction. Swaps mend a singular
     selection. For E the gain is that in the sum of the variances, which is at most p
     times and at least once the largest: an incomplete selection has no least eigenvalue
     to raise.
@@ -89,38 +86,16 @@ def greedy_indices(problem: Problem) -> Indices:
             break
     else:
         return climbs.best_of(1 + _MENDING)[0]
-    if isinstance(problem, ScenarioProblem):
+    if problem.criterion.name != "D" or _affine(problem):
         return chosen
-    several = np.array([chosen, *_from_ridges(problem)])
-    worth, log_det = values(problem, several)
-    worth = worth if problem.criterion.larger_is_better else -worth
-    return np.asarray(several[np.where(np.isfinite(log_det), worth, -np.inf).argmax()])
+    plain = climbs.climbed(problem.required, _RANK_FIRST, 0)
+    return plain[0] if plain[1] > phi + 1e-9 * max(1.0, abs(phi)) else chosen
 
 
-def _from_ridges(problem: Problem) -> list[Indices]:
-    """Selections (k,) by gain alone, from small multiples of the identity.
-
-    In the caller's coordinates. Of [u, 1] in those where the range of u is [0, 1],
-    counted from either end, so that the pick is the same in any unit.
-    """
-    basis, rows = problem.white.basis, problem.raw[problem.available, 0]
-    bases = [basis]
-    if problem.blocks.shape[1] == 1 and (rows[:, -1] == rows[0, -1]).all():
-        bases, low, span = [], rows.min(axis=0), np.ptp(rows, axis=0)
-        n = len(span) - 1
-        for ends in itertools.product((0.0, 1.0), repeat=min(n, _ENDS)):
-            far = np.append(ends, np.zeros(n + 1 - len(ends)))
-            unit = np.diag(np.where(span > 0.0, span, 1.0) * (1.0 - 2.0 * far))
-            unit[-1] = low + far * span
-            bases.append(unit @ basis)
-    available, found = problem.blocks[problem.available], []
-    for basis in bases:
-        ridge = basis.T @ basis
-        size = (available**2).sum() / np.trace(ridge) / len(available)
-        white = problem.white._replace(prior=problem.prior + _RIDGE * size * ridge)
-        begun = Climbs(dataclasses.replace(problem, white=white), 0)
-        found.append(begun.climbed(problem.required, 0.0, 0)[0])
-    return found
+def _affine(problem: Problem) -> bool:
+    """Whether candidates are rows [u, 1], of which gains with a share choose better."""
+    last = problem.raw[problem.available, :, -1]
+    return bool(last.shape[1] == 1 and (last == last[0]).all() and problem.multiplicity)
 
 
 def default_restarts(problem: Problem) -> int:

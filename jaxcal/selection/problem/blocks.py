@@ -170,7 +170,7 @@ class _ModelBlocks(Blocks):
     def predicted(self) -> Array | None:
         noise = self._noise
         same = self._read is noise and noise.command_std is None
-        by_row = np.ndim(noise.std) == 2 or np.ndim(noise.covariance) == 3
+        by_row = len(np.shape(noise.std)) == 2 or len(np.shape(noise.covariance)) == 3
         return self.used if by_row or not same else None
 
     def leverage_slopes(self, commands: Array, metric: Array) -> Array | None:
