@@ -163,11 +163,11 @@ def _noise(
         moves = (np.diff(off, axis=0) != 0.0).mean(axis=(0, 1)) if off.size else 1.0
         new = _of_differences(off)
         if not len(noise):
-            noise, known = new, np.zeros(len(new), dtype=np.bool_)
+            noise, settled = new, np.zeros(len(new), dtype=np.bool_)
             size = np.abs(values).max(axis=(0, 1), initial=0.0)
-        noise = np.where(known, noise, new)
-        known = known | (moves > 0.5)
-        if known.all():
+        noise = np.where(settled, noise, new)
+        settled = settled | (moves > 0.5)
+        if settled.all():
             break
     quantum = _printed(np.concatenate(seen))
     return np.maximum(

@@ -43,6 +43,7 @@ Array = NDArray[np.float64]
 
 _PILOTS = 4  # commands at which steps are chosen
 _ROUGH = 0.1  # of the largest derivative: a difference between orders that is told
+_LONG = 512  # rows of a table that is remembered as a whole
 _SETS = 6  # of parameters whose results are kept in memory
 
 
@@ -436,6 +437,13 @@ class _Memory:
     ) -> Array:
         """Results (N, ...) at rows, those made that are not known."""
         key = what, theta.tobytes()
+        if len(rows) > _LONG:  # as a whole
+            key = key[0], key[1] + rows.tobytes()
+            results = self._sets.pop(key, None) or {b"": make(rows)}
+            self._sets[key] = results
+            while len(self._sets) > 3 * _SETS:
+                del self._sets[next(iter(self._sets))]
+            return results[b""]
         results = self._sets.pop(key, {})
         self._sets[key] = results  # the newest
         while len(self._sets) > 3 * _SETS:

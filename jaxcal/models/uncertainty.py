@@ -157,6 +157,15 @@ class Noise:
             covariance = np.asarray(covariance)[rows]
         return Noise(std, covariance, self.command_std)
 
+    def typical(self, rows: NDArray[np.bool_]) -> Noise:
+        """Noise that does not differ by row: in root mean square over ``rows`` (N,)."""
+        std, covariance = self.std, self.covariance
+        if std is not None and np.ndim(std) == 2:
+            std = np.sqrt((np.asarray(std)[rows] ** 2).mean(axis=0))
+        if covariance is not None and np.ndim(covariance) == 3:
+            covariance = np.asarray(covariance)[rows].mean(axis=0)
+        return Noise(std, covariance, self.command_std)
+
     def beside(self, std: float) -> Noise:
         """This noise and, independent of it, one of ``std`` in every reading."""
         if self.covariance is None:

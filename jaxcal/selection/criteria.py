@@ -232,7 +232,9 @@ class E(Criterion):
 
 
 class I(Criterion):  # noqa: E742 - the criterion's own name in the literature
-    """Mean variance of the predictions over a region.
+    """Mean variance of the predictions over a region, in units of the noise.
+
+    Noise that differs by row is taken in root mean square: a prediction is no reading.
 
     Args:
         region: (R, n) commands, or (R, q, p) blocks, at which predictions are wanted;

@@ -19,6 +19,7 @@ from jaxcal.late import late
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.exact.exact import TIME_LIMIT, solve_exact
+from jaxcal.selection.exchange.exchange import fewest_regular
 from jaxcal.selection.problem import (
     CandidateSet,
     Problem,
@@ -222,7 +223,8 @@ class Design:
         """
         checked = checked_options(method, options)
         start = time.perf_counter()
-        problem = _with_optima(self.problem(k, criterion, region))
+        problem = self.problem(k, criterion, region)
+        problem = _with_optima(fewest_regular(problem) if k is None else problem)
         solution = SOLVERS[method](problem, **checked)
         return self._judged(problem, solution, method, start)
 

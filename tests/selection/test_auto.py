@@ -115,3 +115,15 @@ def test_a_senseless_efficiency_is_refused(value):
 def test_unknown_methods_name_auto_too():
     with pytest.raises(ValueError, match="auto, got 'best'"):
         jaxcal.select(np.eye(4)[:, :3], method="best")
+
+
+def test_the_search_is_no_worse_than_the_exchange(rng):
+    model = jaxcal.models.Polynomial(2, 3, 1)
+    design = jaxcal.Design(rng.uniform(-1.0, 1.0, (600, 3)), model)
+    for criterion in ("D", "A"):
+        exchange = design.select(14, criterion, "exchange")
+        better = exchange.value if criterion == "D" else -exchange.value
+        for method in ("exact", "auto"):
+            found = design.select(14, criterion, method, time_limit=0.3)
+            value = found.value if criterion == "D" else -found.value
+            assert value >= better - 1e-9 * abs(better)

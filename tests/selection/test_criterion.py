@@ -1,10 +1,13 @@
 """Each criterion against its definition, its gradient against finite differences."""
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import jaxcal
 from jaxcal.selection.criteria import CRITERIA
 
 P = 4
@@ -93,3 +96,25 @@ def test_a_factor_of_the_root_is_given_back_by_the_offset():
     plain = CRITERIA["Ds"].of_rows(PICK, 2)
     expected = plain.reported(plain.value(m))
     assert changed.reported(changed.value(m)) == pytest.approx(expected)
+
+
+def test_i_of_noise_that_differs_by_row_is_the_mean_variance(rng):
+    rows = np.linspace(0.0, 1.0, 9)[:, None]
+    plain = np.hstack([np.ones((9, 1)), rows])
+    model = jaxcal.models.Polynomial(1, 1, 1)
+    for _ in range(5):
+        std = 0.2 + rng.uniform(0.0, 2.0) * rows
+
+        def mean_variance(chosen, std=std):
+            white = plain[list(chosen)] / std[list(chosen)]
+            return np.trace(np.linalg.inv(white.T @ white) @ plain.T @ plain) / 9
+
+        best = min(map(mean_variance, itertools.combinations(range(9), 3)))
+        for criterion in ("I", jaxcal.I(rows)):
+            chosen = jaxcal.select(
+                rows, 3, model=model, noise=jaxcal.Noise(std=std), criterion=criterion
+            )
+            assert chosen.proven
+            np.testing.assert_allclose(mean_variance(chosen.indices), best, rtol=1e-9)
+            # In units of the noise, which is 1 in root mean square.
+            np.testing.assert_allclose(chosen.value * (std**2).mean(), best, rtol=1e-9)

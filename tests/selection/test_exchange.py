@@ -143,3 +143,32 @@ def test_the_smallest_eigenvalue_is_no_lower_than_that_of_known_selections():
         )
         rise.append(np.log(now / then))
     assert np.mean(rise) >= 0.0
+
+
+def textbook(rows, k):
+    """Greedy from a small ridge, the largest gain of log det first."""
+    information, left, chosen = 1e-8 * np.eye(rows.shape[1]), np.ones(len(rows)), []
+    for _ in range(k):
+        gains = np.einsum("ij,jk,ik->i", rows, np.linalg.inv(information), rows)
+        chosen.append(int((gains * left).argmax()))
+        left[chosen[-1]] = 0.0
+        information += np.outer(rows[chosen[-1]], rows[chosen[-1]])
+    return chosen
+
+
+@pytest.mark.parametrize(
+    "count, degree, k", [(50, 1, 4), (50, 1, 12), (2000, 2, 12), (20_000, 2, 20)]
+)
+def test_greedy_is_as_good_as_the_textbooks(rng, count, degree, k):
+    model, shares = jaxcal.models.Polynomial(degree, 3, 1), []
+    for _ in range(3 if count > 50 else 15):
+        candidates = rng.uniform(0.0, 1.0, (count, 3))
+        rows = model.jacobian(candidates)[:, 0]
+        chosen = jaxcal.select(candidates, k, "greedy", model=model, criterion="D")
+        own, other = (
+            np.linalg.slogdet(rows[one].T @ rows[one])[1]
+            for one in (chosen.indices, textbook(rows, k))
+        )
+        shares.append(np.exp((own - other) / rows.shape[1]))
+    assert np.mean(shares) >= 0.99
+    assert degree == 1 or min(shares) >= 0.95

@@ -60,7 +60,7 @@ _READINGS = 1.5  # for each parameter; of fewer another machine explains as much
 _CHANCE = 0.02  # that so many outliers stand so near one another
 _APART = "apart"  # kind: outliers that are one block
 _SORTED = ("commands sorted", "readings sorted")  # kinds
-_ROWS = 20_000  # of more the first
+_ROWS, _RUNS = 20_000, 400  # of more the first; of a function that is run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,10 +183,10 @@ def _table(
     """
     resolved = prior.resolve(model)
     free = resolved.free & (not held)
-    if len(commands) > _ROWS:
-        commands, measured, counted = (
-            commands[:_ROWS], measured[:_ROWS], counted[:_ROWS],
-        )  # fmt: skip
+    most = _RUNS if model.resolution else _ROWS
+    if len(commands) > most:
+        commands, measured = commands[:most], measured[:most]
+        counted = counted[:most]
     flat = bool((resolved.precisions == 0.0).all() and free.all())
     shared = model.multiplicity > 0 and flat
     # A measurement that is written twice counts once.

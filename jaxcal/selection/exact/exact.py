@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 STARTING_RESTARTS = 30  # of the exchange: the search does the rest
+_SEARCHED = 0.85  # of the time, before the exchange goes on where nothing is proven
 TIME_LIMIT = 10.0  # seconds of one search where none is given
 _BLOCKS_LIMIT = 2.0  # of auto: what is not proven by then often takes minutes
 
@@ -147,11 +148,17 @@ def solve_exact(
     if len(first) < len(keep):
         rules = [np.add.reduceat(numbers, first) for numbers in rules]
     low, high, begun = rules
+    more = default_restarts(problem)
+    time = deadline.part(_SEARCHED) if more > restarts else deadline
     searched = _branched(
         problem, keep[first], low, np.minimum(high, problem.k), begun,
-        best=best, deadline=deadline, enough=enough,
+        best=best, deadline=time, enough=enough,
     )  # fmt: skip
     subsets = [_expand(problem, keep, first, numbers) for numbers in searched.counts]
+    if not searched.proven and more > restarts:  # no worse than the exchange alone
+        other = np.sort(exchange_indices(problem, more, seed, deadline))
+        if not any(np.array_equal(other, np.sort(one)) for one in subsets):
+            subsets.append(other)
     bound = None if searched.proven else searched.bound
     return _solution_of(problem, subsets, best, bound, searched.nodes)
 

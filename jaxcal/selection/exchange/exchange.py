@@ -27,6 +27,7 @@ __all__ = [
     "default_restarts",
     "exchange_from",
     "exchange_indices",
+    "fewest_regular",
     "greedy_indices",
     "solve",
     "solve_greedy",
@@ -66,17 +67,30 @@ def solve_greedy(problem: Problem) -> Solution:
 def greedy_indices(problem: Problem) -> Indices:
     """(k,) candidates in the order picked, the required ones first.
 
-    Gains count a share of what the candidates not chosen yet will give, and swaps mend
-    a singular selection. For E the gain is that in the sum of the variances, which is
-    at most p times and at least once the largest: an incomplete selection has no least
-    eigenvalue to raise.
+    Gains count a share of what the candidates not chosen yet will give; for D it is the
+    better of that and of plain gains from a small ridge in the coordinates where all
+    candidates together say as much of every direction. Swaps mend a singular
+    selection. For E the gain is that in the sum of the variances, which is at most p
+    times and at least once the largest: an incomplete selection has no least eigenvalue
+    to raise.
     """
     climbs = Climbs(problem, 0)
     for share, swaps in ((climbs.share, 0), (_RANK_FIRST, 0), (climbs.share, 1)):
         chosen, phi = climbs.climbed(problem.required, share, swaps)
         if phi > -np.inf:
-            return chosen
-    return climbs.best_of(1 + _MENDING)[0]
+            break
+    else:
+        return climbs.best_of(1 + _MENDING)[0]
+    if problem.criterion.name != "D" or _affine(problem):
+        return chosen
+    plain = climbs.climbed(problem.required, _RANK_FIRST, 0)
+    return plain[0] if plain[1] > phi + 1e-9 * max(1.0, abs(phi)) else chosen
+
+
+def _affine(problem: Problem) -> bool:
+    """Whether candidates are rows [u, 1], of which gains with a share choose better."""
+    last = problem.raw[problem.available, :, -1]
+    return bool(last.shape[1] == 1 and (last == last[0]).all() and problem.multiplicity)
 
 
 def default_restarts(problem: Problem) -> int:
@@ -234,6 +248,21 @@ def exchange_indices(
             "but every start was singular"
         )
     return chosen
+
+
+def fewest_regular(problem: Problem) -> Problem:
+    """The problem with the fewest to choose that identify in every scenario.
+
+    One scenario alone needs ``problem.k``; none of them may hold all of several.
+    """
+    if not isinstance(problem, ScenarioProblem):
+        return problem
+    most = int(problem.upper.sum())
+    for k in range(problem.k, min(most, len(problem.members) * problem.k) + 1):
+        trial = problem.of_size(k)
+        if Climbs(trial, 0).best_of(1)[1] > -np.inf:
+            return trial
+    return problem
 
 
 def exchange_from(problem: Problem, indices: ArrayLike) -> Indices:

@@ -263,7 +263,12 @@ def _rows(
     indices: Indices | None = None
     ks = range(least_k, max_k + 1) if sizes.bound(max_k) <= _ENOUGH else ()
     for k in ks:  # none where no K allowed is enough
-        indices, variance = sizes.best(k, indices)
+        try:
+            indices, variance = sizes.best(k, indices)
+        except ValueError:  # singular in a scenario
+            if rows or k == max_k:
+                raise
+            continue
         bound = max(min(sizes.bound(k), variance.max()), 0.0)
         row = PlanRow(k, indices, unit * np.sqrt(variance), unit * np.sqrt(bound))
         rows.append(row)

@@ -72,7 +72,8 @@ def problem_of(
     default = "I" if offer.model and not offer.model.multiplicity else "D"
     of_one = criterion_of(joined.criterion, region, default)
     if offer.scenarios is None:
-        return _problem_of_one(offer, k, of_one)
+        one = _problem_of_one(offer, k, of_one)
+        return joined_problem([one], np.ones(1), joined, None)
     members = []
     for s, alone in enumerate(offer.by_scenario()):
         try:

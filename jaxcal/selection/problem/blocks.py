@@ -141,7 +141,7 @@ class _ModelBlocks(Blocks):
         return blocks
 
     def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
-        noise = self._read if readings else self._noise
+        noise = self._read if readings else self._noise.typical(self._available)
         for name, axes in (("std", 1), ("covariance", 2)):
             shape = np.shape(getattr(noise, name))
             if len(shape) > axes:
@@ -168,8 +168,10 @@ class _ModelBlocks(Blocks):
         return noise.weigh(jacobian, slopes)
 
     def predicted(self) -> Array | None:
-        same = self._read is self._noise and self._noise.command_std is None
-        return None if same else self.used
+        noise = self._noise
+        same = self._read is noise and noise.command_std is None
+        by_row = len(np.shape(noise.std)) == 2 or len(np.shape(noise.covariance)) == 3
+        return self.used if by_row or not same else None
 
     def leverage_slopes(self, commands: Array, metric: Array) -> Array | None:
         if self._read.command_std is not None:

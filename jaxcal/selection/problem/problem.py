@@ -264,7 +264,8 @@ def joined_problem(
     criterion: ScenarioCriterion,
     nominal: Problem | None,
 ) -> Problem:
-    """The problem of scenarios; where all are equal it is that of one.
+    """The problem of scenarios; where all are equal it is that of one, but
+    for efficiencies.
 
     Args:
         members: (S,) problems that differ in blocks and prior only.
@@ -273,7 +274,7 @@ def joined_problem(
         nominal: the problem at the model's nominal, where there is a model.
     """
     first, k = members[0], max(member.k for member in members)
-    if all(
+    if not criterion.of_efficiency and all(
         (member.raw == first.raw).all() and np.array_equal(member.root, first.root)
         for member in members[1:]
     ):
