@@ -54,12 +54,15 @@ def chosen(fit: Fit) -> Fit:
     """The calibration, or one with the effects that held-out readings ask for.
 
     Left as it is: of a noise or prior that was stated, a scatter that the noise
-    explains, contacts at few places, and fewer than 12 measurements.
+    explains, contacts at few places, a table that is mispaired, and fewer than 12
+    measurements.
     """
     model = fit.model
     stated = fit.noise_std is None or fit.noise_known or "prior" in fit.provenance
     few = fit.num_measurements < max(_ENOUGH, len(model.joint_names) + 6)
     if stated or few or not model.fits_misfit or scatter(fit) < SCATTER:
+        return fit
+    if fit.mispairing is not None:  # no effect of the arm
         return fit
     before, trials = _held_out(fit), {}
     for words, other, prior in _alternatives(model):
