@@ -54,12 +54,15 @@ def chosen(fit: Fit) -> Fit:
     """The calibration, or one with the effects that held-out readings ask for.
 
     Left as it is: of a noise or prior that was stated, a scatter that the noise
-    explains, contacts at few places, and fewer than 12 measurements.
+    explains, contacts at few places, a table that is mispaired, and fewer than 12
+    measurements.
     """
     model = fit.model
     stated = fit.noise_std is None or fit.noise_known or "prior" in fit.provenance
     few = fit.num_measurements < max(_ENOUGH, len(model.joint_names) + 6)
     if stated or few or not model.fits_misfit or scatter(fit) < SCATTER:
+        return fit
+    if fit.mispairing is not None:  # no effect of the arm
         return fit
     before, trials = _held_out(fit), {}
     for words, other, prior in _alternatives(model):
@@ -74,15 +77,15 @@ def chosen(fit: Fit) -> Fit:
     best = min((off for _, off in trials.values()), key=np.mean)
     # The least that is added: more must be better beyond chance.
     name = next(n for n, (_, off) in trials.items() if not _surely(off, best))
-    found, off = trials[name]
+    fitted, off = trials[name]
     if not (_surely(before, off) and off.mean() < _BETTER * before.mean()):
-        name, found = _AS_IT_IS, fit
+        name, fitted = _AS_IT_IS, fit
     errors = {n: float(off.mean()) for n, (_, off) in trials.items()}
     effects = {"chosen": name, "held_out": {_AS_IT_IS: float(before.mean())} | errors}
     origin = {**fit.provenance, "effects": effects}
-    if found is not fit:
+    if fitted is not fit:
         origin["prior"] = "stated"
-    return dataclasses.replace(found, provenance=origin)
+    return dataclasses.replace(fitted, provenance=origin)
 
 
 def _surely(errors: Array, less: Array) -> bool:
@@ -188,8 +191,8 @@ def play_in_words(fit: Fit, unit: str) -> list[str]:
         return []
     names = np.array(zeros)[seen][sure]
     sizes = ", ".join(
-        f"{name} {2.0 * abs(each):.2g} deg"
-        for name, each in zip(names, play[sure], strict=True)
+        f"{name} {2.0 * abs(half):.2g} deg"
+        for name, half in zip(names, play[sure], strict=True)
     )
     return [
         f"Residuals follow the side that joints came from (play: {sizes}): always "

@@ -174,7 +174,7 @@ class ArmVerdict(models.Verdict):
 def _missed(
     errors: Sequence[HeldOut], accuracy: Mapping[str, float] | None
 ) -> list[HeldOut]:
-    """Those that are not below the accuracy asked for."""
+    """Errors that are not below the accuracy asked for."""
     asked = accuracy or {}
     return [one for one in errors if one.interval[1] > asked.get(one.unit, np.inf)]
 
@@ -550,7 +550,7 @@ class _Helps(NamedTuple):
 
 
 def _helps(held_out: Array, off: Array) -> _Helps:
-    """Of readings (K, q) in noise."""
+    """Held-out errors (K, q) and the nominal arm's, in noise, compared."""
     mean, half_width = _mean(np.linalg.norm(held_out, axis=1))
     nominal = float(np.linalg.norm(off, axis=1).mean()) or 1e-300
     return _Helps(mean / nominal, (mean + half_width) / nominal)

@@ -183,7 +183,8 @@ class SavedFiles:
             lines = [f"saved {self.out}"]
         if self.transform:
             parent, child = (self.frames or ",").split(",")
-            count = len(calibration.model.sensor.members)
+            arm: Any = calibration.model
+            count = len(arm.sensor.members)
             for camera in range(count):
                 stem, ending = os.path.splitext(self.transform)
                 number = f"_{camera}" if count > 1 else ""

@@ -88,8 +88,8 @@ def static_transform(
     ]
     tool = [f"tool {axis}" for axis in sensor.tool]
     owns = [model.names[model.own(i)] for i in range(len(sensors))]
-    found = {*tool, *(name for own in owns for name in own)}
-    held = tuple(name for name in model.names if name not in found)
+    fitted = {*tool, *(name for own in owns for name in own)}
+    held = tuple(name for name in model.names if name not in fitted)
     again = calibration.again(model, Prior(model.default_prior().std, fixed=held))
     theta, source = again.parameters, model.source
     if sensor.moves == "camera":

@@ -387,10 +387,10 @@ def _hand_and_eye(tip: Tip, turn: Array, shift: Array) -> tuple[float, Array, Ar
         left, size, right = np.linalg.svd(mix)
         free = np.eye(3)  # directions of the tool's shift that the views show
         if size[1] > _ONE_AXIS * size[0]:
-            found = _about_one_axis(arm, tip.position[used], turn[used], shift[used])
-            if found is None:
+            partial = _about_one_axis(arm, tip.position[used], turn[used], shift[used])
+            if partial is None:
                 return np.inf, place, new
-            stand, free = found
+            stand, free = partial
             tool = _nearest((np.matrix_transpose(arm) @ stand @ turn[used]).sum(axis=0))
         else:
             tool, stand = (_nearest(v.reshape(3, 3)) for v in (left[:, 0], right[0]))
@@ -448,11 +448,11 @@ def _about_one_axis(
     rows = [arm @ across, eye, -flat[..., None], -aside[..., None]]
     right = np.outer(there @ axis, axis) - position
     table = np.concatenate(rows, axis=-1).reshape(3 * len(arm), -1)
-    found, _, rank, _ = np.linalg.lstsq(table, right.ravel(), rcond=1e-6)
+    solution, _, rank, _ = np.linalg.lstsq(table, right.ravel(), rcond=1e-6)
     if rank < table.shape[1]:
         return None
-    by = Rotation.from_rotvec(np.arctan2(found[-1], found[-2]) * axis)
-    return by.as_matrix() @ first, across
+    angle = np.arctan2(solution[-1], solution[-2])
+    return Rotation.from_rotvec(angle * axis).as_matrix() @ first, across
 
 
 def _inverse(turn: Array, shift: Array) -> tuple[Array, Array]:

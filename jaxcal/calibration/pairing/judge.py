@@ -53,6 +53,7 @@ _TRIED = 6  # hypotheses that are fitted one by one
 _WORTH = 12.0  # log of the odds: of those that are so much worse at first, none
 _EXACT = 1e-6  # of the spread: readings so near a fit have nothing to explain
 _NEXT, _LARGE = 8.0, 3.0  # times the residuals: neighbours, a row
+_USUAL = 2.0  # times the usual noise of a sensor
 _TREND = 1.4  # of a sum of residuals, over the root of their squares
 _LEAST = 6  # rows
 _NAMED = 2  # other explanations
@@ -285,8 +286,13 @@ def _plainly_right(fit: Fit) -> bool:
     apart = np.sort(np.abs(said[1:] - said[:-1]), axis=0)[len(off) // 2 - 1]
     if (rms <= _EXACT * apart).all():
         return True
-    if (apart < _NEXT * rms).any() or (np.abs(off) > _LARGE * rms).any():
+    # Of many normal residuals the largest is about the root of 2 log N.
+    large = max(_LARGE, float(np.sqrt(2.0 * np.log(off.size))) + 0.7)
+    if (apart < _NEXT * rms).any() or (np.abs(off) > large * rms).any():
         return False
+    usual = fit.model.default_noise()
+    if usual is not None and (rms <= _USUAL * np.asarray(usual.std)).all():
+        return True  # no more is left than a sensor of its kind reads beside
     moved = fit.commands - fit.commands.mean(axis=0)
     factors = np.concatenate([np.ones((len(off), 1)), moved], axis=1)
     scores = off[..., None] * factors[:, None]
