@@ -170,7 +170,8 @@ class _ModelBlocks(Blocks):
     def predicted(self) -> Array | None:
         noise = self._noise
         same = self._read is noise and noise.command_std is None
-        by_row = len(np.shape(noise.std)) == 2 or len(np.shape(noise.covariance)) == 3
+        sizes = (noise.std, 2), (noise.covariance, 3)
+        by_row = any(x is not None and np.ndim(x) == axes for x, axes in sizes)
         return self.used if by_row or not same else None
 
     def leverage_slopes(self, commands: Array, metric: Array) -> Array | None:
