@@ -16,11 +16,10 @@ from rig.config.maps import (
     MAP_FOLDER,
     DriveMap,
     RegisterMap,
-    decode,
-    encode,
     load_map,
 )
 from rig.config.schema import Section, parse
+from rig.registers import decode, encode
 
 EXAMPLE_TEXT = (EXAMPLES / "simulate.toml").read_text()
 GENERIC = (MAP_FOLDER / "generic.toml").read_text()

@@ -137,7 +137,8 @@ def test_mutated_sensor_logger_messages(count):
         body = mutate(rng, json.dumps({"messageId": 1, "payload": [entry]}).encode())
         for reading in parser.body(body, number * 0.01):
             entry = json.loads(body)["payload"][0]
-            given = entry.get("values", entry)
+            within = [v for v in entry.values() if isinstance(v, dict)]
+            given = next(each for each in [entry, *within] if "qx" in each)
             numbers = [float(given[key]) for key in ("qx", "qy", "qz", "qw")]
             right = Rotation.from_quat(numbers).as_matrix()
             np.testing.assert_allclose(reading.value, right, atol=1e-9)
