@@ -355,15 +355,15 @@ def check(
 
     path = config or file or FILE
     loaded = load_config(path)
-    left = not_asked_for(loaded, run)
-    if loaded.model is not None and loaded.model.factory not in left:
+    unrun = not_asked_for(loaded, run)
+    if loaded.model is not None and loaded.model.factory not in unrun:
         from rig.device_model import model_of  # numpy: half of this command's time
 
         model_of(loaded)
-    if not {axis.map.drive for axis in loaded.axes} & {*left}:
+    if not {axis.map.drive for axis in loaded.axes} & {*unrun}:
         make_drives(loaded.bus, loaded.axes)
     print(f"{path}: valid")
-    for name in left:
+    for name in unrun:
         print(f"  NOT run, and so not checked: {name}, a program that it names. "
               f"With --run {name} it is")  # fmt: skip
     for axis in loaded.axes:

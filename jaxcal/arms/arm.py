@@ -430,7 +430,7 @@ def apparent_length(table: Array, tool: Array) -> tuple[float, int]:
         along[i + 1] += np.sign(np.cos(between[i])) * along[i]
         along[i] = 0.0
     together = float(np.hypot(table[:, 0], along).sum() + rest)
-    if plain < _CANCELS * together:
+    if plain <= _CANCELS * together:
         return plain, 0
     return together, 1 + int(np.abs(table[:, 2]).argmax())
 

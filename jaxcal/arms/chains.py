@@ -301,6 +301,10 @@ class Chains(Model):
                 )
         return slopes
 
+    def length_unit(self, measured_unit: str) -> str:
+        """The unit of lengths, which all arms share; see ``SerialChain``."""
+        return self.chains[0].length_unit(measured_unit)
+
     def accuracy_units(self, measured_unit: str) -> tuple[str, ...]:
         units = (unit for arm in self.chains for unit in arm.accuracy_units(""))
         return tuple(dict.fromkeys(units))

@@ -29,6 +29,7 @@ from jaxcal.information.singular import depends, significant
 from jaxcal.models import verdict as models
 from jaxcal.models.reasons import (
     Reason,
+    computed,
     in_rows,
     never_measured,
     outlying,
@@ -196,7 +197,10 @@ def verdict(calibration: Fit) -> ArmVerdict:
             f"sensor's usual one: {_usual_noise(calibration)})",
             unit=unit,
         )
-    if not model.sensor.zeros and (reason := never_measured(calibration)):
+    reason = None
+    if not model.sensor.zeros:
+        reason = never_measured(calibration) or computed(calibration)
+    if reason is not None:
         return ArmVerdict(
             good=False, reasons=(reason.fact,), next_step=reason.remedy, unit=unit
         )

@@ -24,7 +24,7 @@ _ARM = """\
 jaxcal select poses.csv -k 12 --model arm.urdf --noise 0.0001
 jaxcal identify measured.csv --model arm.urdf --noise 0.0001 --out arm.json
 jaxcal predict arm.json poses.csv"""
-_DEVICE = "jaxcal-rig calibrate --simulate --config rig.toml"
+_DEVICE = "jaxcal-rig simulate calibrate --config rig.toml"
 _LINKS = np.array([[0.09, 0.0], [0.42, 0.0], [0.39, 0.0], [0.11, 0.0]])  # x, z in m
 _AXES = ["0 0 1", "0 1 0", "0 1 0", "1 0 0"]
 

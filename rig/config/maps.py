@@ -46,8 +46,8 @@ Names = Annotated[
 class Read(Section, registers.Value):
     """A value to read: registers, or bits."""
 
-    address: Register
-    type: Kind = "u16"
+    address: Register = key("of the register, or bit, as the protocol counts: from 0")
+    type: Kind = key("of the number, as in a map", "u16")
     function: Literal[1, 2, 3, 4] = key(
         "3 holding or 4 input registers, 1 coils, 2 discrete inputs", 3
     )

@@ -196,7 +196,7 @@ class Bus(Line):
         raise AssertionError("unreachable")
 
     def _tell_late(self, unit: int, error: BusError) -> None:
-        """Of a unit that has never answered: whether its reply comes after its time.
+        """Say of a unit that has never answered whether its reply is only late.
 
         Nothing was moved over this line then, so there is time to wait for it.
         """
@@ -261,14 +261,14 @@ class Bus(Line):
         function, address = place
         for _ in range(PROBES):
             recent = time.monotonic() - LATEST_S
-            owed = [each for each in self._owed.get(unit, []) if each[2] > recent]
+            owed = [reply for reply in self._owed.get(unit, []) if reply[2] > recent]
             self._owed[unit] = owed
             if not owed:
                 return
             sizes = [size if asked == function else 0 for asked, size, _ in owed]
-            each = 1 if function in REGISTERS else 8
+            step = 1 if function in REGISTERS else 8
             quantity = next(
-                n for n in range(each, 99 * each, each)
+                n for n in range(step, 99 * step, step)
                 if data_size(function, n) not in sizes
             )  # fmt: skip
             try:

@@ -102,7 +102,7 @@ class StreamParser:
         """Readings of CSV lines that arrived at ``now`` (monotonic s)."""
         if self._settings.format != "json":
             return self._accept(lines, self._line, now)
-        found: list[Any] = []
+        entries: list[Any] = []
         for line in lines:
             try:
                 told = [*_orientations(json.loads(line))]
@@ -110,8 +110,8 @@ class StreamParser:
                 self.counts["not JSON"] += 1
                 continue
             self.counts["without a rotation vector or quaternion"] += not told
-            found += told
-        return self._accept(found, self._orientation, now)
+            entries += told
+        return self._accept(entries, self._orientation, now)
 
     def body(self, body: bytes, now: float) -> list[Reading]:
         """Readings of one message Sensor Logger pushed; ``foreign`` says that it is
@@ -184,12 +184,12 @@ class StreamParser:
         names = [re.sub(r"[^a-z]", "", f.partition("(")[0].lower()) for f in fields]
         for end in QUATERNION:
             ends = [end.format(letter) for letter in "xyzw"]
-            found = [[i for i, n in enumerate(names) if n.endswith(e)] for e in ends]
-            if all(len(columns) == 1 for columns in found):
-                x, y, z, w = (columns[0] for columns in found)
+            places = [[i for i, n in enumerate(names) if n.endswith(e)] for e in ends]
+            if all(len(columns) == 1 for columns in places):
+                x, y, z, w = (columns[0] for columns in places)
                 self._quaternion, self._width = (x, y, z, w), len(fields)
                 starts = [n.startswith("motiontimestamp") for n in names]
-                stamps = [i for i, found_there in enumerate(starts) if found_there]
+                stamps = [i for i, starts_so in enumerate(starts) if starts_so]
                 self._stamp_column = stamps[0] if stamps else -1
                 self._unit_s = 1.0 if stamps else None
                 used = [*self._quaternion, *stamps[:1]]
@@ -197,8 +197,8 @@ class StreamParser:
                 return
 
     def _seconds(self, stamp: float, unit: str) -> float:
-        """Of a stamp: in the unit in which the first one is the present time, within a
-        day; else in that which is configured, or usual for the app."""
+        """A stamp in seconds, by the unit in which the first one is the present time
+        within a day; else by that which is configured, or usual for the app."""
         if self._unit_s is None:
             now = time.time()
             units = [u for u in UNITS_S.values() if abs(stamp * u - now) < DAY_S]
@@ -293,8 +293,8 @@ def _orientations(data: Any) -> Iterator[tuple[Any, list[Any]]]:
     "android.sensor.rotation_vector", "values": [..]}``, ``{"name": "orientation",
     "values": {"qx": ..}}``, alone, in a list or as a ``payload``."""
     if isinstance(data, list):
-        for each in data:
-            yield from _orientations(each)
+        for entry in data:
+            yield from _orientations(entry)
     if not isinstance(data, dict):
         return
     values = data.get("values", data.get("value", data))

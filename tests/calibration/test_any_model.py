@@ -560,7 +560,10 @@ def broken(method: str, answer: Any) -> Any:
         ({"noise": Noise(1.0, command_std=[1, 2, 3])}, "command_std must be one"),
         ({"noise": Noise(1.0, command_std=np.inf)}, "must leave fewer unknown"),
         ({"noise_std": 1.0, "common_noise": True}, "give one of them"),
-        ({"noise": 0.1}, r"noise must be a jaxcal.Noise\(std=...\), got float"),
+        (
+            {"noise": "0.1"},
+            "noise must be a jaxcal.Noise or its standard deviation, got str",
+        ),
         ({"common_noise": "no"}, "common_noise must be True, False or a label"),
         ({"input_names": "ab"}, "input_names must hold 2 different names, got 'ab'"),
         ({"loss": "huber"}, "loss must be one of student, gaussian"),

@@ -131,7 +131,7 @@ def test_a_negative_value_after_a_blank(folder, monkeypatch, capsys):
     ],
 )
 def test_an_import_names_its_extra(imported, missing, extra):
-    code = f"import sys; sys.modules[{missing!r}] = None; import {imported}"
+    code = f"import sys; sys.modules[{missing!r}] = None; from {imported} import *"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False
     )
