@@ -144,12 +144,8 @@ def flock(fd: int, kind: int = EXCLUSIVE) -> bool:
     """
     try:
         if sys.platform == "win32":
-            at = os.lseek(fd, 0, os.SEEK_CUR)
-            os.lseek(fd, 1 << 30, os.SEEK_SET)
-            try:
-                msvcrt.locking(fd, msvcrt.LK_NBLCK, 1)
-            finally:
-                os.lseek(fd, at, os.SEEK_SET)
+            os.lseek(fd, 1 << 30, os.SEEK_SET)  # what is written goes to the end
+            msvcrt.locking(fd, msvcrt.LK_NBLCK, 1)
         else:
             fcntl.flock(fd, kind | fcntl.LOCK_NB)
     except (BlockingIOError, PermissionError):

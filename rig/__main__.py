@@ -14,10 +14,7 @@ if sys.argv[1:2] == ["stop"]:  # nothing may keep it from the drives
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     if sys.platform == "win32":
-        print(
-            "jaxcal-rig needs Linux or macOS: its locks and signals are POSIX's",
-            file=sys.stderr,
-        )
+        print("jaxcal-rig needs Linux or macOS", file=sys.stderr)
         return 2
     argv = sys.argv[1:] if argv is None else list(argv)
     if argv[:1] == ["stop"] and not {"-h", "--help"} & {*argv}:
