@@ -124,6 +124,15 @@ def test_random_imu_streams_keep_no_memory(count):
     assert len(parser.counts) < 20
 
 
+def quaternion_in(data):
+    """The first dictionary with a quaternion, however deep."""
+    if isinstance(data, dict) and "qx" in data:
+        return data
+    inner = data.values() if isinstance(data, dict) else data
+    within = [quaternion_in(each) for each in inner if isinstance(each, dict | list)]
+    return next((each for each in within if each), None)
+
+
 @pytest.mark.parametrize("count", [pytest.param(5_000, id="quick"),
     pytest.param(100_000, id="full", marks=pytest.mark.slow)])  # fmt: skip
 def test_mutated_sensor_logger_messages(count):
@@ -136,9 +145,7 @@ def test_mutated_sensor_logger_messages(count):
         entry = {"name": "orientation", "time": number * 10_000_000, "values": values}
         body = mutate(rng, json.dumps({"messageId": 1, "payload": [entry]}).encode())
         for reading in parser.body(body, number * 0.01):
-            entry = json.loads(body)["payload"][0]
-            within = [v for v in entry.values() if isinstance(v, dict)]
-            given = next(each for each in [entry, *within] if "qx" in each)
+            given = quaternion_in(json.loads(body)["payload"])
             numbers = [float(given[key]) for key in ("qx", "qy", "qz", "qw")]
             right = Rotation.from_quat(numbers).as_matrix()
             np.testing.assert_allclose(reading.value, right, atol=1e-9)
