@@ -379,8 +379,8 @@ def check(
 
 
 def not_asked_for(config: RigConfig, run: list[str] | None) -> list[str]:
-    """Programs that a file names, a model's and of drives of one's own, and that were
-    not asked for by name: a folder that somebody sent may hold anything."""
+    """Programs named in the file (the model's, custom drives') but not on the command
+    line. They are not run: a folder from someone else may hold any code."""
     named = [config.model.factory] if config.model and config.model.factory else []
     named += [axis.map.drive for axis in config.axes if axis.map.drive != "modbus"]
     return [name for name in dict.fromkeys(named) if name not in (run or ())]

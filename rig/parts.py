@@ -63,9 +63,10 @@ def require(command: str, simulated: bool = False) -> None:
     extra = "workbench" if simulated else _extra_of(module)
     needed = (module.partition(".")[0], *NEEDED[extra])
     if lacking := [name for name in needed if importlib.util.find_spec(name) is None]:
+        verb = "are" if len(lacking) > 1 else "is"
         raise MissingExtraError(
             f"{command}{' --simulate' * simulated} needs {', '.join(lacking)}, which "
-            f"is not installed: {install(extra)}"
+            f"{verb} not installed: {install(extra)}"
         )
 
 

@@ -134,4 +134,7 @@ assert main(["example", "arm", "--folder", "a"]) == 0
 given = "a/measured.csv --model a/arm.urdf --noise 0.0001 --out a.json"
 assert main(["identify", *given.split()]) == 0
 """
-    modules_of(body, tmp_path)
+    names = modules_of(body, tmp_path)
+    assert "jaxcal.jsonlines" not in names and required_apart(names, ("rig",)) == []
+    for saved in ("c.json", "a.json"):
+        assert (tmp_path / saved).stat().st_size > 100

@@ -199,9 +199,11 @@ class Grbl(GCodeDrive):
         self._ask(text)
 
     def stop(self) -> None:
-        """Cancel jogs, those in the queue too. At rest that does nothing; a feed hold
-        there would keep the controller in Hold, and what comes after it in its queue.
-        What somebody else runs is held: `hold` ends it."""
+        """Cancel all jogs, queued ones too; at rest this does nothing.
+
+        A feed hold is sent only while another sender's program runs: at rest it would
+        leave the controller in Hold and queue every later move. `hold` ends a Hold.
+        """
         self.line.tell(self.axis.unit, text="stop")
         self._seen(b"\x85?")
         if self._state == "Run":

@@ -270,7 +270,7 @@ def verdict(calibration: Fit) -> ArmVerdict:
 
 
 class Place(NamedTuple):
-    """How well readings show where something is, of which nobody knew."""
+    """How well the readings determine a place that was unknown before."""
 
     std: tuple[float, float]  # of what they show, in length and degrees
     hidden: tuple[str, ...]  # parameters that they do not show

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.pairing import of_new_readings
-from jaxcal.checks import array_of, numbers, one_of, table, whole_number
+from jaxcal.checks import array_of, one_of, table, whole_number
 from jaxcal.information.blocks import without
 from jaxcal.models.model import recorded
 from jaxcal.models.recording import Recording
@@ -346,6 +346,18 @@ def _postures(calibration: Fit, name: str, given: ArrayLike) -> Array:
     return rows
 
 
+def by_unit(
+    name: str, given: float | Mapping[str, float], units: tuple[str, ...]
+) -> dict[str, float]:
+    """Positive sizes by unit; a number alone is of the first of the units."""
+    asked = given if isinstance(given, Mapping) else {units[0]: given}
+    for unit, size in asked.items():
+        one_of(f"unit of {name}", unit, units)
+        if not array_of(name, size) > 0.0:
+            raise ValueError(f"{name} must be positive, got {size}")
+    return {unit: float(size) for unit, size in asked.items()}
+
+
 def _tolerances(
     calibration: Fit, where: Array, given: float | Mapping[str, float] | None
 ) -> dict[str, float]:
@@ -353,12 +365,7 @@ def _tolerances(
     quantities = calibration.model.quantities(calibration.measured_unit)
     units = tuple(quantity.unit for quantity in quantities)
     if given is not None:
-        asked = given if isinstance(given, Mapping) else {units[0]: given}
-        for unit, size in asked.items():
-            one_of("unit of tolerance", unit, units)
-            if not numbers("tolerance", size) > 0.0:
-                raise ValueError(f"tolerance must be positive, got {size}")
-        return {unit: float(size) for unit, size in asked.items()}
+        return by_unit("tolerance", given, units)
     std = calibration.predict_std(where, new_measurement=True)
     std = np.where(np.isfinite(std), std, np.asarray(calibration.noise_std))
     return {

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.calibration import Calibration
+from jaxcal.calibration.check import by_unit
 from jaxcal.calibration.fit_model import fit_model, require_fitting
 from jaxcal.calibration.pairing import of_unfitted
 from jaxcal.checks import (
     array_of,
     axis_names,
     levels,
-    one_of,
     require_none,
     table,
 )
@@ -137,7 +137,9 @@ def identify(
     model = require_fitting(model, readings.commands, readings.measured)
     if accuracy is not None:
         units = model.accuracy_units(measured_unit)
-        about["provenance"]["accuracy"] = _accuracy(accuracy, units)
+        if not units:
+            raise ValueError("accuracy is of an arm")
+        about["provenance"]["accuracy"] = by_unit("accuracy", accuracy, units)
     plain = prior is None and plain_noise and loss in (None, "gaussian")
     affine = isinstance(model, Affine)
     if plain and (affine or model.affine(model.nominal) is not None):
@@ -267,20 +269,6 @@ def _with_sessions(calibration: Calibration, labels: ArrayLike) -> Calibration:
     about = {"count": len(names), "std": std}
     provenance = {**calibration.provenance, "sessions": about}
     return dataclasses.replace(calibration, provenance=provenance)
-
-
-def _accuracy(
-    given: float | Mapping[str, float], units: tuple[str, ...]
-) -> dict[str, float]:
-    """The accuracy asked for, by the units of the model's readings."""
-    if not units:
-        raise ValueError("accuracy is of an arm")
-    asked = given if isinstance(given, Mapping) else {units[0]: given}
-    for unit, value in asked.items():
-        one_of("unit of accuracy", unit, units)
-        if not array_of("accuracy", value) > 0.0:
-            raise ValueError(f"accuracy must be positive, got {value}")
-    return {unit: float(value) for unit, value in asked.items()}
 
 
 # The model of most calibrations, whose names are then made once.

@@ -12,6 +12,7 @@ import datetime
 import functools
 import math
 import pathlib
+import pprint
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -153,7 +154,10 @@ def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) 
         introduction = _introduction(config, out, devices.describe(mesh))
         more = {"validation": None, "teacher": teacher}
     if first:
-        print(f"{introduction}\nconfiguration: {config.as_meta()}")
+        print(f"{introduction}\nconfiguration:")
+        print(
+            pprint.pformat(config.as_meta(), width=88, compact=True, sort_dicts=False)
+        )
         if validates:
             more["validation"] = fixed_validation(config)
         _begin_table(unit, columns)

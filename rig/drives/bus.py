@@ -109,8 +109,8 @@ class Bus(Line):
         """Units whose replies came after their time."""
         return set() if self._client is None else self._client.late
 
-    def answers_for_nobody(self) -> bool:
-        """Whether a server answers for a unit that is none: then for every one."""
+    def answers_for_every_unit(self) -> bool:
+        """Whether the server also answers for a unit number that no device has."""
         if self.settings.transport == "rtu":
             return False
         try:

@@ -148,15 +148,15 @@ class Drive(abc.ABC):
 
     def watch(self) -> int:
         """The line's timeout as the drive's register holds it, where it has one."""
-        raise NotImplementedError  # asked where the map has comm_timeout
+        raise NotImplementedError("its map has no comm_timeout")  # else overridden
 
     def set_watch(self, counts: int) -> None:
         """Set the register of the timeout of the line."""
-        raise NotImplementedError  # asked where the map has comm_timeout
+        raise NotImplementedError("its map has no comm_timeout")  # else overridden
 
     def watch_counts(self, seconds: float) -> int:
         """The timeout's register for so many seconds, or for a little more."""
-        raise NotImplementedError  # asked where the map has comm_timeout
+        raise NotImplementedError("its map has no comm_timeout")  # else overridden
 
     def lasting(self, ids: dict[str, int | str]) -> dict[str, int | str]:
         """The ids of a drive that do not change."""

@@ -92,8 +92,8 @@ class Line(abc.ABC):
         """Whether what a unit acknowledged last was perhaps not acknowledged."""
         return False
 
-    def answers_for_nobody(self) -> bool:
-        """Whether a unit answers that there is not: then its drives are one."""
+    def answers_for_every_unit(self) -> bool:
+        """Whether a unit number that no device has is answered too."""
         return False
 
     # Of all of them

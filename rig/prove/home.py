@@ -188,7 +188,7 @@ def identity(drives: list[Drive]) -> dict[str, dict[str, int | str]]:
                 "`jaxcal-rig check scan`"
             )
         identities[axis.name] = drive.lasting(values)
-    if len(drives) > 1 and drives[0].line.answers_for_nobody():
+    if len(drives) > 1 and drives[0].line.answers_for_every_unit():
         raise Refused(
             f"{drives[0].line.settings.where} answers for every unit id: the drives "
             "cannot be told apart. Set the gateway so that it looks at the id"

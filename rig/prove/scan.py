@@ -112,7 +112,7 @@ def scan(
                 say(str(answer))
             if unit % 10 == 0 or unit == units:
                 say(f"  {unit} of {units} units asked")
-        for_all = len(answers) == units and bus.answers_for_nobody()
+        for_all = len(answers) == units and bus.answers_for_every_unit()
         echo, noise, late = bus.echoes, bus.noise, sorted(bus.late)
     if for_all:
         del answers[1:]
