@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -48,11 +49,12 @@ def require_fitting(model: Any, commands: Array, measured: Array) -> Model:
     model = as_model(model)
     if not len(commands):
         raise ValueError("commands must hold at least one row, got none")
-    try:
-        shapes = model.num_inputs, model.num_outputs
-    except ValueError:  # of a function, not known before its first commands
-        model.predict(commands[:1], None)
-        shapes = model.num_inputs, model.num_outputs
+    known = False
+    with contextlib.suppress(ValueError):  # of a function, not before its first run
+        known = model.num_inputs != commands.shape[1] or model.num_outputs > 0
+    if not known:
+        model.predict(commands, None)
+    shapes = model.num_inputs, model.num_outputs
     for name, table, width in zip(
         ("commands", "measured"), (commands, measured), shapes, strict=True
     ):

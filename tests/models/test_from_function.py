@@ -260,6 +260,16 @@ def test_fit_check_and_prediction_are_those_of_the_exact_model():
     np.testing.assert_allclose(fits[0].predict(command[None]), 1.0)
 
 
+@pytest.mark.parametrize("inputs", [None, 1, ("minutes",)])
+def test_readings_that_lie_before_are_fitted_first_of_all(inputs):
+    y = np.array([[decay(u, (2.4, 0.4, 0.1))] for u in U])
+    y += 0.01 * np.random.default_rng(0).normal(size=y.shape)
+    fit = jaxcal.identify(U, y, model=model(inputs=inputs))
+    assert np.abs(fit.parameters - [2.4, 0.4, 0.1]).max() < 0.05
+    with pytest.raises(ValueError, match=r"measured must have shape \(N, 1\)"):
+        jaxcal.identify(U, np.hstack([y, y]), model=model(inputs=inputs))
+
+
 def test_a_trajectory_is_one_measurement():
     t = np.linspace(0.0, 5.0, 400)
 
