@@ -113,6 +113,8 @@ class Parser(argparse.ArgumentParser):
             for flag in (word.partition("=")[0] for word in unknown):
                 if like := nearest(flag, self._option_string_actions):
                     self.error(f"there is no option {flag}; did you mean {like}?")
+                if flag.isdecimal() and "-k" in self._option_string_actions:
+                    self.error(f"{flag} is no option; a number of rows is -k {flag}")
         return parsed, unknown
 
     def error(self, message: str) -> NoReturn:

@@ -16,6 +16,7 @@ from jaxcal.checks import array_of, one_of, table, whole_number
 from jaxcal.information.blocks import without
 from jaxcal.models.model import recorded
 from jaxcal.models.recording import Recording
+from jaxcal.tables import say_order
 
 __all__ = ["Check", "check", "verification"]
 
@@ -140,6 +141,7 @@ def check(
         says about how many rows would tell (``enough``).
     """
     all_commands, measured, _ = recorded(calibration.model, commands, measured)
+    say_order(all_commands, measured)
     commands, measured = _distinct(calibration, all_commands, measured)
     off = _deviations(calibration, commands, measured, placed_anew)
     names, free = calibration.names, off.free

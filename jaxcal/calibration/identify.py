@@ -42,6 +42,7 @@ from jaxcal.tables import (
     names_in,
     of_frame,
     outputs_of,
+    say_order,
 )
 
 __all__ = ["identify"]
@@ -206,6 +207,7 @@ def _measurements(
     commands, measured, is_recording = recorded(model, commands, measured)
     if is_recording:
         input_names = input_names or getattr(model, "inputs", ()) or None
+    say_order(commands, measured)
     inputs, outputs = _columns(model, commands, measured)
     u = table("commands", of_frame("commands", commands, inputs or (), COMMANDS))
     y = of_frame("measured", measured, outputs or (), MEASURED)

@@ -12,6 +12,7 @@ from jaxcal.tables.frames import (
     names_in,
     of_frame,
     outputs_of,
+    say_order,
     table_of_frame,
 )
 from jaxcal.tables.names import COMMANDS, MEASURED, columns_by_name
@@ -31,5 +32,6 @@ __all__ = [
     "outputs_of",
     "parse",
     "read_table",
+    "say_order",
     "table_of_frame",
 ]

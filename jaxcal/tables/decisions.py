@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from jaxcal.tables.cells import truths_of
 from jaxcal.tables.names import COMMANDS, MEASURED
 
-__all__ = ["AVAILABLE", "COUNTED", "Decision", "decide", "sentence"]
+__all__ = ["AVAILABLE", "COUNTED", "Decision", "decide", "is_available", "sentence"]
 
 Array = NDArray[np.float64]
 
 AVAILABLE = "available"
+_AVAILABLE = re.compile(r"(is[ _]?)?available\W*([\[(].*)?", re.IGNORECASE)
 _LEAST_ROWS = 5  # of which a constant step is no chance
 # Columns that number the rows, by their names; runs only where each has its own.
 _NUMBERS = re.compile(
@@ -36,6 +37,7 @@ _STAMPS = {"stamp", "timestamp", "date", "datetime", "epoch", "datum"}
 _TIMES = {"time", "uhrzeit", "elapsed", "clock"}
 _SECONDS = re.compile(r"t([ _]?[\[(]?(s|ms|us|ns|sec|seconds|min)[\])]?)?", re.I)
 COUNTED = "it counts the rows or tells their time"
+_LIKE_U, _LIKE_Y = re.compile(r"[uU]\d*|U_.*"), re.compile(r"[yY]\d*|Y_.*")
 _EPOCH = 1e8  # seconds; no factor of an experiment is so large
 
 
@@ -62,7 +64,7 @@ def decide(
     for name in table.header:
         if name in outputs:
             decision = Decision("output")
-        elif name.strip().casefold() == AVAILABLE and table.headed:
+        elif table.headed and is_available(name):
             decision = Decision("available")
         elif name.startswith(COMMANDS):
             decision = Decision("input")
@@ -80,6 +82,11 @@ def decide(
                 decisions[name] = Decision("input", "it is the only one")
                 break
     return decisions if marked else decisions | _counting(table, decisions)
+
+
+def is_available(name: str) -> bool:
+    """Whether a column tells which rows may be chosen, by its name."""
+    return bool(_AVAILABLE.fullmatch(name.strip()))
 
 
 def _of_numbers(
@@ -108,6 +115,8 @@ def _of_numbers(
     if marked:
         reason = f"commands are those that begin with {COMMANDS}"
         return Decision("left out", reason)
+    if _LIKE_Y.fullmatch(name) and any(_LIKE_U.fullmatch(x) for x in header):
+        return Decision("input", f"readings begin with {MEASURED}")
     return Decision("input")
 
 

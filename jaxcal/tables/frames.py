@@ -17,6 +17,7 @@ __all__ = [
     "names_in",
     "of_frame",
     "outputs_of",
+    "say_order",
     "table_of_frame",
 ]
 
@@ -128,6 +129,24 @@ def of_frame(
             f"{np.asarray(block)[*place]}"
         )
     return block
+
+
+def say_order(commands: Any, measured: Any) -> None:
+    """Say that two frames whose index is in another order are paired by place."""
+    orders = [
+        None if index is None or callable(index) else [*index]
+        for index in (getattr(frame, "index", None) for frame in (commands, measured))
+    ]
+    one, other = orders
+    if one is None or other is None or one == other or len(one) != len(other):
+        return
+    if set(one) == set(other):
+        k = next(k for k in range(len(one)) if one[k] != other[k])
+        say(
+            "commands and measured have one index in two orders, and are paired by "
+            f"place: row {k} is {one[k]!r} of commands and {other[k]!r} of measured; "
+            "by index it is measured.loc[commands.index]"
+        )
 
 
 def _collected(frame: Any) -> Any:

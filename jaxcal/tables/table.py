@@ -15,6 +15,7 @@ from jaxcal.tables.decisions import (
     COUNTED,
     Decision,
     decide,
+    is_available,
     listed,
     of_role,
     sentence,
@@ -232,7 +233,7 @@ class Table:
 
     def available(self) -> Mask | None:
         """(N,) True where the column ``available`` is 1; None without that column."""
-        names = [x for x in self.header if x.strip().casefold() == AVAILABLE]
+        names = [x for x in self.header if is_available(x)]
         if len(names) > 1:
             both = " and ".join(map(repr, names))
             raise ValueError(f"{self.source}: columns {both} could both be {AVAILABLE}")

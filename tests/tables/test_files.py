@@ -154,7 +154,17 @@ def test_true_and_false_are_numbers_where_a_command_is_asked_for():
     assert table.decisions["done"].role == "label" and table.row_names is None
 
 
-@pytest.mark.parametrize("name", ["available", "Available", "AVAILABLE", " available "])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "available",
+        "Available",
+        "AVAILABLE",
+        " available ",
+        "available?",
+        "Available (0/1)",
+    ],
+)
 @pytest.mark.parametrize("words", [("0", "1"), ("FALSE", "TRUE"), ("No", "yes")])
 def test_available_in_any_spelling(name, words):
     rows = [f"{i},{words[i % 2]}" for i in range(4)]

@@ -180,3 +180,18 @@ def test_an_import_loads_no_frames():
         "assert not {'pandas', 'polars', 'pyarrow', 'narwhals'} & {*sys.modules}"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_an_index_in_another_order_is_said():
+    shuffled = COMMANDS.sample(frac=1.0, random_state=0)
+    said = "one index in two orders, and are paired by place: row 0 is"
+    with pytest.warns(UserWarning, match=said):
+        jaxcal.identify(shuffled, READINGS, noise_std=0.01)
+    at_hand = jaxcal.identify(shuffled, READINGS.loc[shuffled.index], noise_std=0.01)
+    np.testing.assert_allclose(at_hand.affine[0], np.diag([0.43, 0.71, 0.87]), atol=1e-6)
+
+
+@pytest.mark.parametrize("names", [("u1", "u2", "y1"), ("U_a", "U_b", "Y_a")])
+def test_a_reading_in_another_spelling_is_said(names):
+    with pytest.warns(UserWarning, match=f"'{names[2]}' is read as input: readings"):
+        jaxcal.select(pandas.DataFrame(U, columns=names), 4)
