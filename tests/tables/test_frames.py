@@ -188,7 +188,9 @@ def test_an_index_in_another_order_is_said():
     with pytest.warns(UserWarning, match=said):
         jaxcal.identify(shuffled, READINGS, noise_std=0.01)
     at_hand = jaxcal.identify(shuffled, READINGS.loc[shuffled.index], noise_std=0.01)
-    np.testing.assert_allclose(at_hand.affine[0], np.diag([0.43, 0.71, 0.87]), atol=1e-6)
+    np.testing.assert_allclose(
+        at_hand.affine[0], np.diag([0.43, 0.71, 0.87]), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("names", [("u1", "u2", "y1"), ("U_a", "U_b", "Y_a")])
