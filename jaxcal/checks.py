@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
+    "ONE_COLUMN",
     "aligned",
     "array_of",
     "axis_letter",
@@ -33,6 +34,8 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+
+ONE_COLUMN = "a column alone is values[:, None], or frame[['name']]"
 
 
 def in_words(values: Array) -> str:
@@ -98,8 +101,10 @@ def array_of(
     if not fits:
         comma = "," if len(shape) == 1 else ""
         shape_text = f"({', '.join(map(str, shape))}{comma})"
+        alone = len(shape) == 2 and array.ndim == 1
         raise ValueError(
             f"{name} must have shape {shape_text}{rule}, got {array.shape}"
+            + ("; " + ONE_COLUMN if alone else "")
         )
     return array
 
@@ -132,7 +137,7 @@ def table(name: str, values: ArrayLike, count: int | None = None) -> Array:
     if table.ndim != 2 or table.shape[1] < 1:
         raise ValueError(
             f"{name} must have shape (N, {'m' if name == 'measured' else 'n'}), "
-            f"got {table.shape}"
+            f"got {table.shape}" + ("; " + ONE_COLUMN if table.ndim == 1 else "")
         )
     if count is not None and len(table) != count:
         raise ValueError(

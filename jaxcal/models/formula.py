@@ -69,10 +69,34 @@ def parse(formula: str) -> tuple[dict[str, list[Factor]], set[str]]:
             f"features must be a formula of one side, got {formula!r}"
             + (f": {why}" if why else "")
         ) from error
+    _require_powers(formula)
     used: set[str] = set()
     return {
         term: [_compile(part, used) for part in parts] for term, parts in factors
     }, used
+
+
+def _require_powers(formula: str) -> None:
+    """A formula takes the product of a factor with itself for the factor: refused."""
+    calls: list[str] = []
+
+    def hide(call: re.Match[str]) -> str:
+        if call[0] not in calls:
+            calls.append(call[0])
+        return f"_{calls.index(call[0])}_"
+
+    plain, count = formula, 1
+    while count:  # calls whose arguments hold none, the innermost first
+        plain, count = re.subn(r"\w+\([^()]*\)", hide, plain)
+    itself = r"\b([^\W\d]\w*)\s*(?:(?:\*\*|\^)\s*(\d+)|[:*]\s*\1\b(?!\())"
+    if found := re.search(itself, plain):
+        name, whole = found[1], found[0]
+        for k in reversed(range(len(calls))):
+            name, whole = (x.replace(f"_{k}_", calls[k]) for x in (name, whole))
+        raise ValueError(
+            f"features: {whole} is the same as {name} in a formula; its power is "
+            f"I({name}**{found[2] or 2})"
+        )
 
 
 def input_names(used: set[str]) -> tuple[str, ...]:

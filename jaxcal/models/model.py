@@ -454,6 +454,8 @@ def as_model(model: Any) -> Model:
             "model must be of jaxcal.models, or an object with the methods of "
             f"jaxcal.models.Model, got {got}"
             + (f" without {missing[0]}" if missing else "")
+            + ("; FromFunction(f, nominal) is one" if callable(model) else "")
+            + (f"; Linear({model!r}) is one" if isinstance(model, str) else "")
         )
     return _Adapter(model)
 

@@ -738,3 +738,18 @@ def test_trajectories_of_a_thousand_readings_are_identified():
         lambda theta: (trajectory(u, theta) - measured).ravel(), [1.0, 0.5]
     )
     assert (np.abs(fit.parameters - least.x) < 0.1 * fit.standard_errors).all()
+
+
+@pytest.mark.parametrize(
+    ("given", "remedy"),
+    [
+        (lambda u, theta: theta[0] * u, r"FromFunction\(f, nominal\) is one"),
+        ("1 + x", r"Linear\('1 \+ x'\) is one"),
+    ],
+)
+def test_what_could_be_made_a_model_is_told_how(given, remedy):
+    u = np.linspace(0.0, 1.0, 6)[:, None]
+    with pytest.raises(ValueError, match=f"without predict; {remedy}"):
+        jaxcal.identify(u, u, model=given)
+    with pytest.raises(ValueError, match=r"a column alone is values\[:, None\]"):
+        jaxcal.identify(u, u[:, 0])

@@ -71,7 +71,7 @@ def test_a_polynomial_holds_every_monomial():
 
 MODELS = [
     Linear(FORMULA, 2),
-    Linear("0 + exp(x) + abs(x - 1):tanh(y) + sqrt(y + 4) + x**3*arctan(z)"),
+    Linear("0 + exp(x) + abs(x - 1):tanh(y) + sqrt(y + 4) + I(x**3):arctan(z)"),
     Linear(lambda u: np.stack([u[:, 0], u[:, 1] ** 2], axis=1), 2, inputs=2),
     Polynomial(3, 2, 2),
     Affine(3, 2),
@@ -119,6 +119,14 @@ def test_a_data_frame_is_read_by_its_columns():
         ("x + foo(x)", {}, r"features may hold .* got 'foo\(x\)'"),
         ("x +* y", {}, r"must be a formula of one side, got 'x \+\* y': Operator"),
         ("y ~ x", {}, "must be a formula of one side"),
+        (
+            "x + x^2",
+            {},
+            r"x\^2 is the same as x in a formula; its power is I\(x\*\*2\)",
+        ),
+        ("x + y + y ** 3", {}, r"its power is I\(y\*\*3\)"),
+        ("x + x:x", {}, "x:x is the same as x"),
+        ("x + sin(2 * x)**2", {}, r"is I\(sin\(2 \* x\)\*\*2\)"),
         ("angle + load", {}, "inputs must be given, .* uses angle, load"),
         ("angle", {"inputs": ["load"]}, "must use the inputs load, got 'angle'"),
         ("x", {"terms": ["a"]}, "terms must be left out"),
