@@ -111,11 +111,21 @@ class Parser(argparse.ArgumentParser):
         parsed, unknown = super().parse_known_args(words, namespace)
         if self.exit_on_error and self._subparsers is None:
             for flag in (word.partition("=")[0] for word in unknown):
-                if like := nearest(flag, self._option_string_actions):
+                if like := self._meant(flag):
                     self.error(f"there is no option {flag}; did you mean {like}?")
                 if flag.isdecimal() and "-k" in self._option_string_actions:
                     self.error(f"{flag} is no option; a number of rows is -k {flag}")
         return parsed, unknown
+
+    def _meant(self, flag: str) -> str | None:
+        """The option that a mistyped one is nearest to; of -o one that begins --o."""
+        if not flag.startswith("-"):
+            return None
+        options = self._option_string_actions
+        begins = [x for x in options if x.startswith("-" + flag)]
+        if flag[1:2].isalpha() and begins:
+            return min(begins, key=len)
+        return nearest(flag, options)
 
     def error(self, message: str) -> NoReturn:
         if found := re.match(r"argument (?:.*/)?(--[\w-]+): expected one", message):
