@@ -350,7 +350,8 @@ class _Recorder:
         self._of_seeds: list[
             dict[str, float]
         ] = []  # of every seed, at the last validation
-        self._skipped = 0
+        self._skipped, self._judged = 0, 0
+        self._judging_s = 0.0  # the last validation, the first apart: it compiles
 
     def note(
         self,
@@ -390,7 +391,10 @@ class _Recorder:
         """Validate and report when due, and at the first and last update."""
         recipe, config = self.recipe, self.recipe.config
         done, now = int(row["update"]), time.perf_counter()
-        due = now - self._validated > config.validate_every
+        pause = config.validate_every  # 0: every update
+        if pause:  # validation has at most a tenth of the time
+            pause = max(pause, 9.0 * self._judging_s)
+        due = now - self._validated > pause
         if not due and done not in (1, self.last):
             return
         spread: dict[str, float] = {}
@@ -407,6 +411,9 @@ class _Recorder:
                     _add(self._seeds, self._seed_columns, validation)
         rate = (done - self.reported) / max(now - self._validated, 1e-9)
         self._validated, self.reported = time.perf_counter(), done
+        if self._judged:
+            self._judging_s = self._validated - now
+        self._judged += 1
         self.report(
             Report(
                 update=done,
