@@ -12,7 +12,7 @@ import pathlib
 from collections.abc import Iterator
 
 ROOT = pathlib.Path(__file__).parents[2]
-PACKAGES = ("jaxcal", "rig", "rig_workbench", "studies")
+PACKAGES = ("jaxcal", "rig", "rig_workbench")
 
 
 def room_of(module: str) -> str:
