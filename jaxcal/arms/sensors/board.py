@@ -79,6 +79,7 @@ class Board(Sensor):
     intrinsics: bool = False
 
     kind = "board"
+    views = True
     tool = ("x", "y", "z", "rx", "ry", "rz")
     stands = True
     _seen: ClassVar[tuple[str, ...]] = tuple(f"seen {axis}" for axis in tool)

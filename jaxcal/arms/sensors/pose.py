@@ -24,6 +24,8 @@ class Pose(Sensor):
     """
 
     kind = "pose"
+    positions = True
+    relative = True
     tool = ("x", "y", "z", "rx", "ry", "rz")
     outputs = tool
     quantities = (Quantity("length", slice(3)), Quantity("deg", slice(3, 6)))

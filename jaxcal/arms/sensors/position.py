@@ -19,6 +19,7 @@ class Position(Sensor):
     """x, y, z of the tip in the measuring frame; noise 0.01 % of the arm's length."""
 
     kind = "position"
+    positions = True
     lengths = True
     outputs = ("x", "y", "z")
     misfit = 3e-4

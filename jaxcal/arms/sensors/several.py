@@ -47,6 +47,7 @@ class Several(Sensor):
     mounts: ArrayLike | None = None
 
     kind = "several"
+    joined = True
     first_unit = "times the noise"
 
     def __post_init__(self) -> None:
