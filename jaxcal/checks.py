@@ -10,28 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "aligned",
-    "array_of",
-    "axis_letter",
-    "axis_names",
-    "in_words",
-    "lasted",
-    "levels",
-    "nearest",
-    "numbers",
-    "one_of",
-    "one_or_each",
-    "require_finite",
-    "require_kind",
-    "require_known",
-    "require_none",
-    "seconds",
-    "share",
-    "table",
-    "whole_number",
-]
-
 Array = NDArray[np.float64]
 
 

@@ -35,8 +35,6 @@ from jaxcal.models.model import (
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
 
-__all__ = ["SerialChain"]
-
 Array = NDArray[np.float64]
 
 _POSTURES = 500  # that show where an arm stands

@@ -21,14 +21,6 @@ if TYPE_CHECKING:
     from jaxcal.arms.chain import SerialChain as Chain
     from jaxcal.arms.verdict import ArmFit as Fit
 
-__all__ = [
-    "SCATTER",
-    "chosen",
-    "in_words",
-    "play_in_words",
-    "scatter",
-    "unexplained",
-]
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from jaxcal.arms.chain import SerialChain as Chain
 
-__all__ = ["mistaken_columns"]
 
 Array = NDArray[np.float64]
 

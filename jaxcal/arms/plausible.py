@@ -16,13 +16,6 @@ from jaxcal.checks import in_words
 if TYPE_CHECKING:
     from jaxcal.arms.chain import SerialChain as Chain
 
-__all__ = [
-    "require_readings",
-    "require_sockets",
-    "require_touched",
-    "warn_of_picture",
-    "warn_of_radians",
-]
 
 Array = NDArray[np.float64]
 _OTHER_ARM = "a wrong tip, unit, sign or order of columns, or rows of another place?"

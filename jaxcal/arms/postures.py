@@ -16,7 +16,6 @@ from jaxcal.checks import array_of, in_words, numbers, whole_number
 if TYPE_CHECKING:
     from jaxcal.arms.chain import SerialChain as Chain
 
-__all__ = ["ReachableSet", "Room", "View", "in_turn", "postures", "view_and_room"]
 
 Array = NDArray[np.float64]
 

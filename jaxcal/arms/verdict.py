@@ -50,16 +50,6 @@ if TYPE_CHECKING:
 
     Fit = ArmFit
 
-__all__ = [
-    "CLEAR_UP",
-    "ArmVerdict",
-    "HeldOut",
-    "Part",
-    "Place",
-    "other_distances",
-    "place_of",
-    "verdict",
-]
 
 Array = NDArray[np.float64]
 

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from jaxcal.evaluation.results import Evaluation, Summary
     from jaxcal.progress import Progress
 
-__all__ = ["main", "parser"]
 
 EXIT_INTERRUPTED = 130
 EXIT_TERMINATED = 143

@@ -11,16 +11,6 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration as Fit
 
-__all__ = [
-    "RULES",
-    "Reason",
-    "computed",
-    "in_rows",
-    "never_measured",
-    "not_invertible",
-    "outlying",
-    "wrong_noise",
-]
 
 Array = NDArray[np.float64]
 

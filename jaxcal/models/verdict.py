@@ -20,14 +20,6 @@ if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
     from jaxcal.calibration.fit import Fit
 
-__all__ = [
-    "USE",
-    "CalibrationWarning",
-    "Verdict",
-    "between_sessions",
-    "left_out",
-    "verdict",
-]
 
 Array = NDArray[np.float64]
 

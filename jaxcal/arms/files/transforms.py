@@ -19,7 +19,6 @@ from jaxcal.models.uncertainty import Prior
 if TYPE_CHECKING:
     from jaxcal.arms.verdict import ArmFit as Calibration
 
-__all__ = ["StaticTransform", "static_transform", "to_transform"]
 
 Array = NDArray[np.float64]
 

@@ -21,8 +21,6 @@ from jaxcal.arms.sensors.sensor import (
 from jaxcal.checks import array_of, numbers, one_of
 from jaxcal.models.model import Quantity
 
-__all__ = ["Board"]
-
 Array = NDArray[np.float64]
 
 _FEW = 3  # views that find where a board stands and its tool

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.arms.sensors.sensor import Reading, Sensor, Tip, hats
 from jaxcal.models.model import Quantity
 
-__all__ = ["Pose", "rotation_vector_rate"]
-
 Array = NDArray[np.float64]
 
 

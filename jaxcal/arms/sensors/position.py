@@ -9,8 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.arms.sensors.sensor import Reading, Sensor, Tip
 
-__all__ = ["Position"]
-
 Array = NDArray[np.float64]
 
 

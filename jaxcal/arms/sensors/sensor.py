@@ -15,19 +15,6 @@ from jaxcal.checks import array_of, numbers, whole_number
 from jaxcal.models.model import Quantity
 from jaxcal.models.periods import within_half
 
-__all__ = [
-    "BASE",
-    "HasNames",
-    "Landmarks",
-    "Reading",
-    "Readings",
-    "Sensor",
-    "Tip",
-    "hats",
-    "label",
-    "turns",
-]
-
 Array = NDArray[np.float64]
 
 BASE = tuple(f"base {axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
