@@ -50,7 +50,7 @@ evaluate: $(READY) ## compare every method with the proven optimum on 1,000 unse
 	$(BIN)/python evaluate.py $(ARGS)
 
 reproduce: $(READY) ## the paper's figures, tables and claims from our own runs, in report/index.html
-	$(BIN)/python -m studies.paper $(ARGS)
+	$(BIN)/python -m benchmarks.paper $(ARGS)
 
 # Most of a first run is XLA compiling: without its optimiser that takes a third of the
 # time. In `make test-all` adaptive and learning compile so, the others as users do.

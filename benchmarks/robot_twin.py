@@ -14,8 +14,8 @@ import time
 import numpy as np
 
 import jaxcal
-from jaxcal.paper.datasets import BIAS_DEG, SCALE, make_dataset
-from jaxcal.paper.twin import ORDERS, RobotConfig, read_out, simulate
+from benchmarks.paper.datasets import BIAS_DEG, SCALE, make_dataset
+from benchmarks.paper.twin import ORDERS, RobotConfig, read_out, simulate
 
 GROUPS, LENGTH = 20, 50
 

@@ -31,22 +31,6 @@ from typing import Annotated, Any, Literal, NoReturn, TypeVar
 from jaxcal.checks import nearest
 from jaxcal.extras import typed
 
-__all__ = [
-    "Numbers",
-    "Parser",
-    "Was",
-    "exit_code",
-    "levels",
-    "number_type",
-    "outdated",
-    "refused",
-    "several",
-    "told",
-    "typed_line",
-    "unread",
-    "values_of",
-]
-
 T = TypeVar("T")
 _METAVARS = {int: "N", float: "X", pathlib.Path: "FILE"}
 

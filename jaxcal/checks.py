@@ -10,29 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "ONE_COLUMN",
-    "aligned",
-    "array_of",
-    "axis_letter",
-    "axis_names",
-    "in_words",
-    "lasted",
-    "levels",
-    "nearest",
-    "numbers",
-    "one_of",
-    "one_or_each",
-    "require_finite",
-    "require_kind",
-    "require_known",
-    "require_none",
-    "seconds",
-    "share",
-    "table",
-    "whole_number",
-]
-
 Array = NDArray[np.float64]
 
 ONE_COLUMN = "a column alone is values[:, None], or frame[['name']]"

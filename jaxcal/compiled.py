@@ -12,8 +12,6 @@ import threading
 from importlib.machinery import EXTENSION_SUFFIXES, PathFinder
 from typing import Any
 
-__all__ = ["UNCHECKED", "check", "kernel"]
-
 UNCHECKED = "JAXCAL_KERNELS_UNCHECKED"  # of the environment
 
 _LOADING = threading.Lock()

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 import time
 
-__all__ = ["NEVER", "Deadline"]
-
 
 class Deadline:
     """The time at which a search stops; it begins to run when it is made.

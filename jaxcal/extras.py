@@ -13,8 +13,6 @@ import sys
 import urllib.parse
 from collections.abc import Iterator
 
-__all__ = ["MissingExtraError", "install", "installed", "needs", "typed", "versions"]
-
 _COMPUTE = ("jaxcal", "numpy", "scipy", "jax", "jaxlib", "flax", "optax")
 
 

@@ -10,8 +10,6 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import IO, Any
 
-__all__ = ["atomic_write", "require_kept", "require_writable_folder", "write_text"]
-
 _WRITTEN = {"out", "servos_out", "picture", "json"}  # arguments that are files
 _RECORDS = {".json", ".jsonl", ".toml", ".csv"}
 

@@ -22,7 +22,6 @@ if sys.platform == "win32":
 else:
     import fcntl
 
-__all__ = ["DamagedError", "JsonLines", "Record", "flock", "read_records", "until"]
 
 Record = dict[str, Any]
 LOOK_S = 0.02  # between two tries

@@ -7,8 +7,6 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["late"]
-
 
 class late:
     """A method that a module further up defines: ``report = late("module:function")``.

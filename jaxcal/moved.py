@@ -19,6 +19,7 @@ MOVED = {  # longer names first
     "jaxcal.models.serial.servos": "jaxcal.arms.files.servos",
     "jaxcal.models.serial.urdf": "jaxcal.arms.files.urdf",
     "jaxcal.models.serial": "jaxcal.arms",
+    "jaxcal.paper.twin": "benchmarks.paper.twin",
     "jaxcal.pages": "jaxcal.reports.page",
     "jaxcal.plots": "jaxcal.reports.plots",
     "jaxcal.selection.continuous": "jaxcal.designs.continuous",

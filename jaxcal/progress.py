@@ -7,8 +7,6 @@ import sys
 import time
 from typing import TextIO
 
-__all__ = ["Progress"]
-
 _SILENT = 2.0  # seconds below which nothing is shown
 _OF_LOG, _OF_TERMINAL = 10.0, 0.1  # seconds between lines; between rewritings of one
 _ERASED = "\r\x1b[K"  # to the line's beginning, and empty it

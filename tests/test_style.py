@@ -38,7 +38,7 @@ def test_a_docstring_needs_no_neighbour() -> None:
     """Its first words say what comes out, also in an index and in ``help()``."""
     leaning = [
         f"{name}: {sentence}"
-        for package in ("jaxcal", "rig*", "studies", "benchmarks", "examples")
+        for package in ("jaxcal", "rig*", "benchmarks", "examples")
         for name, text in sources(package)
         for sentence in LEANING.findall(text)
     ]

@@ -12,7 +12,7 @@ import pathlib
 from collections.abc import Iterator
 
 ROOT = pathlib.Path(__file__).parents[2]
-PACKAGES = ("jaxcal", "rig", "rig_workbench", "studies")
+PACKAGES = ("jaxcal", "rig", "rig_workbench")
 
 
 def room_of(module: str) -> str:
@@ -48,12 +48,21 @@ def lines_of_rooms() -> dict[str, int]:
     return lines
 
 
+def at_run_time(tree: ast.AST) -> Iterator[ast.AST]:
+    """The nodes of a module but for those that only a type checker reads."""
+    for node in ast.iter_child_nodes(tree):
+        test = getattr(node, "test", None) if isinstance(node, ast.If) else None
+        if getattr(test, "id", None) != "TYPE_CHECKING":
+            yield node
+            yield from at_run_time(node)
+
+
 def arrows() -> dict[str, set[str]]:
-    """For each room those that it imports."""
+    """For each room those that it imports when it runs."""
     found: dict[str, set[str]] = {}
     for room, text in sources():
         ahead = found.setdefault(room, set())
-        for node in ast.walk(ast.parse(text)):
+        for node in at_run_time(ast.parse(text)):
             names = []
             if isinstance(node, ast.Import):
                 names = [alias.name for alias in node.names]

@@ -13,15 +13,12 @@ from jaxcal.extras import needs
 
 if TYPE_CHECKING:
     from jaxcal.adaptive.episodes import compare, play
-    from jaxcal.adaptive.grid import GridBelief, GridTask
-    from jaxcal.adaptive.loop import Loop, estimates, next_measurement, run
-    from jaxcal.adaptive.particles import ParticleBelief, ParticleTask
+    from jaxcal.adaptive.grid import GridTask
+    from jaxcal.adaptive.loop import estimates, next_measurement, run
+    from jaxcal.adaptive.particles import ParticleTask
 
 __all__ = [
-    "GridBelief",
     "GridTask",
-    "Loop",
-    "ParticleBelief",
     "ParticleTask",
     "compare",
     "estimates",
@@ -39,7 +36,7 @@ _HOME = {
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
+    if name not in _HOME:
         raise AttributeError(f"module 'jaxcal.adaptive' has no attribute {name!r}")
     with needs("policy", "jaxcal.adaptive"):
         home = importlib.import_module(f"jaxcal.adaptive.{_HOME[name]}")

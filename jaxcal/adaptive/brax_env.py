@@ -11,8 +11,6 @@ from jaxcal.adaptive.environment import TaskEnv
 from jaxcal.adaptive.rules import SHARES, Rule
 from jaxcal.learning.brax import EpisodeEnv
 
-__all__ = ["SequentialEnv"]
-
 
 class SequentialEnv(EpisodeEnv):
     """Sessions of a task; arguments as of ``TaskEnv``."""

@@ -15,8 +15,6 @@ from jaxcal.adaptive.policy.sessions import Exercise, Sessions, State
 from jaxcal.adaptive.rules import SHARES, Rule
 from jaxcal.learning.environments.functional import FunctionalEnv
 
-__all__ = ["TaskEnv"]
-
 
 @struct.dataclass
 class _Episode(State):

@@ -13,8 +13,6 @@ from flax import struct
 
 from jaxcal.adaptive.session import Decider, SequentialTask, jit_by_class
 
-__all__ = ["Comparison", "Episodes", "compare", "play"]
-
 
 @struct.dataclass
 class Episodes:

@@ -32,14 +32,6 @@ from jaxcal.adaptive.tasks.registry import Entry
 from jaxcal.adaptive.tuning import tune
 from jaxcal.evaluation.results import Evaluation, MethodResult, Summary, finite
 
-__all__ = [
-    "METHODS",
-    "DeciderEvaluation",
-    "DeciderResult",
-    "evaluate",
-    "seconds_a_choice",
-]
-
 Array = NDArray[np.float64]
 
 METHODS = {

@@ -9,8 +9,6 @@ from jaxcal.adaptive.evaluation import DeciderEvaluation
 from jaxcal.evaluation.figures import intervals, styles_of
 from jaxcal.reports.plots.style import GREY, panels
 
-__all__ = ["decider_figures"]
-
 
 def decider_figures(evaluation: DeciderEvaluation) -> dict[str, Figure]:
     """Mean nats by method, and less those of the rival in pairs, 95 % intervals."""

@@ -28,8 +28,6 @@ from jaxcal.adaptive.rules import SHARES, Shares
 from jaxcal.adaptive.search_kernel import NODE, SUM
 from jaxcal.adaptive.tuning import search
 
-__all__ = ["AheadFit", "fit", "outside"]
-
 Array = NDArray[np.float32]
 
 # Multiplications to simulate: each set of constants in a generation, the deep tree,

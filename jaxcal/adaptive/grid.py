@@ -14,8 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.adaptive.session import Options, Session, pays
 from jaxcal.checks import in_words, numbers, whole_number
 
-__all__ = ["GridBelief", "GridTask"]
-
 Array = NDArray[np.float64]
 
 _SMALL = 1e-30  # probability whose logarithm is still finite in float32

@@ -17,17 +17,6 @@ from jaxcal.adaptive.session import SequentialTask, Session, jit_by_class
 from jaxcal.checks import in_words, numbers, whole_number
 from jaxcal.checks import seconds as checked_seconds
 
-__all__ = [
-    "History",
-    "StepKeys",
-    "after",
-    "begin",
-    "checked_entry",
-    "from_leaves",
-    "replay",
-    "step_keys",
-]
-
 History = Iterable[tuple[Any, Any]]  # (design, outcome) of each measurement, in order
 
 _NEAR = 1e-5  # of a coordinate's range: tolerance for coordinates of a design

@@ -9,8 +9,6 @@ import jax
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
-__all__ = ["on_host"]
-
 
 def on_host(
     function: Callable[..., Any], result: jax.ShapeDtypeStruct, *arrays: Any

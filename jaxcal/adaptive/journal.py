@@ -13,8 +13,6 @@ import numpy as np
 
 from jaxcal.jsonlines import JsonLines, Record
 
-__all__ = ["SessionJournal", "fingerprint"]
-
 _KIND = "jaxcal adaptive session"
 
 

@@ -16,8 +16,6 @@ from jaxcal.adaptive.rules import SHARES, Shares
 from jaxcal.adaptive.search_kernel import Tree
 from jaxcal.adaptive.session import Options, Session
 
-__all__ = ["AHEAD", "Ahead", "tree"]
-
 
 @struct.dataclass
 class Ahead:

@@ -35,16 +35,6 @@ from jaxcal.adaptive.session import (
     jit_by_class,
 )
 
-__all__ = [
-    "Estimate",
-    "Loop",
-    "Proposal",
-    "SessionResult",
-    "estimates",
-    "next_measurement",
-    "run",
-]
-
 Array = NDArray[np.float64]
 
 _DRAWS = 32  # of the gain that is told, which a single one leaves uncertain by a third

@@ -33,8 +33,6 @@ from jaxcal.models.model import (
 )
 from jaxcal.models.uncertainty import Noise, Prior
 
-__all__ = ["Candidates", "candidates_of"]
-
 Array = NDArray[np.float64]
 Draw = Callable[[jax.Array], jax.Array]  # p standard normal numbers -> parameters (p,)
 

@@ -21,15 +21,6 @@ from jaxcal.adaptive.session import Options, Session, jit_by_class, pays
 from jaxcal.checks import in_words, numbers, whole_number
 from jaxcal.models.uncertainty import Noise, Prior
 
-__all__ = [
-    "ParticleBelief",
-    "ParticleModel",
-    "ParticleTask",
-    "log_mean",
-    "outcome_shape",
-    "systematic",
-]
-
 _FLOOR = -1e6  # least log likelihood, of impossible outcomes
 _ENOUGH = 0.5  # effective share of the particles below which they are moved
 _HALVINGS = 10  # bisections for a temperature

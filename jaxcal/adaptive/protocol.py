@@ -25,8 +25,6 @@ import numpy as np
 
 from jaxcal.adaptive.loop import Loop, estimates
 
-__all__ = ["answers"]
-
 _FIELDS = {
     "suggest": set(),
     "observed": {"outcome", "design", "number"},

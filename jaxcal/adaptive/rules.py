@@ -12,21 +12,6 @@ from flax import struct
 
 from jaxcal.adaptive.session import Options, Session
 
-__all__ = [
-    "SHARES",
-    "Gain",
-    "GainRate",
-    "Priced",
-    "Random",
-    "Rule",
-    "Shares",
-    "StateRule",
-    "best",
-    "groups_of",
-    "log_score",
-    "shortlist",
-]
-
 
 def best(score: jax.Array, options: Options) -> jax.Array:
     """() int32 index of the allowed option of the largest score (A,)."""

@@ -16,16 +16,6 @@ from typing import Any, Protocol
 import jax
 from flax import struct
 
-__all__ = [
-    "Belief",
-    "Decider",
-    "Options",
-    "SequentialTask",
-    "Session",
-    "jit_by_class",
-    "pays",
-]
-
 _ROUNDING = 1e-4  # of a cost: sums of float32 may miss the budget by less
 
 

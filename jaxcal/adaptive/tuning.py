@@ -14,8 +14,6 @@ from jaxcal.adaptive.rules import Rule
 from jaxcal.adaptive.session import SequentialTask
 from jaxcal.checks import whole_number
 
-__all__ = ["search", "tune"]
-
 R = TypeVar("R", bound=Rule)
 
 _SPREAD = 0.7  # of the first generation, in units of ``Rule.moved``

@@ -12,17 +12,6 @@ from jaxcal.arms.arm import Load
 from jaxcal.arms.sensors import SENSORS, Position, Sensor
 from jaxcal.checks import array_of, in_words, numbers, one_of, whole_number
 
-__all__ = [
-    "joint_kinds",
-    "joint_numbers",
-    "limits_of",
-    "load",
-    "pose_matrix",
-    "rows_of",
-    "sensor_of",
-    "transform",
-]
-
 Array = NDArray[np.float64]
 
 

@@ -15,8 +15,6 @@ from jaxcal.arms.sensors import Reading, Sensor, Tip
 from jaxcal.checks import array_of, numbers
 from jaxcal.models.model import as_commands
 
-__all__ = ["Arm", "Load", "apparent_length"]
-
 Array = NDArray[np.float64]
 Load = tuple[int, float, tuple[float, float, float]]  # link from 1, weight, its centre
 

@@ -23,7 +23,7 @@ from jaxcal.arms.arguments import (
     transform,
 )
 from jaxcal.arms.arm import Arm, apparent_length
-from jaxcal.arms.sensors import Board, Pose, Position, Sensor, Several
+from jaxcal.arms.sensors import Position, Sensor, Several
 from jaxcal.checks import array_of, axis_names, in_words, numbers, one_of
 from jaxcal.models.model import (
     ErrorGroups,
@@ -34,8 +34,6 @@ from jaxcal.models.model import (
 )
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
-
-__all__ = ["SerialChain"]
 
 Array = NDArray[np.float64]
 
@@ -424,7 +422,7 @@ class SerialChain(Arm, Model):
         for _, one, rows, _ in self.sensor.parts(commands[:, self.num_joints :]):
             largest = np.abs(joints[rows][:, units == "deg"]).max(initial=0.0)
             small = self.num_joints > 2 and 1.0 < largest < 7.0
-            if small and not isinstance(one, Position | Pose):  # readings tell of these
+            if small and not one.positions:  # readings tell of these
                 raise ValueError(
                     f"commands must be in degrees, got angles of at most {largest:.3g},"
                     " which look like radians: np.degrees(commands), --radians"
@@ -564,13 +562,13 @@ class SerialChain(Arm, Model):
                 were rests; there are no readings.
         """
         sensor = self.sensor
-        views = isinstance(sensor, Board) and sensor.zeros
+        views = sensor.views and sensor.zeros
         if not views and tuple(sensor.inputs) not in ((), (sensor.kind,)):
             raise ValueError(
                 f"commands of a {sensor.kind} hold {', '.join(sensor.inputs)}, which "
                 "no recording has: take the postures by at_rest"
             )
-        pixels = isinstance(sensor, Board) and not views
+        pixels = sensor.views and not views
         of_recording = self._rests(recording, "" if pixels else sensor.kind)
         commands, read = of_recording.joints, of_recording.readings
         if views:
@@ -821,10 +819,10 @@ class SerialChain(Arm, Model):
         for (one, _, predicted), (_, _, reached) in zip(
             nominal, self.of_each_sensor(commands, measured), strict=True
         ):
-            if isinstance(one.sensor, Position | Pose):
+            if one.sensor.positions:
                 moved = _far(predicted[:, :3], reached[:, :3], self.length)
                 base = moved @ self.base
-                if isinstance(one.sensor, Position):
+                if not one.sensor.relative:
                     return self.base if (moved == np.eye(4)).all() else base
                 shift = np.linalg.norm((base - self.base)[:3, 3])
                 turned = np.trace(moved[:3, :3]) < 1.0 + 2.0 * _ASIDE
@@ -842,7 +840,7 @@ class SerialChain(Arm, Model):
         self, commands: Array, measured: Array
     ) -> Iterator[tuple[Self, Array, Array]]:
         """The arm with each sensor of ``Several`` that read, its commands, readings."""
-        if not isinstance(self.sensor, Several):
+        if not self.sensor.joined:
             yield self, commands, measured
             return
         joints, inputs = np.split(commands, [self.num_joints], axis=1)
@@ -880,7 +878,7 @@ class SerialChain(Arm, Model):
     def quantities_of(self, sensor: Sensor, measured_unit: str) -> tuple[Quantity, ...]:
         """What one of its sensors reads, "length" where the unit of that is unknown."""
         first, *others = sensor.quantities
-        if not others and first.points == 1 and not isinstance(self.sensor, Several):
+        if not others and first.points == 1 and not self.sensor.joined:
             first = first._replace(unit=measured_unit or first.unit)
         length = self.length_unit(measured_unit) or "length"
         return tuple(
@@ -1116,7 +1114,7 @@ class SerialChain(Arm, Model):
     @property
     def relative(self) -> bool:
         """The turns of a pose are from the nominal orientation at the command."""
-        return isinstance(self.sensor, Pose)
+        return self.sensor.relative
 
     def targets(
         self, desired: Array, start: Array | None

@@ -22,8 +22,6 @@ from jaxcal.models import verdict as models
 from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
 from jaxcal.models.uncertainty import Noise, Prior
 
-__all__ = ["Chains", "ChainsVerdict"]
-
 Array = NDArray[np.float64]
 _SAME = 1e-9  # of lengths and degrees: one and the same link
 

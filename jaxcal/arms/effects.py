@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,18 +17,12 @@ from numpy.typing import NDArray
 from jaxcal.models.uncertainty import Prior
 from jaxcal.models.verdict import left_out
 
-__all__ = [
-    "SCATTER",
-    "chosen",
-    "in_words",
-    "play_in_words",
-    "scatter",
-    "unexplained",
-]
+if TYPE_CHECKING:
+    from jaxcal.arms.chain import SerialChain as Chain
+    from jaxcal.arms.verdict import ArmFit as Fit
+
 
 Array = NDArray[np.float64]
-Fit = Any  # a jaxcal.Calibration, whose package imports this one
-Chain = Any  # a SerialChain, whose module imports this one
 
 SCATTER = 3.0  # times the sensor's usual noise: the model does not explain that
 # Times the tolerances of the default prior: lengths, turns of the axes, zeros of the

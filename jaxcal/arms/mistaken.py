@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.arms.sensors import Landmarks
+if TYPE_CHECKING:
+    from jaxcal.arms.chain import SerialChain as Chain
 
-__all__ = ["mistaken_columns"]
 
 Array = NDArray[np.float64]
-Chain = Any  # a SerialChain, whose module imports this one
 
 _SAME = 1.25  # times the least error: no worse
 _EXPLAINED = 0.2  # of the errors as given: what is left when the mistake is undone
@@ -75,7 +74,7 @@ def _error(arm: Chain, commands: Array, measured: Array) -> float:
     off = measured - at.predict(commands)
     tip, inputs = at.nominal_tip(commands), commands[:, at.num_joints :]
     for part in at.sensor.of_members(tip, inputs, off):
-        if isinstance(part.sensor, Landmarks):  # its place is no merit of the arm
+        if part.sensor.num_places:  # its place is no merit of the arm
             which = part.sensor.of_rows(part.columns)
             for i in np.unique(which):
                 rows = part.rows[which == i]

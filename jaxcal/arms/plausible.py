@@ -4,26 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arms.mistaken import mistaken_columns
-from jaxcal.arms.sensors import Board, Pose, Position, Sensor, Socket
+from jaxcal.arms.sensors import Board, Sensor, Socket
 from jaxcal.checks import in_words
 
-__all__ = [
-    "require_readings",
-    "require_sockets",
-    "require_touched",
-    "warn_of_picture",
-    "warn_of_radians",
-]
+if TYPE_CHECKING:
+    from jaxcal.arms.chain import SerialChain as Chain
+
 
 Array = NDArray[np.float64]
 _OTHER_ARM = "a wrong tip, unit, sign or order of columns, or rows of another place?"
-Chain = Any  # a SerialChain, whose module imports this one
 
 _NOMINAL = 0.1  # of its length: no arm is so far off, tip included, before it is fitted
 _APART = 0.2  # of it: what two sockets may seem to be off their distance
@@ -42,11 +37,11 @@ def require_readings(arm: Chain, commands: Array, measured: Array) -> None:
         raise ValueError(
             f"the joints are the same in all {len(joints)} rows: were they recorded?"
         )
-    if isinstance(arm.sensor, Pose):
+    if arm.sensor.relative:
         _require_tool(arm, commands, measured)
     if isinstance(arm.sensor, Board):
         _require_in_picture(arm.sensor, measured, arm.length or 1.0)
-    if not isinstance(arm.sensor, Position | Pose):
+    if not arm.sensor.positions:
         return
     spread = []
     for points in (measured[:, :3], arm.predict(commands)[:, :3]):

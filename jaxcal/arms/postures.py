@@ -5,18 +5,19 @@ from __future__ import annotations
 import dataclasses
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.arms.sensors import Board, Landmarks, Plane, Several, Socket
+from jaxcal.arms.sensors import Board, Plane, Socket
 from jaxcal.checks import array_of, in_words, numbers, whole_number
 
-__all__ = ["ReachableSet", "Room", "View", "in_turn", "postures", "view_and_room"]
+if TYPE_CHECKING:
+    from jaxcal.arms.chain import SerialChain as Chain
+
 
 Array = NDArray[np.float64]
-Chain = Any  # a SerialChain, whose module imports this one
 
 _ROUNDS, _STEPS = 40, 80  # batches of starts; steps of the inverse kinematics
 _BATCH = 2_000  # starts at a time, where few are any good
@@ -212,9 +213,9 @@ def postures(
 ) -> Array:
     """Candidate postures (M, n) of an arm; arguments as ``SerialChain.postures``."""
     whole_number("count", count, 1)
-    if view is not None and not isinstance(arm.sensor, Board):
+    if view is not None and not arm.sensor.views:
         raise ValueError("camera is of an arm with sensor=Board(...)")
-    if isinstance(arm.sensor, Several):
+    if arm.sensor.joined:
         raise ValueError(
             "postures are of one sensor at a time: arm.measured_with(sensor).postures()"
         )
@@ -258,7 +259,7 @@ class _Collection:
         # (J,) two of these are as far as postures must be apart.
         self.unit = np.where(turns, 1.0, (self.high - self.low) / 100.0)
         self.kept, self.tried = np.zeros((0, arm.num_inputs)), 0
-        num_places = arm.sensor.count if isinstance(arm.sensor, Landmarks) else 1
+        num_places = max(arm.sensor.num_places, 1)
         self.reached = np.zeros(num_places, dtype=int)  # postures at each place
         self.refused: list[Counter[str]] = [Counter() for _ in self.reached]
 
@@ -302,16 +303,17 @@ class _Collection:
 
     def shortfall(self, near: ArrayLike | None) -> str:
         """What is missing: a place that no posture reaches, or postures."""
-        sensor, missed = self.arm.sensor, np.flatnonzero(self.reached == 0)
+        missed = np.flatnonzero(self.reached == 0)
         if len(self.reached) > 1 and len(missed):
             place = missed[0]
             where = ""
-            if sensor.places is not None:
-                where = f" at {in_words(sensor.places[place])}"
+            places = getattr(self.arm.sensor, "places", None)
+            if places is not None:
+                where = f" at {in_words(places[place])}"
             refused = self.refused[place]
             return (
-                f"{sensor.kind} {place}{where} must be reached by a posture: of "
-                f"{refused.total()} postures tried {_counted(refused)}"
+                f"{self.arm.sensor.kind} {place}{where} must be reached by a posture: "
+                f"of {refused.total()} postures tried {_counted(refused)}"
             )
         reasons = _counted(sum(self.refused, Counter()))
         if not len(self.kept):
@@ -341,18 +343,18 @@ class ReachableSet:
         view: View | None,
         room: Room | None,
     ) -> None:
-        if isinstance(arm.sensor, Several):
+        if arm.sensor.joined:
             raise ValueError(
                 "reachable is of one sensor at a time: "
                 "arm.measured_with(sensor).reachable()"
             )
-        if view is not None and not isinstance(arm.sensor, Board):
+        if view is not None and not arm.sensor.views:
             raise ValueError("camera is of an arm with sensor=Board(...)")
         self._arm, self._targets = _aimed(arm, near)
         if room is not None:
             room.require_sockets(self._arm)
         self._allowed, self._view, self._room = allowed, view, room
-        self._ends = None if view is None else _distances(arm.sensor, view)
+        self._ends = None if view is None else _distances(_board(arm), view)
 
     @property
     def limits(self) -> Array:
@@ -372,8 +374,8 @@ class ReachableSet:
         low, high = self.limits.T
         j = arm.num_joints
         commands[:, :j] = commands[:, :j].clip(low, high)
-        if isinstance(arm.sensor, Landmarks) and arm.sensor.count > 1:
-            labels = np.round(commands[:, j]).clip(0, arm.sensor.count - 1)
+        if (count := arm.sensor.num_places) > 1:
+            labels = np.round(commands[:, j]).clip(0, count - 1)
             commands[:, j] = labels
         if self._view is not None and self._ends is not None:
             moved, reasons = _in_picture(arm, commands, self._view, self._ends)
@@ -469,14 +471,19 @@ def _touching(
     return commands, ["" if one else why for one in reached]
 
 
+def _board(arm: Chain) -> Board:
+    """The sensor of an arm that sees, or is, a board."""
+    return cast(Board, arm.sensor)
+
+
 def _in_view(arm: Chain, commands: Array) -> tuple[Array, list[str]]:
     """The board before the camera and turned to it; ``seen`` as it is predicted."""
     commands = commands.copy()
-    j = arm.num_joints
-    posed = arm.measured_with(dataclasses.replace(arm.sensor, corners=None))
+    j, board = arm.num_joints, _board(arm)
+    posed = arm.measured_with(dataclasses.replace(board, corners=None))
     # Of a board seen at zero: its pose in the camera.
     pose = posed.predict(np.hstack([commands[:, :j], np.zeros((len(commands), 6))]))
-    if arm.sensor.corners is None:
+    if board.corners is None:
         commands[:, j:] = pose
     from scipy.spatial.transform import Rotation
 
@@ -499,7 +506,7 @@ def _pictured(
     """
     from scipy.spatial.transform import Rotation
 
-    sensor, j, count = arm.sensor, arm.num_joints, len(commands)
+    sensor, j, count = _board(arm), arm.num_joints, len(commands)
     points = sensor.outline
     middle = points.mean(axis=0)
     width, height, fx, fy, cx, cy = view.camera
@@ -528,7 +535,7 @@ def _pictured(
     return _in_picture(arm, commands, view, ends)
 
 
-def _distances(sensor: Any, view: View) -> tuple[float, float]:
+def _distances(sensor: Board, view: View) -> tuple[float, float]:
     """Least and greatest from the camera to the board's middle."""
     points = sensor.outline
     size = 2.0 * np.linalg.norm(points - points.mean(axis=0), axis=1).max()
@@ -550,7 +557,7 @@ def _in_picture(
     """Commands with what the camera sees of the board, and why it is of no use."""
     from scipy.spatial.transform import Rotation
 
-    sensor, j, count = arm.sensor, arm.num_joints, len(commands)
+    sensor, j, count = _board(arm), arm.num_joints, len(commands)
     points, known_side = sensor.outline, view.side or sensor.side
     width, height, fx, fy, cx, cy = view.camera
     posed = arm.measured_with(dataclasses.replace(sensor, corners=None))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,7 @@ from numpy.typing import NDArray
 from jaxcal.arms.effects import SCATTER, in_words, play_in_words, scatter
 from jaxcal.arms.mistaken import mistaken_columns
 from jaxcal.arms.sensors import (
-    Board,
-    Landmarks,
     Pose,
-    Position,
     Sensor,
     Socket,
     Wrench,
@@ -37,20 +34,24 @@ from jaxcal.models.reasons import (
 )
 from jaxcal.models.verdict import left_out
 
-__all__ = [
-    "CLEAR_UP",
-    "ArmVerdict",
-    "HeldOut",
-    "Part",
-    "Place",
-    "other_distances",
-    "place_of",
-    "verdict",
-]
+if TYPE_CHECKING:
+    from jaxcal.arms.chain import SerialChain as Chain
+    from jaxcal.calibration import Calibration
+
+    class ArmFit(Calibration):
+        """A calibration of an arm, or of several."""
+
+        model: Chain
+
+        def again(self, *given: Any) -> ArmFit: ...
+
+        @property
+        def verdict(self) -> ArmVerdict: ...
+
+    Fit = ArmFit
+
 
 Array = NDArray[np.float64]
-Chain = Any  # a Chain, whose module imports this one
-Fit = Any  # a jaxcal.Calibration, whose package imports this one
 
 _LOOK = (
     "look at the residuals (report, --report); keep the nominal machine until they are "
@@ -226,7 +227,7 @@ def verdict(calibration: Fit) -> ArmVerdict:
     findings = _left_open(findings, parts, _in(calibration), anywhere, nominal)
     clean = not (findings.doubtful or (findings.moved and not explains))
     place = None
-    if all(isinstance(part.sensor, Board) for part in parts):
+    if all(part.sensor.views for part in parts):
         place = place_of(calibration, [f"tool {axis}" for axis in Pose.tool])
     reach = model.length or float(np.ptp(parts[0].points, axis=0).max())
     reasons = findings.reasons
@@ -323,10 +324,8 @@ class Part(NamedTuple):
 
     def groups(self) -> list[NDArray[np.intp]]:
         """Rows of each socket, plane or anchor, in the order of measuring."""
-        if not isinstance(self.sensor, Landmarks):
-            return []
         which = self.sensor.of_rows(self.columns)
-        return [self.rows[which == i] for i in range(self.sensor.count)]
+        return [self.rows[which == i] for i in range(self.sensor.num_places)]
 
     def touched(self) -> NDArray[np.bool_]:
         """(D,) distances both of whose sockets have contacts of this arm."""
@@ -463,7 +462,7 @@ def _left_open(
     Of contacts the size: an arm a tenth smaller, its sockets nearer together, touches
     them as well.
     """
-    sockets = [part for part in parts if isinstance(part.sensor, Socket)]
+    sockets = [part for part in parts if part.sensor.socketed]
     sized = any(part.touched().any() for part in sockets)
     if findings.mistaken or sized or not anywhere > _VAGUE * nominal:
         return findings
@@ -621,7 +620,7 @@ def _scattered(calibration: Fit, usual: Array, parts: list[Part]) -> Reason | No
         return None
     largest = float(noise[(noise / usual).argmax()])
     unit = _in(calibration) if np.ptp(usual) == 0.0 else ""
-    touches = any(isinstance(part.sensor, Socket) for part in parts)
+    touches = any(part.sensor.socketed for part in parts)
     several = ", or of several sockets as one" * (touches and times > _LOUD)
     return Reason(
         f"the readings scatter by {largest:.3g}{unit}, {times:.3g} times what this "
@@ -658,7 +657,7 @@ def _net_mass(calibration: Fit, parts: list[Part]) -> list[str]:
 def _kept(calibration: Fit) -> list[str]:
     """Shifts of the tool that contacts do not show, as a sentence."""
     sensor, names = calibration.model.sensor.members[0], calibration.names
-    if not sensor.zeros or isinstance(sensor, Board):
+    if not sensor.zeros or sensor.views:
         return []
     shown = dict(zip(names, np.asarray(calibration.from_data), strict=True))
     kept = [name for name in names if name[:-1] == "tool " and shown[name] < _SHOWN]
@@ -809,7 +808,7 @@ def _other_links(calibration: Fit, parts: list[Part]) -> list[str]:
     lengths = units[: model.table.size] == "length"
     most = np.full(model.table.size, _LINK * model.length)
     reasons = []
-    if not any(isinstance(part.sensor, Position) for part in parts):
+    if not any(p.sensor.positions and not p.sensor.relative for p in parts):
         far = np.flatnonzero(lengths & (sure > most))
         if far.size:
             reasons.append(
@@ -835,7 +834,7 @@ def _anywhere(calibration: Fit, model: Chain, parts: list[Part]) -> tuple[int, f
     number of the part whose readings are positions.
     """
     for at, part in enumerate(parts):
-        if isinstance(part.sensor, Position | Pose | Socket):
+        if part.sensor.positions or part.sensor.socketed:
             return at, _anywhere_of(calibration, model, part)
     return 0, np.nan
 
@@ -928,20 +927,20 @@ def _split(values: Array) -> tuple[float, int, float, float]:
 def _swapped(calibration: Fit, part: Part, explains: bool) -> dict[int, int]:
     """Outliers that fit another socket or plane, as if their column were wrong."""
     model, sensor = calibration.model, part.sensor
-    if not (isinstance(sensor, Landmarks) and sensor.zeros and sensor.count > 1):
+    if not (sensor.zeros and sensor.num_places > 1):
         return {}
     noise = np.asarray(calibration.noise_std)
     at = part.rows[np.isin(part.rows, list(calibration.outliers))]
     swaps: dict[int, int] = {}
     if at.size:
-        trial = np.repeat(calibration.commands[None, at], sensor.count, axis=0)
+        trial = np.repeat(calibration.commands[None, at], sensor.num_places, axis=0)
         column = model.num_joints + model.sensor.inputs.index(sensor.inputs[0])
         stated = trial[..., column].copy()
-        trial[..., column] = np.arange(sensor.count)[:, None]
+        trial[..., column] = np.arange(sensor.num_places)[:, None]
         off = np.abs(calibration.predict(trial) / noise).max(axis=-1)
         for other, row in np.argwhere((off < 4.0) & (stated != trial[..., column])):
             swaps[int(at[row])] = int(other)
-    if isinstance(sensor, Socket) and not explains:
+    if sensor.socketed and not explains:
         # So many that none is an outlier: by the arm as described, where that can tell.
         points = part.points
         labels, which = np.unique(sensor.of_rows(part.columns), return_inverse=True)

@@ -23,13 +23,6 @@ from jaxcal.tables import COMMANDS, Table
 if TYPE_CHECKING:
     from jaxcal.arms import Sensor, SerialChain
 
-__all__ = [
-    "ArmOptions",
-    "ModelPath",
-    "RecordingOptions",
-    "in_degrees",
-    "is_recording",
-]
 
 Array = NDArray[np.float64]
 

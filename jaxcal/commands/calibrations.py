@@ -27,8 +27,6 @@ from jaxcal.commands.tables import (
 )
 from jaxcal.tables import COMMANDS, MEASURED, Table, read_table
 
-__all__ = ["check", "command", "identify", "predict"]
-
 Array = NDArray[np.float64]
 
 RecordPath = Annotated[

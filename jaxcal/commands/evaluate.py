@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from jaxcal.evaluation.results import Evaluation, Summary
     from jaxcal.progress import Progress
 
-__all__ = ["main", "parser"]
 
 EXIT_INTERRUPTED = 130
 EXIT_TERMINATED = 143
@@ -66,8 +65,8 @@ methods:
                       D-efficiency of 0.999; not among the methods run by default
 
 datasets:
-  dataset0 to 5       the paper's, made from --seed (200, 200,000, 1,000, 100, 100 and
-                      1 episodes); 4 and 5 from --recordings, or those that ship
+  dataset1 to 5       the paper's, made from --seed (200,000, 1,000, 100, 100 and 1
+                      episodes); 4 and 5 from --recordings, or those that ship
   FILE.npz            candidates (episodes, M, n); optional measured, available
   FILE.csv            episode,candidate,u_x,u_y,u_z[,y_x,y_y,y_z]
 
@@ -338,7 +337,7 @@ def _whole(
     """Every dataset, read or made before the first is evaluated."""
     from jaxcal.evaluation.methods import evaluate
 
-    for dataset in [_dataset(name, options, progress) for name in options.datasets]:
+    for dataset in [_dataset(name, options) for name in options.datasets]:
         evaluation = evaluate(
             dataset,
             options.k,
@@ -353,7 +352,7 @@ def _whole(
         yield evaluation.summarise(indices=options.indices), evaluation
 
 
-def _dataset(name: str, options: EvaluateOptions, progress: Progress) -> Dataset:
+def _dataset(name: str, options: EvaluateOptions) -> Dataset:
     """The first episodes of one of the paper's datasets, or of a file."""
     from jaxcal.commands.pools import draw_sets, holds_sets
     from jaxcal.evaluation.dataset import Dataset
@@ -361,17 +360,10 @@ def _dataset(name: str, options: EvaluateOptions, progress: Progress) -> Dataset
     from jaxcal.paper.constants import EPISODES
 
     if name in EPISODES:
-        with needs("study", f"--dataset {name}"):
-            from jaxcal.paper.datasets import make_dataset
+        from jaxcal.paper.datasets import make_dataset
 
-            count = min(options.episodes or EPISODES[name], EPISODES[name])
-            return make_dataset(
-                name,
-                options.seed,
-                count,
-                recordings=options.recordings,
-                progress=progress,
-            )
+        count = min(options.episodes or EPISODES[name], EPISODES[name])
+        return make_dataset(name, options.seed, count, recordings=options.recordings)
     if Path(name).suffix.lower() not in (".npz", ".csv"):
         raise ValueError(
             f"--dataset must be one of {', '.join(EPISODES)} or a .npz or .csv file, "
@@ -390,7 +382,7 @@ def _streamed(
     """One dataset in parts."""
     assert options.stream is not None  # it was given
     from jaxcal.evaluation.stream import evaluate_stream
-    from jaxcal.paper.datasets.datasets import drawn
+    from jaxcal.paper.datasets import drawn
 
     whole = {
         "--report": options.report is not None,

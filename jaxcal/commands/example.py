@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from jaxcal.files import write_text
 
-__all__ = ["example"]
-
 Array = NDArray[np.float64]
 
 _TABLE = """\

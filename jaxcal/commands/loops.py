@@ -8,8 +8,6 @@ from typing import Annotated
 
 from jaxcal.extras import needs
 
-__all__ = ["loop"]
-
 
 def loop(
     task: Annotated[str, "a task's name, or a Python file that defines ENTRY"],

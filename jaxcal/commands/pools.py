@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from jaxcal.tables import read_table
 
-__all__ = ["draw_sets", "holds_sets", "read_pool"]
-
 Array = NDArray[np.float64]
 
 

@@ -20,8 +20,6 @@ from jaxcal.extras import needs
 from jaxcal.selection import Design
 from jaxcal.tables import COMMANDS, read_table
 
-__all__ = ["postures"]
-
 Array = NDArray[np.float64]
 
 _DRAWS = 10  # random choices that a plan is compared with

@@ -17,8 +17,6 @@ from jaxcal.commands.tables import write_json
 from jaxcal.extras import MissingExtraError, install
 from jaxcal.files import require_kept
 
-__all__ = ["COMMANDS", "run"]
-
 _HERE = {  # command: one line of help, and the module with its flags and function
     "select": ("choose the few rows of a table worth measuring", "questions"),
     "plan": ("how many measurements a wanted accuracy takes", "questions"),

@@ -17,8 +17,6 @@ from jaxcal.selection import Design, Selection, Worst
 from jaxcal.selection.criteria import CRITERIA, offered
 from jaxcal.tables import Table, read_table
 
-__all__ = ["plan", "select"]
-
 Names = Annotated[list[str] | None, several(str, "names")]
 Rows = Annotated[list[int] | None, several(int, "whole numbers")]
 

@@ -15,13 +15,6 @@ import numpy as np
 
 from jaxcal.files import write_text
 
-__all__ = [
-    "Output",
-    "TablePath",
-    "write_json",
-    "write_rows",
-]
-
 TablePath = Annotated[str, "CSV, or - (standard input)"]
 
 

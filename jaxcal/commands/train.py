@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from jaxcal.learning.training.presets import TrainConfig
     from jaxcal.learning.training.run import Report
 
-__all__ = ["main"]
 
 Stop = Callable[[], bool]
 

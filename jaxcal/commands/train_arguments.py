@@ -20,17 +20,6 @@ from jaxcal.learning.runtime import processes
 from jaxcal.learning.training import presets
 from jaxcal.learning.training.presets import TrainConfig
 
-__all__ = [
-    "TASK_PARTS",
-    "TrainOptions",
-    "candidates_of",
-    "flag_of",
-    "given_flags",
-    "preset_of",
-    "read",
-    "trained_on",
-]
-
 _EPILOG = """\
 presets, of postures:
 {presets}

@@ -9,8 +9,6 @@ from jaxcal.learning.training.postures import Validation
 from jaxcal.learning.training.presets import TrainConfig
 from jaxcal.selection import exact_batch, exchange_batch
 
-__all__ = ["fixed_validation", "teacher"]
-
 _VALIDATED = 500  # sets that a training run is measured on
 
 

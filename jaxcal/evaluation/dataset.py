@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from jaxcal.candidates import JointRanges
 from jaxcal.checks import array_of, require_none
 
-__all__ = ["Dataset"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 

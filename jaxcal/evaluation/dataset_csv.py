@@ -15,8 +15,6 @@ from jaxcal.evaluation.dataset import Dataset
 from jaxcal.files import atomic_write
 from jaxcal.tables import COMMANDS, MEASURED, Table, parse
 
-__all__ = ["read_csv", "save_csv"]
-
 _LABELS = ("episode", "candidate")
 _MASK = "available"
 

@@ -30,19 +30,6 @@ from jaxcal.reports.plots.style import (
 )
 from jaxcal.reports.plots.style import panels as _panels
 
-__all__ = [
-    "best_so_far",
-    "det_distributions",
-    "det_means",
-    "det_per_episode",
-    "evaluation_figures",
-    "first_selection",
-    "gap_to_optimum",
-    "intervals",
-    "styles_of",
-    "variances",
-]
-
 Array = NDArray[np.float64]
 
 SHOWN_EPISODES = 200  # more than these points side by side cannot be told apart

@@ -24,18 +24,6 @@ from jaxcal.information.regression import log_det_gram
 from jaxcal.models.affine import Affine
 from jaxcal.selection.problem import make_problems
 
-__all__ = [
-    "BASELINES",
-    "DEFAULT_METHODS",
-    "DEFAULT_RANDOM_DRAWS",
-    "METHODS",
-    "POLICIES",
-    "check_methods",
-    "evaluate",
-    "label_of",
-    "rows_of",
-]
-
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 T = TypeVar("T")

@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from jaxcal.evaluation.dataset import Dataset
 
-__all__ = ["estimate_parameters", "least_squares", "predict"]
-
 Array = NDArray[np.float64]
 
 

@@ -21,14 +21,6 @@ from jaxcal.evaluation.results import (
 )
 from jaxcal.models.affine import Affine
 
-__all__ = [
-    "HIT_TOLERANCE",
-    "PostureEvaluation",
-    "PostureResult",
-    "log_mean",
-    "summary_of",
-]
-
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 

@@ -13,8 +13,6 @@ from jaxcal.extras import versions
 from jaxcal.files import atomic_write
 from jaxcal.reports.page import Block, Code, Figure, Page, Section, Table, Text, render
 
-__all__ = ["file_prefixes", "json_document", "text_table", "write_report"]
-
 
 def text_table(shown: Summary) -> str:
     """One evaluation as a table, with its notes."""

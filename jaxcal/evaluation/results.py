@@ -10,16 +10,6 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "Column",
-    "Evaluation",
-    "MethodNumbers",
-    "MethodResult",
-    "Summary",
-    "finite",
-    "moments",
-]
-
 Array = NDArray[np.float64]
 
 

@@ -24,8 +24,6 @@ from jaxcal.evaluation.results import MethodNumbers, Summary, finite
 from jaxcal.extras import versions
 from jaxcal.files import write_text
 
-__all__ = ["PART", "evaluate_stream", "total"]
-
 PART = 5_000  # episodes whose rows are one file; the draws' blocks of 1,000 divide it
 _MEANS = ("ratio_to_exact", "hit_rate", "d_efficiency", "seconds_per_selection")
 

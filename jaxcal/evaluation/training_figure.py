@@ -14,8 +14,6 @@ from scipy.signal import lfilter
 from jaxcal.reports.plots.style import COLOURS, panels
 from jaxcal.tables import read_table
 
-__all__ = ["last_rewards", "read_metrics", "training_curves"]
-
 Array = NDArray[np.float64]
 
 

@@ -30,15 +30,6 @@ from jaxcal.learning.environments.functional import FunctionalEnv, PosturesEnv
 from jaxcal.learning.environments.selection import CandidateSource, SelectionConfig
 from jaxcal.learning.policies.networks import NetworkConfig
 
-__all__ = [
-    "EpisodeEnv",
-    "SelectionEnv",
-    "brax_networks",
-    "repaired",
-    "train",
-    "wrap_fresh",
-]
-
 
 class EpisodeEnv(Env):
     """Episodes of ``env`` as a brax environment; brax's wrappers make the batch."""

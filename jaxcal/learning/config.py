@@ -15,24 +15,6 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
-__all__ = [
-    "SHAPES",
-    "TRACED",
-    "EpisodesConfig",
-    "PPOConfig",
-    "RunConfig",
-    "SelectionConfig",
-    "Setting",
-    "StreamsConfig",
-    "Sweep",
-    "named",
-    "path_of",
-    "require",
-    "runs_of",
-    "setting",
-    "settings_of",
-]
-
 SHAPES = ("uniform", "gaussian", "sphere", "clustered", "grid", "cluster_uniform")
 """Shapes of a cloud of candidates, see ``environments.scenarios``."""
 

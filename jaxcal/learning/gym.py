@@ -32,8 +32,6 @@ from jaxcal.learning.environments.functional import (
 )
 from jaxcal.learning.environments.selection import SelectionConfig
 
-__all__ = ["JaxSingle", "JaxVector", "posture", "postures"]
-
 Array = NDArray[Any]
 
 

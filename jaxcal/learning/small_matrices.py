@@ -10,17 +10,6 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-__all__ = [
-    "cholesky",
-    "cholesky_pivots",
-    "log_det_gram",
-    "picked",
-    "row_dot",
-    "row_parts",
-    "row_sum",
-    "solve_lower",
-]
-
 _TINY = 1e-12  # least squared pivot; float32 commands in [0, 1] resolve no smaller one
 _UNROLLED_ROWS = 16  # sums over at most so many rows are written out
 

@@ -10,21 +10,18 @@ from typing import TYPE_CHECKING, Any
 
 from jaxcal.models.affine import Affine
 from jaxcal.models.from_dict import from_dict
-from jaxcal.models.identifiability import Direction, Identifiability, identifiability
+from jaxcal.models.identifiability import Identifiability, identifiability
 from jaxcal.models.model import Model
 from jaxcal.models.recording import Recording
-from jaxcal.models.uncertainty import Noise, Prior, ResolvedPrior
+from jaxcal.models.uncertainty import Noise, Prior
 
 if TYPE_CHECKING:
-    from jaxcal.models.differences import Differences
     from jaxcal.models.from_jax import FromJax
     from jaxcal.models.function import FromFunction
     from jaxcal.models.linear import Linear, Polynomial
 
 __all__ = [
     "Affine",
-    "Differences",
-    "Direction",
     "FromFunction",
     "FromJax",
     "Identifiability",
@@ -34,26 +31,26 @@ __all__ = [
     "Polynomial",
     "Prior",
     "Recording",
-    "ResolvedPrior",
     "from_dict",
     "identifiability",
 ]
 
 _HOME = {
-    "Differences": "differences",
-    "FromFunction": "function",
-    "FromJax": "from_jax",
-    "Linear": "linear",
-    "Polynomial": "linear",
+    "Differences": "jaxcal.models.differences",
+    "Direction": "jaxcal.models.identifiability",
+    "FromFunction": "jaxcal.models.function",
+    "FromJax": "jaxcal.models.from_jax",
+    "Linear": "jaxcal.models.linear",
+    "Polynomial": "jaxcal.models.linear",
+    "ResolvedPrior": "jaxcal.models.uncertainty",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name.startswith("__"):  # asked of every module, as by inspect
         raise AttributeError(name)
-    near = f"jaxcal.models.{_HOME.get(name)}"
-    home = importlib.import_module(near if name in _HOME else "jaxcal.arms")
-    if name not in home.__all__:
+    home = importlib.import_module(_HOME.get(name, "jaxcal.arms"))
+    if name not in (*_HOME, *getattr(home, "__all__", ())):
         raise AttributeError(f"module 'jaxcal.models' has no attribute {name!r}")
     globals()[name] = value = getattr(home, name)
     return value

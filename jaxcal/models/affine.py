@@ -14,8 +14,6 @@ from jaxcal.checks import axis_letter, whole_number
 from jaxcal.information.regression import regressors
 from jaxcal.models.model import Model, as_commands, as_parameters
 
-__all__ = ["Affine"]
-
 Array = NDArray[np.float64]
 
 

@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 from jaxcal.checks import aligned
 from jaxcal.models.periods import within_half
 
-__all__ = ["STENCILS", "Differences", "Stencil", "combined", "look"]
-
 Array = NDArray[np.float64]
 Evaluate = Callable[[Array], Array]  # points (S, p) -> values (S, N, q), NaN: refused
 

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from jaxcal.extras import needs
 
-__all__ = ["Factor", "input_names", "parse"]
-
 Numbers = NDArray[Any]
 Factor = Callable[[Mapping[str, Numbers]], Any]  # values of the inputs by name
 

@@ -10,8 +10,6 @@ from jaxcal.extras import installed
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model
 
-__all__ = ["from_dict"]
-
 _GROUP = "jaxcal.models"  # entry points by which others, as jaxcal.arms, add kinds
 _KINDS = ("affine", "linear", "polynomial")
 _UNWRITTEN = ("function", "jax")  # kinds that hold a function

@@ -15,8 +15,6 @@ from jaxcal.extras import needs
 from jaxcal.models.model import Model, as_commands, as_parameters
 from jaxcal.models.periods import checked_periods
 
-__all__ = ["FromJax"]
-
 Array = NDArray[np.float64]
 
 

@@ -37,8 +37,6 @@ from jaxcal.models.periods import checked_periods
 from jaxcal.models.runs import CommandLine, Runs
 from jaxcal.models.uncertainty import Noise, Prior, as_noise
 
-__all__ = ["FromFunction"]
-
 Array = NDArray[np.float64]
 
 _PILOTS = 4  # commands at which steps are chosen

@@ -21,8 +21,6 @@ from jaxcal.models.model import (
 )
 from jaxcal.models.uncertainty import Noise, Prior, as_noise
 
-__all__ = ["Direction", "Identifiability", "identifiability", "unknown"]
-
 Array = NDArray[np.float64]
 
 

@@ -15,8 +15,6 @@ from jaxcal.checks import axis_names, numbers, whole_number
 from jaxcal.models.formula import input_names, parse
 from jaxcal.models.model import Model, as_commands, as_parameters
 
-__all__ = ["Linear", "Polynomial"]
-
 Array = NDArray[np.float64]
 
 

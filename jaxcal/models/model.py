@@ -27,20 +27,6 @@ from jaxcal.tables import COMMANDS, header_of, of_frame
 if TYPE_CHECKING:
     from jaxcal.models.verdict import Verdict
 
-__all__ = [
-    "ErrorGroups",
-    "Model",
-    "Quantity",
-    "answered",
-    "as_commands",
-    "as_model",
-    "as_parameters",
-    "by_name",
-    "derivative",
-    "predict",
-    "recorded",
-    "without_effect",
-]
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]

@@ -7,8 +7,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import one_or_each, require_none
 
-__all__ = ["checked_periods", "within_half"]
-
 Array = NDArray[np.float64]
 
 

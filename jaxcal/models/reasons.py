@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "RULES",
-    "Reason",
-    "computed",
-    "in_rows",
-    "never_measured",
-    "not_invertible",
-    "outlying",
-    "wrong_noise",
-]
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration as Fit
+
 
 Array = NDArray[np.float64]
-Fit = Any  # a jaxcal.Calibration, whose package imports this one
 
 UNLIKELY = 1e-4  # p-value of residuals under the noise that was given
 _CHANCE = 0.01  # that readings of nothing pass for a fit
@@ -173,14 +165,18 @@ def _unknown(fit: Fit) -> Reason | None:
     of_prior = fit.prior_precision.any()
     if fit.noise_std is None or (fit.model.linear and not of_prior):
         return None
-    errors = fit.standard_errors
+    errors = np.asarray(fit.standard_errors)
     free = fit.free[: len(errors)] > 0.0
     sizes = np.fmax(np.abs(fit.parameters), fit.model.parameter_sizes())
     bad = np.isnan(errors)
     if not fit.model.linear:
         bad |= np.isfinite(errors) & (errors > _SIZES * sizes)
     prior = fit.prior_precision[: len(errors)] > 0.0
-    if free.any() and prior[free].all() and (fit.from_data[free] < 0.1).all():
+    if (
+        free.any()
+        and prior[free].all()
+        and (np.asarray(fit.from_data)[free] < 0.1).all()
+    ):
         bad |= free
     if not (bad & free).any():
         return None
@@ -226,7 +222,8 @@ def wrong_noise(fit: Fit) -> Reason | None:
 
     if not fit.noise_known or fit.dof < 0.5:
         return None
-    white, names = fit.residuals / fit.noise_std, np.array(fit.output_names)
+    noise, where = np.asarray(fit.noise_std), ""
+    white, names = fit.residuals / noise, np.array(fit.output_names)
     squares = (white**2).sum(axis=0)
     if fit.model.error_groups() is not None or not _in_noise(fit, white):
         squares, names = np.array([fit.square]), np.array([""])
@@ -242,7 +239,7 @@ def wrong_noise(fit: Fit) -> Reason | None:
     if not (small | large).any():
         return None
     worst = int(np.where(small | large, np.abs(np.log(times)), -1.0).argmax())
-    noise, where, factor = fit.noise_std, "", times[worst]
+    factor = times[worst]
     if times.max() > _TOO_LARGE * times.min():
         noise, where = noise[[worst]], f" for {names[worst]}"
     word, ratio = ("small", factor) if small[worst] else ("large", 1.0 / factor)
@@ -305,7 +302,7 @@ def _short(value: float) -> str:
     return f"{float(f'{value:.2g}'):g}"
 
 
-Rule = Callable[[Fit], Reason | None]
+Rule = Callable[["Fit"], Reason | None]
 RULES: tuple[Rule, ...] = (
     _no_noise,
     _undetermined,

@@ -6,8 +6,6 @@ import dataclasses
 import os
 from collections.abc import Mapping, Sequence
 
-__all__ = ["Recording"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Recording:

@@ -30,8 +30,6 @@ from numpy.typing import NDArray
 from jaxcal.checks import in_words
 from jaxcal.progress import Progress
 
-__all__ = ["CommandLine", "Runs"]
-
 Array = NDArray[np.float64]
 Job = tuple[Array, Array]  # commands (N, n) and parameters (p,)
 Answer = Array | str  # readings (q,), or why there are none

@@ -20,8 +20,6 @@ from jaxcal.checks import (
 )
 from jaxcal.information.singular import significant
 
-__all__ = ["Noise", "Prior", "ResolvedPrior", "as_noise"]
-
 Array = NDArray[np.float64]
 PerParameter = ArrayLike | Mapping[str, float]
 

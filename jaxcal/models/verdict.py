@@ -8,7 +8,7 @@ and warnings ask no one else.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +16,12 @@ from numpy.typing import NDArray
 from jaxcal.late import late
 from jaxcal.models.reasons import RULES, computed, never_measured, not_invertible
 
-__all__ = [
-    "USE",
-    "CalibrationWarning",
-    "Verdict",
-    "between_sessions",
-    "left_out",
-    "verdict",
-]
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration
+    from jaxcal.calibration.fit import Fit
+
 
 Array = NDArray[np.float64]
-Fit = Any  # a jaxcal.Calibration, whose package imports this one
 
 _CHECK = "a change of the machine (check, jaxcal check)"
 USE = (
@@ -85,7 +80,7 @@ def left_out(fit: Fit) -> Array:
     return np.asarray(np.linalg.solve(root, white)[..., 0])
 
 
-def between_sessions(fit: Fit, labels: NDArray[np.intp]) -> Array:
+def between_sessions(fit: Calibration, labels: NDArray[np.intp]) -> Array:
     """(m,) standard deviation of readings of another session, beyond what is expected.
 
     Each session is predicted from a fit of the others.
@@ -117,7 +112,7 @@ def between_sessions(fit: Fit, labels: NDArray[np.intp]) -> Array:
     return np.sqrt(excess.clip(0.0))
 
 
-def verdict(fit: Fit) -> Verdict:
+def verdict(fit: Calibration) -> Verdict:
     """Good if no rule speaks against the fit and its inverse is not refused.
 
     Where readings were not measured, that is the only reason given: the others would

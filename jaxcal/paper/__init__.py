@@ -1,4 +1,4 @@
-"""What a user of jaxcal has of the paper: its network and preset, robot and datasets.
+"""What a user of jaxcal has of the paper: its network, presets and datasets.
 
-Its figures, tables and claims are a study of the repository: ``make reproduce``.
+Its robot, figures, tables and claims are benchmarks: ``make reproduce``.
 """

@@ -6,20 +6,6 @@ import numpy as np
 
 from jaxcal.candidates import JointRanges
 
-__all__ = [
-    "AXES",
-    "BIAS_DEG",
-    "BLOCK",
-    "DRAWN",
-    "EPISODES",
-    "NAMES",
-    "NOISE_STD_DEG",
-    "NUM_CANDIDATES",
-    "RANGES",
-    "RECORDED",
-    "SCALE",
-]
-
 AXES = ("pitch", "yaw", "roll")
 SCALE = np.array([0.43, 0.71, 0.87])  # pitch, yaw, roll; Table 1 lists roll before yaw
 BIAS_DEG = np.array([3.1, -5.8, 2.41])

@@ -12,8 +12,6 @@ from jaxcal.learning.core.network import Network, mask_logits
 from jaxcal.learning.environments.observation import context_features
 from jaxcal.learning.policies.networks import NetworkConfig
 
-__all__ = ["HEADS", "Decision", "Observing", "PaperFeatures", "PaperNetwork"]
-
 HEADS = ("actor", "critic_1", "critic_2")  # everything else is shared
 
 

@@ -16,8 +16,6 @@ from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training.presets import TrainConfig
 
-__all__ = ["OBSERVATION", "PAPER"]
-
 PAPER = TrainConfig(
     preset="paper",
     about="the paper's network (3.5 million weights) and schedule; hours on a CPU",

@@ -21,8 +21,6 @@ from jaxcal.learning.core.network import mask_logits
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.paper.network import Decision, Observing, PaperFeatures
 
-__all__ = ["ProductNetwork"]
-
 _STATE = 64  # numbers that the chosen postures become
 _HEADS = 4
 _READ = 4  # squares that are read from every layer

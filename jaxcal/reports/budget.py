@@ -20,8 +20,6 @@ from jaxcal.calibration.fit import Fit
 from jaxcal.checks import aligned, array_of, one_or_each
 from jaxcal.information.singular import depends
 
-__all__ = ["Budget", "Source", "budget"]
-
 Array = NDArray[np.float64]
 
 

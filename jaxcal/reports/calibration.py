@@ -30,7 +30,6 @@ from jaxcal.tables import COMMANDS, MEASURED
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
 
-__all__ = ["SCHEMA", "moved", "report"]
 
 Array = NDArray[np.float64]
 

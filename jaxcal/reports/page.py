@@ -16,24 +16,6 @@ from typing import Any, Literal
 from jaxcal.extras import needs
 from jaxcal.files import write_text
 
-__all__ = [
-    "Badge",
-    "Block",
-    "Box",
-    "Code",
-    "Content",
-    "Figure",
-    "Link",
-    "Page",
-    "Row",
-    "Section",
-    "Strong",
-    "Table",
-    "Text",
-    "render",
-    "write_page",
-]
-
 
 @dataclasses.dataclass(frozen=True)
 class Link:

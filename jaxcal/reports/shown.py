@@ -9,8 +9,6 @@ import numpy as np
 
 from jaxcal.extras import MissingExtraError, needs
 
-__all__ = ["as_html", "plot_calibration", "plot_plan", "plot_selection"]
-
 
 def _axes(given: Any, solid: bool = False) -> Any:
     """Axes to draw on: those given, or of a new figure."""

@@ -21,7 +21,7 @@ from jaxcal.evaluation import figures, stream
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import save_csv, save_npz
 from jaxcal.information.regression import regression_matrix
-from jaxcal.paper.datasets.datasets import make_dataset
+from jaxcal.paper.datasets import make_dataset
 from jaxcal.progress import Progress
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -244,7 +244,6 @@ def test_a_missing_checkpoint_is_one_line_and_code_2(
     [
         ("matplotlib", ["--report", "{tmp}/r"], "--report needs matplotlib"),
         ("jinja2", ["--report", "{tmp}/r"], "--report needs jinja2"),
-        ("mujoco", ["--dataset", "dataset0"], "--dataset dataset0 needs mujoco"),
     ],
 )
 def test_a_missing_extra_is_one_line_that_names_the_command(
@@ -257,20 +256,20 @@ def test_a_missing_extra_is_one_line_that_names_the_command(
 ) -> None:
     for name in [name for name in sys.modules if name.partition(".")[0] == package]:
         monkeypatch.delitem(sys.modules, name)
-    importers = {
-        "mujoco": "jaxcal.paper.twin",
-    }
-    if package in importers:  # which is imported again, in vain
-        monkeypatch.delitem(sys.modules, importers[package], raising=False)
     monkeypatch.setitem(sys.modules, package, None)
     given = [argument.format(tmp=tmp_path) for argument in arguments]
     done = call(capsys, "--methods", "greedy", "--episodes", 2, *given)
     assert done.returncode == 2 and done.stdout == ""
-    extra = "study" if package == "mujoco" else "plots"
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"evaluate.py: {says}, which is not installed: ")
-    assert line.endswith(f"[{extra}]'")
+    assert line.endswith("[plots]'")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_dataset0_says_how_it_is_made(capsys: pytest.CaptureFixture[str]) -> None:
+    done = call(capsys, "--methods", "greedy", "--dataset", "dataset0")
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
+    assert "python -m benchmarks.paper.datasets dataset0 --out DIR" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ from jaxcal.evaluation.report import (
 from jaxcal.evaluation.training_figure import training_curves
 from jaxcal.information.regression import regression_matrix
 from jaxcal.models import Affine
-from jaxcal.paper.datasets.datasets import make_dataset
+from jaxcal.paper.datasets import make_dataset
 from jaxcal.reports.plots import as_bytes
 
 BASELINES = ("random", "greedy", "exchange", "exact")

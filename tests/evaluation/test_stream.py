@@ -20,7 +20,7 @@ from jaxcal.evaluation.report import json_document, text_table
 from jaxcal.evaluation.results import MethodNumbers, Summary
 from jaxcal.evaluation.stream import evaluate_stream
 from jaxcal.information.regression import log_det_information
-from jaxcal.paper.datasets.datasets import drawn, make_dataset
+from jaxcal.paper.datasets import drawn, make_dataset
 
 PLAN: dict[str, Any] = {
     **{"dataset": "dataset2", "seed": 0, "k": 4, "checkpoints": [None]},

@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxcal
+from benchmarks.paper.datasets import main, make_dataset
 from jaxcal.candidates import JointRanges
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import (
@@ -32,9 +33,8 @@ from jaxcal.paper.constants import (
     RECORDED,
     SCALE,
 )
-from jaxcal.paper.datasets import chunks, make_dataset
-from jaxcal.paper.datasets.__main__ import main
-from jaxcal.paper.datasets.recordings import SHIPPED, read_pool
+from jaxcal.paper.datasets import chunks
+from jaxcal.paper.recordings import SHIPPED, read_pool
 
 # A loaded machine is no failure.
 settings.register_profile("patient", deadline=None)

@@ -18,9 +18,8 @@ from PIL import Image
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from jaxcal.paper.datasets import BIAS_DEG, SCALE, make_dataset
-from jaxcal.paper.datasets.__main__ import write_datasets
-from studies.paper.reproduce import main
+from benchmarks.paper.datasets import BIAS_DEG, SCALE, make_dataset, write_datasets
+from benchmarks.paper.reproduce import main
 
 ROOT = pathlib.Path(__file__).parents[2]
 
@@ -29,7 +28,7 @@ pytestmark = pytest.mark.slow  # one report for all; its parts are tested quickl
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "studies.paper", *map(str, arguments)],
+        [sys.executable, "-m", "benchmarks.paper", *map(str, arguments)],
         capture_output=True,
         text=True,
         cwd=ROOT,

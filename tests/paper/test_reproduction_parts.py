@@ -11,21 +11,21 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.typing import NDArray
 from scipy import stats
 
-from jaxcal.calibration.identify import identify
-from jaxcal.evaluation.parameters import least_squares, predict
-from jaxcal.reports.plots import as_bytes
-from jaxcal.tables import csv_text
-from studies.paper.exhibits.devices import Device
-from studies.paper.exhibits.intervals import (
+from benchmarks.paper.exhibits.devices import Device
+from benchmarks.paper.exhibits.intervals import (
     bootstrap_interval,
     mean_interval,
     median_interval,
     ratio_interval,
     share_interval,
 )
-from studies.paper.exhibits.study import Settings, Study
-from studies.paper.exhibits.training import exhibits, kept_runs, plateau
-from studies.paper.exhibits.variance import variance_table
+from benchmarks.paper.exhibits.study import Settings, Study
+from benchmarks.paper.exhibits.training import exhibits, kept_runs, plateau
+from benchmarks.paper.exhibits.variance import variance_table
+from jaxcal.calibration.identify import identify
+from jaxcal.evaluation.parameters import least_squares, predict
+from jaxcal.reports.plots import as_bytes
+from jaxcal.tables import csv_text
 
 Array = NDArray[np.float64]
 

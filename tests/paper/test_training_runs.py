@@ -8,9 +8,9 @@ import pathlib
 import numpy as np
 import pytest
 
+from benchmarks.paper.training_runs import main, thinned
 from jaxcal.commands.train import main as train
 from jaxcal.evaluation.training_figure import read_metrics
-from studies.paper.training_runs import main, thinned
 
 
 def test_thinning_keeps_moments_and_last_values(rng: np.random.Generator) -> None:

@@ -12,7 +12,7 @@ import pytest
 from scipy.optimize import minimize
 
 import jaxcal
-from jaxcal.paper.twin import (
+from benchmarks.paper.twin import (
     GRAVITY,
     ORDERS,
     RobotConfig,
@@ -182,7 +182,7 @@ def test_mujoco_is_not_the_release_that_solves_wrongly() -> None:
 
 def test_the_closed_form_loads_neither_mujoco_nor_jax() -> None:
     code = (
-        "import sys\nfrom jaxcal.paper.twin import RobotConfig, read_out\n"
+        "import sys\nfrom benchmarks.paper.twin import RobotConfig, read_out\n"
         "read_out(RobotConfig(), [[1, 2, 3]])\n"
         "assert not {'mujoco', 'matplotlib', 'jax'} & set(sys.modules)"
     )

@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from jaxcal.adaptive.rules import Rule
     from jaxcal.learning.core.streams import Streams
 
-__all__ = ["PPO", "PolicyConfig"]
 
 PPO = StreamsConfig(
     num_epochs=4,

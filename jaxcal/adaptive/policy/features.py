@@ -11,8 +11,6 @@ from flax import struct
 from jaxcal.adaptive.rules import Rule, groups_of, log_score, shortlist
 from jaxcal.adaptive.session import Options, Session
 
-__all__ = ["NUM_FEATURES", "Shortlist", "shortlist_of"]
-
 NUM_FEATURES = 31
 _SCALE = 20.0  # seconds
 

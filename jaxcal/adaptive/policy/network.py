@@ -13,8 +13,6 @@ from jaxcal.adaptive.policy.features import NUM_FEATURES, Shortlist, shortlist_o
 from jaxcal.adaptive.rules import Rule
 from jaxcal.adaptive.session import Options, Session
 
-__all__ = ["Correction", "PolicyDecider"]
-
 # Initial factor of the rule's log score: an option whose score is a fifth below the
 # best one's is sampled a third as often (0.8^5).
 _SHARPNESS = 5.0

@@ -15,8 +15,6 @@ from jaxcal.adaptive.rules import Rule
 from jaxcal.adaptive.session import Session
 from jaxcal.learning.core.streams import Step
 
-__all__ = ["Exercise", "Sessions", "State"]
-
 
 @struct.dataclass
 class Exercise:

@@ -21,8 +21,6 @@ from jaxcal.learning.training import checkpoint
 from jaxcal.learning.training.checkpoint import CheckpointError
 from jaxcal.learning.training.run import Recipe, run
 
-__all__ = ["MEASURED", "TaskPolicy", "exercises", "load", "train"]
-
 SCHEMA = "jaxcal-sequential-policy"
 MEASURED = ("nats", "nats_over_base")
 _VALIDATED = 1024  # sessions of a validation

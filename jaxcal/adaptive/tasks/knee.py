@@ -14,8 +14,6 @@ from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.rules import Priced, StateRule
 from jaxcal.adaptive.tasks.registry import Entry
 
-__all__ = ["PRICED", "STATE_RULE", "knee"]
-
 # Tuned on this task with its default constants.
 PRICED = Priced(c0=0.015, c1=0.182, c2=2.392)
 STATE_RULE = StateRule(

@@ -19,8 +19,6 @@ from typing import Any
 from jaxcal.adaptive.rules import Priced, StateRule
 from jaxcal.extras import installed
 
-__all__ = ["FREE", "Entry", "load", "names", "options_from"]
-
 _GROUP = "jaxcal.tasks"  # entry points
 _OWN = {
     "knee": "jaxcal.adaptive.tasks.knee:ENTRY",

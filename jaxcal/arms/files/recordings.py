@@ -17,8 +17,6 @@ from jaxcal.checks import in_words
 from jaxcal.extras import needs
 from jaxcal.models.recording import Recording
 
-__all__ = ["Rests", "jitter", "rests", "rests_of"]
-
 Array = NDArray[np.float64]
 
 _WITHIN = 0.05  # degrees in which a resting joint stays

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from jaxcal.files import write_text
 
-__all__ = ["Servos"]
-
 Array = NDArray[np.float64]
 
 _KEYS = ("id", "drive_mode", "homing_offset", "range_min", "range_max")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,11 @@ from jaxcal.arms.verdict import place_of
 from jaxcal.checks import one_of
 from jaxcal.models.uncertainty import Prior
 
-__all__ = ["StaticTransform", "static_transform", "to_transform"]
+if TYPE_CHECKING:
+    from jaxcal.arms.verdict import ArmFit as Calibration
+
 
 Array = NDArray[np.float64]
-Calibration = Any  # a jaxcal.Calibration of an arm with a board
 
 _FORMS = (".yaml", ".yml", ".sh", ".py", ".urdf")
 _METRES = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}

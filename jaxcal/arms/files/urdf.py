@@ -19,20 +19,6 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal.checks import numbers, one_of
 
-__all__ = [
-    "Joint",
-    "joints_of",
-    "led",
-    "links_of",
-    "moved",
-    "read_ur_kinematics",
-    "read_urdf",
-    "row_matrix",
-    "table_of",
-    "turn_of_z",
-    "walk",
-]
-
 Array = NDArray[np.float64]
 
 _PARALLEL = 0.2  # sine; below it the common normal of two axes is far away

@@ -34,7 +34,6 @@ from jaxcal.files import atomic_write
 if TYPE_CHECKING:
     from jaxcal.arms.arm import Arm
 
-__all__ = ["fixed_joint", "pose_words", "save", "urdf_text", "with_origins", "written"]
 
 Array = NDArray[np.float64]
 

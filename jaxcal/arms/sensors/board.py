@@ -21,8 +21,6 @@ from jaxcal.arms.sensors.sensor import (
 from jaxcal.checks import array_of, numbers, one_of
 from jaxcal.models.model import Quantity
 
-__all__ = ["Board"]
-
 Array = NDArray[np.float64]
 
 _FEW = 3  # views that find where a board stands and its tool
@@ -79,6 +77,7 @@ class Board(Sensor):
     intrinsics: bool = False
 
     kind = "board"
+    views = True
     tool = ("x", "y", "z", "rx", "ry", "rz")
     stands = True
     _seen: ClassVar[tuple[str, ...]] = tuple(f"seen {axis}" for axis in tool)

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.arms.sensors.sensor import Landmarks, Reading, Tip
 
-__all__ = ["Distance"]
-
 Array = NDArray[np.float64]
 
 

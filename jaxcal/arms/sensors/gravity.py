@@ -12,8 +12,6 @@ from jaxcal.arms.sensors.sensor import HasNames, Reading, Sensor, Tip, hats
 from jaxcal.checks import in_words, numbers
 from jaxcal.models.model import Quantity
 
-__all__ = ["Gravity"]
-
 Array = NDArray[np.float64]
 
 _ASIDE = 0.7  # cosine: readings farther from up have another up

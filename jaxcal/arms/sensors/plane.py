@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.arms.sensors.sensor import Landmarks, Reading, Tip, hats
 from jaxcal.models.model import Quantity
 
-__all__ = ["Flush", "Plane"]
-
 Array = NDArray[np.float64]
 
 

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.arms.sensors.sensor import Reading, Sensor, Tip, hats
 from jaxcal.models.model import Quantity
 
-__all__ = ["Pose", "rotation_vector_rate"]
-
 Array = NDArray[np.float64]
 
 
@@ -24,6 +22,8 @@ class Pose(Sensor):
     """
 
     kind = "pose"
+    positions = True
+    relative = True
     tool = ("x", "y", "z", "rx", "ry", "rz")
     outputs = tool
     quantities = (Quantity("length", slice(3)), Quantity("deg", slice(3, 6)))

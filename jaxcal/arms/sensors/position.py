@@ -9,8 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.arms.sensors.sensor import Reading, Sensor, Tip
 
-__all__ = ["Position"]
-
 Array = NDArray[np.float64]
 
 
@@ -19,6 +17,7 @@ class Position(Sensor):
     """x, y, z of the tip in the measuring frame; noise 0.01 % of the arm's length."""
 
     kind = "position"
+    positions = True
     lengths = True
     outputs = ("x", "y", "z")
     misfit = 3e-4

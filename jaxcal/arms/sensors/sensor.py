@@ -15,19 +15,6 @@ from jaxcal.checks import array_of, numbers, whole_number
 from jaxcal.models.model import Quantity
 from jaxcal.models.periods import within_half
 
-__all__ = [
-    "BASE",
-    "HasNames",
-    "Landmarks",
-    "Reading",
-    "Readings",
-    "Sensor",
-    "Tip",
-    "hats",
-    "label",
-    "turns",
-]
-
 Array = NDArray[np.float64]
 
 BASE = tuple(f"base {axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
@@ -130,6 +117,11 @@ class Sensor(abc.ABC):
     compliant: ClassVar[bool] = False  # shown to be better with joints that yield
     local: ClassVar[bool] = False  # of few places: harmonics are fitted if they gain
     stands: ClassVar[bool] = False  # what is read stands at a place that it finds
+    positions: ClassVar[bool] = False  # its first three readings are the tip's place
+    relative: ClassVar[bool] = False  # the others are turns from the nominal ones
+    views: ClassVar[bool] = False  # it sees a board, or is one, by a camera
+    socketed: ClassVar[bool] = False  # its contacts are of a ball in a socket
+    joined: ClassVar[bool] = False  # it is several sensors in one table
     needed: ClassVar[int] = 1  # readings that find a place
     # How well the tool is known, by the arm's length: it may hang anywhere; 0.4 % where
     # readings hardly show it and would put it anywhere.
@@ -206,6 +198,11 @@ class Sensor(abc.ABC):
         Of one that finds its tool too, that: every arm has its own.
         """
         return self
+
+    @property
+    def num_places(self) -> int:
+        """Sockets, planes or anchors that stand around the arm."""
+        return 0
 
     def of_rows(self, inputs: Array) -> NDArray[np.int64]:
         """(N,) which of the things that stand around each row is of."""
@@ -313,6 +310,10 @@ class Landmarks(Sensor):
         if self.places is not None:
             places = array_of("places", self.places, self.count, self.width)
             object.__setattr__(self, "places", places)
+
+    @property
+    def num_places(self) -> int:
+        return self.count
 
     @property
     def inputs(self) -> tuple[str, ...]:

@@ -21,8 +21,6 @@ from jaxcal.arms.sensors.sensor import (
 )
 from jaxcal.checks import array_of, table
 
-__all__ = ["Several"]
-
 Array = NDArray[np.float64]
 
 _MOUNTING = ("x", "y", "z", "rx", "ry", "rz")
@@ -47,6 +45,7 @@ class Several(Sensor):
     mounts: ArrayLike | None = None
 
     kind = "several"
+    joined = True
     first_unit = "times the noise"
 
     def __post_init__(self) -> None:

@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.arms.sensors.sensor import Landmarks, Reading, Tip
 from jaxcal.checks import numbers
 
-__all__ = ["Socket"]
-
 Array = NDArray[np.float64]
 
 
@@ -35,6 +33,7 @@ class Socket(Landmarks):
     distances: Sequence[Sequence[float]] = ()
 
     kind = "socket"
+    socketed = True
     lengths = True
     outputs = ("off x", "off y", "off z")
     zeros = True

@@ -12,8 +12,6 @@ from jaxcal.arms.sensors.sensor import HasNames, Reading, Sensor, Tip, hats
 from jaxcal.checks import array_of, in_words, numbers
 from jaxcal.models.model import Quantity
 
-__all__ = ["Wrench"]
-
 Array = NDArray[np.float64]
 
 _FEW = 4  # postures that show how the sensor is mounted

@@ -12,7 +12,7 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,12 +39,13 @@ from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Prior
 from jaxcal.models.verdict import Verdict
 
+if TYPE_CHECKING:
+    from jaxcal.calibration.fit import Fit
+
 __all__ = ["Mispairing", "against", "mispairing", "of_new_readings", "of_unfitted"]
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
-
-Fit = Any  # a jaxcal.calibration.fit.Fit, whose module need not be known here
 
 _SURE = 8.0  # log of the odds at which a mispairing is said
 _RATIO = 2.0  # times the noise without it, least squares of the table as it stands

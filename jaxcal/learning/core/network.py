@@ -21,8 +21,6 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-__all__ = ["Network", "decode", "encode", "initial", "mask_logits"]
-
 _OWN = "every Network defines this itself; this class only declares it"
 _LAST = "a Network with num_unlearned > 0 defines this itself"
 

@@ -30,8 +30,6 @@ from jaxcal.learning.core.ppo import (
     surrogate,
 )
 
-__all__ = ["Episode", "Postures"]
-
 
 class Episode(Protocol):
     """The environment: one episode, as pure functions. Hashable.

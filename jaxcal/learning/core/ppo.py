@@ -29,24 +29,6 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxcal.learning.config import TRACED, PPOConfig
 
-__all__ = [
-    "Batch",
-    "Learner",
-    "Metrics",
-    "TrainState",
-    "advantages",
-    "begin",
-    "explained_variance",
-    "make_train",
-    "make_update",
-    "mean_over",
-    "minibatches",
-    "normalised",
-    "placed",
-    "schedule",
-    "surrogate",
-]
-
 _LEAST = -1e9  # logit of what is not available, as ``mask_logits`` has it
 
 Metrics = dict[str, jax.Array]

@@ -30,8 +30,6 @@ from jaxcal.learning.core.ppo import (
     surrogate,
 )
 
-__all__ = ["Environment", "Step", "Stream", "Streams"]
-
 
 @struct.dataclass
 class Step:

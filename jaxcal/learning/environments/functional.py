@@ -32,8 +32,6 @@ from jaxcal.learning.environments.selection import CandidateSource, SelectionCon
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 
-__all__ = ["EnvParams", "FunctionalEnv", "PosturesEnv", "renewed"]
-
 _LARGEST = float(np.finfo(np.float32).max)
 
 

@@ -13,8 +13,6 @@ from jaxcal.learning.small_matrices import (
     row_sum,
 )
 
-__all__ = ["context_features"]
-
 
 def context_features(candidates: jax.Array, chosen: jax.Array) -> jax.Array:
     """The paper's ten context numbers: statistics, progress, matrix features.

@@ -14,8 +14,6 @@ import math
 import jax
 import jax.numpy as jnp
 
-__all__ = ["uniform"]
-
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from jaxcal.learning.environments.selection import CandidateSource, SelectionState
 
-__all__ = ["GivenCandidates", "Task"]
-
 
 @dataclasses.dataclass(frozen=True)
 class GivenCandidates:

@@ -11,8 +11,6 @@ from jaxcal.learning.core.network import Network
 from jaxcal.learning.policies.compact import CompactNetwork
 from jaxcal.learning.policies.networks import GROUP, NetworkConfig
 
-__all__ = ["build"]
-
 
 def build(config: NetworkConfig) -> Network:
     """The network that a configuration names: ``compact``, one's own, a package's."""

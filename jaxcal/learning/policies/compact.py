@@ -20,8 +20,6 @@ from jaxcal.learning.policies.features import (
 )
 from jaxcal.learning.policies.networks import NetworkConfig
 
-__all__ = ["CompactNetwork"]
-
 _SHARP = 60.0  # inverse temperature of the choices that need no learning
 
 

@@ -17,8 +17,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Scorer", "choose", "in_pieces", "log_dets"]
-
 Array = NDArray[Any]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]

@@ -15,17 +15,6 @@ import numpy as np
 
 from jaxcal.learning.policies import geometry
 
-__all__ = [
-    "AHEAD",
-    "FEATURES",
-    "CandidateFeatures",
-    "DecisionFeatures",
-    "VectorFeatures",
-    "close_up_of",
-    "decision_features",
-    "vector_features",
-]
-
 _FLOOR = -8.0  # least log-volume, relative to the best, that a feature can show
 _RIDGE = 0.01  # of the mean square of a whitened coordinate, which is one
 _CLOSE = (32.0, 256.0, 2048.0)  # scales at which near-equal look-aheads differ

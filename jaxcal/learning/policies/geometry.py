@@ -16,15 +16,6 @@ import jax.numpy as jnp
 
 from jaxcal.learning.small_matrices import cholesky, solve_lower
 
-__all__ = [
-    "ALL_START",
-    "STARTS",
-    "lookahead",
-    "normalised_by",
-    "projected",
-    "whiten",
-]
-
 _LOWEST = -30.0  # log-volume of a candidate that is not active
 ALL_START = 1024  # M up to which all are looked ahead from
 STARTS = 512  # of more, those of largest gain that are

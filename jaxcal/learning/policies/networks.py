@@ -17,8 +17,6 @@ from typing import Any
 from jaxcal.extras import installed
 from jaxcal.learning.config import path_of, require, setting
 
-__all__ = ["GROUP", "NetworkConfig"]
-
 GROUP = "jaxcal.networks"
 
 

@@ -16,8 +16,6 @@ from jaxcal.learning.core.network import Network
 from jaxcal.learning.policies import decoding as decoders
 from jaxcal.learning.small_matrices import log_det_gram
 
-__all__ = ["NetworkScorer", "choose", "log_det_of", "scores_of"]
-
 
 class NetworkScorer:
     """The ``decoding.Scorer`` of a ``Network`` and its parameters."""

@@ -9,8 +9,6 @@ import os
 import pathlib
 import sys
 
-__all__ = ["keep_compiled_programs"]
-
 
 def keep_compiled_programs() -> None:
     """Have JAX cache compiled code on disk: in the folder that the user has set, else

@@ -22,18 +22,6 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxcal.learning.runtime.processes import collective
 
-__all__ = [
-    "a_device_for_each_core",
-    "any_process",
-    "describe",
-    "is_first",
-    "local",
-    "make_mesh",
-    "on_first",
-    "replicate",
-    "spread",
-]
-
 T = TypeVar("T")
 
 

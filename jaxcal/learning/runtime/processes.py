@@ -19,15 +19,6 @@ from typing import Annotated, ClassVar
 
 from jaxcal.arguments import Parser, values_of
 
-__all__ = [
-    "EXIT_LOST",
-    "HEARTBEAT_SECONDS",
-    "Job",
-    "collective",
-    "expected",
-    "run_job",
-]
-
 EXIT_LOST = 3  # another process of the job is gone
 HEARTBEAT_SECONDS = 20  # silence after which a process counts as lost
 _CONNECT_SECONDS = 300  # for all processes to come together

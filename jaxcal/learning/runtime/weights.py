@@ -20,18 +20,6 @@ from numpy.typing import NDArray
 
 from jaxcal.files import atomic_write
 
-__all__ = [
-    "CheckpointError",
-    "Weights",
-    "flat",
-    "locate",
-    "nested",
-    "read",
-    "require_trained_by_d",
-    "shipped",
-    "write",
-]
-
 _FORMAT = "jaxcal-policy-weights"
 _VERSION = 2
 

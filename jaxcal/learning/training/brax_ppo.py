@@ -21,8 +21,6 @@ from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training import checkpoint
 from jaxcal.learning.training.presets import TrainConfig
 
-__all__ = ["adapted", "network_params", "require_read", "train"]
-
 _READ = {  # fields of PPOConfig that brax is given: brax's names
     "learning_rate": "learning_rate",
     "entropy_start": "entropy_cost",

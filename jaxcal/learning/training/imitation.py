@@ -26,8 +26,6 @@ from jaxcal.learning.core.network import decode, encode, mask_logits
 from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.core.ppo import Metrics
 
-__all__ = ["Imitation", "Lesson", "Lessons", "Teacher", "draw"]
-
 Teacher = Callable[
     [np.ndarray, np.ndarray, np.ndarray, int], tuple[np.ndarray, np.ndarray]
 ]

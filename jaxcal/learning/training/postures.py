@@ -20,8 +20,6 @@ from jaxcal.learning.training.presets import TrainConfig
 from jaxcal.learning.training.room import require_room
 from jaxcal.learning.training.run import Recipe, run
 
-__all__ = ["MEASURED", "Validation", "train"]
-
 MEASURED = ("ratio_to_exact", "hit_rate")
 
 

@@ -22,7 +22,6 @@ from jaxcal.learning.policies.networks import NetworkConfig
 if TYPE_CHECKING:
     from jaxcal.learning.core.postures import Postures
 
-__all__ = ["PARTS", "TrainConfig", "field_names", "load", "names", "with_values"]
 
 _GROUP = "jaxcal.presets"  # entry points: the presets of installed packages
 

@@ -14,8 +14,6 @@ from jax.sharding import Mesh
 
 from jaxcal.learning.training.run import Recipe, updates
 
-__all__ = ["memory", "require_room"]
-
 _SMALL = 2**20  # candidates of an update's episodes; fewer fit into any memory
 
 

@@ -33,8 +33,6 @@ from jaxcal.learning.runtime import devices
 from jaxcal.learning.runtime.processes import collective
 from jaxcal.learning.training import checkpoint
 
-__all__ = ["DivergedError", "Recipe", "Report", "run", "updates"]
-
 _LOSSES = (
     "entropy", "policy_loss", "value_loss", "kl", "kl_after", "clip_fraction",
     "explained_variance", "grad_norm", "learning_rate",

@@ -12,8 +12,6 @@ from jaxcal.reports.plots.style import COLOURS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["postures"]
-
 
 def postures(figure: Figure, arm: Any, commands: ArrayLike, columns: int = 4) -> Figure:
     """A ``SerialChain`` at each row of ``commands`` (N, n), its tip marked, from 1.

@@ -18,8 +18,6 @@ from jaxcal.reports.plots.style import (
     plain_axes,
 )
 
-__all__ = ["against_count", "pareto", "plan", "scenarios"]
-
 
 def against_count(
     axes: Any, counts: Sequence[int], values: dict[str, ArrayLike], label: str = ""

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike
 
 from jaxcal.reports.plots.style import BLACK, plain_axes, points
 
-__all__ = ["before_after", "residuals"]
-
 
 def before_after(
     axes: Any,

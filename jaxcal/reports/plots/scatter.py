@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike
 
 from jaxcal.reports.plots.style import COLOURS, GREY, plain_axes
 
-__all__ = ["ellipsoid", "selection"]
-
 
 def ellipsoid(
     axes: Any, centre: ArrayLike, covariance: ArrayLike, scale: float = 1.0, **look: Any

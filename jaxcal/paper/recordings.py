@@ -27,8 +27,6 @@ from jaxcal.evaluation.dataset import Dataset
 from jaxcal.paper.constants import AXES, EPISODES, NUM_CANDIDATES, RANGES
 from jaxcal.tables import parse
 
-__all__ = ["SHIPPED", "read_pool", "recorded_dataset"]
-
 Array = NDArray[np.float64]
 
 SHIPPED = pathlib.Path(__file__).parent / "data"

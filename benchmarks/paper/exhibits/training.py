@@ -1,7 +1,7 @@
 """Figure 2: training curves of the compact preset over seeds, and of a ``paper`` run.
 
 Nothing is trained here: the runs are kept in ``kept/`` by
-``studies.paper.training_runs`` and read from there; what is not there is said to be
+``benchmarks.paper.training_runs`` and read from there; what is not there is said to be
 missing.
 """
 
@@ -16,15 +16,15 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from benchmarks.paper.exhibits.exhibit import Exhibit, Verdict, judge
+from benchmarks.paper.exhibits.intervals import mean_interval
+from benchmarks.paper.exhibits.study import Study
 from jaxcal.evaluation.training_figure import (
     last_rewards,
     read_metrics,
     training_curves,
 )
 from jaxcal.reports.plots.style import COLOURS, GREY, band, boxes, panels
-from studies.paper.exhibits.exhibit import Exhibit, Verdict, judge
-from studies.paper.exhibits.intervals import mean_interval
-from studies.paper.exhibits.study import Study
 
 Array = NDArray[np.float64]
 

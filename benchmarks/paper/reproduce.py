@@ -13,8 +13,8 @@ from jaxcal.files import atomic_write, require_writable_folder
 from jaxcal.progress import Progress
 
 if TYPE_CHECKING:
-    from studies.paper.exhibits.exhibit import Claim, Exhibit
-    from studies.paper.exhibits.study import Settings
+    from benchmarks.paper.exhibits.exhibit import Claim, Exhibit
+    from benchmarks.paper.exhibits.study import Settings
 
 _DESCRIPTION = """\
 Make every figure and table of the paper from our own runs, each beside what the paper
@@ -28,19 +28,19 @@ states, and judge its claims one by one. Writes into --out:
 The policy is the agent that PPO trained on the paper's 210 numbers
 (checkpoints/paper.npz); beside it, named so, the default that ships, trained by
 imitation. Every exhibit says which it shows. Training curves are read from --studies,
-where python -m studies.paper.training_runs puts them; without them the report says so.
+where python -m benchmarks.paper.training_runs puts them; without them it says so.
 The same seed gives the same numbers on the same machine.
 """
 _EPILOG = """\
 examples:
   make reproduce
       the whole report, in report/index.html
-  python -m studies.paper --quick
+  python -m benchmarks.paper --quick
       fewer episodes and draws, to see whether everything works
-  python -m studies.paper --data recordings
+  python -m benchmarks.paper --data recordings
       Datasets 4 and 5 from a rig: dataset4.csv and dataset5.csv in that folder, each
       the pairs.csv that jaxcal-rig collect writes (docs/datasets.md)
-  python -m studies.paper --seed 1 --out report_1
+  python -m benchmarks.paper --seed 1 --out report_1
       other candidate sets, draws and devices: how much of it is luck?
 """
 _PARTS = (  # modules of exhibits, in the order in which they are computed
@@ -59,7 +59,7 @@ _ORDER = (  # of the exhibits, that of the paper
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compute, write, say where; the exit code."""
     parser = Parser(
-        prog="python -m studies.paper", description=_DESCRIPTION, epilog=_EPILOG
+        prog="python -m benchmarks.paper", description=_DESCRIPTION, epilog=_EPILOG
     )
     given = parser.of(_make).parse_args(arguments)
     return exit_code(
@@ -85,9 +85,9 @@ def _make(
     require_writable_folder(out)
     begun, progress = time.perf_counter(), Progress(quiet=quiet)
 
+    from benchmarks.paper.exhibits.claims import claims
+    from benchmarks.paper.exhibits.study import STUDIES, Settings
     from jaxcal.learning.runtime import cache
-    from studies.paper.exhibits.claims import claims
-    from studies.paper.exhibits.study import STUDIES, Settings
 
     cache.keep_compiled_programs()
     settings = Settings(seed, quick, data, studies or STUDIES)
@@ -109,7 +109,7 @@ def _make(
 
 def _exhibits(settings: Settings, progress: Progress) -> list[Exhibit]:
     """All of them, in the order of the paper."""
-    from studies.paper.exhibits.study import Study
+    from benchmarks.paper.exhibits.study import Study
 
     study = Study(settings, progress)
     # Small inputs that may be wrong come first: a bad file is refused at once.
@@ -118,7 +118,7 @@ def _exhibits(settings: Settings, progress: Progress) -> list[Exhibit]:
     found: list[Exhibit] = []
     for number, name in enumerate(_PARTS):
         study.stage = f"part {number + 1} of {len(_PARTS)}, "
-        part = importlib.import_module(f"studies.paper.exhibits.{name}")
+        part = importlib.import_module(f"benchmarks.paper.exhibits.{name}")
         found += part.exhibits(study)
     return sorted(found, key=lambda exhibit: _ORDER.index(exhibit.key))
 
@@ -130,9 +130,9 @@ def _files(
     progress: Progress,
 ) -> dict[str, bytes]:
     """Everything to write, by path below the folder; the page last."""
+    from benchmarks.paper.exhibits.page import json_document, page
     from jaxcal.reports.plots.style import as_files
     from jaxcal.tables import csv_text
-    from studies.paper.exhibits.page import json_document, page
 
     figures = {name: f for e in exhibits for name, f in e.figures.items()}
     files: dict[str, bytes] = {}

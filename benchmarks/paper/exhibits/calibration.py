@@ -8,16 +8,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from benchmarks.paper.datasets import dataset0_robot
+from benchmarks.paper.exhibits.exhibit import Exhibit, by_axis, judge
+from benchmarks.paper.exhibits.intervals import mean_interval, share_interval
+from benchmarks.paper.exhibits.study import Study, commands_deg
+from benchmarks.paper.twin import ORDERS, RobotConfig, read_out, simulate
 from jaxcal.calibration.identify import identify
 from jaxcal.evaluation.parameters import least_squares, predict
 from jaxcal.models import Affine
 from jaxcal.paper.constants import AXES, BIAS_DEG, NOISE_STD_DEG, RANGES, SCALE
-from jaxcal.paper.datasets import dataset0_robot
-from jaxcal.paper.twin import ORDERS, RobotConfig, read_out, simulate
 from jaxcal.reports.plots.style import BLACK, COLOURS, boxes, legend_right, panels
-from studies.paper.exhibits.exhibit import Exhibit, by_axis, judge
-from studies.paper.exhibits.intervals import mean_interval, share_interval
-from studies.paper.exhibits.study import Study, commands_deg
 
 Array = NDArray[np.float64]
 

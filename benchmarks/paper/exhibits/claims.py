@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from studies.paper.exhibits.exhibit import Claim, Exhibit, judge
+from benchmarks.paper.exhibits.exhibit import Claim, Exhibit, judge
 
 Found = Mapping[str, Exhibit]
 claim = Claim.from_texts
@@ -107,7 +107,7 @@ def _training(found: Found) -> Iterator[Claim]:
 def _convergence_of_seeds(exhibit: Exhibit) -> str:
     numbers = exhibit.numbers
     if numbers["seeds"] < 2:
-        return "no kept run in studies/paper/kept"
+        return "no kept run in benchmarks/paper/kept"
     if exhibit.verdict == "not comparable":
         return f"{min(numbers['episodes']):,} episodes run, not finished or too few"
     return (
@@ -120,7 +120,7 @@ def _convergence_of_seeds(exhibit: Exhibit) -> str:
 def _convergence_of_paper(exhibit: Exhibit) -> str:
     numbers = exhibit.numbers
     if not numbers["present"]:
-        return "no kept run in studies/paper/kept"
+        return "no kept run in benchmarks/paper/kept"
     text = f"{numbers['episodes']:,} episodes run"
     if exhibit.verdict == "not comparable":
         return f"{text}, {'too few' if numbers['finished'] else 'not finished'}"

@@ -8,16 +8,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from jaxcal.evaluation import figures
-from jaxcal.evaluation.postures import HIT_TOLERANCE, PostureEvaluation
-from jaxcal.reports.plots.style import BLACK, COLOURS, legend_right, panels
-from studies.paper.exhibits.exhibit import Columns, Exhibit, judge
-from studies.paper.exhibits.intervals import (
+from benchmarks.paper.exhibits.exhibit import Columns, Exhibit, judge
+from benchmarks.paper.exhibits.intervals import (
     bootstrap_interval,
     mean_interval,
     share_interval,
 )
-from studies.paper.exhibits.study import Settings, Study
+from benchmarks.paper.exhibits.study import Settings, Study
+from jaxcal.evaluation import figures
+from jaxcal.evaluation.postures import HIT_TOLERANCE, PostureEvaluation
+from jaxcal.reports.plots.style import BLACK, COLOURS, legend_right, panels
 
 Array = NDArray[np.float64]
 

@@ -15,20 +15,20 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 from numpy.typing import NDArray
 
-from jaxcal.evaluation.parameters import least_squares, predict
-from jaxcal.information.regression import regressors
-from jaxcal.paper.constants import NOISE_STD_DEG
-from jaxcal.reports.plots.style import BLACK, band, numbered, panels, plain_log
-from jaxcal.selection import exchange_batch
-from studies.paper.exhibits.devices import Device, pick, rms
-from studies.paper.exhibits.exhibit import Exhibit, from_rows, judge
-from studies.paper.exhibits.intervals import (
+from benchmarks.paper.exhibits.devices import Device, pick, rms
+from benchmarks.paper.exhibits.exhibit import Exhibit, from_rows, judge
+from benchmarks.paper.exhibits.intervals import (
     mean_interval,
     median_interval,
     ratio_interval,
     share_interval,
 )
-from studies.paper.exhibits.study import Study, commands_deg
+from benchmarks.paper.exhibits.study import Study, commands_deg
+from jaxcal.evaluation.parameters import least_squares, predict
+from jaxcal.information.regression import regressors
+from jaxcal.paper.constants import NOISE_STD_DEG
+from jaxcal.reports.plots.style import BLACK, band, numbered, panels, plain_log
+from jaxcal.selection import exchange_batch
 
 Array = NDArray[np.float64]
 

@@ -2,5 +2,5 @@
 
 One topic per module: ``exhibits(study)`` computes and draws it. ``claims`` judges
 what the paper states; ``texts.toml`` holds what is said; ``page`` makes one HTML file
-of all. ``python -m studies.paper`` runs it.
+of all. ``python -m benchmarks.paper`` runs it.
 """

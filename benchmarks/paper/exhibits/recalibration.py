@@ -15,6 +15,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from benchmarks.paper.exhibits.devices import Device, pick, rms
+from benchmarks.paper.exhibits.exhibit import Exhibit, by_axis, from_rows, judge
+from benchmarks.paper.exhibits.intervals import (
+    median_interval,
+    ratio_interval,
+    share_interval,
+)
+from benchmarks.paper.exhibits.study import Study, choose
 from jaxcal.evaluation.parameters import least_squares, predict
 from jaxcal.paper.constants import AXES, NOISE_STD_DEG, RANGES
 from jaxcal.reports.plots.style import (
@@ -28,14 +36,6 @@ from jaxcal.reports.plots.style import (
     panels,
 )
 from jaxcal.selection import exact_batch
-from studies.paper.exhibits.devices import Device, pick, rms
-from studies.paper.exhibits.exhibit import Exhibit, by_axis, from_rows, judge
-from studies.paper.exhibits.intervals import (
-    median_interval,
-    ratio_interval,
-    share_interval,
-)
-from studies.paper.exhibits.study import Study, choose
 
 Array = NDArray[np.float64]
 

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.paper.exhibits.exhibit import Exhibit, judge
+from benchmarks.paper.exhibits.selection import STREAM, words_of
+from benchmarks.paper.exhibits.study import METHODS, Study
 from jaxcal.evaluation import figures
 from jaxcal.models import Affine
 from jaxcal.reports.plots.style import BLACK, COLOURS, GREY
-from studies.paper.exhibits.exhibit import Exhibit, judge
-from studies.paper.exhibits.selection import STREAM, words_of
-from studies.paper.exhibits.study import METHODS, Study
 
 Array = NDArray[np.float64]
 

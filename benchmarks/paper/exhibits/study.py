@@ -8,11 +8,11 @@ import pathlib
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.paper.datasets import make_dataset
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.methods import Progress, evaluate
 from jaxcal.evaluation.parameters import least_squares
 from jaxcal.evaluation.postures import PostureEvaluation, PostureResult
-from jaxcal.paper.datasets import make_dataset
 
 Array = NDArray[np.float64]
 
@@ -55,7 +55,7 @@ class Settings:
     @property
     def command(self) -> str:
         """What makes the same report again."""
-        words = ["python -m studies.paper"]
+        words = ["python -m benchmarks.paper"]
         words += [f"--seed {self.seed}"] if self.seed else []
         words += ["--quick"] if self.quick else []
         words += [f"--data {self.data}"] if self.data is not None else []

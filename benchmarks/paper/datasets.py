@@ -1,4 +1,4 @@
-"""``python -m jaxcal.paper.datasets``: write the paper's datasets with data cards."""
+"""``python -m benchmarks.paper.datasets``: the paper's datasets with data cards."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import json
 import pathlib
 import platform
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
 import numpy as np
 
+from benchmarks.paper.twin import HOLD_S, RobotConfig, simulate
 from jaxcal.arguments import Parser, exit_code, several, values_of
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import save_csv, save_npz
@@ -24,15 +25,19 @@ from jaxcal.paper.constants import (
     EPISODES,
     NAMES,
     NOISE_STD_DEG,
+    NUM_CANDIDATES,
+    RANGES,
     RECORDED,
     SCALE,
 )
-from jaxcal.paper.datasets.datasets import dataset0_robot, make_dataset
-from jaxcal.paper.datasets.recordings import SHIPPED
+from jaxcal.paper.datasets import make_dataset as drawn_or_recorded
+from jaxcal.paper.datasets import streams
+from jaxcal.paper.recordings import SHIPPED
 from jaxcal.progress import Progress
 
-__all__ = ["main", "write_datasets"]
+__all__ = ["dataset0_robot", "main", "make_dataset", "write_datasets"]
 
+_PROGRAM = "python -m benchmarks.paper.datasets"
 _DESCRIPTION = """\
 Write the paper's Datasets 0 to 5 to a folder: NAME.npz, NAME.csv and the data card
 NAME.json of each. dataset0 is simulated in MuJoCo (some seconds), dataset1 takes
@@ -47,6 +52,41 @@ _WHAT = {
     "dataset4": "drawn from a pool of recorded postures, without repeats in an episode",
     "dataset5": "one recorded session",
 }
+
+
+def dataset0_robot() -> RobotConfig:
+    """The ideal robot of Table 1."""
+    return RobotConfig(tuple(SCALE), tuple(BIAS_DEG))
+
+
+def make_dataset(
+    name: str,
+    seed: int = 0,
+    episodes: int | None = None,
+    *,
+    recordings: pathlib.Path | str | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Dataset:
+    """One of the paper's datasets, whole: dataset0, which is simulated, too.
+
+    Args:
+        name: dataset0, of which every group of postures has a random stream of its
+            own, or what ``jaxcal.paper.datasets.make_dataset`` makes.
+        seed: of the streams, 0 or greater.
+        episodes: the first so many; all when not given.
+        recordings: folder of dataset4.csv and dataset5.csv; the shipped one when not
+            given.
+        progress: told how much of dataset0 is simulated.
+    """
+    if name != "dataset0":
+        return drawn_or_recorded(name, seed, episodes, recordings=recordings)
+    shape = (NUM_CANDIDATES, 3)
+    groups = range(EPISODES[name] if episodes is None else episodes)
+    pairs = [streams(name, seed, group) for group in groups]
+    unit = np.stack([draw.random(shape) for draw, _ in pairs])
+    noise = np.stack([rng.normal(0.0, NOISE_STD_DEG, shape) for _, rng in pairs])
+    read = simulate(dataset0_robot(), RANGES.denormalise(unit), progress=progress)
+    return Dataset(name, unit, read + noise, ranges=RANGES, seed=seed)
 
 
 def write_datasets(
@@ -136,8 +176,7 @@ def _card(
         "distribution": "uniform within the ranges, independent",
         "seed": dataset.seed,
         "files": digests,
-        "command": f"python -m jaxcal.paper.datasets --out DIR --seed {dataset.seed} "
-        f"{name}",
+        "command": f"{_PROGRAM} --out DIR --seed {dataset.seed} {name}",
         "made_with": {p: importlib.metadata.version(p) for p in ("jaxcal", "numpy")}
         | {"python": platform.python_version()},
     }
@@ -149,8 +188,6 @@ def _card(
             "bias_deg": dict(zip(AXES, BIAS_DEG.tolist(), strict=True)),
         }
     if name == "dataset0":
-        from jaxcal.paper.twin import HOLD_S
-
         card["made_with"]["mujoco"] = importlib.metadata.version("mujoco")
         card["simulation"] = {
             "seconds_per_posture": HOLD_S,
@@ -202,7 +239,7 @@ def _write(
 
 def main(arguments: list[str] | None = None) -> int:
     """Write; the exit code."""
-    parser = Parser(prog="python -m jaxcal.paper.datasets", description=_DESCRIPTION)
+    parser = Parser(prog=_PROGRAM, description=_DESCRIPTION)
     given = parser.of(_write).parse_args(arguments)
     kept = "each file in the folder is complete"
     return exit_code(lambda: _write(**values_of(given)), "datasets", kept)

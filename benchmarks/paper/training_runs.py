@@ -35,8 +35,8 @@ metrics.csv, last_rewards.npy and summary.json, in a folder under --out for each
 
   python train.py --seed 3 --episodes 200000 --no-close-up \\
       --out runs/compact_seeds/seed_3
-  python -m studies.paper.training_runs runs/compact_seeds/* \\
-      --out studies/paper/kept/compact_seeds
+  python -m benchmarks.paper.training_runs runs/compact_seeds/* \\
+      --out benchmarks/paper/kept/compact_seeds
 """
 
 
@@ -120,7 +120,7 @@ def _summary(run: pathlib.Path) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Keep the runs; the exit code."""
-    name = "python -m studies.paper.training_runs"
+    name = "python -m benchmarks.paper.training_runs"
     given = Parser(prog=name, description=_DESCRIPTION).of(_keep).parse_args(arguments)
     kept = "runs already named are kept"
     return exit_code(lambda: _keep(**values_of(given)), "training_runs", kept)

@@ -10,10 +10,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from benchmarks.paper.exhibits.exhibit import Claim, Exhibit, Verdict
+from benchmarks.paper.exhibits.study import Settings
 from jaxcal.extras import versions
 from jaxcal.reports import page as pages
-from studies.paper.exhibits.exhibit import Claim, Exhibit, Verdict
-from studies.paper.exhibits.study import Settings
 
 _TONES: dict[Verdict, tuple[Literal["good", "fair", "bad", "neutral"], str]] = {
     "agrees": ("good", "agree"),

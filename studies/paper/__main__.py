@@ -1,8 +1,0 @@
-"""``python -m studies.paper``: the paper's figures, tables and claims."""
-
-import sys
-
-from studies.paper.reproduce import main
-
-if __name__ == "__main__":
-    sys.exit(main())
