@@ -65,13 +65,13 @@ class Check:
         """The finding, in a sentence."""
         text = f"the calibration {self.says}"
         if self.says == "cannot be told":
-            text = "whether the calibration holds cannot be told"
+            text = "inconclusive: too few readings"
         tolerances = self.tolerances or {self.unit: self.tolerance}
         changes = (f"{size:.3g} {unit}".strip() for unit, size in tolerances.items())
         change = " or ".join(changes)
         text += (
-            f" (p = {self.p_value:.3g}, false alarms 5 %); a change by {change} is "
-            f"seen with {self.power:.0%} on average"
+            f" (p = {self.p_value:.3g}, false alarms 5 %); the check would detect a "
+            f"change of {change} (power {self.power:.0%})"
         )
         if self.mispairing:
             text += f"; {self.mispairing}"
@@ -88,7 +88,7 @@ class Check:
     def next_step(self) -> str:
         """What to do next, in a sentence."""
         if self.good:
-            return "go on using it"
+            return "keep using it"
         if self.mispairing:
             return "correct the table, then check again"
         if self.says == "does not hold":

@@ -393,8 +393,9 @@ class _Search(_Responses):
         if reached:
             axis = int(beyond.argmax())
             raise ValueError(
-                f"desired {in_words(desired)} needs {names[axis]} = {free[axis]:.6g}, "
-                f"outside its limits [{bounds[axis, 0]:.6g}, {bounds[axis, 1]:.6g}]"
+                f"desired {in_words(desired)} cannot be reached: {names[axis]} would "
+                f"have to be {free[axis]:.6g} (limits {bounds[axis, 0]:.6g} to "
+                f"{bounds[axis, 1]:.6g})"
             )
         close = np.minimum(nearest - low, high - nearest) < 1e-4 * self.spread
         active = [name for name, at in zip(names, close, strict=True) if at]

@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 
 ModelPath = Annotated[
     str | None,
-    "model: JSON of its to_dict(), an arm's .urdf, or a .py that sets `model`; "
+    "an arm (.urdf), a saved model (.json) or a Python file that sets `model`; "
     "y = A u + b by default",
     "FILE",
 ]
@@ -338,8 +338,8 @@ def _read_model(path: str) -> Model:
         read = json.loads(pathlib.Path(path).read_text(encoding="utf-8-sig"))
     except ValueError:
         raise ValueError(
-            f"{path}: a model must be a JSON file of its to_dict(), an arm's .urdf or "
-            "a .py"
+            f"{path}: --model takes an arm (.urdf), a saved model (.json) or a Python "
+            "file (.py)"
         ) from None
     if isinstance(read, dict) and read.get("format") == "jaxcal-calibration":
         raise ValueError(

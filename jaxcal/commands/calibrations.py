@@ -498,6 +498,8 @@ def command(
         raise ValueError("--clip needs --limits")
     if limits and len(limits) == 1:
         limits = limits * calibrated.num_inputs
+    if limits and {len(pair) for pair in limits} != {2}:
+        raise ValueError("--limits takes LOW,HIGH, once for all axes or once per axis")
     commands = calibrated.command_for(desired, limits=limits or None, clip=clip)
     _emit(output, calibrated.input_names, commands)
 

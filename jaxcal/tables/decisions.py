@@ -35,7 +35,7 @@ _RUNS = re.compile(
 _STAMPS = {"stamp", "timestamp", "date", "datetime", "epoch", "datum"}
 _TIMES = {"time", "uhrzeit", "elapsed", "clock"}
 _SECONDS = re.compile(r"t([ _]?[\[(]?(s|ms|us|ns|sec|seconds|min)[\])]?)?", re.I)
-COUNTED = "it counts the rows or tells their time"
+COUNTED = "it looks like a row number or a time"
 _EPOCH = 1e8  # seconds; no factor of an experiment is so large
 
 
