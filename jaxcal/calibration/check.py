@@ -81,7 +81,7 @@ class Check:
             text += f", and could hide in {', '.join(self.unseen)}"
         if self.blind:
             names = ", ".join(self.blind)
-            text += f"; {names} cannot be told from where things were placed anew"
+            text += f"; not judged, as things were placed anew: {names}"
         return (text,)
 
     @property
@@ -233,14 +233,14 @@ def _deviations(
     free, blind = calibration.free[:p] > 0.0, np.zeros(p, dtype=np.bool_)
     if placed_anew:
         if not calibration.model.placed:
-            raise ValueError("placed_anew is of an arm whose sensor stands somewhere")
+            raise ValueError("placed_anew needs sockets, planes, wires or a board")
         placed = np.isin(names, calibration.model.placed)  # which says nothing now
         white, by = without(by[:, placed], white, by)
         level, free = np.zeros(len(white), dtype=np.intp), free & ~placed
         blind = free & _taken_up(calibration, placed)
         free &= ~blind
     if not len(white):
-        raise ValueError("measured must hold a reading beside what was placed anew")
+        raise ValueError("measured holds too few readings to find what was placed anew")
     return _Deviations(
         white, by, level == np.unique(level)[:, None], free, blind, least
     )

@@ -176,9 +176,9 @@ class _Responses:
         sure, last = _sureness(self.fit, self.spread)
         if sure < _SURE:
             raise ValueError(
-                "matrix A cannot be told from a singular one: its smallest singular "
-                f"value is {sure:.2g} standard deviations from zero, so within the "
-                f"noise {self._insensitive(last)}"
+                "matrix A may be singular: its smallest singular value is "
+                f"{sure:.2g} standard deviations from zero; within the noise "
+                f"{self._insensitive(last)}"
             )
         return turn, singular, right, rows
 

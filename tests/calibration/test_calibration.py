@@ -429,7 +429,7 @@ def test_no_inverse_near_singular(rng: np.random.Generator) -> None:
     with pytest.raises(ValueError, match=r"is singular .* direction u_y of the"):
         identify(commands, twins).command_for(np.zeros(3))
     noisy = silent + rng.normal(0, 0.05, silent.shape)
-    with pytest.raises(ValueError, match=r"cannot be told from a singular .* standard"):
+    with pytest.raises(ValueError, match=r"may be singular: .* standard"):
         identify(commands, noisy).command_for(np.zeros(3))
     for count in (4, 8):
         constant = identify(commands[:count], np.tile([0.1, 0.2, 0.3], (count, 1)))

@@ -279,7 +279,7 @@ def test_a_recording_is_identified_and_checked_in_the_shell(files, capsys):
         assert main([*given, *more]) == 2, more
         assert message in capsys.readouterr().err, more
     assert _run(files, "--which", "0,1") == 2
-    assert "are of a recording, not a table" in capsys.readouterr().err
+    assert "go with a recording, not a table" in capsys.readouterr().err
 
 
 def test_zeros_are_written_for_lerobot_in_the_shell(files, capsys):

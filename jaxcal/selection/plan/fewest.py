@@ -322,7 +322,7 @@ def _request(
     """Check the arguments of ``plan``."""
     of_parameters = criterion == "parameters"
     if parameters is not None and not of_parameters:
-        raise ValueError("parameters must come with criterion parameters only")
+        raise ValueError("parameters goes with criterion='parameters' only")
     cap = whole_number("max_replicates", offer.max_replicates, 1)
     total = max(1, int(offer.available.sum()) * cap)
     model, std = offer.model, _reading_std(offer, noise_std)
