@@ -14,7 +14,7 @@ from typing import Any
 from jaxcal.reports.plots.style import as_bytes
 
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.M | re.S)
-DRAWN = re.compile(r"[\w.]+\.plot\(.*\)")
+DRAWN = re.compile(r"((?!axes\b)[^=#]*\.plot\([^#]*\))(\s+#.*)?")
 
 
 def executed(markdown: str, session: str) -> str:
@@ -22,9 +22,8 @@ def executed(markdown: str, session: str) -> str:
 
     def run(block: re.Match[str]) -> str:
         code = block[1]
-        last = code.rstrip().rpartition("\n")[2]
-        if DRAWN.fullmatch(last):
-            code += f"picture_{block.start()} = {last}  # markdown-exec: hide\n"
+        if shown := DRAWN.fullmatch(code.rstrip().rpartition("\n")[2]):
+            code += f"picture_{block.start()} = {shown[1]}  # markdown-exec: hide\n"
         return (
             f'```python exec="on" source="above" result="text" session="{session}"\n'
             f'{code}```\n\n```python exec="on" html="on" session="{session}"\n'

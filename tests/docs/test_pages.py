@@ -7,6 +7,7 @@ import re
 import shlex
 import sys
 
+import common
 import jax
 import matplotlib.figure
 import pytest
@@ -55,10 +56,10 @@ def test_the_code_of_the_readme_runs(tmp_path, monkeypatch):
 
 
 def test_a_block_is_run_and_its_picture_shown_once(tmp_path):
-    page = "# One\n\n```python\nx = made()\nx.plot()\n```\n\n```py\nnot_run()\n```\n"
+    page = "# One\n\n```python\nx = made()\nx.plot()  # two\n```\n\n```py\nnot_run()\n```\n"
     given = pictures.executed(page, "one.md")
     code = re.findall(r'exec="on".*?\n(.*?)^```', given, re.M | re.S)
-    assert len(code) == 2 and code[0].startswith("x = made()\nx.plot()\n")
+    assert len(code) == 2 and code[0].startswith("x = made()\nx.plot()  # two\n")
     assert "# markdown-exec: hide" in code[0] and "not_run" not in "".join(code)
 
     class Made:
@@ -69,6 +70,15 @@ def test_a_block_is_run_and_its_picture_shown_once(tmp_path):
     exec(code[0], names)
     assert pictures.drawn(names).count("<img") == 1
     assert pictures.drawn(names) == ""
+
+
+def test_every_example_is_in_the_gallery_by_a_light_picture():
+    page = (ROOT / "docs" / "gallery.md").read_text()
+    for name in common.NAMES:
+        picture = ROOT / "docs" / "assets" / "gallery" / f"{name}.webp"
+        assert 1_000 < picture.stat().st_size < 40_000
+        assert f"(assets/gallery/{name}.webp)" in page
+        assert f"(../examples/{name}.md)" in page
 
 
 def test_the_pages_have_at_most_forty_thousand_words():
