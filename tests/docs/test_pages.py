@@ -56,7 +56,7 @@ def test_the_code_of_the_readme_runs(tmp_path, monkeypatch):
 
 
 def test_a_block_is_run_and_its_picture_shown_once(tmp_path):
-    page = "# One\n\n```python\nx = made()\nx.plot()  # two\n```\n\n```py\nnot_run()\n```\n"
+    page = "```python\nx = made()\nx.plot()  # two\n```\n\n```py\nnot_run()\n```\n"
     given = pictures.executed(page, "one.md")
     code = re.findall(r'exec="on".*?\n(.*?)^```', given, re.M | re.S)
     assert len(code) == 2 and code[0].startswith("x = made()\nx.plot()  # two\n")
