@@ -152,19 +152,18 @@ def of_scipy(one: Certified, start: int) -> float:
 
 def main(names: list[str]) -> None:
     warnings.simplefilter("ignore")
-    print("| set | level | start | parameters | deviations | curve_fit | it says |")
-    print("|---|---|---|---|---|---|---|")
+    print("| set | level | parameters | deviations | curve_fit | it says |")
+    print("|---|---|---|---|---|---|")
     for name in names or MODELS:
         one = read(name)
-        for start in (0, 1):
-            with np.errstate(all="ignore"):
-                of_values, of_errors, said = fitted(one, start)
-                peer = of_scipy(one, start)
-            print(
-                f"| {name} | {one.level} | {start + 1} | {of_values:.1f} | "
-                f"{of_errors:.1f} | {peer:.1f} | {said} |",
-                flush=True,
-            )
+        with np.errstate(all="ignore"):
+            both = [(*fitted(one, start), of_scipy(one, start)) for start in (0, 1)]
+        of_values, of_errors, said, peer = zip(*both, strict=True)
+        pairs = (
+            ", ".join(f"{x:.1f}" for x in pair) for pair in (of_values, of_errors, peer)
+        )
+        reason = said[0] if said[0] == said[1] else "; ".join(filter(None, said))
+        print(f"| {name} | {one.level} | {' | '.join(pairs)} | {reason} |", flush=True)
 
 
 if __name__ == "__main__":

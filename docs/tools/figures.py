@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import json
 import pathlib
@@ -159,6 +160,13 @@ FIGURES: dict[str, Callable[[], Figure]] = {
 }
 
 
+def thumbnail(name: str) -> bytes:
+    """The picture of an example, small."""
+    image = io.BytesIO()
+    common.picture(name).savefig(image, format="webp", dpi=72)
+    return image.getvalue()
+
+
 def benchmarks() -> dict[str, Any]:
     """What `make benchmark` found, as committed."""
     return json.loads((ROOT / "docs" / "benchmarks" / "results.json").read_text())
@@ -169,6 +177,7 @@ def draw_all() -> dict[str, bytes]:
     found = {path: as_bytes(draw(), "svg") for path, draw in FIGURES.items()}
     for name in common.NAMES:
         found[f"examples/{name}.png"] = as_bytes(common.picture(name), "png")
+        found[f"assets/gallery/{name}.webp"] = thumbnail(name)
     results = benchmarks()
     found["benchmarks/benchmark.svg"] = as_bytes(report.overview(results), "svg")
     scaling = report.scaling(results["scaling"]["series"])
@@ -176,7 +185,8 @@ def draw_all() -> dict[str, bytes]:
     return found
 
 
-if __name__ == "__main__":  # those of README, which no build of the site draws
-    for path, draw in FIGURES.items():
+if __name__ == "__main__":  # those that README and the gallery show on GitHub
+    (ROOT / "docs" / "assets" / "gallery").mkdir(exist_ok=True)
+    for path, image in draw_all().items():
         if path.startswith("assets/"):
-            (ROOT / "docs" / path).write_bytes(as_bytes(draw(), "svg"))
+            (ROOT / "docs" / path).write_bytes(image)

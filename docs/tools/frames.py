@@ -1,4 +1,4 @@
-"""Frames of the live page during a simulated session: docs/assets/live_*.webp.
+"""Pictures of a simulated session: docs/assets/live_*.webp, its page; report.webp.
 
 Needs Chromium and its driver (Debian: chromium, chromium-driver) and the extras
 live and dev. ``python docs/tools/frames.py``, two to three minutes.
@@ -54,6 +54,16 @@ def frame(page: Any) -> Image.Image:
     return picture.resize(SHOWN)
 
 
+def picture_of(report: pathlib.Path, page: Any) -> None:
+    """The upper part of a report, as docs/assets/report.webp."""
+    size = {"width": SIZE[0], "height": 1400, "deviceScaleFactor": 1, "mobile": False}
+    page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    page.get(report.as_uri())
+    shot = page.execute_cdp_cmd("Page.captureScreenshot", {})["data"]
+    picture = Image.open(io.BytesIO(base64.b64decode(shot))).convert("RGB")
+    picture.resize((960, 1050)).save(FOLDER / "report.webp", quality=60, method=6)
+
+
 def main() -> None:
     pages = {scheme: browser(scheme) for scheme in ("light", "dark")}
     found: dict[str, list[Image.Image]] = {scheme: [] for scheme in pages}
@@ -73,6 +83,9 @@ def main() -> None:
             time.sleep(2.0)  # the page shows the end
             for scheme, page in pages.items():
                 found[scheme].append(frame(page))
+            (report,) = pathlib.Path(folder).glob("*/report.html")
+            picture_of(report, pages["light"])
+            for page in pages.values():
                 page.quit()
     if (number := min(map(len, found.values()))) < FEWEST:
         sys.exit(

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import os
 import pathlib
 import re
+import shutil
 import sys
+import tempfile
 from typing import Any
 
+import matplotlib
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
 
@@ -16,6 +20,7 @@ ROOT = pathlib.Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT), str(pathlib.Path(__file__).parent)]
 
 import figures
+import pictures
 import reference
 
 PUBLIC = (
@@ -86,7 +91,9 @@ def api_page(module_name: str) -> str:
 
 
 def on_pre_build(config: Any) -> None:
-    """Stop where a public name has no documentation."""
+    """Stop where a public name has no documentation; commands of pages are ours."""
+    os.environ["PATH"] = f"{pathlib.Path(sys.executable).parent}:{os.environ['PATH']}"
+    matplotlib.use("Agg")
     if bare := [name for module in PUBLIC for name in undocumented(module)]:
         raise PluginError(f"public names without a docstring: {', '.join(bare)}")
 
@@ -111,22 +118,31 @@ def on_files(files: Any, config: Any) -> Any:
         text = page.read_text(encoding="utf-8").replace("](../docs/", "](../")
         script = page.with_suffix(".py").read_text(encoding="utf-8")
         add(f"examples/{page.name}", f"{text}\n## The script\n\n```py\n{script}```\n")
-    for notebook in sorted((ROOT / "examples").glob("*.ipynb")):
-        add(f"examples/{notebook.name}", notebook.read_bytes())
     for path, image in figures.draw_all().items():
         add(path, image)
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """The home page shows README's table; an example's picture is found in the site."""
+    """Code runs in a folder of its own; the home page shows README's table."""
     if "/" not in page.file.src_uri:
         markdown = re.sub(r"(!\[[^]]*\]\()\.\./examples/", r"\1examples/", markdown)
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    figures = readme.partition("<!-- figures -->")[2].partition("<!-- end -->")[0]
-    return markdown.replace(
-        "<!-- figures of README -->", figures.replace("](docs/", "](")
-    )
+    table = readme.partition("<!-- figures -->")[2].partition("<!-- end -->")[0]
+    table = table.replace("](docs/", "](")
+    place = pathlib.Path(tempfile.mkdtemp())
+    (place / "examples").symlink_to(ROOT / "examples")
+    os.chdir(place)
+    markdown = markdown.replace("<!-- figures of README -->", table)
+    return pictures.executed(markdown, page.file.src_uri)
+
+
+def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
+    """Back from the page's folder."""
+    place = pathlib.Path.cwd()
+    os.chdir(ROOT)
+    shutil.rmtree(place)
+    return html
 
 
 def on_post_page(output: str, page: Any, config: Any) -> str:

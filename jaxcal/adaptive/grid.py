@@ -185,8 +185,8 @@ class GridTask:
             num_uses: uses that end a session, or the list it is drawn from.
             horizon: measurements after which a session ends in any case.
             overrun: True: a measurement may begin while any time and uses are left. By
-                default only one whose dearest possible outcome can be paid; a session
-                in which none can is over.
+                default none that could exceed what is left; a session in which all
+                could is over.
 
         Raises:
             ValueError: naming the table, the rule and the value.

@@ -24,7 +24,7 @@ from jaxcal.arms.arguments import (
 )
 from jaxcal.arms.arm import Arm, apparent_length
 from jaxcal.arms.sensors import Position, Sensor, Several
-from jaxcal.checks import array_of, axis_names, in_words, numbers, one_of
+from jaxcal.checks import array_of, axis_names, numbers, one_of
 from jaxcal.models.model import (
     ErrorGroups,
     Model,
@@ -454,8 +454,9 @@ class SerialChain(Arm, Model):
                 advice = "are the columns in this order: "
                 advice += f"{', '.join(self.joint_names)}?"
             raise ValueError(
-                f"{name} must be within its limits {in_words(self.limits[joint])}, to "
-                f"{slack[joint]:g}, got {joints[row, joint]:g} in row {row}; {advice} "
+                f"row {row}: {name} = {joints[row, joint]:g} is outside its limits "
+                f"({low[joint]:g} to {high[joint]:g}, by more than {slack[joint]:g}); "
+                f"{advice} "
                 "Where the file's limits are wrong, give limits={name: (low, high)}, "
                 "--limits"
             )

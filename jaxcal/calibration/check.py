@@ -66,13 +66,13 @@ class Check:
         """The finding, in a sentence."""
         text = f"the calibration {self.says}"
         if self.says == "cannot be told":
-            text = "whether the calibration holds cannot be told"
+            text = "inconclusive: too few readings"
         tolerances = self.tolerances or {self.unit: self.tolerance}
         changes = (f"{size:.3g} {unit}".strip() for unit, size in tolerances.items())
         change = " or ".join(changes)
         text += (
-            f" (p = {self.p_value:.3g}, false alarms 5 %); a change by {change} is "
-            f"seen with {self.power:.0%} on average"
+            f" (p = {self.p_value:.3g}, false alarms 5 %); the check would detect a "
+            f"change of {change} (power {self.power:.0%})"
         )
         if self.mispairing:
             text += f"; {self.mispairing}"
@@ -82,14 +82,14 @@ class Check:
             text += f", and could hide in {', '.join(self.unseen)}"
         if self.blind:
             names = ", ".join(self.blind)
-            text += f"; {names} cannot be told from where things were placed anew"
+            text += f"; not judged, as things were placed anew: {names}"
         return (text,)
 
     @property
     def next_step(self) -> str:
         """What to do next, in a sentence."""
         if self.good:
-            return "go on using it"
+            return "keep using it"
         if self.mispairing:
             return "correct the table, then check again"
         if self.says == "does not hold":
@@ -235,14 +235,14 @@ def _deviations(
     free, blind = calibration.free[:p] > 0.0, np.zeros(p, dtype=np.bool_)
     if placed_anew:
         if not calibration.model.placed:
-            raise ValueError("placed_anew is of an arm whose sensor stands somewhere")
+            raise ValueError("placed_anew needs sockets, planes, wires or a board")
         placed = np.isin(names, calibration.model.placed)  # which says nothing now
         white, by = without(by[:, placed], white, by)
         level, free = np.zeros(len(white), dtype=np.intp), free & ~placed
         blind = free & _taken_up(calibration, placed)
         free &= ~blind
     if not len(white):
-        raise ValueError("measured must hold a reading beside what was placed anew")
+        raise ValueError("measured holds too few readings to find what was placed anew")
     return _Deviations(
         white, by, level == np.unique(level)[:, None], free, blind, least
     )

@@ -77,7 +77,7 @@ def read(path: str | os.PathLike[str]) -> Any:
 
     data = pathlib.Path(path).read_bytes()
     try:
-        return json.loads(data.decode("utf-8"), parse_constant=constant)
+        return json.loads(data.decode("utf-8-sig"), parse_constant=constant)
     except json.JSONDecodeError as error:
         problem = (
             f"not JSON: {error.msg} in line {error.lineno}; `jaxcal identify ... "
@@ -102,10 +102,13 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
     """
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f'not a calibration: "format" is not "{FORMAT}"')
-    if content.get("version") != VERSION:
+    version = content.get("version")
+    if version != VERSION:
+        newer = isinstance(version, int) and version > VERSION
         raise ValueError(
-            f"a calibration of version {content.get('version')!r}, this jaxcal reads "
-            f"version {VERSION}: identify again from the measurements"
+            f"a calibration of version {version!r}, this jaxcal reads version "
+            f"{VERSION}: {'update jaxcal, or ' * newer}identify again from the "
+            "measurements"
         )
     values = _checked_values(content)
     names = content["derived"].get("parameter_names")

@@ -139,7 +139,7 @@ def identify(
     if accuracy is not None:
         units = model.accuracy_units(measured_unit)
         if not units:
-            raise ValueError("accuracy is of an arm")
+            raise ValueError("accuracy needs an arm as the model")
         about["provenance"]["accuracy"] = by_unit("accuracy", accuracy, units)
     plain = prior is None and plain_noise and loss in (None, "gaussian")
     affine = isinstance(model, Affine)
@@ -299,7 +299,7 @@ def _noise(
                 f"{num_outputs} outputs, got {common_noise!r}"
             )
     if noise is not None and noise_std is not None:
-        raise ValueError("noise_std is short for noise: give one of them")
+        raise ValueError("noise_std and noise are the same: give one")
     plain = noise is None or _is_of_levels(noise)
     if plain:
         level = noise_std if noise is None else noise.std

@@ -176,9 +176,9 @@ class _Responses:
         sure, last = _sureness(self.fit, self.spread)
         if sure < _SURE:
             raise ValueError(
-                "matrix A cannot be told from a singular one: its smallest singular "
-                f"value is {sure:.2g} standard deviations from zero, so within the "
-                f"noise {self._insensitive(last)}"
+                "matrix A may be singular: its smallest singular value is "
+                f"{sure:.2g} standard deviations from zero; within the noise "
+                f"{self._insensitive(last)}"
             )
         return turn, singular, right, rows
 
@@ -393,8 +393,9 @@ class _Search(_Responses):
         if reached:
             axis = int(beyond.argmax())
             raise ValueError(
-                f"desired {in_words(desired)} needs {names[axis]} = {free[axis]:.6g}, "
-                f"outside its limits [{bounds[axis, 0]:.6g}, {bounds[axis, 1]:.6g}]"
+                f"desired {in_words(desired)} cannot be reached: {names[axis]} would "
+                f"have to be {free[axis]:.6g} (limits {bounds[axis, 0]:.6g} to "
+                f"{bounds[axis, 1]:.6g})"
             )
         close = np.minimum(nearest - low, high - nearest) < 1e-4 * self.spread
         active = [name for name, at in zip(names, close, strict=True) if at]

@@ -557,8 +557,8 @@ class FitSolution:
                 slope = np.abs(rows.T @ right).max() / np.linalg.norm(right)
                 if slope > 1e-3 and not np.isfinite(after):
                     raise ValueError(
-                        "model.predict must answer where the fit goes, but it fails "
-                        f"next to the parameters {in_words(self.parameters)}: narrow "
+                        "model.predict fails next to the parameters "
+                        f"{in_words(self.parameters)}, where the fit leads: narrow "
                         "the prior, or begin nearer, with Prior(mean=...)"
                     )
                 if slope > 1e-3:

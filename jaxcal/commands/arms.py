@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 ModelPath = Annotated[
     str | None,
-    "model: JSON of its to_dict(), an arm's .urdf, or a .py that sets `model`; "
+    "an arm (.urdf), a saved model (.json) or a Python file that sets `model`; "
     "y = A u + b by default",
     "FILE",
 ]
@@ -69,7 +69,7 @@ class ArmOptions:
     ] = None
     limits: Annotated[
         list[list[Any]] | None,
-        "of a joint instead of the file's, degrees or metres: wrist=-160,160",
+        "limits of a joint in degrees or metres: wrist=-160,160",
         _of_joint,
     ] = None
     distance: Annotated[
@@ -232,13 +232,13 @@ class RecordingOptions:
 
     which: Annotated[
         list[int] | None,
-        "of a recording, the socket, plane or wire of each rest: 0,0,1 or 0x12,1x12",
+        "socket, plane or wire of each rest of a recording: 0,0,1 or 0x12,1x12",
         _counted,
     ] = None
-    topic: Annotated[str, "of a recording, the topic of the sensor's readings"] = ""
+    topic: Annotated[str, "topic of the sensor's readings in a recording"] = ""
     servos: Annotated[
         str | None,
-        "of a LeRobot dataset in -100 to 100, the arm's calibration file",
+        "the arm's calibration file, for a LeRobot dataset in -100 to 100",
         "FILE",
     ] = None
     in_degrees: Annotated[
@@ -255,7 +255,7 @@ class RecordingOptions:
         if not is_recording(path):
             if self.which is not None or self.topic or self.in_degrees:
                 raise ValueError(
-                    "--which, --topic and --in-degrees are of a recording, not a table"
+                    "--which, --topic and --in-degrees go with a recording, not a table"
                 )
             return None
         from jaxcal.arms import SerialChain
@@ -331,8 +331,8 @@ def _read_model(path: str) -> Model:
         read = json.loads(pathlib.Path(path).read_text(encoding="utf-8-sig"))
     except ValueError:
         raise ValueError(
-            f"{path}: a model must be a JSON file of its to_dict(), an arm's .urdf or "
-            "a .py"
+            f"{path}: --model takes an arm (.urdf), a saved model (.json) or a Python "
+            "file (.py)"
         ) from None
     if isinstance(read, dict) and read.get("format") == "jaxcal-calibration":
         raise ValueError(

@@ -121,7 +121,7 @@ class SavedFiles:
     ] = ""
     frames: Annotated[
         str | None,
-        "of --transform, the link that the camera is in, the name of its optical frame",
+        "with --transform: the camera's link, the name of its optical frame",
         "PARENT,CHILD",
     ] = None
 
@@ -158,7 +158,7 @@ class SavedFiles:
         if self.servos_out and not servos:
             raise ValueError("--servos-out needs --servos, the file that it corrects")
         if servos and not (self.servos_out or is_recording(file)):
-            raise ValueError("--servos is of a recording, or of --servos-out")
+            raise ValueError("--servos goes with a recording or with --servos-out")
         if self.as_urdf and not of_urdf:
             raise ValueError("--out FILE.urdf needs --model FILE.urdf")
         if self.as_urdf and os.path.exists(self.out) and not self.overwrite:
@@ -258,7 +258,7 @@ def identify(
     table = read_table(file) if table is None else table
     machine: Any = of_arm.machine(model, table)
     if accuracy is not None and not _is_arm(machine):
-        raise ValueError("--accuracy is of an arm, --model FILE.urdf")
+        raise ValueError("--accuracy needs an arm: --model FILE.urdf")
     if of_urdf:
         readings = _arm_readings(of_arm, machine, table, inputs, outputs, weights)
         if machine.sensor.lengths:  # files of this format are in metres
@@ -496,6 +496,8 @@ def command(
         raise ValueError("--clip needs --limits")
     if limits and len(limits) == 1:
         limits = limits * calibrated.num_inputs
+    if limits and {len(pair) for pair in limits} != {2}:
+        raise ValueError("--limits takes LOW,HIGH, once for all axes or once per axis")
     commands = calibrated.command_for(desired, limits=limits or None, clip=clip)
     _emit(output, calibrated.input_names, commands)
 

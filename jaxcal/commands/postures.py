@@ -221,7 +221,7 @@ def _worth(design: Design, chosen: NDArray[np.int_], seed: int) -> str:
     while same < offered and by_random(same) > expected:
         same = min(same + max(1, k // 4), offered)
     return (
-        f"these {k}: expected error {expected / random:.2f} of that of {k} random "
-        f"ones, and that of about {same}; the gain is less where the arm has errors "
-        "that no parameter explains"
+        f"Expected error: {1.0 - expected / random:.0%} below {k} random postures, as "
+        f"good as about {same} of them. Less if the arm has errors that the model "
+        "cannot describe."
     )

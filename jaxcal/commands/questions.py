@@ -105,9 +105,9 @@ class CriterionOptions:
         kind = None if name is None else CRITERIA[name]
         if (kind is not None and kind.of_parameters) != (parameters is not None):
             raise ValueError(
-                "--parameters, those of interest, must be given with --criterion "
-                f"{_of_parameters('or')}, and with no other, got {parameters!r} with "
-                f"{name!r}"
+                f"--criterion {name} needs --parameters NAME,..."
+                if parameters is None
+                else f"--parameters goes with --criterion {_of_parameters('or')} only"
             )
         criterion: Any = name
         if kind is not None and parameters is not None:

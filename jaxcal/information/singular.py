@@ -221,16 +221,16 @@ def require_excited(
     null = null_directions(offset, largest)
     if count >= n + 1 and not null:
         return
-    never = directions_in_words("the direction{} never excited: ", null, names)
+    same = directions_in_words("the same in every row: ", null, names)
     if count < n + 1:
         raise ValueError(
-            f"{argument} must hold at least {n + 1} postures of positive weight for "
-            f"{n} inputs and a bias, got {count}" + (f"; {never}" if never else "")
+            f"{argument} must hold {n + 1} or more rows to fit {n} inputs plus an "
+            f"offset, got {count}" + (f"; {same}" if same else "")
         )
     place = {1: "at one point", 2: "on one line"}.get(n, "in one plane")
     raise ValueError(
         f"{argument} must vary in every direction, but the {count} {which} lie "
-        f"{place}; {never}"
+        f"{place}; {same}"
     )
 
 

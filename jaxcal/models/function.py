@@ -261,8 +261,8 @@ class FromFunction(Model):
         zero = np.flatnonzero(self.nominal == 0.0)
         if zero.size:
             raise ValueError(
-                "scale, by how much each parameter may be off, must be given where "
-                f"the nominal value is 0, as of {self.names[zero[0]]}"
+                f"scale must be given, as {self.names[zero[0]]} is nominally 0: by how "
+                "much may each parameter be off?"
             )
         return np.asarray(0.1 * np.abs(self.nominal))
 
@@ -367,8 +367,7 @@ class FromFunction(Model):
             warnings.warn(
                 f"f is not smooth in {steps.names[j]} at the command "
                 f"{in_words(rows[i])}{f' and {others} others' if others else ''}: its "
-                "derivative there is not to be trusted (a reading that wraps needs "
-                "periods=)",
+                "derivative there may be wrong (a reading that wraps needs periods=)",
                 stacklevel=5,
             )
         # A derivative that is the noise of f for all commands is none.

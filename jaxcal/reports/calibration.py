@@ -361,13 +361,13 @@ def _prediction_section(
 ) -> pages.Section:
     unit = f", {calibration.measured_unit}" if calibration.measured_unit else ""
     text = (
-        f"Of the true outputs{unit}, without the noise of a reading there; rows "
+        f"Uncertainty of the true outputs{unit}, without a reading's noise; rows "
         "are counted from 0."
     )
     if at is None:
         text += (
-            " Of the rows measured the first is nearest to their middle, the "
-            "second is known least."
+            " The first row is nearest to the middle of those measured, the second "
+            "is known least."
         )
     rows = budget.rows()
     table = pages.Table(rows[0], rows[1:])

@@ -480,15 +480,14 @@ def criterion_of(criterion: Any, region: Any, default: str) -> Criterion:
             asked = CRITERIA[name]()
         except TypeError:
             raise ValueError(
-                f"criterion {name} must carry its data: "
+                f"criterion {name} needs its parameters: "
                 f"jaxcal.{CRITERIA[name].__name__}([...])"
             ) from None
     if region is None:
         return asked
     if not asked.of_region or asked.region is not None:
         raise ValueError(
-            "region, where predictions are wanted, must come with criterion I, once, "
-            f"got criterion {asked.name}"
+            f"region goes with criterion I only, and once, got criterion {asked.name}"
         )
     return I(region)
 

@@ -181,7 +181,7 @@ class Selection:
             return f"singular without {self._noun} {names[0]}"
         worst = int(self.left_without.argmin())
         share, name = self.left_without[worst], f"{self._noun} {self.labels[worst]}"
-        return f"{name} matters most, {share:.3g} of det S is left without it"
+        return f"losing {name} costs most: {100 * share:.3g} % of det S remains"
 
     def __str__(self) -> str:
         head = ["candidate"] + (["name"] if self.names is not None else [])

@@ -36,7 +36,7 @@ _RUNS = re.compile(
 _STAMPS = {"stamp", "timestamp", "date", "datetime", "epoch", "datum"}
 _TIMES = {"time", "uhrzeit", "elapsed", "clock"}
 _SECONDS = re.compile(r"t([ _]?[\[(]?(s|ms|us|ns|sec|seconds|min)[\])]?)?", re.I)
-COUNTED = "it counts the rows or tells their time"
+COUNTED = "it looks like a row number or a time"
 _LIKE_U, _LIKE_Y = re.compile(r"[uU]\d*|U_.*"), re.compile(r"[yY]\d*|Y_.*")
 _EPOCH = 1e8  # seconds; no factor of an experiment is so large
 

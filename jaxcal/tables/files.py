@@ -120,7 +120,7 @@ def _unnamed(
         columns["index"] = cells
         return []
     if len({*cells}) == len(cells) and all(cell.isdecimal() for cell in cells):
-        return [f"column {place} is not read: it counts the rows"]
+        return [f"column {place} is not read: it looks like a row number"]
     raise ValueError(f"{source}: column {place} has no name")
 
 

@@ -116,7 +116,7 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     if calibration.noise_std is not None:
         rows = run.model.outputs(config, records) if run.model else pairs(records)
         told = calibration.check(*rows, tolerance=limit)
-        run.say(f"a drift that moves it by {limit:g} is seen with {told.power:.0%}")
+        run.say(f"the check would detect a drift of {limit:g} (power {told.power:.0%})")
     over = "RECALIBRATE: over session.verify_limit_deg. Run `jaxcal-rig calibrate`"
     run.say(over if again else "the calibration still holds")
     return EXIT_RECALIBRATE if again else EXIT_OK

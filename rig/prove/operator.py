@@ -39,9 +39,7 @@ class Operator:
 
     def _answer(self, prompt: str) -> str:
         if self._read is input and not sys.stdin.isatty():
-            raise Refused(
-                f"{prompt}no terminal to answer on; confirm with {self._option}"
-            )
+            raise Refused(f"{prompt}no terminal: pass {self._option} to confirm")
         try:
             return self._read(prompt).strip()
         except EOFError:

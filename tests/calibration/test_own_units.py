@@ -57,7 +57,7 @@ def test_an_accuracy_is_of_a_unit():
         with pytest.raises(ValueError, match=words):
             _posed(accuracy=wrong)
     joints = np.random.default_rng(0).uniform(size=(8, 2))
-    with pytest.raises(ValueError, match="accuracy is of an arm"):
+    with pytest.raises(ValueError, match="accuracy needs an arm"):
         jaxcal.identify(joints, joints + 1.0, accuracy=1.0)
 
 

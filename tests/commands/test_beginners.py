@@ -67,7 +67,7 @@ CASES = [  # what was typed, what the line must hold
     ("select gap.csv", "line 6, column 'yaw'", "empty cell"),
     ("select short.csv", "line 6 has 2 cells, the first has 3"),
     ("select repeated.csv", "12 rows (3 of them distinct)", "pitch"),
-    ("select flat.csv", "never excited: roll"),
+    ("select flat.csv", "the same in every row: roll"),
     ("select header.csv", "no rows below the header"),
     ("select empty.csv", "the table is empty"),
     ("select twice.csv", "column 'pitch' comes twice"),
@@ -79,14 +79,21 @@ CASES = [  # what was typed, what the line must hold
     ("select table.csv --method best", "method must be one of", "got 'best'"),
     ("select table.csv --model arm.urdf", "there is no column 'turn'"),
     ("select table.csv --model calibration.json", "a model is needed, this is a cal"),
-    ("select table.csv --model table.csv", "a model must be a JSON file"),
+    ("select table.csv --model table.csv", "--model takes an arm (.urdf), a saved"),
     ("select table.csv --score no.csv", "no.csv: No such file"),
-    ("plan table.csv --accuracy 0.001 --noise 0.1", "best design found has a largest"),
+    (
+        "plan table.csv --accuracy 0.001 --noise 0.1",
+        "0.001 cannot be reached: all",
+    ),
     ("identify table.csv", "no column begins with y_", "--outputs"),
     ("identify pairs.csv --inputs u_yaw,y_yaw", "must differ, both hold y_yaw"),
     ("identify unread.csv", "unread.csv: line 3, column 'y_a' must hold a number"),
-    ("identify three.csv", "at least 4 postures", "got 3"),
-    ("command calibration.json far.csv --limits=-20,20", "u_pitch = 457.9", "[-20, 20"),
+    ("identify three.csv", "4 or more rows", "got 3"),
+    (
+        "command calibration.json far.csv --limits=-20,20",
+        "u_pitch would have to be 457.9",
+        "(limits -20 to 20",
+    ),
     ("command calibration.json two.csv", "3 columns are needed", "got 2 without a"),
     ("command table.csv target.csv", "`jaxcal identify ... --out FILE` writes"),
     ("command calibration.json target.csv --limits=20,-20", "a least and a greatest"),
@@ -114,6 +121,19 @@ def test_an_error_is_one_line_that_says_what_to_do(
     assert said.err.count("\n") == 1
     for part in wanted:
         assert part in said.err
+
+
+def test_a_calibration_that_an_editor_saved_with_a_byte_order_mark(
+    folder, monkeypatch, capsys
+):
+    monkeypatch.chdir(folder)
+    plain = "command calibration.json target.csv".split()
+    assert main(plain) == 0
+    wanted = capsys.readouterr().out
+    marked = (folder / "calibration.json").read_text(encoding="utf-8")
+    (folder / "marked.json").write_text(marked, encoding="utf-8-sig")
+    assert main(["command", "marked.json", "target.csv"]) == 0
+    assert capsys.readouterr().out == wanted
 
 
 def test_a_negative_value_after_a_blank(folder, monkeypatch, capsys):

@@ -199,7 +199,7 @@ def test_predict_and_command_are_inverse(calibration, tmp_path, commands, capsys
         (["command", "CALIBRATION", "CANDIDATES", "--clip"], "--clip needs --limits"),
         (
             ["command", "CALIBRATION", "CANDIDATES", "--limits", "1"],
-            "limits must have shape (3, 2), got (3, 1)",
+            "--limits takes LOW,HIGH, once for all axes",
         ),
     ],
 )

@@ -345,7 +345,7 @@ def test_an_unnamed_column_is_a_data_frames_index_or_refused(ask):
     text = "\n".join([rows[0], *(row.replace(".0", "", 1) for row in rows[1:])])
     code, _, said = ask("select t.csv -k 5", text)
     assert code == 0
-    assert "column 1 is not read: it counts the rows" in said
+    assert "column 1 is not read: it looks like a row number" in said
     code, _, said = ask("select t.csv -k 5", text.replace("\n3,", "\n7,"))
     assert code == 2
     assert "column 1 has no name" in said

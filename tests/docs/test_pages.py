@@ -1,42 +1,38 @@
-"""Every code block of the site and of README runs, or is parsed by its command."""
+"""README's code runs, every command of a page parses, and pages are short."""
 
 from __future__ import annotations
 
-import contextlib
-import io
-import os
 import pathlib
 import re
 import shlex
-import shutil
-import subprocess
 import sys
 
+import common
 import jax
-import matplotlib
+import matplotlib.figure
 import pytest
 
 ROOT = pathlib.Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "docs" / "tools"))
 
+import pictures
 import rooms
+import words as word_count
 
 PAGES = sorted(
     [*ROOT.glob("docs/**/*.md"), *ROOT.glob("examples/*.md"), *ROOT.glob("*.md")]
 )
-QUICK = {"calibration.md", "datasets.md", "evaluation.md", "own_function.md"}
-RUN = {"candidates.md", "device.md"}  # their shell commands too are executed
 
 
 def blocks(page: pathlib.Path) -> list[tuple[str, str]]:
     """(language, text) of each fenced block."""
-    return re.findall(r"^```(\w*)\n(.*?)^```", page.read_text(), re.M | re.S)
+    return re.findall(r"^```(\w*)[^\n]*\n(.*?)^```", page.read_text(), re.M | re.S)
 
 
 def commands(page: pathlib.Path) -> list[list[str]]:
     """Words of every command line, fenced or indented, without its comment."""
     whole = page.read_text().replace("\\\n", " ")  # lines that go on
-    fenced = re.findall(r"^```\w*\n(.*?)^```", whole, re.M | re.S)
+    fenced = re.findall(r"^```[^\n]*\n(.*?)^```", whole, re.M | re.S)
     lines = [line for text in fenced for line in text.splitlines()]
     lines += re.findall(r"^    (\S.*)$", whole, re.M)
     starts = ("jaxcal ", "jaxcal-rig ", "python ", "make ")
@@ -48,57 +44,48 @@ def commands(page: pathlib.Path) -> list[list[str]]:
     ]
 
 
-def with_code() -> list:
-    pages = [
-        page for page in PAGES if any(lang == "python" for lang, _ in blocks(page))
-    ]
-    return [
-        pytest.param(page, id=str(page.relative_to(ROOT)),
-                     marks=[] if page.name in QUICK else [pytest.mark.slow])
-        for page in [*pages, ROOT / "docs" / "start" / "device.md"]
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize("page", with_code())
-def test_the_blocks_of_a_page_run_in_their_order(page, tmp_path, monkeypatch, capsys):
+def test_the_code_of_the_readme_runs(tmp_path, monkeypatch):
+    """Code of the other pages is run by the site's build, which ends at an error."""
     monkeypatch.chdir(tmp_path)
-    matplotlib.use("Agg")
-    shutil.copytree(ROOT / "examples" / "ur5", tmp_path / "examples" / "ur5")
-    path = f"{pathlib.Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     names: dict[str, object] = {}
-    printed, shown = "", []
-    for language, text in blocks(page):
-        if language == "python":
-            out = io.StringIO()
-            with jax.numpy_rank_promotion("allow"), contextlib.redirect_stdout(out):
-                exec(compile(text, str(page), "exec"), names)
-            printed += out.getvalue()
-        elif language == "bash" and page.name in RUN:
-            done = subprocess.run(
-                ["bash", "-ec", text], env={**os.environ, "PATH": path},
-                capture_output=True, text=True, check=False,
-            )  # fmt: skip
-            assert done.returncode == 0, done.stdout + done.stderr
-            printed += done.stdout
-        elif language == "text":
-            shown.append(text)
-            for line in re.findall(r"^\$ .*\n", text, re.M):
-                done = subprocess.run(
-                    ["bash", "-c", line[2:]], env={**os.environ, "PATH": path},
-                    capture_output=True, text=True, check=False,
-                )  # fmt: skip
-                printed += line + done.stdout + done.stderr
-    if page.name in ("models.md", "arms.md", "arm.md", "candidates.md"):
-        assert lines_of("".join(shown)) == lines_of(printed)
+    with jax.numpy_rank_promotion("allow"):
+        for language, text in blocks(ROOT / "README.md"):
+            if language == "python":
+                exec(compile(text, "README.md", "exec"), names)
+    assert (tmp_path / "best.png").stat().st_size > 1000
 
 
-def lines_of(text: str) -> list[str]:
-    """What is printed, less the time that a selection took, to nine digits."""
-    return [
-        re.sub(r"(\d\.\d{8})\d+", r"\1", line.rstrip())
-        for line in text.splitlines()
-        if line.strip() and not line.startswith("time ")
-    ]
+def test_a_block_is_run_and_its_picture_shown_once(tmp_path):
+    page = "```python\nx = made()\nx.plot()  # two\n```\n\n```py\nnot_run()\n```\n"
+    given = pictures.executed(page, "one.md")
+    code = re.findall(r'exec="on".*?\n(.*?)^```', given, re.M | re.S)
+    assert len(code) == 2 and code[0].startswith("x = made()\nx.plot()  # two\n")
+    assert "# markdown-exec: hide" in code[0] and "not_run" not in "".join(code)
+
+    class Made:
+        def plot(self):
+            return matplotlib.figure.Figure().subplots()
+
+    names = {"made": Made}
+    exec(code[0], names)
+    assert pictures.drawn(names).count("<img") == 1
+    assert pictures.drawn(names) == ""
+
+
+def test_every_example_is_in_the_gallery_by_a_light_picture():
+    page = (ROOT / "docs" / "gallery.md").read_text()
+    for name in common.NAMES:
+        picture = ROOT / "docs" / "assets" / "gallery" / f"{name}.webp"
+        assert 1_000 < picture.stat().st_size < 40_000
+        assert f"(assets/gallery/{name}.webp)" in page
+        assert f"(../examples/{name}.md)" in page
+
+
+def test_the_pages_have_at_most_forty_thousand_words():
+    counted = word_count.counted()
+    assert counted["README.md"] <= 1_200
+    assert sum(counted.values()) <= 40_000
+    assert {"docs/index.md", "examples/ur5.md", "CONTRIBUTING.md"} <= counted.keys()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -184,7 +184,7 @@ def test_every_page_and_link(site, browser, scheme, size):
             for text in page["scrolled"]
             if size == "desktop" or text.startswith("md-typeset__scrollwrap")
         ]
-        # The nine phases of the matrix and long signatures scroll on a phone.
+        # Names of faults and long signatures scroll on a phone.
         few = "fault_matrix" in url or "/reference/" in url
         assert not scrolled or (few and size == "phone"), (url, scrolled)
         outside = [name for name in page["loaded"] if name.startswith("http")]

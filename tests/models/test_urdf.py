@@ -165,7 +165,7 @@ ONE = [("revolute", (0, 0, 1), (0, 0, 0), (0, 0, 1))]
             ),
             "link link1 is the child of the joints j1 and j2",
         ),
-        (_urdf([("fixed", *ONE[0][1:])]), "no joint moves between"),
+        (_urdf([("fixed", *ONE[0][1:])]), "no movable joint between"),
     ],
 )
 def test_a_file_that_is_no_chain_is_refused(tmp_path, text, message):
@@ -271,7 +271,7 @@ def test_columns_of_a_table_are_taken_by_the_names_of_the_joints(tmp_path):
 def test_links_that_do_not_fit_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"tip link must be one of .* got 'flange'"):
         _read(tmp_path, _urdf(ONE), tip="flange")
-    with pytest.raises(ValueError, match="no joint moves between base 'link0' and"):
+    with pytest.raises(ValueError, match="no movable joint between base 'link0' and"):
         _read(tmp_path, _urdf(ONE), tip="link0", base="link0")
     with pytest.raises(ValueError, match="base 'b' and tip 'link1' hang on different"):
         _read(tmp_path, _urdf(ONE, '<link name="b"/>'), tip="link1", base="b")

@@ -159,7 +159,6 @@ HOST_PHASES = {
     "foreign_stop": ("moving",),
     "suspended_stop": ("moving", "measuring"),
 }
-COLUMNS = (*PHASES, "finishing", "axes", "start", "overnight")
 DEAF = ("dead_drive", "lost_request", "exception_reply")  # cannot take a stop
 MAX_RESUMES = 6
 HARNESS = pathlib.Path(__file__).with_name("harness.py")
@@ -654,94 +653,72 @@ def cells() -> list[tuple[str, str]]:
 
 
 def table(outcomes: list[Outcome]) -> str:
-    """The published page."""
+    """The published page: faults that ended alike share a row."""
     counts: dict[str, int] = {}
+    rows: dict[str, dict[str, list[str]]] = {}  # fault, outcome, phases
     for outcome in outcomes:
         counts[outcome.word] = counts.get(outcome.word, 0) + 1
+        said = f"{outcome.word} ({outcome.first_code})"
+        ends = rows.setdefault(outcome.fault, {})
+        ends.setdefault(said, []).append(outcome.phase)
+    alike: dict[str, list[str]] = {}  # outcomes in words, faults
+    for fault in dict.fromkeys(fault for fault, _ in cells()):
+        ends = rows[fault]
+        said = "; ".join(f"{word}: {_named(ends[word])}" for word in sorted(ends))
+        alike.setdefault(said, []).append(f"`{fault}`")
     worst = max(outcome.worst for outcome in outcomes)
     counted = ", ".join(f"{count} {word}" for word, count in sorted(counts.items()))
     lines = [
-        "# Fault matrix",
+        "# Faults of a rig",
         "",
-        "Written by `python tests/rig/fault_matrix.py docs/fault_matrix.md`; the slow "
-        "test `tests/rig/test_rig_faults.py` runs the same cells.",
+        f"**{len(outcomes)} of {len(outcomes)} cells hold**: {counted}. A cell is a "
+        "fault in one phase of a simulated session. Largest difference of any element "
+        f"of A or b from a run without a fault: {worst:.1e} (readings are noise-free).",
         "",
-        f"**{len(outcomes)} of {len(outcomes)} cells hold**: {counted}. Largest "
-        "difference of any element of A or b between a run that was spoilt and resumed "
-        f"and one that was not: {worst:.1e} (the simulated readings are noise-free "
-        "here, so that any lost, doubled or mixed-up posture would show).",
+        "`python tests/rig/fault_matrix.py docs/fault_matrix.md` writes this page and "
+        "prints what the session said of each fault; the slow test "
+        "`tests/rig/test_rig_faults.py` runs the same cells.",
         "",
-        "A cell begins a fault when the session enters the phase (after two recorded "
-        "postures, so that there is something to lose), lets it act until the session "
-        "ends, repairs it, and resumes. It holds when: the drives were commanded to "
-        "stop while the process lived, and stand; every line of the journal reads; the "
-        "drives ran no move twice and none that was not journalled (the simulator "
-        "counts); no posture is recorded twice or missing; the resumed calibration is "
-        "that of the uninterrupted run. *Ridden out* means the first session reached "
-        "the same calibration by itself. Faults without a count last until the session "
-        "ends; a full disk is a limit on the size of the process's files, set by the "
-        "operating system.",
+        "A fault begins when the session enters the phase, after two recorded "
+        "postures, and lasts until the session ends, unless it has a count. It is then "
+        "repaired and the session resumed. A cell holds when the drives were told to "
+        "stop and stand, every line of the journal reads, no move ran twice or without "
+        "a line of the journal, no posture is recorded twice or missing, and the "
+        "calibration is that of a run without a fault.",
         "",
-        "*start*: the device is so from the start. What real drives do (slow to "
-        "enable, a position that flickers, slow replies, a watchdog on idle lines) is "
-        "ridden out. A mistake (an axis that turns the other way, two drives on each "
-        "other's cables, another gearing in the drive) is *refused*: no calibration is "
-        "saved, and with exit code 2 nothing moved. *axes*: the check of the axes with "
-        "a file whose gearing is wrong, or a phone that sends radians: it is said, no "
-        f"joint is moved by {MOST_DEG:g} degrees, and the device is not sign-checked. "
-        f"`{ENTER}`: asked for the word `axes`, the operator presses Enter; nothing "
-        "moves. *overnight*: between a stopped "
-        "session and its resumption the drives were without power and count from "
-        "elsewhere, or the joints were moved; the resumption is refused and measures "
-        "nothing until the origin is found again. `second_session` and `other_stop` "
-        "are commands in another terminal; `sigkill_watched` leaves drives whose "
-        "communication timeout is set, which must stop themselves, and get their own "
-        "timeout back. Faults are left out of the phases in which they would do the "
-        "same again.",
+        "- *Ridden out*: the first session reached the calibration by itself.",
+        "- *Refused*: no calibration is saved; with exit code 2 nothing moved.",
+        "- *start*: the device is so from the start. A joint whose gearing, phone or "
+        f"speed changed since `axes` goes less than {CHANGED_DEG:g} degrees, and passes"
+        f" its soft limit by {PAST_DEG:g} degree at most (`near_limit`).",
+        "- *axes*: the check of the axes finds it, and no joint goes "
+        f"{MOST_DEG:g} degrees.",
+        "- *overnight*: the drives lost power, or the joints were moved, between a "
+        "stopped session and its resumption; nothing is measured until the origin is "
+        "found again.",
         "",
-        "`late_reply_rtu`: on a serial line, with a map whose status and position are "
-        "two registers each, three replies come when the next question was asked. "
-        "`imu_new_heading`: the phone comes back turned by "
-        f"{TURNED_DEG:g} degrees. `imu_400_strangers`: 400 senders of another address, "
-        "each with 64 kB, at the port of a phone that pushes over HTTP. "
-        "`other_controller`: another computer on the gateway moves a drive; no lock "
-        "is common to both, so it is found by what the drives do. `pushed_while_off`: "
-        "drives without a homed bit, switched off and pushed by 10 degrees. "
-        "`simulated_calibration`: `goto` with a calibration that was made with "
-        "`--simulate`. `drives_halted`, `drive_halted`: another controller stops drives"
-        " in a move, and they say that they are done; `sto`: their power is off "
-        "for a second, without an alarm. `regeared`, `phone_turned`, `fast_drive` at "
-        "*start*: a joint's gearing, the phone's place on its holder or a speed "
-        f"is not as `axes` saw it; no joint goes {CHANGED_DEG:g} degrees. "
-        "`near_limit`: the same of a joint that stands close to its soft limit, which "
-        f"is not passed by more than {PAST_DEG:g} degree. `foreign_stop`: `stop` from "
-        "another lock folder, as another user or computer would. "
-        "`stop_ignored`, `stop_resumes`: the drives acknowledge their stop and go on, "
-        "or go on later; the device is not STOP_PROVED.",
+        "| outcome (exit code of the first session): phases | faults |",
+        "|---|---|",
+        *(f"| {said} | {', '.join(faults)} |" for said, faults in alike.items()),
         "",
-        "| fault | " + " | ".join(COLUMNS) + " |",
-        "|---" * (len(COLUMNS) + 1) + "|",
+        "Names that need a word: `other_stop`, `second_session`: a command in another "
+        "terminal; `foreign_stop`: `stop` by another user or computer; "
+        "`other_controller`: another computer on the gateway moves a drive; "
+        "`drives_halted`: it stops them, and they say that they are done; `sto`: their "
+        "power is off for a second; `stop_ignored`, `stop_resumes`: they acknowledge a "
+        "stop and go on; `sigkill_watched`: they watch the line, and must stop by "
+        "themselves; `pushed_while_off`: moved by 10 degrees without power; "
+        f"`imu_new_heading`: the phone comes back turned by {TURNED_DEG:g} degrees; "
+        "`imu_400_strangers`: 400 other senders at its port.",
     ]
-    by_cell = {(o.fault, o.phase): o for o in outcomes}
-    faults = list(dict.fromkeys(fault for fault, _ in cells()))
-    for fault in faults:
-        row = []
-        for phase in COLUMNS:
-            found = by_cell.get((fault, phase))
-            row.append("" if found is None else f"{found.word} ({found.first_code})")
-        lines.append(f"| `{fault}` | " + " | ".join(row) + " |")
-    lines += ["", "In brackets the exit code of the first session.", "",
-              "## What stopped each", ""]  # fmt: skip
-    for fault in faults:
-        reasons = {
-            re.sub(r"/\S*/", "", o.reason.partition(": ")[2])
-            for o in outcomes
-            if o.fault == fault
-        } - {""}
-        if reasons:
-            shortest = min(reasons, key=lambda reason: (len(reason), reason))
-            lines.append(f"- `{fault}`: {shortest}")
     return "\n".join(lines) + "\n"
+
+
+def _named(phases: list[str]) -> str:
+    whole = "every phase"
+    if set(PHASES) <= set(phases):
+        phases = [whole, *(each for each in phases if each not in PHASES)]
+    return ", ".join(phases)
 
 
 def main(target: str, store: str = "", *only: str) -> int:

@@ -366,7 +366,7 @@ def test_float32_candidates_in_a_plane_are_refused(u):
         jaxcal.select(u, 4)
     with pytest.raises(ValueError, match="in one plane"):
         exact_batch(np.stack([u, u]), 4)
-    with pytest.raises(ValueError, match=r"never excited|nothing of the direction"):
+    with pytest.raises(ValueError, match=r"same in every row|nothing of the direct"):
         jaxcal.Design(u, measured=u[:3]).select(4)
     rows = u[:, None, :]
     with pytest.raises(ValueError, match="nothing of the direction"):

@@ -314,8 +314,8 @@ HELD = jaxcal.Prior(1.0, fixed=("a11", "a12", "a13", "b1"))
             {"criterion": "D+A"},
         ),
         ("criterion must be one of", {"criterion": ["D", "A"]}),
-        (r"criterion Ds must carry its data: jaxcal.Ds\(\[", {"criterion": "Ds"}),
-        (r"criterion Ds must carry its data: jaxcal.Ds\(\[", {"criterion": jaxcal.Ds}),
+        (r"criterion Ds needs its parameters: jaxcal.Ds\(\[", {"criterion": "Ds"}),
+        (r"criterion Ds needs its parameters: jaxcal.Ds\(\[", {"criterion": jaxcal.Ds}),
         ("parameters must be names or indices, got 3", {"criterion": jaxcal.Ds(3)}),
         (r"required must have shape \(r,\), got \(1, 2\)", {"required": [[0, 1]]}),
         ("required must be one array", {"required": [[1, 2], [3]]}),
@@ -324,7 +324,7 @@ HELD = jaxcal.Prior(1.0, fixed=("a11", "a12", "a13", "b1"))
         ("parameters must be indices .*'x'", {"criterion": jaxcal.As("x")}),
         ("parameters must name some once", {"criterion": jaxcal.As([1, 1])}),
         (
-            "region, where .* must come with criterion I, once",
+            "region goes with criterion I only, and once",
             {"region": np.ones((3, 2, 4)), "criterion": jaxcal.I(np.ones((3, 2, 4)))},
         ),
         (
@@ -332,7 +332,7 @@ HELD = jaxcal.Prior(1.0, fixed=("a11", "a12", "a13", "b1"))
             {"region": np.ones((3, 4)), "criterion": "I"},
         ),
         (
-            "region, where .* must come with criterion I, once, got criterion D",
+            "region goes with criterion I only, and once, got criterion D",
             {"region": np.ones((3, 2, 4))},
         ),
         (r"measured must have shape \(N, 2, 4\)", {"measured": np.ones((3, 1, 4))}),

@@ -79,7 +79,9 @@ def test_a_criterion_of_ones_own_is_solved_and_proven(monkeypatch, seed) -> None
             assert found.value == pytest.approx(best, rel=2e-3)
         assert found.proven or method != "exact"
     assert "variance" in str(found) and found.criterion == "c"
-    with pytest.raises(ValueError, match=r"criterion c must carry its data: jaxcal\.C"):
+    with pytest.raises(
+        ValueError, match=r"criterion c needs its parameters: jaxcal\.C"
+    ):
         design.select(3, "c")
 
 

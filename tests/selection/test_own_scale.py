@@ -175,8 +175,8 @@ def test_what_is_left_without_each_measurement_is_told(rng):
     assert "singular, whichever is lost" in str(fewest)
     more = jaxcal.select(rng.random((9, 3)), 6)
     worst = more.left_without.argmin()
-    share = f"{more.left_without[worst]:.3g} of det S is left without it\n"
-    assert f"candidate {more.indices[worst]} matters most, {share}" in str(more)
+    share = f"{100 * more.left_without[worst]:.3g} % of det S remains\n"
+    assert f"losing candidate {more.indices[worst]} costs most: {share}" in str(more)
 
 
 def test_a_time_limit_is_kept_by_many_best_and_by_many_replicates(rng):

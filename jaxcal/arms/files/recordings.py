@@ -189,7 +189,7 @@ def _dataset(
     """
     with needs("lerobot", "reading a LeRobot dataset"):
         from pyarrow import parquet
-    info = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8"))
+    info = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8-sig"))
     feature = info.get("features", {}).get("observation.state", {})
     columns = feature.get("names") or []
     if isinstance(columns, dict):

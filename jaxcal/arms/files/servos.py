@@ -63,7 +63,7 @@ class Servos:
             OSError: it cannot be read.
             ValueError: it is none; the message names the file.
         """
-        text = pathlib.Path(path).read_text(encoding="utf-8")
+        text = pathlib.Path(path).read_text(encoding="utf-8-sig")
         try:
             content = json.loads(text)
             if not isinstance(content, dict):

@@ -106,7 +106,7 @@ def walk(
     if base is not None and len(top) > 1:
         raise ValueError(f"base {base!r} and tip {tip!r} hang on different roots")
     if not up and not down:
-        raise ValueError(f"no joint moves between base {base!r} and tip {tip!r}")
+        raise ValueError(f"no movable joint between base {base!r} and tip {tip!r}")
     yield from ((joint, False) for joint in up)
     yield from ((joint, True) for joint in reversed(down))
 
@@ -313,7 +313,8 @@ def table_of(
             frame = frame @ np.linalg.inv(joint.origin)
     if not lines:
         raise ValueError(
-            f"no joint moves between base {source['base']!r} and tip {source['tip']!r}"
+            f"no movable joint between base {source['base']!r} and tip "
+            f"{source['tip']!r}"
         )
     columns = list(dict.fromkeys(leader for leader, _, _ in leads))
     drive = np.zeros((len(leads), len(columns)))

@@ -291,11 +291,12 @@ def _unreachable(
     hardest = int((unit * np.sqrt(variance) / request.target).argmax())
     bound = sizes.bound(max_k)
     reached, least = unit[hardest] * np.sqrt([variance.max(), bound])
-    every = " (all that are allowed)" if max_k == sizes.problem.k else ""
+    all_of = "all " if max_k == sizes.problem.k else ""
     return ValueError(
-        f"accuracy must be reachable with max_k = {max_k} measurements{every}: the "
-        f"best design found has a {summary} standard error of {reached:.6g}, no design "
-        f"has less than {least:.6g}, got {request.target[hardest]:g}"
+        f"accuracy = {request.target[hardest]:g} cannot be reached: {all_of}{max_k} "
+        f"measurements give a {summary} standard error of {reached:.6g}, no choice of "
+        f"them less than {least:.6g}; repeat rows (max_replicates, --replicates) or "
+        "measure with less noise"
     )
 
 
@@ -321,7 +322,7 @@ def _request(
     """Check the arguments of ``plan``."""
     of_parameters = criterion == "parameters"
     if parameters is not None and not of_parameters:
-        raise ValueError("parameters must come with criterion parameters only")
+        raise ValueError("parameters goes with criterion='parameters' only")
     cap = whole_number("max_replicates", offer.max_replicates, 1)
     total = max(1, int(offer.available.sum()) * cap)
     model, std = offer.model, _reading_std(offer, noise_std)

@@ -99,9 +99,8 @@ class _ThroughJax:
         masked = max(int((~problem.available).sum()) for problem in problems)
         if masked and self._policy.network.mask_is_chosen:
             raise ValueError(
-                f"checkpoint {self._path} takes what is not available for chosen: "
-                f"every candidate must be available, got {masked} that are not; leave "
-                "them out"
+                f"checkpoint {self._path} needs every candidate available, got "
+                f"{masked} that are not; leave them out"
             )
 
     def __call__(

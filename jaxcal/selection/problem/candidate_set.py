@@ -217,8 +217,7 @@ def _available(frame: Any, available: Any) -> Any:
         return available if column is None else column
     if not np.array_equal(column, np.asarray(available)):
         raise ValueError(
-            "available must be that of the candidates' column, or that column be left "
-            "out: they differ"
+            "available differs from the candidates' column 'available': leave one out"
         )
     return column
 
