@@ -19,6 +19,7 @@ from jaxcal.checks import one_of
 from jaxcal.models.model import Model, as_model
 from jaxcal.models.recording import Recording
 from jaxcal.tables import COMMANDS, Table
+from jaxcal.tables.names import say
 
 if TYPE_CHECKING:
     from jaxcal.arms import Sensor, SerialChain
@@ -197,7 +198,8 @@ class ArmOptions:
             # x, y, z of a polynomial are places: the table's columns in their order.
             names = table.commands(chosen, but=but)
             if len(names) == len(inputs):
-                table.say(inputs, names, "in their order")
+                listed = f"{', '.join(names)} are read as {', '.join(inputs)}"
+                say(f"{table.source}: columns {listed}, in their order")
                 return names
         beside = but or getattr(getattr(model, "sensor", None), "outputs", ())
         return table.named(inputs, COMMANDS, chosen=chosen, others=beside)

@@ -129,7 +129,7 @@ class Table:
                 )
             by_name = columns_by_name(wanted, taken, prefix, unit)
             if None not in by_name:
-                self.say(wanted, by_name, "by name")
+                self.say(by_name)
                 return tuple(by_name)
             for name, column, place in zip(wanted, by_name, taken, strict=True):
                 if column not in (None, place):
@@ -162,7 +162,7 @@ class Table:
                 + (advice if option else "")
             )
         spare = "" if others is None else self.unread(columns, prefix, others)
-        self.say(wanted, columns, "by name", spare)
+        self.say(columns, spare)
         return tuple(columns)
 
     def commands(
@@ -249,16 +249,11 @@ class Table:
             )
         return np.asarray(mask == 1.0)
 
-    def say(
-        self, wanted: Sequence[str], columns: Sequence[Any], how: str, more: str = ""
-    ) -> None:
-        """Say which columns are what; nothing where their names and order say it."""
+    def say(self, columns: Sequence[Any], more: str = "") -> None:
+        """Say where columns stand in another order than is asked for, and ``more``."""
         order = [name for name in self.header if name in columns]
-        parts = [more] if more else []
-        if [*wanted] != [*columns] or order != [*columns]:
-            listed = ", ".join(columns), how, ", ".join(wanted)
-            parts.insert(0, "columns {} are read {}, as {}".format(*listed))
-        if parts:
+        parts = ["columns reordered by name"] if order != [*columns] else []
+        if parts := parts + [more] * bool(more):
             say(f"{self.source}: {'; '.join(parts)}")
 
     def bare(self, prefix: str) -> list[str]:
