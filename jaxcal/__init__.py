@@ -18,22 +18,10 @@ if TYPE_CHECKING:
     from jaxcal.calibration import Calibration, CalibrationWarning
     from jaxcal.calibration.identify import identify
     from jaxcal.designs import Motion, optimise
-    from jaxcal.information.regression import (
-        log_det_information,
-        regression_matrix,
-    )
+    from jaxcal.information.regression import log_det_information, regression_matrix
     from jaxcal.models import Noise, Prior
     from jaxcal.models.identifiability import identifiability
-    from jaxcal.selection import (
-        As,
-        Design,
-        Ds,
-        I,
-        Mean,
-        Selection,
-        Worst,
-        select,
-    )
+    from jaxcal.selection import As, Design, Ds, I, Mean, Selection, Worst, select
     from jaxcal.tables import read_table
 
 __all__ = [

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.adaptive.episodes import Episodes
-from jaxcal.adaptive.particles import ParticleBelief, ParticleTask, log_mean
+from jaxcal.adaptive.particle_model import log_mean
+from jaxcal.adaptive.particles import ParticleBelief, ParticleTask
 from jaxcal.adaptive.session import jit_by_class
 from jaxcal.checks import whole_number
 

@@ -28,12 +28,7 @@ from jaxcal.adaptive.journal import SessionJournal, fingerprint
 from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.particles import ParticleBelief
 from jaxcal.adaptive.rules import Gain
-from jaxcal.adaptive.session import (
-    Decider,
-    SequentialTask,
-    Session,
-    jit_by_class,
-)
+from jaxcal.adaptive.session import Decider, SequentialTask, Session, jit_by_class
 
 Array = NDArray[np.float64]
 

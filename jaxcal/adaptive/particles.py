@@ -8,7 +8,7 @@ alters, is that of the unknowns themselves.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,57 +17,27 @@ from flax import struct
 from numpy.typing import ArrayLike
 
 from jaxcal.adaptive.model_task import Draw, candidates_of
+from jaxcal.adaptive.particle_model import (
+    FLOOR,
+    ParticleModel,
+    effective,
+    gain_of,
+    log_likelihood_of,
+    log_prior,
+    outcome_shape,
+    reweighted,
+    systematic,
+)
 from jaxcal.adaptive.session import Options, Session, jit_by_class, pays
 from jaxcal.checks import in_words, numbers, whole_number
 from jaxcal.models.uncertainty import Noise, Prior
 
-_FLOOR = -1e6  # least log likelihood, of impossible outcomes
 _ENOUGH = 0.5  # effective share of the particles below which they are moved
 _HALVINGS = 10  # bisections for a temperature
 _STEPS = 40  # temperatures that one outcome may take
 _FEW = 8  # outcomes per design that a two-step look-ahead follows
 _AT_ONCE = 2**25  # log probabilities that sessions played at once may hold
 _DESIGNS = 512  # whose gains are computed at once
-
-
-class ParticleModel(Protocol):
-    """What is measured: a pytree with these methods, for one z and one design each.
-
-    An outcome is a number. Where it is an array, the model says so by an attribute
-    ``outcome_shape``; where its designs are the rows of a table (A, e), by their index,
-    it has the table as ``commands``.
-    """
-
-    @property
-    def dim(self) -> int:
-        """Coordinates z."""
-
-    @property
-    def support(self) -> jax.Array | None:
-        """(Y,) all outcomes where they are few; None where they are continuous."""
-
-    def unknowns(self, z: jax.Array) -> Any:
-        """The unknowns, from coordinates (d,)."""
-
-    def predict(self, unknowns: Any, design: Any) -> Any:
-        """The parameters of the outcome's distribution."""
-
-    def log_prob(self, prediction: Any, outcome: jax.Array) -> jax.Array:
-        """() log probability, or density, of an outcome."""
-
-    def sample(self, prediction: Any, key: jax.Array) -> jax.Array:
-        """() an outcome, drawn."""
-
-    def propose(
-        self, unknowns: Any, session: Session, key: jax.Array, count: int
-    ) -> Any:
-        """``count`` candidate designs, given draws of the unknowns, leaves (N, ...).
-
-        At least one must cost at most ``session.seconds``; others are not chosen.
-        """
-
-    def cost(self, session: Session, design: Any) -> jax.Array:
-        """() cost of a design, in the unit of ``session.seconds``."""
 
 
 @struct.dataclass
@@ -85,13 +55,13 @@ class ParticleBelief:
 
     def entropy(self) -> jax.Array:
         """() nats, of z: log evidence less the particles' mean log joint density."""
-        joint = _log_prior(self.z) + self.log_likelihood
+        joint = log_prior(self.z) + self.log_likelihood
         return self.log_evidence - (jnp.exp(self.log_weight) * joint).sum()
 
     def log_density(self, truth: jax.Array) -> jax.Array:
         """() estimated log posterior density at coordinates (d,)."""
         mine = self._history(truth[None])[0]
-        return _log_prior(truth) + mine - self.log_evidence
+        return log_prior(truth) + mine - self.log_evidence
 
     def draws(self, count: int, key: jax.Array) -> jax.Array:
         """(count, d) equally weighted particles."""
@@ -129,7 +99,7 @@ class ParticleBelief:
         """() bool: some particle gives the outcome a probability above 0."""
         unknowns = jax.vmap(self.model.unknowns)(self.z)
         return jax.vmap(
-            lambda u: _log_likelihood(self.model, u, design, outcome) > _FLOOR
+            lambda u: log_likelihood_of(self.model, u, design, outcome) > FLOOR
         )(unknowns).any()
 
     def gains(self, task: ParticleTask, options: Options, key: jax.Array) -> jax.Array:
@@ -145,7 +115,7 @@ class ParticleBelief:
         keys = jax.random.split(key_noise, count)
 
         def gain(design: Any) -> jax.Array:
-            return _gain(self.model, unknowns, design, keys)
+            return gain_of(self.model, unknowns, design, keys)
 
         if len(options.seconds) > _DESIGNS:
             of_all: jax.Array = jax.lax.map(gain, options.designs, batch_size=_DESIGNS)
@@ -177,8 +147,8 @@ class ParticleBelief:
         )
         new = observed._last(self.z)
         enough = _ENOUGH * len(self.z)
-        whole = _effective(self.log_weight + new) >= enough
-        log_weight, evidence = _reweighted(self.log_weight, jnp.where(whole, new, 0.0))
+        whole = effective(self.log_weight + new) >= enough
+        log_weight, evidence = reweighted(self.log_weight, jnp.where(whole, new, 0.0))
         carry = (
             jnp.where(whole, 1.0, 0.0), jnp.int32(0), self.z, log_weight,
             self.log_likelihood, new, evidence, key,
@@ -195,14 +165,14 @@ class ParticleBelief:
             def halve(_: int, ends: Any) -> Any:
                 low, high = ends
                 middle = 0.5 * (low + high)
-                fits = _effective(log_weight + middle * new) >= enough
+                fits = effective(log_weight + middle * new) >= enough
                 return jnp.where(fits, middle, low), jnp.where(fits, high, middle)
 
-            full = _effective(log_weight + high * new) >= enough
+            full = effective(log_weight + high * new) >= enough
             full = full | (steps + 1 >= _STEPS)
             part = jax.lax.fori_loop(0, _HALVINGS, halve, (low, high))[0]
             step = jnp.where(full, high, jnp.maximum(part, 1e-6 * high))
-            log_weight, add = _reweighted(log_weight, step * new)
+            log_weight, add = reweighted(log_weight, step * new)
             power = jnp.where(full, 1.0, power + step)
             index = systematic(log_weight, len(z), key_resample)
             z, old, new = observed._moved(
@@ -244,7 +214,7 @@ class ParticleBelief:
             whole, last = self._history(there), self._last(there)
             before = whole - last
             change = (
-                _log_prior(there) - _log_prior(z)
+                log_prior(there) - log_prior(z)
                 + before - old + power * (last - new)
             )  # fmt: skip
             level = jnp.log(jax.random.uniform(key_accept, (count,), minval=1e-30))
@@ -265,7 +235,7 @@ class ParticleBelief:
         def one(at: jax.Array, total: jax.Array) -> jax.Array:
             design = jax.tree.map(lambda leaf: leaf[at], self.designs)
             return total + jax.vmap(
-                lambda u: _log_likelihood(self.model, u, design, self.answers[at])
+                lambda u: log_likelihood_of(self.model, u, design, self.answers[at])
             )(unknowns)
 
         return jax.lax.fori_loop(0, self.made, one, jnp.zeros(len(z)))
@@ -276,7 +246,7 @@ class ParticleBelief:
         design = jax.tree.map(lambda leaf: leaf[at], self.designs)
         unknowns = jax.vmap(self.model.unknowns)(z)
         return jax.vmap(
-            lambda u: _log_likelihood(self.model, u, design, self.answers[at])
+            lambda u: log_likelihood_of(self.model, u, design, self.answers[at])
         )(unknowns)
 
 
@@ -465,7 +435,9 @@ class ParticleTask:
         self, truth: jax.Array, design: Any, outcome: jax.Array
     ) -> jax.Array:
         """() log probability, or density, of an outcome."""
-        return _log_likelihood(self.model, self.model.unknowns(truth), design, outcome)
+        return log_likelihood_of(
+            self.model, self.model.unknowns(truth), design, outcome
+        )
 
 
 def _check(task: ParticleTask) -> None:
@@ -481,7 +453,7 @@ def _check(task: ParticleTask) -> None:
             f"model.sample must give shape {shape} and model.log_prob a number, got "
             f"shapes {outcomes.shape[1:]} and {log_prob.shape[1:]}"
         )
-    if not (log_prob > _FLOOR).all():
+    if not (log_prob > FLOOR).all():
         raise ValueError(
             "model.log_prob must be finite for what model.sample draws, got "
             f"{log_prob.min():g} for the outcome "
@@ -518,68 +490,3 @@ def _tried(task: ParticleTask) -> tuple[jax.Array, ...]:
         log_prob,
         jnp.exp(support_log_prob(predictions)).sum(axis=-1),
     )
-
-
-def outcome_shape(model: ParticleModel) -> tuple[int, ...]:
-    """Shape of an outcome; () of a number."""
-    return tuple(getattr(model, "outcome_shape", ()))
-
-
-def systematic(log_weight: jax.Array, count: int, key: jax.Array) -> jax.Array:
-    """(count,) int32 indices, each ``count`` times its weight often, to within one."""
-    below = jnp.cumsum(jnp.exp(log_weight))
-    ticks = (jnp.arange(count) + jax.random.uniform(key)) / count * below[-1]
-    index = jnp.searchsorted(below, ticks, side="right")
-    return jnp.minimum(index, len(log_weight) - 1).astype(jnp.int32)
-
-
-def log_mean(values: jax.Array) -> jax.Array:
-    """Log of the mean over the last axis of values that are given by their logs."""
-    return jax.nn.logsumexp(values, axis=-1) - jnp.log(float(values.shape[-1]))
-
-
-def _gain(
-    model: ParticleModel, unknowns: Any, design: Any, keys: jax.Array
-) -> jax.Array:
-    predictions = jax.vmap(lambda u: model.predict(u, design))(unknowns)
-    if model.support is None:
-        outcomes = jax.vmap(model.sample)(predictions, keys)
-        log_prob = jax.vmap(model.log_prob)(predictions, outcomes)
-        all_of = jax.vmap(
-            lambda y: jax.vmap(lambda p: model.log_prob(p, y))(predictions)
-        )(outcomes)
-        # Outcomes are likely under their own particle: clipping prevents overflow.
-        ratio = jnp.exp(jnp.minimum(all_of - log_prob[:, None], 80.0))
-        gain = -jnp.log(ratio.mean(axis=-1)).mean()
-    else:
-        log_p = jax.vmap(
-            lambda p: jax.vmap(lambda y: model.log_prob(p, y))(model.support)
-        )(predictions)  # (n, Y)
-        p = jnp.exp(log_p)
-        within = (p * jnp.maximum(log_p, _FLOOR)).sum(axis=-1).mean()
-        mixed = p.mean(axis=0)
-        gain = within - (mixed * jnp.log(mixed + 1e-30)).sum()
-    return jnp.maximum(gain, 0.0)
-
-
-def _log_likelihood(
-    model: ParticleModel, unknowns: Any, design: Any, outcome: jax.Array
-) -> jax.Array:
-    return jnp.maximum(model.log_prob(model.predict(unknowns, design), outcome), _FLOOR)
-
-
-def _log_prior(z: jax.Array) -> jax.Array:
-    dim = z.shape[-1]
-    return -0.5 * (z * z).sum(axis=-1) - 0.5 * dim * jnp.log(2.0 * jnp.pi)
-
-
-def _effective(log_weight: jax.Array) -> jax.Array:
-    """Effective sample size of weights that need not sum to one."""
-    weight = jnp.exp(log_weight - log_weight.max())
-    return weight.sum() ** 2 / (weight * weight).sum()
-
-
-def _reweighted(log_weight: jax.Array, add: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Weights that sum to one, and the log of what they summed to."""
-    total = jax.nn.logsumexp(log_weight + add)
-    return log_weight + add - total, total

@@ -25,13 +25,7 @@ from jaxcal.arms.arguments import (
 from jaxcal.arms.arm import Arm, apparent_length
 from jaxcal.arms.sensors import Position, Sensor, Several
 from jaxcal.checks import array_of, axis_names, numbers, one_of
-from jaxcal.models.model import (
-    ErrorGroups,
-    Model,
-    Quantity,
-    as_commands,
-    as_parameters,
-)
+from jaxcal.models.model import ErrorGroups, Model, Quantity, as_commands, as_parameters
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
 

@@ -658,7 +658,7 @@ class Chains(Model):
 
         Distances that one chain's contacts judge are left to its own verdict.
         """
-        from jaxcal.arms.verdict import Part
+        from jaxcal.arms.parts import Part
 
         used = np.flatnonzero(fit.loss_weights > 0.0)
         tables = [(k, at, None) for k, _, _, at in self._parts(fit.commands[used])]
@@ -683,7 +683,7 @@ class Chains(Model):
 
     def verdict(self, fit: Any) -> ChainsVerdict:
         """Good where every chain that was read is, and distances that they share."""
-        from jaxcal.arms.verdict import CLEAR_UP, other_distances
+        from jaxcal.arms.findings import CLEAR_UP, other_distances
 
         read = {
             self.tips[k]

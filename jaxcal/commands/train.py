@@ -7,7 +7,6 @@ measurement of a task (``--task``); they differ in what is read from the flags.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import datetime
 import functools
 import math
@@ -15,20 +14,16 @@ import pathlib
 import pprint
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from jaxcal.arguments import refused, told, typed_line
+from jaxcal.commands.train_configuration import of_postures, of_task
 from jaxcal.extras import MissingExtraError, needs
-from jaxcal.files import require_writable_folder
 from jaxcal.learning.runtime import cache, processes
 
 if TYPE_CHECKING:
-    from jaxcal.adaptive.policy.config import PolicyConfig
-    from jaxcal.adaptive.rules import StateRule
-    from jaxcal.adaptive.tasks.registry import Entry
     from jaxcal.commands.train_arguments import TrainOptions
-    from jaxcal.learning.environments.task import GivenCandidates
     from jaxcal.learning.training.presets import TrainConfig
     from jaxcal.learning.training.run import Report
 
@@ -73,7 +68,7 @@ def _run(arguments: TrainOptions, prog: str) -> int:
         arguments.task = _task_held(out)
     if arguments.export and not arguments.export.endswith(".npz"):
         raise ValueError(f"--export must be a file NAME.npz, got {arguments.export}")
-    configuration = _task_configuration if arguments.task else _configuration
+    configuration = of_task if arguments.task else of_postures
     configure = functools.partial(configuration, arguments, out)
     config: Any = None
     later = arguments.task, arguments.resume, arguments.sweep, "jax" in sys.modules
@@ -215,184 +210,6 @@ def _num_runs(arguments: TrainOptions, out: pathlib.Path) -> int:
 
 
 # -- what to train ---------------------------------------------------------------------
-
-
-def _configuration(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
-    """Configuration of postures: from the flags, or from the run to go on with."""
-    from jaxcal.commands.train_arguments import (
-        candidates_of,
-        given_flags,
-        preset_of,
-        trained_on,
-    )
-    from jaxcal.learning.training import presets
-
-    flags = given_flags(arguments, task=False)
-    path = arguments.candidates
-    candidates = candidates_of(path) if path else None
-    config = presets.load(preset_of(arguments))
-    if arguments.trainer == "brax":
-        config = _for_brax(config, arguments, flags)
-    if arguments.resume:
-        budget = _budget(flags)
-        _refuse_with_resume(flags | _swept(arguments), out)
-        return _prolonged(_configuration_of(out, candidates), budget)
-    _refuse_to_overwrite(out)
-    if candidates is None:
-        config = presets.with_values(config, flags)
-    else:
-        config = trained_on(config, candidates, flags)
-    config = dataclasses.replace(config, sweep=tuple(arguments.sweep))
-    if config.num_runs > 1 and arguments.no_validation:
-        raise ValueError(
-            "--seeds and --sweep need the validation by which the best is known: leave "
-            "--no-validation out"
-        )
-    require_writable_folder(out)
-    return config
-
-
-def _configuration_of(
-    out: pathlib.Path, candidates: GivenCandidates | None
-) -> TrainConfig:
-    """The configuration of a run to go on with, on the same candidates."""
-    from jaxcal.learning.training import checkpoint
-    from jaxcal.learning.training.presets import TrainConfig
-
-    config = TrainConfig.from_meta(checkpoint.read_meta(out)[1])
-    held = config.tasks[0].given
-    if held != candidates:  # they are compared by their digest
-        what = f"{held.name} (SHA-256 {held.sha256[:12]})" if held else "no file"
-        rule = "give the same file" if held else "leave it out"
-        raise ValueError(f"--candidates: the run was trained on {what}; {rule}")
-    if candidates is not None:
-        task = dataclasses.replace(config.tasks[0], given=candidates)
-        config = dataclasses.replace(config, tasks=(task,))
-    return config
-
-
-def _for_brax(
-    config: TrainConfig, arguments: TrainOptions, given: dict[str, Any]
-) -> TrainConfig:
-    """A preset as brax trains it; what brax does not read is refused."""
-    import jax
-
-    from jaxcal.commands.train_arguments import flag_of
-
-    with needs("study", "--trainer brax"):
-        from jaxcal.learning.training import brax_ppo
-
-    refused = {"resume": arguments.resume, "sweep": arguments.sweep}
-    for name, value in (refused | given).items():
-        if value and name in ("resume", "sweep", "num_seeds"):
-            raise ValueError(f"{flag_of(name)} works with --trainer jaxcal only")
-    if jax.process_count() > 1:
-        raise ValueError("--trainer brax works in a single process only")
-    if len(config.tasks) > 1:
-        raise ValueError(
-            f"--trainer brax trains on one task, preset {config.preset} has "
-            f"{len(config.tasks)}: use compact or paper"
-        )
-    unread = {"devices": arguments.devices, "no_validation": arguments.no_validation}
-    brax_ppo.require_read([*given, *(name for name, value in unread.items() if value)])
-    return brax_ppo.adapted(config)
-
-
-def _task_configuration(arguments: TrainOptions, out: pathlib.Path) -> PolicyConfig:
-    """Configuration of a task: from the flags, or from the run to go on with."""
-    from jaxcal.adaptive.policy import training
-    from jaxcal.adaptive.policy.config import PolicyConfig
-    from jaxcal.adaptive.tasks import registry
-    from jaxcal.commands.train_arguments import TASK_PARTS, given_flags
-    from jaxcal.learning.config import settings_of
-    from jaxcal.learning.training import checkpoint
-
-    assert arguments.task is not None  # it is what this function is for
-    entry = registry.load(arguments.task)
-    flags = given_flags(arguments, task=True)
-    if arguments.resume:
-        more = {"with": arguments.with_} if arguments.with_ else {}
-        budget = _budget(flags)
-        _refuse_with_resume(flags | more | _swept(arguments), out)
-        _, meta = checkpoint.read_meta(out, training.SCHEMA)
-        config = PolicyConfig.from_meta(meta)
-        held, given_task = map(pathlib.Path, (config.task, arguments.task))
-        moved = held.suffix == ".py" and held.name == given_task.name
-        if held != given_task and not moved:
-            raise ValueError(f"--task must be {config.task}, that of {out}")
-        return _prolonged(dataclasses.replace(config, task=arguments.task), budget)
-    _refuse_to_overwrite(out)
-    options = entry.train_on
-    if arguments.with_:
-        options = (registry.options_from(entry, arguments.with_),)
-    ppo, policy = (
-        {
-            f.name: flags[f.name]
-            for f in settings_of(TASK_PARTS[part])
-            if f.name in flags
-        }
-        for part in ("ppo", "policy")
-    )
-    require_writable_folder(out)
-    base = entry.rules.get("state") or _tuned(entry, options[0])
-    config = PolicyConfig(task=arguments.task, base=base, options=options, **policy)
-    changed = dataclasses.replace(config.ppo, **ppo)
-    return dataclasses.replace(config, ppo=changed, sweep=tuple(arguments.sweep))
-
-
-def _tuned(entry: Entry, options: Mapping[str, Any]) -> StateRule:
-    """The base rule of a task that ships none: tuned before the training."""
-    from jaxcal.adaptive.rules import StateRule
-    from jaxcal.adaptive.tuning import tune
-
-    print("tuning the rule that the policy begins as ...", flush=True)
-    return tune(entry.make(**options), StateRule(), episodes=1024, seed=1)
-
-
-def _swept(arguments: TrainOptions) -> dict[str, Any]:
-    return {"sweep": arguments.sweep} if arguments.sweep else {}
-
-
-def _budget(flags: dict[str, Any]) -> dict[str, int]:
-    """What a run may be prolonged to, taken out of the flags."""
-    names = [name for name in ("num_episodes", "num_updates") if name in flags]
-    return {name: flags.pop(name) for name in names}
-
-
-def _prolonged(config: Any, budget: Mapping[str, int]) -> Any:
-    """A run to go on with to a larger budget; what it imitates stays what it was."""
-    from jaxcal.commands.train_arguments import flag_of
-
-    for name, value in budget.items():
-        if value <= (held := getattr(config.ppo, name)):
-            raise ValueError(
-                f"{flag_of(name)} must be more than the run's {held}, got {value}"
-            )
-    imitated = getattr(config, "num_imitated", 0)
-    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **budget))
-    if imitated:
-        share = imitated / config.ppo.num_updates
-        config = dataclasses.replace(config, imitation=share)
-    return config
-
-
-def _refuse_with_resume(given: Mapping[str, Any], out: pathlib.Path) -> None:
-    from jaxcal.commands.train_arguments import flag_of
-
-    if given:
-        raise ValueError(
-            f"--resume takes its configuration from {out}; leave out "
-            + ", ".join(sorted(map(flag_of, given)))
-        )
-
-
-def _refuse_to_overwrite(out: pathlib.Path) -> None:
-    steps = out / "checkpoint"
-    if steps.is_dir() and any(steps.iterdir()):
-        raise ValueError(
-            f"--out {out} already holds a run: go on with --resume, or name another, "
-            f"--out {out}_2 say"
-        )
 
 
 # -- what is said ----------------------------------------------------------------------

@@ -14,12 +14,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxcal.learning.brax import (
-        SelectionEnv,
-        brax_networks,
-        repaired,
-        wrap_fresh,
-    )
+    from jaxcal.learning.brax import SelectionEnv, brax_networks, repaired, wrap_fresh
     from jaxcal.learning.config import EpisodesConfig, StreamsConfig
     from jaxcal.learning.core.network import Network, mask_logits
     from jaxcal.learning.core.postures import Episode, Postures

@@ -25,11 +25,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from jaxcal.learning.environments.functional import (
-    FunctionalEnv,
-    PosturesEnv,
-    renewed,
-)
+from jaxcal.learning.environments.functional import FunctionalEnv, PosturesEnv, renewed
 from jaxcal.learning.environments.selection import SelectionConfig
 
 Array = NDArray[Any]

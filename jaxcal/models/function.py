@@ -21,18 +21,8 @@ from jaxcal.checks import (
     table,
     whole_number,
 )
-from jaxcal.models.differences import (
-    STENCILS,
-    Differences,
-    combined,
-    look,
-)
-from jaxcal.models.model import (
-    Model,
-    as_commands,
-    as_parameters,
-    by_name,
-)
+from jaxcal.models.differences import STENCILS, Differences, combined, look
+from jaxcal.models.model import Model, as_commands, as_parameters, by_name
 from jaxcal.models.periods import checked_periods
 from jaxcal.models.runs import CommandLine, Runs
 from jaxcal.models.uncertainty import Noise, Prior, as_noise

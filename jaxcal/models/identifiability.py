@@ -12,13 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import one_of, require_kind, table
 from jaxcal.information.blocks import triangle
 from jaxcal.information.singular import exact_zeros, flat, significant
-from jaxcal.models.model import (
-    Model,
-    answered,
-    as_model,
-    derivative,
-    without_effect,
-)
+from jaxcal.models.model import Model, answered, as_model, derivative, without_effect
 from jaxcal.models.uncertainty import Noise, Prior, as_noise
 
 Array = NDArray[np.float64]

@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 
 import jaxcal
+from jaxcal.arms.findings import Findings, left_open
 from jaxcal.arms.mistaken import mistaken_columns
-from jaxcal.arms.verdict import _Findings, _left_open, _parts
+from jaxcal.arms.parts import parts_of
 from jaxcal.commands import main
 from jaxcal.models import Chains, Gravity, Prior, Several, Socket
 
@@ -377,9 +378,9 @@ def test_a_distance_between_sockets_that_are_not_touched_is_no_size():
         fit = types.SimpleNamespace(
             model=arm, commands=np.column_stack([joints, which])
         )
-        parts = _parts(fit, np.flatnonzero(weights))
-        none = _Findings((), False, False, "", (), False)
-        said = _left_open(none, parts, " mm", anywhere=10.0, nominal=1.0)
+        parts = parts_of(fit, np.flatnonzero(weights))
+        none = Findings((), False, False, "", (), False)
+        said = left_open(none, parts, " mm", anywhere=10.0, nominal=1.0)
         assert said.doubtful == doubtful
 
 

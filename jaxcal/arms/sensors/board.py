@@ -9,15 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.arms.sensors.pose import Pose, rotation_vector_rate
-from jaxcal.arms.sensors.sensor import (
-    BASE,
-    HasNames,
-    Reading,
-    Sensor,
-    Tip,
-    hats,
-    turns,
-)
+from jaxcal.arms.sensors.sensor import BASE, HasNames, Reading, Sensor, Tip, hats, turns
 from jaxcal.checks import array_of, numbers, one_of
 from jaxcal.models.model import Quantity
 

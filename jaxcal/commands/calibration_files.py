@@ -1,0 +1,204 @@
+"""What ``identify`` writes: the options of its files and of its report."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.calibration import Calibration
+from jaxcal.commands.arms import is_recording
+from jaxcal.tables import COMMANDS, Table, read_table
+
+Array = NDArray[np.float64]
+
+ReportFolder = Annotated[
+    str,
+    "write a page, verdict.json and the calibration into this folder; the exit code is "
+    "then 1 where it is not good",
+    "FOLDER",
+]
+
+
+@dataclasses.dataclass
+class ReportOptions:
+    """The page of a calibration, and what it is compared with."""
+
+    TITLE: ClassVar[str] = "the page of a calibration"
+    RARE: ClassVar[Any] = {"against", "certificate", "at"}
+
+    report: ReportFolder = ""
+    against: Annotated[
+        str | None, "an earlier calibration.json that the page compares with", "FILE"
+    ] = None
+    certificate: Annotated[
+        float | None,
+        "expanded uncertainty (k = 2) in the certificate of the reference instrument, "
+        "in the measured unit, for the budget on the page",
+        "U",
+    ] = None
+    at: Annotated[
+        str | None,
+        "table of commands whose predictions get a budget on the page",
+        "FILE",
+    ] = None
+
+    def require(self) -> None:
+        """Refuse options of a page without a page."""
+        if not self.report and self != ReportOptions():
+            raise ValueError("--against, --certificate and --at are of --report FOLDER")
+
+    def written(self, calibration: Calibration, files: Sequence[str | None]) -> bool:
+        """Write the page, if it was asked for; whether nothing on it is bad."""
+        if not self.report:
+            return True
+        sources = []
+        if self.certificate is not None:
+            from jaxcal.reports.budget import Source
+
+            sources = [Source.certificate("certificate", self.certificate)]
+        at = None
+        if self.at is not None:
+            at = commands_for(calibration, read_table(self.at))[1]
+        return calibration.report(
+            self.report,
+            before=Calibration.load(self.against) if self.against else None,
+            sources=sources,
+            at=at,
+            files=[path for path in files if path and os.path.isfile(path)],
+        )
+
+
+@dataclasses.dataclass
+class SavedFiles:
+    """What an identification is saved as."""
+
+    RARE: ClassVar[Any] = {"overwrite", "unproven", "repair", "servos_out"}
+
+    out: Annotated[
+        str,
+        "save the calibration (.json), or of an arm the corrected file (.urdf)",
+        "FILE",
+    ] = ""
+    overwrite: Annotated[bool, "write over an .urdf or servos file that is there"] = (
+        False
+    )
+    unproven: Annotated[bool, "write the .urdf of a fit that is not good"] = False
+    repair: Annotated[
+        str, "write the rows that belong together, where they were mispaired", "FILE"
+    ] = ""
+    servos_out: Annotated[
+        str, "write LeRobot's calibration, of --servos, with the zeros found", "FILE"
+    ] = ""
+
+    transform: Annotated[
+        str,
+        "of --sensor board, write where the camera is, for the arm as described: a "
+        "TransformStamped (.yaml), ROS 2's static_transform_publisher (.sh, or .py to "
+        "launch it), or the .urdf with its link",
+        "FILE",
+    ] = ""
+    frames: Annotated[
+        str | None,
+        "with --transform: the camera's link, the name of its optical frame",
+        "PARENT,CHILD",
+    ] = None
+
+    @property
+    def as_urdf(self) -> bool:
+        """The arm's own file is written, corrected."""
+        return self.out.lower().endswith(".urdf")
+
+    @property
+    def corrected(self) -> str:
+        """The file that a robot would go by, if one was asked for."""
+        return (self.out if self.as_urdf else self.servos_out) or self.transform
+
+    def require(self, file: str, of_urdf: bool, servos: str | None) -> None:
+        """Refuse files that cannot be written, or must not be, before the fit."""
+        if self.servos_out and self.as_urdf:
+            raise ValueError(
+                "one of --servos-out and --out FILE.urdf must be left out: either "
+                "corrects the zeros, both would twice"
+            )
+        files = "--out FILE.urdf, --servos-out and --transform"
+        if self.unproven and not self.corrected:
+            raise ValueError(f"--unproven is of {files}")
+        if self.overwrite and not self.corrected:
+            raise ValueError(f"--overwrite is of {files}")
+        if self.frames is not None and not self.transform:
+            raise ValueError("--frames is of --transform FILE")
+        if len((self.frames or "a,b").split(",")) != 2:
+            raise ValueError(f"--frames must be PARENT,CHILD, got {self.frames}")
+        if self.transform and os.path.exists(self.transform) and not self.overwrite:
+            raise ValueError(
+                f"{self.transform} is there already; --overwrite writes over it"
+            )
+        if self.servos_out and not servos:
+            raise ValueError("--servos-out needs --servos, the file that it corrects")
+        if servos and not (self.servos_out or is_recording(file)):
+            raise ValueError("--servos goes with a recording or with --servos-out")
+        if self.as_urdf and not of_urdf:
+            raise ValueError("--out FILE.urdf needs --model FILE.urdf")
+        if self.as_urdf and os.path.exists(self.out) and not self.overwrite:
+            raise ValueError(f"{self.out} is there already; --overwrite writes over it")
+
+    def written(self, calibration: Calibration, servos: str | None) -> list[str]:
+        """Write the files that were asked for; a line of each."""
+        corrected = self.corrected
+        if corrected and not calibration.verdict.good and not self.unproven:
+            raise ValueError(
+                f"{corrected} is not written: the calibration is not good, as said "
+                "above; --unproven writes it all the same"
+            )
+        lines = []
+        if self.as_urdf:
+            tip = calibration.to_urdf(self.out, force=self.overwrite)
+            lines = [f"saved {self.out}, tip link {tip}"]
+        elif self.out:
+            calibration.save(self.out)
+            lines = [f"saved {self.out}"]
+        if self.transform:
+            parent, child = (self.frames or ",").split(",")
+            arm: Any = calibration.model
+            count = len(arm.sensor.members)
+            for camera in range(count):
+                stem, ending = os.path.splitext(self.transform)
+                number = f"_{camera}" if count > 1 else ""
+                pose = calibration.to_transform(
+                    f"{stem}{number}{ending}",
+                    child=child.strip() + number * bool(child.strip()) or None,
+                    parent=parent.strip() or None,
+                    camera=camera,
+                    force=self.overwrite,
+                )
+                lines.append(f"saved {stem}{number}{ending}: {pose}")
+        if self.servos_out:
+            steps = calibration.to_lerobot(
+                self.servos_out, str(servos), force=self.overwrite
+            )
+            moved = ", ".join(f"{name} {step:+d}" for name, step in steps.items())
+            lines.append(f"saved {self.servos_out}, steps: {moved}")
+        return lines
+
+
+def commands_for(
+    calibration: Calibration,
+    table: Table,
+    chosen: str | None = None,
+    option: str = "--inputs",
+) -> tuple[tuple[str, ...], Array]:
+    """The columns of the commands of a calibration in a table, and (N, n) they hold."""
+    names = table.named(
+        calibration.input_names,
+        COMMANDS,
+        chosen=chosen,
+        option=option,
+        unit=calibration.command_unit,
+        others=calibration.output_names,
+    )
+    return names, table.columns(names)
