@@ -49,10 +49,10 @@ def require_fitting(model: Any, commands: Array, measured: Array) -> Model:
     model = as_model(model)
     if not len(commands):
         raise ValueError("commands must hold at least one row, got none")
-    known = False
+    shaped = False
     with contextlib.suppress(ValueError):  # of a function, not before its first run
-        known = model.num_inputs != commands.shape[1] or model.num_outputs > 0
-    if not known:
+        shaped = model.num_inputs != commands.shape[1] or model.num_outputs > 0
+    if not shaped:
         model.predict(commands, None)
     shapes = model.num_inputs, model.num_outputs
     for name, table, width in zip(

@@ -555,7 +555,7 @@ def broken(method: str, answer: Any) -> Any:
         ({"prior": Prior(1.0, {"a": "x"})}, "mean of the prior of a must be an array"),
         ({"prior": Prior(1.0, fixed=WAVE.names)}, "must leave a parameter free"),
         ({"prior": Prior({"zz": 1.0})}, "parameter in std of the prior must be one of"),
-        ({"noise": Noise(1.0), "noise_std": 1.0}, "give one of them"),
+        ({"noise": Noise(1.0), "noise_std": 1.0}, "are the same: give one"),
         ({"noise": Noise(np.ones((3, 2)))}, r"std of the noise must be .* \(3, 2\)"),
         ({"noise": Noise(1.0, command_std=[1, 2, 3])}, "command_std must be one"),
         ({"noise": Noise(1.0, command_std=np.inf)}, "must leave fewer unknown"),

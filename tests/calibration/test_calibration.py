@@ -544,7 +544,7 @@ def test_the_direction_named_is_constant_in_the_data(
     commands = commands * 10.0**size + 10.0**offset
     with pytest.raises(ValueError, match="the same in every row") as caught:
         identify(commands, commands)
-    words = str(caught.value).split("excited: ")[1].strip("()").split()
+    words = str(caught.value).split("in every row: ")[1].strip("()").split()
     named = np.zeros(3)
     if len(words) == 1:
         named["xyz".index(words[0][-1])] = 1.0
@@ -570,7 +570,7 @@ good = np.vstack([np.zeros(3), np.eye(3), np.ones(3)])
         ({"commands": [[None] * 3] * 5}, r"commands must be (an array of|finite)"),
         ({"weights": [1, 1, 1, 1]}, r"weights must have shape \(5,\), got \(4,\)"),
         ({"weights": [1, 1, 1, 1, -2]}, "not be negative, got -2.0"),
-        ({"weights": [0, 0, 1, 1, 1]}, "at least 4 postures of positive weight"),
+        ({"weights": [0, 0, 1, 1, 1]}, "4 or more rows to fit 3 inputs plus an offset"),
         ({"weights": np.zeros(5)}, "positive for one measurement at least"),
         ({"noise_std": 0.0}, "noise_std must be positive, got 0"),
         ({"noise_std": [1, 1]}, r"noise_std must be one number or \(3,\), got \(2,\)"),

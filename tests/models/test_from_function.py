@@ -300,7 +300,7 @@ def test_a_program_is_a_model():
 
 
 def test_bad_input_is_named():
-    with pytest.raises(ValueError, match="nominal value is 0, as of c"):
+    with pytest.raises(ValueError, match="as c is nominally 0"):
         FromFunction(decay, NOMINAL, names=NAMES)
     with pytest.raises(ValueError, match="scale must be positive"):
         FromFunction(decay, NOMINAL, [1.0, 0.0, 1.0])

@@ -598,7 +598,7 @@ def test_how_a_wrench_is_mounted_is_found_and_its_mistakes_are_named():
     assert "is what the readings show: where the controller" in str(found.verdict)
     said = found.check(joints, read)
     assert [*said.tolerances] == ["N", "N length"]
-    assert f"a change by {said.tolerance:.3g} N or " in str(said)
+    assert f"a change of {said.tolerance:.3g} N or " in str(said)
     turn = found.arm.tool[:3, :3].T @ MOUNT[:3, :3]
     assert np.degrees(Rotation.from_matrix(turn).magnitude()) < 2.0
     with pytest.raises(ValueError, match="negate forces and torques") as told:

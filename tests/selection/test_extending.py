@@ -120,7 +120,7 @@ def test_a_criterion_of_ones_own_takes_parameters_on_the_command_line(
         min(map(variance, itertools.combinations(range(8), 4)))
     )
     assert main(words) == 2
-    assert "--criterion Ds or As or Cs" in capsys.readouterr().err
+    assert "--criterion Cs needs --parameters" in capsys.readouterr().err
 
 
 def test_the_worst_of_some_combinations(monkeypatch) -> None:

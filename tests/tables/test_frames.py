@@ -167,7 +167,7 @@ def test_available_is_given_once():
     mask = np.array([False, True] * 6)
     found = jaxcal.select(frame, 4, available=mask)
     np.testing.assert_array_equal(found.indices, jaxcal.select(frame, 4).indices)
-    with pytest.raises(ValueError, match="they differ"):
+    with pytest.raises(ValueError, match="differs from the candidates' column"):
         jaxcal.select(frame, 4, available=~mask)
 
 
