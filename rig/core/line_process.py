@@ -128,7 +128,7 @@ class Owner:
 
     def _check(self) -> None:
         """Before each exchange of the session that is not of a stop."""
-        if self.reason or self._here.request["epoch"] != self._epoch:
+        if self.reason or self._here.request["epoch"] < self._epoch:
             raise BusError(self.reason or "a stop was asked for meanwhile", WHY)
         self._fed += 1
         if time.monotonic() > self._here.tell:
