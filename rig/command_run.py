@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterable, Iterator
 
 from rig.config import RigConfig
 from rig.config.axis import Pulses
-from rig.core.device import Device
+from rig.core.device import Device, Lines
+from rig.core.line_client import line_of
 from rig.core.record_check import ZeroRecord, check_drives
 from rig.core.session import Beside, Check, open_device, take_zero
 from rig.device_model import model_of
@@ -27,6 +28,7 @@ class Run(RunFolder):
     """The folder of a run, and the options of its command."""
 
     check: Check = staticmethod(check_drives)  # of the drives, before they are armed
+    lines: Lines = staticmethod(line_of)  # who makes its line and drives
     simulated = False  # nothing real moves: it need not be slow
     again = ""  # the command of a run that is not resumed, but begun again
 
@@ -85,6 +87,7 @@ class Run(RunFolder):
             check=self.check, beside=self.beside, simulated=self.simulated,
             reset_alarms=self.reset_alarms,
             predict=None if self.model is None else self.model.predict,
+            lines=self.lines,
         ) as device:  # fmt: skip
             if device.proof.stops and not (self.record.state(STOP_PROVED) or {}).get(
                 "distances"

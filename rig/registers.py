@@ -6,6 +6,7 @@ of what it can read of a map, whatever else is wrong with that.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -18,6 +19,7 @@ REGISTERS = (3, 4)  # functions that read registers; 1 and 2 read bits
 FLOATS = {"f32": ">f", "f64": ">d"}
 COIL_ON = 0xFF00  # as function 5 writes it
 VALUES = ("position", "speed", "accel", "decel", "timeout", "min", "max", "home")
+ROUNDING = 1e-9  # of a product that is a whole number of counts but for its last bits
 LOWEST, HIGHEST = -(2**31), 2**31 - 1  # of a position
 FLAGS = ("enabled", "done", "moving", "fault")
 
@@ -75,6 +77,28 @@ def word_of(word: Any) -> Word:
 def registers_in(words: Sequence[Word]) -> int:
     """Registers of all words of a frame."""
     return sum(registers_of(word.kind) for word in words)
+
+
+def motion_counts(
+    units: Any, pulses_per_rev: int, speed: float, accel: float
+) -> dict[str, int]:
+    """Register values of a speed and of ramps, never faster or harder than these.
+
+    Args:
+        units: of the map's registers.
+        pulses_per_rev: for one turn of the motor.
+        speed, accel: pulses a second, and a second squared.
+    """
+    per = {"pulse_per_s": 1.0, "pulse_per_s2": 1.0}
+    per_pulse = per.get(units.speed, 1.0 / pulses_per_rev) * units.speed_per_unit
+    counts = {"speed": math.floor(speed * per_pulse * (1.0 + ROUNDING))}
+    if units.accel == "s_per_rev_per_s":  # longer is gentler
+        time = units.accel_per_unit * pulses_per_rev / accel
+        ramp = math.ceil(time * (1.0 - ROUNDING))
+    else:
+        per_pulse = per.get(units.accel, 1.0 / pulses_per_rev) * units.accel_per_unit
+        ramp = math.floor(accel * per_pulse * (1.0 + ROUNDING))
+    return counts | {"accel": ramp, "decel": ramp}
 
 
 class Table:

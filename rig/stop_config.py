@@ -1,4 +1,4 @@
-"""What a stop needs of rig.toml: the bus, and unit and map of each axis.
+"""What a stop, or who moves drives, needs of rig.toml: bus, units and maps of axes.
 
 Nothing else of the file is looked at, and what is wrong with it does not matter. Of a
 file that is not TOML every line counts that can be read. A value that is none is
@@ -31,6 +31,10 @@ RANGES = {
     "port": (1, 65535), "baudrate": (1200, 3_000_000), "stopbits": (1, 2),
     "bytesize": (7, 8), "timeout_s": (0.01, 5), "read_retries": (0, 10),
 }  # fmt: skip
+FRAMES = (  # of a map, besides its stop
+    "move", "home", "hold", "enable", "alarm_reset", "comm_timeout", "limits",
+    "set_zero",
+)  # fmt: skip
 Faults = list[str]
 
 
@@ -191,11 +195,21 @@ def map_of(text: str, folder: pathlib.Path, faults: Faults) -> SimpleNamespace |
         inter_frame_s=_number(data.get("inter_frame_s", 0), 0.0, 0, 1, "silence", []),
         word_order="little" if data.get("word_order") == "little" else "big",
         broadcast_stop=data.get("broadcast_stop") is True,
-        stop=_frames(_near(data, "stop")), hold=_frames(data.get("hold")),
-        position=_value(data.get("position"), "i32"), status=None, homed=None,
-        move=None, home=None, set_zero=None,
+        stop=_frames(_near(data, "stop")),
+        position=_value(data.get("position"), "i32"), status=None,
+        **{name: _frames(data.get(name)) for name in FRAMES},
+        **{name: _value(data.get(name), "u16") for name in ("alarm", "pulses_per_rev")},
+        target=_value(data.get("target"), "i32"), homed=_bits(data.get("homed")),
+        units=SimpleNamespace(**_table(data.get("units"))),
+        identity={n: _value(v, "u16") for n, v in _table(data.get("identity")).items()},
+        recognise=_table(data.get("recognise")),
     )  # fmt: skip
-    set_zero = _frames(data.get("set_zero"))
+    if drive_map.alarm:
+        names = _table(_table(data["alarm"]).get("names")).items()
+        drive_map.alarm.names = {int(code, 0): text for code, text in names}
+    if drive_map.comm_timeout:
+        drive_map.comm_timeout.per_s = _table(data["comm_timeout"]).get("per_s")
+    set_zero = drive_map.set_zero
     drive_map.home_place = set_zero.place_of("home") if set_zero else None
     status = _near(data, "status")
     if (value := _value(status, "u16")) and isinstance(status, dict):
@@ -253,6 +267,10 @@ def _bits(table: Any) -> Bits | None:
     lists = [numbers if type(numbers) is list else [] for numbers in lists]
     bits = [tuple(bit for bit in numbers if type(bit) is int) for numbers in lists]
     return Bits(set=bits[0], clear=bits[1]) if any(bits) else None
+
+
+def _table(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
 
 
 def _rows(tables: Any) -> list[dict[str, Any]]:

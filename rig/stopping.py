@@ -91,20 +91,24 @@ class ArmedBus:
         if self.holder is None:
             return
         freed = self.lock.freed(ASK_S - (time.monotonic() - self.since))
-        if not freed and self._stand:  # it looks whether they stay
-            stand_s = (read_armed(self.lock.armed_path) or {}).get("stand_s", 0.0)
-            freed = self.lock.freed(END_S + stand_s)
+        if not freed and self._stand:
+            freed = self._stayed()
         if not freed:
             _say("it has not stopped its drives in time: it is killed now")
             with contextlib.suppress(OSError, Refused):
                 self.lock.signal_holder(signal.SIGKILL)
-            if not self.lock.freed(KILLED_S):
+            if not self.lock.freed(KILLED_S) and not (self._stand and self._stayed()):
                 _say("it still holds the bus")
         _say(
             "it reported that all its drives stand"
             if self._stand
             else "it did not report that its drives stand"
         )
+
+    def _stayed(self) -> bool:
+        """Wait while it looks whether its drives stay; whether it let go."""
+        stand_s = (read_armed(self.lock.armed_path) or {}).get("stand_s", 0.0)
+        return self.lock.freed(END_S + stand_s)
 
     @property
     def _stand(self) -> bool:
@@ -135,9 +139,7 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
         results: list[UnitStop] = []
         faults: list[Exception] = []
         with ThreadPoolExecutor(len(targets)) as pool:
-            jobs = {
-                pool.submit(_stop_units, target, True): target for target in targets
-            }
+            jobs = {pool.submit(stop_units, target, True): target for target in targets}
             reached: list[pathlib.Path] = []
             for job in as_completed(jobs):
                 try:
@@ -153,26 +155,6 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
             _say(told(fault))
         good = all(result.acknowledged and result.standing for result in results)
         return EXIT_OK if good and not faults else EXIT_FAULT
-
-
-def stop_run(run: pathlib.Path) -> list[UnitStop]:
-    """Stop the device that a session of this computer moves; what the drives say.
-
-    Args:
-        run: folder of the session's run.
-
-    Raises:
-        Fault: no drive was told to stop.
-    """
-    for path in armed_files():
-        armed = read_armed(path)
-        target = armed and _armed_bus(armed)
-        if target:
-            holder = target.lock.holder()
-            if holder and holder.get("run") == str(run.resolve()):
-                target.ask()
-                return _stop_units(target)
-    raise Fault(f"{NOTHING}: no session of this computer moves {run.name}")
 
 
 def _targets(path: pathlib.Path, given: bool) -> list[ArmedBus]:
@@ -197,7 +179,7 @@ def _targets(path: pathlib.Path, given: bool) -> list[ArmedBus]:
         lack = f"{path} cannot be read: {getattr(error, 'strerror', None) or error}"
     if not lack:
         return targets
-    every = [bus for file in armed_files() if (bus := _armed_bus(read_armed(file)))]
+    every = [bus for file in armed_files() if (bus := armed_bus(read_armed(file)))]
     paths = [target.lock.path for target in targets]
     more = [bus for bus in every if bus.moves and bus.lock.path not in paths]
     if not (targets or more or every):
@@ -210,7 +192,7 @@ def _targets(path: pathlib.Path, given: bool) -> list[ArmedBus]:
     return targets + more or every
 
 
-def _armed_bus(armed: dict[str, Any] | None) -> ArmedBus | None:
+def armed_bus(armed: dict[str, Any] | None) -> ArmedBus | None:
     """The bus of what a session left; None where that says nothing of use."""
     bus = armed and config_of(armed).bus
     return ArmedBus(bus) if bus else None
@@ -222,7 +204,7 @@ def _tell_others(stopped: list[pathlib.Path]) -> None:
         armed = read_armed(path)
         if path in stopped or armed is None or armed["standing"]:
             continue
-        if (target := _armed_bus(armed)) is None:
+        if (target := armed_bus(armed)) is None:
             continue
         holder = target.lock.holder()
         device = f", {armed['device']}" if "device" in armed else ""
@@ -243,7 +225,7 @@ def _say(text: str) -> None:
         sys.stdout = None  # nothing is left to be flushed at the end
 
 
-def _stop_units(target: ArmedBus, stay: bool = False) -> list[UnitStop]:
+def stop_units(target: ArmedBus, stay: bool = False) -> list[UnitStop]:
     """Stop the drives that were armed last, else those of the configuration file.
 
     Who was asked to is waited for first. ``stay``: look whether they stay, too.

@@ -1,6 +1,5 @@
 """One ``[[axes]]`` table: a joint, its drive, and pulses against degrees."""
 
-import math
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
@@ -14,12 +13,11 @@ from pydantic import (
 
 from rig.config.maps import DriveMap, Units, load_map
 from rig.config.schema import Section, advanced, key
-from rig.registers import encode
+from rig.registers import encode, motion_counts
 
 AXIS_NAMES = ("pitch", "yaw", "roll")  # of the device that `setup` begins with
 MOST_AXES = 6
 DEFAULT_ROTATES = {"pitch": "X", "yaw": "Z", "roll": "Y"}
-ROUNDING = 1e-9  # of a product that is a whole number of counts but for its last bits
 
 Pulses = tuple[int, ...]  # (n,) in the order of the axes
 # Keys of a translation, and where their values are kept: in the unit of the axis.
@@ -182,12 +180,9 @@ class Axis(Scale):
             return {}
         place_of = self.map.place_of
         per_speed, per_accel = self._counts_per_deg(units)
-        counts = {"speed": math.floor(self.speed_deg_s * per_speed * (1.0 + ROUNDING))}
-        if units.accel == "s_per_rev_per_s":  # longer is gentler
-            accel = math.ceil(per_accel / self.accel_deg_s2 * (1.0 - ROUNDING))
-        else:
-            accel = math.floor(self.accel_deg_s2 * per_accel * (1.0 + ROUNDING))
-        counts["accel"] = counts["decel"] = accel
+        motion = self.speed_deg_s, self.accel_deg_s2
+        in_pulses = (each * abs(self.pulses_per_deg) for each in motion)
+        counts = motion_counts(units, self.pulses_per_rev, *in_pulses)
         for name, count in counts.items():
             place = place_of(name)
             if place is None:

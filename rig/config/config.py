@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+# Of an axis, for whoever moves its drive.
+SCALE = ("min_pulses", "max_pulses", "pulses_per_rev", "pulses_per_deg")
 EXAMPLES = pathlib.Path(__file__).parent.parent / "examples"
 POLLS, HICCUP_S = 4, 0.5  # of the motion loop's heartbeat
 PHONE = (
@@ -227,6 +229,29 @@ class RigConfig(Section):
     def silence_s(self) -> float:
         """Silence between frames that the slowest of the drives wants."""
         return max(axis.map.inter_frame_s for axis in self.axes)
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """What a stop of its drives needs, and what whoever moves them keeps to."""
+        return {
+            "bus": self.bus.model_dump(),
+            "silence_s": self.silence_s,
+            "standing": False,
+            "device": str(self.device_path.resolve()),
+            "stand_s": max(axis.map.restart_s for axis in self.axes),
+            "drives": [
+                {
+                    "name": axis.name,
+                    "unit": axis.unit,
+                    "map": axis.map.text,
+                    "folder": str(axis.map.folder),
+                    "scale": {name: getattr(axis, name) for name in SCALE},
+                    # Counts a second, and a second squared, of its fastest move.
+                    "pace": [n * abs(axis.pulses_per_deg) for n in axis.drive_motion],
+                }
+                for axis in self.axes
+            ],
+        }
 
     @property
     def heartbeat_s(self) -> float:

@@ -12,19 +12,22 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rig.config.axis import Pulses
 from rig.config.config import RigConfig
+from rig.core import stop
+from rig.core.line_client import line_of
 from rig.core.proof import Proof, Turns, slopes
-from rig.core.stop import Stopper
+from rig.core.stop import UnitStop
 from rig.core.stop_distance import stop_distances
-from rig.drives import Drive, make_drives
+from rig.drives import Drive, Line
 from rig.drives.drive import Status
 from rig.drives.line import BusError
 from rig.faults import (
+    EXIT_FAULT,
     LimitError,
     MotionFault,
     PauseRequested,
@@ -44,6 +47,9 @@ TELLS = 0.03  # least of the singular values, of the largest: by so little an ax
 TICK_S = 0.05  # of the heartbeat
 PATIENCE_S = 60.0  # with a stream that pauses while nothing moves
 SLEPT_S = 1.0  # by which the clock that runs on in a computer's sleep is ahead
+
+
+Lines = Callable[[RigConfig, Callable[..., Any]], tuple[Line, list[Drive]]]
 
 
 class Pace(NamedTuple):
@@ -84,6 +90,45 @@ def check_plan(config: RigConfig, targets: Iterable[Pulses]) -> None:
         raise LimitError("outside the limits, nothing was sent: " + "; ".join(faults))
 
 
+class Stopper:
+    """The latch: after a stop for a fault only a new process, armed anew, moves."""
+
+    def __init__(self, drives: list[Drive], emit: Callable[..., Any]) -> None:
+        self.drives = drives
+        self.reason = ""  # of the stop that has latched
+        self.results: list[UnitStop] = []
+        self._emit = emit
+        self._lock = threading.RLock()
+
+    def stop(self, reason: str, latch: bool = True) -> list[UnitStop]:
+        """Stop every unit now; the first reason is the one that is kept."""
+        if latch and not self.reason:  # before the lock: whoever moves looks at it
+            self.reason = reason or "stopped"
+        with self._lock:
+            self.results = stop.stop_all(self.drives)
+            units = [dataclasses.asdict(result) for result in self.results]
+            self._emit("stop", reason=reason, units=units)
+            return self.results
+
+    def stay(self) -> list[UnitStop]:
+        """After a stop for a reason: look whether the drives stay where they stand."""
+        with self._lock:
+            stand_s = stop.stand_s(self.drives)
+            words = stop.stay(self.drives, self.results, stand_s)
+            units = [dataclasses.asdict(result) for result in self.results]
+            self._emit("stayed", went_on=words, units=units)
+            return self.results
+
+    def tell(self, text: str) -> None:
+        """Note something that stops nothing."""
+        self._emit("note", text=text)
+
+    def check(self) -> None:
+        """Raise StopRequested where a stop has latched."""
+        if self.reason:
+            raise StopRequested(self.reason, EXIT_FAULT)
+
+
 class Heartbeat(threading.Thread):
     """A thread that stops the drives when the motion loop is silent for too long, or
     does not answer to a stop.
@@ -115,7 +160,9 @@ class Heartbeat(threading.Thread):
 
     def run(self) -> None:
         ahead = clock_ahead_s()
+        line = self._stopper.drives[0].line
         while not self._closing.wait(TICK_S):
+            line.alive()
             silence = time.monotonic() - self._fed
             slept_s, ahead = clock_ahead_s() - ahead, clock_ahead_s()
             if slept_s > SLEPT_S:
@@ -246,16 +293,16 @@ class Device:
         *,
         simulated: bool = False,
         predict: Callable[[Array], Array] | None = None,
+        lines: Lines = line_of,
     ) -> None:
         """``simulated``: it need not be slow where nothing is proved. ``predict``:
-        what is measured at (n,) commands by its model as designed, where it has one."""
+        what is measured at (n,) commands by its model as designed, where it has one.
+        ``lines``: who makes its line and drives."""
         self.config = config
         self.run = run
         self.record = record
         self.emit = run.emit
-        self.line, self.drives = make_drives(
-            config.bus, config.axes, config.silence_s, run.emit
-        )
+        self.line, self.drives = lines(config, run.emit)
         self.imu = make_source(config, run.emit)
         self.geometry = geometry_of(config)
         self.stopper = Stopper(self.drives, run.emit)

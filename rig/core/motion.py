@@ -19,6 +19,7 @@ FOLLOWING_DEG = 3.0  # a drive may leave its way by
 TOO_FAST = 1.6  # times the speed that is asked for: more is a fault, but of a crawl:
 LEAST_TURNS_S, LEAST_DEG_S = 0.05, 5.0  # motor, joint: many drives begin at 2 rpm
 SPAN_S = 0.5  # over which a speed is taken, or from the start of the move
+TOOK_POLL_S = 0.05  # of a drive that may have taken a move
 LAG_S = 0.1  # of the phone behind a move that is longer than those before
 
 
@@ -117,14 +118,40 @@ def _send(device: Device, drive: Drive, start: Status, pulses: int) -> None:
             if error.refused:
                 drive.sound()  # an alarm says more than a refusal
                 raise
-            took = drive.took(pulses, start, tolerance)
-            outcome = {True: "obeyed", False: "not taken", None: "unknown"}[took]
+            obeys = took(drive, pulses, start, tolerance)
+            outcome = {True: "obeyed", False: "not taken", None: "unknown"}[obeys]
             device.emit("lost_reply", axis=axis.name, pulses=pulses, outcome=outcome)
-            if took:
+            if obeys:
                 return None
-            if took is None or not tries_left:
+            if obeys is None or not tries_left:
                 raise
             device.guard(moving=True)  # no move once a stop was asked for
+
+
+def took(drive: Drive, pulses: int, start: Status, tolerance: int) -> bool | None:
+    """Whether the drive obeys a move whose reply was lost; None: unknown.
+
+    A drive that obeys moves, has left ``start`` by more than ``tolerance`` pulses,
+    or stands at its target. One that does not holds another target, or has stood
+    idle at ``start`` for START_S.
+
+    Raises:
+        MotionFault: it is in alarm. BusError: it does not answer.
+    """
+    begun = time.monotonic()
+    while True:
+        status, held = drive.sound(), drive.held()
+        other = held is not None and held - drive.origin != pulses
+        idle = status.done and not status.moving
+        if idle and abs(status.position - pulses) <= tolerance:
+            return True
+        if status.moving or abs(status.position - start.position) > tolerance:
+            return None if other else True
+        if idle and other:
+            return False
+        if time.monotonic() - begun > START_S:
+            return False if idle else None
+        time.sleep(TOOK_POLL_S)
 
 
 def _watch(

@@ -21,8 +21,9 @@ import numpy as np
 from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.core import record_check
-from rig.core.device import Device, Posture, check_plan
+from rig.core.device import Device, Lines, Posture, check_plan
 from rig.core.joints import show
+from rig.core.line_client import line_of
 from rig.core.measure import measure, zeroed
 from rig.core.motion import Arrival, move
 from rig.drives import Drive
@@ -62,6 +63,7 @@ def open_device(
     simulated: bool = False,
     reset_alarms: bool = False,
     predict: Predict | None = None,
+    lines: Lines = line_of,
 ) -> Iterator[Device]:
     """The device, armed; however this ends its drives are stopped and looked at.
 
@@ -73,11 +75,15 @@ def open_device(
         simulated: it need not be slow where nothing is proved.
         reset_alarms: of drives that are in alarm.
         predict: (m,) that is measured at (n,) commands, by its model as designed.
+        lines: who makes its line and drives.
 
     Raises:
         MotionFault, BusError, ReadingError, Refused: not fit to move.
     """
-    device = Device(config, run, record, requests, simulated=simulated, predict=predict)
+    device = Device(
+        config, run, record, requests,
+        simulated=simulated, predict=predict, lines=lines,
+    )  # fmt: skip
     requests, lock = device.requests, BusLock(config.bus)
     # A request that came while something was computed may have been raised in a
     # callback that drops exceptions, as those of a garbage collection are.

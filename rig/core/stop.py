@@ -2,21 +2,16 @@
 
 Nothing here touches JAX, the IMU or the plan. A stop goes to each unit by itself, to
 those that answered last first, and goes on past units that fail. It is repeated (a stop
-may be sent twice, unlike a move) and is verified by reading the status back. After a
-fault the latch stays on: only a new process, armed by a person, moves again.
+may be sent twice, unlike a move) and is verified by reading the status back.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import threading
 import time
-from collections.abc import Callable
-from typing import Any
 
 from rig.drives.drive import STILL_COUNTS, Drive
-from rig.faults import EXIT_FAULT, StopRequested
 
 ROUNDS = 3  # times a stop is sent to a unit that does not acknowledge
 VERIFY_S = 3.0  # for all units together to come to rest
@@ -174,41 +169,3 @@ def _restarted(pairs: Pairs, end: float) -> tuple[list[UnitStop], list[UnitStop]
 def stand_s(drives: list[Drive]) -> float:
     """How long drives that stand are looked at."""
     return max(drive.axis.map.restart_s for drive in drives)
-
-
-class Stopper:
-    """The latch: after a stop for a fault nothing moves again."""
-
-    def __init__(self, drives: list[Drive], emit: Callable[..., Any]) -> None:
-        self.drives = drives
-        self.reason = ""  # of the stop that has latched
-        self.results: list[UnitStop] = []
-        self._emit = emit
-        self._lock = threading.RLock()
-
-    def stop(self, reason: str, latch: bool = True) -> list[UnitStop]:
-        """Stop every unit now; the first reason is the one that is kept."""
-        if latch and not self.reason:  # before the lock: whoever moves looks at it
-            self.reason = reason or "stopped"
-        with self._lock:
-            self.results = stop_all(self.drives)
-            units = [dataclasses.asdict(result) for result in self.results]
-            self._emit("stop", reason=reason, units=units)
-            return self.results
-
-    def stay(self) -> list[UnitStop]:
-        """After a stop for a reason: look whether the drives stay where they stand."""
-        with self._lock:
-            words = stay(self.drives, self.results, stand_s(self.drives))
-            units = [dataclasses.asdict(result) for result in self.results]
-            self._emit("stayed", went_on=words, units=units)
-            return self.results
-
-    def tell(self, text: str) -> None:
-        """Note something that stops nothing."""
-        self._emit("note", text=text)
-
-    def check(self) -> None:
-        """Raise StopRequested where a stop has latched."""
-        if self.reason:
-            raise StopRequested(self.reason, EXIT_FAULT)

@@ -253,31 +253,6 @@ class Drive(abc.ABC):
         speed, accel = axis.drive_motion
         self.move(pulses + self.origin, speed * per_deg, accel * per_deg)
 
-    def took(self, pulses: int, start: Status, tolerance: int) -> bool | None:
-        """Whether the drive obeys a move whose reply was lost; None: unknown.
-
-        A drive that obeys moves, has left ``start`` by more than ``tolerance`` pulses,
-        or stands at its target. One that does not holds another target, or has stood
-        idle at ``start`` for START_S.
-
-        Raises:
-            MotionFault: it is in alarm. BusError: it does not answer.
-        """
-        begun = time.monotonic()
-        while True:
-            status, held = self.sound(), self.held()
-            other = held is not None and held - self.origin != pulses
-            idle = status.done and not status.moving
-            if idle and abs(status.position - pulses) <= tolerance:
-                return True
-            if status.moving or abs(status.position - start.position) > tolerance:
-                return None if other else True
-            if idle and other:
-                return False
-            if time.monotonic() - begun > START_S:
-                return False if idle else None
-            time.sleep(POLL_S)
-
     def bring(
         self, act: Callable[[], object], ready: Callable[[Status], bool]
     ) -> Status:

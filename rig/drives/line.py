@@ -52,7 +52,7 @@ class Line(abc.ABC):
     """One line with any number of units; safe to use from several threads."""
 
     transports: ClassVar[tuple[str, ...]] = ()  # of [bus] that it can be
-    in_turn: ClassVar[bool] = False  # its drives move one after another
+    in_turn: bool = False  # its drives move one after another
 
     def __init__(
         self,
@@ -80,6 +80,9 @@ class Line(abc.ABC):
     @abc.abstractmethod
     def close(self) -> None:
         """Close the port; opening it again is possible."""
+
+    def alive(self) -> None:
+        """The session goes on: told every 50 ms, where another process is to know."""
 
     def stops_at_once(self, drives: Sequence[Any]) -> bool:
         """Whether one frame stops all of these."""

@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Any
 from rig.drives.bus import Bus, Rejected, words_of
 from rig.drives.drive import Drive, Look
 from rig.drives.line import BusError
-from rig.registers import HIGHEST, LOWEST, REGISTERS, Frames, Value, decode
+from rig.registers import (
+    HIGHEST,
+    LOWEST,
+    REGISTERS,
+    Frames,
+    Value,
+    decode,
+    motion_counts,
+)
 
 if TYPE_CHECKING:
     from rig.config.axis import Axis
@@ -90,7 +98,9 @@ class ModbusDrive(Drive):
     def move(self, count: int, speed: float, accel: float) -> None:
         """Every frame is sent exactly once; speed and ramps as registers hold them."""
         place = count / self.map.position.counts
-        self.write(self.map.move, position=place, **self.axis.motion_counts())
+        per_rev = self.axis.pulses_per_rev
+        counts = motion_counts(self.map.units, per_rev, speed, accel)
+        self.write(self.map.move, position=place, **counts)
 
     def stop(self) -> None:
         """Quick stop; torque stays on."""

@@ -33,7 +33,9 @@ if TYPE_CHECKING:
 FOLDER = pathlib.Path(
     os.environ.get("JAXCAL_RIG_LOCKS", f"/var/tmp/jaxcal-rig-{os.getuid()}")
 )
+HELD: dict[pathlib.Path, int] = {}  # locks of this process
 PATIENCE_S = 0.2  # a `holder` of another process keeps the flock for an instant
+ENDING, ENDING_S = "the end of a session", 8.0  # which stops its drives, and looks
 _ASKERS_S = 2.0  # the same where several `holder` calls follow one another
 
 
@@ -63,16 +65,32 @@ class BusLock:
             return flock(fd, fcntl.LOCK_EX)
 
         free = until(PATIENCE_S, taken)
-        if not (free or (not _content(fd) and until(_ASKERS_S, taken))):
+        if not free and not (told := _content(fd)):
+            free = until(_ASKERS_S, taken)
+        elif not free and told["command"] == ENDING:
+            free = until(ENDING_S, taken)
+        if not free:
             told = _content(fd)
             self.release()
             raise Refused(
                 f"{self.where} is {held_by(told)}. Wait until it ends, or end it with "
                 "`jaxcal-rig stop`"
             )
-        self._told = {}
-        since = time.strftime("%Y-%m-%d %H:%M:%S")
-        self.tell(pid=os.getpid(), command=what, since=since)
+        os.ftruncate(fd, 0)
+        HELD[self.path] = fd
+        return self.adopt(fd, what)
+
+    @property
+    def held_fd(self) -> int:
+        """The file of the lock, where this process holds it; -1 where it does not."""
+        return HELD.get(self.path, -1)
+
+    def adopt(self, fd: int, what: str) -> BusLock:
+        """Go on holding what another process held, of which this one has the file."""
+        if fd >= 0:
+            self._fd, self._told = fd, _content(fd)
+            since = time.strftime("%Y-%m-%d %H:%M:%S")
+            self.tell(pid=os.getpid(), command=what, since=since)
         return self
 
     def tell(self, **facts: Any) -> None:
@@ -88,6 +106,7 @@ class BusLock:
         if self._fd is not None:
             if self._told:
                 os.ftruncate(self._fd, 0)
+                HELD.pop(self.path, None)
             os.close(self._fd)
         self._fd, self._told = None, {}
 
@@ -138,34 +157,19 @@ class BusLock:
         Raises:
             Refused: the folder cannot be written.
         """
-        told = {
-            "bus": config.bus.model_dump(),
-            "silence_s": config.silence_s,
-            "standing": False,
-            "device": str(config.device_path.resolve()),
-            "stand_s": max(axis.map.restart_s for axis in config.axes),
-            "drives": [
-                {
-                    "name": axis.name,
-                    "unit": axis.unit,
-                    "map": axis.map.text,
-                    "folder": str(axis.map.folder),
-                }
-                for axis in config.axes
-            ],
-        }
-        self._write_armed(told)
+        self._write_armed(config.told)
 
-    def stood(self, forget: bool = False) -> None:
+    def stood(self, forget: bool = False, standing: bool = True) -> None:
         """All drives were seen standing: nothing has to be stopped any more.
 
-        ``forget``: they are gone as well, as simulated ones are.
+        ``forget``: they are gone as well, as simulated ones are. Not ``standing``: one
+        was seen to go on.
         """
         with contextlib.suppress(Refused, OSError):  # they stand, whatever is written
             if forget:
                 self.armed_path.unlink(missing_ok=True)
             elif told := read_armed(self.armed_path):
-                self._write_armed(told | {"standing": True})
+                self._write_armed(told | {"standing": standing})
 
     def _write_armed(self, told: dict[str, Any]) -> None:
         new = self.armed_path.with_suffix(f".{os.getpid()}")

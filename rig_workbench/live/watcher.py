@@ -14,12 +14,13 @@ from collections import deque
 from typing import Any
 
 from rig.core.stop import UnitStop
-from rig.faults import Refused
+from rig.faults import Fault, Refused
+from rig.journal.lock import armed_files, read_armed
 from rig.journal.run_folder import JOURNAL, Record, is_written
 from rig.outputs.run_state import RunState
 from rig.outputs.telemetry import PERIOD_S, TELEMETRY
 from rig.signals import PAUSE
-from rig.stopping import stop_run
+from rig.stopping import NOTHING, armed_bus, stop_units
 from rig_workbench.live.charts import SHOWN_S
 
 ASK_S = 0.5  # between two looks at the journal's lock; for a session to say it stopped
@@ -145,4 +146,11 @@ class Watcher:
             if ended:
                 return []  # it had armed nothing
             time.sleep(0.02)
-        return stop_run(self.folder)
+        for path in armed_files():
+            target = armed_bus(read_armed(path))
+            holder = target and target.lock.holder()
+            if target and holder and holder.get("run") == str(self.folder.resolve()):
+                target.ask()
+                return stop_units(target)
+        name = self.folder.name
+        raise Fault(f"{NOTHING}: no session of this computer moves {name}")

@@ -22,6 +22,8 @@ from rig.config import RigConfig, parse_config
 from rig.config.config import EXAMPLES
 from rig.config.maps import RegisterMap, available_maps, load_map
 from rig.core import device, motion, stop
+from rig.core.line_client import line_of
+from rig.drives import make_drives
 from rig.drives.bus import words_of
 from rig.journal.device import (
     HOMED,
@@ -51,6 +53,13 @@ device.PATIENCE_S = 2.0  # with a phone that is gone
 stop.stand_s = lambda drives: 0.05
 motion.TOO_FAST *= 3.0  # as fast as the simulated drives are
 
+
+def line_here(config, emit):
+    """A line without a process of its own: of sessions in the process of a test."""
+    return make_drives(config.bus, config.axes, config.silence_s, emit)
+
+
+LINES = line_here  # of sessions in this process; those of commands have their own
 RATE_HZ = 250.0
 MODBUS_MAPS = [n for n in available_maps() if isinstance(load_map(n), RegisterMap)]
 SPEEDUP = 3.0  # of the drives over what the configuration says of them
@@ -249,6 +258,7 @@ def simulator(config: RigConfig, **options) -> Simulator:
 def make_run(*args, **more) -> Run:
     """A run as the command line makes it: signals, console and telemetry listen."""
     run = Run(*args, signals=Signals(), **more)
+    run.lines = LINES
     listen(run)
     return run
 
@@ -333,6 +343,8 @@ def _spoil(fault: str, journal: pathlib.Path) -> None:
 
 
 def _main(folder: str, config_path: str, fault: str, phase: str) -> int:
+    global LINES
+    LINES = line_of
     config = parse_config(pathlib.Path(config_path).read_text())
     done = []
 

@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from rig.__main__ import main
 from rig.config import parse_config
 from rig.config.settings import BusSettings
+from rig.core.motion import took
 from rig.core.stop import stop_all
 from rig.drives.bus import Bus
 from rig.drives.line import BusError
@@ -176,9 +177,9 @@ def test_every_family_enables_moves_and_stops(program, register_map, family):
             eventually(lambda: slave.enabled == [2])
         start = drive.status()
         assert start.enabled and start.done and not start.moving and not start.fault
-        assert drive.took(-4321, start, 14) is False
+        assert took(drive, -4321, start, 14) is False
         drive.go(-4321)
-        assert drive.took(-4321, start, 14) is True
+        assert took(drive, -4321, start, 14) is True
         end = time.monotonic() + 5
         while not (status := drive.status()).done:
             assert status.moving and time.monotonic() < end

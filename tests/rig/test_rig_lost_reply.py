@@ -21,6 +21,7 @@ from test_rig_motion import bench
 from rig.config import ConfigError, parse_config
 from rig.config.maps import MAP_FOLDER, RegisterMap
 from rig.config.schema import parse
+from rig.core.motion import took
 from rig.drives.bus import Bus
 from rig.drives.line import BusError
 from rig.drives.modbus import ModbusDrive
@@ -100,11 +101,11 @@ def test_a_drive_shows_whether_it_took_a_move(register_map):
     with simulator(config, speedup=0.05) as sim, Bus(sim.start().bus) as bus:
         drive, start = ModbusDrive(bus, config.axes[0]), sim.drives[0].position
         before = drive.status()
-        assert drive.took(2000, before, 14) is False
-        assert drive.took(round(start), before, 14) is True  # it stands there
+        assert took(drive, 2000, before, 14) is False
+        assert took(drive, round(start), before, 14) is True  # it stands there
         drive.go(2000)
-        assert drive.took(2000, before, 14) is True
-        assert drive.took(1000, before, 14) is None  # it goes elsewhere
+        assert took(drive, 2000, before, 14) is True
+        assert took(drive, 1000, before, 14) is None  # it goes elsewhere
         assert len(sim.drives[0].executions) == 1
 
 

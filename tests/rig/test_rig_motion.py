@@ -15,6 +15,7 @@ from harness import (
     WATCHED,
     fast_config,
     fast_text,
+    line_here,
     read_words,
     simulator,
 )
@@ -54,7 +55,7 @@ def bench(config=None, arm=True, **options):
             journal=SimpleNamespace(records=[]),
         )
         checked = SimpleNamespace(missing=lambda *_: None, state=lambda _: None)
-        device = Device(served, run, checked, Signals())
+        device = Device(served, run, checked, Signals(), lines=line_here)
         with device.imu as imu, device.line:
             sim.start_phone(imu.port)
             imu.wait_for_stream(5)

@@ -16,6 +16,7 @@ from other_drives import MATRIX, place_of, sensed, stage_text
 import jaxcal
 from rig.__main__ import main
 from rig.config import parse_config
+from rig.core.motion import took
 from rig.drives import make_drives
 from rig.drives.line import BusError, Refusal
 from rig.faults import LimitError, Refused
@@ -111,7 +112,7 @@ def test_a_refused_target_is_told_from_a_silent_controller():
             made.lost = 1
             with pytest.raises(BusError) as told:
                 x.move(1000, 1000, 1000)
-            assert not told.value.refused and x.took(1000, x.status(), 2)
+            assert not told.value.refused and took(x, 1000, x.status(), 2)
 
 
 def grbl_of(made, **changes):
