@@ -173,7 +173,7 @@ def test_contacts_are_checked_as_they_are_fitted():
         ((JOINTS[:2], MEASURED[:2, :2]), r"measured must have shape \(2, 3\)"),
         ((JOINTS[:0], MEASURED[:0]), "commands must hold at least one row, got none"),
         ((JOINTS[:2], MEASURED[:2], 0.0), "tolerance must be positive"),
-        ((JOINTS[:2], MEASURED[:2], None, True), "placed_anew needs sockets, planes, wires or a board"),
+        ((JOINTS[:2], MEASURED[:2], None, True), "placed_anew needs sockets"),
     ],
 )
 def test_bad_input_is_named(given, message):
