@@ -196,7 +196,7 @@ def _whitening(
         raise ValueError("noise must be given: the model has no usual one")
     by_command = None
     if noise.command_std is not None:
-        if np.isinf(noise.of_commands(commands.shape[1])).any():
+        if np.isinf(noise.of_commands(*commands.shape)).any():
             raise ValueError(
                 "command_std must be finite here: a reading whose command is unknown "
                 "has no density"

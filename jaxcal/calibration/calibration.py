@@ -18,6 +18,7 @@ from jaxcal.calibration.file import save, to_dict
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.fit_model import fit_model
 from jaxcal.calibration.inverse import command_for, no_inverse
+from jaxcal.calibration.of_readings import inverse
 from jaxcal.checks import aligned, in_words
 from jaxcal.late import late
 from jaxcal.models.model import Model
@@ -43,6 +44,7 @@ class Calibration(Fit):
         return self.summary()
 
     command_for = command_for
+    inverse = inverse
     no_inverse = no_inverse
     check = check
     budget = late("jaxcal.reports.budget:budget")

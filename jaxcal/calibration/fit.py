@@ -186,7 +186,7 @@ class Fit:
             ValueError: the noise is unknown, or ``confidence`` is not in (0, 1).
         """
         self.require_noise("confidence intervals")
-        half = self._quantile(confidence) * np.asarray(self.standard_errors)
+        half = self.quantile(confidence) * np.asarray(self.standard_errors)
         return np.stack([self.parameters - half, self.parameters + half], axis=-1)
 
     def predict_interval(
@@ -198,7 +198,7 @@ class Fit:
     ) -> tuple[Array, Array]:
         """Lower and upper end, (..., m) each; arguments as for ``predict_std``."""
         centre = self.predict(commands)
-        half = self._quantile(confidence) * self.predict_std(
+        half = self.quantile(confidence) * self.predict_std(
             commands, new_measurement=new_measurement
         )
         return centre - half, centre + half
@@ -261,16 +261,21 @@ class Fit:
         """
         points = self.points("commands", commands, self.num_inputs)
         noise = self.require_noise("prediction uncertainty")
-        slopes, covariance = self.linear(points.reshape(-1, self.num_inputs))
+        rows = points.reshape(-1, self.num_inputs)
+        variance = self.variance(rows, noise**2 if new_measurement else 0.0 * noise)
+        return np.sqrt(variance).reshape(*points.shape[:-1], self.num_outputs)
+
+    def variance(self, rows: Array, of_readings: Array) -> Array:
+        """(N, m) of ``predict`` at ``rows`` (N, n) and of readings (m,) there."""
+        slopes, covariance = self.linear(rows)
         variance = above_rounding(
             ((slopes @ covariance) * slopes).sum(axis=-1), slopes, covariance
         )
-        more = self.model.unexplained(self, points.reshape(-1, self.num_inputs)) ** 2
-        least = noise**2 if new_measurement else 0.0
-        std = np.sqrt(variance + np.maximum(more, least) + self.session_std**2)
+        more = self.model.unexplained(self, rows) ** 2
+        variance = variance + np.maximum(more, of_readings) + self.session_std**2
         if self.unidentified is not None:
-            std = np.where(depends(slopes, self.unseen), np.inf, std)
-        return std.reshape(*points.shape[:-1], self.num_outputs)
+            variance = np.where(depends(slopes, self.unseen), np.inf, variance)
+        return variance
 
     @property
     def session_std(self) -> Array:
@@ -339,7 +344,7 @@ class Fit:
             raise ValueError(self.no_noise(what))
         return self.noise_std
 
-    def _quantile(self, confidence: float) -> float:
+    def quantile(self, confidence: float) -> float:
         """Half-width of an interval in standard errors."""
         if not 0.0 < array_of("confidence", confidence) < 1.0:
             raise ValueError(f"confidence must be in (0, 1), got {confidence}")

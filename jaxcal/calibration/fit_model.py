@@ -179,7 +179,7 @@ def _problem(
         mean=mean,
         precision=resolved.precisions,
         free=resolved.free,
-        command_std=command_std,
+        command_std=command_std[used],
         noise_known=noise.std is not None or noise.covariance is not None,
         levels=levels,
         loss=LOSSES[loss],
@@ -331,14 +331,13 @@ def _reading_noise(
 
 
 def _command_noise(noise: Noise, commands: Array, q: int) -> Array:
-    """(n,) command_std, zero where it is not given."""
-    if noise.command_std is None:
-        return np.zeros(commands.shape[1])
-    spread = noise.of_commands(commands.shape[1])
-    if np.isinf(spread).sum() >= q:
+    """(N, n) command_std, zero where it is not given."""
+    spread = noise.of_commands(*commands.shape)
+    unknown = int(np.isinf(spread[0]).sum())
+    if unknown and unknown >= q:
         raise ValueError(
             f"command_std must leave fewer unknown commands than the {q} readings of a "
-            f"measurement, got {int(np.isinf(spread).sum())}"
+            f"measurement, got {unknown}"
         )
     return spread
 
@@ -351,7 +350,7 @@ def _with_play(model: Model, noise: Noise, commands: Array, spread: Array) -> No
     """
     if not np.isfinite(spread).all():
         raise ValueError("command_std of an arm must be finite")
-    slopes = model.command_jacobian(commands) * spread
+    slopes = model.command_jacobian(commands) * spread[:, None]
     plain = Noise(std=noise.std, covariance=noise.covariance)
     root = np.linalg.inv(plain.whitening(len(commands), model.num_outputs))
     covariance = root @ np.matrix_transpose(root)

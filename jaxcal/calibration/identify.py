@@ -143,8 +143,9 @@ def identify(
         about["provenance"]["accuracy"] = by_unit("accuracy", accuracy, units)
     plain = prior is None and plain_noise and loss in (None, "gaussian")
     affine = isinstance(model, Affine)
-    if plain and (affine or model.affine(model.nominal) is not None):
-        loss = "gaussian"
+    if loss is None and prior is None:
+        if affine or model.affine(model.nominal) is not None:
+            loss = "gaussian"
     try:
         fields = fit_model(
             readings.commands,

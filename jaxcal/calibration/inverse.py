@@ -19,11 +19,11 @@ from jaxcal.information.singular import (
 from jaxcal.models.identifiability import unknown
 from jaxcal.models.model import derivative, predict
 
-__all__ = ["command_for", "no_inverse"]
+__all__ = ["FAR", "Responses", "command_for", "limits_of", "no_inverse"]
 
 Array = NDArray[np.float64]
 
-_FAR = 0.25  # of the range of what was measured, beyond it
+FAR = 0.25  # of the range of what was measured, beyond it
 _NAMED = 3  # targets in a warning
 _STARTS, _STEPS, _REACHED = 6, 60, 1e-9  # of the outputs' spread over the measurements
 _SURE = 3.0  # standard deviations from zero: a direction that the outputs respond to
@@ -69,7 +69,7 @@ def command_for(
         raise ValueError(
             f"command_for needs at most as many outputs as inputs, got {m} and {n}"
         )
-    bounds = _limits(limits, fit.input_names)
+    bounds = limits_of(limits, fit.input_names)
     begin = None
     if start is not None:
         first = fit.points("start", start, n)
@@ -103,7 +103,7 @@ def no_inverse(fit: Fit) -> str:
     """
     if fit.num_outputs > fit.num_inputs or not fit.model.linear:
         return ""
-    responses, of_map = _Responses(fit), fit.affine is not None
+    responses, of_map = Responses(fit), fit.affine is not None
     if of_map and fit.unidentified is None:
         if _sureness(fit, responses.spread)[0] >= _SURE:
             return ""
@@ -121,7 +121,7 @@ def no_inverse(fit: Fit) -> str:
     return refusal
 
 
-def _limits(limits: ArrayLike | None, names: tuple[str, ...]) -> Array:
+def limits_of(limits: ArrayLike | None, names: tuple[str, ...]) -> Array:
     """(n, 2), least below greatest, with at least one finite command between them."""
     if limits is None:
         return np.tile([-np.inf, np.inf], (len(names), 1))
@@ -152,7 +152,7 @@ def _sureness(fit: Fit, spread: Array) -> tuple[float, Array]:
     return size[-1] / float(np.sqrt(variance) or 1e-300), last
 
 
-class _Responses:
+class Responses:
     """How outputs respond to commands, these in their spread over the measurements."""
 
     def __init__(self, fit: Fit) -> None:
@@ -230,7 +230,7 @@ class _Responses:
         return f"the outputs do not respond to the direction {unseen} of the commands"
 
 
-class _Search(_Responses):
+class _Search(Responses):
     """Outputs and derivatives in units of their spread over the measurements."""
 
     def __init__(self, fit: Fit, wanted: Array, start: Array | None) -> None:
@@ -282,7 +282,7 @@ class _Search(_Responses):
             low, high = measured[used].min(axis=0), measured[used].max(axis=0)
             width = np.where(high > low, high - low, np.inf)
             beyond = np.maximum(low - values, values - high) / width
-            far |= {*np.flatnonzero((beyond > _FAR).any(axis=1))}
+            far |= {*np.flatnonzero((beyond > FAR).any(axis=1))}
             if far and not worst:
                 i, j = np.unravel_index(beyond.argmax(), beyond.shape)
                 worst = (

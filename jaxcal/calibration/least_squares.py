@@ -63,7 +63,7 @@ class FitProblem:
     mean: Array  # (P,) of the prior
     precision: Array  # (P,) of the prior, 0 where nothing is known
     free: NDArray[np.bool_]  # (P,) False: held at the mean
-    command_std: Array  # (n,) 0 exact, inf unknown in every measurement
+    command_std: Array  # (N, n) 0 exact, inf unknown in every measurement
     noise_known: bool  # the level is 1; else it is estimated
     levels: NDArray[np.intp]  # (q,) from 0: outputs of the same number share one
     loss: Loss | None  # None: least squares
@@ -219,13 +219,17 @@ class FitSolution:
         # (R, r) roots of the hat matrix, hardly damped, where a step had them.
         self.solved: Array | None = None
         q = problem.measured.shape[1]
-        self.uncertain = problem.command_std > 0.0
-        self.command_root = 1.0 / problem.command_std[self.uncertain]  # 0: unknown
-        self.num_readings = q - np.count_nonzero(self.command_root == 0.0)
+        self.uncertain = (problem.command_std > 0.0).any(axis=0)
+        self.num_uncertain = k = int(self.uncertain.sum())
+        spread = problem.command_std[:, self.uncertain]
+        self.moves = spread > 0.0  # (N, k) False: exact in this measurement
+        # (N, k) 0: unknown, in every measurement.
+        self.command_root = 1.0 / np.where(self.moves, spread, 1.0)
+        self.num_readings = q - k + np.count_nonzero(self.command_root[0])
         # From where another search ended, the derivatives are right far enough.
         self.damping, self.grow = 1e-3 if start is None else 1e-10, 2.0
         # Least squares are searched to the last digit, along curves.
-        exact = not (problem.loss or len(self.command_root))
+        exact = not (problem.loss or self.num_uncertain)
         self.whole = exact and not (rough or problem.model.linear)
         self.basis: Array | None = None  # (F, r) directions of a linear model
         self.freedom = np.zeros(q)
@@ -234,7 +238,7 @@ class FitSolution:
         self.climbed, self.trust = np.zeros(q), 1.0
         self.all_free = bool(problem.free.all())
         self.informed = bool(np.logical_and(problem.free, problem.precision).any())
-        linear = problem.model.linear and not len(self.command_root)
+        linear = problem.model.linear and not self.num_uncertain
         from_zero = linear and start is None and not self.informed
         if start is None:
             self._begin(from_zero)
@@ -271,7 +275,7 @@ class FitSolution:
             self._take(start.residuals)
             self.level = self._first_level()
             self._linearise()
-        if len(self.command_root):
+        if self.num_uncertain:
             self.by_command = start.by_command
         if not self.problem.model.linear:
             self.sizes = start.sizes
@@ -350,10 +354,11 @@ class FitSolution:
         if self._grown is not None and self._grown[1] is not None:
             slopes = problem.growth_slopes(self.parameters)
             self.by_theta += self.white[..., None] * slopes[:, None]
-        if len(self.command_root):
+        if self.num_uncertain:
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
             rows = derivative(problem.model, self.commands, self.parameters, inputs)
-            self.by_command = self.whitened(rows[..., self.uncertain])
+            rows = rows[..., self.uncertain] * self.moves[:, None]
+            self.by_command = self.whitened(rows)
 
     def _directions(self) -> Array:
         """(F, r) changes of the parameters, those that nothing determines left out.
@@ -431,7 +436,7 @@ class FitSolution:
     def _distance(self, white: Array, commands: Array) -> Array:
         """(N,) squared distance of each measurement from the fit, in noise."""
         square = np.asarray(((white / self.level) ** 2).sum(axis=1))
-        if len(self.command_root):
+        if self.num_uncertain:
             moved = (commands - self.problem.commands)[:, self.uncertain]
             square += ((moved * self.command_root) ** 2).sum(axis=1)
         return square
@@ -454,13 +459,11 @@ class FitSolution:
         """Rows (N, R, F) and residuals (N, R), the commands eliminated."""
         rows = self.by_theta / self.level[:, None]
         right = self.white / self.level
-        k = len(self.command_root)
+        k = self.num_uncertain
         if not k:
             return rows, right
         by_command = self.by_command / self.level[:, None]
-        command_rows = np.broadcast_to(
-            np.diag(self.command_root), (len(by_command), k, k)
-        )
+        command_rows = self.command_root[..., None] * np.eye(k)
         by_command = np.concatenate([by_command, command_rows], axis=1)
         length = np.sqrt((by_command**2).sum(axis=1))[:, :, None] * np.eye(k)
         by_command = np.concatenate([by_command, np.sqrt(damping) * length], axis=1)
@@ -475,7 +478,7 @@ class FitSolution:
     def _moved(self, step: Array) -> Array:
         """(N, n) the commands after the parameters move by ``step`` (F,)."""
         commands = self.commands
-        if len(self.command_root):
+        if self.num_uncertain:
             triangle, rows, right = self._back
             change = np.linalg.solve(triangle, (right - rows @ step)[..., None])[..., 0]
             commands = commands.copy()
@@ -669,14 +672,14 @@ class FitSolution:
         if root is None:
             root = _factor(self._system(0.0)[0], _LEAST_DAMPING)[1]
         count, width = len(self.weights), root.shape[1]
-        readings = self.residuals.shape[1] + len(self.command_root)
+        readings = self.residuals.shape[1] + self.num_uncertain
         return root[: count * readings].reshape(count, readings, width)
 
     def _freedom(self, readings: Array) -> Array:
         """(q,) residual degrees of freedom of each output."""
         count, q = self.residuals.shape
         used = np.vecdot(readings, readings).sum(axis=0)
-        if len(self.command_root):
+        if self.num_uncertain:
             return np.full(q, (count * self.num_readings - used.sum()) / q)
         freedom = count - used
         if (met := self.residuals == 0.0).any():
@@ -701,7 +704,7 @@ class FitSolution:
         """
         if self.stale:
             self._linearise()
-        readings, uncertain = self._leverage(solved), len(self.command_root)
+        readings, uncertain = self._leverage(solved), self.num_uncertain
         right = self._reduce(0.0)[1] if uncertain else self.white / self.level
         if solved is None or self.problem.noise_known:
             self.freedom = self._freedom(readings)

@@ -167,13 +167,15 @@ def optimise(
     Raises:
         ValueError: naming the argument, the rule and the value.
     """
+    deadline = _deadline(time_limit)
     box = _limits(limits)
     model = as_model(model) if model is not None else Affine(len(box), len(box))
-    pool = _drawn(box, _POOL, allowed, seed)
+    count = _affordable(model, box, deadline, max(16, 3 * (k or 1)), _POOL)
+    pool = _drawn(box, count, allowed, seed)
     offer = CandidateSet(
         pool, model, prior, noise, measured, max_replicates=_POOL, scenarios=scenarios
     ).checked()
-    search = _Ascent(offer, box, allowed, k, criterion, region, seed, time_limit)
+    search = _Ascent(offer, box, allowed, k, criterion, region, seed, deadline)
     return search.run(None, whole_number("starts", starts, 1))
 
 
@@ -206,8 +208,11 @@ def refine(
     Raises:
         ValueError: naming the argument, the rule and the value.
     """
+    deadline = _deadline(time_limit)
     offer = design.candidate_set
     candidates, available = offer.candidates, offer.available
+    if offer.constraints is not None:
+        raise ValueError("constraints are of select and score, not of refine")
     if offer.model is None or candidates is None:
         raise ValueError("refine needs candidates and a model, not blocks")
     begun = _commands_of(selection, candidates)
@@ -216,9 +221,7 @@ def refine(
     box = _limits(_range(candidates[available], allowed) if limits is None else limits)
     _require_inputs(box, candidates)
     _require_within(begun, box, allowed)
-    search = _Ascent(
-        offer, box, allowed, len(begun), criterion, region, seed, time_limit
-    )
+    search = _Ascent(offer, box, allowed, len(begun), criterion, region, seed, deadline)
     return search.run(begun, whole_number("starts", starts, 1))
 
 
@@ -265,6 +268,27 @@ def _same_criterion(selection: Selection) -> Any:
             f"refine(..., criterion=jaxcal.{type(criterion).__name__}([...]))"
         )
     return criterion.name
+
+
+def _deadline(time_limit: float | None) -> Deadline:
+    limit = _MINUTE if time_limit is None else seconds("time_limit", time_limit)
+    return Deadline(limit)
+
+
+def _affordable(
+    model: Model, box: Array, deadline: Deadline, least: int, most: int
+) -> int:
+    """Points at which a model may be asked for derivatives in an eighth of the time.
+
+    Only of a function, whose differences cost what it costs.
+    """
+    if not model.resolution:
+        return most
+    begun, points = time.perf_counter(), box.mean(axis=1)[None].repeat(2, axis=0)
+    points[1] += 0.1 * np.ptp(box, axis=1)
+    model.jacobian(points, None)
+    each = 0.5 * (time.perf_counter() - begun)
+    return int(np.clip(0.125 * deadline.remaining_s / each, least, most))
 
 
 def _limits(limits: ArrayLike) -> Array:
@@ -346,6 +370,7 @@ def _descended(
     low: float,
     high: float,
     iterations: int,
+    deadline: Deadline,
 ) -> Array:
     """The lowest point on the way down from x between low and high.
 
@@ -359,7 +384,7 @@ def _descended(
     for _ in range(iterations):
         step = (x - length * slope).clip(low, high) - x
         gain = float(slope @ step)
-        if gain > -1e-14 * max(1.0, abs(value)):
+        if deadline.passed or gain > -1e-14 * max(1.0, abs(value)):
             break
         share = 1.0
         for _ in range(30):
@@ -434,11 +459,9 @@ class _Ascent:
         criterion: Any,
         region: ArrayLike | None,
         seed: int,
-        time_limit: float | None,
+        deadline: Deadline,
     ) -> None:
-        self.started = time.perf_counter()
-        limit = _MINUTE if time_limit is None else seconds("time_limit", time_limit)
-        self.deadline = Deadline(limit)
+        self.deadline = deadline
         self.offer, self.box = offer, box
         self.allowed, self.seed = allowed, seed
         self.low, self.span = box[:, 0], np.ptp(box, axis=1)
@@ -630,7 +653,7 @@ class _Ascent:
         best, best_phi = self._swapped(best, best_phi)
         bound, error, certain = self._bound(best, best_phi)
         if begun is not None:
-            began = self._judged(begun)[1]
+            began = float(self.objective.reported(first_phi))
         problem, value, log_det = self._judged(best)
         assert begun is None or best_phi >= first_phi
         return Refinement(
@@ -639,7 +662,7 @@ class _Ascent:
             log_det=log_det,
             method="optimise" if begun is None else "refine",
             proven=False,
-            seconds=time.perf_counter() - self.started,
+            seconds=self.deadline.elapsed_s,
             problem=problem,
             seed=self.seed,
             known_bound=float(self.objective.reported(bound)),
@@ -683,10 +706,12 @@ class _Ascent:
         unit = self.unit(best_phi)
 
         def down(x: Array) -> tuple[float, Array]:
+            if self.deadline.passed:
+                return 1e10, np.zeros_like(x)
             at = self.low + x.reshape(shape) * self.span
             information = self.information(self.blocks(at))
             phi = float(self.phi(information))
-            if not np.isfinite(phi) or self.deadline.passed:
+            if not np.isfinite(phi):
                 return 1e10, np.zeros_like(x)
             if self.smooth:
                 value, metric, _ = self.soft(information, _SHARP[-1] / unit)
@@ -697,7 +722,7 @@ class _Ascent:
         if self.surface:
             return self._tried(best, best_phi)
         start = ((commands - self.low) / self.span).clip(0.0, 1.0).ravel()
-        ends = _descended(down, start, 0.0, 1.0, 300)
+        ends = _descended(down, start, 0.0, 1.0, 300, self.deadline)
         there = self.low + ends.reshape(shape) * self.span
         there = there.clip(self.box[:, 0], self.box[:, 1])
         phi = float(self.phi(self.information(self.blocks(there))))
@@ -799,9 +824,10 @@ class _Ascent:
     @functools.cached_property
     def _spread(self) -> Array:
         """(R, n) points over the limits, where d is looked at."""
-        assert self.offer.model is not None
-        cheap = not (self.offer.model.resolution or self.surface)
-        count = _SEARCH if cheap else _POOL
+        model = self.offer.model
+        assert model is not None
+        count = _POOL if model.resolution or self.surface else _SEARCH
+        count = _affordable(model, self.box, self.deadline, 16, count)
         return _drawn(self.box, count, self.allowed, self.seed + 1)
 
     @functools.cached_property
@@ -842,7 +868,7 @@ class _Ascent:
             return -value, -self.slopes(at, metric).ravel() / size
 
         start = ((points - self.low) / self.span).clip(0.0, 1.0).ravel()
-        ends = _descended(down, start, 0.0, 1.0, 150)
+        ends = _descended(down, start, 0.0, 1.0, 150, self.deadline)
         there = self.low + ends.reshape(shape) * self.span
         there = there.clip(self.box[:, 0], self.box[:, 1])
         higher = self.leverage(self.blocks(there), metric)
@@ -961,7 +987,9 @@ class _Ascent:
         x = begun.ravel()
         for sharp in _SHARP_BOUND:
             smoothed = functools.partial(down, sharp=sharp)
-            x = of(_descended(smoothed, x, -np.inf, np.inf, 300))[0].ravel()
+            x = of(_descended(smoothed, x, -np.inf, np.inf, 300, self.deadline))[
+                0
+            ].ravel()
         return of(x)[2]
 
     def _corners(self) -> Array:
@@ -1004,10 +1032,10 @@ class _Ascent:
             return -score, -w * (slope - w @ slope)
 
         start = np.log(np.maximum(weights, 1e-9))
-        logits = _descended(down, start, -np.inf, np.inf, 300)
+        logits = _descended(down, start, -np.inf, np.inf, 300, self.deadline)
         for sharper in _SHARP[1:] if self.smooth else ():
             sharp = sharper
-            logits = _descended(down, logits, -np.inf, np.inf, 300)
+            logits = _descended(down, logits, -np.inf, np.inf, 300, self.deadline)
         e = np.exp(logits - logits.max())
         return np.asarray(e / e.sum())
 

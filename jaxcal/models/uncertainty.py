@@ -117,9 +117,9 @@ class Noise:
         std: of the readings, in their units: one number, (q,), or (N, q) for each
             candidate. 1 where neither it nor ``covariance`` is given.
         covariance: of the readings instead of std: (q, q) or (N, q, q).
-        command_std: of the commands: one number or (n,), in their units. ``inf``: the
-            command is unknown in every measurement (a nuisance parameter, as the pose
-            of a camera in each view) and is eliminated.
+        command_std: of the commands, in their units: one number, (n,), or (N, n) for
+            each measurement. ``inf``: the command is unknown in every measurement (a
+            nuisance parameter, as the pose of a camera in each view) and is eliminated.
     """
 
     std: ArrayLike | None = None
@@ -139,6 +139,9 @@ class Noise:
         spread = numbers("command_std", self.command_std, finite=False)
         rule = "command_std must not be negative (inf: unknown in every measurement)"
         require_none(~(spread >= 0.0), spread, rule)
+        unknown = np.isinf(np.atleast_2d(spread))
+        if (unknown.any(axis=0) & ~unknown.all(axis=0)).any():
+            raise ValueError("command_std must be inf in every row of a column or none")
         uncertain = np.isfinite(spread) & (spread > 0.0)
         if self.std is None and self.covariance is None and uncertain.any():
             raise ValueError(
@@ -153,7 +156,10 @@ class Noise:
             std = np.asarray(std)[rows]
         if covariance is not None and np.ndim(covariance) == 3:
             covariance = np.asarray(covariance)[rows]
-        return Noise(std, covariance, self.command_std)
+        of_commands = self.command_std
+        if of_commands is not None and np.ndim(of_commands) == 2:
+            of_commands = np.asarray(of_commands)[rows]
+        return Noise(std, covariance, of_commands)
 
     def typical(self, rows: NDArray[np.bool_]) -> Noise:
         """Noise that does not differ by row: in root mean square over ``rows`` (N,)."""
@@ -162,7 +168,10 @@ class Noise:
             std = np.sqrt((np.asarray(std)[rows] ** 2).mean(axis=0))
         if covariance is not None and np.ndim(covariance) == 3:
             covariance = np.asarray(covariance)[rows].mean(axis=0)
-        return Noise(std, covariance, self.command_std)
+        of_commands = self.command_std
+        if of_commands is not None and np.ndim(of_commands) == 2:
+            of_commands = np.sqrt((np.asarray(of_commands)[rows] ** 2).mean(axis=0))
+        return Noise(std, covariance, of_commands)
 
     def beside(self, std: float) -> Noise:
         """This noise and, independent of it, one of ``std`` in every reading."""
@@ -199,10 +208,10 @@ class Noise:
                     "or command_jacobian (N, q, n)"
                 )
             derivative = array_of("command_jacobian", command_jacobian, *shape[:2], "n")
-            spread = self.of_commands(derivative.shape[-1])
+            spread = self.of_commands(count, derivative.shape[-1])[:, None]
             by_commands = derivative * np.where(np.isinf(spread), 0.0, spread)
             covariance = covariance + by_commands @ np.matrix_transpose(by_commands)
-            unknown = derivative[..., np.isinf(spread)]
+            unknown = derivative[..., np.isinf(spread).any(axis=(0, 1))]
         white = np.linalg.inv(np.linalg.cholesky(covariance))
         white = np.broadcast_to(white, shape)
         if not unknown.shape[-1]:
@@ -270,10 +279,12 @@ class Noise:
             )
         return std.reshape(1, 1) if std.ndim == 0 else std[..., None]
 
-    def of_commands(self, n: int) -> Array:
-        """(n,) command_std, zero where it is not given."""
+    def of_commands(self, count: int, n: int) -> Array:
+        """(N, n) command_std, zero where it is not given."""
         given = 0.0 if self.command_std is None else self.command_std
-        return one_or_each("command_std", given, n)
+        if np.ndim(given) == 2:
+            return array_of("command_std", given, count, n, finite=False)
+        return np.tile(one_or_each("command_std", given, n), (count, 1))
 
 
 def as_noise(noise: Any) -> Noise | None:

@@ -17,10 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.fit import Fit
+from jaxcal.calibration.of_readings import by_readings, inverse
 from jaxcal.checks import aligned, array_of, one_or_each
 from jaxcal.information.singular import depends
 
 Array = NDArray[np.float64]
+
+_READING = "noise of the reading"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,8 +104,13 @@ class Budget:
     @property
     def dof(self) -> Array:
         """(R,) effective degrees of freedom by Welch and Satterthwaite."""
+        parts, dof = self.contributions, self.source_dof
+        if _READING in self.sources:  # of one estimate with the first, which is noise
+            last = self.sources.index(_READING)
+            parts, dof = np.delete(parts, last, axis=1), np.delete(dof, last)
+            parts[:, 0] = np.hypot(parts[:, 0], self.contributions[:, last])
         with np.errstate(divide="ignore", invalid="ignore"):
-            terms = self.contributions**4 / self.source_dof
+            terms = parts**4 / dof
             found = self.combined**4 / terms.sum(axis=1)
         return np.where(np.isnan(found), np.inf, found)
 
@@ -186,10 +194,12 @@ def budget(
     calibration: Fit,
     commands: ArrayLike | None = None,
     *,
+    readings: ArrayLike | None = None,
+    repeats: int = 1,
     sources: Sequence[Source] = (),
     confidence: float = 0.95,
 ) -> Budget:
-    """The uncertainty budget of the parameters, or of the outputs at commands.
+    """The uncertainty budget of the parameters, of outputs, or of commands.
 
     Without ``sources`` the combined uncertainty is that of ``standard_errors`` and of
     ``predict_std``. A source reaches a result as the fit lets it: an offset of the
@@ -199,6 +209,9 @@ def budget(
         calibration: with a known or an estimated noise.
         commands: (N, n), of which the true outputs are predicted; the parameters when
             not given.
+        readings: (P, m) instead, of which the commands are found, and ``repeats``, as
+            of ``Calibration.inverse``. A source moves them as it moved the readings of
+            the calibration, so an offset that both share cancels.
         sources: what the scatter of the readings does not show: zero, certificate.
         confidence: of the expanded uncertainty, in (0, 1).
 
@@ -212,13 +225,21 @@ def budget(
         raise ValueError(
             f"sources must hold jaxcal.calibration.Source, got {wrong[0]!r}"
         )
-    results = _results(calibration, commands)
+    if readings is None:
+        results = _results(calibration, commands)
+    elif commands is None:
+        results = _of_readings(calibration, readings, repeats)
+    else:
+        raise ValueError("budget is of commands or of readings: give one of them")
     slopes, parts = results.slopes, _parts(calibration, results.slopes)
+    if results.turn is not None:
+        noise = calibration.require_noise("budget") ** 2 / repeats
+        parts[_READING] = results.turn**2 @ noise, calibration.noise_dof or np.inf
     gain = _gain(calibration, slopes.shape[-1]) if sources else None
     for source in sources:
         if source.name in parts:
             raise ValueError(f"sources must have names of their own: {source.name!r}")
-        parts[source.name] = _squares(calibration, source, slopes, gain), source.dof
+        parts[source.name] = _squares(calibration, source, results, gain), source.dof
     contributions = np.sqrt(np.stack([square for square, _ in parts.values()], 1))
     finite = np.where(np.isfinite(contributions), contributions, 0.0)
     least = 1e-9 * finite.max(axis=1, keepdims=True)  # below is rounding
@@ -234,12 +255,14 @@ def budget(
 
 
 class _Results(NamedTuple):
-    """What a budget is of: the parameters, or the outputs at commands."""
+    """What a budget is of: the parameters, outputs, or commands."""
 
     names: tuple[str, ...]  # R
     values: Array  # (R,)
     unit: str
     slopes: Array  # (R, P) by all parameters, as joint_covariance has them
+    turn: Array | None = None  # (R, m) by the readings that commands answer
+    readings: Array | None = None  # (R, m)
 
 
 def _results(calibration: Fit, commands: ArrayLike | None) -> _Results:
@@ -257,6 +280,23 @@ def _results(calibration: Fit, commands: ArrayLike | None) -> _Results:
         calibration.predict(points).ravel(),
         calibration.measured_unit,
         slopes.reshape(-1, slopes.shape[-1]),
+    )
+
+
+def _of_readings(calibration: Fit, readings: ArrayLike, repeats: int) -> _Results:
+    """The commands of readings (P, m): P n results."""
+    answer = inverse(calibration, readings, repeats)
+    n, m = calibration.num_inputs, calibration.num_outputs
+    commands, names = answer.commands.reshape(-1, n), calibration.input_names
+    turn = by_readings(calibration, commands)
+    slopes = -turn @ calibration.linear(commands)[0]
+    return _Results(
+        tuple(f"{name} of reading {i}" for i in range(len(commands)) for name in names),
+        commands.ravel(),
+        calibration.command_unit,
+        slopes.reshape(-1, slopes.shape[-1]),
+        turn.reshape(-1, m),
+        np.asarray(readings, float).reshape(-1, m).repeat(n, axis=0),
     )
 
 
@@ -304,17 +344,21 @@ def _gain(calibration: Fit, width: int) -> Array:
     return np.asarray(inverse.reshape(width, *weight.shape) * np.sqrt(weight))
 
 
-def _squares(calibration: Fit, source: Source, slopes: Array, gain: Any) -> Array:
+def _squares(calibration: Fit, source: Source, results: _Results, gain: Any) -> Array:
     """(R,) variances of the results by one source."""
     m = calibration.num_outputs
     measured = calibration.measured
-    moved = np.zeros(len(slopes))
+    moved = np.zeros(len(results.slopes))
     for name, shape in (("offset", np.ones_like(measured)), ("scale", measured)):
         value = getattr(source, name)
         if not np.any(value):
             continue
         size = one_or_each(f"{name} of {source.name}", value, m)
         # Of each output by itself: (R, m).
-        moves = slopes @ np.einsum("pnm,nm->pm", gain, shape * size)
+        moves = results.slopes @ np.einsum("pnm,nm->pm", gain, shape * size)
+        if results.turn is not None:
+            moves = moves + results.turn * size * (
+                1.0 if name == "offset" else results.readings
+            )
         moved = moved + (moves**2).sum(axis=1)
     return moved

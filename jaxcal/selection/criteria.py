@@ -1,4 +1,4 @@
-"""What a choice is judged by: D, A, I, E, Ds, As. A new criterion is one class here.
+"""What a choice is judged by: D, A, I, G, E, Ds, As. A new criterion is one class here.
 
 ``V = C M^-1 C.T`` is the covariance of the combinations ``C theta`` that matter, M the
 information (p, p). Every criterion is written as a concave phi(M) to be maximised:
@@ -14,7 +14,8 @@ kind      phi                          names   reported value               effi
 v is the value of a selection, b that of the optimum or a bound on it, s the rows of C.
 C is the identity for D, A and E, picks the parameters of interest for Ds and As, and
 for I ``C.T @ C`` is the mean of ``J.T @ J`` over a region: V's trace is then the mean
-variance of the predictions there.
+variance of the predictions there. G, their largest variance, is the worst of as many
+traces as the region has rows; all of them are judged as scenarios are.
 
 Sources: Pukelsheim, Optimal Design of Experiments (concavity, subsets of parameters);
 Atkinson, Donev and Tobias, Optimum Experimental Designs.
@@ -42,7 +43,9 @@ __all__ = [
     "Coordinates",
     "Criterion",
     "Ds",
+    "G",
     "I",
+    "Largest",
     "Mean",
     "ScenarioCriterion",
     "Worst",
@@ -52,6 +55,8 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+
+_HULL = 5  # parameters up to which qhull's facets are few
 
 
 class Coordinates(NamedTuple):
@@ -263,6 +268,32 @@ class I(Criterion):  # noqa: E742 - the criterion's own name in the literature
         return np.asarray(size[keep, None] * right[keep] / np.sqrt(count))
 
 
+class G(I):
+    """Largest variance of a prediction over a region, in units of the noise.
+
+    Args:
+        region: as of ``I``.
+    """
+
+    name, says = "G", "largest variance"
+
+    def rows(self, at: Coordinates) -> Array:
+        """(R, p) the predictions that may be the least certain."""
+        rows = at.white.blocks if at.region is None else at.white.of(at.region)
+        rows = rows.reshape(-1, len(at.white.prior))
+        rows = np.unique(rows, axis=0)
+        rows = rows[rows.any(axis=1)]
+        if not 2 <= rows.shape[1] <= _HULL or len(rows) <= 4 * rows.shape[1]:
+            return rows
+        from scipy.spatial import ConvexHull, QhullError
+
+        try:  # a variance is convex in its row, and even
+            vertices = ConvexHull(np.concatenate([rows, -rows])).vertices
+        except QhullError:
+            return rows
+        return rows[np.unique(vertices % len(rows))]
+
+
 class _SubsetCriterion(Criterion):
     """A criterion of the parameters of interest."""
 
@@ -448,8 +479,14 @@ class Worst(ScenarioCriterion):
         return super().says
 
 
+class Largest(Worst):
+    """G: the worst of the predictions, each of which stands for a scenario."""
+
+    word, efficiency_name, name, says = "", "G-efficiency", "G", "largest variance"
+
+
 CRITERIA: dict[str, type[Criterion]] = {
-    each.name: each for each in (D, A, I, E, Ds, As)
+    each.name: each for each in (D, A, I, G, E, Ds, As)
 }
 
 
@@ -468,7 +505,7 @@ def criterion_of(criterion: Any, region: Any, default: str) -> Criterion:
 
     Args:
         criterion: a name of ``CRITERIA``, one of its classes' objects, or None.
-        region: of I, where it is asked for by its letter.
+        region: of I and G, where they are asked for by their letter.
         default: the criterion where none is asked for.
     """
     if isinstance(criterion, Criterion):
@@ -487,9 +524,10 @@ def criterion_of(criterion: Any, region: Any, default: str) -> Criterion:
         return asked
     if not asked.of_region or asked.region is not None:
         raise ValueError(
-            f"region goes with criterion I only, and once, got criterion {asked.name}"
+            "region goes with criterion I or G only, and once, "
+            f"got criterion {asked.name}"
         )
-    return I(region)
+    return type(asked)(region)
 
 
 def positions(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import collections
 import dataclasses
 import inspect
 import math
@@ -59,7 +58,8 @@ class Design:
         available: (M,) bool or 0 and 1, True where a candidate may be chosen; all by
             default.
         required: (r,) candidates that must be among the chosen.
-        max_replicates: how often one candidate may be chosen; 1 keeps them distinct.
+        max_replicates: how often one candidate may be chosen, a number or (M,) of each;
+            1 keeps them distinct.
         blocks: (M, q, p) instead of candidates and model; candidate i gives q readings,
             ``y = B_i theta + noise`` with noise of unit variance unless ``noise`` is
             given, and adds ``B_i.T @ B_i`` to the information. Or (S, M, q, p), those
@@ -70,6 +70,9 @@ class Design:
             ``(parameters, weights)``; of blocks (S, M, q, p) their weights (S,), of sum
             1, equal when not given. A criterion is then ``jaxcal.Mean("D")``, as
             letters alone are, or ``jaxcal.Worst("D")``.
+        constraints: (A, b), A (r, M) or (M,) and b (r,) or a number: a selection must
+            have ``A w <= b``, w (M,) how often each candidate is chosen. A row of costs
+            and a budget; ones at some rows and "at most s of these".
         names: (M,) names of the candidates, for the answers.
 
     Raises:
@@ -88,11 +91,12 @@ class Design:
         measured: ArrayLike | None = None,
         available: ArrayLike | None = None,
         required: ArrayLike | None = None,
-        max_replicates: int = 1,
+        max_replicates: ArrayLike = 1,
         *,
         blocks: ArrayLike | None = None,
         commands: ArrayLike | None = None,
         scenarios: Any = None,
+        constraints: Any = None,
         names: Sequence[str] | None = None,
     ) -> None:
         if (candidates is None) == (blocks is None):
@@ -102,7 +106,7 @@ class Design:
         labels: Any = names
         self.candidate_set = CandidateSet(
             rows, model, prior, noise, measured, available, required, max_replicates,
-            blocks, scenarios, labels,
+            blocks, scenarios, labels, constraints=constraints,
         ).checked()  # fmt: skip
 
     @classmethod
@@ -191,23 +195,23 @@ class Design:
         Args:
             k: candidates to choose; the fewest that identify (n + 1) when not given.
             criterion: "D" (joint uncertainty of the parameters), "A" (sum of their
-                variances), "I" (mean variance of the predictions), "E" (the worst-known
-                combination), or one with data: ``jaxcal.I(region)``,
-                ``jaxcal.Ds([...])``, ``jaxcal.As([...])``. D for the affine model and
-                for blocks, I for other models.
+                variances), "I" (mean variance of the predictions), "G" (the largest of
+                them), "E" (the worst-known combination), or one with data:
+                ``jaxcal.I(region)``, ``jaxcal.Ds([...])``, ``jaxcal.As([...])``. D for
+                the affine model and for blocks, I for other models.
             method: "auto" (the cheapest way to an answer proven to have
                 ``least_efficiency``), "exact" (proven), "exchange" (near-optimal),
                 "greedy", "random" or "policy" (the trained network; affine model, D).
-            region: short for ``jaxcal.I(region)``.
+            region: where predictions are wanted, of I and G by their letters.
             options: those that the method reads:
 
                 - seed: whole number, 0, or numpy Generator; of all but greedy.
                 - restarts: starts of exchange, and of the one that starts exact and
                   auto; see ``exchange.default_restarts``, 30 with these.
                 - time_limit: seconds after which exact and auto return the best found
-                  with a true ``bound``, not proven; ``math.inf`` for none. 10, and 2
-                  for auto with several readings per candidate, a prior or another
-                  criterion than D.
+                  with a true ``bound``, not proven, and exchange what it has;
+                  ``math.inf`` for none. 10, of exchange none, and 2 for auto with
+                  several readings per candidate, a prior or another criterion than D.
                 - best: of exact, how many best subsets to prove, in ``alternatives``.
                 - least_efficiency: of auto, the efficiency in (0, 1] that suffices,
                   0.999.
@@ -277,12 +281,14 @@ class Design:
             raise ValueError(
                 f"indices must hold every required candidate, got no {missing[0]}"
             )
-        repeats = int(times.max())
-        if repeats > problem.max_replicates:
+        if (over := np.flatnonzero(times > problem.upper)).size:
             raise ValueError(
                 "indices must repeat a candidate at most max_replicates = "
-                f"{problem.max_replicates} times, got {repeats}"
+                f"{problem.upper[over[0]]} times, got {times[over[0]]}"
             )
+        if problem.constraints is not None:
+            if broken := problem.constraints.broken(times):
+                raise ValueError(f"indices must keep the constraints, got {broken}")
         return problem
 
     plan = late("jaxcal.selection.plan:plan")
@@ -353,6 +359,7 @@ class Design:
             available=np.isin(np.arange(len(self.available)), indices),
             required=None,
             max_replicates=len(indices),
+            constraints=None,
         )
         try:
             problem_of(alone, len(indices))
@@ -385,16 +392,13 @@ def _whole_numbers(indices: ArrayLike) -> Indices:
 
 def _require_allowed(problem: Problem, indices: Indices, method: str) -> None:
     """Refuse what is no selection of this problem: the solver is wrong."""
-    chosen, count = indices.ravel().tolist(), len(problem.available)
-    distinct = set(chosen)
     right = indices.ndim == 1 and indices.dtype.kind in "iu"
-    right = right and len(chosen) == problem.k
-    right = right and distinct.issuperset(problem.required.tolist())
-    if len(distinct) < len(chosen):
-        most = max(collections.Counter(chosen).values())
-        right = right and most <= problem.max_replicates
-    right = right and 0 <= min(distinct) and max(distinct) < count
-    if not right or not problem.available[indices].all():
+    right = right and len(indices) == problem.k
+    right = right and 0 <= indices.min() and indices.max() < len(problem.available)
+    if right:
+        counts = np.bincount(indices, minlength=len(problem.available))
+        right = bool(((problem.lower <= counts) & (counts <= problem.upper)).all())
+    if not right or not problem.allows(indices):
         raise RuntimeError(
             f"method {method!r} must return {problem.k} candidates within lower "
             f"and upper of its problem, by number, got {indices.tolist()}"
@@ -429,9 +433,9 @@ def select(
         method: "auto", "exact", "exchange", "greedy", "random" or "policy".
         criterion, region: what is best, see ``Design.select``.
         given: model, prior, noise, measured, available, required, max_replicates,
-            blocks, commands, scenarios, names: of the problem, see ``Design``; seed,
-            restarts, time_limit, best, least_efficiency, checkpoint, decoding, num:
-            those that the method reads, see ``Design.select``.
+            constraints, blocks, commands, scenarios, names: of the problem, see
+            ``Design``; seed, restarts, time_limit, best, least_efficiency, checkpoint,
+            decoding, num: those that the method reads, see ``Design.select``.
 
     Returns:
         The selection; never a singular one.

@@ -60,7 +60,7 @@ class Selection:
 
     @property
     def criterion(self) -> str:
-        """Name in ``CRITERIA``, D, A, I, E, Ds or As; of scenarios "Mean(D)"."""
+        """Name in ``CRITERIA``, as D or I; of scenarios "Mean(D)"."""
         return self.problem.criterion.name
 
     @property
@@ -100,7 +100,8 @@ class Selection:
     @cached_property
     def in_scenarios(self) -> ScenarioTable | None:
         """The efficiency in each scenario; None where there is one only."""
-        if (joint := self.problem.joint) is None:
+        joint = self.problem.joint
+        if joint is None or self.criterion == "G":
             return None
         from jaxcal.selection.in_scenarios import in_scenarios
 

@@ -34,9 +34,11 @@ _TRIES = 200  # random selections, before the greedy one, where all are singular
 def solve_random(problem: Problem, *, seed: int | np.random.Generator) -> Solution:
     """The baseline of the paper: drawn uniformly, never singular, required first."""
     rng = np.random.default_rng(seed)
+    ruled = problem.constraints is not None or np.ndim(problem.max_replicates) > 0
+    start = exchange.Climbs(problem, checked_seed(rng)).random_start if ruled else None
     for _ in range(_TRIES):  # none singular in any scenario
-        indices = random_indices([problem], rng)[0][0]
-        if np.isfinite(problem.log_det(indices)):
+        indices = start() if start else random_indices([problem], rng)[0][0]
+        if problem.allows(indices) and np.isfinite(problem.log_det(indices)):
             return Solution(indices, seed=seed if isinstance(seed, int) else None)
     return exchange.solve_greedy(problem)
 
@@ -45,7 +47,7 @@ def random_indices(
     problems: Sequence[Problem], rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """(B, k) drawn until none is singular, of problems of one shape, and log det S."""
-    k, cap = problems[0].k, min(problems[0].max_replicates, problems[0].k)
+    k, cap = problems[0].k, int(problems[0].upper.max())
     required, count = np.array([p.required for p in problems]), len(problems)
     taken = ~np.array([p.available for p in problems]).repeat(cap, axis=1)
     indices, values = np.empty((count, k), np.int64), np.empty(count)
@@ -101,10 +103,10 @@ def _policy(
             'method must be auto, exact or exchange here: "policy" is trained for '
             f"criterion D, got {problem.criterion.name}"
         )
-    if problem.max_replicates > 1:
+    if problem.constraints is not None or np.max(problem.upper) > 1:
         raise ValueError(
             'max_replicates must be 1 with method "policy", which picks distinct '
-            f"postures, got {problem.max_replicates}"
+            f"postures and keeps no constraints, got {problem.max_replicates}"
         )
     indices = choose([problem], decoding, num, seed, checkpoint)[0]
     return Solution(np.asarray(indices, dtype=np.int64), seed=seed)

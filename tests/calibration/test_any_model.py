@@ -293,6 +293,46 @@ def test_uncertain_commands_are_estimated_beside_the_parameters(
     np.testing.assert_allclose(found.estimated_commands, told + moved, atol=1e-5)
 
 
+def test_pearsons_data_with_yorks_weights() -> None:
+    """York, 1966: slope -.480533, intercept 5.47991; and scipy's odr."""
+    x = np.array([0.0, 0.9, 1.8, 2.6, 3.3, 4.4, 5.2, 6.1, 6.5, 7.4])
+    y = np.array([5.9, 5.4, 4.4, 4.6, 3.5, 3.7, 2.8, 2.8, 2.4, 1.5])
+    of_x = np.array([1000, 1000, 500, 800, 200, 80, 60, 20, 1.8, 1.0]) ** -0.5
+    of_y = np.array([1, 1.8, 4, 8, 20, 20, 70, 70, 100, 500]) ** -0.5
+    noise = Noise(std=of_y[:, None], command_std=of_x[:, None])
+    found = identify(x[:, None], y[:, None], noise=noise)
+    np.testing.assert_allclose(found.matrix[0, 0], -0.480533407, atol=1e-8)
+    np.testing.assert_allclose(found.bias[0], 5.47991022, atol=1e-7)
+    from scipy import odr
+
+    line = odr.Model(lambda beta, x: beta[0] * x + beta[1])
+    data = odr.RealData(x, y, sx=of_x, sy=of_y)
+    other = odr.ODR(data, line, beta0=[-0.5, 5.0], sstol=1e-14).run()
+    errors = np.sqrt(np.diag(other.cov_beta))
+    np.testing.assert_allclose(found.standard_errors, errors, rtol=1e-3)
+
+
+def test_commands_that_are_exact_in_some_rows_stay_there() -> None:
+    """The limit of a standard deviation that goes to zero."""
+    rng = np.random.default_rng(2)
+    commands, measured = waves(7, 14)
+    spread = rng.uniform(0.02, 0.1, commands.shape)
+    exact = rng.random(commands.shape) < 0.4
+    found, near = (
+        identify(
+            commands,
+            measured,
+            model=WAVE,
+            noise=Noise(0.05, command_std=np.where(exact, least, spread)),
+            loss="gaussian",
+        )
+        for least in (0.0, 1e-7)
+    )
+    np.testing.assert_array_equal(found.estimated_commands[exact], commands[exact])
+    np.testing.assert_allclose(found.parameters, near.parameters, atol=1e-6)
+    np.testing.assert_allclose(found.standard_errors, near.standard_errors, rtol=1e-4)
+
+
 # -- uncertainty -----------------------------------------------------------------------
 
 
@@ -559,6 +599,7 @@ def broken(method: str, answer: Any) -> Any:
         ({"noise": Noise(np.ones((3, 2)))}, r"std of the noise must be .* \(3, 2\)"),
         ({"noise": Noise(1.0, command_std=[1, 2, 3])}, "command_std must be one"),
         ({"noise": Noise(1.0, command_std=np.inf)}, "must leave fewer unknown"),
+        ({"noise": Noise(1.0, command_std=np.ones((3, 2)))}, "command_std must have"),
         ({"noise_std": 1.0, "common_noise": True}, "give one of them"),
         (
             {"noise": "0.1"},

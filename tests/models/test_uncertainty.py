@@ -131,6 +131,10 @@ def test_a_level_of_noise_for_everything_each_output_or_each_candidate():
         ({"command_std": -1.0}, "command_std must not be negative"),
         ({"command_std": 1.0}, "needs std or covariance of the readings beside it"),
         ({"std": 1.0, "command_std": 1.0}, "needs the derivative by the commands"),
+        (
+            {"std": 1.0, "command_std": [[1.0], [np.inf]]},
+            "inf in every row of a column",
+        ),
     ],
 )
 def test_noise_that_cannot_be_is_refused(arguments, message):
@@ -181,6 +185,7 @@ def test_noise_of_each_candidate_goes_with_the_available_ones():
     jaxcal.Noise(0.3), jaxcal.Noise([0.1, 0.2]), jaxcal.Noise(np.full((4, 2), 0.5)),
     jaxcal.Noise(covariance=[[1.0, 0.2], [0.2, 2.0]]),
     jaxcal.Noise(0.1, command_std=[0.2, np.inf]),
+    jaxcal.Noise(0.1, command_std=[[0.1, 0.3], [0.2, 0.1], [0.0, 0.4], [1.0, 0.2]]),
 ])  # fmt: skip
 def test_rows_are_weighed_by_the_whitening_matrices(noise):
     rng = np.random.default_rng(0)

@@ -99,7 +99,7 @@ def test_nothing_moves_without_confirmation(tmp_path, capsys):
         code = main(["calibrate", "--config", str(tmp_path / "rig.toml"),
                      "--out", str(tmp_path / "runs")])  # fmt: skip
         assert code == 2
-        assert "confirm with --arm" in capsys.readouterr().out
+        assert "pass --arm to confirm" in capsys.readouterr().out
         assert sim.server.requests == 0
 
 

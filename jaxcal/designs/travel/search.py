@@ -157,10 +157,10 @@ def _require_travel(offer: CandidateSet, motion: Motion) -> Array:
     """(M, n) commands between which the device travels; refuses what has no run."""
     if offer.scenarios is not None:
         raise ValueError("scenarios must be left out with fastest and pareto")
-    if offer.max_replicates != 1:
+    if np.any(offer.max_replicates != 1) or offer.constraints is not None:
         raise ValueError(
             "max_replicates must be 1 with fastest and pareto, which visit a posture "
-            f"once, got {offer.max_replicates}"
+            f"once and keep no constraints, got {offer.max_replicates}"
         )
     if offer.candidates is None:
         raise ValueError(

@@ -21,12 +21,14 @@ from jaxcal import compiled
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.information.blocks import gram, largest_rank
 from jaxcal.selection.criteria import Criterion, ScenarioCriterion
+from jaxcal.selection.problem.constraints import Constraints
 
 __all__ = ["JointScenarios", "Scenario", "branch_and_bound"]
 
 TOLERANCE = 1e-10  # of phi of "det"; of the others a share of it
 _MEMORY = 64 * 2**20  # bytes of open nodes up to which the best bound goes first
 _USEFUL = {"trace": -0.5, "least": 2.0}  # of values near 1: an efficiency of a half
+_CUTS, _DEAR, _PRICED = 30, 1.0, 1e-5  # of prices: tries, a high one, near enough
 _FREE = 3e6  # node x M q p^2 spent on a proof although ``enough`` is reached: 10 ms
 
 Array = NDArray[np.float64]
@@ -131,6 +133,7 @@ def branch_and_bound(
     deadline: Deadline = NEVER,
     enough: float | None = None,
     root_only: bool = False,
+    rules: Constraints | None = None,
 ) -> BranchResult:
     """The ``best`` selections by phi of the criterion, with proof.
 
@@ -144,15 +147,65 @@ def branch_and_bound(
         enough: share of the best possible (its efficiency) at which to stop, once the
             proof has had a fair try.
         root_only: stop at the bound of the relaxation.
+        rules: on the counts.
     """
     incumbents = _incumbents(best, len(start))
     started = judged_by.search(upper, start, incumbents)
     counts = np.array([lower, upper, start], dtype=np.float64)
+    begin = counts[2]
+    if rules is not None:
+        begin = _price(started.search, rules, counts, deadline.part(0.2))
     good = (0.0, np.inf) if root_only else (0.0, -np.inf)
     if enough is not None:
         slope, shift = judged_by.criterion.enough(enough)
         good = slope, shift / started.scale
-    return _searched(started, incumbents, counts, deadline, good, root_only)
+    return _searched(started, incumbents, counts, begin, deadline, good, root_only)
+
+
+def _price(search: Any, rules: Constraints, begun: Array, deadline: Deadline) -> Array:
+    """Have the search keep the rules, at prices that make the bound at the root least.
+
+    Any prices from 0 give true bounds; these are found by cutting planes (Kelley).
+    ``begun`` (3, M): bounds of the counts, and counts. Returns (M,) those where the
+    relaxation ended.
+    """
+    from scipy import optimize
+
+    size = np.abs(rules.costs).max(axis=1, initial=0.0)
+    size = np.where(size > 0.0, size, 1.0)
+    costs = np.ascontiguousarray(rules.costs / size[:, None])
+    most, counts = rules.most / size, begun[2].copy()
+
+    def bound(prices: Array) -> tuple[float, Array]:
+        search.limit(costs, most, rules.order, np.maximum(prices, 0.0))
+        counts[:] = begun[2]  # from elsewhere the climb may end early
+        value = search.relaxed(begun[0], begun[1], counts, deadline.remaining_s)
+        return value, most - costs @ counts
+
+    prices, best, cheapest, cuts = np.zeros(len(most)), np.inf, np.zeros(len(most)), []
+    dearest = _DEAR
+    for _ in range(_CUTS):
+        value, slope = bound(prices)
+        if value < best:
+            best, cheapest = value, prices
+        free = not prices.any() and (slope >= 0.0).all()
+        if free or not np.isfinite(value) or deadline.passed:
+            break
+        cuts.append([*slope, -1.0, slope @ prices - value])
+        rows = np.array(cuts)
+        limits = [(0.0, dearest)] * len(most) + [(None, None)]
+        objective = [0.0] * len(most) + [1.0]
+        found = optimize.linprog(objective, rows[:, :-1], rows[:, -1], bounds=limits)
+        if found.x is None:
+            break
+        if (found.x[:-1] > 0.99 * dearest).any() and dearest < 1e3 * _DEAR:
+            dearest *= 4.0
+        elif best - found.x[-1] <= _PRICED * max(1.0, abs(best)):
+            break
+        # Halfway: a cut may be off by what the relaxation was not solved to.
+        prices = 0.5 * (found.x[:-1] + cheapest)
+    bound(cheapest)
+    return counts
 
 
 def _packs(num_scenarios: int, blocks: Array) -> bool:
@@ -174,6 +227,7 @@ def _searched(
     started: _KernelSearch,
     incumbents: tuple[Array, Array, Indices],
     begun: Array,
+    begin: Array,
     deadline: Deadline,
     good: tuple[float, float],
     root_only: bool,
@@ -184,6 +238,7 @@ def _searched(
         started: the kernel's search.
         incumbents: its best selections.
         begun: (3, M) lower and upper bounds of the counts, and a good selection.
+        begin: (M,) counts that the relaxation begins with.
         deadline: when to stop with what there is.
         good: enough is a bound of at most the first times the best, plus the second.
         root_only: stop at the bound of the relaxation.
@@ -194,7 +249,7 @@ def _searched(
     num_blocks = len(low)
     search.offer(low, high, counts, deadline.remaining_s)
     nodes, bounds = np.empty((64, 3, num_blocks)), np.full(64, np.inf)
-    nodes[0] = low, high, counts
+    nodes[0] = low, high, begin
     tries = 1 if root_only else int(_FREE / work)
     size, done, bound, going = 1, 0, np.inf, True
     while size and going:

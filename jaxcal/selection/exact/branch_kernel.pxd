@@ -77,6 +77,14 @@ cdef class Search:
     cdef double* packed  # (triangle,) work space
     cdef double* squares  # (M, triangle) where it packs
     cdef Watch watch
+    cdef bint ruled  # whether rules of the counts are given, as the next five say
+    cdef const double[:, ::1] rules  # (r, M)
+    cdef const double[::1] most_of  # (r,)
+    cdef const Py_ssize_t[:, ::1] order_of  # (r, M)
+    cdef double[::1] price  # (M,) what a count pays
+    cdef double paid  # beside that
+    cdef double _priced(self, double value, const double* c) noexcept nogil
+    cdef bint _keeps(self, const double* low, const double* high) noexcept nogil
     cdef Py_ssize_t _lay_out(self, double* room) noexcept
     cdef void _pack(self, const double* matrix, double* into, double times) noexcept nogil
     cdef void _sum(self, const double* low, const double* counts, const double* start, double* gram) noexcept nogil
@@ -96,6 +104,7 @@ cdef class Search:
     cdef void _leverages(self) noexcept nogil
     cdef double _linear_gain(self, const double* low, const double* high, const double* c) noexcept nogil
     cdef int _working_set(self, const double* low, const double* high, const double* c) noexcept nogil
+    cdef void _two_sided(self, int size) noexcept nogil
     cdef double _solve(self, int m, int size) noexcept nogil
     cdef void _quadratic_step(self, int m) noexcept nogil
     cdef double _at(self, int kind, const double* low, const double* c) noexcept nogil

@@ -139,6 +139,7 @@ class Search:
         )
         copy(self.blocks, address(given[0]), given.shape[0])
         i: cython.Py_ssize_t
+        self.ruled = False
         for i in range(self.count if self.packs else 0):
             block = self.blocks + i * self.q * self.p
             for a in range(self.p * self.p):
@@ -192,6 +193,68 @@ class Search:
                 at += 1
             into[at] = matrix[a * self.p + a]
             at += 1
+
+    # --- linear rules of the counts -------------------------------------------------
+
+    def limit(self, rules, most, order, prices):
+        """Let ``rules @ counts <= most`` hold, which a bound pays ``prices`` for.
+
+        phi of a selection is at most ``phi - prices @ (rules @ counts - most)``, for
+        prices from 0: Lagrange's relaxation, concave where phi is.
+
+        Args:
+            rules, most: (r, M) and (r,).
+            order: (r, M) candidates, the cheapest of each rule first.
+            prices: (r,) in the kernel's phi.
+        """
+        self.ruled = True
+        self.rules, self.most_of, self.order_of = rules, most, order
+        self.price, self.paid = np.asarray(prices) @ rules, prices @ most
+
+    def relaxed(self, low, high, counts, seconds):
+        """The bound of a node, (M,) bounds and counts, these as they end."""
+        self.watch = begin(seconds)
+        start = address(self.node[0])
+        i: cython.Py_ssize_t
+        for i in range(self.count):
+            start[i], start[self.count + i] = low[i], high[i]
+            start[2 * self.count + i] = counts[i]
+        kind = self._kind_of(start)
+        bound = self._relax(
+            kind, start, start + self.count, start + 2 * self.count, -1e300, 0.0
+        )
+        for i in range(self.count):
+            counts[i] = start[2 * self.count + i]
+        return bound
+
+    def _priced(self, value, c):
+        """The value with what the counts c pay; the base likewise."""
+        if not self.ruled:
+            return value
+        paid: cython.double = self.paid
+        for i in range(self.count):
+            paid -= self.price[i] * c[i]
+        self.base += paid
+        return value + paid
+
+    def _keeps(self, low, high):
+        """Whether a choice of k within the bounds can keep each rule by itself."""
+        for r in range(self.rules.shape[0] if self.ruled else 0):
+            room: cython.double = self.most_of[r]
+            to_choose: cython.double = self.k
+            for i in range(self.count):
+                room -= low[i] * self.rules[r, i]
+                to_choose -= low[i]
+            for t in range(self.count):
+                if to_choose <= 0.0:
+                    break
+                i = self.order_of[r, t]
+                taken = min(high[i] - low[i], to_choose)
+                room -= taken * self.rules[r, i]
+                to_choose -= taken
+            if room < 0.0:
+                return False
+        return True
 
     # --- the criterion at fractional counts -----------------------------------------
 
@@ -614,7 +677,33 @@ class Search:
             if inside or (wished and size < room):
                 self.which[size] = i
                 size += 1
+        if fractional == 0:
+            self._two_sided(size)
         return size
+
+    def _two_sided(self, size):
+        """Let counts of ``which`` that all wish to grow, or all to shrink, give half of
+        their places to others, without which they can hardly move."""
+        grows: cython.int = 0
+        wishes: cython.int = 0
+        for g in range(size):
+            if self.wish[self.which[g]] > 0.0:
+                wishes += 1
+                grows += self.leverage[self.which[g]] > self.cut
+        if wishes == 0 or (0 < grows and grows < wishes):
+            return
+        for f in range(size // 2, size):
+            best: cython.Py_ssize_t = -1
+            for o in range(self.opened):
+                i = self.open[o]
+                up: cython.bint = self.leverage[i] > self.cut
+                if self.wish[i] > 0.0 and up == (grows == 0):
+                    if best < 0 or self.wish[i] > self.wish[best]:
+                        best = i
+            if best < 0:
+                return
+            self.which[f] = best
+            self.wish[best] = 0.0
 
     def _solve(self, m, size):
         """Where the free counts would go: ``right``; the multiplier of their sum.
@@ -749,6 +838,8 @@ class Search:
         for step in range(_MAX_STEPS):
             self.now = kind
             self._leverages()
+            for o in range(self.opened if self.ruled else 0):
+                self.leverage[self.open[o]] -= self.price[self.open[o]]
             gain = self._linear_gain(low, high, c)
             bound = self.base + gain
             if not bound > -INFINITY:  # rounding left no number
@@ -774,7 +865,7 @@ class Search:
                     break
                 self.smoothing *= 4.0 if changed else 1.0
             if changed:
-                value = self._evaluate(kind)
+                value = self._priced(self._evaluate(kind), c)
                 continue
             if solved:
                 break
@@ -796,7 +887,7 @@ class Search:
         if not value > -INFINITY:
             self._spread(low, high, c)
             value = self._at(kind, low, c)
-        return value
+        return self._priced(value, c)
 
     def _step(self, kind, low, high, c, value):
         """phi after a step of the working set, which is halved while it falls short."""
@@ -819,7 +910,7 @@ class Search:
                 near = floor(c[j] + 0.5)
                 if fabs(c[j] - near) < _ROUNDING:
                     c[j] = near
-            after = self._at(kind, low, c)
+            after = self._priced(self._at(kind, low, c), c)
             if after >= value + 1e-4 * part * promised or part < 1e-6:
                 return after
             part *= 0.5
@@ -836,6 +927,8 @@ class Search:
         """Insert a selection into the sorted list of the best, once."""
         best = self.best_values
         place: cython.Py_ssize_t = best.shape[0] - 1
+        if not self._keeps(counts, counts):
+            return
         value = self._worth(counts)
         if not value > best[place]:
             return
@@ -975,7 +1068,7 @@ class Search:
                     low[i] = high[i] - units
             total_low += low[i]
             total_high += high[i]
-        if total_low > self.k or total_high < self.k:
+        if total_low > self.k or total_high < self.k or not self._keeps(low, high):
             return -1
         settled: cython.bint = total_low == self.k or total_high == self.k
         if settled:
@@ -1239,6 +1332,8 @@ class JointSearch(Search):
             for i in range(m):
                 c = self.which[i]
                 ends[i] = self.scale[s] * leverage[c] - self.leverage[c]
+                if self.ruled:
+                    ends[i] -= self.price[c]
             for i in range(m):
                 for j in range(m):
                     out[i * m + j] += weight * ends[i] * ends[j]

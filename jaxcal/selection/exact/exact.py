@@ -213,6 +213,8 @@ def _branched(
     judged_by: Scenario | JointScenarios = members[0]
     if (joint := problem.joint) is not None:
         judged_by = JointScenarios(members, joint.joined, joint.weights, joint.terms())
+    of_counts = problem.constraints
+    options["rules"] = None if of_counts is None else of_counts.of(keep)
     return branch_and_bound(judged_by, *rules, **options)
 
 
@@ -341,6 +343,8 @@ def _groups(problem: Problem, merge: bool) -> tuple[Indices, Indices]:
     keep = np.flatnonzero(problem.available)
     if merge:
         raw = [member.raw[keep].reshape(len(keep), -1) for member in problem.members]
+        if problem.constraints is not None:
+            raw.append(problem.constraints.costs[:, keep].T)
         flat = np.concatenate(raw, axis=1) if len(raw) > 1 else raw[0]
         total = np.sort(flat.sum(axis=1))
         if (total[1:] == total[:-1]).any():  # otherwise no two are equal

@@ -21,6 +21,7 @@ from jaxcal import compiled
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection.criteria import Criterion
 from jaxcal.selection.problem import Problem, ScenarioProblem, Solution
+from jaxcal.selection.problem.constraints import Constraints
 
 __all__ = [
     "Climbs",
@@ -52,10 +53,17 @@ _MENDING = 10  # random starts where all greedy ones are singular
 _CLIMBS = 2.5e5  # k p^3 of the climbs of E in one call, from each kind of start
 
 
-def solve(problem: Problem, *, seed: int, restarts: int | None) -> Solution:
-    """The solver "exchange"."""
+def solve(
+    problem: Problem,
+    *,
+    seed: int,
+    restarts: int | None,
+    time_limit: float | None = None,
+) -> Solution:
+    """The solver "exchange"; without a time limit all starts are climbed."""
     restarts = restarts or default_restarts(problem)
-    indices = exchange_indices(problem, restarts, seed)
+    deadline = NEVER if time_limit is None else Deadline(time_limit)
+    indices = exchange_indices(problem, restarts, seed, deadline)
     return Solution(indices, seed=seed, restarts=restarts)
 
 
@@ -67,30 +75,21 @@ def solve_greedy(problem: Problem) -> Solution:
 def greedy_indices(problem: Problem) -> Indices:
     """(k,) candidates in the order picked, the required ones first.
 
-    Gains count a share of what the candidates not chosen yet will give; for D it is the
-    better of that and of plain gains from a small ridge in the coordinates where all
-    candidates together say as much of every direction. Swaps mend a singular
-    selection. For E the gain is that in the sum of the variances, which is at most p
-    times and at least once the largest: an incomplete selection has no least eigenvalue
-    to raise.
+    Gains count a share of what the candidates not chosen yet will give, in the
+    coordinates where all candidates together say as much of every direction: the best
+    of several shares, the last a small ridge. Swaps mend a singular selection. For E
+    the gain is that in the sum of the variances, which is at most p times and at least
+    once the largest: an incomplete selection has no least eigenvalue to raise.
     """
-    climbs = Climbs(problem, 0)
-    for share, swaps in ((climbs.share, 0), (_RANK_FIRST, 0), (climbs.share, 1)):
-        chosen, phi = climbs.climbed(problem.required, share, swaps)
-        if phi > -np.inf:
-            break
-    else:
-        return climbs.best_of(1 + _MENDING)[0]
-    if problem.criterion.name != "D" or _affine(problem):
-        return chosen
-    plain = climbs.climbed(problem.required, _RANK_FIRST, 0)
-    return plain[0] if plain[1] > phi + 1e-9 * max(1.0, abs(phi)) else chosen
-
-
-def _affine(problem: Problem) -> bool:
-    """Whether candidates are rows [u, 1], of which gains with a share choose better."""
-    last = problem.raw[problem.available, :, -1]
-    return bool(last.shape[1] == 1 and (last == last[0]).all() and problem.multiplicity)
+    climbs, best, phi = Climbs(problem, 0), problem.required, -np.inf
+    for share in (climbs.share, *_FURTHER, _RANK_FIRST):
+        chosen, value = climbs.climbed(problem.required, share, 0)
+        if not phi > -np.inf or value > phi + 1e-9 * max(1.0, abs(phi)):
+            best, phi = chosen, value
+    if phi > -np.inf:
+        return best
+    chosen, phi = climbs.climbed(problem.required, climbs.share)
+    return chosen if phi > -np.inf else climbs.best_of(1 + _MENDING)[0]
 
 
 def default_restarts(problem: Problem) -> int:
@@ -100,7 +99,7 @@ def default_restarts(problem: Problem) -> int:
     200; replicates leave more local optima, and 1 in 1,000 selections of 12 was by 400,
     so they get more. Large problems of blocks get fewer, to take 10 to 15 ms.
     """
-    most = 200 if problem.max_replicates == 1 else 600
+    most = 200 if np.max(problem.max_replicates) == 1 else 600
     if problem.rank_one:
         return most
     if problem.criterion.kind == "least":
@@ -121,6 +120,7 @@ class Climbs:
 
     def __init__(self, problem: Problem, seed: int, deadline: Deadline = NEVER) -> None:
         self._required, self._deadline = problem.required, deadline
+        self._problem, self._allows = problem, problem.allows
         _, q, p = problem.blocks.shape
         self.share = _SHARE * min(1.0, problem.k * q / p) ** 6
         self._terms: tuple[tuple[Array, Array], ...] = ()  # of the swaps that raise E
@@ -161,7 +161,7 @@ class Climbs:
             self._climber.weigh(*self._terms[swaps == 2])
         found: tuple[Indices, float]
         found = self._climber.climb(start, share, swaps, self._deadline.remaining_s)
-        return found
+        return found if self._allows(found[0]) else (found[0], -np.inf)
 
     def best_of(self, restarts: int) -> tuple[Indices, float]:
         """The best local optimum from greedy selections and then random starts."""
@@ -178,6 +178,11 @@ class Climbs:
             best, phi = self._climber.random_climbs(
                 more, best, phi, self._deadline.remaining_s
             )
+        if not phi > -np.inf and (rules := self._problem.constraints) is not None:
+            one = self._problem  # rules that a choice one by one runs against
+            counts = rules.selection(one.k, one.lower, one.upper)
+            assert counts is not None  # or there were no problem
+            return self.climbed(_in_order(one, counts))
         return best, phi
 
     def best_least(self, problem: Problem, restarts: int) -> tuple[Indices, float]:
@@ -202,11 +207,24 @@ class Climbs:
         return max(climbed, key=lambda one: one[1])
 
 
+def _in_order(problem: Problem, counts: Indices) -> Indices:
+    """(k,) candidates of counts (M,), the required first."""
+    rest = np.repeat(np.arange(len(counts)), counts - problem.lower)
+    return np.concatenate([problem.required, rest])
+
+
 def _lengths(criterion: Criterion) -> Array:
     """(s,) by which combinations are divided for a kernel: variances near 1."""
     if criterion.form == "subset":
         return np.asarray(np.linalg.norm(criterion.root, axis=1))
     return np.ones(len(criterion.root))
+
+
+def rules_of(rules: Constraints | None, count: int) -> tuple[Array, Array, Any]:
+    """Costs (r, M), most (r,) and order (r, M) as a kernel takes them."""
+    if rules is None:
+        rules = Constraints(np.zeros((0, count)), np.zeros(0))
+    return rules.costs, rules.most, rules.order
 
 
 def _climber(problem: Problem, seed: int) -> Any:
@@ -218,11 +236,11 @@ def _climber(problem: Problem, seed: int) -> Any:
     return kernel.Climber(
         "trace" if criterion.form == "least" else criterion.form,
         *map(np.ascontiguousarray, (problem.blocks, problem.prior, root)),
-        problem.available.view(np.uint8),
-        min(problem.max_replicates, problem.k),
+        problem.upper.astype(np.intp),
         problem.required,
         problem.k,
         seed,
+        *rules_of(problem.constraints, len(problem.available)),
     )
 
 

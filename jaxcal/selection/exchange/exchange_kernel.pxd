@@ -6,8 +6,11 @@ cdef enum:
 
 cdef class Choice:
     cdef int k, fixed, groups  # to choose, of them required; groups of candidates
-    cdef const unsigned char[::1] usable  # (M,) which may be chosen
-    cdef Py_ssize_t cap, available  # how often each of them may be, and their number
+    cdef Py_ssize_t available  # candidates that may be chosen
+    cdef const Py_ssize_t[::1] caps  # (M,) how often each may be
+    cdef const double[:, ::1] rules  # (r, M), whose sums over the chosen are at most
+    cdef const double[::1] most  # (r,)
+    cdef const Py_ssize_t[:, ::1] order  # (r, M) candidates, the cheapest first
     cdef Py_ssize_t[::1] counts  # (M,)
     cdef Py_ssize_t[::1] tried  # (M,) swaps made when a candidate was last tried
     cdef Py_ssize_t[::1] chosen  # (k,), the required first
@@ -17,6 +20,8 @@ cdef class Choice:
     cdef int sweep, looked  # groups in a look at all candidates; since the clock was read
     cdef void _clear(self) noexcept nogil
     cdef void _count(self, Py_ssize_t i, int more) noexcept nogil
+    cdef bint _restrict(self, Py_ssize_t out, Py_ssize_t more) noexcept nogil
+    cdef bint _allowed(self) noexcept nogil
     cdef Py_ssize_t _draw(self, Py_ssize_t below) noexcept nogil
     cdef void _random_start(self) noexcept nogil
     cdef int _late(self) except -1 nogil

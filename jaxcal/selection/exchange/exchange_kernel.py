@@ -234,6 +234,8 @@ class Choice:
                     break
                 self._random_start()
                 reached = self._finish(True)
+                if not self._allowed():
+                    continue
                 least = value + 1e-10 * max(1.0, fabs(value))
                 if reached > least or not value > -INFINITY:
                     value = reached
@@ -251,13 +253,51 @@ class Choice:
         """Nothing is chosen."""
         for i in range(self.counts.shape[0]):
             self.counts[i] = 0
-            self.closed[i] = 0.0 if self.usable[i] else INFINITY
+            self.closed[i] = 0.0 if self.caps[i] > 0 else INFINITY
 
     def _count(self, i, more):
         """Candidate i is chosen once more, or once less."""
         self.counts[i] += more
-        is_open: cython.bint = self.usable[i] and self.counts[i] < self.cap
-        self.closed[i] = 0.0 if is_open else INFINITY
+        self.closed[i] = 0.0 if self.counts[i] < self.caps[i] else INFINITY
+
+    def _restrict(self, out, more):
+        """Close what breaks a rule once ``out`` (-1: none) has gone, with ``more`` yet
+        to come, which take the cheapest at least; true where one is left open."""
+        left: cython.bint = False
+        for i in range(self.counts.shape[0]):
+            self._count(i, 0)
+        if out >= 0:
+            self.closed[out] = 0.0
+        for r in range(self.rules.shape[0]):
+            room: cython.double = self.most[r]
+            to_come: cython.Py_ssize_t = more
+            for i in range(self.counts.shape[0]):
+                room -= self.counts[i] * self.rules[r, i]
+            if out >= 0:
+                room += self.rules[r, out]
+            for t in range(self.counts.shape[0]):
+                i = self.order[r, t]
+                if to_come <= 0:
+                    break
+                taken = min(self.caps[i] - self.counts[i], to_come)
+                room -= taken * self.rules[r, i]
+                to_come -= taken
+            for i in range(self.counts.shape[0]):
+                if self.rules[r, i] > room:
+                    self.closed[i] = INFINITY
+        for i in range(self.counts.shape[0]):
+            left = left or self.closed[i] == 0.0
+        return left
+
+    def _allowed(self):
+        """Whether what is chosen keeps the rules."""
+        for r in range(self.rules.shape[0]):
+            room: cython.double = self.most[r]
+            for i in range(self.counts.shape[0]):
+                room -= self.counts[i] * self.rules[r, i]
+            if room < 0.0:
+                return False
+        return True
 
     def _draw(self, below):
         """A whole number in [0, below) from a xorshift generator."""
@@ -268,9 +308,13 @@ class Choice:
 
     def _random_start(self):
         """Fill ``chosen`` at random, distinct where there are enough candidates."""
-        distinct: cython.bint = self.k <= self.available
+        ruled: cython.bint = self.rules.shape[0] > 0
+        distinct: cython.bint = self.k <= self.available and not ruled
         self._clear()
         for c in range(self.k):
+            if ruled and c >= self.fixed and not self._restrict(-1, self.k - c - 1):
+                for i in range(self.counts.shape[0]):  # a selection of no use
+                    self._count(i, 0)
             i = self.chosen[c] if c < self.fixed else self._draw(self.counts.shape[0])
             while c >= self.fixed and (
                 self.closed[i] > 0.0 or (distinct and self.counts[i] > 0)
@@ -297,8 +341,14 @@ class Choice:
         self._evaluate(size, False)
         self._refresh()
         while True:
-            best = -1 if self._late() else self._addition()
+            best = -1
+            if self.rules.shape[0] > 0:
+                self._restrict(-1, self.k - size - 1)
+            if not self._late():
+                best = self._addition()
             if best < 0:
+                for i in range(self.counts.shape[0]):
+                    self._count(i, 0)
                 self._fill(size)
                 return 0
             self.chosen[size] = best
@@ -362,6 +412,8 @@ class Choice:
                 continue
             self.tried[out] = swaps
             rise = _IMPROVES * max(1.0, fabs(value))
+            if self.rules.shape[0] > 0:
+                self._restrict(out, 0)
             if least:
                 best = self._strongest(at, address(after))
             else:
@@ -422,14 +474,17 @@ class Climber(Choice):
         blocks: (M, q, p) whitened.
         prior: (p, p).
         root: C (s, p).
-        usable: (M,) which may be chosen; blocks of others are zero.
-        cap: how often each of them may be.
+        caps: (M,) how often each may be chosen; blocks of those that may not are zero.
         required: (r,) candidates that are chosen in any case.
         k: candidates to choose.
         seed: of the random starts.
+        rules, most: (r, M) and (r,): ``rules @ counts <= most``.
+        order: (r, M) candidates, the cheapest of each rule first.
     """
 
-    def __init__(self, form, blocks, prior, root, usable, cap, required, k, seed):
+    def __init__(
+        self, form, blocks, prior, root, caps, required, k, seed, rules, most, order
+    ):  # fmt: skip
         count: cython.Py_ssize_t = blocks.shape[0]
         q: cython.Py_ssize_t = blocks.shape[1]
         p: cython.Py_ssize_t = blocks.shape[2]
@@ -443,8 +498,9 @@ class Climber(Choice):
         self.size = q * q * WIDE
         self.rows = q == 1 and self.kind == DET
         self.blocks, self.prior, self.root = blocks, prior, root
-        self.usable, self.available = usable, np.count_nonzero(usable)
-        self.cap, self.counts = cap, np.zeros(count, dtype=np.intp)
+        self.available = np.count_nonzero(caps)
+        self.caps, self.counts = caps, np.zeros(count, dtype=np.intp)
+        self.rules, self.most, self.order = rules, most, order
         self.sweep = self.groups
         self.chosen = np.zeros(k, dtype=np.intp)
         self.times, self.tried = np.zeros((2, count), dtype=np.intp)
@@ -732,9 +788,9 @@ class Climber(Choice):
                 best, most = c * WIDE + j, alone[j]
         if best < 0:
             best = 0
-            while self.closed[best] > 0.0:
+            while best < self.counts.shape[0] and self.closed[best] > 0.0:
                 best += 1
-        return best
+        return best if best < self.counts.shape[0] else -1
 
     def _replacement(self, out, value, rise):
         """The candidate that raises phi most in the place of ``out``; -1: none."""
@@ -871,7 +927,8 @@ class JointClimber(Choice):
         self.total = np.zeros(WIDE)
         lead: Climber = self.climbers[0]
         self.k, self.fixed, self.groups = lead.k, lead.fixed, lead.groups
-        self.usable, self.available, self.cap = lead.usable, lead.available, lead.cap
+        self.available, self.caps = lead.available, lead.caps
+        self.rules, self.most, self.order = lead.rules, lead.most, lead.order
         self.counts, self.tried, self.chosen = lead.counts, lead.tried, lead.chosen
         self.closed, self.state = lead.closed, lead.state
         self.ahead = np.zeros(self.groups * WIDE)

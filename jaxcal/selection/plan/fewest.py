@@ -323,8 +323,9 @@ def _request(
     of_parameters = criterion == "parameters"
     if parameters is not None and not of_parameters:
         raise ValueError("parameters goes with criterion='parameters' only")
-    cap = whole_number("max_replicates", offer.max_replicates, 1)
-    total = max(1, int(offer.available.sum()) * cap)
+    if offer.constraints is not None:
+        raise ValueError("constraints go with select and score, not with plan")
+    total = max(1, int((offer.available * np.int64(offer.max_replicates)).sum()))
     model, std = offer.model, _reading_std(offer, noise_std)
     shared = False  # one regressor for all outputs?
     if model is not None and std is not None:

@@ -6,6 +6,7 @@ their own, joined. ``make_problems`` makes a batch of the affine model's.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ from jaxcal.selection.criteria import (
     CRITERIA,
     Coordinates,
     Criterion,
+    G,
+    Largest,
     Mean,
     ScenarioCriterion,
     criterion_of,
@@ -44,13 +47,16 @@ from jaxcal.selection.problem.candidate_set import (
     rounding_of,
     usable_numbers,
 )
-from jaxcal.selection.problem.problem import Problem, joined_problem
+from jaxcal.selection.problem.constraints import Constraints
+from jaxcal.selection.problem.problem import Problem, ScenarioProblem, joined_problem
 
 __all__ = ["make_problems", "problem_of"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+
+_LARGEST = 3e7  # numbers of all predictions' problems: 240 MB
 
 
 def problem_of(
@@ -73,6 +79,8 @@ def problem_of(
     of_one = criterion_of(joined.criterion, region, default)
     if offer.scenarios is None:
         one = _problem_of_one(offer, k, of_one)
+        if isinstance(of_one, G):
+            return _of_largest([one])
         return joined_problem([one], np.ones(1), joined, None)
     members = []
     for s, alone in enumerate(offer.by_scenario()):
@@ -80,6 +88,10 @@ def problem_of(
             members.append(_problem_of_one(alone, k, of_one))
         except ValueError as error:
             raise ValueError(f"in scenario {s}: {error}") from None
+    if isinstance(of_one, G):
+        if not joined.least or joined.of_efficiency:
+            raise ValueError('criterion of scenarios must be jaxcal.Worst("G") for G')
+        return _of_largest(members)
     compared = offer.model is not None and len(members) > 1
     nominal = _problem_of_one(offer, k, of_one) if compared else None
     return joined_problem(members, offer.scenarios.weights, joined, nominal)
@@ -103,7 +115,29 @@ def _problem_of_one(
         raw, root, criterion, k, offer.available, offer.required,
         offer.max_replicates, names=blocks.names, times=blocks.times, region=region,
         candidates=offer.candidates, model=offer.model,
+        constraints=offer.constraints,
     )  # fmt: skip
+
+
+def _of_largest(problems: list[Problem]) -> Problem:
+    """The problem of the largest variance of all predictions, in every scenario."""
+    k, members = max(one.k for one in problems), []
+    for one in problems:
+        for row in one.criterion.root:
+            of_row = one.criterion.of_rows(row[None], unit=one.criterion.unit)
+            members.append(dataclasses.replace(one, k=k, criterion=of_row))
+    if not members:
+        raise ValueError("criterion G needs a prediction that depends on a parameter")
+    if len(members) * problems[0].blocks.size > _LARGEST:
+        raise ValueError(
+            f"criterion G takes {_LARGEST:.0e} numbers at most, got {len(members)} "
+            f"predictions with {problems[0].blocks.size} of the candidates; give a "
+            "smaller region"
+        )
+    fields = {f.name: getattr(members[0], f.name) for f in dataclasses.fields(Problem)}
+    fields["criterion"] = Largest().within(members[0].criterion)
+    weights = np.full(len(members), 1.0 / len(members))
+    return ScenarioProblem(**fields, members=tuple(members), weights=weights)
 
 
 def _with_measured(root: Array, blocks: Array) -> Array:
@@ -169,7 +203,7 @@ def _checked_problem(
     k: int | None,
     available: Mask,
     required: ArrayLike | None,
-    max_replicates: int,
+    max_replicates: int | Indices,
     *,
     white: WhiteBlocks | None = None,
     names: tuple[str, ...] = (),
@@ -177,6 +211,7 @@ def _checked_problem(
     region: Array | None = None,
     candidates: Array | None = None,
     model: Model | None = None,
+    constraints: Constraints | None = None,
 ) -> Problem:
     """The problem of blocks (M, q, p) that were checked; whitened here.
 
@@ -192,12 +227,15 @@ def _checked_problem(
         region: (R, q, p) blocks that the criterion is about, if it is of a region.
         candidates: (M, n), where there are any.
         model: what made blocks of them.
+        constraints: on how often candidates are chosen.
     """
     readings, count = raw, int(np.count_nonzero(available)) * raw.shape[1]
     if raw.shape[1] > raw.shape[2]:  # as much information in p rows, at q^3 less cost
         raw = np.asarray(np.linalg.qr(raw, mode="r"))
     k = _check_k(k, raw, available, root, regressors=not names)
-    cap = whole_number("max_replicates", max_replicates, 1)
+    cap = max_replicates
+    if np.ndim(cap) == 0:
+        cap = whole_number("max_replicates", cap, 1)
     _require_enough(available, k, cap)
     forced = _checked_required(required, available, k)
     computed = bool(names) and model is not None
@@ -214,12 +252,15 @@ def _checked_problem(
     at = Coordinates(white, names, count, region, times)
     problem = Problem(
         white, k, available, forced, cap, criterion.within(at), times, raw, readings,
-        root, candidates, model,
+        root, candidates, model, constraints,
     )  # fmt: skip
     for array in (raw, readings, root, available, forced):
         array.flags.writeable = False
     if len(forced):
         _check_required_rank(problem)
+    if constraints is not None:
+        if constraints.selection(k, problem.lower, problem.upper) is None:
+            raise ValueError(f"constraints must leave a selection of k = {k}, got none")
     return problem
 
 
@@ -236,15 +277,16 @@ def _uninformed(
     )
 
 
-def _require_enough(mask: Mask, k: int, cap: int) -> None:
+def _require_enough(mask: Mask, k: int, cap: int | Indices) -> None:
     """Refuse fewer available candidates (M,) than k takes."""
     count = int(np.count_nonzero(mask))
     if not count:
         raise ValueError(f"available must leave at least {k} candidates, got none")
-    if count * cap < k:
+    if int((mask * np.int64(cap)).sum()) < k:
+        often = "at most max_replicates" if np.ndim(cap) else f"at most {cap}"
         raise ValueError(
             f"k must not exceed what is available: {count} candidates"
-            + (f", each at most {cap} times" if cap > 1 else "")
+            + (f", each {often} times" if np.ndim(cap) or cap > 1 else "")
             + f", got {k}"
         )
 

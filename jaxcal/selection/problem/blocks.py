@@ -142,7 +142,7 @@ class _ModelBlocks(Blocks):
 
     def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
         noise = self._read if readings else self._noise.typical(self._available)
-        for name, axes in (("std", 1), ("covariance", 2)):
+        for name, axes in (("std", 1), ("covariance", 2), ("command_std", 1)):
             shape = np.shape(getattr(noise, name))
             if len(shape) > axes:
                 raise ValueError(

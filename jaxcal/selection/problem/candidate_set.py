@@ -14,10 +14,18 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import array_of, numbers, require_finite, require_kind
+from jaxcal.checks import (
+    array_of,
+    numbers,
+    require_finite,
+    require_kind,
+    require_none,
+    whole_number,
+)
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, answered, as_model
 from jaxcal.models.uncertainty import Prior, as_noise
+from jaxcal.selection.problem.constraints import checked_constraints
 from jaxcal.selection.problem.scenarios import Scenarios, checked_weights, scenarios_of
 from jaxcal.tables import (
     COMMANDS,
@@ -62,12 +70,13 @@ class CandidateSet:
     measured: Any = None  # commands (N, n), blocks (N, q, p), of scenarios (S, N, q, p)
     available: Any = None  # (M,) bool
     required: Any = None  # candidates that must be chosen, as given
-    max_replicates: int = 1  # how often one candidate may be chosen
+    max_replicates: Any = 1  # how often one candidate may be chosen, or (M,)
     blocks: Any = None  # (M, q, p), of S scenarios (M, S, q, p), where given
     scenarios: Any = None  # a Scenarios; None: the nominal alone
     names: tuple[str, ...] | None = None  # (M,) of the candidates, the caller's own
     axes: tuple[str, ...] | None = None  # (n,) of the inputs, the caller's own
     parameters: Array | None = None  # (p,) of one scenario; None: the nominal's
+    constraints: Any = None  # a Constraints on the counts; None: no more of them
 
     def checked(self) -> Self:
         """Itself, its fields checked and the caller's arrays copied.
@@ -80,8 +89,23 @@ class CandidateSet:
             self._check_commands()
         else:
             self._check_blocks()
+        self._check_counts()
         self.required = copy.deepcopy(self.required)
         return self
+
+    def _check_counts(self) -> None:
+        """Caps of the candidates, and constraints on how often they are chosen."""
+        count, caps = len(self.available), one_array("replicates", self.max_replicates)
+        if caps.ndim == 0:
+            self.max_replicates = whole_number("max_replicates", caps[()], 1)
+        else:
+            rule = "max_replicates must be a whole number, or (M,) of them from 0"
+            if caps.shape != (count,) or caps.dtype.kind not in "iu":
+                raise ValueError(f"{rule}, got {caps.dtype} of shape {caps.shape}")
+            require_none(caps < 0, caps, rule)
+            self.max_replicates = caps.astype(np.int64)
+            self.available = self.available & (caps > 0)
+        self.constraints = checked_constraints(self.constraints, count)
 
     def _check_commands(self) -> None:
         """Commands (M, n) of a model, or a frame."""

@@ -26,6 +26,7 @@ from jaxcal.information.blocks import WhiteBlocks, rank_of_blocks
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model
 from jaxcal.selection.criteria import ScenarioCriterion
+from jaxcal.selection.problem.constraints import Constraints
 
 __all__ = [
     "Problem",
@@ -54,7 +55,7 @@ class Problem:
     k: int  # candidates to choose
     available: Mask  # (M,) True where a candidate may be chosen
     required: Indices  # (r,) candidates that must be chosen, r <= k
-    max_replicates: int  # how often one candidate may be chosen
+    max_replicates: int | Indices  # how often one candidate may be chosen, or (M,)
     criterion: Any  # Criterion or ScenarioCriterion, in the same coordinates
     multiplicity: int  # how often log det of the blocks counts
     raw: Array  # (M, q, p) blocks in the caller's numbers, at most p readings each
@@ -62,6 +63,7 @@ class Problem:
     root: Array  # (r, p) root of the caller's prior precision, with what was measured
     candidates: Array | None = None  # (M, n) in the caller's unit, where there are any
     model: Model | None = None  # what made blocks of the candidates
+    constraints: Constraints | None = None  # on how often each is chosen
 
     @property
     def members(self) -> tuple[Problem, ...]:
@@ -118,7 +120,13 @@ class Problem:
     @property
     def upper(self) -> Indices:
         """(M,) how often each candidate may be chosen."""
-        return self.available * np.int64(min(self.max_replicates, self.k))
+        return self.available * np.minimum(np.int64(self.max_replicates), self.k)
+
+    def allows(self, indices: Indices) -> bool:
+        """Whether a selection (k,) keeps the constraints."""
+        rules = self.constraints
+        counts = np.bincount(indices, minlength=len(self.available))
+        return rules is None or not rules.broken(counts)
 
     @property
     def simplex(self) -> bool:
@@ -129,6 +137,8 @@ class Problem:
         optimum then uses vertices of the convex hull only.
         """
         if not self.rank_one or self.k != self.num_regressors or len(self.root):
+            return False
+        if self.constraints is not None:
             return False
         height = self.rows @ self.rows.sum(axis=0)
         return bool((np.abs(height - 1.0) <= _IN_PLANE)[self.available].all())
