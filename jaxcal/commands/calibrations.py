@@ -410,7 +410,7 @@ def check(
     """
     calibrated = Calibration.load(calibration)
     if recording.servos and not is_recording(file):
-        raise ValueError("--servos is of a recording, not a table")
+        raise ValueError("--servos goes with a recording, not a table")
     table = recording.table(file, lambda which: calibrated.model)
     if table is not None and radians:
         raise ValueError("--radians is of tables, recordings say their unit")
