@@ -14,7 +14,7 @@ from typing import Any
 from jaxcal.reports.plots.style import as_bytes
 
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.M | re.S)
-DRAWN = re.compile(r"((?!axes\b)[^=#]*\.plot\([^#]*\))(\s+#.*)?")
+DRAWN = re.compile(r"((?!axes\b|[\w, ]+ = )[^#]*\.plot\([^#]*\))(\s+#.*)?")
 
 
 def executed(markdown: str, session: str) -> str:
