@@ -145,7 +145,7 @@ def test_rules_that_leave_nothing_or_are_broken_are_said():
     design = Design(x, constraints=(np.arange(9.0), 10.0))
     with pytest.raises(ValueError, match="row 0 of A w is 26, more than 10"):
         design.score([5, 6, 7, 8])
-    with pytest.raises(ValueError, match="of select and score, not of plan"):
+    with pytest.raises(ValueError, match="with select and score, not with plan"):
         design.plan(0.1, noise_std=0.1)
     with pytest.raises(ValueError, match="keeps no constraints"):
         design.select(4, method="policy")

@@ -324,7 +324,7 @@ HELD = jaxcal.Prior(1.0, fixed=("a11", "a12", "a13", "b1"))
         ("parameters must be indices .*'x'", {"criterion": jaxcal.As("x")}),
         ("parameters must name some once", {"criterion": jaxcal.As([1, 1])}),
         (
-            "region goes with criterion I only, and once",
+            "region goes with criterion I or G only, and once",
             {"region": np.ones((3, 2, 4)), "criterion": jaxcal.I(np.ones((3, 2, 4)))},
         ),
         (
@@ -332,7 +332,7 @@ HELD = jaxcal.Prior(1.0, fixed=("a11", "a12", "a13", "b1"))
             {"region": np.ones((3, 4)), "criterion": "I"},
         ),
         (
-            "region goes with criterion I only, and once, got criterion D",
+            "region goes with criterion I or G only, and once, got criterion D",
             {"region": np.ones((3, 2, 4))},
         ),
         (r"measured must have shape \(N, 2, 4\)", {"measured": np.ones((3, 1, 4))}),
