@@ -265,21 +265,11 @@ def test_stop_ends_the_session_that_moves_and_then_stops_every_unit(
     assert all(len(drive.stops) >= 2 for drive in rig.drives)
 
 
-LOADS = "import rig.core.stop, rig.drives.drive, rig.config.config"
-
-
 @pytest.mark.parametrize(
     "transport", ["tcp", pytest.param("rtu", marks=pytest.mark.slow)]
 )
-@pytest.mark.parametrize("alone", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_a_suspended_session_is_ended_and_its_drives_are_stopped(
-    alone, transport, tmp_path
-):
-    """C: it took 8 s over TCP, and on a serial line nothing was stopped.
-
-    Within 2 s from the start of the process, on a computer that does nothing else; on a
-    busy one what Python takes to load is left out.
-    """
+def test_a_suspended_session_is_ended_and_its_drives_are_stopped(transport, tmp_path):
+    """C: it took 8 s over TCP, and on a serial line nothing was stopped."""
     with simulator(fast_config(), transport=transport, speedup=0.02) as sim:
         bus = sim.start().bus
         sim.path = tmp_path / "rig.toml"
@@ -291,12 +281,9 @@ def test_a_suspended_session_is_ended_and_its_drives_are_stopped(
             sim.path.write_text(fast_text({**HASTY, old: new}))
         commissioned(load_config(sim.path), tmp_path)
         with running_session(sim, tmp_path) as child:
+            begun = time.monotonic()
             child.send_signal(signal.SIGSTOP)
             sim.path.write_text("this is no TOML")  # what it armed is enough
-            begun = time.monotonic()
-            subprocess.run([sys.executable, "-c", LOADS], check=True)
-            loading = 0.0 if alone else time.monotonic() - begun
-            begun = time.monotonic()
             command = [sys.executable, "-m", "rig", "stop", "--config", str(sim.path)]
             done = subprocess.run(command, capture_output=True, text=True, check=True)
             took = max(
@@ -309,7 +296,7 @@ def test_a_suspended_session_is_ended_and_its_drives_are_stopped(
             assert said.count("acknowledged, standing") == 3
             assert child.wait(5) == -signal.SIGKILL
         assert not any(drive.moving for drive in sim.drives)
-        assert took - loading < 2.0
+        assert took < 2.0  # its line's process, before this command was loaded
 
 
 @pytest.mark.parametrize(
