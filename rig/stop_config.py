@@ -8,6 +8,7 @@ told, and the rest is stopped.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import pathlib
@@ -205,8 +206,9 @@ def map_of(text: str, folder: pathlib.Path, faults: Faults) -> SimpleNamespace |
         recognise=_table(data.get("recognise")),
     )  # fmt: skip
     if drive_map.alarm:
-        names = _table(_table(data["alarm"]).get("names")).items()
-        drive_map.alarm.names = {int(code, 0): text for code, text in names}
+        names, drive_map.alarm.names = _table(_table(data["alarm"]).get("names")), {}
+        with contextlib.suppress(ValueError):  # a stop needs none
+            drive_map.alarm.names = {int(code, 0): names[code] for code in names}
     if drive_map.comm_timeout:
         drive_map.comm_timeout.per_s = _table(data["comm_timeout"]).get("per_s")
     set_zero = drive_map.set_zero
