@@ -219,7 +219,7 @@ class FitSolution:
         # (R, r) roots of the hat matrix, hardly damped, where a step had them.
         self.solved: Array | None = None
         q = problem.measured.shape[1]
-        self.uncertain = (problem.command_std > 0.0).any(axis=0)
+        self.uncertain = np.asarray((problem.command_std > 0.0).any(axis=0))
         self.num_uncertain = k = int(self.uncertain.sum())
         spread = problem.command_std[:, self.uncertain]
         self.moves = spread > 0.0  # (N, k) False: exact in this measurement

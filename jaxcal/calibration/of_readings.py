@@ -134,7 +134,7 @@ def by_readings(fit: Fit, commands: Array) -> Array:
         if fit.num_inputs == 1:
             return np.asarray(1.0 / slopes)
     responses.require_regular(commands)
-    return np.linalg.inv(slopes)
+    return np.asarray(np.linalg.inv(slopes))
 
 
 def _first_order(fit: Fit, commands: Array, of_readings: Array) -> Array:

@@ -357,8 +357,8 @@ def _squares(calibration: Fit, source: Source, results: _Results, gain: Any) -> 
         # Of each output by itself: (R, m).
         moves = results.slopes @ np.einsum("pnm,nm->pm", gain, shape * size)
         if results.turn is not None:
-            moves = moves + results.turn * size * (
-                1.0 if name == "offset" else results.readings
-            )
+            assert results.readings is not None
+            scaled = 1.0 if name == "offset" else results.readings
+            moves = moves + results.turn * size * scaled
         moved = moved + (moves**2).sum(axis=1)
     return moved

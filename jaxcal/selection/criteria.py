@@ -527,7 +527,7 @@ def criterion_of(criterion: Any, region: Any, default: str) -> Criterion:
             "region goes with criterion I or G only, and once, "
             f"got criterion {asked.name}"
         )
-    return type(asked)(region)
+    return type(asked)(region)  # type: ignore[call-arg]  # I and G
 
 
 def positions(

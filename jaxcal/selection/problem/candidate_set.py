@@ -102,9 +102,9 @@ class CandidateSet:
             rule = "max_replicates must be a whole number, or (M,) of them from 0"
             if caps.shape != (count,) or caps.dtype.kind not in "iu":
                 raise ValueError(f"{rule}, got {caps.dtype} of shape {caps.shape}")
-            require_none(caps < 0, caps, rule)
-            self.max_replicates = caps.astype(np.int64)
-            self.available = self.available & (caps > 0)
+            self.max_replicates = often = caps.astype(np.int64)
+            require_none(often < 0, often, rule)
+            self.available = self.available & (often > 0)
         self.constraints = checked_constraints(self.constraints, count)
 
     def _check_commands(self) -> None:
