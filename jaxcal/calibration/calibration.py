@@ -18,7 +18,6 @@ from jaxcal.calibration.file import save, to_dict
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.fit_model import fit_model
 from jaxcal.calibration.inverse import command_for, no_inverse
-from jaxcal.calibration.of_readings import inverse
 from jaxcal.checks import aligned, in_words
 from jaxcal.late import late
 from jaxcal.models.model import Model
@@ -44,7 +43,7 @@ class Calibration(Fit):
         return self.summary()
 
     command_for = command_for
-    inverse = inverse
+    inverse = late("jaxcal.calibration.of_readings:inverse")
     no_inverse = no_inverse
     check = check
     budget = late("jaxcal.reports.budget:budget")

@@ -226,8 +226,8 @@ class _Curve:
     def _crossings(self, grid: Array, values: Array, function: Any) -> Array:
         """Where a function changes its sign between points of the grid, by halving."""
         sign = values <= 0.0
-        known = ~np.isnan(values)
-        here = np.flatnonzero((sign[1:] != sign[:-1]) & known[1:] & known[:-1])
+        finite = ~np.isnan(values)
+        here = np.flatnonzero((sign[1:] != sign[:-1]) & finite[1:] & finite[:-1])
         low, high, first = grid[here], grid[here + 1], sign[here]
         for _ in range(_HALVINGS if len(here) else 0):
             middle = 0.5 * (low + high)

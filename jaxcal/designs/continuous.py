@@ -287,8 +287,8 @@ def _affordable(
     begun, points = time.perf_counter(), box.mean(axis=1)[None].repeat(2, axis=0)
     points[1] += 0.1 * np.ptp(box, axis=1)
     model.jacobian(points, None)
-    each = 0.5 * (time.perf_counter() - begun)
-    return int(np.clip(0.125 * deadline.remaining_s / each, least, most))
+    point_s = 0.5 * (time.perf_counter() - begun)
+    return int(np.clip(0.125 * deadline.remaining_s / point_s, least, most))
 
 
 def _limits(limits: ArrayLike) -> Array:

@@ -111,8 +111,8 @@ class Budget:
             parts[:, 0] = np.hypot(parts[:, 0], self.contributions[:, last])
         with np.errstate(divide="ignore", invalid="ignore"):
             terms = parts**4 / dof
-            found = self.combined**4 / terms.sum(axis=1)
-        return np.where(np.isnan(found), np.inf, found)
+            dofs = self.combined**4 / terms.sum(axis=1)
+        return np.where(np.isnan(dofs), np.inf, dofs)
 
     @property
     def coverage_factor(self) -> Array:

@@ -86,6 +86,7 @@ class Criterion:
     says: ClassVar[str]  # what a table prints before the value; V is a covariance
     per_output: ClassVar[bool] = False  # the value is one output's, not their sum
     of_region: ClassVar[bool] = False  # it is about predictions, see ``region``
+    of_each: ClassVar[bool] = False  # and about each alone, whatever they say together
     by_name: ClassVar[bool] = (
         False  # it tells the parameters apart, ``Coordinates.names``
     )
@@ -275,7 +276,7 @@ class G(I):
         region: as of ``I``.
     """
 
-    name, says = "G", "largest variance"
+    name, says, of_each = "G", "largest variance", True
 
     def rows(self, at: Coordinates) -> Array:
         """(R, p) the predictions that may be the least certain."""

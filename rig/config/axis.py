@@ -181,7 +181,7 @@ class Axis(Scale):
         place_of = self.map.place_of
         per_speed, per_accel = self._counts_per_deg(units)
         motion = self.speed_deg_s, self.accel_deg_s2
-        in_pulses = (each * abs(self.pulses_per_deg) for each in motion)
+        in_pulses = (value * abs(self.pulses_per_deg) for value in motion)
         counts = motion_counts(units, self.pulses_per_rev, *in_pulses)
         for name, count in counts.items():
             place = place_of(name)

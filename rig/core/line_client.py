@@ -172,8 +172,8 @@ class LineClient(Line):
             return reply["result"]
         text, kind = error["text"], error["kind"]
         if not error["bus"]:
-            known = KINDS.get(kind)
-            raise known(text) if known else RuntimeError(f"{kind}: {text}")
+            kinds = KINDS.get(kind)
+            raise kinds(text) if kinds else RuntimeError(f"{kind}: {text}")
         raised = BusError(text, error["advice"], error["lost"])
         raised.refused, raised.out_of_reach = error["refused"], error["out_of_reach"]
         raise raised
@@ -238,5 +238,5 @@ def line_of(
         Refused: the drives are of several kinds of line, or of none on this bus.
     """
     line = LineClient(config, emit)
-    own = enumerate(line.own_drives)
-    return line, [DriveClient(line, number, drive) for number, drive in own]
+    made = enumerate(line.own_drives)
+    return line, [DriveClient(line, number, drive) for number, drive in made]

@@ -18,7 +18,15 @@ from jaxcal.selection.exchange.exchange import exchange_from
 
 laws = settings(max_examples=20, deadline=None)
 NAMES = st.sampled_from(tuple(CRITERIA))
-SIGN = {"D": 1, "Ds": 1, "E": 1, "A": -1, "As": -1, "I": -1}  # 1: larger is better
+SIGN = {
+    "D": 1,
+    "Ds": 1,
+    "E": 1,
+    "A": -1,
+    "As": -1,
+    "I": -1,
+    "G": -1,
+}  # 1: larger is better
 
 
 def definition(name, blocks, prior, chosen, region=None):
@@ -38,7 +46,8 @@ def definition(name, blocks, prior, chosen, region=None):
     if name == "As":
         return np.trace(v[:2, :2])
     where = blocks if region is None else region
-    return np.einsum("iqa,ab,iqb->iq", where, v, where).mean()
+    variances = np.einsum("iqa,ab,iqb->iq", where, v, where)
+    return variances.max() if name == "G" else variances.mean()
 
 
 def brute_force(name, blocks, prior, k, cap=1, available=None, required=()):
@@ -310,7 +319,7 @@ HELD = jaxcal.Prior(1.0, fixed=("a11", "a12", "a13", "b1"))
     ("message", "change"),
     [
         (
-            r"criterion must be one of D, A, I, E, Ds, As, got 'D\+A'",
+            r"criterion must be one of D, A, I, G, E, Ds, As, got 'D\+A'",
             {"criterion": "D+A"},
         ),
         ("criterion must be one of", {"criterion": ["D", "A"]}),

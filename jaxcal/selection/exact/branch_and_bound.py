@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,9 @@ from jaxcal import compiled
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.information.blocks import gram, largest_rank
 from jaxcal.selection.criteria import Criterion, ScenarioCriterion
-from jaxcal.selection.problem.constraints import Constraints
+
+if TYPE_CHECKING:
+    from jaxcal.selection.problem.constraints import Constraints
 
 __all__ = ["JointScenarios", "Scenario", "branch_and_bound"]
 
@@ -165,7 +167,7 @@ def branch_and_bound(
 def _price(search: Any, rules: Constraints, begun: Array, deadline: Deadline) -> Array:
     """Have the search keep the rules, at prices that make the bound at the root least.
 
-    Any prices from 0 give true bounds; these are found by cutting planes (Kelley).
+    Any prices from 0 give true bounds; these are optimum by cutting planes (Kelley).
     ``begun`` (3, M): bounds of the counts, and counts. Returns (M,) those where the
     relaxation ended.
     """
@@ -195,15 +197,15 @@ def _price(search: Any, rules: Constraints, begun: Array, deadline: Deadline) ->
         rows = np.array(cuts)
         limits = [(0.0, dearest)] * len(most) + [(None, None)]
         objective = [0.0] * len(most) + [1.0]
-        found = optimize.linprog(objective, rows[:, :-1], rows[:, -1], bounds=limits)
-        if found.x is None:
+        optimum = optimize.linprog(objective, rows[:, :-1], rows[:, -1], bounds=limits)
+        if optimum.x is None:
             break
-        if (found.x[:-1] > 0.99 * dearest).any() and dearest < 1e3 * _DEAR:
+        if (optimum.x[:-1] > 0.99 * dearest).any() and dearest < 1e3 * _DEAR:
             dearest *= 4.0
-        elif best - found.x[-1] <= _PRICED * max(1.0, abs(best)):
+        elif best - optimum.x[-1] <= _PRICED * max(1.0, abs(best)):
             break
         # Halfway: a cut may be off by what the relaxation was not solved to.
-        prices = 0.5 * (found.x[:-1] + cheapest)
+        prices = 0.5 * (optimum.x[:-1] + cheapest)
     bound(cheapest)
     return counts
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from jaxcal import compiled
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection.exact.volume_kernel import descend
+from jaxcal.selection.exchange.exchange import rules_of
 
 __all__ = ["Volumes", "largest_volumes"]
 
@@ -114,8 +115,10 @@ def _climbed(vectors: Array) -> Indices:
     kernel = compiled.kernel("jaxcal.selection.exchange.exchange_kernel")
     q, none = vectors.shape[1], np.zeros(0, dtype=np.int64)
     blocks = np.ascontiguousarray(vectors[:, None])
-    nothing, unit, every = np.zeros((q, q)), np.eye(q), np.ones(len(blocks), np.uint8)
-    climber = kernel.Climber("det", blocks, nothing, unit, every, 1, none, q, 0)
+    nothing, unit, once = np.zeros((q, q)), np.eye(q), np.ones(len(blocks), np.intp)
+    climber = kernel.Climber(
+        "det", blocks, nothing, unit, once, none, q, 0, *rules_of(None, len(blocks))
+    )
     chosen, phi = climber.climb(none, _SHARE, 1, math.inf)
     return np.asarray(climber.random_climbs(_STARTS, chosen, phi, math.inf)[0])
 

@@ -12,7 +12,7 @@ still because two are equal.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +21,9 @@ from jaxcal import compiled
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection.criteria import Criterion
 from jaxcal.selection.problem import Problem, ScenarioProblem, Solution
-from jaxcal.selection.problem.constraints import Constraints
+
+if TYPE_CHECKING:
+    from jaxcal.selection.problem.constraints import Constraints
 
 __all__ = [
     "Climbs",
@@ -223,7 +225,8 @@ def _lengths(criterion: Criterion) -> Array:
 def rules_of(rules: Constraints | None, count: int) -> tuple[Array, Array, Any]:
     """Costs (r, M), most (r,) and order (r, M) as a kernel takes them."""
     if rules is None:
-        rules = Constraints(np.zeros((0, count)), np.zeros(0))
+        none = np.zeros((0, count))
+        return none, np.zeros(0), none.astype(np.intp)
     return rules.costs, rules.most, rules.order
 
 

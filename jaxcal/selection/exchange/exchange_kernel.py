@@ -262,8 +262,8 @@ class Choice:
 
     def _restrict(self, out, more):
         """Close what breaks a rule once ``out`` (-1: none) has gone, with ``more`` yet
-        to come, which take the cheapest at least; true where one is left open."""
-        left: cython.bint = False
+        to come, which take the cheapest at least; true where one is remains open."""
+        remains: cython.bint = False
         for i in range(self.counts.shape[0]):
             self._count(i, 0)
         if out >= 0:
@@ -286,8 +286,8 @@ class Choice:
                 if self.rules[r, i] > room:
                     self.closed[i] = INFINITY
         for i in range(self.counts.shape[0]):
-            left = left or self.closed[i] == 0.0
-        return left
+            remains = remains or self.closed[i] == 0.0
+        return remains
 
     def _allowed(self):
         """Whether what is chosen keeps the rules."""

@@ -7,7 +7,7 @@ their own, joined. ``make_problems`` makes a batch of the affine model's.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -47,8 +47,10 @@ from jaxcal.selection.problem.candidate_set import (
     rounding_of,
     usable_numbers,
 )
-from jaxcal.selection.problem.constraints import Constraints
 from jaxcal.selection.problem.problem import Problem, ScenarioProblem, joined_problem
+
+if TYPE_CHECKING:
+    from jaxcal.selection.problem.constraints import Constraints
 
 __all__ = ["make_problems", "problem_of"]
 
@@ -231,6 +233,8 @@ def _checked_problem(
     """
     readings, count = raw, int(np.count_nonzero(available)) * raw.shape[1]
     if raw.shape[1] > raw.shape[2]:  # as much information in p rows, at q^3 less cost
+        if criterion.of_each and region is None:
+            region = raw[available]
         raw = np.asarray(np.linalg.qr(raw, mode="r"))
     k = _check_k(k, raw, available, root, regressors=not names)
     cap = max_replicates

@@ -25,7 +25,6 @@ from jaxcal.checks import (
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, answered, as_model
 from jaxcal.models.uncertainty import Prior, as_noise
-from jaxcal.selection.problem.constraints import checked_constraints
 from jaxcal.selection.problem.scenarios import Scenarios, checked_weights, scenarios_of
 from jaxcal.tables import (
     COMMANDS,
@@ -105,7 +104,10 @@ class CandidateSet:
             self.max_replicates = often = caps.astype(np.int64)
             require_none(often < 0, often, rule)
             self.available = self.available & (often > 0)
-        self.constraints = checked_constraints(self.constraints, count)
+        if self.constraints is not None:
+            from jaxcal.selection.problem.constraints import checked_constraints
+
+            self.constraints = checked_constraints(self.constraints, count)
 
     def _check_commands(self) -> None:
         """Commands (M, n) of a model, or a frame."""

@@ -34,7 +34,7 @@ class Constraints:
         return ""
 
     def of(self, rows: Indices) -> Constraints:
-        """Those of some of the candidates."""
+        """Constraints on the candidates ``rows`` alone."""
         return Constraints(np.ascontiguousarray(self.costs[:, rows]), self.most)
 
     @functools.cached_property
@@ -55,18 +55,18 @@ class Constraints:
             np.append(np.full(len(self.most), -np.inf), k),
             np.append(self.most, k),
         )
-        found = optimize.milp(
+        counts = optimize.milp(
             np.zeros(len(lower)),
             integrality=np.ones(len(lower)),
             bounds=optimize.Bounds(lower, upper),
             constraints=within,
             options={"time_limit": 60.0},
         )
-        if found.status not in (0, 2):
+        if counts.status not in (0, 2):
             raise ValueError(
-                f"constraints could not be checked for a selection: {found.message}"
+                f"constraints could not be checked for a selection: {counts.message}"
             )
-        return None if found.x is None else np.rint(found.x).astype(np.int64)
+        return None if counts.x is None else np.rint(counts.x).astype(np.int64)
 
 
 def checked_constraints(given: Any, count: int) -> Constraints | None:

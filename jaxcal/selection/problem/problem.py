@@ -17,7 +17,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,9 @@ from jaxcal.information.blocks import WhiteBlocks, rank_of_blocks
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model
 from jaxcal.selection.criteria import ScenarioCriterion
-from jaxcal.selection.problem.constraints import Constraints
+
+if TYPE_CHECKING:
+    from jaxcal.selection.problem.constraints import Constraints
 
 __all__ = [
     "Problem",
