@@ -126,7 +126,7 @@ def on_files(files: Any, config: Any) -> Any:
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     """Code runs in a folder of its own; the home page shows README's table."""
     if "/" not in page.file.src_uri:
-        markdown = re.sub(r"(!\[[^]]*\]\()\.\./examples/", r"\1examples/", markdown)
+        markdown = markdown.replace("](../examples/", "](examples/")
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     table = readme.partition("<!-- figures -->")[2].partition("<!-- end -->")[0]
     table = table.replace("](docs/", "](")
