@@ -6,7 +6,6 @@ import importlib
 import inspect
 import os
 import pathlib
-import re
 import shutil
 import sys
 import tempfile
