@@ -118,7 +118,7 @@ benchmark: $(BENCH)/.ready ## every benchmark with its peers: table, JSON, figur
 	$(BENCH)/bin/python -m benchmarks $(ARGS)
 
 docs: $(READY) ## the documentation site in site/, strictly and without a network
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet $(ARGS)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build $(ARGS)
 
 docs-serve: $(READY) ## the site at http://127.0.0.1:8000, built again at each change
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve $(ARGS)

@@ -112,6 +112,7 @@ def on_files(files: Any, config: Any) -> Any:
     add("benchmarks/table.md", figures.report.table(figures.benchmarks()))
     for name in ("CHANGELOG.md", "CONTRIBUTING.md"):
         text = (ROOT / name).read_text(encoding="utf-8")
+        text = text.replace("[code of conduct](CODE_OF_CONDUCT.md)", "code of conduct")
         add(name, text.replace("](docs/", "]("))
     for page in sorted((ROOT / "examples").glob("*.md")):
         text = page.read_text(encoding="utf-8").replace("](../docs/", "](../")

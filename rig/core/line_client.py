@@ -27,6 +27,7 @@ from rig.journal.lock import BusLock
 NORMAL_S = 30.0  # for a reply, or word of it; a board that was reset takes seconds
 URGENT_S = 1.0  # for one of a stop, besides an exchange that is under way
 END_S = 2.0  # for the process to end
+# Errors that the line's process reports and this side raises again, by name.
 KINDS = {kind.__name__: kind for kind in (LimitError, NotImplementedError, ValueError)}
 GONE = "Look who ended it. Its drives are stopped by the session"
 

@@ -56,7 +56,7 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
     names, outputs = names_of(config)
     axis_unit, output_unit = units_of(config)
     for name in (*names, *outputs):
-        if not NAME.fullmatch(name):  # the folder may be somebody else's
+        if not NAME.fullmatch(name):  # the folder may come from another person
             raise Refused(f"{folder}: {name!r} is no name of an axis or of a reading")
     of_name = {axis["name"]: axis for axis in config["axes"]}
     axes = [of_name[name] for name in names]

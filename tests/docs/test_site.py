@@ -67,7 +67,7 @@ def site(tmp_path_factory):
     pytest.importorskip("mkdocs")
     folder = tmp_path_factory.mktemp("site")
     subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "-q", "-d", folder],
+        [sys.executable, "-m", "mkdocs", "build", "-d", folder],
         cwd=ROOT, check=True, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
     )  # fmt: skip
     return folder

@@ -166,7 +166,7 @@ def test_wrong_functions_are_refused(tmp_path, factory, told):
 
 
 def test_check_and_refit_run_no_program_that_was_not_asked_for(tmp_path, capsys):
-    """A folder that somebody sent may hold any."""
+    """The folder may come from another person, with any program in it."""
     text = stage_text(tmp_path)
     (tmp_path / "bent.py").write_text(
         "import pathlib\npathlib.Path(__file__).with_name('ran').touch()\n" + BENT

@@ -516,7 +516,7 @@ def test_no_unit_ends_a_comment(inverse, language, comment):
 
 
 def test_a_name_that_is_no_name_is_refused(finished):
-    """The journal may be of a folder that somebody sent."""
+    """The journal may come from another person, so its names are not trusted."""
     records = read_journal(finished / "journal.jsonl")
     config = json.loads(json.dumps(records[0]["config"]))
     config["axes"][0]["name"] = "pitch; int evil"
