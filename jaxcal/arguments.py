@@ -78,7 +78,17 @@ class Parser(argparse.ArgumentParser):
     def format_help(self) -> str:
         hidden = sum(each.help == argparse.SUPPRESS for each in self.rare)
         more = f"\n{hidden} more options: --help all\n" if hidden else ""
-        return super().format_help() + more
+        groups, self._action_groups = (
+            self._action_groups,
+            [
+                group
+                for group in self._action_groups
+                if any(x.help != argparse.SUPPRESS for x in group._group_actions)
+            ],
+        )
+        text = super().format_help() + more
+        self._action_groups = groups
+        return text
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         words = sys.argv[1:] if args is None else [*args]

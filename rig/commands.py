@@ -452,9 +452,16 @@ emergency stop is required.
 class RigParser(Parser):
     """Takes ``setup home`` and ``simulate calibrate``."""
 
+    def __init__(self, **fields: Any) -> None:
+        super().__init__(**fields)
+        self.simulators: dict[argparse.Action, str | None] = {}  # with its help
+
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         if self.prog == "jaxcal-rig" and args is not None:
             args, _ = resolved(args)
+        if "--simulate" in (args or ()):
+            for action, text in self.simulators.items():
+                action.help = text
         return super().parse_known_args(args, namespace)
 
 
@@ -479,7 +486,8 @@ def make_parser(only: str | None = None) -> Parser:
         command.of(function)
         for action in command._actions if name != "simulate" else ():
             if action.dest in SIMULATOR:
-                command.rare[action], action.help = action.help, argparse.SUPPRESS
+                command.simulators[action] = action.help
+                action.help = argparse.SUPPRESS
     for name, text in absent.items():
         added.add_parser(name, help=text)
     return parser

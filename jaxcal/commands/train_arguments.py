@@ -7,7 +7,7 @@ import dataclasses
 import pathlib
 import textwrap
 from collections.abc import Iterable, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
@@ -55,6 +55,10 @@ Ctrl-C saves and stops; --resume then continues bit for bit (on the same CPU).
 All devices of all processes share each update: docs/scaling.md."""
 
 TASK_PARTS: dict[str, type] = {"ppo": StreamsConfig, "policy": PolicyConfig}
+# Settings that the first screen of the help shows; --help all shows the others.
+FIRST = {"seed", "seeds", "learning_rate", "width", "episodes", "updates", "kind"} | {
+    *("num_selected", "num_candidates", "num_inputs", "imitation")
+}
 _NAMES = {"num_episodes": "episodes", "num_updates": "updates", "num_seeds": "seeds"}
 
 
@@ -77,6 +81,8 @@ def _swept(text: str) -> Swept:
 @dataclasses.dataclass
 class TrainOptions:
     """What is trained and where it is kept."""
+
+    RARE: ClassVar[Any] = {"no_validation", "devices", "sweep"}
 
     preset: Annotated[str | None, "of postures, see below [compact]", "NAME"] = None
     task: Annotated[str | None, "of sequential measurement, see below", "NAME"] = None
@@ -136,8 +142,9 @@ def _flags(title: str, settings: Iterable[Setting]) -> type:
         default = dataclasses.field(default=None)
         fields.append((_NAMES.get(field.name, field.name), said, default))
     about = "in brackets the value of compact"
+    rare = {name for name, *_ in fields} - FIRST
     return dataclasses.make_dataclass(
-        "Settings", fields, namespace={"TITLE": title, "ABOUT": about}
+        "Settings", fields, namespace={"TITLE": title, "ABOUT": about, "RARE": rare}
     )
 
 
@@ -178,10 +185,14 @@ def read(prog: str, argv: Sequence[str]) -> TrainOptions:
     parser = Parser(
         prog=prog,
         usage="%(prog)s [--preset NAME | --task NAME] [--out DIR] [flags below]",
-        description="Train a policy, and save it with all it needs: one that selects "
-        "postures, or with --task one that picks the next measurement. Without flags: "
-        "our network on geometric features; --preset paper is the paper's, on the 210 "
-        "numbers of its observation, --preset observation ours on these, by PPO alone.",
+        description=textwrap.fill(
+            "Train a policy, and save it with all it needs: one that selects postures, "
+            "or with --task one that picks the next measurement. Without flags: our "
+            "network on geometric features; --preset paper is the paper's, on the 210 "
+            "numbers of its observation, --preset observation ours on these, by PPO "
+            "alone.",
+            86,
+        ),
         epilog=_EPILOG.format(
             program=typed_line(prog),
             evaluate=typed_line(prog.replace("train", "evaluate")),

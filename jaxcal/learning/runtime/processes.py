@@ -31,6 +31,7 @@ class Job:
 
     TITLE: ClassVar = "several processes"
     ABOUT: ClassVar = "found by itself under SLURM, Open MPI and on Cloud TPU"
+    RARE: ClassVar = True
 
     coordinator: Annotated[
         str | None, "of process 0; the same everywhere", "HOST:PORT"
