@@ -6,7 +6,7 @@ DOORS = (
     *("jaxcal", "jaxcal.models", "jaxcal.calibration", "jaxcal.selection"),
     *("jaxcal.designs", "jaxcal.arms", "jaxcal.adaptive"),
 )
-MOST = 61  # sixty are wanted
+MOST = 60
 
 
 def test_the_doors_show_few_names() -> None:

@@ -22,7 +22,6 @@ __all__ = [
     "Calibration",
     "CalibrationWarning",
     "Check",
-    "Mispairing",
     "Source",
     "Verdict",
     "identify",

@@ -20,7 +20,7 @@ __all__ = ["AVAILABLE", "COUNTED", "Decision", "decide", "is_available", "senten
 Array = NDArray[np.float64]
 
 AVAILABLE = "available"
-_AVAILABLE = re.compile(r"(is[ _]?)?available\W*([\[(].*)?", re.IGNORECASE)
+_AVAILABLE = re.compile(r"(is[ _]?)?avail(able|ability)?\W*([\[(].*)?", re.IGNORECASE)
 _LEAST_ROWS = 5  # of which a constant step is no chance
 # Columns that number the rows, by their names; runs only where each has its own.
 _NUMBERS = re.compile(

@@ -27,6 +27,7 @@ from rig.journal.lock import BusLock
 NORMAL_S = 30.0  # for a reply, or word of it; a board that was reset takes seconds
 URGENT_S = 1.0  # for one of a stop, besides an exchange that is under way
 END_S = 2.0  # for the process to end
+GRACE_S = 0.1  # for one whose channels are closed to be gone
 # Errors that the line's process reports and this side raises again, by name.
 KINDS = {kind.__name__: kind for kind in (LimitError, NotImplementedError, ValueError)}
 GONE = "Look who ended it. Its drives are stopped by the session"
@@ -182,9 +183,12 @@ class LineClient(Line):
     def _lose(self, why: str) -> NoReturn:
         """The process is gone, or is ended here."""
         assert self._process is not None
-        self._process.kill()
-        code = self._process.wait()
+        code = 0  # of a process that ended by itself
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            code = self._process.wait(GRACE_S)
         by = f" by signal {-code}" if code < 0 else ""
+        self._process.kill()
+        self._process.wait()
         self._gone = self._gone or f"the process of the line {why}{by}"
         raise BusError(self._gone, GONE, lost=True)
 

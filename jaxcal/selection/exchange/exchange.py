@@ -79,7 +79,8 @@ def greedy_indices(problem: Problem) -> Indices:
 
     Gains count a share of what the candidates not chosen yet will give, in the
     coordinates where all candidates together say as much of every direction: the best
-    of several shares, the last a small ridge. Swaps mend a singular selection. For E
+    of several shares, the last a small ridge, and of D's textbook, whose small ridge is
+    in the caller's numbers. Swaps mend a singular selection. For E
     the gain is that in the sum of the variances, which is at most p times and at least
     once the largest: an incomplete selection has no least eigenvalue to raise.
     """
@@ -88,10 +89,33 @@ def greedy_indices(problem: Problem) -> Indices:
         chosen, value = climbs.climbed(problem.required, share, 0)
         if not phi > -np.inf or value > phi + 1e-9 * max(1.0, abs(phi)):
             best, phi = chosen, value
+    if (
+        problem.joint is None
+        and problem.criterion.name == "D"
+        and not problem.root.size
+    ):
+        chosen, value = climbs.climbed(_textbook(problem), 0.0, 0)
+        best, phi = max((best, phi), (chosen, value), key=lambda found: found[1])
     if phi > -np.inf:
         return best
     chosen, phi = climbs.climbed(problem.required, climbs.share)
     return chosen if phi > -np.inf else climbs.best_of(1 + _MENDING)[0]
+
+
+def _textbook(problem: Problem) -> Indices:
+    """The required candidates, and the largest gains from a small ridge on, in the
+    caller's numbers, until there are as many readings as parameters."""
+    raw, upper = problem.raw, problem.upper.copy()
+    _, q, p = raw.shape
+    ridge, chosen = _RANK_FIRST * np.mean(raw**2), [*problem.required]
+    np.subtract.at(upper, problem.required, 1)
+    while len(chosen) < min(problem.k, -(-p // q)):
+        rows = raw[chosen].reshape(-1, p)
+        known = np.linalg.inv(np.eye(p) * ridge + rows.T @ rows)
+        gains = np.linalg.slogdet(np.eye(q) + raw @ known @ raw.transpose(0, 2, 1))[1]
+        chosen.append(int(np.where(upper > 0, gains, -np.inf).argmax()))
+        upper[chosen[-1]] -= 1
+    return np.array(chosen, dtype=np.int64)
 
 
 def default_restarts(problem: Problem) -> int:
