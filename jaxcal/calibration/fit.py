@@ -218,8 +218,8 @@ class Fit:
         """Rows too far from the fit of the others (1 % in all) and their weights."""
         from scipy import special
 
-        chance = special.chdtrc(self.num_readings, self.distance)
-        (rows,) = (chance < 0.01 / self.num_measurements).nonzero()
+        most = special.chdtri(self.num_readings, 0.01 / self.num_measurements)
+        (rows,) = (self.distance > most).nonzero()
         return {int(i): float(self.loss_weights[i]) for i in rows}
 
     def lack_of_fit(self) -> float | None:

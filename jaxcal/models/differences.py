@@ -103,7 +103,7 @@ class Differences:
 
 
 def combined(values: Array, weights: Array, periods: Array | None) -> Array:
-    """(...) sum of weights (4,), which add up to 0, times values (4, ...)."""
+    """(..., ...) sums of weights (..., 4), which add up to 0, times values (4, ...)."""
     return np.tensordot(weights, within_half(values - values[:1], periods), 1)
 
 

@@ -29,6 +29,7 @@ from jaxcal.models.uncertainty import Noise, Prior, as_noise
 
 Array = NDArray[np.float64]
 
+SIDES = tuple(STENCILS)
 _PILOTS = 4  # commands at which steps are chosen
 _ROUGH = 0.1  # of the largest derivative: a difference between orders that is told
 _LONG = 512  # rows of a table that is remembered as a whole
@@ -287,7 +288,7 @@ class FromFunction(Model):
             return moved
 
         values = self._run(jobs(rows, range(len(theta))))
-        sides = [[side] * len(rows) for side in steps.sides]
+        sides = self._sides(steps, rows)
         failed = np.asarray(np.isnan(np.array(values)).any(axis=(0, 2)))
         if failed.any():
             failed[failed] = ~np.isnan(self.predict(rows[failed], theta)).any(axis=1)
@@ -300,8 +301,7 @@ class FromFunction(Model):
                 tried = self._run(jobs(rows[lost], [j], side))
                 for old, new in zip(its, tried, strict=True):
                     old[lost] = new
-                for i in np.flatnonzero(lost):
-                    sides[j][i] = side
+                sides[j, lost] = SIDES.index(side)
         return self._slopes(steps, rows, values, sides)
 
     def _by_commands(self, rows: Array, theta: Array) -> Array:
@@ -314,8 +314,14 @@ class FromFunction(Model):
                 points.append(moved)
         values = self._run([(np.concatenate(points), theta)])[0]
         values = values.reshape(len(points), len(rows), -1)
-        sides = [[side] * len(rows) for side in steps.sides]
+        sides = self._sides(steps, rows)
         return self._slopes(steps, rows, [*values], sides)
+
+    @staticmethod
+    def _sides(steps: Differences, rows: Array) -> NDArray[np.int8]:
+        """(p, N) places in ``SIDES``."""
+        places = [SIDES.index(side) for side in steps.sides]
+        return np.repeat(np.array(places, np.int8)[:, None], len(rows), axis=1)
 
     @staticmethod
     def _offsets(steps: Differences) -> list[Array]:
@@ -327,7 +333,7 @@ class FromFunction(Model):
         steps: Differences,
         rows: Array,
         values: list[Array],
-        sides: list[list[str]],
+        sides: NDArray[np.int8],
     ) -> Array:
         """(N, q, p) of the values at the offsets, four for each parameter.
 
@@ -335,17 +341,17 @@ class FromFunction(Model):
             steps: of the differences.
             rows: (N, n) commands.
             values: 4 p times (N, q).
-            sides: p times N.
+            sides: (p, N) places in ``SIDES``.
         """
         slopes = np.empty((*values[0].shape, len(steps.steps)))
         rough = np.empty_like(slopes)
         for j, step in enumerate(steps.steps):
             stack = np.array(values[4 * j : 4 * j + 4])
-            for side in {*sides[j]}:
-                at, stencil = np.array(sides[j]) == side, STENCILS[side]
-                for weights, into in ((stencil.fine, slopes), (stencil.coarse, rough)):
-                    derivatives = combined(stack[:, at], weights, self.periods)
-                    into[at, :, j] = derivatives / step
+            for place in np.flatnonzero(np.bincount(sides[j])):
+                at, stencil = sides[j] == place, STENCILS[SIDES[place]]
+                weights = np.array([stencil.fine, stencil.coarse]) / step
+                fine, coarse = combined(stack[:, at], weights, self.periods)
+                slopes[at, :, j], rough[at, :, j] = fine, coarse
         with np.errstate(invalid="ignore"):
             largest = np.nanmax(np.abs(slopes), axis=0, initial=0.0)  # (q, p)
             apart = np.abs(slopes - rough)

@@ -171,16 +171,21 @@ class Runs:
         return self._arrays(answers, q)
 
     def _whole(self, commands: Array, parameters: Array) -> Array | None:
-        """(N, q) of a batch whose readings are as before; None: it is taken apart."""
+        """(N, q) of a batch whose readings are as before, or the first; None: it is
+        taken apart."""
         try:
             with np.errstate(all="ignore"):
                 values = np.asarray(self.f(commands.copy(), parameters.copy()))
         except Exception:
             return None
-        if values.shape != (len(commands), self.num_outputs):
+        q = values.shape[-1] if values.ndim == 2 else 0
+        if values.shape != (len(commands), self.num_outputs or q) or not q:
             return None
         values = values.astype(np.float64)
-        return values if np.isfinite(values).all() else None
+        if not np.isfinite(values).all():
+            return None
+        self.num_outputs = q
+        return values
 
     def close(self) -> None:
         """End the processes, but for those of the caller's executor."""
