@@ -93,6 +93,14 @@ def require_finite(name: str, array: Array) -> None:
         raise ValueError(f"{name} must be finite, got {array[where]} at {where}")
 
 
+def require_size(name: str, array: Array, most: float = 1e100) -> None:
+    """Refuse a column (..., n) whose largest number is out of reach of its square."""
+    size = np.abs(array).reshape(-1, array.shape[-1]).max(axis=0, initial=0.0)
+    rule = f"{name} must be between {1.0 / most:g} and {most:g} in size"
+    bad = (size > most) | ((size > 0.0) & (size < 1.0 / most))
+    require_none(bad, size, rule, "; choose another unit")
+
+
 def require_none(bad: NDArray[np.bool_], of: Any, rule: str, more: str = "") -> None:
     """Refuse by ``rule`` the first of the values where ``bad`` holds."""
     if bad.any():
@@ -139,6 +147,7 @@ def levels(name: str, values: ArrayLike, count: int) -> Array:
     given = one_or_each(name, values, count)
     require_finite(name, given)
     require_none(given <= 0.0, given, f"{name} must be positive")
+    require_size(name, given)
     given.flags.writeable = False
     return given
 

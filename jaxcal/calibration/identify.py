@@ -26,6 +26,7 @@ from jaxcal.checks import (
     axis_names,
     levels,
     require_none,
+    require_size,
     table,
 )
 from jaxcal.models.affine import Affine
@@ -213,6 +214,8 @@ def _measurements(
     u = table("commands", of_frame("commands", commands, inputs or (), COMMANDS))
     y = of_frame("measured", measured, outputs or (), MEASURED)
     y = table("measured", y, len(u))
+    require_size("commands", u)
+    require_size("measured", y)
     input_names, output_names = input_names or inputs, output_names or outputs
     inputs = axis_names("input_names", input_names, "u", u.shape[1])
     outputs = axis_names("output_names", output_names, "y", y.shape[1])

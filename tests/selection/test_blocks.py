@@ -9,7 +9,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from questions import make_block_problem, make_problem, of
 
-from jaxcal.models import Affine
+from jaxcal.models import Affine, Polynomial
 from jaxcal.selection import select
 from jaxcal.selection.exchange.exchange import exchange_indices
 
@@ -289,3 +289,14 @@ def test_bad_blocks_are_one_clear_error():
         "required must leave room .* span 2 of 4 regressors",
         blocks=np.concatenate([blocks[:1], blocks[:1], blocks[1:]]), required=[0, 1],
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("criterion", ["D", "I", "G"])
+def test_an_offset_far_beyond_the_spread_changes_no_choice(rng, criterion):
+    u, model = rng.uniform(-1.0, 1.0, (40, 2)), Polynomial(2, 2, 1)
+    near, far = (
+        select(u + offset, 6, "exchange", model=model, criterion=criterion)
+        for offset in (0.0, [0.0, 1e5])
+    )
+    np.testing.assert_array_equal(np.sort(near.indices), np.sort(far.indices))
+    assert far.value == pytest.approx(near.value, rel=1e-6)

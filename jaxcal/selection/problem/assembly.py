@@ -103,7 +103,8 @@ def _problem_of_one(
     offer: CandidateSet, k: int | None, criterion: Criterion
 ) -> Problem:
     """The problem of one scenario, or at the nominal."""
-    blocks = blocks_of(offer, criterion.by_name, criterion.of_region)
+    volume = criterion.name == "D"
+    blocks = blocks_of(offer, criterion.by_name, criterion.of_region, volume)
     raw, root = blocks.of_candidates(), blocks.root
     if offer.measured is not None:
         measured = blocks.at("measured", offer.measured, readings=True)

@@ -24,6 +24,7 @@ __all__ = ["Blocks", "blocks_of", "shares_regressor"]
 
 Array = NDArray[np.float64]
 
+_FAR = 100.0  # spreads of the candidates, from which they are counted from their middle
 _OF_MODEL = " for this model"
 
 
@@ -104,12 +105,24 @@ class _ModelBlocks(Blocks):
         offer: the candidates, prior and noise.
         model: that of the candidates, with the parameters of its misfit if they count.
         misfit: standard deviation of a reading by what no parameter explains.
+        invariant: parameters may be of commands counted from their middle, which
+            neither the determinant nor predictions depend on.
     """
 
-    def __init__(self, offer: CandidateSet, model: Model, misfit: float) -> None:
+    def __init__(
+        self, offer: CandidateSet, model: Model, misfit: float, invariant: bool
+    ) -> None:
         assert offer.candidates is not None
         self._candidates, self._available = offer.candidates, offer.available
         model = self._model = model.prepared(self.used)
+        self._centre = np.zeros(self._candidates.shape[1])
+        if invariant and offer.prior is None and len(self.used):
+            low, high = self.used.min(axis=0), self.used.max(axis=0)
+            middle = 0.5 * (low + high)
+            far = np.abs(middle) > _FAR * (high - low)
+            no_slopes = offer.noise is None or offer.noise.command_std is None
+            if far.any() and no_slopes and model.centred(middle) is not None:
+                self._centre = np.where(far, middle, 0.0)
         self._noise = Noise() if offer.noise is None else offer.noise
         # Readings are off by what no parameter explains; a prediction is no reading.
         self._read = self._noise.beside(misfit) if misfit else self._noise
@@ -157,7 +170,7 @@ class _ModelBlocks(Blocks):
 
     def _jacobian(self, commands: Array) -> Array:
         """(N, q, p) derivative by the free parameters, checked."""
-        jacobian = derivative(self._model, commands, self._mean)
+        jacobian = derivative(self._model, commands - self._centre, self._mean)
         return jacobian if self._free.all() else jacobian[..., self._free]
 
     def _weighed(self, jacobian: Array, commands: Array, noise: Noise) -> Array:
@@ -191,7 +204,7 @@ class _ModelBlocks(Blocks):
             commands = np.concatenate([commands, np.asarray(measured)])
         noise = self._noise.of(self._available)
         unknown = identifiability(
-            self._model, commands, noise=noise, prior=self._prior
+            self._model, commands - self._centre, noise=noise, prior=self._prior
         ).directions
         if unknown:
             directions = "; ".join(direction.words for direction in unknown)
@@ -203,7 +216,10 @@ class _ModelBlocks(Blocks):
 
 
 def blocks_of(
-    offer: CandidateSet, of_parameters: bool, of_predictions: bool = False
+    offer: CandidateSet,
+    of_parameters: bool,
+    of_predictions: bool = False,
+    of_volume: bool = False,
 ) -> Blocks:
     """The blocks of a candidate set.
 
@@ -211,6 +227,7 @@ def blocks_of(
         offer: what may be measured.
         of_parameters: of all parameters by name, also where outputs share a regressor.
         of_predictions: those of an arm without a prior have what no parameter explains.
+        of_volume: their determinant alone counts.
     """
     model, prior = offer.model, offer.prior
     if model is None:
@@ -218,8 +235,9 @@ def blocks_of(
     if not of_parameters and shares_regressor(model, prior, offer.noise):
         return _FixedBlocks(offer)
     if of_predictions and prior is None and model.misfit_std:
-        return _ModelBlocks(offer, model.with_misfit(), model.misfit_std)
-    return _ModelBlocks(offer, model, 0.0)
+        misfit = model.misfit_std
+        return _ModelBlocks(offer, model.with_misfit(), misfit, of_predictions)
+    return _ModelBlocks(offer, model, 0.0, of_predictions or of_volume)
 
 
 def shares_regressor(model: Model, prior: Prior | None, noise: Noise | None) -> bool:

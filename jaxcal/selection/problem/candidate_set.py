@@ -20,6 +20,7 @@ from jaxcal.checks import (
     require_finite,
     require_kind,
     require_none,
+    require_size,
     whole_number,
 )
 from jaxcal.models.affine import Affine
@@ -301,6 +302,8 @@ def usable_numbers(name: str, array: Array, mask: Mask) -> Array:
         hidden = ~finite & ~mask.reshape(*mask.shape, *[1] * (array.ndim - mask.ndim))
         array[hidden] = 0.0
         require_finite(name, array)
+    if name == "candidates":
+        require_size(name, array, 1e305)
     return array
 
 
