@@ -206,10 +206,12 @@ def test_sockets_as_one_are_told():
 
 @pytest.mark.slow
 def test_another_zero_and_noise_in_another_unit_are_named():
-    arm, joints = ur5(), np.random.default_rng(0).uniform(-120.0, 120.0, (40, 6))
-    turned = joints + 20.0 * np.eye(6)[1]
+    rng = np.random.default_rng(0)
+    arm, joints = ur5(), rng.uniform(-120.0, 120.0, (40, 6))
+    readings = arm.predict(joints + 20.0 * np.eye(6)[1])
+    readings *= rng.normal(1.0, 1e-5, readings.shape)  # as of a sensor
     with pytest.warns(UserWarning, match=r"theta2 is 20 degrees from the arm's"):
-        found = jaxcal.identify(joints, arm.predict(turned), model=arm)
+        found = jaxcal.identify(joints, readings, model=arm)
     assert not found.verdict.good
     for std, good in ((2e-4, True), (0.15, False)):
         options = {"model": contacts.arm("panda_1"), "noise_std": std}
@@ -298,7 +300,7 @@ def test_what_is_wrong_of_contacts_is_told_beside_other_sensors():
     other = sockets.copy()
     other[[3, 40]] = 1.0 - other[[3, 40]]
     for wrong, said in (
-        ((apart, joints, sockets), "sockets 0 and 1 are given as 0.048 apart, but"),
+        ((apart, joints, sockets), "sockets 0 and 1 are given as 0.048 m apart, but"),
         ((placed, joints, 1.0 - sockets), "socket 0 was found where socket 1 was"),
         ((arm, joints, other), "measurement 3 fits socket 0 instead"),
     ):
@@ -315,14 +317,14 @@ def test_what_is_wrong_of_contacts_is_told_of_a_chain_with_other_sensors():
     arm, (joints, sockets) = contacts.arm("panda_1"), PLACE
     apart = arm.measured_with(Socket(2, distances=[(0, 1, 0.048, 1e-4)]))
     verdict = _with_gravity("panda_1", apart, joints, sockets, in_pair=True)
-    assert "sockets 0 and 1 are given as 0.048 apart, but" in str(verdict)
+    assert "sockets 0 and 1 are given as 0.048 m apart, but" in str(verdict)
     still = joints * (np.arange(7) != 6)
     verdict = _with_gravity("panda_1", arm, still, sockets, still=True, in_pair=True)
     assert "panda_joint7 is 0 in all 92" in str(verdict) and not verdict.good
     moved = contacts.arm("dinova_1"), *contacts.load("dinova_1")["front"]
     said = str(_with_gravity("dinova_1", *moved, in_pair=True))
     assert re.search(
-        r"socket 0 seems to have moved by 0\.01\d+ between .* 6 and 7", said
+        r"socket 0 seems to have moved by 0\.01\d+ m between .* 6 and 7", said
     )
     with pytest.raises(ValueError, match="look like radians"):
         _with_gravity("panda_1", arm, np.radians(joints), sockets)
