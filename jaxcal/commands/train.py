@@ -49,8 +49,10 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
         try:
             with needs("policy", "training"):
                 from jaxcal.commands.train_arguments import read
+
+                arguments = read(prog, words)
             with told():
-                return _run(read(prog, words), prog)
+                return _run(arguments, prog)
         except (ValueError, OSError, MissingExtraError) as error:
             return refused(prog, error)
 
@@ -65,7 +67,8 @@ def _run(arguments: TrainOptions, prog: str) -> int:
     named = pathlib.Path(arguments.task or preset_of(arguments)).stem
     out = pathlib.Path(arguments.out or f"runs/{named}")
     if arguments.resume and not arguments.task:
-        arguments.task = _task_held(out)
+        with needs("policy", "training"):
+            arguments.task = _task_held(out)
     if arguments.export and not arguments.export.endswith(".npz"):
         raise ValueError(f"--export must be a file NAME.npz, got {arguments.export}")
     configuration = of_task if arguments.task else of_postures
@@ -74,7 +77,8 @@ def _run(arguments: TrainOptions, prog: str) -> int:
     later = arguments.task, arguments.resume, arguments.sweep, "jax" in sys.modules
     if not any((*later, arguments.values.get("num_seeds"))):
         config = configure()  # what is wrong is said before JAX is loaded
-    from jaxcal.learning.runtime import devices
+    with needs("policy", "training"):
+        from jaxcal.learning.runtime import devices
 
     if (runs := _num_runs(arguments, out)) > 1:
         devices.a_device_for_each_core(runs)
