@@ -102,26 +102,33 @@ class Parser(argparse.ArgumentParser):
             if new := self.renamed.get(old):
                 outdated(self.prog, old, new)
                 words[place] = "=".join([new, *value])
+        if sys.stdout is None:  # jaxcal ... >&-
+            self.exit(2, f"{self.prog}: standard output is closed\n")
+        self.words = words
         parsed, unknown = super().parse_known_args(words, namespace)
-        if self.exit_on_error and self._subparsers is None:
-            for flag in (word.partition("=")[0] for word in unknown):
-                if like := self._meant(flag):
-                    self.error(f"there is no option {flag}; did you mean {like}?")
-                if flag.isdecimal() and "-k" in self._option_string_actions:
-                    self.error(f"{flag} is no option; a number of rows is -k {flag}")
+        if unknown and self.exit_on_error and self._subparsers is None:
+            self._correct(unknown)
+            if unknown[0].isdecimal() and "-k" in self._option_string_actions:
+                self.error(
+                    "{0} is no option; a number of rows is -k {0}".format(*unknown)
+                )
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return parsed, unknown
 
-    def _meant(self, flag: str) -> str | None:
-        """The option that a mistyped one is nearest to; of -o one that begins --o."""
-        if not flag.startswith("-"):
-            return None
+    def _correct(self, words: Sequence[str]) -> None:
+        """Refuse a mistyped option by the nearest; -o by one that begins --o."""
         options = self._option_string_actions
-        begins = [x for x in options if x.startswith("-" + flag)]
-        if flag[1:2].isalpha() and begins:
-            return min(begins, key=len)
-        return nearest(flag, options)
+        for flag in (word.partition("=")[0] for word in words):
+            if flag.startswith("-") and flag not in options:
+                begins = [x for x in options if x.startswith("-" + flag)]
+                short = flag[1:2].isalpha() and min(begins, key=len, default="")
+                if like := short or nearest(flag, options):
+                    self.error(f"there is no option {flag}; did you mean {like}?")
 
     def error(self, message: str) -> NoReturn:
+        if "are required" in message:
+            words, self.words = self.words, []  # once
+            self._correct(words)
         if found := re.match(r"argument (?:.*/)?(--[\w-]+): expected one", message):
             message += f"; write {found[1]}=VALUE where it begins with a minus"
         choice = r"argument (.+): invalid choice: '(.*)' \(choose from (.*)\)"
@@ -239,7 +246,7 @@ def told(at_end: bool = False) -> Iterator[None]:
     log.addHandler(shown)
     try:
         yield
-        if at_end:
+        if at_end and sys.stderr is not None:
             sys.stderr.write(lines.getvalue())
     finally:
         log.setLevel(level)
@@ -337,7 +344,7 @@ def levels(text: str) -> list[float]:
         raise argparse.ArgumentTypeError(
             f"may be one number or two, got {whole!r}: write {point}, or {two}"
         )
-    return several(float, "numbers")(text)
+    return several(number_type(float), "numbers")(text)
 
 
 Numbers = Annotated[list[float] | None, levels]

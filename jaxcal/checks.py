@@ -90,7 +90,8 @@ def require_finite(name: str, array: Array) -> None:
     finite = np.isfinite(array)
     if not finite.all():
         where = tuple(int(i) for i in np.argwhere(~finite)[0])
-        raise ValueError(f"{name} must be finite, got {array[where]} at {where}")
+        at = f" at {where}" if where else ""
+        raise ValueError(f"{name} must be finite, got {array[where]}{at}")
 
 
 def require_size(name: str, array: Array, most: float = 1e100) -> None:
@@ -179,10 +180,11 @@ def one_of(argument: str, value: Any, choices: Sequence[str]) -> str:
 
 
 def nearest(name: str, names: Iterable[str]) -> str:
-    """The most alike of the names; "" where none is."""
+    """The most alike of the names, dashes before them aside; "" where none is."""
     import difflib
 
-    return next(iter(difflib.get_close_matches(name, names, 1)), "")
+    bare = {one.lstrip("-"): one for one in names}
+    return bare.get(*difflib.get_close_matches(name.lstrip("-"), bare, 1, 0.65), "")
 
 
 def require_known(what: str, name: str, names: Sequence[str]) -> None:

@@ -29,8 +29,9 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
         OSError: the folder is missing, not writable or full.
     """
     target = pathlib.Path(path).resolve()
-    if target.is_dir():
-        raise IsADirectoryError(f"{path} is a folder, not a file")
+    if target.exists() and not target.is_file():
+        kind = "folder" if target.is_dir() else "device"
+        raise IsADirectoryError(f"{path} is a {kind}, not a file")
     partial = target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
     try:
         descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
@@ -102,6 +103,7 @@ def require_kept(given: Mapping[str, Any]) -> None:
     """
     written = {name: given.get(name) for name in _WRITTEN}
     if folder := given.get("report"):
+        require_writable_folder(folder)
         pages = ("index.html", "verdict.json", "calibration.json")
         written |= {f"report {page}": os.path.join(folder, page) for page in pages}
     for option, path in written.items():

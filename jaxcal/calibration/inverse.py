@@ -372,6 +372,7 @@ class _Search(Responses):
         high = np.maximum(high, low + 1e-12 * self.spread)
         desired, names, at = self.wanted[i], self.fit.input_names, np.array([i])
         nearest, least = np.clip(free, low, high), np.inf
+        target = f"target {i + 1} {in_words(desired)}"
         if self.affine:
             nearest = self._nearest_within(desired, low, high)
         for begin in () if self.affine else (free, *self.nearest[i]):
@@ -393,14 +394,14 @@ class _Search(Responses):
         if reached:
             axis = int(beyond.argmax())
             raise ValueError(
-                f"desired {in_words(desired)} cannot be reached: {names[axis]} would "
-                f"have to be {free[axis]:.6g} (limits {bounds[axis, 0]:.6g} to "
+                f"{target} cannot be reached: {names[axis]} would have to be "
+                f"{free[axis]:.6g} (limits {bounds[axis, 0]:.6g} to "
                 f"{bounds[axis, 1]:.6g})"
             )
         close = np.minimum(nearest - low, high - nearest) < 1e-4 * self.spread
         active = [name for name, at in zip(names, close, strict=True) if at]
         raise ValueError(
-            f"desired {in_words(desired)} is out of reach; the nearest output found is "
+            f"{target} is out of reach; the nearest output found is "
             f"{in_words(self.outputs(nearest[None])[0])}"
             + (f", at the limit of {', '.join(active)}" if active else "")
         )

@@ -82,7 +82,10 @@ class ArmOptions:
     @property
     def kind(self) -> str:
         """The sensor's kind."""
-        return self.sensor or "position"
+        from jaxcal.arms.sensors import SENSORS
+
+        kinds = [name for name in SENSORS if name != "several"]
+        return one_of("--sensor", self.sensor or "position", kinds)
 
     def read(self, path: str, table: Table | None, places: Any = None) -> SerialChain:
         """The arm in this file; things that it touches are given or in the table."""
@@ -113,8 +116,7 @@ class ArmOptions:
         """The sensor, with as many landmarks as are given or in the table."""
         from jaxcal.arms.sensors import SENSORS, Board, Landmarks, Several, Socket
 
-        kinds = {name: kind for name, kind in SENSORS.items() if name != "several"}
-        kind = kinds[one_of("--sensor", self.kind, tuple(kinds))]
+        kind = SENSORS[self.kind]
         landmarks: dict[str, Any] = {}
         if issubclass(kind, Landmarks):
             if places is not None:

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.files import write_text
+from jaxcal.files import require_writable_folder, write_text
 
 Array = NDArray[np.float64]
 
@@ -41,6 +41,7 @@ def example(
     for name in files:
         if (folder / name).exists():
             raise ValueError(f"{folder / name} exists: name another --folder")
+    require_writable_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in files.items():
         write_text(folder / name, text)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from jaxcal.arguments import several
 from jaxcal.arms import SerialChain
 from jaxcal.arms.sensors import SENSORS, Board, Landmarks
-from jaxcal.checks import aligned
+from jaxcal.checks import aligned, one_of
 from jaxcal.commands.arms import ArmOptions
 from jaxcal.commands.tables import Output
 from jaxcal.extras import needs
@@ -130,7 +130,9 @@ def postures(
     """
     if picture:
         with needs("plots", "--picture"):
-            import matplotlib.figure  # noqa: F401 - told before the search
+            from matplotlib.backend_bases import FigureCanvasBase as Canvas
+        ending = picture.suffix.lower().removeprefix(".")  # told before the search
+        one_of("ending of --picture", ending, tuple(Canvas.filetypes))
     reached = None if measured is None else read_table(measured)
     placed = issubclass(SENSORS[of_arm.kind], Landmarks)
     arm = of_arm.read(model, reached, near if placed else None)

@@ -62,8 +62,6 @@ def run(argv: list[str] | None = None) -> int:
         was wrong, 130 after Ctrl-C.
     """
     words = [*(sys.argv[1:] if argv is None else argv)]
-    if sys.stdout is None:  # jaxcal ... >&-
-        return refused("jaxcal", ValueError("standard output is closed"))
     if words and words[0] in _WHOLE:
         module = importlib.import_module(f"jaxcal.commands.{words[0]}")
         return int(module.main(words[1:], prog=f"jaxcal {words[0]}"))

@@ -43,7 +43,7 @@ class DesignOptions:
     noise: Annotated[
         Numbers, "standard deviation of a measurement, or one for each output", "S"
     ] = None
-    replicates: Annotated[int, "how often one row may be measured", "R"] = 1
+    replicates: Annotated[int, (1,), "how often one row may be measured", "R"] = 1
     required: Annotated[Rows, "rows, counted from 0, that must be chosen", "I,J"] = None
     scenarios: Annotated[
         int | None, "draws of the model's parameters; the mean over them counts", "N"
@@ -62,7 +62,8 @@ class DesignOptions:
         if self.model is None:  # said here in the names of the columns
             used = candidates if mask is None else candidates[mask]
             distinct = f"rows ({len(np.unique(used, axis=0))} of them distinct)"
-            require_excited(used, names, table.source, distinct)
+            offered = "" if mask is None else ", rows whose 'available' is 1,"
+            require_excited(used, names, table.source + offered, distinct)
         design = Design(
             candidates,
             model,

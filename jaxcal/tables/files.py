@@ -56,6 +56,8 @@ def read_table(path: Any) -> Table:
     if not isinstance(path, str | os.PathLike):
         return table_of_frame("table", path)
     if path == "-":
+        if sys.stdin is None:  # <&-
+            raise ValueError("standard input is closed")
         stream = getattr(sys.stdin, "buffer", None)
         data = stream.read() if stream else sys.stdin.read().encode()
         return parse("standard input", data)
@@ -138,11 +140,11 @@ def decoded(source: str, data: bytes) -> tuple[str, str]:
     """The text of a file, and a note where it is not UTF-8.
 
     Raises:
-        ValueError: the file is a spreadsheet's own, or no text.
+        ValueError: the file is a spreadsheet's own, JSON, XML, or no text.
     """
     if data.startswith(b"\x1f\x8b"):
         data = gzip.decompress(data)
-    if data.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0", b"PAR1")):
+    if data.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0", b"PAR1", b"{", b"<")):
         raise ValueError(f"{source}: a table must be CSV; save this one as CSV")
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         return data.decode("utf-16", errors="replace"), ""

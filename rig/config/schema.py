@@ -86,9 +86,9 @@ class ConfigError(ValueError):
     def __init__(self, source: str, faults: list[str]) -> None:
         self.source = source
         self.faults = faults
-        count = f"{len(faults)} fault{'s' if len(faults) > 1 else ''}"
-        lines = "".join(f"\n  - {fault}" for fault in faults)
-        super().__init__(f"{source}: {count}{lines}")
+        lines = [f"{source}: {len(faults)} faults", *faults]
+        one = f"{source}: {''.join(faults)}"
+        super().__init__("\n  - ".join(lines) if len(faults) > 1 else one)
 
 
 def read_text(path: str | pathlib.Path) -> str:

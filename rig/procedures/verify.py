@@ -44,7 +44,8 @@ def load_calibration(
         model = None if made is None else made.model
         calibration = jaxcal.Calibration.load(path, model=model)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise Refused(f"{path}: not a calibration: {error}") from None
+        reason = getattr(error, "strerror", None) or error
+        raise Refused(f"{path}: not a calibration: {reason}") from None
     notes = calibration.provenance.get("notes", {})
     if notes.get("simulated") and not simulated:
         raise Refused(

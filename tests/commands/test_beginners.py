@@ -47,6 +47,7 @@ FILES = {
     "empty.csv": "",
     "twice.csv": TABLE.replace("yaw", "pitch"),
     "book.xlsx": "PK\x03\x04",
+    "masked.csv": "\n".join([f"{HEAD},available", *(f"{row},0" for row in ROWS)]),
     "pairs.csv": csv(
         "u_pitch,u_yaw,u_roll,y_pitch,y_yaw,y_roll", np.hstack([POINTS, REACHED])
     ),
@@ -81,6 +82,14 @@ CASES = [  # what was typed, what the line must hold
     ("select table.csv --model calibration.json", "a model is needed, this is a cal"),
     ("select table.csv --model table.csv", "--model takes an arm (.urdf), a saved"),
     ("select table.csv --score no.csv", "no.csv: No such file"),
+    ("select masked.csv", "rows whose 'available' is 1,", "got 0"),
+    ("select calibration.json", "save this one as CSV"),
+    ("select arm.urdf", "save this one as CSV"),
+    ("select table.csv --noise 0", "must be positive, got 0.0"),
+    ("identify pairs.csv --report table.csv", "table.csv is not a folder"),
+    ("example table --folder table.csv", "table.csv is not a folder"),
+    ("postures arm.urdf -k 6 --sensor sockt", "--sensor must be one of", "'sockt'"),
+    ("postures arm.urdf -k 6 --picture .", "ending of --picture must be one of"),
     (
         "plan table.csv --accuracy 0.001 --noise 0.1",
         "0.001 cannot be reached: all",
@@ -91,7 +100,7 @@ CASES = [  # what was typed, what the line must hold
     ("identify three.csv", "4 or more rows", "got 3"),
     (
         "command calibration.json far.csv --limits=-20,20",
-        "u_pitch would have to be 457.9",
+        "target 1 (200, -4, 3) cannot be reached: u_pitch would have to be 457.9",
         "(limits -20 to 20",
     ),
     ("command calibration.json two.csv", "3 columns are needed", "got 2 without a"),

@@ -127,7 +127,10 @@ def test_names_of_0_2_work_and_warn(candidates, capsys):
         ("select t.csv 4", "4 is no option; a number of rows is -k 4"),
         ("select t.csv -k 2 -o c.csv", "there is no option -o; did you mean --out?"),
         ("select t.csv --criterion=As1", "did you mean As?"),
-        ("select t.csv --zzz", "unrecognized arguments: --zzz"),
+        ("select t.csv --zzz", "jaxcal select: unrecognized arguments: --zzz"),
+        ("plan t.csv --acuracy 1", "no option --acuracy; did you mean --accuracy?"),
+        ("select t.csv --noise nan", "--noise: must be a number, got 'nan'"),
+        ("select t.csv --replicates 0", "--replicates: must be a whole number of at"),
     ],
 )
 def test_what_is_mistyped_is_answered_with_the_nearest(words, nearest, capsys):
@@ -153,11 +156,29 @@ def test_every_command_has_a_version(words, capsys):
     assert capsys.readouterr().out == f"jaxcal {jaxcal.__version__}\n"
 
 
-def test_a_closed_standard_output_is_one_line(candidates):
-    typed = f"{sys.executable} -m jaxcal select {candidates} >&-"
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ("select t.csv >&-", "jaxcal: standard output is closed\n"),
+        ("select - <&-", "jaxcal select: standard input is closed\n"),
+    ],
+)
+def test_a_closed_stream_is_one_line(typed, said):
+    typed = f"{sys.executable} -m jaxcal {typed}"
     done = subprocess.run(typed, shell=True, capture_output=True, text=True)
-    assert done.returncode == 2
-    assert done.stderr == "jaxcal: standard output is closed\n"
+    assert done.returncode == 2 and done.stderr == said
+
+
+def test_a_device_is_not_replaced_by_a_file(candidates, tmp_path, capsys):
+    os.mkfifo(tmp_path / "device")
+    assert main(["select", candidates, "--out", str(tmp_path / "device")]) == 2
+    assert "is a device, not a file" in capsys.readouterr().err
+
+
+def test_standard_error_may_be_closed(candidates):
+    typed = f"{sys.executable} -m jaxcal select {candidates} 2>&-"
+    done = subprocess.run(typed, shell=True, capture_output=True, text=True)
+    assert done.returncode == 0 and "candidates" in done.stdout
 
 
 def test_plan_prints_a_table_and_the_rows(candidates, capsys):
