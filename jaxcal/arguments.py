@@ -76,16 +76,14 @@ class Parser(argparse.ArgumentParser):
         return self
 
     def format_help(self) -> str:
-        hidden = sum(each.help == argparse.SUPPRESS for each in self.rare)
+        hidden = sum(action.help == argparse.SUPPRESS for action in self.rare)
         more = f"\n{hidden} more options: --help all\n" if hidden else ""
-        groups, self._action_groups = (
-            self._action_groups,
-            [
-                group
-                for group in self._action_groups
-                if any(x.help != argparse.SUPPRESS for x in group._group_actions)
-            ],
-        )
+        groups = self._action_groups
+        self._action_groups = [
+            group
+            for group in groups
+            if any(x.help != argparse.SUPPRESS for x in group._group_actions)
+        ]
         text = super().format_help() + more
         self._action_groups = groups
         return text
@@ -129,13 +127,13 @@ class Parser(argparse.ArgumentParser):
         if "are required" in message:
             words, self.words = self.words, []  # once
             self._correct(words)
-        if found := re.match(r"argument (?:.*/)?(--[\w-]+): expected one", message):
-            message += f"; write {found[1]}=VALUE where it begins with a minus"
+        if match := re.match(r"argument (?:.*/)?(--[\w-]+): expected one", message):
+            message += f"; write {match[1]}=VALUE where it begins with a minus"
         choice = r"argument (.+): invalid choice: '(.*)' \(choose from (.*)\)"
-        if found := re.match(choice, message):
-            if like := nearest(found[2], re.findall(r"[^\s',]+", found[3])):
-                what = found[1].lower()
-                message = f"there is no {what} {found[2]!r}; did you mean {like}?"
+        if match := re.match(choice, message):
+            if like := nearest(match[2], re.findall(r"[^\s',]+", match[3])):
+                what = match[1].lower()
+                message = f"there is no {what} {match[2]!r}; did you mean {like}?"
         self.exit(2, f"{self.prog}: {message}; see --help\n")
 
 

@@ -95,7 +95,7 @@ def greedy_indices(problem: Problem) -> Indices:
         and not problem.root.size
     ):
         chosen, value = climbs.climbed(_textbook(problem), 0.0, 0)
-        best, phi = max((best, phi), (chosen, value), key=lambda found: found[1])
+        best, phi = max((best, phi), (chosen, value), key=lambda pair: pair[1])
     if phi > -np.inf:
         return best
     chosen, phi = climbs.climbed(problem.required, climbs.share)
@@ -111,8 +111,8 @@ def _textbook(problem: Problem) -> Indices:
     np.subtract.at(upper, problem.required, 1)
     while len(chosen) < min(problem.k, -(-p // q)):
         rows = raw[chosen].reshape(-1, p)
-        known = np.linalg.inv(np.eye(p) * ridge + rows.T @ rows)
-        gains = np.linalg.slogdet(np.eye(q) + raw @ known @ raw.transpose(0, 2, 1))[1]
+        inverse = np.linalg.inv(np.eye(p) * ridge + rows.T @ rows)
+        gains = np.linalg.slogdet(np.eye(q) + raw @ inverse @ raw.transpose(0, 2, 1))[1]
         chosen.append(int(np.where(upper > 0, gains, -np.inf).argmax()))
         upper[chosen[-1]] -= 1
     return np.array(chosen, dtype=np.int64)
