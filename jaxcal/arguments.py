@@ -108,7 +108,7 @@ class Parser(argparse.ArgumentParser):
                 if like := self._meant(flag):
                     self.error(f"there is no option {flag}; did you mean {like}?")
                 if flag.isdecimal() and "-k" in self._option_string_actions:
-                    self.error(f"{flag} is no option; a number of rows is -k {flag}")
+                    self.error(f"there is no option {flag}; did you mean -k {flag}?")
         return parsed, unknown
 
     def _meant(self, flag: str) -> str | None:
@@ -123,7 +123,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         if found := re.match(r"argument (?:.*/)?(--[\w-]+): expected one", message):
-            message += f"; write {found[1]}=VALUE where it begins with a minus"
+            message += f"; write {found[1]}=VALUE if the value begins with a minus"
         choice = r"argument (.+): invalid choice: '(.*)' \(choose from (.*)\)"
         if found := re.match(choice, message):
             if like := nearest(found[2], re.findall(r"[^\s',]+", found[3])):
@@ -335,7 +335,7 @@ def levels(text: str) -> list[float]:
         whole = text.strip()
         point, two = whole.replace(",", "."), whole.replace(",", ".0,") + ".0"
         raise argparse.ArgumentTypeError(
-            f"may be one number or two, got {whole!r}: write {point}, or {two}"
+            f"{whole!r} may be one number or two: write {point}, or {two}"
         )
     return several(float, "numbers")(text)
 

@@ -142,9 +142,9 @@ class SerialChain(Arm, Model):
         if cancels := apparent_length(rows, end)[1]:
             warnings.warn(
                 f"d{cancels} = {rows[cancels - 1, 2]:g} cancels with another length, "
-                "as in Universal Robots' own calibration of nearly parallel axes, and "
-                "is counted with it. A plain table, or from_ur_kinematics(file) of "
-                "their ROS description, has small lengths whose errors can be read",
+                "as in Universal Robots' own calibration of nearly parallel axes; "
+                "their sum counts. To read the errors of single lengths, use a plain "
+                "table or from_ur_kinematics(file) of their ROS description",
                 stacklevel=2,
             )
         if compliance is None:
@@ -418,15 +418,15 @@ class SerialChain(Arm, Model):
             small = self.num_joints > 2 and 1.0 < largest < 7.0
             if small and not one.positions:  # readings tell of these
                 raise ValueError(
-                    f"commands must be in degrees, got angles of at most {largest:.3g},"
-                    " which look like radians: np.degrees(commands), --radians"
+                    f"commands must be in degrees, but no angle exceeds {largest:.3g}: "
+                    "are they radians? Use np.degrees(commands), --radians"
                 )
         largest = np.abs(joints[:, units == "deg"]).max(initial=0.0)
         twice = np.degrees(_BEYOND_TURNS)
         if largest > twice and self.num_joints > 2:
             raise ValueError(
-                f"commands must be in degrees, got angles of {largest:.6g}, which look "
-                "like degrees that were converted from radians: leave out np.degrees, "
+                f"commands must be in degrees, but angles reach {largest:.6g}: were "
+                "degrees converted as if they were radians? Leave out np.degrees, "
                 "--radians"
             )
         slack = np.where(units == "deg", _BEYOND, 0.01 * _BEYOND * (high - low))
@@ -440,19 +440,18 @@ class SerialChain(Arm, Model):
                 advice = f"{name} seems to be read in 0 to 360: subtract 360 from what "
                 advice += "is above 180."
             elif ((column >= least) & (column <= most)).all():
-                advice = f"{name} seems reversed, all rows are within them with the "
-                advice += "other sign: negate that column."
+                advice = f"{name} seems reversed: with the other sign all rows are "
+                advice += "within the limits. Negate that column."
             elif len(column) > 1 and not np.ptp(column):
-                advice = f"it never changes in {len(column)} rows, was it recorded?"
+                advice = f"it is the same in all {len(column)} rows: was it recorded?"
             else:
                 advice = "are the columns in this order: "
                 advice += f"{', '.join(self.joint_names)}?"
             raise ValueError(
                 f"row {row}: {name} = {joints[row, joint]:g} is outside its limits "
-                f"({low[joint]:g} to {high[joint]:g}, by more than {slack[joint]:g}); "
-                f"{advice} "
-                "Where the file's limits are wrong, give limits={name: (low, high)}, "
-                "--limits"
+                f"({low[joint]:g} to {high[joint]:g}) by more than {slack[joint]:g}; "
+                f"{advice} If the file's limits are wrong, give "
+                f"limits={{name: (low, high)}}, --limits"
             )
 
     def prepared(self, commands: Array, measured: Array | None = None) -> Self:
@@ -560,8 +559,8 @@ class SerialChain(Arm, Model):
         views = sensor.views and sensor.zeros
         if not views and tuple(sensor.inputs) not in ((), (sensor.kind,)):
             raise ValueError(
-                f"commands of a {sensor.kind} hold {', '.join(sensor.inputs)}, which "
-                "no recording has: take the postures by at_rest"
+                f"commands of a {sensor.kind} need {', '.join(sensor.inputs)}, which "
+                "no recording has; pass the postures of at_rest"
             )
         pixels = sensor.views and not views
         of_recording = self._rests(recording, "" if pixels else sensor.kind)
@@ -570,7 +569,7 @@ class SerialChain(Arm, Model):
             from scipy.spatial.transform import Rotation
 
             if read is None:
-                raise ValueError(f"{recording.path} has no poses of a board")
+                raise ValueError(f"{recording.path} has no board poses")
             turns = Rotation.from_matrix(read[:, 3:].reshape(-1, 3, 3).swapaxes(1, 2))
             turns_deg = np.degrees(turns.as_rotvec())
             commands = np.column_stack([commands, read[:, :3], turns_deg])
@@ -578,8 +577,8 @@ class SerialChain(Arm, Model):
             which = () if recording.which is None else recording.which
             if len(which) != len(commands):
                 raise ValueError(
-                    f"which must say of {len(commands)} rests which {sensor.kind} each "
-                    f"is of, got {len(which)} numbers"
+                    f"which must give the {sensor.kind} of each of the {len(commands)} "
+                    f"rests, got {len(which)} numbers"
                 )
             commands = np.column_stack([commands, numbers("which", which)])
         if sensor.zeros:
@@ -750,15 +749,15 @@ class SerialChain(Arm, Model):
         ratios, yields, waves = self._drives(as_parameters(self, parameters))
         for i in np.flatnonzero(ratios != 1.0):
             raise ValueError(
-                f"gear{i + 1} is {ratios[i]:.6g}, which such a file cannot hold"
+                f"gear{i + 1} is {ratios[i]:.6g}, which this file format cannot hold"
             )
         lost = [f"compliance{self.compliance[i]}" for i in np.flatnonzero(yields)]
         bent = np.flatnonzero(waves.any(axis=1))
         lost += [f"harmonics of joint {self.harmonics[i]}" for i in bent]
         if lost:
             warnings.warn(
-                f"{', '.join(lost)} left out of the file: its joints are stiff and "
-                "their gears round",
+                f"{', '.join(lost)} left out: the file cannot hold compliance and gear "
+                "harmonics",
                 stacklevel=2,
             )
         text, tip = written(form, self, self.calibrated(parameters))
@@ -823,10 +822,10 @@ class SerialChain(Arm, Model):
                 turned = np.trace(moved[:3, :3]) < 1.0 + 2.0 * _ASIDE
                 if turned or shift > _AWAY * self.length:
                     raise ValueError(
-                        "base must be given, roughly, to an arm with Pose, whose turns "
-                        "are from the nominal ones: the positions fit "
-                        f"base={base.round(7).tolist()}; then make the turns by its "
-                        "rotation_vectors"
+                        "base is missing: with Pose, turns are relative to the "
+                        "nominal ones, so give base roughly. The positions fit "
+                        f"base={base.round(7).tolist()}; then compute the turns with "
+                        "its rotation_vectors"
                     )
                 break
         return self.base
@@ -1119,8 +1118,8 @@ class SerialChain(Arm, Model):
             return super().targets(desired, start)
         if start is None:
             raise ValueError(
-                "start must be given for an arm's pose: the joints at whose nominal "
-                "orientation desired is a turn, as rotation_vectors(start, R) makes it"
+                "start is missing: for an arm's pose give joints, at whose nominal "
+                "orientation desired is a turn, as in rotation_vectors(start, R)"
             )
         turned = self.rotations(start, desired[:, 3:])
 

@@ -80,7 +80,7 @@ class Calibration(Fit):
                 source += f": {shared}"
             lines.append(f"noise std {in_words(self.noise_std)}{unit}, {source}")
             if self.dof < 0.5:
-                lines.append("no residual degree of freedom: the noise is not checked")
+                lines.append("noise not checked: no residual degrees of freedom")
         lines += str(self.verdict).splitlines()
         return "\n".join(lines)
 
@@ -208,8 +208,8 @@ class Calibration(Fit):
         if again.noise_std is not None:
             verdict: Any = again.verdict
             warnings.warn(
-                "the file holds zeros of the joints alone: held-out error "
-                f"{verdict.held_out:.3g}, nominal {verdict.nominal:.3g}",
+                "the file corrects the zeros of the joints only: cross-validated error "
+                f"{verdict.held_out:.3g}, before calibration {verdict.nominal:.3g}",
                 stacklevel=2,
             )
         return steps
@@ -273,15 +273,15 @@ class Calibration(Fit):
         told = getattr(self.verdict, "held_out", np.nan)
         of_tip = self.num_outputs == 3 and "tool x" in self.names
         errors = (
-            f"; held-out error about {np.hypot(told, scatter):.3g}{unit}, of the "
-            f"calibration {told:.3g}"
+            f"; cross-validated error about {np.hypot(told, scatter):.3g}{unit}, of "
+            f"the calibration {told:.3g}"
             if of_tip and np.isfinite(told)
             else ""
         )
         warnings.warn(
-            "the file has stiff joints and round gears: the arm without compliance "
-            "and harmonics, moved as a whole, whose tip at the measured postures "
-            f"is {apart:.3g}{unit} from the calibration's on average{errors}",
+            "the file cannot hold compliance and gear harmonics. The arm in it, moved "
+            f"as a whole, puts the tip at the measured postures {apart:.3g}{unit} from "
+            f"the calibration's on average{errors}",
             stacklevel=4,
         )
         return parameters
@@ -292,19 +292,18 @@ class Calibration(Fit):
         moved = self.predict(self.commands) - again.predict(self.commands)
         unit = f" {self.measured_unit}" if self.measured_unit else ""
         effect = (
-            "its predictions at the measured postures are "
-            f"{np.linalg.norm(moved, axis=1).mean():.3g}{unit} from the calibration's "
-            "on average"
+            "at the measured postures its predictions differ from the calibration's "
+            f"by {np.linalg.norm(moved, axis=1).mean():.3g}{unit} on average"
         )
         if again.noise_std is not None and self.noise_std is not None:
             of_arms: tuple[Any, Any] = again.verdict, self.verdict
             effect += (
-                f"; held-out error {of_arms[0].held_out:.3g}{unit}, of the "
+                f"; cross-validated error {of_arms[0].held_out:.3g}{unit}, of the "
                 f"calibration {of_arms[1].held_out:.3g}"
             )
         warnings.warn(
-            "the file has stiff joints and round gears and was fitted without "
-            f"harmonics: {effect}",
+            "the file cannot hold compliance and gear harmonics; it was fitted "
+            f"without harmonics: {effect}",
             stacklevel=4,
         )
         return again.parameters

@@ -77,12 +77,12 @@ class Check:
         if self.mispairing:
             text += f"; {self.mispairing}"
         elif self.slipped:
-            text += f"; a slip of {self.slipped} would explain it"
+            text += f"; a change of {self.slipped} would explain it"
         if self.unseen and not self.good:
-            text += f", and could hide in {', '.join(self.unseen)}"
+            text += f"; a change could be hidden in {', '.join(self.unseen)}"
         if self.blind:
             names = ", ".join(self.blind)
-            text += f"; not judged, as things were placed anew: {names}"
+            text += f"; not checked, because parts were moved: {names}"
         return (text,)
 
     @property
@@ -94,13 +94,13 @@ class Check:
             return "correct the table, then check again"
         if self.says == "does not hold":
             return (
-                "measure one of these rows again to rule out a wrong reading, then "
-                "calibrate again (identify)"
+                "repeat one of these rows to rule out a wrong reading, then calibrate "
+                "again (identify)"
             )
         text = "measure more"
         if self.enough:
-            text += f", about {self.enough} rows like these in all"
-        return f"{text}: calibration.verification(candidates, k) says where"
+            text += f", about {self.enough} rows like these in total"
+        return f"{text}: calibration.verification(candidates, k) chooses them"
 
     def __str__(self) -> str:
         return f"{self.reasons[0]}; next: {self.next_step}"
@@ -242,7 +242,7 @@ def _deviations(
         blind = free & _taken_up(calibration, placed)
         free &= ~blind
     if not len(white):
-        raise ValueError("measured holds too few readings to find what was placed anew")
+        raise ValueError("measured has too few readings to locate the moved parts")
     return _Deviations(
         white, by, level == np.unique(level)[:, None], free, blind, least
     )
@@ -297,8 +297,8 @@ def _whitening(calibration: Fit, commands: Array, noise: Array) -> tuple[Array, 
         factor = np.linalg.cholesky(np.diag(variances) + slopes @ parameters @ slopes.T)
     except np.linalg.LinAlgError:
         raise ValueError(
-            "the calibration must predict what is checked, but its uncertainty there "
-            "is beyond rounding: see calibration.verdict"
+            "the calibration cannot predict these rows: its uncertainty there is too "
+            "large for double precision; see calibration.verdict"
         ) from None
     root = np.asarray(lapack.dtrtri(factor, lower=1)[0])  # rest of factor: zeros
     # Misfit that is allowed for may not be there, and hides a drift all the same.
@@ -328,8 +328,8 @@ def _require_unit(
             ]
             raise ValueError(
                 f"measured must be in the calibration's unit{unit}: "
-                f"{', '.join(columns)} fit when multiplied by {factor:.6g}; "
-                f"are they {what}?"
+                f"{', '.join(columns)} fit when multiplied by {factor:.6g}. Are they "
+                f"{what}?"
             )
 
 

@@ -358,14 +358,14 @@ class Fit:
     def no_noise(self, what: str) -> str:
         left = f"only {self.dof:.2g}" if self.dof >= 0.5 else "no"
         return (
-            f"no {what}: {self.num_measurements} measurements leave {left} residual "
-            f"degree of freedom for {int(self.free.sum())} free parameters, so the "
-            "noise is unknown; measure more or give noise_std"
+            f"no {what}, because the noise is unknown: {self.num_measurements} "
+            f"measurements leave {left} residual degree of freedom for "
+            f"{int(self.free.sum())} free parameters. Measure more, or give noise_std"
         )
 
     def _affine(self, name: str) -> tuple[Array, Array]:
         if self.affine is None:
-            raise AttributeError(f"{name}: only an affine model y = A u + b has one")
+            raise AttributeError(f"{name}: only an affine model y = A u + b has this")
         return self.affine
 
 

@@ -139,7 +139,7 @@ def identify(
     if accuracy is not None:
         units = model.accuracy_units(measured_unit)
         if not units:
-            raise ValueError("accuracy needs an arm as the model")
+            raise ValueError("accuracy needs an arm (model=)")
         about["provenance"]["accuracy"] = by_unit("accuracy", accuracy, units)
     plain = prior is None and plain_noise and loss in (None, "gaussian")
     affine = isinstance(model, Affine)
@@ -169,7 +169,7 @@ def identify(
         )
         if mispaired is None:
             raise
-        raise ValueError(f"{mispaired.reason}. As it stands: {error}") from None
+        raise ValueError(f"{mispaired.reason}. Uncorrected: {error}") from None
     if shared := fields.pop("noise_levels"):
         about["provenance"]["noise_levels"] = shared
     if prior is not None and not prior.by_data:
@@ -300,7 +300,7 @@ def _noise(
                 f"{num_outputs} outputs, got {common_noise!r}"
             )
     if noise is not None and noise_std is not None:
-        raise ValueError("noise_std and noise are the same: give one")
+        raise ValueError("give noise_std or noise, not both")
     plain = noise is None or _is_of_levels(noise)
     if plain:
         level = noise_std if noise is None else noise.std
@@ -312,8 +312,8 @@ def _noise(
     )
     if common_noise is not None and level_known:
         raise ValueError(
-            "common_noise says how to estimate the noise, and noise says what it is: "
-            "give one of them"
+            "give noise (the noise itself) or common_noise (how to estimate it), not "
+            "both"
         )
     return noise, plain
 
@@ -340,7 +340,7 @@ def _provenance(
     try:
         noted = json.loads(json.dumps(dict(notes), allow_nan=False)) if notes else {}
     except (TypeError, ValueError) as error:
-        raise ValueError(f"notes must be what JSON can hold: {error}") from None
+        raise ValueError(f"notes must be valid JSON: {error}") from None
     content = b"".join(
         str(array.shape).encode() + array.astype(_LITTLE_ENDIAN, copy=False).tobytes()
         for array in (commands, measured, weight)

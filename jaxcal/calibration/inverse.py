@@ -130,8 +130,8 @@ def limits_of(limits: ArrayLike | None, names: tuple[str, ...]) -> Array:
     bad = np.flatnonzero(~((low <= high) & (low < np.inf) & (high > -np.inf)))
     if bad.size:
         raise ValueError(
-            f"limits of {names[bad[0]]} must be a least and a greatest value, "
-            f"got {in_words(bounds[bad[0]])}"
+            f"limits of {names[bad[0]]} must be LOW, HIGH, got "
+            f"{in_words(bounds[bad[0]])}"
         )
     return bounds
 
@@ -176,8 +176,8 @@ class Responses:
         sure, last = _sureness(self.fit, self.spread)
         if sure < _SURE:
             raise ValueError(
-                "matrix A may be singular: its smallest singular value is "
-                f"{sure:.2g} standard deviations from zero; within the noise "
+                f"matrix A may be singular: its smallest singular value is {sure:.2g} "
+                "standard deviations from zero. Within the noise, "
                 f"{self._insensitive(last)}"
             )
         return turn, singular, right, rows
@@ -220,8 +220,8 @@ class Responses:
             ]
             raise ValueError(
                 f"{fit.output_names[j]} at the command {in_words(commands[i])} depends "
-                f"on what no measurement shows: {'; '.join(words)}; measure there, or "
-                "give a prior"
+                f"on unmeasured parameters: {'; '.join(words)}. Measure there, or give "
+                "a prior"
             )
 
     def _insensitive(self, direction: Array) -> str:
@@ -286,13 +286,13 @@ class _Search(Responses):
             if far and not worst:
                 i, j = np.unravel_index(beyond.argmax(), beyond.shape)
                 worst = (
-                    f"target {i + 1} has {names[j]} = {values[i, j]:.6g}, measured was "
-                    f"{low[j]:.6g} to {high[j]:.6g}"
+                    f"target {i + 1} has {names[j]} = {values[i, j]:.6g}, measured "
+                    f"range {low[j]:.6g} to {high[j]:.6g}"
                 )
         if far:
             warnings.warn(
                 f"{len(far)} of {len(commands)} targets are far outside the "
-                f"measurements: {worst}; the calibration was never tried there",
+                f"measurements, where the calibration is untested: {worst}",
                 stacklevel=3,
             )
 
@@ -315,7 +315,7 @@ class _Search(Responses):
             command = np.asarray(centre + self.spread * step.T)
         if not np.isfinite(command).all():
             raise ValueError(
-                "desired must be within reach of finite commands, got larger"
+                "desired values are too large: no finite command reaches them"
             )
         return command
 
@@ -400,7 +400,7 @@ class _Search(Responses):
         close = np.minimum(nearest - low, high - nearest) < 1e-4 * self.spread
         active = [name for name, at in zip(names, close, strict=True) if at]
         raise ValueError(
-            f"desired {in_words(desired)} is out of reach; the nearest output found is "
-            f"{in_words(self.outputs(nearest[None])[0])}"
+            f"desired {in_words(desired)} cannot be reached; the nearest output found "
+            f"is {in_words(self.outputs(nearest[None])[0])}"
             + (f", at the limit of {', '.join(active)}" if active else "")
         )

@@ -98,7 +98,7 @@ class Differences:
             rows.append((name, f"{step:.3g}", side, shown))
         share = float((self.noise / np.where(self.size > 0, self.size, 1.0)).max())
         return "\n".join(
-            [*aligned(rows, "<"), f"noise of f: {share:.1e} of its readings"]
+            [*aligned(rows, "<"), f"noise of f: {share:.1e} of its readings (relative)"]
         )
 
 

@@ -66,8 +66,8 @@ class FromJax(Model):
         """n."""
         if self._num_inputs is None:
             raise ValueError(
-                "num_inputs of this model is not known before its first commands: "
-                "FromJax(f, nominal, num_inputs=...)"
+                "give num_inputs: FromJax(f, nominal, num_inputs=...). Before the "
+                "first commands this model does not know it"
             )
         return self._num_inputs
 

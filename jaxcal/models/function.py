@@ -102,13 +102,13 @@ class FromFunction(Model):
         if not callable(f):
             if not self.inputs or batch:
                 raise ValueError(
-                    "a program needs the names of its commands, inputs=[...], and "
-                    "takes one at a time"
+                    "a program needs inputs=[...], the names of its commands, and "
+                    "takes one command at a time"
                 )
             limit = None if timeout is None else seconds("timeout", timeout)
             f = CommandLine(f, (*self.inputs, *self.names), limit)
         elif timeout is not None:
-            raise ValueError("timeout is of a program, and f is a function")
+            raise ValueError("timeout needs a program; f is a function")
         noise = as_noise(noise)
         require_kind("prior", prior, Prior)
         self._noise, self._prior, self._given_periods = noise, prior, periods
@@ -131,8 +131,8 @@ class FromFunction(Model):
         """n."""
         if self._num_inputs is None:
             raise ValueError(
-                "num_inputs of this model is not known before its first commands: "
-                "FromFunction(f, nominal, inputs=...)"
+                "give inputs: FromFunction(f, nominal, inputs=...). Before the first "
+                "commands this model does not know num_inputs"
             )
         return self._num_inputs
 
@@ -251,8 +251,8 @@ class FromFunction(Model):
         zero = np.flatnonzero(self.nominal == 0.0)
         if zero.size:
             raise ValueError(
-                f"scale must be given, as {self.names[zero[0]]} is nominally 0: by how "
-                "much may each parameter be off?"
+                f"scale must be given, because {self.names[zero[0]]} is nominally 0: "
+                "how far off may each parameter be?"
             )
         return np.asarray(0.1 * np.abs(self.nominal))
 
@@ -357,7 +357,8 @@ class FromFunction(Model):
             warnings.warn(
                 f"f is not smooth in {steps.names[j]} at the command "
                 f"{in_words(rows[i])}{f' and {others} others' if others else ''}: its "
-                "derivative there may be wrong (a reading that wraps needs periods=)",
+                "derivative there may be wrong (a reading that wraps around needs "
+                "periods=)",
                 stacklevel=5,
             )
         # A derivative that is the noise of f for all commands is none.
@@ -378,8 +379,7 @@ class FromFunction(Model):
                 break
         if not pilots:
             raise ValueError(
-                f"f must return readings, but fails for all {len(rows)} commands, for "
-                f"{in_words(rows[0])}: "
+                f"f fails for all {len(rows)} commands; for {in_words(rows[0])}: "
                 f"{self._reasons[rows[0].tobytes()]}"
             )
         at = rows[pilots[:_PILOTS]]

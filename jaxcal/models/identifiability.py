@@ -58,13 +58,16 @@ class Identifiability:
             direction.words for direction in self.directions if len(direction.names) > 1
         ]
         if tied:
-            lines += ["Seen only in combination:", *(f"  {words}" for words in tied)]
+            lines += [
+                "Only in combination:",
+                *(f"  {words}" for words in tied),
+            ]
         if alone:
-            lines.append(f"Not seen at all: {', '.join(alone)}")
+            lines.append(f"No effect on the readings: {', '.join(alone)}")
         if self.identifiable:
-            lines.append(f"Identified by themselves: {', '.join(self.identifiable)}")
+            lines.append(f"Individually identifiable: {', '.join(self.identifiable)}")
         if self.held:
-            lines.append(f"Held, as it is not shown: {', '.join(self.held)}")
+            lines.append(f"Held at the nominal value: {', '.join(self.held)}")
         return "\n".join(lines)
 
 

@@ -65,8 +65,8 @@ class Prior:
         std = numbers("std of the prior", stds, finite=False)
         if not (std > 0.0).all():
             raise ValueError(
-                "std of the prior must be positive (inf: nothing is known; "
-                f"fixed=[name] holds a parameter), got {in_words(std[~(std > 0.0)])}"
+                "std of the prior must be positive (inf: nothing known; fixed=[name] "
+                f"holds a parameter), got {in_words(std[~(std > 0.0)])}"
             )
 
     def sized(self) -> Prior:
@@ -90,7 +90,7 @@ class Prior:
         for name in self.fixed:
             free[names.index(one_of("parameter in fixed", name, names))] = False
         if self.fixed and not free.any():
-            raise ValueError("prior must leave a parameter free, but it fixes them all")
+            raise ValueError("prior fixes all parameters; at least one must be free")
         return ResolvedPrior(mean, 1.0 / std**2, free)
 
 
@@ -141,12 +141,12 @@ class Noise:
         require_none(~(spread >= 0.0), spread, rule)
         unknown = np.isinf(np.atleast_2d(spread))
         if (unknown.any(axis=0) & ~unknown.all(axis=0)).any():
-            raise ValueError("command_std must be inf in every row of a column or none")
+            raise ValueError("command_std must be inf in a whole column, or nowhere")
         uncertain = np.isfinite(spread) & (spread > 0.0)
         if self.std is None and self.covariance is None and uncertain.any():
             raise ValueError(
-                "command_std needs std or covariance of the readings beside it: "
-                "the two are added in the readings' units"
+                "command_std needs std or covariance of the readings too: the two are "
+                "added in the readings' units"
             )
 
     def of(self, rows: NDArray[np.bool_]) -> Noise:
@@ -204,7 +204,7 @@ class Noise:
         if self.command_std is not None:
             if command_jacobian is None:
                 raise ValueError(
-                    "command_std needs the derivative by the commands: give a model, "
+                    "command_std needs the derivative by the commands: pass a model, "
                     "or command_jacobian (N, q, n)"
                 )
             derivative = array_of("command_jacobian", command_jacobian, *shape[:2], "n")

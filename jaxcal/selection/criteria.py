@@ -347,7 +347,7 @@ class ScenarioCriterion:
     def __init__(self, criterion: Any = None) -> None:
         if isinstance(criterion, ScenarioCriterion):
             raise ValueError(
-                f"{type(self).__name__} must be given a criterion of one scenario, got "
+                f"{type(self).__name__} needs a criterion of one scenario, got "
                 f"{type(criterion).__name__}"
             )
         self.criterion = criterion
@@ -427,8 +427,8 @@ class ScenarioCriterion:
             scale = 1.0 / np.maximum(units, 1e-320)
         if not (np.isfinite(scale) & (scale > 0.0)).all():
             raise ValueError(
-                f"criterion {self.name} must be a number in double precision in every "
-                "scenario, but is not in these units; give the commands in others"
+                f"criterion {self.name} exceeds double precision in a scenario; give "
+                "the commands in other units"
             )
         return (scale if optima is None else scale / optima), np.zeros(len(scale))
 
@@ -525,8 +525,7 @@ def criterion_of(criterion: Any, region: Any, default: str) -> Criterion:
         return asked
     if not asked.of_region or asked.region is not None:
         raise ValueError(
-            "region goes with criterion I or G only, and once, "
-            f"got criterion {asked.name}"
+            f"region works once, with criterion I or G only, got criterion {asked.name}"
         )
     return type(asked)(region)  # type: ignore[call-arg]  # I and G
 
@@ -547,5 +546,5 @@ def positions(
                 f"({', '.join(names)}), got {asked!r}"
             )
     if len(set(places)) < len(places) or not places:
-        raise ValueError(f"parameters must name some once each, got {parameters!r}")
+        raise ValueError(f"parameters must be names, each once, got {parameters!r}")
     return [int(at) for at in places]

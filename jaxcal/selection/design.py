@@ -101,7 +101,7 @@ class Design:
     ) -> None:
         if (candidates is None) == (blocks is None):
             got = "neither" if blocks is None else "both"
-            raise ValueError(f"either candidates or blocks must be given, got {got}")
+            raise ValueError(f"give either candidates or blocks, got {got}")
         rows: Any = candidates if blocks is None else commands
         labels: Any = names
         self.candidate_set = CandidateSet(
@@ -278,17 +278,15 @@ class Design:
         times = np.bincount(subset, minlength=count)
         missing = problem.required[times[problem.required] == 0]
         if len(missing):
-            raise ValueError(
-                f"indices must hold every required candidate, got no {missing[0]}"
-            )
+            raise ValueError(f"indices lack the required candidate {missing[0]}")
         if (over := np.flatnonzero(times > problem.upper)).size:
             raise ValueError(
-                "indices must repeat a candidate at most max_replicates = "
+                "indices may repeat a candidate at most max_replicates = "
                 f"{problem.upper[over[0]]} times, got {times[over[0]]}"
             )
         if problem.constraints is not None:
             if broken := problem.constraints.broken(times):
-                raise ValueError(f"indices must keep the constraints, got {broken}")
+                raise ValueError(f"indices violate the constraints: {broken}")
         return problem
 
     plan = late("jaxcal.selection.plan:plan")
@@ -348,8 +346,8 @@ class Design:
         least = problem.criterion.kind == "least"
         if not math.isfinite(value) or (least and not value > 0.0):
             raise ValueError(
-                f"criterion {problem.criterion.name} must be a number in double "
-                f"precision, got {value} in these units; give the commands in others"
+                f"criterion {problem.criterion.name} is {value}, which exceeds double "
+                "precision; give the commands in other units"
             )
 
     def _why_singular(self, indices: Indices) -> str:
@@ -400,8 +398,8 @@ def _require_allowed(problem: Problem, indices: Indices, method: str) -> None:
         right = bool(((problem.lower <= counts) & (counts <= problem.upper)).all())
     if not right or not problem.allows(indices):
         raise RuntimeError(
-            f"method {method!r} must return {problem.k} candidates within lower "
-            f"and upper of its problem, by number, got {indices.tolist()}"
+            f"method {method!r} must return {problem.k} candidates within the bounds "
+            f"lower and upper of its problem, got {indices.tolist()}"
         )
 
 

@@ -174,7 +174,7 @@ class Selection:
         """What is left of det S where one measurement fails, in words."""
         needed = np.flatnonzero(self.left_without == 0.0)
         if len(needed) == len(self.indices):
-            return "singular, whichever is lost"
+            return "singular, whichever measurement is lost"
         names = [self.labels[i] for i in needed]
         if len(names) > 1:
             return f"singular without any one of {self._noun}s {', '.join(names)}"

@@ -68,7 +68,7 @@ def test_a_scalar_is_one_output():
 )
 def test_the_number_of_inputs_is_that_of_the_first_commands(f):
     model = FromJax(f, [1.0])
-    with pytest.raises(ValueError, match="num_inputs of this model is not known"):
+    with pytest.raises(ValueError, match="give num_inputs"):
         model.num_inputs  # noqa: B018 (reading it is the test)
     model.predict([[1.0, 2.0, 3.0, 4.0]])
     assert model.num_inputs == 4

@@ -78,7 +78,7 @@ def test_corners_outside_the_picture_are_named():
     np.testing.assert_array_equal(narrow.predict(joints), arm.predict(joints))
     arm.prepared(joints, arm.predict(joints))
     arm.prepared(joints, _at_left(pixels, 3, -0.0005).reshape(8, -1))  # noise
-    with pytest.raises(ValueError, match=r"in 1 of the board's 8 .* its row 3 is at"):
+    with pytest.raises(ValueError, match=r"1 of 8 board rows .* of row 3 is at"):
         arm.prepared(joints, _at_left(pixels, 3, -0.01).reshape(8, -1))
     aside = joints.copy()
     aside[5, 4] += 180.0  # the camera looks away

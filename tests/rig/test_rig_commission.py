@@ -198,4 +198,4 @@ def test_a_count_of_0_after_a_power_cycle_is_not_home(at, name, obeys, monkeypat
             else:
                 check_drives(served, drives, record)
     assert (record.state(HOMED) is None) is obeys
-    assert any("is not noticed" in line for line in told) is not obeys
+    assert any("is not detected" in line for line in told) is not obeys

@@ -245,7 +245,7 @@ def test_a_serial_port_in_use_says_so():
     pytest.importorskip("serial", reason="serial ports need pyserial")
     with simulator(fast_config(), transport="rtu") as sim:
         settings = sim.start().bus
-        with Bus(settings), pytest.raises(BusError, match="held by another"):
+        with Bus(settings), pytest.raises(BusError, match="in use by another"):
             Bus(settings).open()
 
 

@@ -249,7 +249,7 @@ def test_what_goes_on_after_a_fault_is_what_the_console_said():
     lack = "the device is not HOMED: yaw. Run `jaxcal-rig setup home`. Then resume"
     fault = {"event": "fault", "code": 3, "reason": "alarm", "go_on": lack}
     state = state_of(numbered([*begun(), fault]))
-    assert f"To go on: {lack}" in view.trouble(state, False, "runs/one")
+    assert f"To continue: {lack}" in view.trouble(state, False, "runs/one")
 
 
 def test_a_missing_record_is_told_and_a_foreign_one_harms_nothing(tmp_path):

@@ -318,7 +318,7 @@ def test_a_creeping_device_never_settles():
     ("fault", "error"),
     [
         ("stuck_axis,axis=yaw@moving", "yaw does not follow"),
-        ("alarm,axis=roll", "roll: alarm 0x30. .* go on with --reset-alarms"),
+        ("alarm,axis=roll", "roll: alarm 0x30. .* continue with --reset-alarms"),
         ("sto,axis=yaw", "power stage of yaw was switched off while armed"),
         ("imu_gap@moving", "s old"),
         ("dead_drive,axis=pitch", "no valid reply"),

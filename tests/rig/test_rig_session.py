@@ -380,7 +380,7 @@ def test_goto_refuses_what_the_limits_do_not_reach(finished, tmp_path, capsys):
     code = main(["goto", str(finished[0]), "--simulate", "--to", "40", "0", "0",
                  "--out", str(tmp_path)])  # fmt: skip
     assert code == 2
-    assert "outside [" in capsys.readouterr().out
+    assert "(limits " in capsys.readouterr().out
 
 
 def test_a_session_leaves_no_thread_and_no_open_socket(tmp_path):
