@@ -221,7 +221,7 @@ def test_four_postures_with_known_noise_have_a_covariance() -> None:
         found.covariance, 0.01 * np.linalg.inv(full.T @ full), rtol=1e-8, atol=1e-12
     )
     assert found.lack_of_fit() is None
-    assert "the noise is not checked" in found.summary()
+    assert "noise not checked: no residual" in found.summary()
 
 
 @pytest.mark.parametrize(

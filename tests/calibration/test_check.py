@@ -264,7 +264,7 @@ def test_contacts_of_sockets_placed_anew_hold_where_enough_of_them_say_so():
     assert told.says == "cannot be told"
     assert {"d1", "theta1"} <= set(told.blind) and "theta2" not in told.blind
     assert "not checked, because parts were moved: " in str(told)
-    assert f"about {told.enough} rows like these in all" in told.next_step
+    assert f"about {told.enough} rows like these in total" in told.next_step
     assert 6 < told.enough <= 36
     rows = commands[24:][: told.enough], zeros[24:][: told.enough]
     assert found.check(*rows, placed_anew=True).says == "holds"

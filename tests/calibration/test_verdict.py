@@ -242,7 +242,7 @@ def test_a_contact_that_is_written_twice_counts_once():
         for each in (rows, np.append(rows, rows[0]))
     )
     np.testing.assert_array_equal(once.parameters, twice.parameters)
-    assert twice.verdict.reasons[-1] == "measurement 13 is 0 again, counted once"
+    assert twice.verdict.reasons[-1] == "measurement 13 repeats 0, counted once"
 
 
 @pytest.mark.parametrize(("name", "off"), [("panda_1", -0.01), ("kuka_14", 0.01)])
@@ -351,7 +351,7 @@ def test_a_distance_that_contacts_contradict_is_named(apart):
     with pytest.warns(UserWarning, match="measure that distance again"):
         found = jaxcal.identify(np.column_stack(PLACE), np.zeros((62, 3)), model=arm)
     said = " ".join(found.verdict.reasons)
-    free = float(re.search(r"lengths say (\S+) \+-", said)[1])
+    free = float(re.search(r"lengths give (\S+) \+-", said)[1])
     assert not found.verdict.good and abs(free - 0.05) < 0.2 * abs(apart - 0.05) + 5e-4
 
 
@@ -368,7 +368,7 @@ def test_a_distance_is_freed_under_the_prior_that_was_stated():
         free = arm.measured_with(Socket(2))
         places = jaxcal.identify(commands, zeros, model=free, prior=prior).parameters
     apart = np.linalg.norm(places[-3:] - places[-6:-3])
-    told = float(re.search(r"lengths say (\S+) \+-", said)[1])
+    told = float(re.search(r"lengths give (\S+) \+-", said)[1])
     assert told == pytest.approx(apart, abs=1e-5)
 
 
@@ -407,7 +407,7 @@ def test_a_column_that_never_changes_is_named():
 
 
 def test_degrees_that_were_converted_again_are_named():
-    with pytest.raises(ValueError, match=r"leave out np\.degrees, --radians"):
+    with pytest.raises(ValueError, match=r"Leave out np\.degrees, --radians"):
         _fit("panda_1", np.degrees(PLACE[0]), PLACE[1])
 
 

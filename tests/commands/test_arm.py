@@ -271,7 +271,7 @@ def test_a_recording_is_identified_and_checked_in_the_shell(files, capsys):
     for more, message in (
         (["--radians"], "recordings state their unit"),
         (["--topic", "/none"], "got none with topic /none"),
-        (["--sensor", "socket", "--which", "0x3,1"], "of 8 rests which socket each"),
+        (["--sensor", "socket", "--which", "0x3,1"], "socket of each of the 8 rests"),
         (
             ["--sensor", "socket", "--which", "0x4,1x4", "--distance", "0,1,.05,.0001"],
             "contacts of socket",

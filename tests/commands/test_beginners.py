@@ -74,7 +74,7 @@ CASES = [  # what was typed, what the line must hold
     ("select book.xlsx", "save this one as CSV"),
     ("select table.csv --out plan.xlsx", "must end in .csv or .json, got plan.xlsx"),
     ("select table.csv -k 3", "k must be at least 4"),
-    ("select table.csv -k 13", "available candidates: 12, got 13"),
+    ("select table.csv -k 13", "12 available candidates, got 13"),
     ("select table.csv --inputs pitch,jaw", "no column 'jaw'; columns: pitch, yaw"),
     ("select table.csv --method best", "method must be one of", "got 'best'"),
     ("select table.csv --model arm.urdf", "there is no column 'turn'"),

@@ -183,7 +183,7 @@ FLAT[1, :, 2] = 1.0
     ("arguments", "message"),
     [
         (["--k", "3"], "k must be at least 4"),
-        (["--k", "51"], "k must not exceed the available"),
+        (["--k", "51"], "available candidates, got 51"),
         (["--k", "x"], "--k: must be a whole number of at least 1, got 'x'"),
         (["--episodes", "0"], "--episodes: must be a whole number"),
         (["--seed", "-1"], "--seed: must be a whole number of at least 0"),
@@ -332,8 +332,8 @@ def test_a_stream_stopped_by_sigterm_says_so_and_keeps_its_parts(
     child.send_signal(signal.SIGTERM)
     _, errors = child.communicate(timeout=120)
     assert child.returncode == 143, errors
-    says = "evaluate.py: terminated, finished parts are kept; run the same command again to resume"
-    assert errors.splitlines()[-1] == says
+    says = "terminated, finished parts are kept; run the same command again to resume"
+    assert errors.splitlines()[-1] == f"evaluate.py: {says}"
     assert not [path for path in folder.iterdir() if path.suffix != ".json"]
 
 

@@ -100,8 +100,8 @@ def test_an_update_that_does_not_fit_is_refused_with_what_would(
     monkeypatch.setattr(room, "memory", lambda: 4e4)
     with pytest.raises(
         ValueError,
-        match=r"--episodes-per-update 64 of 8 candidates needs [\d.e+-]+ GB of memory, "
-        r"there are 4e-05 GB: --episodes-per-update 8 should fit",
+        match=r"--episodes-per-update 64 of 8 candidates needs [\d.e+-]+ GB of memory; "
+        r"4e-05 GB are free: try --episodes-per-update 8",
     ):
         training.train(CONFIG, tmp_path)
     monkeypatch.setattr(room, "memory", lambda: 1e9)

@@ -520,7 +520,7 @@ def test_a_distance_from_one_hand_to_the_other_is_judged_by_both(apart, tmp_path
     said = [why for why in verdict.reasons if "measure that distance again" in why]
     assert verdict.good == (apart == 0.24) and len(said) == (apart != 0.24)
     if said:
-        told = re.search(r"0 and 2 are given as 0.23 .* say (\S+) \+- (\S+):", said[0])
+        told = re.search(r"0 and 2 was given as 0.23 .* give (\S+) \+- (\S+):", said[0])
         free, std = map(float, told.groups())
         assert abs(free - 0.24) < 3.0 * std < 0.003
         assert "fix the problems listed" in verdict.next_step

@@ -118,7 +118,9 @@ def test_processes_agree_and_a_run_that_ends_one_is_named(tmp_path, monkeypatch)
         parallel.predict(rows)[[0, 1, 3]], 2 * rows[[0, 1, 3]]
     )
     parallel.close()
-    with pytest.raises(ValueError, match="f must be a function at the top of a module"):
+    with pytest.raises(
+        ValueError, match="f must be a function at the top of an importable"
+    ):
         model(lambda u, t: decay(u, t), processes=2)
 
 
@@ -312,7 +314,7 @@ def test_bad_input_is_named():
         model(lambda u, t: np.zeros(3), batch=True).predict(U)
     with pytest.raises(ValueError, match="f must return numbers, got str"):
         model(lambda u, t: "one").predict(U)
-    with pytest.raises(ValueError, match="holds a function, which a file cannot"):
+    with pytest.raises(ValueError, match="contains a function, which cannot"):
         from_dict(model().to_dict())
     with pytest.raises(ValueError, match="f must be a program that can be run"):
         FromFunction("no-such-program {u}", [1.0], inputs=["u"])

@@ -81,7 +81,7 @@ def test_what_is_not_allowed_is_left_out():
         (
             _panda(Socket()),
             {"near": [[3.0, 0, 0]]},
-            "no posture reaches near = .* do not reach within .* unit of the arm's",
+            "no posture reaches near = .* cannot reach it within .* unit of the arm's",
         ),
         (_panda(Position()), {"allowed": lambda q: False}, "are not allowed"),
         (_panda(Socket()), {}, "near is missing: the rough place of each socket"),
@@ -97,7 +97,7 @@ def test_what_is_not_allowed_is_left_out():
         (
             SerialChain.from_dh([(1.0, 0, 0, 0)], limits=[[0.0, 5.0]]),
             {"count": 9},
-            "count must be at most 2 for this arm .* got 9: .* are next to another one",
+            "count must be at most 2 for this arm .* got 9: .* too close to another",
         ),
     ],
 )

@@ -184,7 +184,7 @@ def test_a_recording_is_identified_and_checked_as_its_table_is(tmp_path):
     np.testing.assert_allclose(commands[:, :7], joints, atol=1e-9)
     np.testing.assert_array_equal(commands[:, 7], [0, 1] * 4)
     assert not zeros.any()
-    with pytest.raises(ValueError, match="measured must be given"):
+    with pytest.raises(ValueError, match="measured is missing"):
         jaxcal.identify(joints, model=arm)
 
 

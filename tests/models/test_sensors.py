@@ -295,7 +295,7 @@ def test_hand_and_eye_are_found_without_a_guess(moves):
         again = wide.located(JOINTS[ahead], pixels)
         np.testing.assert_allclose(again.tool, tool, atol=1e-5)
         np.testing.assert_allclose(again.sensor.place, PLACE, atol=1e-5)
-    with pytest.raises(ValueError, match="about two axes, or move it in two"):
+    with pytest.raises(ValueError, match="about two axes in these views"):
         still = np.repeat(commands[:1], 5, axis=0)
         model.located(still)
 
@@ -658,8 +658,14 @@ def test_a_sensor_of_ones_own_needs_no_more_than_a_class():
         (lambda: Socket(0), "count must be at least 1"),
         (lambda: Socket(2, np.zeros((3, 3))), r"places must have shape \(2, 3\)"),
         (lambda: Socket(2, distances=[(0, 1, 50.0)]), "distances must be rows"),
-        (lambda: Socket(2, distances=[(0, 2, 50.0, 0.1)]), "two of 2 sockets, from 0"),
-        (lambda: Socket(2, distances=[(1, 1, 50.0, 0.1)]), "two of 2 sockets, from 0"),
+        (
+            lambda: Socket(2, distances=[(0, 2, 50.0, 0.1)]),
+            "two of 2 sockets, counted from 0",
+        ),
+        (
+            lambda: Socket(2, distances=[(1, 1, 50.0, 0.1)]),
+            "two of 2 sockets, counted from 0",
+        ),
         (lambda: Plane(1, [[0, 0, 0, 1]]), "must have normals other than zero"),
         (lambda: Gravity(up=(0, 0, 0)), "up must be a direction"),
         (lambda: Gravity(0.0), "magnitude must be positive"),

@@ -237,7 +237,7 @@ def test_a_weight_bends_a_compliant_joint_by_its_torque():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"table": [(0, 1.5708, 1, 0)]}, "looks like right angles in radians"),
+        ({"table": [(0, 1.5708, 1, 0)]}, "look like right angles in radians"),
         ({"table": [(0, 90, 1)]}, r"table must have shape \(n, 4\)"),
         ({"joints": "RX"}, "joints must be 6 letters R"),
         ({"convention": "craig"}, "convention must be one of standard, modified"),

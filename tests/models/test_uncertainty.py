@@ -133,7 +133,7 @@ def test_a_level_of_noise_for_everything_each_output_or_each_candidate():
         ({"std": 1.0, "command_std": 1.0}, "needs the derivative by the commands"),
         (
             {"std": 1.0, "command_std": [[1.0], [np.inf]]},
-            "inf in every row of a column",
+            "inf in a whole column",
         ),
     ],
 )

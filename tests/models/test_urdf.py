@@ -132,12 +132,12 @@ ONE = [("revolute", (0, 0, 1), (0, 0, 0), (0, 0, 1))]
     ("text", "message"),
     [
         ("<robot>", "is not a URDF file"),
-        ("<sdf/>", r"must hold a <robot>, got <sdf>"),
+        ("<sdf/>", r"must be <robot>, got <sdf>"),
         (_urdf(ONE).replace("revolute", "floating"), "type of joint j1 .* 'floating'"),
         (_urdf(ONE).replace('"0.0 0.0 1.0"', '"0 a 1"'), "of joint j1 must be three"),
         (
             _urdf(ONE).replace("rpy=", 'quat_xyzw="0 0 0.6 0.8" other='),
-            "<origin> of joint j1 must give its rotation as rpy.*got quat_xyzw='0 0 0.6",
+            "<origin> of joint j1 must give its rotation.*got quat_xyzw='0 0 0.6",
         ),
         (
             _urdf(ONE).replace('axis xyz="0.0 0.0 1.0"', 'axis xyz="0 0 0"'),
@@ -165,7 +165,7 @@ ONE = [("revolute", (0, 0, 1), (0, 0, 0), (0, 0, 1))]
                 '<joint name="j2" type="fixed"><parent link="link0"/>'
                 '<child link="link1"/></joint>',
             ),
-            "link link1 is the child of the joints j1 and j2",
+            "link link1 is the child of two joints, j1 and j2",
         ),
         (_urdf([("fixed", *ONE[0][1:])]), "no movable joint between"),
     ],

@@ -299,7 +299,7 @@ def test_what_a_class_lacks_is_named_before_anything_moves(tmp_path, capsys, met
 def test_drives_of_two_lines_and_of_another_bus_are_refused():
     config = parse_config(stage_text(SERIAL.format("x"), family("grbl"), 1))
     other = parse_config(stage_text(CAN.format("x"), family("cia402"), 1))
-    with pytest.raises(Refused, match="share a line"):
+    with pytest.raises(Refused, match="must be of one kind"):
         make_drives(config.bus, [config.axes[0], other.axes[1]])
     with pytest.raises(Refused, match=r"bus\.transport: must be serial"):
         make_drives(other.bus, config.axes)

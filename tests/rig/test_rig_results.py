@@ -122,7 +122,7 @@ def test_refit_mends_a_wrong_order_without_new_recording(run, capsys):
     assert len(beside(run)) == 2
     capsys.readouterr()
     assert main(["refit", str(folder)]) == 2
-    assert "give that run instead" in capsys.readouterr().err
+    assert "pass that run instead" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -233,7 +233,7 @@ def test_a_simulated_setup_leaves_the_device_of_an_existing_file_alone(at, capsy
         (at / "rig.toml").write_text(quick_text(bus, port))
         given = ["setup", "--simulate", "--yes", "--config", "rig.toml"]
         assert main(given) == 2
-        assert "--simulate writes a file of its own" in capsys.readouterr().err
+        assert "--simulate writes a new file" in capsys.readouterr().err
         assert sim.server.requests == 0
 
 

@@ -325,16 +325,16 @@ def test_goto_with_another_gearing_is_refused_before_a_port_opens(
         assert code == 2
         error = capsys.readouterr().err
         for name in ("pitch", "yaw", "roll"):
-            assert f"axes.{name}.pulses_per_rev: 10000 then, 4000 now" in error
+            assert f"axes.{name}.pulses_per_rev: was 10000, is 4000" in error
     assert not (tmp_path / "runs").exists()
 
 
 @pytest.mark.parametrize(
     ("old", "new", "key"),
     [
-        ("direction = -1", "direction = 1", "axes.yaw.direction: -1 then, 1 now"),
+        ("direction = -1", "direction = 1", "axes.yaw.direction: was -1, is 1"),
         ('"leadshine_pr"', '"generic"', "axes.pitch.map: leadshine_pr ("),
-        ('order = "ZXY"', 'order = "YXZ"', "mechanism.order: ZXY then, YXZ now"),
+        ('order = "ZXY"', 'order = "YXZ"', "mechanism.order: was ZXY, is YXZ"),
         ("column_count = 4", "column_count = 4\nmounting_deg = [90, 0, 0]",
          "imu.mounting_deg: [0.0, 0.0, 0.0] then, [90.0, 0.0, 0.0] now"),
     ],

@@ -265,7 +265,7 @@ def refused(message, **change):
 
 def test_bad_blocks_are_one_clear_error():
     blocks, _ = drawn(0, 8, 2, 4)
-    refused("either candidates or blocks must be given, got neither", blocks=None)
+    refused("give either candidates or blocks, got neither", blocks=None)
     refused("got both", candidates=np.ones((8, 3)))
     refused(r"blocks must have shape \(M, q, p\).* got \(8, 4\)", blocks=blocks[:, 0])
     refused(r"none of them 0, got \(8, 0, 4\)", blocks=blocks[:, :0])

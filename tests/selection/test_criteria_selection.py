@@ -348,7 +348,7 @@ HELD = jaxcal.Prior(1.0, fixed=("a11", "a12", "a13", "b1"))
         ("prior must be a .* precision with blocks", {"prior": jaxcal.Prior(1.0)}),
         ("model needs candidates", {"model": Affine(3, 3)}),
         (r"candidates must have shape \(M, 2\)", BARE | {"model": Affine(2, 2)}),
-        ("prior must leave", BARE | {"model": Affine(3, 1), "prior": HELD}),
+        ("prior fixes all", BARE | {"model": Affine(3, 1), "prior": HELD}),
         (r"measured must have shape \(N, 3\)", BARE | {"measured": U[:, :2]}),
         (
             '"policy" is trained for criterion D, got A',

@@ -48,7 +48,7 @@ def test_readings_are_named_where_y_is_an_axis():
     table = roles("x_mm,y_mm,z_mm,r")[0]
     with pytest.raises(ValueError, match=r"'y_mm' may be a coordinate.* --outputs"):
         table.outputs(None)
-    with pytest.warns(UserWarning, match="'y_mm' is read as input: an axis"):
+    with pytest.warns(UserWarning, match="'y_mm' is read as input: a coordinate"):
         assert table.commands(None, but=["r"]) == ("x_mm", "y_mm", "z_mm")
     beside = roles("u_a,u_b,x_mm,y_mm,z_mm")[0]
     with pytest.raises(ValueError, match="'y_mm' may be a coordinate"):

@@ -289,7 +289,7 @@ def _require_enough(mask: Mask, k: int, cap: int | Indices) -> None:
     if int((mask * np.int64(cap)).sum()) < k:
         often = "at most max_replicates" if np.ndim(cap) else f"at most {cap}"
         raise ValueError(
-            f"k must not exceed the available candidates: {count}"
+            f"k must not exceed {count} available candidates"
             + (f", each {often} times" if np.ndim(cap) or cap > 1 else "")
             + f", got {k}"
         )
