@@ -106,13 +106,13 @@ class SerialChain(Arm, Model):
             joints: a letter a joint, R or P; all revolute when not given.
             base: where the arm stands in the measuring frame: (3,) or (4, 4).
             tool: the measured point in the last link's frame: (3,) or (4, 4).
-            sensor: what the tip is measured with, of ``jaxcal.models``, or its
-                ``to_dict()``; Position() when not given.
+            sensor: measures the tip; of ``jaxcal.models``, or its ``to_dict()``;
+                Position() when not given.
             gears: joints, counted from 1, whose gear ratio is a parameter ("gear2"):
                 the joint moves by the ratio, nominally 1, times its command.
             compliance: revolute joints, counted from 1, that yield under the loads
-                ("compliance2"): degrees per unit of weight times length. When not
-                given all of them where contacts are measured, else none.
+                ("compliance2"): degrees per unit of weight times length. By default all
+                joints for contacts, else none.
             yields: (C,) the compliance of these joints, as far as it is known; 0 when
                 not given.
             harmonics: revolute joints, counted from 1, with eccentric gears: they move
@@ -200,8 +200,8 @@ class SerialChain(Arm, Model):
                 by default.
             tip: link whose origin is the measured point, anywhere in the tree; the only
                 last one by default.
-            sensor: what the tip is measured with; Position() when not given.
-            locked: joints that stand still, by name, and where: degrees, metres.
+            sensor: measures the tip; Position() when not given.
+            locked: fixed joints by name, with their values: degrees, metres.
             limits: least and greatest command of joints, by name, instead of the
                 file's.
             options: ``gears``, ``compliance``, ``loads``, ``gravity`` of
@@ -231,7 +231,7 @@ class SerialChain(Arm, Model):
 
         Args:
             path: the .yaml.
-            sensor: what the tip is measured with; Position() when not given.
+            sensor: measures the tip; Position() when not given.
             options: of ``from_dh`` beside the table: ``tool``, ``base``, ``limits``.
         """
         from jaxcal.arms.files.urdf import read_ur_kinematics
@@ -334,10 +334,10 @@ class SerialChain(Arm, Model):
         Args:
             count: how many.
             seed: of the random starts.
-            near: where the sensor reads, roughly: (S, 3) sockets or (S, 4) planes where
-                the sensor has no places; rows (x, y, z, radius), one of which the tip
-                must be near, for a sensor that reads everywhere; nothing for a board.
-            allowed: says of joints (J,) whether they may be taken (collisions).
+            near: rough places: (S, 3) sockets or (S, 4) planes if the sensor has no
+                places; for a sensor that reads everywhere rows (x, y, z, radius), of
+                which the tip must be near one; not for a board.
+            allowed: function of joints (J,), False where they collide.
             camera: of a board, (width, height, fx, fy, cx, cy) in pixels, or a field of
                 view in degrees (horizontal, vertical): every corner is in the picture,
                 with a focal length that is known to a tenth.
@@ -347,10 +347,10 @@ class SerialChain(Arm, Model):
                 not given.
             side: "+z", the printed side is where the board's z axis points, or "-z";
                 known of a board that was found from views, else from either side.
-            floor: height (z in the measuring frame) that no joint is below; sockets
-                neither, by more than 1 % of the arm's length.
-            approach: direction (x, y, z) in which the tool comes, from the last joint
-                to the tip, and the degrees about it that are allowed (60).
+            floor: lowest height (z in the measuring frame) of joints, and of sockets
+                within 1 % of the arm's length.
+            approach: direction (x, y, z) of the tool's approach, from the last joint to
+                the tip, and the largest angle from it in degrees (60).
             clear: planes (normal, offset) whose other side, and boxes (least x, y, z,
                 greatest), that the arm does not touch: spheres along straight lines
                 between the joints, no shapes of the links. The first link and the tip
@@ -362,8 +362,8 @@ class SerialChain(Arm, Model):
             (count, n) commands with the sensor's columns, in an order of little travel.
 
         Raises:
-            ValueError: there are not so many, or a socket is reached by none; the
-                message says what became of the rest.
+            ValueError: there are fewer, or a socket cannot be reached; the message
+                counts the reasons.
         """
         from jaxcal.arms.postures import postures, view_and_room
 
@@ -606,8 +606,8 @@ class SerialChain(Arm, Model):
             path: the file to write.
             parameters: (p,).
             servos: the file that is corrected.
-            names: of motors that are not named as the joints.
-            force: write over a file that is there.
+            names: motors whose names differ from the joints'.
+            force: overwrite an existing file.
 
         Returns:
             Steps by which the middle of each motor's range moved.
@@ -720,8 +720,8 @@ class SerialChain(Arm, Model):
     ) -> str:
         """Write the arm with ``parameters`` as a file that robots read.
 
-        Such files have stiff joints and round gears: what was found of compliance and
-        harmonics is left out, with a warning.
+        Such files cannot hold compliance and gear harmonics: these are left out, with a
+        warning.
 
         Args:
             form: "urdf" is the file that the arm came from, its origins corrected:
@@ -733,7 +733,7 @@ class SerialChain(Arm, Model):
                 Robots' ROS description, for six joints, without base and tool.
             path: the file to write.
             parameters: (p,) as ``identify`` found them.
-            force: write over a file that is there.
+            force: overwrite an existing file.
 
         Returns:
             Of "urdf" the tip link, a new one where no fixed joint before it could hold
@@ -782,7 +782,7 @@ class SerialChain(Arm, Model):
         return self.sensor.rows(self.length, *tables)
 
     def located(self, commands: ArrayLike, measured: ArrayLike | None = None) -> Self:
-        """This arm with its sensor where nominal postures and readings put it.
+        """This arm with its sensor located by nominal postures and readings.
 
         Nothing is changed that was given: sockets, planes, anchors, boards and their
         cameras have no place of their own until the first readings. Of a tracker that
@@ -1016,15 +1016,15 @@ class SerialChain(Arm, Model):
         return Noise(std=self.sensor.stds(self.length or 1.0))
 
     def noise_with_play(self, play: ArrayLike) -> Noise:
-        """The sensor's noise and play of the joints, of which each rests anywhere in.
+        """The sensor's noise plus the backlash of the joints.
 
         Args:
-            play: degrees (or units of length) from stop to stop: one number or (J,),
-                0.3 or so of hobby servos.
+            play: total width of the backlash in degrees (or units of length): one
+                number or (J,); about 0.3 for hobby servos.
 
         Returns:
-            Noise for ``identify`` and ``select``: a joint is off by its play over the
-            square root of twelve.
+            Noise for ``identify`` and ``select``: a joint is off by its backlash over
+            the square root of twelve.
         """
         width = np.broadcast_to(numbers("play", play), (self.num_joints,))
         if not (width >= 0.0).all():
@@ -1034,10 +1034,10 @@ class SerialChain(Arm, Model):
         return dataclasses.replace(self.default_noise(), command_std=spread)
 
     def from_one_side(self, commands: ArrayLike, by: float) -> Array:
-        """Joints (N, J) to go to before each posture, so that all arrive from below.
+        """Joints (N, J) at which to start each move, so that all arrive from below.
 
-        Every joint then ends with its play on the same side, which is an error of its
-        zero and not of each reading.
+        The backlash is then always on the same side: an error of the joint's zero, not
+        of each reading.
 
         Args:
             commands: (N, n) postures.

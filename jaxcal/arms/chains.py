@@ -28,7 +28,7 @@ _SAME = 1e-9  # of lengths and degrees: one and the same link
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Chains(Model):
-    """Chains by the names of their tips; what they share is one parameter.
+    """Chains by the names of their tips; shared parameters occur once.
 
     Chains that begin with the same joints (a torso's) share these joints' columns, and
     the parameters of the links between them. A sensor that is given to several chains

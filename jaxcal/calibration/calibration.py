@@ -1,4 +1,4 @@
-"""``Calibration``: a fit with its inverse, its judges, its summary and its file."""
+"""``Calibration``: a fit with its inverse, checks, summary and file."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ Array = NDArray[np.float64]
 class Calibration(Fit):
     """The identified map from commands u (n inputs) to outputs y (m of them).
 
-    ``y = f(u; theta)`` with the most probable p parameters; printed, they come with
-    their intervals. ``identify`` makes it; see ``Fit`` for its fields.
+    ``y = f(u; theta)`` with the most probable p parameters; ``print`` shows them with
+    their intervals. ``identify`` returns it; see ``Fit`` for its fields.
     """
 
     def __repr__(self) -> str:
@@ -111,9 +111,9 @@ class Calibration(Fit):
     def verdict(self) -> Verdict:
         """Whether the calibration may be used, why not, and what to do next.
 
-        Printed, it is these lines; of an arm with held-out errors
-        (``jaxcal.arms.verdict.ArmVerdict``). The summary, ``report``, exit
-        codes and the warning of ``identify`` say this.
+        ``print`` shows it; for an arm with cross-validated errors
+        (``jaxcal.arms.verdict.ArmVerdict``). The summary, ``report``, exit codes and
+        the warning of ``identify`` use it.
         """
         from jaxcal.calibration.pairing import against
 
@@ -123,8 +123,8 @@ class Calibration(Fit):
     def mispairing(self) -> Mispairing | None:
         """How the readings and commands of the table were mispaired, if they were.
 
-        ``reason`` says it, ``repaired(commands, measured)`` gives the rows that belong
-        together. None: they pair as they stand, or that cannot be told.
+        ``reason`` describes it; ``repaired(commands, measured)`` returns the rows that
+        belong together. None: the rows are paired correctly, or it cannot be decided.
         """
         from jaxcal.calibration.pairing import mispairing
 
@@ -148,10 +148,10 @@ class Calibration(Fit):
     def to_urdf(self, path: str | os.PathLike[str], *, force: bool = False) -> str:
         """The arm's own file, corrected; see ``jaxcal.models.SerialChain.write``.
 
-        Files have stiff joints and round gears: what was found of compliance and
-        harmonics is not in them. Without compliance the arm is moved as a whole to
-        where its tip agrees best with the calibration's over its range; without
-        harmonics alone the rest is fitted again. A warning says how far off it is then.
+        Files cannot hold compliance and gear harmonics. Without compliance the arm is
+        moved as a whole so that its tip agrees best with the calibration's over its
+        range; without harmonics only, the rest is fitted again. A warning gives the
+        difference.
 
         Returns the tip link.
         """
@@ -178,18 +178,18 @@ class Calibration(Fit):
         names: Mapping[str, str] | None = None,
         force: bool = False,
     ) -> dict[str, int]:
-        """LeRobot's calibration file of a servo arm with the zeros that were found.
+        """Write LeRobot's calibration file of a servo arm with corrected zeros.
 
-        The readings are fitted again by what such a file holds, zeros of the joints;
-        a warning says how far off the arm is then. See ``jaxcal.models.Servos``. A
-        corrected URDF file besides would have the zeros twice.
+        The readings are fitted again by zeros of the joints only, as in such a file; a
+        warning gives the error. See ``jaxcal.models.Servos``. Do not also use a
+        corrected URDF file: it would apply the zeros twice.
 
         Args:
             path: the file to write.
             servos: the file that the postures were read with.
-            names: of motors that are not named as the joints: {"Rotation":
+            names: motors whose names differ from the joints': {"Rotation":
                 "shoulder_pan"}.
-            force: write over a file that is there.
+            force: overwrite an existing file.
 
         Returns:
             Steps by which the middle of each motor's range moved.
@@ -223,8 +223,8 @@ class Calibration(Fit):
         """The calibration of the same readings by another model of the machine.
 
         Args:
-            model: it, of the same commands and readings.
-            prior: of its parameters; that which ``identify`` takes when None.
+            model: of the same commands and readings.
+            prior: of its parameters; the default of ``identify`` when None.
             rows: (N,) which of the readings; all when None.
         """
         used = self.loss_weights > 0.0
@@ -318,7 +318,7 @@ class Calibration(Fit):
 
         Args:
             path: the file.
-            model: the model, where it holds a function, which no file can.
+            model: needed if it contains a function, which files cannot hold.
 
         Raises:
             OSError: it cannot be read.

@@ -73,23 +73,23 @@ def identify(
 ) -> Calibration:
     """The parameters of ``y = f(u; theta)`` that the measurements make most probable.
 
-    The fit starts at the prior's mean, and directions that no measurement shows stay
+    The fit starts at the prior's mean; directions that no measurement determines stay
     there. The affine model without prior, student's loss or noise of another kind than
-    ``noise_std`` is weighted least squares, and refuses commands that leave a direction
-    unexcited.
+    ``noise_std`` is weighted least squares; a direction that the commands do not excite
+    is an error.
 
     Args:
-        commands: (N, n) what the device was told, in any unit; an array, or a frame or
-            table, whose columns are read as ``jaxcal.read_table`` decides; of an arm
-            also a ``Recording``, or the path of one: a bag, a LeRobot dataset.
-        measured: (N, m) what it reached, in any unit. Contacts need none, nor does a
-            recording that has the readings, or a table that has columns y_....
+        commands: (N, n) commanded values in any unit; an array, or a frame or table,
+            whose columns are read as ``jaxcal.read_table`` decides; of an arm also a
+            ``Recording``, or the path of one: a bag, a LeRobot dataset.
+        measured: (N, m) readings in any unit. Not needed for contacts, recordings with
+            readings, and tables with columns y_....
         model: of ``jaxcal.models``, or any object with its methods; affine when not
             given.
-        prior: what is known beforehand; ``model.default_prior()`` when not given.
-        noise: of readings and commands; ``command_std`` makes the commands unknowns of
-            their measurement. The level of the readings is estimated where it is not
+        prior: prior knowledge of the parameters; ``model.default_prior()`` when not
             given.
+        noise: of readings and commands; ``command_std`` makes the commands unknowns of
+            their measurement. The level of the readings is estimated if not given.
         noise_std: () or (m,) short for ``Noise(std=...)``: standard deviation of a
             measurement of weight 1, in the measured unit.
         weights: (N,) a measurement of weight w has variance noise_std^2 / w (the number

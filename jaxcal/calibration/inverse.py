@@ -39,21 +39,21 @@ def command_for(
 ) -> Array:
     """Commands that reach desired outputs.
 
-    Of a square affine map its inverse, else Newton's method from several starts; within
-    limits the nearest output.
+    A square affine map is inverted; else Newton's method runs from several starts. With
+    limits it finds the nearest output.
 
     Args:
         fit: the calibration.
-        desired: (..., m) in the measured unit; m at most n. Where m is less than n the
-            command is the one that Newton's method finds near the start. Of an arm's
-            pose, position and turn from the nominal orientation at ``start``, which
-            then must be given, as ``model.rotation_vectors(start, R)``.
+        desired: (..., m) in the measured unit; m at most n. If m is less than n, the
+            command is that which Newton's method finds near the start. For an arm's
+            pose: position and turn from the nominal orientation at ``start`` (then
+            required), as ``model.rotation_vectors(start, R)``.
         limits: (n, 2) least and greatest command of each input, if any.
         start: (n,) or (..., n) where the search begins; the measured command whose
             output is nearest when not given.
-        clip: where the limits leave no exact command, the one within them whose output
-            is nearest, instead of refusing: in the measured unit for a square affine
-            map, else each output in its spread over the measurements.
+        clip: if no command within the limits is exact, return the command with the
+            nearest output instead of an error. Distance is in the measured unit for a
+            square affine map, else in each output's spread over the measurements.
 
     Returns:
         (..., n) in the command unit.

@@ -73,8 +73,8 @@ def inverse(
             of one output also (...).
         repeats: whole number from 1: the noise of a reading counts 1 / repeats.
         confidence: of the intervals, in (0, 1).
-        limits: (n, 2) where commands may lie. Of a curve that is not given them, what
-            was measured and a quarter of its range beyond.
+        limits: (n, 2) range of the commands. For a curve by default the measured range,
+            extended by a quarter.
         start: (n,) as of ``command_for``, where there are several inputs.
 
     Returns:

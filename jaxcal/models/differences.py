@@ -1,4 +1,4 @@
-"""Derivatives by finite differences whose steps are chosen by looking.
+"""Derivatives by finite differences with steps chosen from the noise of f.
 
 Noise: the values at seven points so close together that f is a polynomial there; what
 their higher differences leave is the noise of f. Values of few digits were printed: the

@@ -36,31 +36,32 @@ _SETS = 6  # of parameters whose results are kept in memory
 
 
 class FromFunction(Model):
-    """``y = f(u, theta)`` that can only be run; derivatives by finite differences.
+    """``y = f(u, theta)`` of any function or program; derivatives by finite
+    differences.
 
-    Their steps are chosen by looking, at the first derivative that is asked for, and
-    ``differences`` says which they are and how far off derivatives are. Commands for
-    which f raises, or returns what is not finite, are left out of a choice and named.
+    Steps are chosen from the noise of f at the first derivative; ``differences`` lists
+    them with the errors of derivatives. Commands for which f raises, or returns values
+    that are not finite, are left out of a selection and named.
 
     Args:
         f: function of one command (n,) and parameters (p,) that returns the q readings,
             or a program: its arguments with ``{name}`` where values go, which prints
             them.
         nominal: (p,) parameters of the machine as it was designed.
-        scale: (p,) by how much each parameter may be off: steps are a small part of it.
-            A tenth of the nominal value when not given, which then must not be 0.
+        scale: (p,) how far off each parameter may be: steps are a small part of it. A
+            tenth of the nominal value when not given, which then must not be 0.
         names: of the parameters; t1, t2, ... when not given.
         inputs: names of the n commands, or n; n is that of the first commands when not
             given. A program needs them.
         batch: f takes commands (N, n) and returns (N, q).
-        noise: the usual noise of a reading, where none is given to what asks.
-        prior: what is known of the parameters, where none is given to what asks.
+        noise: usual noise of a reading, the default of ``select`` and ``identify``.
+        prior: prior of the parameters, the default of ``select`` and ``identify``.
         periods: (q,) of readings that wrap, 360 of an angle in degrees, inf of others;
             one number for all.
-        processes: that run f at a time; f must then be importable. Or an executor of
-            ``concurrent.futures``, as a cluster's is, which you close.
-        cache: file in which runs are kept. It tells functions apart by their code, not
-            by what they call or read: delete it when that changes.
+        processes: number that run f; f must then be importable. Or an executor of
+            ``concurrent.futures``, such as a cluster's, which you close.
+        cache: file in which runs are kept. It compares functions by their code, not by
+            what they call or read: delete it when that changes.
         timeout: seconds after which a run of a program has failed.
         quiet: no progress on standard error.
     """

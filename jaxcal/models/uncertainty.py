@@ -1,4 +1,4 @@
-"""What is known before measuring (Prior) and how well one measures (Noise)."""
+"""Prior knowledge (Prior) and measurement noise (Noise)."""
 
 from __future__ import annotations
 
@@ -40,16 +40,15 @@ class ResolvedPrior:
 
 @dataclasses.dataclass(frozen=True)
 class Prior:
-    """Independent normal knowledge of a model's parameters.
+    """Independent normal prior of a model's parameters.
 
     Attributes:
         std: standard deviation in the parameters' units: one number, (p,), or a mapping
             from name to number. ``inf`` and names that are left out: nothing is known.
-        mean: one number, (p,), or a mapping from name to number; the model's nominal
-            value where it is left out.
-        fixed: names of parameters held at the mean, out of the identification.
-        by_data: of an arm, the sizes of the errors are taken from the readings; see
-            ``sized``.
+        mean: one number, (p,), or a mapping from name to number; default the model's
+            nominal values.
+        fixed: names of parameters held at the mean and not identified.
+        by_data: for an arm, the sizes of the errors are estimated; see ``sized``.
     """
 
     std: PerParameter
@@ -70,7 +69,7 @@ class Prior:
             )
 
     def sized(self) -> Prior:
-        """This prior with the scale of its groups taken from the readings.
+        """This prior with the scale of its groups estimated from the readings.
 
         Its standard deviations then say how errors compare within a group, not how
         large they are: a factor each of lengths, turns of the axes, zeros of the joints

@@ -35,7 +35,7 @@ _PREDICT = (
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """Whether a calibration may be used; printed, the reasons and the next step."""
+    """Whether a calibration may be used; ``print`` shows reasons and the next step."""
 
     good: bool
     reasons: tuple[str, ...]  # against it, or worth knowing

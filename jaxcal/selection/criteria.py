@@ -1,4 +1,4 @@
-"""What a choice is judged by: D, A, I, G, E, Ds, As. A new criterion is one class here.
+"""The criteria D, A, I, G, E, Ds, As. A new criterion is one class here.
 
 ``V = C M^-1 C.T`` is the covariance of the combinations ``C theta`` that matter, M the
 information (p, p). Every criterion is written as a concave phi(M) to be maximised:
@@ -75,7 +75,7 @@ class Coordinates(NamedTuple):
 
 
 class Criterion:
-    """What a choice is judged by; subclasses are the rows of ``CRITERIA``.
+    """A criterion; subclasses are the rows of ``CRITERIA``.
 
     As it is asked for it carries its data. ``within`` gives that of one problem, which
     has ``root`` and what follows, in the coordinates of the problem.
@@ -232,7 +232,7 @@ class A(Criterion):
 
 
 class E(Criterion):
-    """The combination of the parameters that is known worst."""
+    """The least certain combination of the parameters."""
 
     name, kind, says, per_output = "E", "least", "eigenvalue", True
 
@@ -240,7 +240,7 @@ class E(Criterion):
 class I(Criterion):  # noqa: E742 - the criterion's own name in the literature
     """Mean variance of the predictions over a region, in units of the noise.
 
-    Noise that differs by row is taken in root mean square: a prediction is no reading.
+    Noise that differs by row is averaged in root mean square.
 
     Args:
         region: (R, n) commands, or (R, q, p) blocks, at which predictions are wanted;
@@ -456,8 +456,8 @@ class Worst(ScenarioCriterion):
 
     Args:
         criterion: letters as "I", or an object that carries data.
-        efficiency: compare scenarios by the efficiency in each, measured by its own
-            optimum, or where that is not proven by the bound on it.
+        efficiency: compare scenarios by the efficiency in each, relative to its own
+            optimum, or to a bound if the optimum is not proven.
     """
 
     least = True

@@ -1,4 +1,4 @@
-"""How many measurements a wanted accuracy takes, with a table to judge it by.
+"""The number of measurements that a wanted accuracy needs, with a table.
 
 With noise of standard deviation sigma on an output, the fitted model predicts that
 output at z = [u, 1] with the standard error ``sigma sqrt(z.T G^-1 z)``, G = Z.T Z of
