@@ -75,7 +75,7 @@ def units_of(described: dict[str, Any]) -> tuple[str, str]:
 
 
 def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    """``key: VALUE then, VALUE now`` of two flat tables, where they differ."""
+    """``key: was VALUE, is VALUE`` of two flat tables, where they differ."""
     return [
         f"{key}: was {then.get(key, 'not known')}, is {now.get(key, 'not known')}"
         for key in dict.fromkeys([*then, *now])

@@ -332,8 +332,8 @@ class Change:
 
     def __str__(self) -> str:
         if self.new is None:
-            return f"{self.key} is removed (was {self.old!r}): {self.reason}"
-        return f"{self.key} = {self.new!r} (was {self.old!r}): {self.reason}"
+            return f"remove {self.key} (now {self.old!r}): {self.reason}"
+        return f"{self.key} = {self.new!r} (now {self.old!r}): {self.reason}"
 
 
 def ratios_of(config: RigConfig, findings: Findings) -> list[float]:

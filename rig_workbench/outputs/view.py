@@ -77,7 +77,7 @@ def trouble(state: RunState, running: bool, folder: str) -> list[str]:
     typed = [PLACES[typed[0]], *typed] if typed[0] in PLACES else typed
     typed = ["resume", folder] if state.mode in SESSIONS else typed
     go_on = (ended or {}).get("go_on", f"jaxcal-rig {shlex.join(typed)}")
-    go_on = f"To go on: {go_on}"
+    go_on = f"To continue: {go_on}"
     if state.damaged:
         lines.append("The journal has lines that cannot be read; some are left out.")
     if ended is None and not running and state.start:

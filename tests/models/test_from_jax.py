@@ -153,7 +153,7 @@ def test_what_is_not_finite_is_named():
 def test_a_function_cannot_come_back_from_a_file(arm):
     data = arm.to_dict()
     assert data["names"] == ["l1", "l2", "o1", "o2"] and data["kind"] == "jax"
-    with pytest.raises(ValueError, match=r"holds a function.*model=\.\.\."):
+    with pytest.raises(ValueError, match=r"contains a function.*model=\.\.\."):
         from_dict(data)
 
 

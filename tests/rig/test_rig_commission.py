@@ -132,7 +132,7 @@ def test_a_declined_correction_leaves_the_file_and_the_state(at):
         told: list[str] = []
 
         def read(question):
-            word = re.search(r"Type (\w+) to go on", question)[1]
+            word = re.search(r"Type (\w+) to continue", question)[1]
             return "no" if word == "correct" else word
 
         config = load_config("rig.toml")

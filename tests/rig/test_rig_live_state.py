@@ -134,9 +134,9 @@ def test_places_of_a_commissioning_step_are_shown_and_what_goes_on_is_the_step()
     for running in (True, False):
         assert commanded in numbers(state, running)
     told = trouble(state, False, "runs/axes")
-    assert "To go on: jaxcal-rig setup axes<" in told and "resume" not in told
+    assert "To continue: jaxcal-rig setup axes<" in told and "resume" not in told
     killed = trouble(state_of(numbered([start, stand])), False, "runs/axes")
-    assert "To go on: jaxcal-rig setup axes<" in killed
+    assert "To continue: jaxcal-rig setup axes<" in killed
 
 
 def test_the_posture_under_way_goes_through_its_states():

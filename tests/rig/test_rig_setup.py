@@ -117,7 +117,7 @@ def test_setup_asks_with_defaults_and_moves_nothing_without_a_yes(at):
 
     def read(question):
         asked.append(question)
-        word = re.search(r"Type (\w+) to go on", question)
+        word = re.search(r"Type (\w+) to continue", question)
         return word[1] if word and word[1] != "axes" else ""
 
     with device() as (sim, bus, port):
@@ -243,7 +243,7 @@ def test_a_simulated_check_of_the_axes_corrects_no_file(at, capsys):
     (at / "rig.toml").write_text(fast_text())
     given = ["--simulate", "--yes", "--config", "rig.toml", "--reversed", "roll"]
     assert main(["axes", *given]) == 1
-    assert "axes.roll.direction = -1 (is 1)" in capsys.readouterr().out
+    assert "axes.roll.direction = -1 (now 1)" in capsys.readouterr().out
     assert (at / "rig.toml").read_text() == fast_text()
 
 

@@ -336,7 +336,7 @@ def test_goto_with_another_gearing_is_refused_before_a_port_opens(
         ('"leadshine_pr"', '"generic"', "axes.pitch.map: leadshine_pr ("),
         ('order = "ZXY"', 'order = "YXZ"', "mechanism.order: was ZXY, is YXZ"),
         ("column_count = 4", "column_count = 4\nmounting_deg = [90, 0, 0]",
-         "imu.mounting_deg: [0.0, 0.0, 0.0] then, [90.0, 0.0, 0.0] now"),
+         "imu.mounting_deg: was [0.0, 0.0, 0.0], is [90.0, 0.0, 0.0]"),
     ],
 )  # fmt: skip
 def test_a_calibration_is_of_one_device(calibrated, old, new, key):
