@@ -133,14 +133,18 @@ def test_an_arm_whose_coupling_slips_is_stopped(tmp_path):
     "old, new, told",
     [
         ("k = 12\n", "", "session.k: missing; with a"),
-        ("[model]\n", '[model]\nfactory = "a:b"\n', "model.urdf: either urdf or fact"),
+        (
+            "[model]\n",
+            '[model]\nfactory = "a:b"\n',
+            "model.urdf: give either urdf or fact",
+        ),
         ("arm5.urdf", "none.urdf", "model.urdf: there is no file"),
         (
             "[model]\n",
             '[model]\nsensor = "position"\n',
             "model.sensor: must be gravity",
         ),
-        ('name = "turn"', 'name = "swing"', "its joints are turn, shoulder, elbow"),
+        ('name = "turn"', 'name = "swing"', "outwards are turn, shoulder, elbow"),
     ],
 )
 def test_wrong_models_of_arms_are_refused(old, new, told):

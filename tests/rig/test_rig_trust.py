@@ -333,7 +333,7 @@ def test_goto_with_another_gearing_is_refused_before_a_port_opens(
     ("old", "new", "key"),
     [
         ("direction = -1", "direction = 1", "axes.yaw.direction: was -1, is 1"),
-        ('"leadshine_pr"', '"generic"', "axes.pitch.map: leadshine_pr ("),
+        ('"leadshine_pr"', '"generic"', "axes.pitch.map: was leadshine_pr ("),
         ('order = "ZXY"', 'order = "YXZ"', "mechanism.order: was ZXY, is YXZ"),
         ("column_count = 4", "column_count = 4\nmounting_deg = [90, 0, 0]",
          "imu.mounting_deg: was [0.0, 0.0, 0.0], is [90.0, 0.0, 0.0]"),
@@ -368,7 +368,7 @@ def test_the_drives_own_gearing_counts(tmp_path):
         assert session(sim.start(), tmp_path, sim, said) == 2
         assert not any(sim.executions())
     assert "the drive of roll (unit 3) is set to 9000 pulses per turn" in said[-1]
-    assert "axes.roll.pulses_per_rev says 10000" in said[-1]
+    assert "axes.roll.pulses_per_rev is 10000" in said[-1]
 
 
 def test_a_drive_without_a_word_on_its_gearing_is_not_asked_for_it(tmp_path):
@@ -427,7 +427,7 @@ def test_another_drive_is_another_device(tmp_path):
         record.reach(SIGN_CHECKED, served)
         record.reach(STOP_PROVED, served)
         assert run_safely(run, lambda r: collect(r, 1)) == 2
-    assert "yaw: another drive (peak_current_tenth_A: 45" in said[-1]
+    assert "yaw: another drive (peak_current_tenth_A: was 45" in said[-1]
     assert DeviceRecord.load(record.path).state(IDENTIFIED) is None
 
 
