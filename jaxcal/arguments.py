@@ -108,7 +108,7 @@ class Parser(argparse.ArgumentParser):
             self._correct(unknown)
             if unknown[0].isdecimal() and "-k" in self._option_string_actions:
                 self.error(
-                    "{0} is no option; a number of rows is -k {0}".format(*unknown)
+                    "there is no option {0}; did you mean -k {0}?".format(*unknown)
                 )
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return parsed, unknown
@@ -128,7 +128,7 @@ class Parser(argparse.ArgumentParser):
             words, self.words = self.words, []  # once
             self._correct(words)
         if match := re.match(r"argument (?:.*/)?(--[\w-]+): expected one", message):
-            message += f"; write {match[1]}=VALUE where it begins with a minus"
+            message += f"; write {match[1]}=VALUE if the value begins with a minus"
         choice = r"argument (.+): invalid choice: '(.*)' \(choose from (.*)\)"
         if match := re.match(choice, message):
             if like := nearest(match[2], re.findall(r"[^\s',]+", match[3])):
@@ -340,7 +340,7 @@ def levels(text: str) -> list[float]:
         whole = text.strip()
         point, two = whole.replace(",", "."), whole.replace(",", ".0,") + ".0"
         raise argparse.ArgumentTypeError(
-            f"may be one number or two, got {whole!r}: write {point}, or {two}"
+            f"{whole!r} may be one number or two: write {point}, or {two}"
         )
     return several(number_type(float), "numbers")(text)
 

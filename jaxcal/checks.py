@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-ONE_COLUMN = "a column alone is values[:, None], or frame[['name']]"
+ONE_COLUMN = "one column alone is values[:, None], or frame[['name']]"
 
 
 def in_words(values: Array) -> str:
@@ -47,7 +47,7 @@ def axis_letter(index: int, count: int) -> str:
 
 def numbers(name: str, values: ArrayLike, *, finite: bool = True) -> Array:
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
-        raise ValueError(f"{name} must not be masked; leave those rows out")
+        raise ValueError(f"{name} must not be masked; leave the masked rows out")
     try:
         raw = np.asarray(values)
         if raw.dtype.kind not in "biufO":

@@ -60,7 +60,7 @@ class JsonLines:
         self._fd = os.open(self.path, flags, 0o644)
         try:
             if not until(patience_s, lambda: flock(self._fd)):
-                raise ValueError(f"{path}: a running session is writing it")
+                raise ValueError(f"{path}: another session is writing this file")
             self.records, self._size = read_records(self.path, whole)
             check(self.records)
             os.ftruncate(self._fd, self._size)

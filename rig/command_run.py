@@ -19,8 +19,8 @@ from rig.journal.run_folder import Record, RunFolder
 from rig.signals import Signals
 
 ONE_SPEED = (
-    "the stop was proved at one speed alone, by an earlier version: the axes move "
-    "slowly near their limits. `jaxcal-rig setup axes` proves it at two"
+    "the stop was proved at one speed only, by an earlier version, so axes move slowly "
+    "near their limits. `jaxcal-rig setup axes` proves it at two speeds"
 )
 
 
@@ -65,7 +65,7 @@ class Run(RunFolder):
             for line in lines:
                 self._say(line)
         except OSError:
-            self.signals.request_stop("the terminal is gone", EXIT_FAULT)
+            self.signals.request_stop("the terminal was closed", EXIT_FAULT)
 
     @property
     def zero_pulses(self) -> Pulses:
@@ -143,10 +143,10 @@ def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
         try:
             run.emit(event, sync=True, code=code, reason=reason, **told)
         except JournalError as error:
-            run.say(f"the run has no last line, as after a kill: {error}")
+            run.say(f"the run was cut off (its last line is missing): {error}")
         if event != "end":
             run.say(f"{event}: {reason}")
             if told:
-                run.say(f"to go on: {told['go_on']}")
+                run.say(f"to continue: {told['go_on']}")
         run.journal.close()
     return code

@@ -33,15 +33,15 @@ FILE = Path("rig.toml")  # without --config
 AxisName = Annotated[str, "of rig.toml"]
 WIDE = (-1e6, 1e6)
 RunPath = Annotated[Path, "the run's folder"]
-Saved = Annotated[Path, "its file, or its run's folder"]
-ConfigPath = Annotated[Path, "default: rig.toml here"]
-Faults = Annotated[list[str], "inject KIND[@PHASE][,count=N]...; list: names them"]
+Saved = Annotated[Path, "rig.toml, or a run's folder"]
+ConfigPath = Annotated[Path, "rig.toml of the device; default: rig.toml in this folder"]
+Faults = Annotated[list[str], "inject KIND[@PHASE][,count=N]...; list: shows kinds"]
 Postures = Annotated[int, "postures"]
-Programs = Annotated[list[str], "programs that the file names, and that are to be run"]
-Units = Annotated[int, "ids 1 to N are asked", (1, 247)]
+Programs = Annotated[list[str], "programs named in the file that may be run"]
+Units = Annotated[int, "scan unit ids 1 to N", (1, 247)]
 BusName = Annotated[
     str,
-    "rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT; of other drives than "
+    "rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT; for other drives than "
     "Modbus serial:DEVICE,BAUD or can:CHANNEL",
 ]
 
@@ -52,19 +52,21 @@ class Simulation:
 
     transport: Annotated[
         Literal["tcp", "rtu_tcp", "rtu"],
-        "of the simulated bus; rtu is a pseudo-terminal",
+        "transport of the simulated bus; rtu is a pseudo-terminal",
     ] = "tcp"
     noise: Annotated[float, "degrees", (0, 90)] = 0.02
     backlash: Annotated[float, "degrees", (0, 90)] = 0.0
     dead_zone: Annotated[float, "degrees", (0, 90)] = 0.0
-    breakaway: Annotated[float, "degrees until a joint at rest yields", (0, 90)] = 0.0
+    breakaway: Annotated[float, "degrees before a joint at rest moves", (0, 90)] = 0.0
     drift: Annotated[float, "degrees per minute", (-90, 90)] = 0.0
     speedup: Annotated[float, "factor on the speed of the axes", (0.01, 100)] = 1.0
     rate: Annotated[float, "of the phone, Hz", (0.1, 1000)] = 100.0
-    reversed: Annotated[list[str], "AXES that turn the other way", _axes] | None = None
-    swapped: Annotated[list[str], "A,B: two drives change cables", _axes] | None = None
-    gearing: Annotated[int, "pulses per turn, in the drives"] | None = None
-    lost_origin: Annotated[float, "degrees the counts are off", (-90, 90)] = 0.0
+    reversed: Annotated[list[str], "AXES that turn backwards", _axes] | None = None
+    swapped: (
+        Annotated[list[str], "A,B: two drives with swapped cables", _axes] | None
+    ) = None
+    gearing: Annotated[int, "pulses per turn that the drives are set to"] | None = None
+    lost_origin: Annotated[float, "offset of the counts, deg", (-90, 90)] = 0.0
     realistic: Annotated[bool, "slow replies and enabling, jitter, watchdog"] = False
 
 
@@ -77,7 +79,7 @@ class DeviceOptions(Simulation):
     """The device that a command is about."""
 
     config: ConfigPath | None = None
-    simulate: Annotated[bool, "run against a simulated rig"] = False
+    simulate: Annotated[bool, "run with a simulated device"] = False
     fault: Faults | None = None
 
     @property
@@ -97,7 +99,7 @@ class DeviceOptions(Simulation):
             if self.simulate or simulated:
                 return parse_config(example_text("simulate"))
             if not FILE.exists():
-                lack = "there is no rig.toml here: give --config FILE or --simulate"
+                lack = "no rig.toml in this folder: give --config FILE or --simulate"
                 setup = "`jaxcal-rig setup` writes one"
                 raise ConfigError("configuration", [f"{lack}; {setup}"])
             self.config = FILE
@@ -116,25 +118,23 @@ class DeviceOptions(Simulation):
 class Step(DeviceOptions):
     """How a step of commissioning is begun."""
 
-    yes: Annotated[bool, "confirm everything and take every default"] = False
-    reset_alarms: Annotated[
-        bool, "reset alarms of the drives before they are armed"
-    ] = False
+    yes: Annotated[bool, "confirm every question and take every default"] = False
+    reset_alarms: Annotated[bool, "reset alarms of the drives before arming"] = False
 
 
 @dataclasses.dataclass
 class Session(DeviceOptions):
     """How a session is begun and shown."""
 
-    out: Annotated[Path, "folder for the run's folder"] | None = None
+    out: Annotated[Path, "folder in which the run's folder is made"] | None = None
     dry_run: Annotated[bool, "plan; open no port"] = False
     arm: Annotated[bool, "arm without prompting"] = False
-    reset_alarms: Annotated[
-        bool, "reset alarms of the drives before they are armed"
+    reset_alarms: Annotated[bool, "reset alarms of the drives before arming"] = False
+    zero: Annotated[bool, "confirm that the device is in its zero posture"] = False
+    use: Annotated[
+        bool, "goto: use a calibration although its session advised against it"
     ] = False
-    zero: Annotated[bool, "the device stands in its zero posture"] = False
-    use: Annotated[bool, "goto: a calibration whose session said not to"] = False
-    live: Annotated[bool, "show it as a page in the browser"] = False
+    live: Annotated[bool, "show the live page in the browser"] = False
 
 
 # Commissioning
@@ -179,7 +179,7 @@ def jog(
 
 
 def home(
-    given: Step, *, here: Annotated[bool, "as it stands; else by the drives"] = False
+    given: Step, *, here: Annotated[bool, "home here, not by the drives"] = False
 ) -> int:
     """make the drives' counts mean a place"""
     return _step(given, "IDENTIFIED", "go_home", here)
@@ -254,7 +254,7 @@ def verify(calibration: Saved, *, count: Postures = 6, given: Session) -> int:
 def goto(
     calibration: Saved,
     *,
-    to: Annotated[tuple[float, ...], "what is to be measured, a number each", WIDE],
+    to: Annotated[tuple[float, ...], "desired value of every reading", WIDE],
     given: Session,
 ) -> int:
     """move the end-effector to a posture, calibrated"""
@@ -268,14 +268,14 @@ def resume(run: RunPath, *, given: Session) -> int:
     config, start = recorded(run, given.config)
     if given.simulate and start["simulated"] is None:
         raise Refused(
-            f"{run} was made with a real device, and resuming it moves that. Leave out "
-            "--simulate, or begin a simulated run"
+            f"{run} was made with a real device, and resuming it moves that device. "
+            "Leave out --simulate, or start a simulated run"
         )
     events = [record["event"] for record in records_of(run)]
     if events[-1] == "end" and "armed" in events:
         raise Refused(
-            f"{run} is finished: nothing is left to go on with. Begin a new run; "
-            f"`jaxcal-rig report {run}` writes its report again"
+            f"{run} is finished and cannot be resumed. Start a new run; `jaxcal-rig "
+            f"report {run}` writes its report again"
         )
     return run_session(given, "resume", config, start, run)
 
@@ -364,8 +364,7 @@ def check(
         make_drives(loaded.bus, loaded.axes)
     print(f"{path}: valid")
     for name in unrun:
-        print(f"  NOT run, and so not checked: {name}, a program that it names. "
-              f"With --run {name} it is")  # fmt: skip
+        print(f"  NOT CHECKED: {name}, a program. To check: --run {name}")
     for axis in loaded.axes:
         print(
             f"  {axis.name}: unit {axis.unit}, {axis.map.name}, "
@@ -386,7 +385,7 @@ def not_asked_for(config: RigConfig, run: list[str] | None) -> list[str]:
     return [name for name in dict.fromkeys(named) if name not in (run or ())]
 
 
-def example(name: Annotated[str, "without it they are listed"] | None = None) -> int:
+def example(name: Annotated[str, "default: list the names"] | None = None) -> int:
     """print a commented example configuration"""
     from rig.config.config import example_names, example_text
 
@@ -418,7 +417,7 @@ def resolved(argv: Sequence[str]) -> tuple[list[str], list[str]]:
         words.insert(1, "--simulate")
     elif flags and name != "simulate":
         given = " ".join([*words[:1], *sorted(flags)])
-        notes.append(f"type `jaxcal-rig simulate {given} ...`; without it this {UNTIL}")
+        notes.append(f"type `jaxcal-rig simulate {given} ...`; the old form {UNTIL}")
     return _ordered(words), notes
 
 
@@ -440,9 +439,9 @@ def _ordered(words: list[str]) -> list[str]:
 
 
 EPILOG = """\
-exit codes: 0 done; 1 done, but the error says calibrate (again); 2 bad input, nothing
+exit codes: 0 done; 1 done, but calibrate (again), see the error; 2 bad input, nothing
 moved; 3 stopped by a fault; 4 paused by Ctrl-C; 128 + signal stopped by a signal.
-After 3, 4 and signals `resume RUN` goes on.
+After 3, 4 and signals `resume RUN` continues the run.
 
 Research software, not a medical device. Calibrate with no patient attached; a hardware
 emergency stop is required.
@@ -467,8 +466,8 @@ class RigParser(Parser):
 
 def make_parser(only: str | None = None) -> Parser:
     """The parser of every command; with the options of one alone it is made quicker."""
-    about = "Calibrate a device of one to six axes: its drives, and what measures them."
-    about += " Begin with `setup`."
+    about = "Calibrate a device of one to six axes with its drives and its sensor."
+    about += " Start with `setup`."
     parser = RigParser(prog="jaxcal-rig", description=about, epilog=EPILOG)
     added = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     absent: dict[str, str] = {}
@@ -480,7 +479,7 @@ def make_parser(only: str | None = None) -> Parser:
         name, text = function.__name__, function.__doc__
         place = PLACES.get(name)
         told = {} if place else {"help": text}  # a step is listed in its place's help
-        more = f"\n\nby themselves: {', '.join(STEPS[name])}" if name in STEPS else ""
+        more = f"\n\nsingle steps: {', '.join(STEPS[name])}" if name in STEPS else ""
         prog = " ".join(filter(None, ("jaxcal-rig", place, name)))
         command = added.add_parser(name, prog=prog, description=text + more, **told)
         command.of(function)

@@ -137,8 +137,8 @@ def _procedure(
         return lambda run: collect(run, inputs["count"]), None, []
     if mode == "goto" and config.is_arm:
         raise Refused(
-            "goto: an arm is moved by its own controller. Give it calibrated.urdf of "
-            "the calibration's folder in place of the URDF"
+            "goto does not move an arm; its own controller does. Give it "
+            "calibrated.urdf of the calibration's folder instead of the URDF"
         )
     calibration, kept = verify.load_calibration(
         pathlib.Path(inputs["calibration"]), config, start["simulated"] is not None
@@ -155,16 +155,16 @@ def _confirm(options: SessionOptions, doubts: list[str], session: Run) -> None:
     questions = {}
     if doubts:
         questions["use"] = (
-            f"the session that made this calibration said not to use it: "
+            "the session that made this calibration advised against using it: "
             f"{' and '.join(doubts)}"
         )
     if not session.simulated:
         questions["arm"] = (
-            "the device will move; its way is clear, no patient is attached, the "
+            "the device will move; its path is clear, no patient is attached, the "
             "emergency stop is at hand"
         )
         if takes_zero and session.config.session.zero == "here":
-            questions["zero"] = "the device stands in its zero posture"
+            questions["zero"] = "the device is in its zero posture"
     for word, text in questions.items():
         if not getattr(options, word):
             Operator(say=say, option=f"--{word}").confirm(text, word)
@@ -177,7 +177,7 @@ def recorded(
     start = records_of(run)[0]
     if start["mode"] == "refit":
         source = start["inputs"]["run"]
-        raise Refused(f"{run} is a refit of {source}; give that run instead")
+        raise Refused(f"{run} is a refit of {source}; pass that run instead")
     if start["mode"] not in ("calibrate", "collect", "verify", "goto"):
         raise Refused(f"{run} is a step of commissioning: run it again instead")
     if config is not None:
@@ -189,16 +189,16 @@ def recorded(
 def records_of(run: pathlib.Path) -> list[Record]:
     """The journal of a run; Refused where its folder holds none, or a damaged one."""
     if not (run / JOURNAL).is_file():
-        raise Refused(f"{run} is not the folder of a run: it holds no {JOURNAL}")
+        raise Refused(f"{run} is not a run's folder: it has no {JOURNAL}")
     try:
         records = read_journal(run / JOURNAL)
     except JournalError as error:
         raise Refused(str(error)) from None
     if not records or records[0]["event"] != "start":
-        raise Refused(f"{run} is not the folder of a run: its journal has no start")
+        raise Refused(f"{run} is not a run's folder: its journal has no start")
     if records[0].get("schema") != SCHEMA:
         raise Refused(
-            f"{run} was written by an earlier version of jaxcal, whose runs are not "
-            "read. Make a new one"
+            f"{run} was written by an earlier version of jaxcal, which is no longer "
+            "supported. Make a new run"
         )
     return records

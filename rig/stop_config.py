@@ -150,18 +150,18 @@ def bus_of(table: Any, faults: Faults) -> Bus | None:
             value = type(default)(value)
         setattr(bus, field.name, value)
     bus.parity = bus.parity[:1].upper() if bus.parity[:1].upper() in "NEO" else "N"
-    fault = "" if bus.transport in TRANSPORTS else f"none of {', '.join(TRANSPORTS)}"
+    fault = "" if bus.transport in TRANSPORTS else f"not one of {', '.join(TRANSPORTS)}"
     word = bus.transport.lower()
     near = difflib.get_close_matches(word, TRANSPORTS, 1, NEAR_NAME)
     given, bus.transport = bus.transport, near[0] if near else ""
     if not (bus.host or bus.device):
-        faults.append("[bus] names no host and no device")
+        faults.append("[bus] has no host and no device")
         return None
     if not (bus.host if bus.transport in NETWORK else bus.device and bus.transport):
-        fault = fault or "its host or device is missing"
+        fault = fault or "host or device is missing"
         bus.transport = "tcp" if bus.host else "rtu"
     if fault:
-        text = f"bus.transport: {fault}, {given!r}; {bus.transport} is tried"
+        text = f"bus.transport: {fault}, {given!r}; trying {bus.transport}"
         faults.append(text)
     return bus
 
@@ -180,8 +180,8 @@ def _map_of(
     if not path.is_file():
         names = [path.stem for path in MAP_FOLDER.glob("*.toml")]
         near = difflib.get_close_matches(path.stem, names, 1, NEAR_NAME)
-        tried = f"; {near[0]} is tried" if near else ""
-        faults.append(f"there is no map {name}{tried}")
+        tried = f"; trying {near[0]}" if near else ""
+        faults.append(f"no map {name}{tried}")
         path = MAP_FOLDER / f"{near[0]}.toml" if near else path
     return map_of(_decoded(path.read_bytes()), path.parent, faults)
 
@@ -221,11 +221,11 @@ def map_of(text: str, folder: pathlib.Path, faults: Faults) -> SimpleNamespace |
             bits["fault"] = bits["fault"] or never
             drive_map.status = Flags(**vars(value), **bits)
     if drive_map.drive == "modbus" and drive_map.stop is None:
-        faults.append(f"the map {drive_map.name} has no [stop] that can be read")
+        faults.append(f"the map {drive_map.name} has no readable [stop]")
         return None
     if drive_map.drive == "modbus" and not (drive_map.status and drive_map.position):
         faults.append(
-            f"of the map {drive_map.name} [status] or [position] cannot be read"
+            f"[status] or [position] of the map {drive_map.name} cannot be read"
         )
     return drive_map
 
@@ -299,8 +299,8 @@ def _number(
             return number
     except (TypeError, ValueError):
         pass
-    used = f"; {default:g} is used" if default else ""
-    faults.append(f"{name}: no number in [{low:g}, {high:g}], {value!r}{used}")
+    used = f"; using {default:g}" if default else ""
+    faults.append(f"{name}: not a number in [{low:g}, {high:g}], {value!r}{used}")
     return default
 
 

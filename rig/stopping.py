@@ -48,7 +48,7 @@ def main(words: Sequence[str]) -> int:
         if name[:1] == "-" and "config".startswith(name.lstrip("-") or "?"):
             value = value if equals else rest.pop(0) if rest else str(FILE)
         elif name.startswith("-") or given:
-            _say(f"{name}: not an option of stop, and not read")
+            _say(f"{name}: not an option of stop, ignored")
             continue
         else:
             value = name + equals + value
@@ -82,9 +82,9 @@ class ArmedBus:
         try:
             self.holder = self.lock.signal_holder(signal.SIGTERM)
         except (OSError, Refused) as error:  # the lock is a help, not a condition
-            _say(f"cannot ask who holds {self.lock.where}: {error}")
+            _say(f"cannot find out who uses {self.lock.where}: {error}")
         if self.holder is not None:
-            _say(f"{self.lock.where} is {held_by(self.holder)}: told to stop now")
+            _say(f"{self.lock.where} is {held_by(self.holder)}; asking it to stop")
 
     def end(self) -> None:
         """Wait for the holder; kill one that has not stopped its drives in time."""
@@ -94,15 +94,15 @@ class ArmedBus:
         if not freed and self._stand:
             freed = self._stayed()
         if not freed:
-            _say("it has not stopped its drives in time: it is killed now")
+            _say("it has not stopped its drives in time; killing it")
             with contextlib.suppress(OSError, Refused):
                 self.lock.signal_holder(signal.SIGKILL)
             if not self.lock.freed(KILLED_S) and not (self._stand and self._stayed()):
-                _say("it still holds the bus")
+                _say("it still uses the bus")
         _say(
-            "it reported that all its drives stand"
+            "it reported that all its drives are at rest"
             if self._stand
-            else "it did not report that its drives stand"
+            else "it did not report that its drives are at rest"
         )
 
     def _stayed(self) -> bool:
@@ -188,7 +188,7 @@ def _targets(path: pathlib.Path, given: bool) -> list[ArmedBus]:
             f"{LAST_RESORT}"
         )
     if not targets or more:
-        _say(f"{lack}: stopping all that sessions of this user have armed")
+        _say(f"{lack}: stopping everything that sessions of this user have armed")
     return targets + more or every
 
 
@@ -210,7 +210,7 @@ def _tell_others(stopped: list[pathlib.Path]) -> None:
         device = f", {armed['device']}" if "device" in armed else ""
         _say(
             f"NOT stopped, another device: {target.lock.where}{device} is armed"
-            + (f" and {held_by(holder)}" if holder else ", by a session that is gone")
+            + (f" and {held_by(holder)}" if holder else ", by a session that ended")
             + ". `jaxcal-rig stop` in its folder stops it"
         )
 
@@ -238,7 +238,7 @@ def stop_units(target: ArmedBus, stay: bool = False) -> list[UnitStop]:
         try:
             stack.enter_context(target.lock.acquire("stop"))
         except (OSError, Refused):  # stop without the lock
-            _say(f"{target.lock.where} is not free: its drives are stopped anyway")
+            _say(f"{target.lock.where} is in use: stopping its drives anyway")
         line, drives = make_drives(bus, axes, silence_s)
         stack.callback(line.close)
         named = ", ".join(f"{axis.name} (unit {axis.unit})" for axis in axes)
@@ -257,7 +257,7 @@ def stop_units(target: ArmedBus, stay: bool = False) -> list[UnitStop]:
                 if time.monotonic() > end:
                     raise BusError(f"{NOTHING}: {error}", LAST_RESORT) from None
                 _say(f"{error}. {LAST_RESORT}")
-            _say("the connection may not be free yet: it is tried again")
+            _say("the connection may not be free yet; trying again")
             time.sleep(AGAIN_S)
         for text in stop.stay(drives, results, stop.stand_s(drives) * stay):
             _say(f"WARNING: {text}, and was stopped again")
@@ -298,11 +298,11 @@ def _drives(target: ArmedBus) -> tuple[Any, float, list[Any], list[UnitStop]]:
             except Refused as error:
                 lost[axis.name] = UnitStop(axis.name, axis.unit, detail=str(error))
         for name, unit in source.lost if first else ():
-            text = "how it is stopped cannot be read"
+            text = "the way to stop it cannot be read"
             lost[name] = UnitStop(name, unit, detail=text)
     if not axes:
         faults = [fault for source in sources for fault in source.faults]
-        reason = "; ".join(faults) or "no axis is known, of the file or armed"
+        reason = "; ".join(faults) or "neither the file nor a session names an axis"
         raise Fault(f"{NOTHING}: {reason}. {LAST_RESORT}")
     silence_s = max(source.silence_s for source in sources)
     return bus, silence_s, axes, [*lost.values()]

@@ -47,11 +47,11 @@ def setup(
     axes: Annotated[
         str, "NAME:KIND,... with a KIND of X, Y, Z (a phone's), deg or mm"
     ] = "",
-    drives: Annotated[str, "their map, of one's own: FILE.toml"] = "",
+    drives: Annotated[str, "your own register map: FILE.toml"] = "",
     readings: Annotated[
-        str, "numbers, not a phone: tcp:HOST:PORT, listen:PORT, serial:DEVICE, ..."
+        str, "instead of a phone: tcp:HOST:PORT, listen:PORT, serial:DEVICE, ..."
     ] = "",
-    urdf: Annotated[str, "of an arm, whose joints are the axes"] = "",
+    urdf: Annotated[str, "URDF file of an arm, whose joints are the axes"] = "",
     set: Annotated[list[str], "KEY=VALUE of the new rig.toml"] | None = None,
 ) -> int:
     """from cables to a device that may be calibrated; writes rig.toml"""
@@ -67,8 +67,8 @@ def setup(
     )  # fmt: skip
     if given.simulate and (axes or drives or readings or urdf):
         raise Refused(
-            "--simulate commissions the simulator's own device: leave out --axes, "
-            "--drives, --readings and --urdf"
+            "--simulate commissions the simulated device: leave out --axes, --drives, "
+            "--readings and --urdf"
         )
     with contextlib.ExitStack() as stack:
         if given.simulate:
@@ -78,8 +78,8 @@ def setup(
             path = given.config or steps.own_folder(simulator.config) / "rig.toml"
             if path.exists():  # its bus may be that of a real device
                 raise Refused(
-                    f"{path} exists: --simulate writes a file of its own. Name a new "
-                    "one, or leave out --config or --simulate"
+                    f"{path} exists: --simulate writes a new file. Name a new file, or "
+                    "leave out --config or --simulate"
                 )
         config = wizard.begin(path, asked, operator)
         site = steps.Site(
@@ -111,7 +111,7 @@ def characterise(axis: AxisName, *, given: Step) -> int:
 def watch(
     run: RunPath,
     *,
-    socket: Annotated[int, "number of a listening one, by a session's --live"]
+    socket: Annotated[int, "port number of a running page, from a session's --live"]
     | None = None,
 ) -> int:
     """show a run, also a running one, as a page in the browser"""
@@ -122,7 +122,7 @@ def watch(
     from rig.pages import listen
 
     if socket is None and not (run / JOURNAL).is_file():
-        raise Refused(f"{run} is not the folder of a run: it holds no {JOURNAL}")
+        raise Refused(f"{run} is not a run's folder: it has no {JOURNAL}")
     with needs("live", "the live page"):
         from rig_workbench.live.server import LINGER_S, serve
     if socket is not None:
@@ -139,11 +139,11 @@ def refit(
     run: RunPath,
     *,
     order: Annotated[Order, "mechanism.order: axes of the joints"] | None = None,
-    imu_order: Annotated[Order, "imu.order: of the phone's angles"] | None = None,
+    imu_order: Annotated[Order, "imu.order: order of the phone's angles"] | None = None,
     signs: Annotated[tuple[int, int, int], "imu.signs", (-1, 1)] | None = None,
     mounting: Annotated[Angles, "imu.mounting_deg: Z, Y, X", CIRCLE] | None = None,
     factors: Annotated[list[float], "readings.factors", _numbers] | None = None,
-    factory: Annotated[str, "of its [model], a program that is run"] = "",
+    factory: Annotated[str, "program of its [model] that may be run"] = "",
 ) -> int:
     """identify a recorded calibration anew"""
     from rig.sessions import recorded, records_of
@@ -151,7 +151,7 @@ def refit(
 
     then, start = recorded(run)
     if start["mode"] != "calibrate":
-        raise Refused(f"{run} is a {start['mode']} run; refit takes a calibration")
+        raise Refused(f"{run} is a {start['mode']} run; refit needs a calibration")
     model = then.model.factory if then.model else ""
     if model != factory:
         raise Refused(
@@ -181,7 +181,7 @@ def export(
     run: RunPath,
     *,
     to: Literal["c", "st", "ros", "json"],
-    out: Annotated[Path, "file to write; without it it is printed"] | None = None,
+    out: Annotated[Path, "file to write; default: print it"] | None = None,
 ) -> int:
     """print the inverse map of a calibration for a controller"""
     from jaxcal.files import write_text
@@ -205,12 +205,12 @@ def trend(folder: Annotated[Path, "of runs, searched with its subfolders"]) -> i
     from rig_workbench.outputs.trend import read_runs, trend_lines, write_trend
 
     if not folder.is_dir():
-        raise Refused(f"{folder} is no folder")
+        raise Refused(f"{folder} is not a folder")
     devices, skipped = read_runs(folder)
     for text in skipped:
         print(f"left out: {text}", file=sys.stderr)
     if not devices:
-        raise Refused(f"{folder} holds no finished calibration or verification")
+        raise Refused(f"{folder} has no finished calibration or verification")
     for device in devices:
         print(*trend_lines(device), sep="\n")
     print(f"saved: {write_trend(folder, devices)}")

@@ -174,8 +174,8 @@ def model_of(config: RigConfig) -> DeviceModel | None:
         gives = len(made.predict(np.zeros(takes)))  # a function says it by its answer
         if (takes, gives) != (commands, outputs):
             raise ValueError(
-                f"it takes {takes} commands and predicts {gives} readings; the device "
-                f"has {commands} axes and measures {outputs}"
+                f"the model has {takes} commands and {gives} readings; the device has "
+                f"{commands} axes and measures {outputs}"
             )
     except Exception as error:  # whatever a file of Python raises
         where = config.model.urdf or config.model.factory
@@ -202,8 +202,8 @@ def _arm(config: RigConfig) -> DeviceModel:
     names = _in_small_letters(arm.joint_names)
     if tuple(names) != config.axis_names:
         raise ValueError(
-            f"its joints are {', '.join(names)} from the base outwards; the axes must "
-            f"be the same, in this order, got {', '.join(config.axis_names)}"
+            f"its joints from the base outwards are {', '.join(names)}; the axes must "
+            f"be the same in this order, got {', '.join(config.axis_names)}"
         )
     prior = arm.default_prior()
     if by_phone:

@@ -47,8 +47,8 @@ def reread(records: list[Record], then: RigConfig, now: RigConfig) -> list[Recor
     zeros = [r for r in records if r["event"] == "zero"]
     if not zeros or len(chosen) < then.k:
         raise Refused(
-            f"the run holds {len(chosen)} of the {then.k} chosen postures that "
-            "a calibration takes. Finish it first with `jaxcal-rig resume`"
+            f"the run has {len(chosen)} of the {then.k} chosen postures that a "
+            "calibration needs. Finish it first with `jaxcal-rig resume`"
         )
     geometry, frame = geometry_of(now), None
     values_of = _numbers(then, now) if then.imu is None else _attitudes(then, now)
@@ -113,11 +113,11 @@ def _changed(then: RigConfig, wanted: dict[str, Any]) -> dict[str, list[Any]]:
             continue
         table, _, key = name.partition(".")
         if table == "imu" and imu is None:
-            raise Refused(f"{name} is of a phone; the run was measured by numbers")
+            raise Refused(f"{name} needs a phone; this run was measured by a sensor")
         if table == "readings" and imu is not None:
-            raise Refused(f"{name} is of numbers; the run was measured by a phone")
+            raise Refused(f"{name} needs a sensor; this run was measured by a phone")
         if table == "mechanism" and (imu is None or then.is_arm):
-            raise Refused(f"{name} is of a phone on three joints, not of this device")
+            raise Refused(f"{name} needs a phone on three joints: not this device")
         old, new = described[table][key], json.loads(json.dumps(value))
         if old != new:
             changed[name] = [old, value]
@@ -125,7 +125,7 @@ def _changed(then: RigConfig, wanted: dict[str, Any]) -> dict[str, list[Any]]:
     for name in changed.keys() & {"imu.order", "imu.signs"} if quaternions else ():
         raise Refused(
             f"{name} cannot be changed to {changed[name][1]}: this phone sent "
-            "quaternions, which have neither order nor signs. Look at mechanism.order "
+            "quaternions, which have neither order nor signs. Check mechanism.order "
             "and imu.mounting_deg"
         )
     return changed
@@ -164,7 +164,7 @@ def refit(
         try:
             warnings = check_matrix(now, calibration.matrix)
         except MotionFault as fault:
-            raise Refused(f"nothing was written: read like this, {fault}") from None
+            raise Refused(f"nothing was written: with these keys, {fault}") from None
     summary |= {
         "mode": "refit",
         "refit_of": folder.name,
@@ -181,7 +181,7 @@ def refit(
             run.emit(record["event"], **fields)
         run.emit("end", sync=True, code=EXIT_OK, reason="")
         chosen = len(summary["postures"])
-        say(f"{folder.name} identified anew from {chosen} postures:")
+        say(f"{folder.name} identified again from {chosen} postures:")
         for key, (before, value) in changed.items():
             say(f"  {key} = {json.dumps(value)}  # was {json.dumps(before)}")
         say("  Set these in your rig.toml too" if changed else "  no key was changed")

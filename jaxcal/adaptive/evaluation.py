@@ -37,11 +37,11 @@ Array = NDArray[np.float64]
 METHODS = {
     "random": "any measurement",
     "gain": "the largest expected information gain (EIG)",
-    "rate": "the largest EIG a second",
-    "shares": "EIG per share of time, uses and number left; its constants are fixed",
-    "ahead": "shares, over a tree of the next measurements, fitted to the task first",
-    "priced": "EIG per price of time and uses, its constants tuned",
-    "state": "EIG per price that follows what is left, tuned",
+    "rate": "the largest expected information gain per second",
+    "shares": "EIG per share of time, uses and number left; constants not tuned",
+    "ahead": "shares, over a tree of the next measurements; constants tuned first",
+    "priced": "EIG per price of time and uses; constants tuned",
+    "state": "EIG per price that depends on what is left; constants tuned",
     "policy": "the trained network, which corrects a rule",
 }
 _RIVALS = ("state", "ahead", "shares", "priced", "rate", "gain")
@@ -65,12 +65,12 @@ class DeciderResult(MethodResult):
 class DeciderEvaluation(Evaluation):
     """Deciders on the same sessions; ``reference`` (B,) are the nats of ``rival``."""
 
-    title: ClassVar[str] = "Deciders of sequential measurement on equal sessions"
+    title: ClassVar[str] = "Sequential measurement: deciders in equal sessions"
     about: ClassVar[str] = (
-        "All methods play the same sessions: the truth, the budget and the noise of "
-        "every measurement are equal. Nats: the sum of the expected information gains "
-        "of the measurements made, with its standard error (95 % intervals in the "
-        "figure). Time: of one core, a choice, averaged over a batch."
+        "All methods play the same sessions, with the same truth, budget and noise of "
+        "every measurement. Nats: sum of the expected information gains of the "
+        "measurements, with its standard error (95 % intervals in the figure). Time: "
+        "per choice on one core, averaged over a batch."
     )
 
     task: str
@@ -92,8 +92,8 @@ class DeciderEvaluation(Evaluation):
         return Summary(
             "",
             f"{self.task}{f' ({shown})' if shown else ''}, seed {self.seed}: "
-            f"{sessions:,} sessions, information gained in nats"
-            f"{f'; ahead is used beyond its tests: {beyond}' if beyond else ''}",
+            f"{sessions:,} sessions, information gained in "
+            f"nats{f'; ahead is untested for this: {beyond}' if beyond else ''}",
             (
                 ("method", lambda row: row.method),
                 ("nats", lambda row: _interval(row.numbers["nats"], "")),

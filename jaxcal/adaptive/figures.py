@@ -25,6 +25,6 @@ def decider_figures(evaluation: DeciderEvaluation) -> dict[str, Figure]:
             ends.append(values.mean() + np.array([-half, 0.0, half]))
         intervals(axes, names, ends, styles_of(results))
     axes_pair[0].set_xlabel("information gained in a session (nats)")
-    axes_pair[1].set_xlabel(f"less that of {rival}, in pairs (nats)")
+    axes_pair[1].set_xlabel(f"paired difference to {rival} (nats)")
     axes_pair[1].axvline(0.0, color=GREY, linestyle="--", zorder=0)
     return {"sequential": figure}

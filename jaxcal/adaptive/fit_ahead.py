@@ -57,7 +57,7 @@ class AheadFit:
 def outside(task: Any) -> tuple[str, ...]:
     """Sizes of a task that exceed those on which ``ahead`` was measured, in words."""
     if not isinstance(task, GridTask):
-        return ("its unknowns are continuous: ahead decides as shares",)
+        return ("its unknowns are continuous, so ahead decides like shares",)
     designs, outcomes, states = task.likelihood.shape
     sizes = {
         "states": states, "designs": designs, "outcomes": outcomes,
@@ -65,7 +65,7 @@ def outside(task: Any) -> tuple[str, ...]:
         "measurements": task.horizon, "groups": task.num_groups,
     }  # fmt: skip
     return tuple(
-        f"{size:,} {name}: measured up to {_MEASURED[name]:,}"
+        f"{size:,} {name}, tested up to {_MEASURED[name]:,}"
         for name, size in sizes.items()
         if size > _MEASURED[name]
     )

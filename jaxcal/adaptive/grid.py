@@ -332,10 +332,10 @@ def _require_affordable(task: GridTask) -> None:
     if not (np.asarray(pays(seconds, cost)) & (needs <= uses)).any():
         cheapest = int(np.lexsort((cost, needs > uses))[0])
         raise ValueError(
-            "seconds and num_uses must pay for a first measurement, whatever its "
-            f"outcome: the cheapest, design {cheapest}, takes up to "
-            f"{cost[cheapest]:g} s and {needs[cheapest]} uses, of {seconds:g} s and "
-            f"{uses}; overrun=True lets the last one cost more"
+            "seconds and num_uses do not suffice for a first measurement with every "
+            f"outcome: the cheapest, design {cheapest}, takes up to {cost[cheapest]:g} "
+            f"s and {needs[cheapest]} uses, of {seconds:g} s and {uses}; overrun=True "
+            "lets the last one exceed the budget"
         )
 
 

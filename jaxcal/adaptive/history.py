@@ -42,12 +42,12 @@ def begin(
         ends = np.asarray(task.num_uses)
         if seconds is None and low < high:
             raise ValueError(
-                f"seconds must be given: the task draws its budget from {low:g} to "
+                f"seconds is missing: the task draws its budget from {low:g} to "
                 f"{high:g} s"
             )
         if uses is None and len(ends) > 1:
             raise ValueError(
-                "uses must be given: the task draws its budget from "
+                "uses is missing: the task draws its budget from "
                 f"{in_words(ends.astype(float))}"
             )
     if seconds is not None:
@@ -98,14 +98,14 @@ def replay(
             ) from None
         if bool(session.spent):
             raise ValueError(
-                f"{where} was measured after the budget was spent: {_left(session)}"
+                f"{where} was measured after the budget was used up: {_left(session)}"
             )
         entries.append(checked_entry(task, belief, session, design, outcome, where))
         key = step_keys(seed, number).update
         belief, session = after(task, belief, session, *entries[-1], key)
         if any(np.isnan(leaf).any() for leaf in _floats(belief)):
             raise ValueError(
-                f"{where}: outcome {outcome!r} cannot follow what was measured before"
+                f"{where}: outcome {outcome!r} is impossible after the earlier ones"
             )
     return belief, session, entries
 
@@ -156,15 +156,15 @@ def _row_outcome(
     if not (likelihood * np.asarray(belief.weights, np.float64)).sum() > 0.0:
         raise ValueError(
             f"{where}: outcome {index} of design "
-            f"{in_words(np.asarray(task.designs[design], np.float64))} cannot "
-            "follow what was measured before: the model gives it probability 0"
+            f"{in_words(np.asarray(task.designs[design], np.float64))} is impossible "
+            "after the earlier measurements: its probability is 0"
         )
     if not task.payable(session)[design]:
         cost = task.travel[session.place, design] + task.most_extra[design]
         raise ValueError(
             f"{where} takes up to {float(cost):.6g} s and "
-            f"{int(task.most_uses[design])} uses: {_left(session)}; a task made with "
-            "overrun=True may spend more"
+            f"{int(task.most_uses[design])} uses: {_left(session)}; tasks with "
+            "overrun=True may exceed the budget"
         )
     return jnp.int32(index)
 
@@ -186,8 +186,8 @@ def _answer(belief: Any, design: Any, outcome: Any, where: str) -> jax.Array:
         )
     if not _can_answer(belief, design, answer):
         raise ValueError(
-            f"{where}: outcome {outcome!r} cannot follow what was measured before: "
-            "every particle gives it probability 0"
+            f"{where}: outcome {outcome!r} is impossible after the earlier "
+            "measurements: every particle gives it probability 0"
         )
     return answer
 
@@ -264,7 +264,7 @@ def _index(table: NDArray[np.float64], design: Any, where: str) -> int:
     nearest = int(off.max(axis=1).argmin())
     if off[nearest].max() > _NEAR:
         raise ValueError(
-            f"{where} must be one of the task's, got {in_words(coordinates)}; the "
+            f"{where} must be a design of the task, got {in_words(coordinates)}; the "
             f"nearest is {nearest}, {in_words(table[nearest])}"
         )
     return nearest

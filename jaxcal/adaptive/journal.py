@@ -84,5 +84,5 @@ def _require_same(
         if written.get(name) != value:
             raise ValueError(
                 f"{path} is of a session with another {name}: {written.get(name)!r}, "
-                f"not {value!r}. Give another path, or the same {name}"
+                f"not {value!r}. Use another path, or the same {name}"
             )

@@ -243,7 +243,7 @@ def _proposal(
     keys = step_keys(seed, number)
     design, gain, took, uses, any_left = _choose(task, decider, belief, session, keys)
     if not took >= 0.0:
-        raise ValueError(f"a measurement must cost at least 0 s, got {float(took):g}")
+        raise ValueError(f"a measurement costs at least 0 s, got {float(took):g}")
     if not any_left:
         return Proposal(None, None, 0.0, 0.0, 0.0, number, belief, session, beyond)
     table = getattr(task, "designs", None)

@@ -163,7 +163,7 @@ def _drawn(
             drawn = np.asarray(prior(jnp.zeros(p)), np.float64)
         except (TypeError, ValueError, IndexError) as error:
             raise ValueError(
-                f"prior must take {p} standard normal numbers: {error}"
+                f"prior fails for {p} standard normal numbers: {error}"
             ) from error
         if drawn.shape != (p,) or not np.isfinite(drawn).all():
             raise ValueError(
@@ -177,7 +177,7 @@ def _drawn(
         named = ", ".join(np.array(model.names)[unknown])
         raise ValueError(
             "prior must have a finite std for every parameter that is not fixed: "
-            f"nothing can be drawn of {named}"
+            f"{named} cannot be drawn"
         )
     with np.errstate(divide="ignore"):
         return resolved.mean, np.where(resolved.free, precision**-0.5, 0.0), None
@@ -193,12 +193,12 @@ def _whitening(
     """(M, q, q); noise of the commands is carried over at the prior's mean."""
     noise = model.default_noise() if noise is None else noise
     if noise is None:
-        raise ValueError("noise must be given: the model has no usual one")
+        raise ValueError("noise is missing: the model has no usual noise")
     by_command = None
     if noise.command_std is not None:
         if np.isinf(noise.of_commands(*commands.shape)).any():
             raise ValueError(
-                "command_std must be finite here: a reading whose command is unknown "
+                "command_std must be finite here: with an unknown command, a reading "
                 "has no density"
             )
         inputs = tuple(f"u{i + 1}" for i in range(commands.shape[1]))

@@ -53,14 +53,14 @@ def _answer(loop: Loop, line: str) -> dict[str, Any]:
         request = json.loads(line)
     except ValueError as error:
         raise ValueError(
-            f"a request must be a JSON object in a line: {error}"
+            f"a request must be a JSON object on one line: {error}"
         ) from None
     asked = request.get("do") if isinstance(request, dict) else None
     if asked not in _FIELDS:
         requests = ", ".join(_FIELDS)
         raise ValueError(f"do must be one of {requests}, got {line.strip()[:80]}")
     if more := set(request) - {"do"} - _FIELDS[asked]:
-        raise ValueError(f"{asked} has no {min(more)!r}")
+        raise ValueError(f"{asked} takes no {min(more)!r}")
     number = int(loop.session.made)
     if asked == "suggest":
         return _suggested(loop)
@@ -70,8 +70,7 @@ def _answer(loop: Loop, line: str) -> dict[str, Any]:
         raise ValueError("observed needs the outcome")
     if request.get("number", number) != number:
         raise ValueError(
-            f"number must be {number}, the measurement that comes next, got "
-            f"{request['number']!r}"
+            f"number must be {number}, the next measurement, got {request['number']!r}"
         )
     loop.observed(request["outcome"], request.get("design"))
     return {"number": number + 1}

@@ -62,8 +62,7 @@ def limits_of(pairs: ArrayLike | None, columns: int) -> Array:
     bad = np.flatnonzero(limits[:, 0] > limits[:, 1])
     if bad.size:
         raise ValueError(
-            "limits must be a least and a greatest command, got "
-            f"{in_words(limits[bad[0]])}"
+            f"limits must be LOW, HIGH of each command, got {in_words(limits[bad[0]])}"
         )
     return limits
 
@@ -74,7 +73,7 @@ def _require_degrees(rows: Array) -> None:
     right = np.isclose(np.abs(alpha), np.pi / 2, atol=2e-3)
     if alpha.size and (right | np.isclose(np.abs(alpha), np.pi, atol=2e-3)).all():
         raise ValueError(
-            f"alpha of table must be in degrees, got {in_words(alpha)}, which looks "
+            f"alpha of table must be in degrees, got {in_words(alpha)}, which look "
             "like right angles in radians"
         )
 
@@ -113,7 +112,9 @@ def joint_numbers(
     n = len(joints)
     result = tuple(whole_number(argument, joint, 1) for joint in given)
     if len(set(result)) < len(result) or max(result, default=1) > n:
-        raise ValueError(f"{argument} must hold joints of 1 to {n} once, got {given!r}")
+        raise ValueError(
+            f"{argument} must be joints of 1 to {n}, each once, got {given!r}"
+        )
     for joint in result:
         if joints[joint - 1] not in kinds:
             raise ValueError(

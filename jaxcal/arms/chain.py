@@ -106,13 +106,13 @@ class SerialChain(Arm, Model):
             joints: a letter a joint, R or P; all revolute when not given.
             base: where the arm stands in the measuring frame: (3,) or (4, 4).
             tool: the measured point in the last link's frame: (3,) or (4, 4).
-            sensor: what the tip is measured with, of ``jaxcal.models``, or its
-                ``to_dict()``; Position() when not given.
+            sensor: measures the tip; of ``jaxcal.models``, or its ``to_dict()``;
+                Position() when not given.
             gears: joints, counted from 1, whose gear ratio is a parameter ("gear2"):
                 the joint moves by the ratio, nominally 1, times its command.
             compliance: revolute joints, counted from 1, that yield under the loads
-                ("compliance2"): degrees per unit of weight times length. When not
-                given all of them where contacts are measured, else none.
+                ("compliance2"): degrees per unit of weight times length. By default all
+                joints for contacts, else none.
             yields: (C,) the compliance of these joints, as far as it is known; 0 when
                 not given.
             harmonics: revolute joints, counted from 1, with eccentric gears: they move
@@ -142,9 +142,9 @@ class SerialChain(Arm, Model):
         if cancels := apparent_length(rows, end)[1]:
             warnings.warn(
                 f"d{cancels} = {rows[cancels - 1, 2]:g} cancels with another length, "
-                "as in Universal Robots' own calibration of nearly parallel axes, and "
-                "is counted with it. A plain table, or from_ur_kinematics(file) of "
-                "their ROS description, has small lengths whose errors can be read",
+                "as in Universal Robots' own calibration of nearly parallel axes; "
+                "their sum counts. To read the errors of single lengths, use a plain "
+                "table or from_ur_kinematics(file) of their ROS description",
                 stacklevel=2,
             )
         if compliance is None:
@@ -200,8 +200,8 @@ class SerialChain(Arm, Model):
                 by default.
             tip: link whose origin is the measured point, anywhere in the tree; the only
                 last one by default.
-            sensor: what the tip is measured with; Position() when not given.
-            locked: joints that stand still, by name, and where: degrees, metres.
+            sensor: measures the tip; Position() when not given.
+            locked: fixed joints by name, with their values: degrees, metres.
             limits: least and greatest command of joints, by name, instead of the
                 file's.
             options: ``gears``, ``compliance``, ``loads``, ``gravity`` of
@@ -231,7 +231,7 @@ class SerialChain(Arm, Model):
 
         Args:
             path: the .yaml.
-            sensor: what the tip is measured with; Position() when not given.
+            sensor: measures the tip; Position() when not given.
             options: of ``from_dh`` beside the table: ``tool``, ``base``, ``limits``.
         """
         from jaxcal.arms.files.urdf import read_ur_kinematics
@@ -334,10 +334,10 @@ class SerialChain(Arm, Model):
         Args:
             count: how many.
             seed: of the random starts.
-            near: where the sensor reads, roughly: (S, 3) sockets or (S, 4) planes where
-                the sensor has no places; rows (x, y, z, radius), one of which the tip
-                must be near, for a sensor that reads everywhere; nothing for a board.
-            allowed: says of joints (J,) whether they may be taken (collisions).
+            near: rough places: (S, 3) sockets or (S, 4) planes if the sensor has no
+                places; for a sensor that reads everywhere rows (x, y, z, radius), of
+                which the tip must be near one; not for a board.
+            allowed: function of joints (J,), False where they collide.
             camera: of a board, (width, height, fx, fy, cx, cy) in pixels, or a field of
                 view in degrees (horizontal, vertical): every corner is in the picture,
                 with a focal length that is known to a tenth.
@@ -347,10 +347,10 @@ class SerialChain(Arm, Model):
                 not given.
             side: "+z", the printed side is where the board's z axis points, or "-z";
                 known of a board that was found from views, else from either side.
-            floor: height (z in the measuring frame) that no joint is below; sockets
-                neither, by more than 1 % of the arm's length.
-            approach: direction (x, y, z) in which the tool comes, from the last joint
-                to the tip, and the degrees about it that are allowed (60).
+            floor: lowest height (z in the measuring frame) of joints, and of sockets
+                within 1 % of the arm's length.
+            approach: direction (x, y, z) of the tool's approach, from the last joint to
+                the tip, and the largest angle from it in degrees (60).
             clear: planes (normal, offset) whose other side, and boxes (least x, y, z,
                 greatest), that the arm does not touch: spheres along straight lines
                 between the joints, no shapes of the links. The first link and the tip
@@ -362,8 +362,8 @@ class SerialChain(Arm, Model):
             (count, n) commands with the sensor's columns, in an order of little travel.
 
         Raises:
-            ValueError: there are not so many, or a socket is reached by none; the
-                message says what became of the rest.
+            ValueError: there are fewer, or a socket cannot be reached; the message
+                counts the reasons.
         """
         from jaxcal.arms.postures import postures, view_and_room
 
@@ -418,15 +418,15 @@ class SerialChain(Arm, Model):
             small = self.num_joints > 2 and 1.0 < largest < 7.0
             if small and not one.positions:  # readings tell of these
                 raise ValueError(
-                    f"commands must be in degrees, got angles of at most {largest:.3g},"
-                    " which look like radians: np.degrees(commands), --radians"
+                    f"commands must be in degrees, but no angle exceeds {largest:.3g}: "
+                    "are they radians? Use np.degrees(commands), --radians"
                 )
         largest = np.abs(joints[:, units == "deg"]).max(initial=0.0)
         twice = np.degrees(_BEYOND_TURNS)
         if largest > twice and self.num_joints > 2:
             raise ValueError(
-                f"commands must be in degrees, got angles of {largest:.6g}, which look "
-                "like degrees that were converted from radians: leave out np.degrees, "
+                f"commands must be in degrees, but angles reach {largest:.6g}: were "
+                "degrees converted as if they were radians? Leave out np.degrees, "
                 "--radians"
             )
         slack = np.where(units == "deg", _BEYOND, 0.01 * _BEYOND * (high - low))
@@ -440,19 +440,18 @@ class SerialChain(Arm, Model):
                 advice = f"{name} seems to be read in 0 to 360: subtract 360 from what "
                 advice += "is above 180."
             elif ((column >= least) & (column <= most)).all():
-                advice = f"{name} seems reversed, all rows are within them with the "
-                advice += "other sign: negate that column."
+                advice = f"{name} seems reversed: with the other sign all rows are "
+                advice += "within the limits. Negate that column."
             elif len(column) > 1 and not np.ptp(column):
-                advice = f"it never changes in {len(column)} rows, was it recorded?"
+                advice = f"it is the same in all {len(column)} rows: was it recorded?"
             else:
                 advice = "are the columns in this order: "
                 advice += f"{', '.join(self.joint_names)}?"
             raise ValueError(
                 f"row {row}: {name} = {joints[row, joint]:g} is outside its limits "
-                f"({low[joint]:g} to {high[joint]:g}, by more than {slack[joint]:g}); "
-                f"{advice} "
-                "Where the file's limits are wrong, give limits={name: (low, high)}, "
-                "--limits"
+                f"({low[joint]:g} to {high[joint]:g}) by more than {slack[joint]:g}; "
+                f"{advice} If the file's limits are wrong, give "
+                f"limits={{name: (low, high)}}, --limits"
             )
 
     def prepared(self, commands: Array, measured: Array | None = None) -> Self:
@@ -560,8 +559,8 @@ class SerialChain(Arm, Model):
         views = sensor.views and sensor.zeros
         if not views and tuple(sensor.inputs) not in ((), (sensor.kind,)):
             raise ValueError(
-                f"commands of a {sensor.kind} hold {', '.join(sensor.inputs)}, which "
-                "no recording has: take the postures by at_rest"
+                f"commands of a {sensor.kind} need {', '.join(sensor.inputs)}, which "
+                "no recording has; pass the postures of at_rest"
             )
         pixels = sensor.views and not views
         of_recording = self._rests(recording, "" if pixels else sensor.kind)
@@ -570,7 +569,7 @@ class SerialChain(Arm, Model):
             from scipy.spatial.transform import Rotation
 
             if read is None:
-                raise ValueError(f"{recording.path} has no poses of a board")
+                raise ValueError(f"{recording.path} has no board poses")
             turns = Rotation.from_matrix(read[:, 3:].reshape(-1, 3, 3).swapaxes(1, 2))
             turns_deg = np.degrees(turns.as_rotvec())
             commands = np.column_stack([commands, read[:, :3], turns_deg])
@@ -578,8 +577,8 @@ class SerialChain(Arm, Model):
             which = () if recording.which is None else recording.which
             if len(which) != len(commands):
                 raise ValueError(
-                    f"which must say of {len(commands)} rests which {sensor.kind} each "
-                    f"is of, got {len(which)} numbers"
+                    f"which must give the {sensor.kind} of each of the {len(commands)} "
+                    f"rests, got {len(which)} numbers"
                 )
             commands = np.column_stack([commands, numbers("which", which)])
         if sensor.zeros:
@@ -607,8 +606,8 @@ class SerialChain(Arm, Model):
             path: the file to write.
             parameters: (p,).
             servos: the file that is corrected.
-            names: of motors that are not named as the joints.
-            force: write over a file that is there.
+            names: motors whose names differ from the joints'.
+            force: overwrite an existing file.
 
         Returns:
             Steps by which the middle of each motor's range moved.
@@ -721,8 +720,8 @@ class SerialChain(Arm, Model):
     ) -> str:
         """Write the arm with ``parameters`` as a file that robots read.
 
-        Such files have stiff joints and round gears: what was found of compliance and
-        harmonics is left out, with a warning.
+        Such files cannot hold compliance and gear harmonics: these are left out, with a
+        warning.
 
         Args:
             form: "urdf" is the file that the arm came from, its origins corrected:
@@ -734,7 +733,7 @@ class SerialChain(Arm, Model):
                 Robots' ROS description, for six joints, without base and tool.
             path: the file to write.
             parameters: (p,) as ``identify`` found them.
-            force: write over a file that is there.
+            force: overwrite an existing file.
 
         Returns:
             Of "urdf" the tip link, a new one where no fixed joint before it could hold
@@ -750,15 +749,15 @@ class SerialChain(Arm, Model):
         ratios, yields, waves = self._drives(as_parameters(self, parameters))
         for i in np.flatnonzero(ratios != 1.0):
             raise ValueError(
-                f"gear{i + 1} is {ratios[i]:.6g}, which such a file cannot hold"
+                f"gear{i + 1} is {ratios[i]:.6g}, which this file format cannot hold"
             )
         lost = [f"compliance{self.compliance[i]}" for i in np.flatnonzero(yields)]
         bent = np.flatnonzero(waves.any(axis=1))
         lost += [f"harmonics of joint {self.harmonics[i]}" for i in bent]
         if lost:
             warnings.warn(
-                f"{', '.join(lost)} left out of the file: its joints are stiff and "
-                "their gears round",
+                f"{', '.join(lost)} left out: the file cannot hold compliance and gear "
+                "harmonics",
                 stacklevel=2,
             )
         text, tip = written(form, self, self.calibrated(parameters))
@@ -783,7 +782,7 @@ class SerialChain(Arm, Model):
         return self.sensor.rows(self.length, *tables)
 
     def located(self, commands: ArrayLike, measured: ArrayLike | None = None) -> Self:
-        """This arm with its sensor where nominal postures and readings put it.
+        """This arm with its sensor located by nominal postures and readings.
 
         Nothing is changed that was given: sockets, planes, anchors, boards and their
         cameras have no place of their own until the first readings. Of a tracker that
@@ -823,10 +822,10 @@ class SerialChain(Arm, Model):
                 turned = np.trace(moved[:3, :3]) < 1.0 + 2.0 * _ASIDE
                 if turned or shift > _AWAY * self.length:
                     raise ValueError(
-                        "base must be given, roughly, to an arm with Pose, whose turns "
-                        "are from the nominal ones: the positions fit "
-                        f"base={base.round(7).tolist()}; then make the turns by its "
-                        "rotation_vectors"
+                        "base is missing: with Pose, turns are relative to the "
+                        "nominal ones, so give base roughly. The positions fit "
+                        f"base={base.round(7).tolist()}; then compute the turns with "
+                        "its rotation_vectors"
                     )
                 break
         return self.base
@@ -1017,15 +1016,15 @@ class SerialChain(Arm, Model):
         return Noise(std=self.sensor.stds(self.length or 1.0))
 
     def noise_with_play(self, play: ArrayLike) -> Noise:
-        """The sensor's noise and play of the joints, of which each rests anywhere in.
+        """The sensor's noise plus the backlash of the joints.
 
         Args:
-            play: degrees (or units of length) from stop to stop: one number or (J,),
-                0.3 or so of hobby servos.
+            play: total width of the backlash in degrees (or units of length): one
+                number or (J,); about 0.3 for hobby servos.
 
         Returns:
-            Noise for ``identify`` and ``select``: a joint is off by its play over the
-            square root of twelve.
+            Noise for ``identify`` and ``select``: a joint is off by its backlash over
+            the square root of twelve.
         """
         width = np.broadcast_to(numbers("play", play), (self.num_joints,))
         if not (width >= 0.0).all():
@@ -1035,10 +1034,10 @@ class SerialChain(Arm, Model):
         return dataclasses.replace(self.default_noise(), command_std=spread)
 
     def from_one_side(self, commands: ArrayLike, by: float) -> Array:
-        """Joints (N, J) to go to before each posture, so that all arrive from below.
+        """Joints (N, J) at which to start each move, so that all arrive from below.
 
-        Every joint then ends with its play on the same side, which is an error of its
-        zero and not of each reading.
+        The backlash is then always on the same side: an error of the joint's zero, not
+        of each reading.
 
         Args:
             commands: (N, n) postures.
@@ -1119,8 +1118,8 @@ class SerialChain(Arm, Model):
             return super().targets(desired, start)
         if start is None:
             raise ValueError(
-                "start must be given for an arm's pose: the joints at whose nominal "
-                "orientation desired is a turn, as rotation_vectors(start, R) makes it"
+                "start is missing: for an arm's pose give joints, at whose nominal "
+                "orientation desired is a turn, as in rotation_vectors(start, R)"
             )
         turned = self.rotations(start, desired[:, 3:])
 

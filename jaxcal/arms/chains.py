@@ -28,7 +28,7 @@ _SAME = 1e-9  # of lengths and degrees: one and the same link
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Chains(Model):
-    """Chains by the names of their tips; what they share is one parameter.
+    """Chains by the names of their tips; shared parameters occur once.
 
     Chains that begin with the same joints (a torso's) share these joints' columns, and
     the parameters of the links between them. A sensor that is given to several chains
@@ -64,7 +64,7 @@ class Chains(Model):
         """
         tips, arms = tuple(chains), tuple(chains.values())
         if len(arms) < 2 or not all(isinstance(arm, SerialChain) for arm in arms):
-            raise ValueError("chains must hold two arms or more (SerialChain), by tip")
+            raise ValueError("chains must hold at least two arms (SerialChain), by tip")
         model = cls(tips, arms, _numbered([arm.sensor.members for arm in arms]))
         for k, arm in enumerate(arms):
             for other, before in zip(arms[:k], tips, strict=False):
@@ -73,8 +73,8 @@ class Chains(Model):
                 if twice:
                     raise ValueError(
                         f"joint {sorted(twice)[0]} is in the chains {before} and "
-                        f"{tips[k]}, which are not the same up to it: joints of "
-                        "different chains must have names of their own (joint_names)"
+                        f"{tips[k]}, which differ before it. Give joints of different "
+                        "chains different names (joint_names)"
                     )
         return model
 
@@ -541,8 +541,8 @@ class Chains(Model):
             if not np.array_equal(arms[k].base, arms[first].base):
                 raise ValueError(
                     f"chains {self.tips[first]} and {self.tips[k]} share their base, "
-                    "but their positions are counted from different frames: give both "
-                    "in one, of a tracker that stays"
+                    "but their positions are in different frames: give both in one "
+                    "frame, such as that of a tracker that stands still"
                 )
         return [self._with(placed, arm, k) for k, arm in enumerate(arms)]
 
@@ -696,7 +696,7 @@ class Chains(Model):
         apart: list[str] = []
         wrong = False
         if fit.noise_std is None:
-            step = "measure more postures, or state noise_std=1: readings are in noise"
+            step = "measure more postures, or state noise_std=1 (in units of noise)"
         else:
             length = min(arm.length for arm in self.chains)
             apart, wrong = other_distances(fit, self._shared_parts(fit), length)

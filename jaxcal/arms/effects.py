@@ -143,12 +143,12 @@ def in_words(fit: Fit, unit: str) -> list[str]:
     )
     if tried["chosen"] == _AS_IT_IS:
         return [
-            f"Tried by held-out error, none helps: {others}{unit}; as described "
-            f"{before:.3g}{unit}."
+            f"None of these effects reduces the cross-validated error: {others}{unit}; "
+            f"without them {before:.3g}{unit}."
         ]
     after = tried["held_out"][tried["chosen"]]
     return [
-        f"Fitted besides, by held-out error: {tried['chosen']}, which cut it from "
+        f"Added effect: {tried['chosen']}. It reduces the cross-validated error from "
         f"{before:.3g} to {after:.3g}{unit} (with {others})."
     ]
 
@@ -189,9 +189,9 @@ def play_in_words(fit: Fit, unit: str) -> list[str]:
         for name, half in zip(names, play[sure], strict=True)
     )
     return [
-        f"Residuals follow the side that joints came from (play: {sizes}): always "
-        "coming from one side (arm.from_one_side) would cut the scatter by "
-        f"{1.0 - left:.0%}."
+        f"Residuals depend on the side from which joints came (backlash: {sizes}). "
+        "Approaching always from one side (arm.from_one_side) would reduce the scatter "
+        f"by {1.0 - left:.0%}."
     ]
 
 

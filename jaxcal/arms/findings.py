@@ -127,7 +127,7 @@ def left_open(
     else:
         remedy = "give the distance between two sockets (distances=, --distance)"
         reason = (
-            "The distance between two sockets is missing, so the arm's size is open:"
+            "The distance between two sockets is missing, so the arm's size is unknown:"
         )
     reason += (
         f" away from the measured poses the tip is uncertain by {anywhere:.2g}{unit}; "
@@ -161,7 +161,7 @@ def _wrong_rows(
     for doubled in np.flatnonzero(calibration.loss_weights == 0.0):
         same = (commands[used] == commands[doubled]).all(axis=1)
         if same.any() and touching[used[same][0]]:
-            said.append(f"measurement {doubled} is {used[same][0]} again, counted once")
+            said.append(f"measurement {doubled} repeats {used[same][0]}, counted once")
     return said
 
 
@@ -172,8 +172,8 @@ def _far(calibration: Fit) -> list[str]:
     off = np.abs(calibration.parameters - calibration.prior_mean[:p])
     off = off * np.sqrt(calibration.prior_precision[:p]) * calibration.free[:p]
     return [
-        f"{names[i]} is {off[i]:.2g} standard deviations of the prior from what was "
-        "known: a wrong tip, file or unit?"
+        f"{names[i]} is {off[i]:.2g} standard deviations from its prior: is the tip, "
+        "file or unit wrong?"
         for i in np.flatnonzero(off > _FAR)
     ]
 
@@ -183,9 +183,9 @@ def _net_mass(calibration: Fit, parts: list[Part]) -> list[str]:
     weighed = [part for part in parts if isinstance(part.sensor, Wrench)]
     masses = [calibration.parameters[part.own][0] for part in weighed]
     return [
-        f"mass {mass:.3g} kg is what the readings show: where the controller subtracts "
-        "a payload, the load less that one, which fits alike. Set its payload to zero, "
-        "or add what it subtracts."
+        f"The readings show a mass of {mass:.3g} kg. If the controller subtracts a "
+        "payload, this is the load less that payload: set the payload to zero, or add "
+        "what is subtracted."
         for mass in masses
     ]
 
@@ -199,8 +199,8 @@ def _kept(calibration: Fit) -> list[str]:
     kept = [name for name in names if name[:-1] == "tool " and shown[name] < _SHOWN]
     return (
         [
-            f"{', '.join(kept)}: not shown by these contacts, kept as described; "
-            "contacts with the tool turned other ways would show it."
+            f"{', '.join(kept)}: not shown by these contacts, kept at the nominal "
+            "value. To find it, add contacts with the tool turned other ways."
         ]
         if kept
         else []
@@ -228,8 +228,8 @@ def _other_tip(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
     allowed = 2.0 / np.sqrt(calibration.prior_precision[at].max() + 1e-300)
     by = ", ".join(f"{shift:.3g}" for shift in moved)
     return [
-        f"the tip is {far:.3g}{unit_after(calibration)} from where the arm's "
-        f"description has it (tool {by}), known to {std:.2g}: is it another tip?"
+        f"the tip is {far:.3g}{unit_after(calibration)} from its place in the arm's "
+        f"description (tool {by}), uncertainty {std:.2g}: is it another tip?"
     ], bool(far > allowed)
 
 
@@ -264,8 +264,8 @@ def other_distances(
                 continue
             most = max(most, change[k])
             said.append(
-                f"{part.kind}s {first:.0f} and {second:.0f} are given as "
-                f"{distance:g}{unit} apart, but the contacts and the arm's lengths say "
+                f"the distance of {part.kind}s {first:.0f} and {second:.0f} was given "
+                f"as {distance:g}{unit}, but the contacts and the arm's lengths give "
                 f"{free:.4g} +- {free_std:.2g}: measure that distance again"
             )
     return said, most > _WRONG * length
@@ -328,7 +328,7 @@ def _still(model: Chain, commands: Array) -> tuple[list[str], bool]:
     still = np.flatnonzero((joints == joints[0]).all(axis=0))
     said = [
         f"{model.joint_names[i]} is {joints[0, i] + 0.0:g} in all {len(joints)} "
-        "measurements: was it recorded? What is said of it is the prior's"
+        "measurements: was it recorded? Its parameters come from the prior"
         for i in still
     ]
     return said, bool((joints[0, still] == 0.0).any())
@@ -348,16 +348,16 @@ def _other_links(calibration: Fit, parts: list[Part]) -> list[str]:
         far = np.flatnonzero(lengths & (sure > most))
         if far.size:
             reasons.append(
-                f"{', '.join(names[far])}: to {off[far].max():.3g}"
-                f"{unit_after(calibration)} from the arm's "
-                "description: readings of another arm, in another unit, of a board of "
-                "another size, or of several sockets as one?"
+                f"{', '.join(names[far])}: up to "
+                f"{off[far].max():.3g}{unit_after(calibration)} from the arm's "
+                "description. Are the readings of another arm, in another unit, of a "
+                "board of another size, or of several sockets numbered as one?"
             )
     turned = [name.startswith("theta") for name in names[: model.table.size]]
     for i in np.flatnonzero(turned & (sure > _ZERO)):
         reasons.append(
             f"{names[i]} is {off[i]:.3g} degrees from the arm's description: is the "
-            "joint's zero another, or its sign?"
+            "joint's zero or sign wrong?"
         )
     return reasons
 
@@ -373,7 +373,7 @@ def _exchanged(calibration: Fit, part: Part) -> list[str]:
     if len(np.unique(nearest)) < len(nearest):  # one was moved, or the arm is far off
         return []
     return [
-        f"{part.kind} {i} was found where socket {j} was said to be: are their rows "
+        f"{part.kind} {i} was found at the stated place of socket {j}: are their rows "
         "exchanged?"
         for i, j in enumerate(nearest)
         if i != j and apart[i, j] < 0.5 * apart[i, i]

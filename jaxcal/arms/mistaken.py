@@ -45,14 +45,11 @@ def mistaken_columns(arm: Chain, commands: Array, measured: Array) -> str:
         return ""
     joints, word = tried[best]
     names = " and ".join(arm.joint_names[joint] for joint in joints)
-    if word == "exchanged":
-        how, remedy = "each in the place of the other", "exchange these columns"
-    else:
-        how, remedy = "with the other sign", "negate these columns"
-    verb, remedy = ("seem", remedy) if len(joints) > 1 else ("seems", "negate it")
+    remedy = "exchange" if word == "exchanged" else "negate"
+    verb, which = ("seem", "these columns") if len(joints) > 1 else ("seems", "it")
     return (
-        f"{names} {verb} {word}: {how} the readings agree with the arm as described; "
-        f"{remedy}"
+        f"{names} {verb} {word}: with that corrected, the readings agree with the "
+        f"nominal arm; {remedy} {which}"
     )
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 Array = NDArray[np.float64]
-_OTHER_ARM = "a wrong tip, unit, sign or order of columns, or rows of another place?"
+_OTHER_ARM = "wrong tip, unit, sign or order of columns, or rows of another place?"
 
 _NOMINAL = 0.1  # of its length: no arm is so far off, tip included, before it is fitted
 _APART = 0.2  # of it: what two sockets may seem to be off their distance
@@ -49,9 +49,9 @@ def require_readings(arm: Chain, commands: Array, measured: Array) -> None:
         spread.append(float(np.median(apart)))
     if max(spread) > max(10.0 * min(spread), 0.01 * arm.length):
         raise ValueError(
-            "measured must be in the unit of the model's lengths and commands in "
-            f"degrees: measured positions spread over {spread[0]:g}, those predicted "
-            f"over {spread[1]:g}"
+            "measured must be in the model's unit of length and commands in degrees: "
+            f"measured positions spread over {spread[0]:g}, predicted ones over "
+            f"{spread[1]:g}"
         )
 
 
@@ -67,10 +67,10 @@ def _require_tool(arm: Chain, commands: Array, poses: Array) -> None:
     angle = float(np.linalg.norm(turn))
     if angle > _TURNED and apart < min(angle, of_base) / 3.0:
         raise ValueError(
-            f"poses fit a tool frame turned by {angle:.0f} degrees on the flange: "
-            "multiply the rotation of tool= from the right by that of the vector "
-            f"{in_words(turn.round() + 0.0)} in degrees, or give the tip link whose "
-            "axes the readings have"
+            f"poses fit a tool frame turned by {angle:.0f} degrees on the flange. "
+            "Multiply the rotation of tool= from the right by the rotation with the "
+            f"vector {in_words(turn.round() + 0.0)} in degrees, or name the tip link "
+            "whose axes the readings use"
         )
 
 
@@ -93,21 +93,20 @@ def _require_in_picture(board: Board, pixels: Array, length: float) -> None:
     beyond = ~board.bent((spots - centre) / focal)[1]
     for row, corner in np.argwhere(beyond)[:1]:
         raise ValueError(
-            "corners must be where the lens of the board's distortion = "
-            f"{board.distortion} has some, but corner {corner + 1} of row {row}, at "
-            f"{in_words(spots[row, corner])}, is where its polynomial turns back. Is "
-            "it of this camera, in OpenCV's order, and are the corners corrected by it?"
+            f"board's distortion = {board.distortion} does not fit: at corner "
+            f"{corner + 1} of row {row}, {in_words(spots[row, corner])}, its "
+            "polynomial turns back. Is it of this camera and in OpenCV's order? Are "
+            "the corners already corrected?"
         )
     outside = ~board.in_picture(spots, _EDGE * float(board.stds(length).max()))
     for row, corner in np.argwhere(outside)[:1]:
         count = np.count_nonzero(outside.any(axis=1))
         raise ValueError(
             f"corners must be in the camera's picture of {size[0]:g} by {size[1]:g} "
-            f"pixels, but in {count} of the board's {len(spots)} rows some are not: "
-            f"corner {corner + 1} of its row {row} is at "
-            f"{in_words(spots[row, corner])}. Is it the width before the height, and "
-            "this camera? Where a lens's distortion was taken out of them, give it: "
-            "distortion=(k1, k2, p1, p2)"
+            f"pixels, but {count} of {len(spots)} board rows have some outside: corner "
+            f"{corner + 1} of row {row} is at {in_words(spots[row, corner])}. Is the "
+            "width first, and is it this camera? If the corners were undistorted, "
+            "give distortion=(k1, k2, p1, p2)"
         )
 
 
@@ -125,9 +124,9 @@ def warn_of_picture(arm: Chain, candidates: Array) -> None:
     lost = np.flatnonzero(~(board.in_picture(spots) & (depth > 0.0)).all(axis=1))
     if lost.size:
         warnings.warn(
-            f"{lost.size} of {len(candidates)} candidates do not have the whole board "
-            f"in the camera's picture, row {lost[0]} of those available first; use "
-            "arm.postures(), which generates views that do",
+            f"{lost.size} of {len(candidates)} candidates do not show the whole board "
+            f"in the picture, the first is row {lost[0]} of the available ones; "
+            "arm.postures() generates views that do",
             stacklevel=2,
         )
 
@@ -141,8 +140,9 @@ def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
     _, first, groups = np.unique(joints, axis=0, return_index=True, return_inverse=True)
     for row in np.flatnonzero(which != which[first][groups.ravel()])[:1]:
         raise ValueError(
-            f"a posture must have the ball in one socket, but row {row} is row "
-            f"{first[groups.ravel()[row]]} with another socket: rows of the other file?"
+            f"a posture can touch only one socket, but rows {row} and "
+            f"{first[groups.ravel()[row]]} are one posture with two sockets: rows of "
+            "another file?"
         )
     if measured.any():  # offsets that were measured, as in a simulation, are of any tip
         return
@@ -150,7 +150,7 @@ def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
     most, middles = _NOMINAL * arm.length, {}
     constant = np.flatnonzero((joints == joints[0]).all(axis=0))
     still = ", ".join(arm.joint_names[i] for i in constant)
-    still = still and f"{still} never changes, was it recorded?"
+    still = still and f"{still} never changes: was it recorded?"
     for i in np.unique(which):
         rows = np.flatnonzero(which == i)
         middles[i] = np.median(points[rows], axis=0)
@@ -158,15 +158,15 @@ def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
         if len(rows) > 2 and np.median(far) > most:
             raise ValueError(
                 f"contacts of socket {i} must be at one point within {most:.2g}, but "
-                f"the arm as described scatters by {np.median(far):.2g} there: "
+                f"with the nominal arm they scatter by {np.median(far):.2g}: "
                 + (still or mistaken_columns(arm, commands, measured) or _OTHER_ARM)
             )
         lost = rows[far > most + 4.0 * np.median(far)]
         if lost.size:
             raise ValueError(
                 f"contacts of socket {i} must be at one point within {most:.2g}, but "
-                f"rows {in_words(lost)} are {far.max():.2g} from the others there: "
-                "rows of another place?"
+                f"rows {in_words(lost)} are {far.max():.2g} from the others: rows of "
+                "another place?"
             )
     for one, other, distance, _ in arm.sensor.distances:
         if not {int(one), int(other)} <= middles.keys():  # another arm's
@@ -177,8 +177,8 @@ def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
         if off > _APART or unit:
             raise ValueError(
                 f"sockets {int(one)} and {int(other)} must be {distance:g} apart, but "
-                f"the arm as described puts them {distance_seen:.3g} apart: rows of "
-                "another place or another unit?"
+                f"with the nominal arm they are {distance_seen:.3g} apart: rows of "
+                "another place or unit?"
             )
 
 
@@ -186,8 +186,8 @@ def require_touched(sensor: Sensor, inputs: Array) -> None:
     """Refuse a distance of a socket that no contact is of."""
     for place in sensor.lacking(inputs):
         raise ValueError(
-            f"commands must have contacts of {sensor.kind} {place}, whose distance "
-            "from another is given"
+            f"commands have no contacts of {sensor.kind} {place}, whose distance from "
+            "another is given"
         )
 
 
@@ -197,7 +197,7 @@ def warn_of_radians(arm: Chain, candidates: Array) -> None:
     largest = np.abs(candidates[:, : arm.num_joints][:, turning]).max(initial=0.0)
     if 0.0 < largest < 2.0 * np.pi:
         warnings.warn(
-            f"no joint of any candidate is over {largest:.3g}, and joints are in "
-            "degrees; use numpy.degrees where these are radians",
+            f"no joint of any candidate exceeds {largest:.3g} degrees: if these are "
+            "radians, use numpy.degrees",
             stacklevel=2,
         )

@@ -63,8 +63,8 @@ class Room:
             size = np.linalg.norm(cone[:3])
             if cone.shape != (4,) or not (size > 0.0 and 0.0 < cone[3] <= 180.0):
                 raise ValueError(
-                    "approach must be a direction (x, y, z) and the degrees about it "
-                    f"that are allowed, got {in_words(numbers('approach', approach))}"
+                    "approach must be a direction (x, y, z) and the largest angle "
+                    f"from it in degrees, got {in_words(numbers('approach', approach))}"
                 )
             cone = np.append(cone[:3] / size, cone[3])
         things: dict[int, list[Array]] = {4: [], 6: []}
@@ -89,8 +89,8 @@ class Room:
             return
         for i in np.flatnonzero(places[:, 2] < self.floor - _SUNK * arm.length)[:1]:
             raise ValueError(
-                f"sockets must not be below floor = {self.floor:g}, got socket {i} at "
-                f"{in_words(places[i])}: is the floor as high in the frame of the base?"
+                f"socket {i} at {in_words(places[i])} is below floor = {self.floor:g}: "
+                "is the floor's height given in the frame of the base?"
             )
 
     def reasons(self, arm: Chain, commands: Array) -> Array:
@@ -107,7 +107,7 @@ class Room:
                 size > 0.01 * (arm.length or 1.0), way / (size + 1e-300), axis
             )
             least = np.cos(np.radians(self.approach[3]))
-            why[way @ self.approach[:3] < least] = "do not come as approach says"
+            why[way @ self.approach[:3] < least] = "approach from another direction"
         if self.floor is not None:
             why[(points[:, 2:-1, 2] < self.floor).any(axis=1)] = "are below the floor"
         return why
@@ -152,9 +152,9 @@ def view_and_room(
     else:
         for name, value in (("distance", distance), ("tilt", tilt), ("side", side)):
             if value is not None:
-                raise ValueError(f"{name} needs camera=, of a board; got {value}")
+                raise ValueError(f"{name} needs camera= and a board, got {value}")
     if radius is not None and not len(clear):
-        raise ValueError(f"radius needs clear=, planes or boxes; got {radius}")
+        raise ValueError(f"radius needs clear= (planes or boxes), got {radius}")
     if radius is not None and not numbers("radius", radius) > 0.0:
         raise ValueError(f"radius must be positive, got {radius}")
     if floor is not None or approach is not None or len(clear):
@@ -174,10 +174,10 @@ def postures(
     """Candidate postures (M, n) of an arm; arguments as ``SerialChain.postures``."""
     whole_number("count", count, 1)
     if view is not None and not arm.sensor.views:
-        raise ValueError("camera is of an arm with sensor=Board(...)")
+        raise ValueError("camera needs an arm with sensor=Board(...)")
     if arm.sensor.joined:
         raise ValueError(
-            "postures are of one sensor at a time: arm.measured_with(sensor).postures()"
+            "use one sensor at a time: arm.measured_with(sensor).postures()"
         )
     arm, targets = _aimed(arm, near)
     if room is not None:
@@ -213,7 +213,7 @@ class _Collection:
         self.arm, self.count, self.allowed = arm, count, allowed
         turns = np.array(arm.command_units) == "deg"
         if not np.isfinite(arm.limits[~turns]).all():
-            raise ValueError("limits of sliding joints must be known: limits=...")
+            raise ValueError("limits=... is missing: the limits of sliding joints")
         low, high = arm.limits.T
         self.low, self.high = np.maximum(low, -180.0), np.minimum(high, 180.0)
         # (J,) two of these are as far as postures must be apart.
@@ -251,7 +251,7 @@ class _Collection:
         if not reason:
             apart = np.abs((self.kept[:, : len(joints)] - joints) / self.unit)
             if len(self.kept) and apart.max(axis=1).min() < _APART:
-                reason = "are next to another one"
+                reason = "are too close to another"
             elif self.allowed is not None and not self.allowed(joints.copy()):
                 reason = "are not allowed"
         if reason:
@@ -272,15 +272,15 @@ class _Collection:
                 where = f" at {in_words(places[place])}"
             refused = self.refused[place]
             return (
-                f"{self.arm.sensor.kind} {place}{where} must be reached by a posture: "
-                f"of {refused.total()} postures tried {_counted(refused)}"
+                f"no posture reaches {self.arm.sensor.kind} {place}{where}: of "
+                f"{refused.total()} postures tried {_counted(refused)}"
             )
         reasons = _counted(sum(self.refused, Counter()))
         if not len(self.kept):
             target = "what the sensor reads" if near is None else f"near = {near}"
             return (
-                f"no posture reaches {target} (of {self.tried} tried {reasons}): is it "
-                "in the unit of the arm's lengths, and in the frame of its base?"
+                f"no posture reaches {target} (of {self.tried} tried {reasons}). Is it "
+                "in the unit of the arm's lengths and in the frame of its base?"
             )
         return (
             f"count must be at most {len(self.kept)} for this arm and sensor, got "
@@ -305,11 +305,11 @@ class ReachableSet:
     ) -> None:
         if arm.sensor.joined:
             raise ValueError(
-                "reachable is of one sensor at a time: "
+                "reachable is for one sensor at a time: "
                 "arm.measured_with(sensor).reachable()"
             )
         if view is not None and not arm.sensor.views:
-            raise ValueError("camera is of an arm with sensor=Board(...)")
+            raise ValueError("camera needs an arm with sensor=Board(...)")
         self._arm, self._targets = _aimed(arm, near)
         if room is not None:
             room.require_sockets(self._arm)
@@ -357,9 +357,9 @@ def _aimed(arm: Chain, near: ArrayLike | None) -> tuple[Chain, Array | None]:
     if isinstance(sensor, Socket | Plane):
         if places is None and sensor.places is None:
             raise ValueError(
-                f"near must be given: where each {sensor.kind} is, roughly, "
-                f"(S, {sensor.width}); contacts that were made by hand show it, "
-                "arm.located(commands)"
+                f"near is missing: the rough place of each {sensor.kind}, (S, "
+                f"{sensor.width}). arm.located(commands) finds it from contacts made "
+                "by hand"
             )
         if places is not None:
             aimed = dataclasses.replace(sensor, count=len(places), places=places)
@@ -368,9 +368,9 @@ def _aimed(arm: Chain, near: ArrayLike | None) -> tuple[Chain, Array | None]:
     if isinstance(sensor, Board):
         if sensor.place is None:
             raise ValueError(
-                "place must be given, Board(place=...): where the board or camera "
-                "stands is not known, and near does not say it; three views show it, "
-                "arm.located(commands, measured), in the shell --measured"
+                "place is missing, Board(place=...): the place of the board or camera "
+                "is unknown and near does not give it. arm.located(commands, measured) "
+                "finds it from three views; on the command line --measured"
             )
         return arm, None
     if places is not None and places.shape[1] != 4:
@@ -427,7 +427,7 @@ def _touching(
         step *= 0.1 / np.maximum(np.abs(step).max(axis=1, keepdims=True), 0.1)
         commands[going, :j] = np.clip(at + step * scale, low, high)
     reached = np.linalg.norm(arm.predict(commands), axis=1) <= limit
-    why = "do not reach within the limits"
+    why = "cannot reach it within the limits"
     return commands, ["" if one else why for one in reached]
 
 

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _LOOK = (
-    "look at the residuals (report, --report); keep the nominal machine until they are "
+    "look at the residuals (report, --report); use the nominal machine until they are "
     "explained"
 )
 
@@ -127,17 +127,17 @@ class ArmVerdict(models.Verdict):
             )
         if self.place is not None:
             lines.append(
-                "Place of the camera or board on the tip: known to "
+                "Position of the camera or board on the tip: uncertainty "
                 f"{self.place.says(length)} (1 sigma)."
             )
         lines += [self.sessions] if self.sessions else []
         for one in _missed(self.errors, self.accuracy):
             asked = one.says((self.accuracy or {})[one.unit])
-            lines.append(f"Not the accuracy you asked for, {asked}.")
+            lines.append(f"The accuracy you asked for is not reached: {asked}.")
         if not self.explains:
-            lines.append("This model does not explain these readings by its noise.")
+            lines.append("The noise of this model does not explain these readings.")
         if self.place is not None and not self.helps:
-            lines.append("The arm itself was as accurate before.")
+            lines.append("The uncalibrated arm was as accurate.")
         elif self.helps is None:
             lines.append("It may not be better than the nominal machine.")
         elif not self.helps:
@@ -166,8 +166,8 @@ def verdict(calibration: Fit) -> ArmVerdict:
         return ArmVerdict(
             good=False,
             reasons=(calibration.no_noise("intervals and no verdict"),),
-            next_step="measure more postures, or state noise_std, --noise (this "
-            f"sensor's usual one: {_usual_noise(calibration)})",
+            next_step="measure more postures, or state noise_std, --noise (usual for "
+            f"this sensor: {_usual_noise(calibration)})",
             unit=unit,
         )
     reason = None
@@ -205,9 +205,9 @@ def verdict(calibration: Fit) -> ArmVerdict:
     reasons = findings.reasons
     if place is not None and place.hidden:
         reasons += (
-            f"{', '.join(place.hidden)}: not shown by these views, kept as described. "
-            "Views with the tip turned about another axis would show it, or measure it "
-            "and give tool=",
+            f"{', '.join(place.hidden)}: not shown by these views, kept at the nominal "
+            "value. To find it, turn the tip about another axis, or measure it and "
+            "give tool=",
         )
     if not explains and not calibration.noise_known:
         unit_of_first = "" if errors[0].unit == "length" else f" {errors[0].unit}"
@@ -283,12 +283,12 @@ def _sessions(calibration: Fit, first: HeldOut) -> str:
     of_sessions = calibration.provenance.get("sessions")
     if of_sessions is None:
         return (
-            "On another day, or mounted again, it may be off by more: unknown from one "
-            "session (sessions=, --session)."
+            "On another day or after remounting the error may be larger; one session "
+            "cannot show it (sessions=, --session)."
         )
     quantity = calibration.model.quantities(calibration.measured_unit)[0]
     size = first.says(float(quantity.size(calibration.session_std)))
-    return f"Another session differs by {size} (1 sigma), which predictions count."
+    return f"Sessions differ by {size} (1 sigma); predictions include this."
 
 
 def _usual_noise(calibration: Fit) -> str:
@@ -316,12 +316,12 @@ def _next_step(
         (
             findings.contradicting,
             f"look at {in_rows(findings.contradicting)} (counted from 0): correct, "
-            "measure again or leave out",
+            "repeat or leave out",
         ),
         (
             findings.moved and scatter,
-            f"measure again with the {kind} fixed, or number it as two: one {kind} "
-            "before it moved and another after",
+            f"measure again with the {kind} fixed, or number it as two: before and "
+            "after it moved",
         ),
         (findings.doubtful, findings.remedy),
         (more, MORE),
@@ -407,10 +407,11 @@ def _scattered(calibration: Fit, usual: Array, parts: list[Part]) -> Reason | No
     largest = float(noise[(noise / usual).argmax()])
     unit = unit_after(calibration) if np.ptp(usual) == 0.0 else ""
     touches = any(part.sensor.socketed for part in parts)
-    several = ", or of several sockets as one" * (touches and times > _LOUD)
+    several = ", or of several sockets numbered as one" * (touches and times > _LOUD)
     return Reason(
-        f"the readings scatter by {largest:.3g}{unit}, {times:.3g} times what this "
-        "sensor usually does: their noise, or what no parameter explains" + several,
+        f"the readings scatter by {largest:.3g}{unit}, {times:.3g} times the usual "
+        "scatter of this sensor: noise, or an effect that no parameter describes"
+        + several,
         _LOOK,
     )
 

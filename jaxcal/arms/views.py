@@ -89,8 +89,8 @@ def in_view(arm: Chain, commands: Array) -> tuple[Array, list[str]]:
     far = np.linalg.norm(pose[:, :3], axis=1)
     ahead = pose[:, 2] / np.where(far > 0.0, far, 1.0) > _VIEW
     turned = np.abs(face[:, 2]) > 0.5  # less than 60 degrees from facing it
-    reasons = np.where(turned, "", "see the board too much from the side")
-    reasons = np.where(ahead, reasons, "do not have the board before the camera")
+    reasons = np.where(turned, "", "see the board at too flat an angle")
+    reasons = np.where(ahead, reasons, "do not have the board in front of the camera")
     return commands, reasons.tolist()
 
 
@@ -141,8 +141,8 @@ def distances(sensor: Board, view: View) -> tuple[float, float]:
         return view.distance
     if not size > 0.0:
         raise ValueError(
-            "distance must be given, (least, greatest) from the camera to the board, "
-            "where Board has neither corners nor extent"
+            "distance is missing: (least, greatest) from the camera to the board; "
+            "Board has neither corners nor extent"
         )
     width, fx = view.camera[0], view.camera[2]
     small, large = _FILLED
@@ -178,7 +178,7 @@ def in_picture(
     face = (rotation[:, :, 2] * -there).sum(axis=1) / np.maximum(away, 1e-9)
     why = np.full(count, "", dtype=object)
     flat = np.abs(face) < np.cos(np.radians(view.tilt))
-    why[flat] = "see the board too much from the side"
+    why[flat] = "see the board at too flat an angle"
     why[(away < ends[0]) | (away > ends[1])] = "are too near or too far"
     why[~inside.all(axis=1)] = "do not have the whole board in the picture"
     if known_side:

@@ -1,4 +1,4 @@
-"""``Calibration``: a fit with its inverse, its judges, its summary and its file."""
+"""``Calibration``: a fit with its inverse, checks, summary and file."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ Array = NDArray[np.float64]
 class Calibration(Fit):
     """The identified map from commands u (n inputs) to outputs y (m of them).
 
-    ``y = f(u; theta)`` with the most probable p parameters; printed, they come with
-    their intervals. ``identify`` makes it; see ``Fit`` for its fields.
+    ``y = f(u; theta)`` with the most probable p parameters; ``print`` shows them with
+    their intervals. ``identify`` returns it; see ``Fit`` for its fields.
     """
 
     def __repr__(self) -> str:
@@ -80,7 +80,7 @@ class Calibration(Fit):
                 source += f": {shared}"
             lines.append(f"noise std {in_words(self.noise_std)}{unit}, {source}")
             if self.dof < 0.5:
-                lines.append("no residual degree of freedom: the noise is not checked")
+                lines.append("noise not checked: no residual degrees of freedom")
         lines += str(self.verdict).splitlines()
         return "\n".join(lines)
 
@@ -111,9 +111,9 @@ class Calibration(Fit):
     def verdict(self) -> Verdict:
         """Whether the calibration may be used, why not, and what to do next.
 
-        Printed, it is these lines; of an arm with held-out errors
-        (``jaxcal.arms.verdict.ArmVerdict``). The summary, ``report``, exit
-        codes and the warning of ``identify`` say this.
+        ``print`` shows it; for an arm with cross-validated errors
+        (``jaxcal.arms.verdict.ArmVerdict``). The summary, ``report``, exit codes and
+        the warning of ``identify`` use it.
         """
         from jaxcal.calibration.pairing import against
 
@@ -123,8 +123,8 @@ class Calibration(Fit):
     def mispairing(self) -> Mispairing | None:
         """How the readings and commands of the table were mispaired, if they were.
 
-        ``reason`` says it, ``repaired(commands, measured)`` gives the rows that belong
-        together. None: they pair as they stand, or that cannot be told.
+        ``reason`` describes it; ``repaired(commands, measured)`` returns the rows that
+        belong together. None: the rows are paired correctly, or it cannot be decided.
         """
         from jaxcal.calibration.pairing import mispairing
 
@@ -148,10 +148,10 @@ class Calibration(Fit):
     def to_urdf(self, path: str | os.PathLike[str], *, force: bool = False) -> str:
         """The arm's own file, corrected; see ``jaxcal.models.SerialChain.write``.
 
-        Files have stiff joints and round gears: what was found of compliance and
-        harmonics is not in them. Without compliance the arm is moved as a whole to
-        where its tip agrees best with the calibration's over its range; without
-        harmonics alone the rest is fitted again. A warning says how far off it is then.
+        Files cannot hold compliance and gear harmonics. Without compliance the arm is
+        moved as a whole so that its tip agrees best with the calibration's over its
+        range; without harmonics only, the rest is fitted again. A warning gives the
+        difference.
 
         Returns the tip link.
         """
@@ -178,18 +178,18 @@ class Calibration(Fit):
         names: Mapping[str, str] | None = None,
         force: bool = False,
     ) -> dict[str, int]:
-        """LeRobot's calibration file of a servo arm with the zeros that were found.
+        """Write LeRobot's calibration file of a servo arm with corrected zeros.
 
-        The readings are fitted again by what such a file holds, zeros of the joints;
-        a warning says how far off the arm is then. See ``jaxcal.models.Servos``. A
-        corrected URDF file besides would have the zeros twice.
+        The readings are fitted again by zeros of the joints only, as in such a file; a
+        warning gives the error. See ``jaxcal.models.Servos``. Do not also use a
+        corrected URDF file: it would apply the zeros twice.
 
         Args:
             path: the file to write.
             servos: the file that the postures were read with.
-            names: of motors that are not named as the joints: {"Rotation":
+            names: motors whose names differ from the joints': {"Rotation":
                 "shoulder_pan"}.
-            force: write over a file that is there.
+            force: overwrite an existing file.
 
         Returns:
             Steps by which the middle of each motor's range moved.
@@ -208,8 +208,8 @@ class Calibration(Fit):
         if again.noise_std is not None:
             verdict: Any = again.verdict
             warnings.warn(
-                "the file holds zeros of the joints alone: held-out error "
-                f"{verdict.held_out:.3g}, nominal {verdict.nominal:.3g}",
+                "the file corrects the zeros of the joints only: cross-validated error "
+                f"{verdict.held_out:.3g}, before calibration {verdict.nominal:.3g}",
                 stacklevel=2,
             )
         return steps
@@ -223,8 +223,8 @@ class Calibration(Fit):
         """The calibration of the same readings by another model of the machine.
 
         Args:
-            model: it, of the same commands and readings.
-            prior: of its parameters; that which ``identify`` takes when None.
+            model: of the same commands and readings.
+            prior: of its parameters; the default of ``identify`` when None.
             rows: (N,) which of the readings; all when None.
         """
         used = self.loss_weights > 0.0
@@ -273,15 +273,15 @@ class Calibration(Fit):
         told = getattr(self.verdict, "held_out", np.nan)
         of_tip = self.num_outputs == 3 and "tool x" in self.names
         errors = (
-            f"; held-out error about {np.hypot(told, scatter):.3g}{unit}, of the "
-            f"calibration {told:.3g}"
+            f"; cross-validated error about {np.hypot(told, scatter):.3g}{unit}, of "
+            f"the calibration {told:.3g}"
             if of_tip and np.isfinite(told)
             else ""
         )
         warnings.warn(
-            "the file has stiff joints and round gears: the arm without compliance "
-            "and harmonics, moved as a whole, whose tip at the measured postures "
-            f"is {apart:.3g}{unit} from the calibration's on average{errors}",
+            "the file cannot hold compliance and gear harmonics. The arm in it, moved "
+            f"as a whole, puts the tip at the measured postures {apart:.3g}{unit} from "
+            f"the calibration's on average{errors}",
             stacklevel=4,
         )
         return parameters
@@ -292,19 +292,18 @@ class Calibration(Fit):
         moved = self.predict(self.commands) - again.predict(self.commands)
         unit = f" {self.measured_unit}" if self.measured_unit else ""
         effect = (
-            "its predictions at the measured postures are "
-            f"{np.linalg.norm(moved, axis=1).mean():.3g}{unit} from the calibration's "
-            "on average"
+            "at the measured postures its predictions differ from the calibration's "
+            f"by {np.linalg.norm(moved, axis=1).mean():.3g}{unit} on average"
         )
         if again.noise_std is not None and self.noise_std is not None:
             of_arms: tuple[Any, Any] = again.verdict, self.verdict
             effect += (
-                f"; held-out error {of_arms[0].held_out:.3g}{unit}, of the "
+                f"; cross-validated error {of_arms[0].held_out:.3g}{unit}, of the "
                 f"calibration {of_arms[1].held_out:.3g}"
             )
         warnings.warn(
-            "the file has stiff joints and round gears and was fitted without "
-            f"harmonics: {effect}",
+            "the file cannot hold compliance and gear harmonics; it was fitted "
+            f"without harmonics: {effect}",
             stacklevel=4,
         )
         return again.parameters
@@ -319,7 +318,7 @@ class Calibration(Fit):
 
         Args:
             path: the file.
-            model: the model, where it holds a function, which no file can.
+            model: needed if it contains a function, which files cannot hold.
 
         Raises:
             OSError: it cannot be read.

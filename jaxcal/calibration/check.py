@@ -1,4 +1,4 @@
-"""Is a machine still as it was calibrated: a few new readings, what they can tell."""
+"""Test by a few new readings whether a machine is still as it was calibrated."""
 
 from __future__ import annotations
 
@@ -77,12 +77,12 @@ class Check:
         if self.mispairing:
             text += f"; {self.mispairing}"
         elif self.slipped:
-            text += f"; a slip of {self.slipped} would explain it"
+            text += f"; a change of {self.slipped} would explain it"
         if self.unseen and not self.good:
-            text += f", and could hide in {', '.join(self.unseen)}"
+            text += f"; a change could be hidden in {', '.join(self.unseen)}"
         if self.blind:
             names = ", ".join(self.blind)
-            text += f"; not judged, as things were placed anew: {names}"
+            text += f"; not checked, because parts were moved: {names}"
         return (text,)
 
     @property
@@ -94,13 +94,13 @@ class Check:
             return "correct the table, then check again"
         if self.says == "does not hold":
             return (
-                "measure one of these rows again to rule out a wrong reading, then "
-                "calibrate again (identify)"
+                "repeat one of these rows to rule out a wrong reading, then calibrate "
+                "again (identify)"
             )
         text = "measure more"
         if self.enough:
-            text += f", about {self.enough} rows like these in all"
-        return f"{text}: calibration.verification(candidates, k) says where"
+            text += f", about {self.enough} rows like these in total"
+        return f"{text}: calibration.verification(candidates, k) chooses them"
 
     def __str__(self) -> str:
         return f"{self.reasons[0]}; next: {self.next_step}"
@@ -114,31 +114,31 @@ def check(
     tolerance: float | Mapping[str, float] | None = None,
     placed_anew: bool = False,
 ) -> Check:
-    """Does the calibration still hold, by a few new measurements.
+    """Test by a few new measurements whether the calibration still holds.
 
     A chi-square test (F where the noise was estimated, one for each level of it) of the
     readings against the predictions, with the uncertainty of both, at 5 % false alarms.
-    Of an arm half of these are left to tests of one joint's zero each (Sidak): a slip
-    of a joint is one direction in many readings.
+    For an arm half of these go to a test of each joint's zero (Sidak): the slip of a
+    joint is one direction in many readings.
 
     Args:
         calibration: what is checked.
-        commands: (N, n), or of an arm a ``Recording`` or its path.
-        measured: (N, m) readings there; contacts need none, nor does a recording that
-            has them.
+        commands: (N, n), or for an arm a ``Recording`` or its path.
+        measured: (N, m) readings there; not needed for contacts and recordings that
+            have them.
         tolerance: how far, root mean square over the calibration's commands, the
             outputs may drift: a number in the unit of the first (lengths of a pose), or
             of each unit, {"mm": 0.5, "deg": 0.1}. When not given three times the
             standard deviation of these measurements: the noise and what the calibration
             does not know.
-        placed_anew: of an arm, what its sensor reads (sockets, planes, anchors, a
-            board) stands elsewhere than at the calibration. What cannot be told from
-            that, as the first joint's zero, is named (``blind``) and not judged.
+        placed_anew: for an arm: sockets, planes, anchors or the board were moved since
+            the calibration. Parameters that cannot be separated from that, such as the
+            first joint's zero, are named (``blind``) and not checked.
 
     Returns:
         "holds", "does not hold", or "cannot be told": a drift of one parameter by more
-        than the tolerance would be seen with less than 80 % probability; the next step
-        says about how many rows would tell (``enough``).
+        than the tolerance would be detected with less than 80 % probability; the next
+        step gives the number of rows needed (``enough``).
     """
     all_commands, measured, _ = recorded(calibration.model, commands, measured)
     say_order(all_commands, measured)
@@ -242,7 +242,7 @@ def _deviations(
         blind = free & _taken_up(calibration, placed)
         free &= ~blind
     if not len(white):
-        raise ValueError("measured holds too few readings to find what was placed anew")
+        raise ValueError("measured has too few readings to locate the moved parts")
     return _Deviations(
         white, by, level == np.unique(level)[:, None], free, blind, least
     )
@@ -297,8 +297,8 @@ def _whitening(calibration: Fit, commands: Array, noise: Array) -> tuple[Array, 
         factor = np.linalg.cholesky(np.diag(variances) + slopes @ parameters @ slopes.T)
     except np.linalg.LinAlgError:
         raise ValueError(
-            "the calibration must predict what is checked, but its uncertainty there "
-            "is beyond rounding: see calibration.verdict"
+            "the calibration cannot predict these rows: its uncertainty there is too "
+            "large for double precision; see calibration.verdict"
         ) from None
     root = np.asarray(lapack.dtrtri(factor, lower=1)[0])  # rest of factor: zeros
     # Misfit that is allowed for may not be there, and hides a drift all the same.
@@ -328,8 +328,8 @@ def _require_unit(
             ]
             raise ValueError(
                 f"measured must be in the calibration's unit{unit}: "
-                f"{', '.join(columns)} fit when multiplied by {factor:.6g}; "
-                f"are they {what}?"
+                f"{', '.join(columns)} fit when multiplied by {factor:.6g}. Are they "
+                f"{what}?"
             )
 
 
@@ -532,17 +532,17 @@ def verification(
     region: ArrayLike | None = None,
     tolerance: float | Mapping[str, float] | None = None,
 ) -> NDArray[np.int64]:
-    """The k of the candidates that show best that the calibration is wrong.
+    """Choose the k candidates that best detect a wrong calibration.
 
     Greedy, then swaps, for the mean power of the check that follows.
 
     Args:
         calibration: what is checked.
         candidates: (M, n) commands that could be measured.
-        k: three or four see what six random ones see.
-        region: (R, n) commands where it is used, which say how much a drift of a
-            parameter matters; those of the calibration when not given.
-        tolerance: the drift to be seen, as of ``check``.
+        k: three or four are as good as six random ones.
+        region: (R, n) commands at which it is used; they weight the drift of each
+            parameter. The calibration's commands when not given.
+        tolerance: the drift to detect, as in ``check``.
 
     Returns:
         (k,) indices.

@@ -106,7 +106,7 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
     if version != VERSION:
         newer = isinstance(version, int) and version > VERSION
         raise ValueError(
-            f"a calibration of version {version!r}, this jaxcal reads version "
+            f"calibration file version {version!r}, this jaxcal reads version "
             f"{VERSION}: {'update jaxcal, or ' * newer}identify again from the "
             "measurements"
         )

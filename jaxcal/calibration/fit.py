@@ -154,7 +154,7 @@ class Fit:
         return np.where(self.undetermined | (self.free[: len(share)] == 0), 0.0, share)
 
     def identifiability(self) -> Identifiability:
-        """What the measurements alone say of the parameters, at the estimate."""
+        """Which parameters the measurements alone determine, at the estimate."""
         here = Prior(np.inf, mean=self.parameters)
         used = self.commands[self.loss_weights > 0.0]
         return identifiability(self.model, used, prior=here)
@@ -225,8 +225,8 @@ class Fit:
     def lack_of_fit(self) -> float | None:
         """p-value of residuals at least this large under the noise that was given.
 
-        Small where the model does not hold, an outlier is among the measurements, or
-        the noise stated is too small. None where no noise was given.
+        Small if the model is wrong, a measurement is an outlier, or the stated noise is
+        too small. None if no noise was given.
         """
         if not self.noise_known or self.dof < 0.5:
             return None
@@ -254,7 +254,7 @@ class Fit:
                 weight 1, for comparison with it.
 
         Returns:
-            (..., m); infinite where it depends on what nothing determines.
+            (..., m); infinite where it depends on undetermined parameters.
 
         Raises:
             ValueError: the noise is unknown.
@@ -358,14 +358,14 @@ class Fit:
     def no_noise(self, what: str) -> str:
         left = f"only {self.dof:.2g}" if self.dof >= 0.5 else "no"
         return (
-            f"no {what}: {self.num_measurements} measurements leave {left} residual "
-            f"degree of freedom for {int(self.free.sum())} free parameters, so the "
-            "noise is unknown; measure more or give noise_std"
+            f"no {what}, because the noise is unknown: {self.num_measurements} "
+            f"measurements leave {left} residual degree of freedom for "
+            f"{int(self.free.sum())} free parameters. Measure more, or give noise_std"
         )
 
     def _affine(self, name: str) -> tuple[Array, Array]:
         if self.affine is None:
-            raise AttributeError(f"{name}: only an affine model y = A u + b has one")
+            raise AttributeError(f"{name}: only an affine model y = A u + b has this")
         return self.affine
 
 

@@ -112,7 +112,7 @@ def fit_model(
     scales, misfit_factor, shared = None, 1.0, ""
     if prior.by_data and scaled:
         if fitted.error_groups() is None or not exact:
-            raise ValueError("Prior.sized() is of arms, without command_std")
+            raise ValueError("Prior.sized() needs an arm, without command_std")
         fit, misfit_factor = _solve_with_misfit(problem, with_misfit)
         solution, scales, problem = fit
     elif _may_pool(problem, common_noise) and are_shared(problem):
@@ -217,7 +217,7 @@ def _distinct_weights(
     """(N,) the weights of the measurements that count, 0 elsewhere, and their rows."""
     used = _used(weights)
     if not isinstance(used, slice) and not used.any():
-        raise ValueError("weights must be positive for one measurement at least")
+        raise ValueError("weights must be positive for at least one measurement")
     once = model.distinct(commands[used], measured[used])
     if len(once) == len(weights):
         return weights, used
@@ -603,9 +603,9 @@ def _require_readings(
         for direction in unknown(problem.model, problem.commands, *prior)
     )
     raise ValueError(
-        f"measured holds {readings} independent readings, too few for "
+        f"measured has {readings} independent readings, too few for "
         f"{int(problem.free.sum())} free parameters: {undetermined} combinations of "
-        f"them stay unknown{f' ({words})' if words else ''}; measure more, or give a "
+        f"them stay unknown{f' ({words})' if words else ''}. Measure more, or give a "
         "prior or fixed parameters"
     )
 

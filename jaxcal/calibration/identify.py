@@ -74,23 +74,23 @@ def identify(
 ) -> Calibration:
     """The parameters of ``y = f(u; theta)`` that the measurements make most probable.
 
-    The fit starts at the prior's mean, and directions that no measurement shows stay
+    The fit starts at the prior's mean; directions that no measurement determines stay
     there. The affine model without prior, student's loss or noise of another kind than
-    ``noise_std`` is weighted least squares, and refuses commands that leave a direction
-    unexcited.
+    ``noise_std`` is weighted least squares; a direction that the commands do not excite
+    is an error.
 
     Args:
-        commands: (N, n) what the device was told, in any unit; an array, or a frame or
-            table, whose columns are read as ``jaxcal.read_table`` decides; of an arm
-            also a ``Recording``, or the path of one: a bag, a LeRobot dataset.
-        measured: (N, m) what it reached, in any unit. Contacts need none, nor does a
-            recording that has the readings, or a table that has columns y_....
+        commands: (N, n) commanded values in any unit; an array, or a frame or table,
+            whose columns are read as ``jaxcal.read_table`` decides; of an arm also a
+            ``Recording``, or the path of one: a bag, a LeRobot dataset.
+        measured: (N, m) readings in any unit. Not needed for contacts, recordings with
+            readings, and tables with columns y_....
         model: of ``jaxcal.models``, or any object with its methods; affine when not
             given.
-        prior: what is known beforehand; ``model.default_prior()`` when not given.
-        noise: of readings and commands; ``command_std`` makes the commands unknowns of
-            their measurement. The level of the readings is estimated where it is not
+        prior: prior knowledge of the parameters; ``model.default_prior()`` when not
             given.
+        noise: of readings and commands; ``command_std`` makes the commands unknowns of
+            their measurement. The level of the readings is estimated if not given.
         noise_std: () or (m,) short for ``Noise(std=...)``: standard deviation of a
             measurement of weight 1, in the measured unit.
         weights: (N,) a measurement of weight w has variance noise_std^2 / w (the number
@@ -140,7 +140,7 @@ def identify(
     if accuracy is not None:
         units = model.accuracy_units(measured_unit)
         if not units:
-            raise ValueError("accuracy needs an arm as the model")
+            raise ValueError("accuracy needs an arm (model=)")
         about["provenance"]["accuracy"] = by_unit("accuracy", accuracy, units)
     plain = prior is None and plain_noise and loss in (None, "gaussian")
     affine = isinstance(model, Affine)
@@ -170,7 +170,7 @@ def identify(
         )
         if mispaired is None:
             raise
-        raise ValueError(f"{mispaired.reason}. As it stands: {error}") from None
+        raise ValueError(f"{mispaired.reason}. Uncorrected: {error}") from None
     if shared := fields.pop("noise_levels"):
         about["provenance"]["noise_levels"] = shared
     if prior is not None and not prior.by_data:
@@ -303,7 +303,7 @@ def _noise(
                 f"{num_outputs} outputs, got {common_noise!r}"
             )
     if noise is not None and noise_std is not None:
-        raise ValueError("noise_std and noise are the same: give one")
+        raise ValueError("give noise_std or noise, not both")
     plain = noise is None or _is_of_levels(noise)
     if plain:
         level = noise_std if noise is None else noise.std
@@ -315,8 +315,8 @@ def _noise(
     )
     if common_noise is not None and level_known:
         raise ValueError(
-            "common_noise says how to estimate the noise, and noise says what it is: "
-            "give one of them"
+            "give noise (the noise itself) or common_noise (how to estimate it), not "
+            "both"
         )
     return noise, plain
 
@@ -343,7 +343,7 @@ def _provenance(
     try:
         noted = json.loads(json.dumps(dict(notes), allow_nan=False)) if notes else {}
     except (TypeError, ValueError) as error:
-        raise ValueError(f"notes must be what JSON can hold: {error}") from None
+        raise ValueError(f"notes must be valid JSON: {error}") from None
     content = b"".join(
         str(array.shape).encode() + array.astype(_LITTLE_ENDIAN, copy=False).tobytes()
         for array in (commands, measured, weight)

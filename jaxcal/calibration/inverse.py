@@ -39,21 +39,21 @@ def command_for(
 ) -> Array:
     """Commands that reach desired outputs.
 
-    Of a square affine map its inverse, else Newton's method from several starts; within
-    limits the nearest output.
+    A square affine map is inverted; else Newton's method runs from several starts. With
+    limits it finds the nearest output.
 
     Args:
         fit: the calibration.
-        desired: (..., m) in the measured unit; m at most n. Where m is less than n the
-            command is the one that Newton's method finds near the start. Of an arm's
-            pose, position and turn from the nominal orientation at ``start``, which
-            then must be given, as ``model.rotation_vectors(start, R)``.
+        desired: (..., m) in the measured unit; m at most n. If m is less than n, the
+            command is that which Newton's method finds near the start. For an arm's
+            pose: position and turn from the nominal orientation at ``start`` (then
+            required), as ``model.rotation_vectors(start, R)``.
         limits: (n, 2) least and greatest command of each input, if any.
         start: (n,) or (..., n) where the search begins; the measured command whose
             output is nearest when not given.
-        clip: where the limits leave no exact command, the one within them whose output
-            is nearest, instead of refusing: in the measured unit for a square affine
-            map, else each output in its spread over the measurements.
+        clip: if no command within the limits is exact, return the command with the
+            nearest output instead of an error. Distance is in the measured unit for a
+            square affine map, else in each output's spread over the measurements.
 
     Returns:
         (..., n) in the command unit.
@@ -130,8 +130,8 @@ def limits_of(limits: ArrayLike | None, names: tuple[str, ...]) -> Array:
     bad = np.flatnonzero(~((low <= high) & (low < np.inf) & (high > -np.inf)))
     if bad.size:
         raise ValueError(
-            f"limits of {names[bad[0]]} must be a least and a greatest value, "
-            f"got {in_words(bounds[bad[0]])}"
+            f"limits of {names[bad[0]]} must be LOW, HIGH, got "
+            f"{in_words(bounds[bad[0]])}"
         )
     return bounds
 
@@ -176,8 +176,8 @@ class Responses:
         sure, last = _sureness(self.fit, self.spread)
         if sure < _SURE:
             raise ValueError(
-                "matrix A may be singular: its smallest singular value is "
-                f"{sure:.2g} standard deviations from zero; within the noise "
+                f"matrix A may be singular: its smallest singular value is {sure:.2g} "
+                "standard deviations from zero. Within the noise, "
                 f"{self._insensitive(last)}"
             )
         return turn, singular, right, rows
@@ -220,8 +220,8 @@ class Responses:
             ]
             raise ValueError(
                 f"{fit.output_names[j]} at the command {in_words(commands[i])} depends "
-                f"on what no measurement shows: {'; '.join(words)}; measure there, or "
-                "give a prior"
+                f"on unmeasured parameters: {'; '.join(words)}. Measure there, or give "
+                "a prior"
             )
 
     def _insensitive(self, direction: Array) -> str:
@@ -286,13 +286,13 @@ class _Search(Responses):
             if far and not worst:
                 i, j = np.unravel_index(beyond.argmax(), beyond.shape)
                 worst = (
-                    f"target {i + 1} has {names[j]} = {values[i, j]:.6g}, measured was "
-                    f"{low[j]:.6g} to {high[j]:.6g}"
+                    f"target {i + 1} has {names[j]} = {values[i, j]:.6g}, measured "
+                    f"range {low[j]:.6g} to {high[j]:.6g}"
                 )
         if far:
             warnings.warn(
                 f"{len(far)} of {len(commands)} targets are far outside the "
-                f"measurements: {worst}; the calibration was never tried there",
+                f"measurements, where the calibration is untested: {worst}",
                 stacklevel=3,
             )
 
@@ -315,7 +315,7 @@ class _Search(Responses):
             command = np.asarray(centre + self.spread * step.T)
         if not np.isfinite(command).all():
             raise ValueError(
-                "desired must be within reach of finite commands, got larger"
+                "desired values are too large: no finite command reaches them"
             )
         return command
 
@@ -401,7 +401,7 @@ class _Search(Responses):
         close = np.minimum(nearest - low, high - nearest) < 1e-4 * self.spread
         active = [name for name, at in zip(names, close, strict=True) if at]
         raise ValueError(
-            f"{target} is out of reach; the nearest output found is "
+            f"{target} cannot be reached; the nearest output found is "
             f"{in_words(self.outputs(nearest[None])[0])}"
             + (f", at the limit of {', '.join(active)}" if active else "")
         )

@@ -137,7 +137,7 @@ def solve(
         if search.settle(slack) and (done or creeps):
             return search.finish()
     raise ValueError(
-        f"identify did not converge in {_LIMIT} iterations: begin nearer, with "
+        f"identify did not converge in {_LIMIT} iterations: start nearer with "
         "Prior(mean=...), narrow the prior, or fix parameters that the measurements "
         "do not determine"
     )
@@ -560,14 +560,14 @@ class FitSolution:
                 slope = np.abs(rows.T @ right).max() / np.linalg.norm(right)
                 if slope > 1e-3 and not np.isfinite(after):
                     raise ValueError(
-                        "model.predict fails next to the parameters "
-                        f"{in_words(self.parameters)}, where the fit leads: narrow "
-                        "the prior, or begin nearer, with Prior(mean=...)"
+                        "model.predict fails near the parameters "
+                        f"{in_words(self.parameters)}, which the fit reaches: narrow "
+                        "the prior, or start nearer with Prior(mean=...)"
                     )
                 if slope > 1e-3:
                     raise ValueError(
-                        "model.jacobian must be the derivative of model.predict: no "
-                        "step along it brings the measurements nearer"
+                        "model.jacobian is not the derivative of model.predict: no "
+                        "step along it improves the fit"
                     )
                 return True
             self.damping *= self.grow

@@ -184,7 +184,7 @@ def _smooth(
             if not np.isfinite(log).all():
                 return None
     profile = np.exp(0.5 * (basis @ weights))
-    says = f"a level that varies smoothly along the {q} readings"
+    says = f"a level that varies smoothly over the {q} readings"
     return _Levels(says, np.zeros(q, np.intp), profile, degree + 1)
 
 

@@ -73,8 +73,8 @@ def inverse(
             of one output also (...).
         repeats: whole number from 1: the noise of a reading counts 1 / repeats.
         confidence: of the intervals, in (0, 1).
-        limits: (n, 2) where commands may lie. Of a curve that is not given them, what
-            was measured and a quarter of its range beyond.
+        limits: (n, 2) range of the commands. For a curve by default the measured range,
+            extended by a quarter.
         start: (n,) as of ``command_for``, where there are several inputs.
 
     Returns:
@@ -208,7 +208,7 @@ class _Curve:
             least, most = np.nanmin(outputs), np.nanmax(outputs)
             name = self.fit.output_names[0]
             raise ValueError(
-                f"readings must agree with a command between {self.low:.6g} and "
+                f"readings must be those of a command between {self.low:.6g} and "
                 f"{self.high:.6g}, where {name} is {least:.6g} to {most:.6g}, got "
                 f"{reading:.6g}; give limits"
             )
@@ -246,7 +246,7 @@ class _Curve:
         if slope == 0.0:
             name = self.fit.output_names[0]
             raise ValueError(
-                f"inverse needs {name} to change with the command: slope 0"
+                f"inverse needs {name} to depend on the command: the slope is 0"
             )
         command = float(middle + spread * off / slope)
         # (off - slope z)^2 <= square + tilt z + bend z^2.

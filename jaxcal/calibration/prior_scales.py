@@ -341,7 +341,7 @@ def _reduced(problem: FitProblem, solution: FitSolution) -> tuple[Array, Array]:
         informed, right = without(flat, informed, right)
     if not len(right):
         raise ValueError(
-            f"measured holds {len(rows)} readings, no more than the {flat.shape[1]} "
-            "unknowns without a prior explain: measure more"
+            f"measured has {len(rows)} readings, too few for {flat.shape[1]} unknowns "
+            "without a prior: measure more"
         )
     return informed, right

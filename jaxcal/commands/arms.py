@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 
 ModelPath = Annotated[
     str | None,
-    "an arm (.urdf), a saved model (.json) or a Python file that sets `model`; "
-    "y = A u + b by default",
+    "arm (.urdf), saved model (.json) or a Python file that sets `model`; default y = "
+    "A u + b",
     "FILE",
 ]
 
@@ -44,28 +44,26 @@ def _of_joint(text: str) -> list[Any]:
 class ArmOptions:
     """Links of an arm in a URDF file, its sensor, the unit of its columns."""
 
-    TITLE: ClassVar[str] = "of an arm, --model FILE.urdf"
+    TITLE: ClassVar[str] = "arms: needs --model FILE.urdf"
     RARE: ClassVar[Any] = {"base", "tip", "radians", "locked", "limits", "distance"}
 
     sensor: Annotated[
         str | None,
-        "of an arm, what measures its tip: position (default), pose, socket, plane, "
-        "distance, gravity, wrench or board",
+        "what measures the tip: position (default), pose, socket, plane, distance, "
+        "gravity, wrench or board",
         "KIND",
     ] = None
-    base: Annotated[str | None, "of an arm, the link that stands still", "LINK"] = None
-    tip: Annotated[list[str] | None, "of an arm, the link that is measured", "LINK"] = (
-        None
-    )
+    base: Annotated[str | None, "the link that is fixed", "LINK"] = None
+    tip: Annotated[list[str] | None, "the link that is measured", "LINK"] = None
     on_tip: Annotated[
         str | None,
-        "of --sensor board, which is on the tip: camera (default), the other stands",
+        "--sensor board: which of the two is on the tip, camera (default) or board",
         ["camera", "board"],
     ] = None
     radians: Annotated[bool, "joint columns are in radians"] = False
     locked: Annotated[
         list[list[Any]] | None,
-        "a joint that stands still, and where, degrees or metres: finger=0.01",
+        "a fixed joint and its value in degrees or metres: finger=0.01",
         _of_joint,
     ] = None
     limits: Annotated[
@@ -75,7 +73,7 @@ class ArmOptions:
     ] = None
     distance: Annotated[
         list[list[float]] | None,
-        "two sockets, how far apart they are and its std: 0,1,0.05,0.0001",
+        "two sockets, the distance between them and its std: 0,1,0.05,0.0001",
         several(float, "numbers"),
     ] = None
 
@@ -94,8 +92,8 @@ class ArmOptions:
         tips = ",".join(self.tip or ())
         if "," in tips:
             raise ValueError(
-                f"--tip must be one link, got {tips}: two chains in one model "
-                "(Chains) are in Python, docs/arms.md, Several chains"
+                f"--tip takes one link, got {tips}. Several chains in one model need "
+                "Python: Chains in docs/arms.md"
             )
         sensor = self._sensor(table, places)
         for option, count in (("locked", 1), ("limits", 2)):
@@ -122,8 +120,8 @@ class ArmOptions:
             if places is not None:
                 if {len(place) for place in places} != {kind.width}:
                     raise ValueError(
-                        f"--near must be {kind.width} numbers for --sensor "
-                        f"{self.kind}, got {places}"
+                        f"--near takes {kind.width} numbers for --sensor {self.kind}, "
+                        f"got {places}"
                     )
                 landmarks |= {"count": len(places), "places": places}
             elif table is not None and self.kind in table.names:
@@ -131,11 +129,11 @@ class ArmOptions:
                 landmarks["count"] = 1 + int(column.max(initial=0.0))
         if self.on_tip is not None:
             if kind is not Board:
-                raise ValueError("--on-tip is of --sensor board")
+                raise ValueError("--on-tip needs --sensor board")
             landmarks["moves"] = self.on_tip
         if self.distance:
             if kind is not Socket:
-                raise ValueError("--distance is of --sensor socket")
+                raise ValueError("--distance needs --sensor socket")
             landmarks["distances"] = self.distance
             if table is not None and self.kind not in table.names:
                 raise ValueError(
@@ -153,7 +151,7 @@ class ArmOptions:
         if not (path or "").lower().endswith(".urdf"):
             return None
         if self.radians:
-            raise ValueError("--radians is of tables, recordings say their unit")
+            raise ValueError("--radians goes with tables; recordings state their unit")
         if which is None:
             return self.read(str(path), None)
         column = np.array(which, dtype=np.float64)[:, None]
@@ -200,7 +198,7 @@ class ArmOptions:
             # x, y, z of a polynomial are places: the table's columns in their order.
             names = table.commands(chosen, but=but)
             if len(names) == len(inputs):
-                listed = f"{', '.join(names)} are read as {', '.join(inputs)}"
+                listed = f"{', '.join(names)} are used as {', '.join(inputs)}"
                 say(f"{table.source}: columns {listed}, in their order")
                 return names
         beside = but or getattr(getattr(model, "sensor", None), "outputs", ())
@@ -231,7 +229,7 @@ def _counted(text: str) -> list[int]:
 class RecordingOptions:
     """Options of a bag or a LeRobot dataset in the place of a table."""
 
-    TITLE: ClassVar[str] = "of a recording of an arm"
+    TITLE: ClassVar[str] = "recordings of an arm"
     RARE: ClassVar[bool] = True
 
     which: Annotated[
@@ -239,10 +237,10 @@ class RecordingOptions:
         "socket, plane or wire of each rest of a recording: 0,0,1 or 0x12,1x12",
         _counted,
     ] = None
-    topic: Annotated[str, "topic of the sensor's readings in a recording"] = ""
+    topic: Annotated[str, "topic of the sensor in a recording"] = ""
     servos: Annotated[
         str | None,
-        "the arm's calibration file, for a LeRobot dataset in -100 to 100",
+        "calibration file of the arm's servos, for a LeRobot dataset in -100 to 100",
         "FILE",
     ] = None
     in_degrees: Annotated[
@@ -266,7 +264,7 @@ class RecordingOptions:
 
         model = arm(self.which)
         if not isinstance(model, SerialChain):
-            raise ValueError(f"{path}: a recording needs an arm, --model FILE.urdf")
+            raise ValueError(f"{path}: a recording needs --model FILE.urdf")
         commands, read = model.recorded(
             Recording(
                 path,
@@ -278,8 +276,8 @@ class RecordingOptions:
         names = (*model.joint_names, *model.sensor.inputs)
         if read is None:
             raise ValueError(
-                f"{path} has no readings of a {model.sensor.kind}: give the postures "
-                "that it rests at as a table with what was read"
+                f"{path} has no readings of a {model.sensor.kind}. Pass a table "
+                "instead: the postures at rest and their readings"
             )
         values = np.hstack([commands, read])
         lines = tuple(range(1, len(values) + 1))
@@ -314,10 +312,10 @@ def _run_model(path: str) -> Model:
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
     if pathlib.Path(getattr(module, "__file__", None) or "").resolve() != file:
         raise ValueError(
-            f"{path}: it must have a name of its own, {file.stem} is another module's"
+            f"{path}: rename this file; another module is named {file.stem}"
         )
     if not hasattr(module, "model"):
-        raise ValueError(f"{path}: it must set `model`, one of jaxcal.models")
+        raise ValueError(f"{path}: it must set `model`, of jaxcal.models")
     try:
         return as_model(module.model)
     except ValueError as error:
@@ -340,8 +338,8 @@ def _read_model(path: str) -> Model:
         ) from None
     if isinstance(read, dict) and read.get("format") == "jaxcal-calibration":
         raise ValueError(
-            f"{path}: a model is needed, this is a calibration; commands that apply "
-            "one are predict and command"
+            f"{path}: this is a calibration, and a model is needed. `predict` and "
+            "`command` take calibrations"
         )
     from jaxcal.models import from_dict
 

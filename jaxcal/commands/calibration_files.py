@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 
 ReportFolder = Annotated[
     str,
-    "write a page, verdict.json and the calibration into this folder; the exit code is "
-    "then 1 where it is not good",
+    "write a page, verdict.json and the calibration into this folder; exit code 1 if "
+    "the calibration is not good",
     "FOLDER",
 ]
 
@@ -33,24 +33,24 @@ class ReportOptions:
 
     report: ReportFolder = ""
     against: Annotated[
-        str | None, "an earlier calibration.json that the page compares with", "FILE"
+        str | None, "earlier calibration.json to compare with on the page", "FILE"
     ] = None
     certificate: Annotated[
         float | None,
-        "expanded uncertainty (k = 2) in the certificate of the reference instrument, "
-        "in the measured unit, for the budget on the page",
+        "expanded uncertainty (k = 2) in the reference instrument's certificate, in "
+        "the measured unit, for the budget on the page",
         "U",
     ] = None
     at: Annotated[
         str | None,
-        "table of commands whose predictions get a budget on the page",
+        "table of commands; the page gives the uncertainty budget of their predictions",
         "FILE",
     ] = None
 
     def require(self) -> None:
         """Refuse options of a page without a page."""
         if not self.report and self != ReportOptions():
-            raise ValueError("--against, --certificate and --at are of --report FOLDER")
+            raise ValueError("--against, --certificate and --at need --report FOLDER")
 
     def written(self, calibration: Calibration, files: Sequence[str | None]) -> bool:
         """Write the page, if it was asked for; whether nothing on it is bad."""
@@ -81,30 +81,30 @@ class SavedFiles:
 
     out: Annotated[
         str,
-        "save the calibration (.json), or of an arm the corrected file (.urdf)",
+        "save the calibration (.json) or an arm's corrected file (.urdf)",
         "FILE",
     ] = ""
-    overwrite: Annotated[bool, "write over an .urdf or servos file that is there"] = (
+    overwrite: Annotated[bool, "overwrite an existing .urdf or servos file"] = False
+    unproven: Annotated[bool, "write the .urdf even if the calibration is not good"] = (
         False
     )
-    unproven: Annotated[bool, "write the .urdf of a fit that is not good"] = False
     repair: Annotated[
-        str, "write the rows that belong together, where they were mispaired", "FILE"
+        str, "if rows are mispaired, write the corrected table", "FILE"
     ] = ""
     servos_out: Annotated[
-        str, "write LeRobot's calibration, of --servos, with the zeros found", "FILE"
+        str, "write LeRobot's calibration file: --servos with corrected zeros", "FILE"
     ] = ""
 
     transform: Annotated[
         str,
-        "of --sensor board, write where the camera is, for the arm as described: a "
+        "--sensor board: write the camera's pose for the uncorrected arm, as a "
         "TransformStamped (.yaml), ROS 2's static_transform_publisher (.sh, or .py to "
-        "launch it), or the .urdf with its link",
+        "launch it), or the .urdf with the camera's link",
         "FILE",
     ] = ""
     frames: Annotated[
         str | None,
-        "with --transform: the camera's link, the name of its optical frame",
+        "with --transform: the camera's parent link and the name of its optical frame",
         "PARENT,CHILD",
     ] = None
 
@@ -122,38 +122,36 @@ class SavedFiles:
         """Refuse files that cannot be written, or must not be, before the fit."""
         if self.servos_out and self.as_urdf:
             raise ValueError(
-                "one of --servos-out and --out FILE.urdf must be left out: either "
-                "corrects the zeros, both would twice"
+                "Leave out --servos-out or --out FILE.urdf: each corrects the zeros, "
+                "so both would correct them twice"
             )
         files = "--out FILE.urdf, --servos-out and --transform"
         if self.unproven and not self.corrected:
-            raise ValueError(f"--unproven is of {files}")
+            raise ValueError(f"--unproven needs {files}")
         if self.overwrite and not self.corrected:
-            raise ValueError(f"--overwrite is of {files}")
+            raise ValueError(f"--overwrite needs {files}")
         if self.frames is not None and not self.transform:
-            raise ValueError("--frames is of --transform FILE")
+            raise ValueError("--frames needs --transform FILE")
         if len((self.frames or "a,b").split(",")) != 2:
-            raise ValueError(f"--frames must be PARENT,CHILD, got {self.frames}")
+            raise ValueError(f"--frames takes PARENT,CHILD, got {self.frames}")
         if self.transform and os.path.exists(self.transform) and not self.overwrite:
-            raise ValueError(
-                f"{self.transform} is there already; --overwrite writes over it"
-            )
+            raise ValueError(f"{self.transform} exists; pass --overwrite to replace it")
         if self.servos_out and not servos:
-            raise ValueError("--servos-out needs --servos, the file that it corrects")
+            raise ValueError("--servos-out needs --servos FILE")
         if servos and not (self.servos_out or is_recording(file)):
-            raise ValueError("--servos goes with a recording or with --servos-out")
+            raise ValueError("--servos needs a recording or --servos-out")
         if self.as_urdf and not of_urdf:
             raise ValueError("--out FILE.urdf needs --model FILE.urdf")
         if self.as_urdf and os.path.exists(self.out) and not self.overwrite:
-            raise ValueError(f"{self.out} is there already; --overwrite writes over it")
+            raise ValueError(f"{self.out} exists; pass --overwrite to replace it")
 
     def written(self, calibration: Calibration, servos: str | None) -> list[str]:
         """Write the files that were asked for; a line of each."""
         corrected = self.corrected
         if corrected and not calibration.verdict.good and not self.unproven:
             raise ValueError(
-                f"{corrected} is not written: the calibration is not good, as said "
-                "above; --unproven writes it all the same"
+                f"{corrected} was not written: the calibration is not good (reasons "
+                "above). --unproven writes it anyway"
             )
         lines = []
         if self.as_urdf:

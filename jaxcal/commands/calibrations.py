@@ -32,7 +32,7 @@ from jaxcal.tables import COMMANDS, MEASURED, Table, read_table
 Array = NDArray[np.float64]
 
 RecordPath = Annotated[
-    str, "CSV, or - (standard input); of an arm also a bag or a LeRobot dataset"
+    str, "CSV, or - (standard input); for an arm also a bag or a LeRobot dataset"
 ]
 
 
@@ -54,39 +54,39 @@ def identify(
     page: ReportOptions,
     of_arm: ArmOptions,
     recording: RecordingOptions,
-    noise: Annotated[Numbers, "std of a measurement, where it is known", "S"] = None,
+    noise: Annotated[Numbers, "std of a measurement, if known", "S"] = None,
     play: Annotated[
-        float | None, "of an arm's joints, degrees from stop to stop: servos 0.3"
+        float | None, "backlash of an arm's joints in degrees: hobby servos 0.3"
     ] = None,
     weights: Annotated[str | None, "column of relative weights", "W"] = None,
-    command_unit: Annotated[str, "of the commands, stored and printed", "UNIT"] = "",
-    measured_unit: Annotated[str, "of the readings, stored and printed", "UNIT"] = "",
+    command_unit: Annotated[str, "unit of the commands", "UNIT"] = "",
+    measured_unit: Annotated[str, "unit of the readings", "UNIT"] = "",
     accuracy: Annotated[
         Any,
-        "of an arm, the held-out error that is enough: 0.002 in the first unit (of "
-        "lengths, where there are some), or m=0.002,deg=0.1",
+        "arms: cross-validated error that you need, 0.002 in the first unit (length if "
+        "any), or m=0.002,deg=0.1",
         _by_unit,
         "A",
     ] = None,
     session: Annotated[
-        str | None, "column that labels the session (day, mounting) of each row", "S"
+        str | None, "column that names the session (day, mounting) of each row", "S"
     ] = None,
     json: Annotated[bool, "print JSON"] = False,
 ) -> int:
     """Fit a model to measurements and save the calibration.
 
-    Columns that begin with u_ are commands, those with y_ what was measured; --inputs
-    and --outputs name others. Of an arm in a URDF file the commands are the columns
-    named as its joints, in any order, and what its sensor asks for; a bag or a LeRobot
-    dataset does in the place of the table, with the postures at which the arm rested.
+    Columns that begin with u_ are commands, those with y_ readings; --inputs and
+    --outputs name others. For an arm in a URDF file the commands are the columns named
+    like its joints, in any order, and those that its sensor needs. A bag or a LeRobot
+    dataset may replace the table; the postures are then those where the arm rested.
     """
     of_urdf = (model or "").lower().endswith(".urdf")
     saved.require(file, of_urdf, recording.servos)
     page.require()
     if saved.repair and weights:
-        raise ValueError("--repair writes no weights: leave out one of them")
+        raise ValueError("--repair writes no weights: leave out --repair or --weights")
     if saved.repair and os.path.realpath(saved.repair) == os.path.realpath(file):
-        raise ValueError(f"--repair must be another file than {file}")
+        raise ValueError(f"--repair must name another file than {file}")
     table = recording.table(file, lambda which: of_arm.of_recording(model, which))
     table = read_table(file) if table is None else table
     machine: Any = of_arm.machine(model, table)
@@ -137,7 +137,7 @@ def _noise(machine: Any, stds: list[float] | None, play: float | None) -> Any:
     if play is None:
         return {"noise": None, "noise_std": std}
     if not _is_arm(machine):
-        raise ValueError("--play is of an arm, --model FILE.urdf")
+        raise ValueError("--play needs an arm: --model FILE.urdf")
     noise = machine.noise_with_play(play)
     if std is not None:
         noise = dataclasses.replace(noise, std=std)
@@ -154,13 +154,13 @@ def _repaired(
     """Write the rows of a mispaired table that belong together; a line that says so."""
     mispairing = calibration.mispairing
     if mispairing is None:
-        raise ValueError(f"{path} is not written: the rows of {file} are not mispaired")
+        raise ValueError(f"{path} was not written: {file} has no mispaired rows")
     names, measured = [*readings.inputs], np.zeros((len(table), 0))
     if {*readings.outputs} <= {*table.names}:
         names, measured = [*names, *readings.outputs], table.columns(readings.outputs)
     columns = mispairing.repaired(table.columns(readings.inputs), measured)
     write_rows(path, names, np.hstack(columns).tolist())
-    return f"saved {path}, {len(columns[0])} of {len(table)} rows; {file} is as it was"
+    return f"saved {path}, {len(columns[0])} of {len(table)} rows; {file} is unchanged"
 
 
 class _Readings(NamedTuple):
@@ -185,7 +185,7 @@ def _arm_readings(
     if not contacts:
         columns = table.named(columns, MEASURED, chosen=outputs, option="--outputs")
     elif outputs:
-        raise ValueError(f"--outputs is of readings, contacts have none, got {outputs}")
+        raise ValueError(f"contacts have no readings: leave out --outputs {outputs}")
     beside = (*columns, weights or "")
     names = of_arm.columns(arm, table, inputs, beside)
     commands = of_arm.commands(arm, table, names)
@@ -207,7 +207,7 @@ def _readings(
     columns = table.outputs(outputs)
     names = of_arm.columns(machine, table, inputs, (*columns, weights or ""))
     if both := sorted({*names} & {*columns}):
-        raise ValueError(f"--inputs and --outputs must differ, both hold {both[0]}")
+        raise ValueError(f"--inputs and --outputs both hold {both[0]}")
     return _Readings(table.columns(names), table.columns(columns), names, columns)
 
 
@@ -221,30 +221,30 @@ def check(
     recording: RecordingOptions,
     tolerance: Annotated[
         Any,
-        "drift of the outputs that matters, a number or m=0.002,deg=0.1; default three "
-        "times the noise",
+        "change of the outputs that matters, a number or m=0.002,deg=0.1; default "
+        "three times the noise",
         _by_unit,
         "T",
     ] = None,
     placed_anew: Annotated[
-        bool, "of an arm: its sockets, planes, anchors or board stand elsewhere now"
+        bool, "arms: sockets, planes, anchors or the board were moved since"
     ] = False,
-    radians: Annotated[bool, "of an arm: joint columns are in radians"] = False,
+    radians: Annotated[bool, "arms: joint columns are in radians"] = False,
     report: ReportFolder = "",
     json: Annotated[bool, "print JSON"] = False,
 ) -> int:
-    """Whether a calibration still holds, by a few new readings.
+    """Test with a few new readings whether a calibration still holds.
 
-    The table has the calibration's columns, of contacts no readings; of an arm a
-    recording does. Exit code 0: it holds; 1: it does not, or that cannot be told from
-    these readings; 2: bad input.
+    The table has the calibration's columns; contacts have no readings. For an arm a
+    recording may replace it. Exit code 0: the calibration holds; 1: it does not, or the
+    test is inconclusive; 2: bad input.
     """
     calibrated = Calibration.load(calibration)
     if recording.servos and not is_recording(file):
-        raise ValueError("--servos goes with a recording, not with a table")
+        raise ValueError("--servos goes with a recording, not a table")
     table = recording.table(file, lambda which: calibrated.model)
     if table is not None and radians:
-        raise ValueError("--radians is of tables, recordings say their unit")
+        raise ValueError("--radians goes with tables; recordings state their unit")
     table = read_table(file) if table is None else table
     inputs, commands = commands_for(calibrated, table, option="")
     if radians:
@@ -277,10 +277,10 @@ def predict(
     *,
     inputs: Annotated[str | None, "columns of commands", "A,B", Was("columns")] = None,
     std: Annotated[bool, "add the standard error of each output"] = False,
-    radians: Annotated[bool, "of an arm: joint columns are in radians"] = False,
+    radians: Annotated[bool, "arms: joint columns are in radians"] = False,
     output: Output,
 ) -> None:
-    """Where a calibrated machine goes for given commands."""
+    """Predict the outputs of a calibrated machine for given commands."""
     calibrated = Calibration.load(calibration)
     table = read_table(file)
     _, commands = commands_for(calibrated, table, inputs)
@@ -303,14 +303,14 @@ def command(
     ] = None,
     limits: Annotated[
         list[list[float]] | None,
-        "lowest and highest command; once for all inputs or for each; inf for none",
+        "lowest and highest command, once for all or once per input; inf for none",
         "LOW,HIGH",
         several(float, "numbers"),
     ] = None,
-    clip: Annotated[bool, "move commands beyond the limits onto them"] = False,
+    clip: Annotated[bool, "move commands beyond the limits to the limit"] = False,
     output: Output,
 ) -> None:
-    """What to command to reach given outputs, the inverse map.
+    """Compute the commands that reach given outputs (inverse map).
 
     A command beyond its limits is refused; --clip moves it onto the limit instead.
     """
@@ -338,7 +338,7 @@ def command(
 def _in_degrees(calibration: Calibration, commands: Array) -> Array:
     """Commands (N, n) of an arm whose joint columns are in radians."""
     if not _is_arm(calibration.model):
-        raise ValueError("--radians is of arms")
+        raise ValueError("--radians needs an arm")
     return in_degrees(cast("Any", calibration.model), commands)
 
 
@@ -354,9 +354,8 @@ def _readings_for(
     )
     if both := sorted({*inputs} & {*outputs}):
         raise ValueError(
-            f"{table.source}: columns of commands and of readings must differ, both "
-            f"would be {', '.join(both)}; begin their names with {COMMANDS} and "
-            f"{MEASURED}"
+            f"{table.source}: {', '.join(both)} would be both commands and readings; "
+            f"begin the names with {COMMANDS} and {MEASURED}"
         )
     return table.columns(outputs)
 

@@ -38,35 +38,35 @@ EXIT_TERMINATED = 143
 _POOLED = 1000  # episodes drawn of one table
 
 _DESCRIPTION = """\
-Let every method choose K postures in every episode of a dataset, and compare the
-determinant of the information matrix S with that of the best choice there is (S*).
+Every method chooses K postures in every episode of a dataset. The table compares the
+determinant of their information matrix S with that of the best choice (S*).
 
 columns:
   mean, median det S  larger is better; in the unit of the dataset's commands
   det S/det S*        mean over the episodes; 1 is optimal
-  hit rate            share of episodes in which the optimum itself was found
+  hit rate            share of episodes in which the optimum was found
   D-eff.              mean of (det S/det S*)^(1/p), p parameters (12 for 3 x 3)
-  x random            mean det S over that of random selection, the paper's measure
-  time each           seconds a selection, averaged over the batch, compilation left out
+  x random            mean det S divided by that of random selection (paper)
+  time each           seconds per selection, mean of the batch, no compilation
 """
 
 _EPILOG = """\
 methods:
-  policy              the trained network, likeliest posture at every step
-  policy:samples      the best of --num sampled passes
-  policy:first        each of the --num likeliest first postures, completed; the best
-  policy:exchange     policy, then Fedorov exchange from what it chose
-  policy:all          all four
-  random              --draws selections an episode, all counted
-  greedy              the posture that adds most, K times
+  policy              trained network; takes the most likely posture at every step
+  policy:samples      the best of --num random selections of the network
+  policy:first        the best after each of the --num most likely first postures
+  policy:exchange     policy, then Fedorov exchange from its selection
+  policy:all          all four, a row each
+  random              --draws selections per episode, all counted
+  greedy              adds the posture of the largest gain, K times
   exchange            Fedorov exchange with random restarts
   exact               the proven optimum
-  auto                what select does by default: the cheapest way to a proven
-                      D-efficiency of 0.999; not among the methods run by default
+  auto                default of `select`: the cheapest way to a proven D-efficiency
+                      of 0.999; runs only when named
 
 datasets:
-  dataset1 to 5       the paper's, made from --seed (200,000, 1,000, 100, 100 and 1
-                      episodes); 4 and 5 from --recordings, or those that ship
+  dataset1 to 5       the paper's, drawn with --seed (200,000, 1,000, 100, 100 and 1
+                      episodes); 4 and 5 from --recordings or the shipped ones
   FILE.npz            candidates (episodes, M, n); optional measured, available
   FILE.csv            episode,candidate,u_x,u_y,u_z[,y_x,y_y,y_z]
 
@@ -74,16 +74,16 @@ examples:
   {program}
       the shipped policy and every baseline on 1,000 unseen sets of 50 postures
   {program} --checkpoint runs/a runs/b --methods policy,exact --json out.json
-      two trainings side by side, the numbers for a script
+      two trainings side by side, numbers as JSON
   {program} --dataset dataset3 mine.npz --report report
-      figures and report/index.html; dataset3 holds outputs, so parameters too
+      figures and report/index.html; dataset3 has outputs: parameters are fitted too
   {program} --methods random,greedy,exact --k 8 --episodes 100
       eight of fifty postures; loads no JAX
   {program} --task knee
       deciders of sequential measurement; {program} --task knee --help
   {program} --stream runs/ten_million --episodes 10000000
-      any number of episodes in constant memory; the same command resumes where it
-      stopped; started again beside it, on any machine, it shares the work
+      any number of episodes in constant memory; the same command resumes, and the
+      same command on another machine shares the work
 """
 
 
@@ -91,8 +91,8 @@ _DECIDERS = "random,gain,rate,shares,ahead,policy"
 _TUNED = "priced,state"  # where the task brings their constants
 
 _TASK_DESCRIPTION = """\
-Let deciders play the same sessions of a task: what they learn in nats, each less the
-best rule in pairs, and the time of a choice.
+Deciders measure in the same sessions of a task. The table shows the information gained
+in nats, the paired difference to the best rule, and the time per choice.
 """
 
 _TASK_EPILOG = """\
@@ -123,7 +123,7 @@ class Outputs:
         """Refuse what cannot be written, before anything is computed."""
         if self.json is not None:
             if self.json.is_dir():
-                raise ValueError(f"--json must be a file, {self.json} is a folder")
+                raise ValueError(f"--json takes a file; {self.json} is a folder")
             require_writable_folder(self.json.parent)
         if self.report is not None:
             with needs("plots", "--report"):
@@ -147,17 +147,17 @@ class TaskOptions(Outputs):
     with_: Annotated[tuple[str, ...], "options of the task", "OPTION=VALUE"] = ()
     methods: Annotated[
         list[str] | None,
-        f"comma separated; {_DECIDERS}, with {_TUNED} where the task has their "
-        "constants, or the task's own",
+        f"comma separated: {_DECIDERS}, {_TUNED} if the task has their constants, or "
+        "the task's own",
         "LIST",
         several(str, "names"),
     ] = None
-    checkpoint: Annotated[str | None, "of the policy; the shipped one", "DIR"] = None
+    checkpoint: Annotated[str | None, "policy; default the shipped", "DIR"] = None
     episodes: Annotated[
-        int | None, "sessions; 4096, fewer where a task takes long", (2,)
+        int | None, "sessions; default 4096, fewer for a slow task", (2,)
     ] = None
     seed: Annotated[int, "of the sessions", "S", (0,)] = 0
-    retune: Annotated[bool, "tune the rules on this task; else as they ship"] = False
+    retune: Annotated[bool, "tune the rules on this task first"] = False
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -165,33 +165,33 @@ class EvaluateOptions(Outputs):
     """Options of an evaluation of postures: methods, policies and datasets."""
 
     checkpoint: Annotated[
-        tuple[str, ...], "trained policies; the shipped one", "DIR"
+        tuple[str, ...], "trained policies; default the shipped one", "DIR"
     ] = ()
     dataset: Annotated[tuple[str, ...], "datasets; dataset2", "NAME|FILE"] = ()
     recordings: Annotated[Path | None, "dataset4.csv, dataset5.csv", "DIR"] = None
     methods: Annotated[
-        list[str] | None, "comma separated; all but auto", "LIST", several(str, "names")
+        list[str] | None, "default: all but auto", "A,B", several(str, "names")
     ] = None
     k: Annotated[int, "postures to choose", "K", (1,)] = 4
     episodes: Annotated[int | None, "at most the first N of each", (1,)] = None
-    seed: Annotated[int, "of datasets and draws", "S", (0,)] = 0
-    num: Annotated[int, "tries of policy:samples and :first", (1,)] = 16
-    draws: Annotated[int, "random selections an episode", (1,)] = 100
+    seed: Annotated[int, "seed of datasets and draws", "S", (0,)] = 0
+    num: Annotated[int, "samples of policy:samples and :first", (1,)] = 16
+    draws: Annotated[int, "random selections per episode", (1,)] = 100
     time_limit: Annotated[
         float | None,
-        "of the exact solver, a dataset; what it cannot prove is bounded",
+        "time limit of the exact solver per dataset; unproven optima are bounded",
         "SECONDS",
         (1e-3,),
     ] = None
-    indices: Annotated[bool, "and the postures chosen, in the JSON"] = False
+    indices: Annotated[bool, "add the chosen postures to the JSON"] = False
     run: Annotated[
         tuple[Path, ...],
-        "training runs to draw curves of; those of --checkpoint are found",
+        "training runs to draw learning curves of, besides those of --checkpoint",
         "DIR",
     ] = ()
     stream: Annotated[
         Path | None,
-        "evaluate in parts kept in DIR: any number of --episodes, resumable",
+        "evaluate in parts kept in DIR, which can be resumed: any number of --episodes",
         "DIR",
     ] = None
 
@@ -225,7 +225,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
         options = values_of(made)["options"]
         options.command = [*command, *words]
         if not of_task and options.stream is not None:
-            kept = "finished parts are kept; the same command goes on"
+            kept = "finished parts are kept; run the same command again to resume"
         require_kept(vars(made))
         with told():
             made.function(options)
@@ -366,8 +366,8 @@ def _dataset(name: str, options: EvaluateOptions) -> Dataset:
         return make_dataset(name, options.seed, count, recordings=options.recordings)
     if Path(name).suffix.lower() not in (".npz", ".csv"):
         raise ValueError(
-            f"--dataset must be one of {', '.join(EPISODES)} or a .npz or .csv file, "
-            f"got {name!r}"
+            f"--dataset takes {', '.join(EPISODES)}, or a .npz or .csv file, got "
+            f"{name!r}"
         )
     if not holds_sets(name):
         sets = draw_sets(name, options.episodes or _POOLED, options.seed)
@@ -390,7 +390,7 @@ def _streamed(
         "--time-limit": options.time_limit is not None,
     }
     for flag in (flag for flag, value in whole.items() if value):
-        raise ValueError(f"{flag} needs every episode at once and --stream keeps none")
+        raise ValueError(f"{flag} needs all episodes in memory: not with --stream")
     if len(options.datasets) > 1:
         raise ValueError(
             f"--stream takes one dataset, got {', '.join(options.datasets)}"

@@ -34,13 +34,13 @@ def example(
 ) -> None:
     """Write small files to try the commands with, and print those commands.
 
-    Readings are those of a simulated machine whose errors are known. A file that exists
-    is not replaced.
+    The readings come from a simulated machine with known errors. Existing files are not
+    replaced.
     """
     files = {"table": _table, "arm": _arm, "device": _device}[kind]()
     for name in files:
         if (folder / name).exists():
-            raise ValueError(f"{folder / name} exists: name another --folder")
+            raise ValueError(f"{folder / name} exists; choose another --folder")
     require_writable_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in files.items():

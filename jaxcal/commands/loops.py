@@ -13,18 +13,16 @@ def loop(
     task: Annotated[str, "a task's name, or a Python file that defines ENTRY"],
     *,
     journal: Annotated[
-        Path | None, "record of the session; a session that is in it goes on"
+        Path | None, "journal of the session; an existing journal is resumed"
     ] = None,
     with_: Annotated[tuple[str, ...], "options of the task", "OPTION=VALUE"] = (),
-    seconds: Annotated[
-        float | None, "time budget; the task's if not given", (0.0,)
-    ] = None,
+    seconds: Annotated[float | None, "time budget; default the task's", (0.0,)] = None,
     uses: Annotated[
-        int | None, "budget of what the task counts; its own if not given", (1,)
+        int | None, "budget of the task's counted resource; default the task's", (1,)
     ] = None,
-    seed: Annotated[int, "of the random draws", "S", (0,)] = 0,
+    seed: Annotated[int, "seed of the random draws", "S", (0,)] = 0,
 ) -> None:
-    """Suggest measurements and take outcomes, as JSON in lines, for other programs.
+    """Suggest measurements and take outcomes as JSON lines, for other programs.
 
     example:
       $ jaxcal loop peak.py --journal session.jsonl
@@ -34,8 +32,8 @@ def loop(
       {"number": 1}
       {"do": "state"}
 
-    Each outcome is in the journal before it is answered; killed and started again, the
-    session goes on.
+    Each outcome is written to the journal before the answer. A session that was killed
+    resumes when started again.
     """
     with needs("policy", "loop"):
         from jaxcal.adaptive.loop import Loop

@@ -34,26 +34,26 @@ class ViewOptions:
 
     camera: Annotated[
         list[float] | None,
-        "of --sensor board: width,height,fx,fy,cx,cy in pixels, or degrees of view "
-        "horizontal,vertical: the board is in the picture",
+        "--sensor board: width,height,fx,fy,cx,cy in pixels, or field of view "
+        "horizontal,vertical in degrees; views keep the board in the picture",
         several(float, "numbers"),
     ] = None
     board: Annotated[
         list[float] | None,
-        "width,height of the board from the corner that its pose is of",
+        "width,height of the board, from the corner at its origin",
         several(float, "numbers"),
     ] = None
     away: Annotated[
         list[float] | None,
-        "least,greatest distance of the camera from the board",
+        "least,greatest distance from the camera to the board",
         several(float, "numbers"),
     ] = None
     tilt: Annotated[
-        float | None, "degrees that the board may be turned from the camera, default 45"
+        float | None, "largest angle between board and camera in degrees, default 45"
     ] = None
     side: Annotated[
         str | None,
-        "where the board's z axis points from its printed side",
+        "side of the board that is printed, along its z axis",
         ["+z", "-z"],
     ] = None
 
@@ -62,7 +62,7 @@ class ViewOptions:
         if self.board is None:
             return arm
         if not isinstance(arm.sensor, Board) or len(self.board) != 2:
-            raise ValueError("--board WIDTH,HEIGHT is of --sensor board")
+            raise ValueError("--board WIDTH,HEIGHT needs --sensor board")
         width, height = self.board
         return arm.measured_with(
             dataclasses.replace(arm.sensor, extent=(width, height))
@@ -71,21 +71,21 @@ class ViewOptions:
 
 @dataclasses.dataclass
 class RoomOptions:
-    """What the arm stays away from."""
+    """What the arm avoids."""
 
-    TITLE: ClassVar[str] = "what the arm stays away from"
+    TITLE: ClassVar[str] = "what the arm avoids"
     RARE: ClassVar[bool] = True
 
-    floor: Annotated[float | None, "height that no joint is below"] = None
+    floor: Annotated[float | None, "lowest allowed height of a joint"] = None
     approach: Annotated[
         list[float] | None,
-        "direction in which the tool comes, and the degrees about it: 0,0,-1,60",
+        "the tool's approach: direction and largest angle from it: 0,0,-1,60",
         several(float, "numbers"),
     ] = None
     clear: Annotated[
         list[list[float]] | None,
-        "a plane (normal, offset) or box (least x,y,z, greatest) that links stay away "
-        "from, as spheres along lines between the joints; once for each",
+        "plane (normal, offset) or box (least x,y,z, greatest) that the links avoid; "
+        "links are spheres along lines between the joints; may be repeated",
         several(float, "numbers"),
     ] = None
 
@@ -93,40 +93,40 @@ class RoomOptions:
 def postures(
     model: Annotated[str, "the arm's .urdf"],
     *,
-    k: Annotated[int, "postures to measure in all", "K"],
+    k: Annotated[int, "number of postures, measured ones included", "K"],
     view: ViewOptions,
     room: RoomOptions,
     of_arm: ArmOptions,
     near: Annotated[
         list[list[float]] | None,
-        "where a socket (x,y,z), a plane (normal, offset) or an anchor (x,y,z,zero) "
-        "is, roughly; for other sensors x,y,z,radius around the tip; once for each",
+        "rough place of a socket (x,y,z), plane (normal, offset) or anchor "
+        "(x,y,z,zero); for other sensors x,y,z,radius around the tip; may be repeated",
         several(float, "numbers"),
     ] = None,
     measured: Annotated[
         str | None,
-        "table of postures that were measured already, with columns named as the "
-        "joints and as the sensor's",
+        "table of postures already measured; columns have the names of the joints and "
+        "of the sensor's readings",
         "FILE",
     ] = None,
-    count: Annotated[int, "postures to choose from"] = 300,
+    count: Annotated[int, "number of postures to choose from"] = 300,
     one_side: Annotated[
         float | None,
-        "columns `from JOINT`: where to come from, so many degrees below, so that play "
-        "is on one side",
+        "add columns `from JOINT`: start every move this many degrees below, so that "
+        "the backlash is always on the same side",
     ] = None,
-    seed: Annotated[int, "of the random draws of these postures"] = 0,
+    seed: Annotated[int, "seed of the random draws"] = 0,
     picture: Annotated[
-        pathlib.Path | None, "draw the arm at each posture chosen: .png, .pdf, .svg"
+        pathlib.Path | None, "draw the arm at each chosen posture: .png, .pdf, .svg"
     ] = None,
     output: Output,
 ) -> None:
     """Choose the postures to measure, in an order of little travel.
 
-    Postures are made within the joint limits, where the sensor reads, and chosen for
-    the predictions of the calibrated arm. With --measured the rest of the K is chosen
-    beside what was reached, which shows where sockets, planes and boards are, too.
-    Collisions are looked at as far as --floor, --approach and --clear say.
+    The postures lie within the joint limits, where the sensor reads, and are chosen for
+    accurate predictions of the calibrated arm. With --measured the remaining postures
+    complement those already measured, which also locate sockets, planes and boards.
+    Collisions are checked only by --floor, --approach and --clear.
     """
     if picture:
         with needs("plots", "--picture"):
@@ -145,7 +145,7 @@ def postures(
         arm = arm.located(done)
     more = k - (0 if done is None else len(done))
     if more < 1:
-        reason = f"-k must be more than the {k - more} that were reached"
+        reason = f"-k must be above {k - more}, the number of postures already measured"
         raise ValueError(f"{reason}, got {k}")
     arm = view.with_board(arm)
     offered = arm.postures(

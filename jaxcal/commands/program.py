@@ -1,4 +1,4 @@
-"""``jaxcal COMMAND``: parse, run, and say in one line what was wrong."""
+"""``jaxcal COMMAND``: parse, run, and report an error in one line."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from jaxcal.extras import MissingExtraError, install
 from jaxcal.files import require_kept
 
 _HERE = {  # command: one line of help, and the module with its flags and function
-    "select": ("choose the few rows of a table worth measuring", "questions"),
-    "plan": ("how many measurements a wanted accuracy takes", "questions"),
+    "select": ("choose the few rows of a table that are worth measuring", "questions"),
+    "plan": ("number of measurements that a wanted accuracy needs", "questions"),
     "postures": ("the postures of an arm to measure, in order", "postures"),
     "identify": (
         "fit y = A u + b, or a model, to measurements and save the calibration",
         "calibrations",
     ),
     "check": (
-        "whether a calibration still holds, by a few new readings",
+        "test with a few new readings whether a calibration still holds",
         "calibrations",
     ),
-    "predict": ("where a calibrated machine goes for given commands", "calibrations"),
-    "command": ("what to command to reach given outputs", "calibrations"),
-    "loop": ("measure in a closed loop that another program drives", "loops"),
+    "predict": ("outputs of a calibrated machine for given commands", "calibrations"),
+    "command": ("commands that reach given outputs", "calibrations"),
+    "loop": ("measure in a closed loop driven by another program", "loops"),
     "example": ("files to try the commands with", "example"),
     "doctor": ("versions and devices, for a bug report", "program"),
 }
@@ -94,7 +94,7 @@ def run(argv: list[str] | None = None) -> int:
 def _parser(given: list[str]) -> Parser:
     parser = Parser(
         prog="jaxcal",
-        description="Which few measurements to make, and the calibration that follows.",
+        description="Choose the few measurements worth making, and calibrate.",
         epilog=_EPILOG,
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -110,7 +110,7 @@ def _parser(given: list[str]) -> Parser:
 
 
 def doctor(*, json: Annotated[bool, "print JSON"] = False) -> None:
-    """Print versions and devices; nothing is changed and no port is opened."""
+    """Print versions and devices. This changes nothing and opens no port."""
     versions = {
         "python": f"{platform.python_version()} ({sys.executable})",
         "platform": platform.platform(),

@@ -29,24 +29,24 @@ class DesignOptions:
 
     inputs: Annotated[
         str | None,
-        "columns of commands; u_... where there are any, else all numbers",
+        "columns of commands; default those that begin with u_, else all numeric ones",
         "A,B",
         Was("columns"),
     ] = None
     model: ModelPath = None
     num_outputs: Annotated[
         int | None,
-        "of y = A u + b; as many as commands when not given",
+        "outputs of y = A u + b; default as many as commands",
         "M",
         Was("outputs"),
     ] = None
     noise: Annotated[
-        Numbers, "standard deviation of a measurement, or one for each output", "S"
+        Numbers, "standard deviation of a measurement: one, or one per output", "S"
     ] = None
-    replicates: Annotated[int, (1,), "how often one row may be measured", "R"] = 1
-    required: Annotated[Rows, "rows, counted from 0, that must be chosen", "I,J"] = None
+    replicates: Annotated[int, (1,), "how often a row may be measured", "R"] = 1
+    required: Annotated[Rows, "rows that must be chosen, counted from 0", "I,J"] = None
     scenarios: Annotated[
-        int | None, "draws of the model's parameters; the mean over them counts", "N"
+        int | None, "average over this many random draws of the model's parameters", "N"
     ] = None
 
     def design(self, table: Table, of_arm: ArmOptions) -> Design:
@@ -56,8 +56,7 @@ class DesignOptions:
         candidates = of_arm.commands(model, table, names, mask)
         if self.num_outputs is not None:
             if model is not None:
-                rule = "must be left out with --model, which has them"
-                raise ValueError(f"--num-outputs {rule}")
+                raise ValueError("--num-outputs is set by --model: leave it out")
             model = Affine(len(names), self.num_outputs)
         if self.model is None:  # said here in the names of the columns
             used = candidates if mask is None else candidates[mask]
@@ -86,7 +85,7 @@ def _of_parameters(word: str) -> str:
 
 @dataclasses.dataclass
 class CriterionOptions:
-    """By which criterion."""
+    """The criterion."""
 
     RARE: ClassVar[Any] = {"parameters", "worst"}
 
@@ -94,14 +93,14 @@ class CriterionOptions:
         str | None, "default D for affine models, else I", offered()
     ] = None
     parameters: Annotated[
-        Names, f"with {_of_parameters('and')}: the parameters of interest", "A,B"
+        Names, f"parameters of interest, with {_of_parameters('and')}", "A,B"
     ] = None
-    worst: Annotated[bool, "with --scenarios: the worst counts, not the mean"] = False
+    worst: Annotated[bool, "with --scenarios: by the worst, not the mean"] = False
 
     def by(self, scenarios: int | None) -> Any:
         """The criterion, over so many scenarios."""
         if self.worst and scenarios is None:
-            raise ValueError("--worst must come with --scenarios N")
+            raise ValueError("--worst needs --scenarios N")
         name, parameters = self.criterion, self.parameters
         kind = None if name is None else CRITERIA[name]
         if (kind is not None and kind.of_parameters) != (parameters is not None):
@@ -123,40 +122,38 @@ class MethodOptions:
     TITLE: ClassVar[str] = "of the method"
     RARE: ClassVar[bool] = True
 
-    seed: Annotated[int | None, "of methods that draw at random; default 0", "S"] = None
+    seed: Annotated[int | None, "seed of random methods; default 0", "S"] = None
     restarts: Annotated[int | None, "random starts of the exchange"] = None
     time_limit: Annotated[
-        float | None, "that auto, exact and the optimum may take; default 10", "SECONDS"
+        float | None, "for auto, exact and the optimum; default 10", "SECONDS"
     ] = None
-    best: Annotated[int | None, "with exact: prove the B best choices", "B"] = None
+    best: Annotated[int | None, "with exact: prove the B best selections", "B"] = None
     least_efficiency: Annotated[
-        float | None, "auto stops once this efficiency is proven; default 0.999"
+        float | None, "auto stops when this efficiency is proven; default 0.999"
     ] = None
-    checkpoint: Annotated[str | None, "with policy: a trained one", "DIR"] = None
-    decoding: Annotated[str | None, "with policy: greedy, first, samples, exchange"] = (
-        None
-    )
+    checkpoint: Annotated[str | None, "with policy: a trained policy", "DIR"] = None
+    decoding: Annotated[str | None, "policy: greedy, first, samples, exchange"] = None
     num: Annotated[
-        int | None, "tries of the decodings first and samples; default 16"
+        int | None, "samples of the decodings first and samples; default 16"
     ] = None
 
 
 @dataclasses.dataclass
 class ScoreOptions:
-    """A choice that was made elsewhere, judged in the place of one that is made."""
+    """A selection made elsewhere, to be scored."""
 
     RARE: ClassVar[Any] = {"reference"}
 
     score: Annotated[
         str | None,
-        "judge this choice instead: rows counted from 0, or the table of --csv",
+        "score this selection: rows counted from 0, or a table written by --csv",
         "ROWS|FILE",
         Was("indices"),
         Was("subset"),
     ] = None
     reference: Annotated[
         Literal["bound", "exact"],
-        "what --score compares with: a bound, or the proven optimum",
+        "compare --score with a bound, or with the proven optimum",
     ] = "bound"
 
     def judged(
@@ -164,10 +161,10 @@ class ScoreOptions:
     ) -> Selection:
         """The choice, judged; ``options`` are those of methods that were given."""
         if "time_limit" in options and self.reference != "exact":
-            raise ValueError("--time-limit is of --reference exact")
+            raise ValueError("--time-limit needs --reference exact")
         if others := sorted({*options} - {"time_limit"}):
             flags = ", ".join(f"--{name.replace('_', '-')}" for name in others)
-            raise ValueError(f"--score judges a choice: leave out {flags}")
+            raise ValueError(f"Leave out with --score: {flags}")
         if set(self.score or "") <= set("0123456789, "):
             rows = np.array(several(int, "whole numbers")(self.score or ""))
         else:
@@ -182,7 +179,7 @@ def select(
     *,
     k: Annotated[
         int | None,
-        "rows to choose; the fewest that identify the model if not given",
+        "rows to choose; default the fewest that identify the model",
         "K",
     ] = None,
     method: Annotated[
@@ -191,17 +188,17 @@ def select(
         "NAME",
     ] = "auto",
     between: Annotated[
-        bool, "move the chosen between the candidates, within the range of these"
+        bool, "then refine the chosen rows between the candidates, within their range"
     ] = False,
     of_criterion: CriterionOptions,
     of_score: ScoreOptions,
     of_method: MethodOptions,
     output: Output,
 ) -> None:
-    """Choose the few rows of a table worth measuring, or judge a choice with --score.
+    """Choose the few rows of a table worth measuring, or score a selection (--score).
 
-    A column named available (0 or 1) says which rows may be chosen. Columns of text are
-    kept as labels. Without --k the fewest rows that identify the model are chosen.
+    A column named available (0 or 1) marks the rows that may be chosen. Text columns
+    are kept as labels. Without --k the fewest rows that identify the model are chosen.
     """
     table = read_table(file)
     options = {name: x for name, x in vars(of_method).items() if x is not None}
@@ -209,9 +206,7 @@ def select(
     criterion = of_criterion.by(of_design.scenarios)
     if of_score.score is not None:
         if k is not None or method != "auto" or between:
-            raise ValueError(
-                "--score judges a choice: leave out -k, --method, --between"
-            )
+            raise ValueError("Leave out -k, --method and --between with --score")
         _show(of_score.judged(design, table, criterion, options), table, output)
         return
     selection = design.select(k, criterion, method, **options)
@@ -220,8 +215,8 @@ def select(
         return
     if of_arm.kind != "position":
         raise ValueError(
-            "--between is of sensors that read everywhere, not of --sensor "
-            f"{of_arm.kind}; in Python: design.refine(..., allowed=arm.reachable())"
+            "--between needs a sensor that reads everywhere, not --sensor "
+            f"{of_arm.kind}. In Python: design.refine(..., allowed=arm.reachable())"
         )
     refined = design.refine(selection, criterion=criterion)
     names = list(design.axes or ())
@@ -236,21 +231,21 @@ def plan(
     *,
     accuracy: Annotated[
         list[float],
-        "standard error that a prediction may have; one number or one per output",
+        "largest allowed standard error of a prediction: one, or one per output",
         "E",
         levels,
     ],
     criterion: Annotated[
         Literal["G", "I"],
-        "G: the largest standard error over the candidates; I: the mean",
+        "G: largest standard error over the candidates; I: mean",
     ] = "G",
     max_k: Annotated[int | None, "largest number of measurements tried", "K"] = None,
     more: Annotated[int, "rows of the table beyond the answer"] = 0,
     output: Output,
 ) -> None:
-    """How many measurements a wanted accuracy takes."""
+    """Find the number of measurements that a wanted accuracy needs."""
     if of_design.noise is None:
-        raise ValueError("--noise, the std of a measurement, must be given")
+        raise ValueError("--noise is missing: the standard deviation of a measurement")
     result = of_design.design(read_table(file), of_arm).plan(
         _one_or_all(accuracy), criterion=criterion, max_k=max_k, more=more
     )
@@ -287,8 +282,8 @@ def _rows_of(subset: Table, table: Table) -> NDArray[np.int64]:
     ):
         raise ValueError(
             f"{subset.source}: line {subset.lines[row]}, column {shared[place]!r} is "
-            f"{in_subset[row, place]:g}, row {rows[row]} of {table.source} has "
-            f"{in_table[row, place]:g}: it is not a choice from this table"
+            f"{in_subset[row, place]:g}, but row {rows[row]} of {table.source} has "
+            f"{in_table[row, place]:g}. This selection is from another table"
         )
     return rows
 

@@ -36,7 +36,7 @@ class Output:
         As JSON the document, an object for each row where there is none.
         """
         if self.json and self.csv:
-            raise ValueError("one of --json and --csv must be left out")
+            raise ValueError("Leave out --json or --csv")
         ending = pathlib.PurePath(self.out).suffix.lower()
         if (self.json and ending == ".csv") or (self.csv and ending == ".json"):
             form = "--json" if self.json else "--csv"

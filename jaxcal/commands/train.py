@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
         except (ValueError, OSError, MissingExtraError) as error:
             return refused(prog, error)
 
-    advice = "what is saved stays: start every process again with --resume"
+    advice = "saved checkpoints are kept: start every process again with --resume"
     return processes.run_job(prog, words, alone, advice)
 
 
@@ -70,7 +70,7 @@ def _run(arguments: TrainOptions, prog: str) -> int:
         with needs("policy", "training"):
             arguments.task = _task_held(out)
     if arguments.export and not arguments.export.endswith(".npz"):
-        raise ValueError(f"--export must be a file NAME.npz, got {arguments.export}")
+        raise ValueError(f"--export takes a file NAME.npz, got {arguments.export}")
     configuration = of_task if arguments.task else of_postures
     configure = functools.partial(configuration, arguments, out)
     config: Any = None
@@ -102,12 +102,12 @@ def _run(arguments: TrainOptions, prog: str) -> int:
     task = f" --task {arguments.task}" if arguments.task else ""
     if done < config.ppo.num_updates:
         print(
-            f"stopped at update {done} of {config.ppo.num_updates} and saved; go on: "
-            f"{typed_line(prog)}{task} --resume --out {out}"
+            f"stopped at update {done} of {config.ppo.num_updates} and saved. To "
+            f"continue: {typed_line(prog)}{task} --resume --out {out}"
         )
         return 0
     print(
-        f"saved {out}/checkpoint; measure it: "
+        f"saved {out}/checkpoint. To evaluate: "
         f"{typed_line(prog.replace('train', 'evaluate'))}{task} --checkpoint {out}"
     )
     if arguments.export:
@@ -123,7 +123,7 @@ def _export(run: pathlib.Path, path: str, of_task: bool) -> None:
 
     load: Callable[..., Any] = training.load if of_task else checkpoint.load
     weights.write(path, load(run).weights)
-    print(f"exported the policy alone to {path}")
+    print(f"exported the policy to {path}")
 
 
 def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) -> int:
@@ -191,7 +191,7 @@ def _task_held(out: pathlib.Path) -> str | None:
         registry.load(task)
     except ValueError as error:
         raise ValueError(
-            f"{out} is a run of task {task}: {error}; say where it is by --task FILE"
+            f"{out} is a run of task {task}: {error}. Give its file: --task FILE"
         ) from error
     return task
 
@@ -282,7 +282,7 @@ def _show(report: Report, measured: tuple[str, ...]) -> None:
         f"{_clock(report.seconds):>9} {_clock(report.eta):>9} "
         + (" imitate " if reward is None else f"{_or_dash(reward, '.4f'):>8} ")
         + " ".join(cells)
-        + f"  {report.skipped} updates skipped, not finite" * bool(report.skipped),
+        + f"  {report.skipped} updates skipped (not finite)" * bool(report.skipped),
         flush=True,
     )
 

@@ -21,10 +21,10 @@ from jaxcal.learning.training import presets
 from jaxcal.learning.training.presets import TrainConfig
 
 _EPILOG = """\
-presets, of postures:
+presets for postures:
 {presets}
 
-tasks, of sequential measurement:
+tasks of sequential measurement:
 {tasks}
   FILE.py   your own: a file that defines ENTRY (docs/adaptive.md)
 
@@ -33,23 +33,23 @@ what to try first:
   {program} --episodes 20000 --out runs/brief   quicker, to try things
   {program} --num-selected 6 --out runs/six     another number of postures
   {program} --candidates mine.csv --out runs/mine   your own machine's postures
-  then --imitation 0.5 --initial-trust 4 --initial-actor 0.05, which adds
-  most where more than n + 1 postures are chosen. Other numbers rarely need a change.
+  then --imitation 0.5 --initial-trust 4 --initial-actor 0.05, which helps most
+  when more than n + 1 postures are chosen. Other settings rarely need a change.
 
 more examples:
-  {program} --task knee            the next measurement from what the last answered
+  {program} --task knee            choose each measurement from the last results
   {program} --task knee --with cells=16 sigma=0.05 --out runs/knee_16
   {program} --seeds 8 --out runs/seeds   eight runs side by side: mean, spread, best
   {program} --sweep learning_rate=1e-3,3e-3 entropy_start=0.01,0.02 --out runs/sweep
-                                   one table of four
-  {program} --resume --out runs/compact      go on where a run stopped
-  {program} --resume --episodes 200000 --out runs/compact   or longer than it was to
-  {program} --preset general --export checkpoints/default.npz   what ships
+                                   four runs in one table
+  {program} --resume --out runs/compact      resume a run
+  {program} --resume --episodes 200000 --out runs/compact   and extend it
+  {program} --preset general --export checkpoints/default.npz   the shipped policy
   {program} --trainer brax --episodes 50000  the same task, brax's own PPO
   srun {program}                             all tasks of a SLURM job step
   {program} --coordinator host0:4711 --num-processes 2 --process-id 0   and 1
 
-A run folder holds metrics.csv and checkpoint/; measure it with
+A run folder holds metrics.csv and checkpoint/. Evaluate it with
   {evaluate} --checkpoint runs/compact
 Ctrl-C saves and stops; --resume then continues bit for bit (on the same CPU).
 All devices of all processes share each update: docs/scaling.md."""
@@ -84,32 +84,32 @@ class TrainOptions:
 
     RARE: ClassVar[Any] = {"no_validation", "devices", "sweep"}
 
-    preset: Annotated[str | None, "of postures, see below [compact]", "NAME"] = None
+    preset: Annotated[str | None, "for postures, see below [compact]", "NAME"] = None
     task: Annotated[str | None, "of sequential measurement, see below", "NAME"] = None
     with_: Annotated[tuple[str, ...], "options of the task", "OPTION=VALUE"] = ()
     out: Annotated[str | None, "run folder [runs/PRESET or runs/TASK]", "DIR"] = None
-    resume: Annotated[bool, "go on from the run folder's checkpoint"] = False
+    resume: Annotated[bool, "resume from the run folder's checkpoint"] = False
     candidates: Annotated[
         str | None,
-        "train on your own postures: one table, .csv, is a pool that every episode "
-        "draws --num-candidates from; a dataset, .csv or .npz, holds candidate sets",
+        "train on your own postures: a table (.csv) of postures, from which every "
+        "episode draws --num-candidates, or a dataset (.csv or .npz) of candidate sets",
         "FILE",
     ] = None
     trainer: Annotated[
         Literal["jaxcal", "brax"], "jaxcal's own PPO, or brax's on the same environment"
     ] = "jaxcal"
     export: Annotated[
-        str | None, "write the finished policy alone to one file, NAME.npz", "FILE"
+        str | None, "also write the finished policy to one file, NAME.npz", "FILE"
     ] = None
     no_validation: Annotated[
-        bool, "do not measure the gap to the proven optimum while training"
+        bool, "do not measure the gap to the proven optimum during training"
     ] = False
     devices: Annotated[int | None, "devices of each process [all]"] = None
     sweep: Annotated[
         tuple[Swept, ...],
         _swept,
-        "values side by side, every combination for every seed, in one table: of "
-        + ", ".join(TRACED),
+        "values to compare; every combination runs with every seed and is listed in "
+        "one table. Names: " + ", ".join(TRACED),
         "NAME=X,Y",
     ] = ()
     # What the other flags set: field of a configuration to value.
@@ -141,7 +141,7 @@ def _flags(title: str, settings: Iterable[Setting]) -> type:
         said = Annotated[kind, f"{field.help} [{_held(field.name)}]", shown[field.kind]]
         default = dataclasses.field(default=None)
         fields.append((_NAMES.get(field.name, field.name), said, default))
-    about = "in brackets the value of compact"
+    about = "in brackets: the value of compact"
     rare = {name for name, *_ in fields} - FIRST
     return dataclasses.make_dataclass(
         "Settings", fields, namespace={"TITLE": title, "ABOUT": about, "RARE": rare}
@@ -151,9 +151,9 @@ def _flags(title: str, settings: Iterable[Setting]) -> type:
 _POSTURES = {f.name: f for part in presets.PARTS.values() for f in settings_of(part)}
 _TASKS = {f.name: f for part in TASK_PARTS.values() for f in settings_of(part)}
 _BOTH = [field for name, field in _POSTURES.items() if name in _TASKS]
-Shared = _flags("of postures and tasks", _BOTH)
+Shared = _flags("for postures and tasks", _BOTH)
 OfPostures = _flags(
-    "of postures, in presets of one task",
+    "for postures, in presets of one task",
     [field for name, field in _POSTURES.items() if name not in _TASKS],
 )
 OfTasks = _flags(
@@ -186,11 +186,11 @@ def read(prog: str, argv: Sequence[str]) -> TrainOptions:
         prog=prog,
         usage="%(prog)s [--preset NAME | --task NAME] [--out DIR] [flags below]",
         description=textwrap.fill(
-            "Train a policy, and save it with all it needs: one that selects postures, "
-            "or with --task one that picks the next measurement. Without flags: our "
-            "network on geometric features; --preset paper is the paper's, on the 210 "
-            "numbers of its observation, --preset observation ours on these, by PPO "
-            "alone.",
+            "Train a policy and save it with everything it needs. The policy selects "
+            "postures, or with --task picks the next measurement. Without flags: our "
+            "network on geometric features. --preset paper: the paper's network on the "
+            "210 numbers of its observation. --preset observation: our network on "
+            "these numbers, by PPO alone.",
             86,
         ),
         epilog=_EPILOG.format(
@@ -229,7 +229,7 @@ def given_flags(arguments: TrainOptions, task: bool) -> dict[str, Any]:
         who = f"--task {arguments.task}" if task else f"preset {preset_of(arguments)}"
         it = "it" if len(unread) == 1 else "them"
         raise ValueError(
-            f"{who} does not read {', '.join(sorted(unread))}: leave {it} out"
+            f"{who} does not use {', '.join(sorted(unread))}: leave {it} out"
         )
     return flags
 
@@ -271,8 +271,8 @@ def candidates_of(path: str) -> GivenCandidates:
     low, high = used.min(axis=0), used.max(axis=0)
     for axis in np.flatnonzero(~(low < high)):  # also where a cell is empty
         raise ValueError(
-            f"{path}: every column must hold numbers that differ, got {low[axis]:g} to "
-            f"{high[axis]:g} in input {axis + 1}: leave it out"
+            f"{path}: input {axis + 1} must hold numbers that differ, got "
+            f"{low[axis]:g} to {high[axis]:g}: leave its column out"
         )
     return GivenCandidates(
         name=pathlib.Path(path).name,
@@ -289,7 +289,7 @@ def trained_on(
     num_sets, m, n = candidates.values.shape
     if len(config.tasks) > 1:
         raise ValueError(
-            f"--candidates goes with a preset of one task, such as compact; "
+            "--candidates needs a preset of one task, such as compact; "
             f"{config.preset} has {len(config.tasks)}"
         )
     sizes = {"num_inputs": n, "num_outputs": n, "num_selected": n + 1}

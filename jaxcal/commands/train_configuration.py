@@ -47,8 +47,7 @@ def of_postures(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
     config = dataclasses.replace(config, sweep=tuple(arguments.sweep))
     if config.num_runs > 1 and arguments.no_validation:
         raise ValueError(
-            "--seeds and --sweep need the validation by which the best is known: leave "
-            "--no-validation out"
+            "--seeds and --sweep compare runs by validation: leave out --no-validation"
         )
     require_writable_folder(out)
     return config
@@ -121,7 +120,7 @@ def of_task(arguments: TrainOptions, out: pathlib.Path) -> PolicyConfig:
         held, given_task = map(pathlib.Path, (config.task, arguments.task))
         moved = held.suffix == ".py" and held.name == given_task.name
         if held != given_task and not moved:
-            raise ValueError(f"--task must be {config.task}, that of {out}")
+            raise ValueError(f"--task must be {config.task}, the task of {out}")
         return _prolonged(dataclasses.replace(config, task=arguments.task), budget)
     _refuse_to_overwrite(out)
     options = entry.train_on
@@ -147,7 +146,7 @@ def _tuned(entry: Entry, options: Mapping[str, Any]) -> StateRule:
     from jaxcal.adaptive.rules import StateRule
     from jaxcal.adaptive.tuning import tune
 
-    print("tuning the rule that the policy begins as ...", flush=True)
+    print("tuning the rule that the policy starts from ...", flush=True)
     return tune(entry.make(**options), StateRule(), episodes=1024, seed=1)
 
 
@@ -168,7 +167,8 @@ def _prolonged(config: Any, budget: Mapping[str, int]) -> Any:
     for name, value in budget.items():
         if value <= (held := getattr(config.ppo, name)):
             raise ValueError(
-                f"{flag_of(name)} must be more than the run's {held}, got {value}"
+                f"{flag_of(name)} must be above {held}, what the run already has, got "
+                f"{value}"
             )
     imitated = getattr(config, "num_imitated", 0)
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **budget))
@@ -192,6 +192,6 @@ def _refuse_to_overwrite(out: pathlib.Path) -> None:
     steps = out / "checkpoint"
     if steps.is_dir() and any(steps.iterdir()):
         raise ValueError(
-            f"--out {out} already holds a run: go on with --resume, or name another, "
-            f"--out {out}_2 say"
+            f"--out {out} already holds a run: pass --resume, or name another folder "
+            f"such as {out}_2"
         )

@@ -113,14 +113,15 @@ class Refinement(Selection):
         proof = (
             "proven"
             if self.certain
-            else f"by a search, not a proof; two differ by {self.search_error:.1g}"
+            else "by a search, not a proof; repeated searches differ by "
+            f"{self.search_error:.1g}"
         )
         name = self.criterion
         lines = [
             f"{len(rows)} commands, method {self.method}",
             *aligned([self._axes(), *rows]),
             f"{self.problem.criterion.says:13} {self.value:.6g}"
-            + ("" if np.isnan(self.began) else f" (began at {self.began:.6g})"),
+            + ("" if np.isnan(self.began) else f" (started at {self.began:.6g})"),
             f"{side + ' bound':13} {self.bound:.6g} ({proof})",
             f"{name + '-efficiency':13} {self.efficiency:.6f} or more",
             f"{'without one':13} {self._lost()}",
@@ -212,7 +213,7 @@ def refine(
     offer = design.candidate_set
     candidates, available = offer.candidates, offer.available
     if offer.constraints is not None:
-        raise ValueError("constraints are of select and score, not of refine")
+        raise ValueError("constraints work with select and score, not with refine")
     if offer.model is None or candidates is None:
         raise ValueError("refine needs candidates and a model, not blocks")
     begun = _commands_of(selection, candidates)
@@ -242,8 +243,7 @@ def _require_within(begun: Array, box: Array, allowed: Allowed | None) -> None:
         bad = ~_permitted(allowed, begun)
         if bad.any():
             raise ValueError(
-                "allowed must hold for the commands that are refined, got False for "
-                f"{in_words(begun[bad][0])}"
+                f"allowed is False for the starting command {in_words(begun[bad][0])}"
             )
 
 
@@ -264,7 +264,7 @@ def _same_criterion(selection: Selection) -> Any:
         return criterion
     if criterion.by_name:
         raise ValueError(
-            f"criterion {criterion.name} must be given again, with its parameters: "
+            f"criterion {criterion.name} must be repeated with its parameters: "
             f"refine(..., criterion=jaxcal.{type(criterion).__name__}([...]))"
         )
     return criterion.name
@@ -296,7 +296,7 @@ def _limits(limits: ArrayLike) -> Array:
     if not len(box) or not (box[:, 0] < box[:, 1]).all():
         bad = box[~(box[:, 0] < box[:, 1])]
         raise ValueError(
-            "limits must be (n, 2), least below greatest, got "
+            "limits must be (n, 2), lower below upper, got "
             f"{in_words(bad[0]) if len(bad) else 'none'}"
         )
     return box
@@ -358,8 +358,7 @@ def _drawn(box: Array, count: int, allowed: Allowed | None, seed: int) -> Array:
             unit = even((batch + 1) * size, size)
     if not len(drawn):
         raise ValueError(
-            f"allowed must hold somewhere within the limits, but is False at all "
-            f"{_DRAWS * size} points tried"
+            f"allowed is False at all {_DRAWS * size} points tried within the limits"
         )
     return drawn
 
@@ -492,9 +491,8 @@ class _Ascent:
         if isinstance(problem, ScenarioProblem):
             if problem.joined.of_efficiency:
                 raise ValueError(
-                    "criterion must be of values with refine, got "
-                    f"{problem.criterion.name}: between candidates no scenario's own "
-                    "optimum is proven"
+                    f"refine does not support criterion {problem.criterion.name}: "
+                    "between candidates no scenario's own optimum is proven"
                 )
             self.members, self.weights = problem.members, problem.weights
             self.scale, self.shift = problem.terms()
@@ -647,8 +645,8 @@ class _Ascent:
                 break
         if best is None or not np.isfinite(best_phi):
             raise ValueError(
-                "limits must allow a design that identifies every parameter, but the "
-                "best found is singular"
+                "limits allow no design that identifies every parameter: the best "
+                "found is singular"
             )
         best, best_phi = self._swapped(best, best_phi)
         bound, error, certain = self._bound(best, best_phi)

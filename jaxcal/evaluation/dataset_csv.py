@@ -71,13 +71,13 @@ def read_csv(source: str, data: bytes) -> dict[str, Any]:
     for place in np.flatnonzero((labels[1:] == labels[:-1]).all(axis=1)):
         first, again = (table.lines[row] for row in order[place : place + 2])
         raise ValueError(
-            f"{source}: line {again}: candidate {labels[place, 1]:.0f} of episode "
-            f"{labels[place, 0]:.0f} was already given in line {first}"
+            f"{source}: line {again} repeats candidate {labels[place, 1]:.0f} of "
+            f"episode {labels[place, 0]:.0f} of line {first}"
         )
     episodes, counts = np.unique(labels[:, 0], return_counts=True)
     for other in np.flatnonzero(counts != counts[0]):
         raise ValueError(
-            f"{source}: every episode must have as many candidates: episode "
+            f"{source}: every episode must have the same number of candidates: episode "
             f"{episodes[0]:.0f} has {counts[0]}, episode {episodes[other]:.0f} has "
             f"{counts[other]}"
         )
@@ -106,7 +106,7 @@ def _columns(table: Table) -> list[str]:
                 f"{source}: column {name!r} is missing; columns: {', '.join(header)}"
             )
     if not any(name.startswith(COMMANDS) for name in header):
-        raise ValueError(f"{source}: no column of commands, u_x say, in the header")
+        raise ValueError(f"{source}: no column of commands, such as u_x, in the header")
     for name in header:
         if name not in (*_LABELS, _MASK) and not name.startswith((COMMANDS, MEASURED)):
             raise ValueError(f"{source}: unknown column {name!r}")

@@ -70,9 +70,9 @@ def _read_npz(data: bytes) -> dict[str, Any]:
     try:
         archive = np.load(io.BytesIO(data), allow_pickle=False)
     except Exception:  # zipfile and numpy raise ten kinds on bytes that are damaged
-        raise ValueError("not a .npz file, or a truncated one") from None
+        raise ValueError("not a .npz file, or truncated") from None
     if not isinstance(archive, np.lib.npyio.NpzFile):
-        raise ValueError("not a .npz file but a single array")
+        raise ValueError("a single array, not a .npz file")
     with archive:
         held = {k: _member(archive, k) for k in archive.files if k in (*_KEYS, *_ENDS)}
         if "candidates" not in held:
@@ -90,8 +90,8 @@ def _member(archive: np.lib.npyio.NpzFile, key: str) -> NDArray[Any]:
     except Exception as error:  # of many kinds, where bytes are damaged
         if isinstance(error, ValueError) and "pickle" in str(error):
             raise ValueError(
-                f'key "{key}" must be an array of numbers; objects (ragged episodes, '
-                "say) are not read"
+                f'key "{key}" must be an array of numbers, not of objects (such as '
+                "ragged episodes)"
             ) from None
         raise ValueError(f'key "{key}" is damaged') from None
     if member.dtype.kind not in "biuf":

@@ -120,7 +120,7 @@ def det_means(evaluation: PostureEvaluation) -> Figure:
     names, _, styles = zip(*results, strict=True)
     intervals(axes, names, ends, styles)
     axes.margins(x=0.12)
-    _det_axis(axes.xaxis, evaluation, "mean {}, with its 95 % interval")
+    _det_axis(axes.xaxis, evaluation, "mean {}, with 95 % interval")
     return figure
 
 

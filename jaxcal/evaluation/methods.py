@@ -261,7 +261,7 @@ class _Run:
         bad |= (free & ~kept).sum(axis=1) != self.k
         for episode in np.flatnonzero(bad)[:1]:
             raise ValueError(
-                f"{label} must choose {self.k} distinct available candidates, got "
+                f"{label} must choose {self.k} different available candidates, got "
                 f"{indices[episode].tolist()} in episode {episode}"
             )
 

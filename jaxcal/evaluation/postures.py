@@ -47,14 +47,13 @@ class PostureEvaluation(Evaluation):
     ``reference`` (E,) is log det S* where proven, else an upper bound on it.
     """
 
-    title: ClassVar[str] = "Posture selection against the proven optimum"
+    title: ClassVar[str] = "Posture selection compared with the proven optimum"
     about: ClassVar[str] = (
-        "det S is quoted in the unit of the dataset's commands; S is the information "
-        "matrix AᵀA of the chosen postures and S* that of the best choice there is. "
-        "Hit rate: share of selections whose determinant equals the optimum's to a "
-        "billionth. D-eff.: mean of (det S / det S*)^(1/p), p parameters. x random: "
-        "mean det S over that of random selection. Time: a selection, averaged over "
-        "the batch."
+        "det S is in the unit of the dataset's commands. S is the information matrix "
+        "AᵀA of the chosen postures, S* that of the best choice. Hit rate: share of "
+        "selections whose determinant equals the optimum's within 1e-9. D-eff.: mean "
+        "of (det S / det S*)^(1/p), p parameters. x random: mean det S divided by that "
+        "of random selection. Time: per selection, averaged over the batch."
     )
 
     dataset: Dataset
@@ -135,14 +134,14 @@ def summary_of(
     notes = []
     if proven < data["episodes"]:
         notes.append(
-            f"{data['episodes'] - proven} of {data['episodes']} optima are not proven: "
-            "there an upper bound stands for det S*, so ratios and efficiencies are at "
-            "least what is shown and no selection counts as a hit"
+            f"{data['episodes'] - proven} of {data['episodes']} optima are not proven. "
+            "There an upper bound replaces det S*: true ratios and efficiencies are "
+            "at least those shown, and no selection counts as a hit"
         )
     if k == data["num_inputs"] + 1:
         notes.append(
             f"k = {k} fits {k * data['num_outputs']} parameters with as many "
-            "equations: no residual, so no estimate of the noise; a larger k leaves one"
+            "equations: no residual, so the noise cannot be estimated; use a larger k"
         )
     facts = facts | {"proven": proven / data["episodes"], "notes": notes}
     return Summary(data["name"], heading, _COLUMNS, rows, facts, tuple(notes))

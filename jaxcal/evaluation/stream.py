@@ -146,5 +146,5 @@ def _read(path: pathlib.Path) -> dict[str, Any]:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, TypeError) as error:
         raise ValueError(
-            f"{path} is damaged ({error}); delete it, and it is made again"
+            f"{path} is damaged ({error}). Delete it; it will be computed again"
         ) from None

@@ -81,7 +81,7 @@ def named(path: str) -> Any:
         return getattr(module, name)
     except (ImportError, AttributeError, OSError) as error:
         raise ValueError(
-            f"{path} must be MODULE:NAME or FILE.py:NAME that is there: {error}"
+            f"{path} must name an existing MODULE:NAME or FILE.py:NAME: {error}"
         ) from error
 
 
@@ -117,30 +117,30 @@ class PPOConfig(abc.ABC):
     """Hyperparameters of the optimisation; subclasses add how much is played."""
 
     unit: ClassVar[str]  # of what is played: "episodes" or "decisions"
-    num_epochs: int = setting(2, "passes over what an update has played")
+    num_epochs: int = setting(2, "passes over the decisions of an update")
     num_minibatches: int = setting(4, "gradient steps per pass")
-    learning_rate: float = setting(2e-3, "of Adam, after the warm-up")
-    final_learning_rate: float = setting(3e-5, "at the end; a cosine leads there")
+    learning_rate: float = setting(2e-3, "learning rate of Adam, after the warm-up")
+    final_learning_rate: float = setting(3e-5, "at the end, reached by a cosine")
     warmup_updates: int = setting(5, "updates in which the learning rate rises")
     clip_range: float = setting(0.2, "probability ratios are clipped to 1 +- this")
     value_coefficient: float = setting(0.5, "weight of the value's error")
     value_error_limit: float = setting(
-        3.0, "reward units; beyond, the value's error counts linearly (Huber)"
+        3.0, "in units of reward; larger errors of the value count linearly (Huber)"
     )
     entropy_start: float = setting(0.02, "entropy bonus at the beginning")
     entropy_end: float = setting(0.0, "entropy bonus at the end; linear between")
-    discount: float = setting(1.0, "of a reward one decision later")
+    discount: float = setting(1.0, "discount of a reward one decision later")
     gae_lambda: float = setting(1.0, "lambda of GAE; 1 is return minus value")
     normalise_per_decision: bool = False
     advantage_limit: float = setting(
-        6.0, "standard deviations; a larger advantage (a singular pick) is clipped"
+        6.0, "in standard deviations; larger advantages (a singular pick) are clipped"
     )
     max_grad_norm: float = setting(0.5, "global norm at which gradients are clipped")
     average_decay: float = setting(
-        0.99, "decay per gradient step of the averaged weights, which are the policy"
+        0.99, "decay per gradient step of the averaged weights, which make the policy"
     )
     slice_rows: int = setting(
-        8, "rows of a minibatch per gradient slice on a CPU, so that it fits the cache"
+        8, "rows of a minibatch per gradient slice on a CPU, to fit the cache"
     )
 
     def __post_init__(self) -> None:
@@ -203,15 +203,15 @@ class EpisodesConfig(PPOConfig):
 
     unit: ClassVar[str] = "episodes"
     num_episodes: int = setting(200_000, "training budget")
-    episodes_per_update: int = setting(2048, "fresh episodes in an update")
+    episodes_per_update: int = setting(2048, "new episodes per update")
     episodes_per_set: int = setting(
-        8, "episodes on the same candidates, which share a baseline"
+        8, "episodes with the same candidates, which share a baseline"
     )
     explore_once: bool = setting(
-        False, "draw and learn one decision of an episode; the likeliest follow it"
+        False, "learn one decision per episode; the most likely actions follow it"
     )
     normalise_per_decision: bool = setting(
-        True, "advantages: own mean and scale for each decision of an episode"
+        True, "advantages: separate mean and scale for each decision of an episode"
     )
 
     def __post_init__(self) -> None:
@@ -222,7 +222,7 @@ class EpisodesConfig(PPOConfig):
         if self.explore_once and self.episodes_per_set < 2:
             raise ValueError(
                 "episodes_per_set must be at least 2 with explore_once, got "
-                f"{self.episodes_per_set}: the others' mean is the baseline"
+                f"{self.episodes_per_set}: the mean of the others is the baseline"
             )
 
     @property
@@ -242,8 +242,8 @@ class StreamsConfig(PPOConfig):
 
     unit: ClassVar[str] = "decisions"
     num_updates: int = setting(300, "training budget")
-    decisions_per_update: int = setting(4096, "decisions in an update")
-    stream_length: int = setting(32, "decisions of one stream in an update")
+    decisions_per_update: int = setting(4096, "decisions per update")
+    stream_length: int = setting(32, "decisions of one stream per update")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -262,7 +262,7 @@ class RunConfig(abc.ABC):
     """What every run has beside what it trains: seeds, swept values, how often it
     validates and saves. Subclasses have a field ``ppo``."""
 
-    seed: int = setting(0, "of everything random")
+    seed: int = setting(0, "seed of all random numbers")
     num_seeds: int = setting(1, "runs side by side: seed, seed + 1, ...")
     sweep: Sweep = ()  # side by side too: every combination, for every seed
     validate_every: float = 15.0  # seconds between validations
@@ -314,11 +314,9 @@ class SelectionConfig:
     num_selected: int = setting(4, "postures chosen; num_inputs + 1 identify the model")
     num_inputs: int = setting(3, "commanded axes")
     num_outputs: int = setting(3, "measured axes; they multiply the log-determinant")
-    reward_scale: float = setting(
-        0.1, "reward per unit of log det S (the paper's 1/10)"
-    )
+    reward_scale: float = setting(0.1, "reward per unit of log det S (paper: 1/10)")
     reward_gain: bool = setting(
-        False, "pay the increase of log det S; on where num_selected > num_inputs + 1"
+        False, "reward the increase of log det S; on if num_selected > num_inputs + 1"
     )
 
     def __post_init__(self) -> None:

@@ -139,8 +139,8 @@ class JaxVector(VectorEnv):
         """
         if np.shape(actions) != (self.num_envs,):
             raise ValueError(
-                f"actions must be one for each environment, ({self.num_envs},), got "
-                f"shape {np.shape(actions)}"
+                f"actions must hold one per environment, ({self.num_envs},), got shape "
+                f"{np.shape(actions)}"
             )
         self._state, *seen = self._step(self._state, self._ended, jnp.asarray(actions))
         (obs, mask), (last, last_mask), reward, done, metric = jax.tree.map(

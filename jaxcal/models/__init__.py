@@ -1,4 +1,4 @@
-"""What a machine does with a command: ``y = f(u; theta)``, its names and derivative.
+"""Models of a machine: ``y = f(u; theta)``, its names and derivative.
 
 Arms and their sensors are ``jaxcal.arms``; their names are here too, and load it.
 """

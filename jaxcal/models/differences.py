@@ -1,4 +1,4 @@
-"""Derivatives by finite differences whose steps are chosen by looking.
+"""Derivatives by finite differences with steps chosen from the noise of f.
 
 Noise: the values at seven points so close together that f is a polynomial there; what
 their higher differences leave is the noise of f. Values of few digits were printed: the
@@ -98,7 +98,7 @@ class Differences:
             rows.append((name, f"{step:.3g}", side, shown))
         share = float((self.noise / np.where(self.size > 0, self.size, 1.0)).max())
         return "\n".join(
-            [*aligned(rows, "<"), f"noise of f: {share:.1e} of its readings"]
+            [*aligned(rows, "<"), f"noise of f: {share:.1e} of its readings (relative)"]
         )
 
 

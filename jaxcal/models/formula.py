@@ -64,7 +64,7 @@ def parse(formula: str) -> tuple[dict[str, list[Factor]], set[str]]:
         # A formula of two sides has no terms; a message is plain in its first line.
         why = str(error).splitlines()[0] if isinstance(error, FormulaicError) else ""
         raise ValueError(
-            f"features must be a formula of one side, got {formula!r}"
+            f"features must be the right-hand side of a formula, got {formula!r}"
             + (f": {why}" if why else "")
         ) from error
     _require_powers(formula)
@@ -92,7 +92,7 @@ def _require_powers(formula: str) -> None:
         for k in reversed(range(len(calls))):
             name, whole = (x.replace(f"_{k}_", calls[k]) for x in (name, whole))
         raise ValueError(
-            f"features: {whole} is the same as {name} in a formula; its power is "
+            f"features: a formula reads {whole} as {name}; for a power write "
             f"I({name}**{found[2] or 2})"
         )
 
@@ -105,8 +105,8 @@ def input_names(used: set[str]) -> tuple[str, ...]:
         last = max(int(name[1:]) for name in used)
         return tuple(f"u{i + 1}" for i in range(last))
     raise ValueError(
-        "inputs must be given, the names of all commands in their order, unless a "
-        "formula uses x, y, z or u1, u2, ...; this one uses "
+        "inputs must be given (names of all commands in their order), unless a formula "
+        "uses x, y, z or u1, u2, ...; this formula uses "
         f"{', '.join(sorted(used)) or 'none'}"
     )
 

@@ -40,7 +40,7 @@ def from_dict(data: Mapping[str, Any]) -> Model:
     kind = one_of("kind of the model", kind, (*kinds, *others))
     if kind in _UNWRITTEN or fields.get("features", "") is None:
         raise ValueError(
-            "the model holds a function, which a file cannot: give the model itself, "
+            "the model contains a function, which cannot be saved: pass the model, "
             "model=..."
         )
     if kind == "linear":  # a formula names its own

@@ -22,11 +22,11 @@ class FromJax(Model):
     """``y = f(u, theta)`` of one command; values and derivatives in float64 by JAX.
 
     The first call with a number of commands compiles f for it; the caller's JAX
-    configuration stays as it is.
+    configuration is unchanged.
 
     Args:
         f: function of a command (n,) and parameters (p,) that returns (q,), or a scalar
-            for one output; written with ``jax.numpy``, without ``if`` on their values.
+            for one output; use ``jax.numpy``, no ``if`` on values.
         nominal: (p,) parameters of the machine as it was designed.
         names: of the parameters; t1, t2, ... when not given.
         num_inputs: n; that of the first commands when not given.
@@ -66,8 +66,8 @@ class FromJax(Model):
         """n."""
         if self._num_inputs is None:
             raise ValueError(
-                "num_inputs of this model is not known before its first commands: "
-                "FromJax(f, nominal, num_inputs=...)"
+                "give num_inputs: FromJax(f, nominal, num_inputs=...). Before the "
+                "first commands this model does not know it"
             )
         return self._num_inputs
 

@@ -37,31 +37,32 @@ _SETS = 6  # of parameters whose results are kept in memory
 
 
 class FromFunction(Model):
-    """``y = f(u, theta)`` that can only be run; derivatives by finite differences.
+    """``y = f(u, theta)`` of any function or program; derivatives by finite
+    differences.
 
-    Their steps are chosen by looking, at the first derivative that is asked for, and
-    ``differences`` says which they are and how far off derivatives are. Commands for
-    which f raises, or returns what is not finite, are left out of a choice and named.
+    Steps are chosen from the noise of f at the first derivative; ``differences`` lists
+    them with the errors of derivatives. Commands for which f raises, or returns values
+    that are not finite, are left out of a selection and named.
 
     Args:
         f: function of one command (n,) and parameters (p,) that returns the q readings,
             or a program: its arguments with ``{name}`` where values go, which prints
             them.
         nominal: (p,) parameters of the machine as it was designed.
-        scale: (p,) by how much each parameter may be off: steps are a small part of it.
-            A tenth of the nominal value when not given, which then must not be 0.
+        scale: (p,) how far off each parameter may be: steps are a small part of it. A
+            tenth of the nominal value when not given, which then must not be 0.
         names: of the parameters; t1, t2, ... when not given.
         inputs: names of the n commands, or n; n is that of the first commands when not
             given. A program needs them.
         batch: f takes commands (N, n) and returns (N, q).
-        noise: the usual noise of a reading, where none is given to what asks.
-        prior: what is known of the parameters, where none is given to what asks.
+        noise: usual noise of a reading, the default of ``select`` and ``identify``.
+        prior: prior of the parameters, the default of ``select`` and ``identify``.
         periods: (q,) of readings that wrap, 360 of an angle in degrees, inf of others;
             one number for all.
-        processes: that run f at a time; f must then be importable. Or an executor of
-            ``concurrent.futures``, as a cluster's is, which you close.
-        cache: file in which runs are kept. It tells functions apart by their code, not
-            by what they call or read: delete it when that changes.
+        processes: number that run f; f must then be importable. Or an executor of
+            ``concurrent.futures``, such as a cluster's, which you close.
+        cache: file in which runs are kept. It compares functions by their code, not by
+            what they call or read: delete it when that changes.
         timeout: seconds after which a run of a program has failed.
         quiet: no progress on standard error.
     """
@@ -103,13 +104,13 @@ class FromFunction(Model):
         if not callable(f):
             if not self.inputs or batch:
                 raise ValueError(
-                    "a program needs the names of its commands, inputs=[...], and "
-                    "takes one at a time"
+                    "a program needs inputs=[...], the names of its commands, and "
+                    "takes one command at a time"
                 )
             limit = None if timeout is None else seconds("timeout", timeout)
             f = CommandLine(f, (*self.inputs, *self.names), limit)
         elif timeout is not None:
-            raise ValueError("timeout is of a program, and f is a function")
+            raise ValueError("timeout needs a program; f is a function")
         noise = as_noise(noise)
         require_kind("prior", prior, Prior)
         self._noise, self._prior, self._given_periods = noise, prior, periods
@@ -132,8 +133,8 @@ class FromFunction(Model):
         """n."""
         if self._num_inputs is None:
             raise ValueError(
-                "num_inputs of this model is not known before its first commands: "
-                "FromFunction(f, nominal, inputs=...)"
+                "give inputs: FromFunction(f, nominal, inputs=...). Before the first "
+                "commands this model does not know num_inputs"
             )
         return self._num_inputs
 
@@ -252,8 +253,8 @@ class FromFunction(Model):
         zero = np.flatnonzero(self.nominal == 0.0)
         if zero.size:
             raise ValueError(
-                f"scale must be given, as {self.names[zero[0]]} is nominally 0: by how "
-                "much may each parameter be off?"
+                f"scale must be given, because {self.names[zero[0]]} is nominally 0: "
+                "how far off may each parameter be?"
             )
         return np.asarray(0.1 * np.abs(self.nominal))
 
@@ -363,7 +364,8 @@ class FromFunction(Model):
             warnings.warn(
                 f"f is not smooth in {steps.names[j]} at the command "
                 f"{in_words(rows[i])}{f' and {others} others' if others else ''}: its "
-                "derivative there may be wrong (a reading that wraps needs periods=)",
+                "derivative there may be wrong (a reading that wraps around needs "
+                "periods=)",
                 stacklevel=5,
             )
         # A derivative that is the noise of f for all commands is none.
@@ -384,8 +386,7 @@ class FromFunction(Model):
                 break
         if not pilots:
             raise ValueError(
-                f"f must return readings, but fails for all {len(rows)} commands, for "
-                f"{in_words(rows[0])}: "
+                f"f fails for all {len(rows)} commands; for {in_words(rows[0])}: "
                 f"{self._reasons[rows[0].tobytes()]}"
             )
         at = rows[pilots[:_PILOTS]]

@@ -29,7 +29,7 @@ class Direction:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Identifiability:
-    """What candidates say of the parameters; printed, it reads as a short report."""
+    """Which parameters candidates determine; ``print`` shows a short report."""
 
     names: tuple[str, ...]  # the p parameters asked about
     rank: int  # combinations of them that are identified
@@ -40,7 +40,7 @@ class Identifiability:
 
     @property
     def identifiable(self) -> tuple[str, ...]:
-        """Parameters that are identified by themselves."""
+        """Parameters that are identified individually."""
         tied = {name for direction in self.directions for name in direction.names}
         return tuple(name for name in self.names if name not in tied)
 
@@ -58,13 +58,16 @@ class Identifiability:
             direction.words for direction in self.directions if len(direction.names) > 1
         ]
         if tied:
-            lines += ["Seen only in combination:", *(f"  {words}" for words in tied)]
+            lines += [
+                "Only in combination:",
+                *(f"  {words}" for words in tied),
+            ]
         if alone:
-            lines.append(f"Not seen at all: {', '.join(alone)}")
+            lines.append(f"No effect on the readings: {', '.join(alone)}")
         if self.identifiable:
-            lines.append(f"Identified by themselves: {', '.join(self.identifiable)}")
+            lines.append(f"Individually identifiable: {', '.join(self.identifiable)}")
         if self.held:
-            lines.append(f"Held, as it is not shown: {', '.join(self.held)}")
+            lines.append(f"Held at the nominal value: {', '.join(self.held)}")
         return "\n".join(lines)
 
 
@@ -76,17 +79,17 @@ def identifiability(
     prior: Prior | None = None,
     parameters: Sequence[str] | None = None,
 ) -> Identifiability:
-    """Every direction of the parameters that no candidate excites.
+    """Find every direction of the parameters that no candidate excites.
 
     Args:
         model: with p parameters.
         candidates: (N, n) commands.
         noise: matters where commands are unknown in every measurement.
-        prior: its mean is where the model is looked at, the nominal parameters without
-            one; it counts as information where its std is finite; parameters that it
-            fixes are left out. Without one the measurements alone count, and what the
-            model's default prior fixes is held.
-        parameters: names to ask about; the others are taken as known.
+        prior: the model is evaluated at its mean, without a prior at the nominal
+            parameters. It counts as information where its std is finite; parameters
+            that it fixes are left out. Without a prior only measurements count, and
+            parameters that the model's default prior fixes are held.
+        parameters: names of interest; the others are taken as known.
     """
     commands = table("candidates", candidates)
     if not len(commands):

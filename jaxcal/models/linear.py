@@ -50,7 +50,7 @@ class Linear(Model):
         self._analytic = isinstance(features, str)
         if isinstance(features, str):
             if terms is not None:
-                raise ValueError("terms must be left out: a formula names its own")
+                raise ValueError("terms must be left out: a formula has its own")
             self._factors, used = parse(features)
             inputs = input_names(used) if inputs is None else inputs
         elif not callable(features):

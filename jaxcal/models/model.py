@@ -440,8 +440,8 @@ def as_model(model: Any) -> Model:
             "model must be of jaxcal.models, or an object with the methods of "
             f"jaxcal.models.Model, got {got}"
             + (f" without {missing[0]}" if missing else "")
-            + ("; FromFunction(f, nominal) is one" if callable(model) else "")
-            + (f"; Linear({model!r}) is one" if isinstance(model, str) else "")
+            + ("; use FromFunction(f, nominal)" if callable(model) else "")
+            + (f"; use Linear({model!r})" if isinstance(model, str) else "")
         )
     return _Adapter(model)
 
@@ -482,7 +482,7 @@ def recorded(model: Any, commands: Any, measured: Any) -> tuple[Any, Any, bool]:
         commands, is_recording = Recording(commands), True
     if is_recording:
         if model is None:
-            raise ValueError("model must be an arm where commands are a recording")
+            raise ValueError("commands are a recording: model must be an arm")
         commands, read = as_model(model).recorded(commands)
         measured = read if measured is None else measured
     elif measured is None and getattr(
@@ -492,7 +492,7 @@ def recorded(model: Any, commands: Any, measured: Any) -> tuple[Any, Any, bool]:
     if measured is None and header_of("commands", commands):
         measured = commands  # a table of both, y_... what was measured
     if measured is None:
-        raise ValueError("measured must be given: what was read at each of commands")
+        raise ValueError("measured is missing: the readings at each of the commands")
     return commands, measured, is_recording
 
 
@@ -569,8 +569,8 @@ def answered(
             named.append(f"{row if names is None else names[row]} ({reason})")
         more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
         warnings.warn(
-            f"{len(lost)} of {len(commands)} candidates are left out, the model fails "
-            f"for {', '.join(named[:_NAMED])}{more}",
+            f"{len(lost)} of {len(commands)} candidates are left out because the model "
+            f"fails there: {', '.join(named[:_NAMED])}{more}",
             stacklevel=4,
         )
     return mask

@@ -55,8 +55,8 @@ def _equals_command(fit: Fit) -> Reason | None:
             how = "" if times == 1.0 else f" times {_short(times)}"
             return Reason(
                 f"{fit.output_names[output]} equals the command "
-                f"{fit.input_names[command]}{how} in every row: it was not measured.",
-                "put what the sensor read into that column",
+                f"{fit.input_names[command]}{how} in every row: not measured.",
+                "put the sensor's readings into that column",
             )
     return None
 
@@ -72,9 +72,9 @@ def _stands_still(fit: Fit) -> Reason | None:
     if not moves.any():
         return None
     return Reason(
-        f"{', '.join(np.array(fit.output_names)[still][moves])}: the reading stands "
-        f"still, {_each(readings[0, still][moves])} in all {len(readings)} rows.",
-        "check that the sensor is connected, recorded and on the part that moves",
+        f"{', '.join(np.array(fit.output_names)[still][moves])}: the reading never "
+        f"changes: {_each(readings[0, still][moves])} in all {len(readings)} rows.",
+        "check that the sensor is connected, recorded and mounted on the moving part",
     )
 
 
@@ -85,8 +85,8 @@ def computed(fit: Fit) -> Reason | None:
     if fit.dof < 0.5 or not exact.all() or not size.any():
         return None
     return Reason(
-        "The readings fit to the last digit, which no sensor's do.",
-        "give readings of the machine, not computed ones",
+        "The fit is exact to the last digit: these readings are computed.",
+        "use readings of the machine",
     )
 
 
@@ -107,9 +107,9 @@ def _undetermined(fit: Fit) -> Reason | None:
     names = ", ".join(fit.names[i] for i in np.flatnonzero(fit.undetermined))
     plateau = ""
     if not (fit.model.linear or fit.prior_precision.any()):
-        plateau = " The search may have ended on a plateau and not converged."
+        plateau = " The search may have stopped on a plateau."
     return Reason(
-        f"Not determined, held near the prior's mean: {names}; see identifiability()."
+        f"Not determined, kept near the prior's mean: {names}; see identifiability()."
         + plateau,
         "measure rows that determine them: "
         "select(candidates, model=..., measured=commands)",
@@ -142,7 +142,7 @@ def _explains_nothing(fit: Fit) -> Reason | None:
     if not nothing.any():
         return None
     return Reason(
-        f"The fit explains nothing of {', '.join(names[nothing])}: a constant does as "
+        f"The fit explains nothing of {', '.join(names[nothing])}: a constant fits as "
         f"well (R2 = {_each(np.maximum(1.0 - share[nothing], 0.0))} of "
         f"{fit.num_measurements} rows).",
         "check that readings and commands belong together (rows, columns, sensor), or "
@@ -184,7 +184,7 @@ def _unknown(fit: Fit) -> Reason | None:
     return Reason(
         f"{', '.join(names)}: known only to +-{_each(errors[bad & free])} (1 sigma).",
         "measure where they matter: select(candidates, model=..., measured=commands); "
-        "or begin nearer, Prior(mean=...)",
+        "or start nearer, Prior(mean=...)",
     )
 
 
@@ -207,8 +207,8 @@ def _on_its_way(fit: Fit) -> Reason | None:
     if step < least:
         return None
     return Reason(
-        f"The fit has not converged: another step is {step:.2g} standard errors long.",
-        "begin nearer: Prior(mean=...)",
+        f"The fit has not converged: a step is {step:.2g} standard errors long.",
+        "start nearer: Prior(mean=...)",
     )
 
 
@@ -244,7 +244,7 @@ def wrong_noise(fit: Fit) -> Reason | None:
         noise, where = noise[[worst]], f" for {names[worst]}"
     word, ratio = ("small", factor) if small[worst] else ("large", 1.0 / factor)
     unit = f" {fit.measured_unit}" if fit.measured_unit else ""
-    pattern = "; where residuals have a pattern (--report), the model lacks terms"
+    pattern = "; if residuals have a pattern (--report), the model lacks terms"
     return Reason(
         f"The noise you gave{where} ({_each(noise)}{unit}) is about {_short(ratio)} "
         f"times too {word}: residuals are {_each(factor * noise)}{unit}.",
@@ -262,7 +262,7 @@ def outlying(fit: Fit, rows: Sequence[int]) -> Reason | None:
     named = in_rows(rows)
     return Reason(
         f"{named.capitalize()} {verb} ({size} sigma).",
-        f"measure {named} (counted from 0) again, or leave out",
+        f"repeat {named} (counted from 0), or leave out",
     )
 
 

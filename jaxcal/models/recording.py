@@ -1,4 +1,4 @@
-"""``Recording``: what an arm recorded, in the place of commands and readings."""
+"""``Recording``: an arm's recording instead of commands and readings."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """What an arm recorded while it went to postures and stood still at each.
+    """A recording of an arm that rested at each of several postures.
 
-    ``identify`` and ``check`` take it for commands. Joints are found by name; what the
+    ``identify`` and ``check`` take it as commands. Joints are found by name; what the
     sensor read is the mean over each rest, of the bag's messages: points or poses
     (geometry_msgs PointStamped, PoseStamped; of a board in the camera too), lengths of
     a wire (sensor_msgs Range, std_msgs Float64), accelerations (sensor_msgs Imu),
@@ -20,15 +20,15 @@ class Recording:
     Attributes:
         path: rosbag2 folder or MCAP file (extra ``ros``), or the folder of a LeRobot
             dataset (extra ``lerobot``), whose joints are in degrees.
-        which: of each rest, in their order, the socket, plane or wire it is of.
-        seconds: of rest, at least.
+        which: socket, plane or wire of each rest, in order.
+        seconds: shortest rest.
         within: degrees (or units of length) in which a resting joint stays. When not
             given 0.05, or eight times what the joint's readings jitter by.
-        servos: LeRobot's calibration file of the arm, where its dataset is not in
-            degrees but in -100 to 100 of each motor's range.
+        servos: LeRobot's calibration file of the arm, if its dataset is in -100 to 100
+            of each motor's range instead of degrees.
         names: of joints that are recorded under another name: {"Rotation":
             "shoulder_pan"}.
-        topic: of the readings, where the bag has several of their kind.
+        topic: of the readings, if the bag has several of this type.
     """
 
     path: str | os.PathLike[str]

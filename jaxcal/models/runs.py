@@ -59,14 +59,14 @@ class CommandLine:
         self.words = tuple(shlex.split(words) if isinstance(words, str) else words)
         self.names, self.timeout = tuple(names), timeout
         if not self.words or not all(isinstance(word, str) for word in self.words):
-            raise ValueError(f"f must be a program and its arguments, got {words!r}")
+            raise ValueError(f"f must be a program with its arguments, got {words!r}")
         if shutil.which(self.words[0]) is None:
             raise ValueError(f"f must be a program that can be run, got {words!r}")
         unused = [x for x in self.names if not any(f"{{{x}}}" in w for w in self.words)]
         if unused:
             raise ValueError(
-                f"the arguments of f must hold {{{unused[0]}}}, where the value of "
-                f"{unused[0]} goes, got {' '.join(self.words)!r}"
+                f"the arguments of f must contain {{{unused[0]}}}, the place of the "
+                f"value of {unused[0]}, got {' '.join(self.words)!r}"
             )
 
     def __call__(self, command: Array, parameters: Array) -> Array:
@@ -128,8 +128,8 @@ class Runs:
                 pickle.dumps(f)
             except Exception as error:
                 raise ValueError(
-                    "f must be a function at the top of a module that can be imported "
-                    f"where processes is above 1: {error}"
+                    "with processes above 1, f must be a function at the top of an "
+                    f"importable module: {error}"
                 ) from None
 
     def __call__(self, jobs: Sequence[Job]) -> tuple[list[Array], list[dict[int, str]]]:
@@ -165,8 +165,8 @@ class Runs:
         if q is None:
             reasons = [x for a in answers for x in a if isinstance(x, str)]
             raise ValueError(
-                f"f must return readings, but fails for all {len(reasons)} commands, "
-                f"for {in_words(jobs[0][0][0])}: {reasons[0]}"
+                f"f fails for all {len(reasons)} commands; for "
+                f"{in_words(jobs[0][0][0])}: {reasons[0]}"
             )
         return self._arrays(answers, q)
 
@@ -283,9 +283,9 @@ class Runs:
                 self._pool.submit(callable, self.f).result()
             except BrokenExecutor:
                 raise ValueError(
-                    "f must be importable by a new process where processes is above 1: "
-                    "put it at the top of a module, and what runs behind `if __name__ "
-                    "== '__main__':`"
+                    "with processes above 1, a new process must import f: define it at "
+                    "the top of a module, and put the code that runs under `if "
+                    "__name__ == '__main__':`"
                 ) from None
         return self._pool.submit(_answer, self.f, self.batch, commands, parameters)
 
@@ -369,7 +369,7 @@ class _Cache:
                     "CREATE TABLE IF NOT EXISTS runs (key BLOB PRIMARY KEY, value BLOB)"
                 )
         except sqlite3.Error as error:
-            raise ValueError(f"cache must be a file of runs, {path}: {error}") from None
+            raise ValueError(f"cache {path} is not a file of runs: {error}") from None
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[sqlite3.Connection]:
@@ -434,7 +434,7 @@ def _content(f: Any) -> bytes:
         return pickle.dumps(f)
     except Exception as error:
         raise ValueError(
-            f"cache must be left out: what f holds cannot be compared: {error}"
+            f"leave out cache: f holds data that cannot be compared: {error}"
         ) from None
 
 

@@ -1,4 +1,4 @@
-"""What is known before measuring (Prior) and how well one measures (Noise)."""
+"""Prior knowledge (Prior) and measurement noise (Noise)."""
 
 from __future__ import annotations
 
@@ -40,16 +40,15 @@ class ResolvedPrior:
 
 @dataclasses.dataclass(frozen=True)
 class Prior:
-    """Independent normal knowledge of a model's parameters.
+    """Independent normal prior of a model's parameters.
 
     Attributes:
         std: standard deviation in the parameters' units: one number, (p,), or a mapping
             from name to number. ``inf`` and names that are left out: nothing is known.
-        mean: one number, (p,), or a mapping from name to number; the model's nominal
-            value where it is left out.
-        fixed: names of parameters held at the mean, out of the identification.
-        by_data: of an arm, the sizes of the errors are taken from the readings; see
-            ``sized``.
+        mean: one number, (p,), or a mapping from name to number; default the model's
+            nominal values.
+        fixed: names of parameters held at the mean and not identified.
+        by_data: for an arm, the sizes of the errors are estimated; see ``sized``.
     """
 
     std: PerParameter
@@ -65,12 +64,12 @@ class Prior:
         std = numbers("std of the prior", stds, finite=False)
         if not (std > 0.0).all():
             raise ValueError(
-                "std of the prior must be positive (inf: nothing is known; "
-                f"fixed=[name] holds a parameter), got {in_words(std[~(std > 0.0)])}"
+                "std of the prior must be positive (inf: nothing known; fixed=[name] "
+                f"holds a parameter), got {in_words(std[~(std > 0.0)])}"
             )
 
     def sized(self) -> Prior:
-        """This prior with the scale of its groups taken from the readings.
+        """This prior with the scale of its groups estimated from the readings.
 
         Its standard deviations then say how errors compare within a group, not how
         large they are: a factor each of lengths, turns of the axes, zeros of the joints
@@ -90,7 +89,7 @@ class Prior:
         for name in self.fixed:
             free[names.index(one_of("parameter in fixed", name, names))] = False
         if self.fixed and not free.any():
-            raise ValueError("prior must leave a parameter free, but it fixes them all")
+            raise ValueError("prior fixes all parameters; at least one must be free")
         return ResolvedPrior(mean, 1.0 / std**2, free)
 
 
@@ -141,12 +140,12 @@ class Noise:
         require_none(~(spread >= 0.0), spread, rule)
         unknown = np.isinf(np.atleast_2d(spread))
         if (unknown.any(axis=0) & ~unknown.all(axis=0)).any():
-            raise ValueError("command_std must be inf in every row of a column or none")
+            raise ValueError("command_std must be inf in a whole column, or nowhere")
         uncertain = np.isfinite(spread) & (spread > 0.0)
         if self.std is None and self.covariance is None and uncertain.any():
             raise ValueError(
-                "command_std needs std or covariance of the readings beside it: "
-                "the two are added in the readings' units"
+                "command_std needs std or covariance of the readings too: the two are "
+                "added in the readings' units"
             )
 
     def of(self, rows: NDArray[np.bool_]) -> Noise:
@@ -204,7 +203,7 @@ class Noise:
         if self.command_std is not None:
             if command_jacobian is None:
                 raise ValueError(
-                    "command_std needs the derivative by the commands: give a model, "
+                    "command_std needs the derivative by the commands: pass a model, "
                     "or command_jacobian (N, q, n)"
                 )
             derivative = array_of("command_jacobian", command_jacobian, *shape[:2], "n")

@@ -35,7 +35,7 @@ _PREDICT = (
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """Whether a calibration may be used; printed, the reasons and the next step."""
+    """Whether a calibration may be used; ``print`` shows reasons and the next step."""
 
     good: bool
     reasons: tuple[str, ...]  # against it, or worth knowing
@@ -107,7 +107,7 @@ def between_sessions(fit: Calibration, labels: NDArray[np.intp]) -> Array:
             square.append(off**2)
             expected.append(trial.predict_std(commands, new_measurement=True) ** 2)
     if not square:
-        raise ValueError("sessions must leave a fit without one of them")
+        raise ValueError("sessions: each fit without one session must be possible")
     excess = np.vstack(square).mean(axis=0) - np.vstack(expected).mean(axis=0)
     return np.sqrt(excess.clip(0.0))
 

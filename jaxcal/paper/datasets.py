@@ -74,7 +74,7 @@ def chunks(
     """
     if name == "dataset0":
         raise ValueError(
-            "dataset0 is simulated in MuJoCo: write dataset0.npz with python -m "
+            "dataset0 is simulated in MuJoCo. Make dataset0.npz with python -m "
             "benchmarks.paper.datasets dataset0 --out DIR, in the repository"
         )
     if name not in NAMES:
@@ -115,8 +115,8 @@ def drawn(name: str, seed: int, begin: int, end: int) -> Dataset:
     """
     if name not in DRAWN:
         raise ValueError(
-            f"a streamed dataset must be one of {', '.join(DRAWN)}, which are drawn "
-            f"from a seed without end, got {name!r}"
+            f"a streamed dataset must be one of {', '.join(DRAWN)} (drawn from a seed "
+            f"without end), got {name!r}"
         )
     parts = []
     for first in range(begin, end, BLOCK):

@@ -42,7 +42,7 @@ PAPER = TrainConfig(
 # episodes that stand in the same state, the choices after it being the likeliest.
 OBSERVATION = TrainConfig(
     preset="observation",
-    about="the paper's 210 numbers, a network of products, PPO alone from nothing",
+    about="the paper's 210 numbers, a network of products, PPO alone from scratch",
     network=NetworkConfig(kind="observation", decoder_rounds=2, mirrored=True),
     ppo=EpisodesConfig(
         num_episodes=10_000_000,

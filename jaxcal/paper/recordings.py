@@ -54,7 +54,7 @@ def recorded_dataset(
     episodes, have = EPISODES[name], len(commands)
     if have < NUM_CANDIDATES:
         raise ValueError(
-            f"{path}: an episode takes {NUM_CANDIDATES} postures, the recording has "
+            f"{path}: an episode needs {NUM_CANDIDATES} postures, the recording has "
             f"{have}"
         )
     if have >= episodes * NUM_CANDIDATES:
@@ -95,8 +95,9 @@ def read_pool(
         low, high = ranges.low.tolist(), ranges.high.tolist()
         raise ValueError(
             f"{table.source}: posture {row + 1} is commanded "
-            f"{values[row, :3].tolist()} deg, outside the ranges {low} to {high}; name "
-            f'wider ones as "ranges_deg" in {file.with_suffix(".json").name}'
+            f"{values[row, :3].tolist()} deg, outside the ranges {low} to {high}. If "
+            'those are too narrow, set "ranges_deg" in '
+            f"{file.with_suffix('.json').name}"
         )
     return values[:, :3], values[:, 3:], ranges, hashlib.sha256(data).hexdigest()
 

@@ -58,7 +58,7 @@ class Source:
                 f"{self.offset} and {self.scale}"
             )
         if not any(size.any() for size in sizes):
-            raise ValueError(f"{self.name} must state an offset or a scale, got 0")
+            raise ValueError(f"{self.name} needs an offset or a scale, both are 0")
         if not self.dof > 0.0:
             raise ValueError(f"dof of {self.name} must be positive, got {self.dof}")
 
@@ -230,7 +230,7 @@ def budget(
     elif commands is None:
         results = _of_readings(calibration, readings, repeats)
     else:
-        raise ValueError("budget is of commands or of readings: give one of them")
+        raise ValueError("budget takes commands or readings, not both")
     slopes, parts = results.slopes, _parts(calibration, results.slopes)
     if results.turn is not None:
         noise = calibration.require_noise("budget") ** 2 / repeats
@@ -238,7 +238,7 @@ def budget(
     gain = _gain(calibration, slopes.shape[-1]) if sources else None
     for source in sources:
         if source.name in parts:
-            raise ValueError(f"sources must have names of their own: {source.name!r}")
+            raise ValueError(f"sources must have different names: {source.name!r}")
         parts[source.name] = _squares(calibration, source, results, gain), source.dof
     contributions = np.sqrt(np.stack([square for square, _ in parts.values()], 1))
     finite = np.where(np.isfinite(contributions), contributions, 0.0)

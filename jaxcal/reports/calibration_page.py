@@ -110,8 +110,8 @@ def _prediction_section(
     )
     if at is None:
         text += (
-            " The first row is nearest to the middle of those measured, the second "
-            "is known least."
+            " The first row is nearest to the middle of the measured ones, the second "
+            "is the least certain."
         )
     rows = budget.rows()
     table = pages.Table(rows[0], rows[1:])
@@ -142,7 +142,7 @@ def _new_section(
         ]
         for i, (row, sizes) in enumerate(zip(off, std, strict=True))
     ]
-    text = "Measured less predicted, and that in what noise and calibration allow."
+    text = "Measured minus predicted, and the part that noise and calibration explain."
     return pages.Section("New readings", [text, pages.Table(head, rows)], "new")
 
 
@@ -170,7 +170,7 @@ def _moved_section(
         cells.append([row["name"], *values, shown, *unit])
     head = ["", "before", "after", "difference", "standard deviations"]
     head += ["unit"] if units else []
-    note = "The difference in its own standard deviations; beyond 3 in bold."
+    note = "The difference divided by its standard deviation; values beyond 3 in bold."
     return pages.Section("What moved", [pages.Table(head, cells), note], "moved")
 
 

@@ -107,8 +107,8 @@ def _solved(
     singular = np.flatnonzero(np.isneginf(values))
     if singular.size:
         raise ValueError(
-            f"candidates of set {singular[0]} must allow an invertible selection, but "
-            f"{method} ended in one plane at {indices[singular[0]].tolist()}"
+            f"candidates of set {singular[0]} allow no invertible selection: {method} "
+            f"ended in one plane at {indices[singular[0]].tolist()}"
         )
     return BatchSelection(
         indices=indices,

@@ -1,4 +1,4 @@
-"""What a choice is judged by: D, A, I, G, E, Ds, As. A new criterion is one class here.
+"""The criteria D, A, I, G, E, Ds, As. A new criterion is one class here.
 
 ``V = C M^-1 C.T`` is the covariance of the combinations ``C theta`` that matter, M the
 information (p, p). Every criterion is written as a concave phi(M) to be maximised:
@@ -75,7 +75,7 @@ class Coordinates(NamedTuple):
 
 
 class Criterion:
-    """What a choice is judged by; subclasses are the rows of ``CRITERIA``.
+    """A criterion; subclasses are the rows of ``CRITERIA``.
 
     As it is asked for it carries its data. ``within`` gives that of one problem, which
     has ``root`` and what follows, in the coordinates of the problem.
@@ -232,7 +232,7 @@ class A(Criterion):
 
 
 class E(Criterion):
-    """The combination of the parameters that is known worst."""
+    """The least certain combination of the parameters."""
 
     name, kind, says, per_output = "E", "least", "eigenvalue", True
 
@@ -240,7 +240,7 @@ class E(Criterion):
 class I(Criterion):  # noqa: E742 - the criterion's own name in the literature
     """Mean variance of the predictions over a region, in units of the noise.
 
-    Noise that differs by row is taken in root mean square: a prediction is no reading.
+    Noise that differs by row is averaged in root mean square.
 
     Args:
         region: (R, n) commands, or (R, q, p) blocks, at which predictions are wanted;
@@ -347,7 +347,7 @@ class ScenarioCriterion:
     def __init__(self, criterion: Any = None) -> None:
         if isinstance(criterion, ScenarioCriterion):
             raise ValueError(
-                f"{type(self).__name__} must be given a criterion of one scenario, got "
+                f"{type(self).__name__} needs a criterion of one scenario, got "
                 f"{type(criterion).__name__}"
             )
         self.criterion = criterion
@@ -427,8 +427,8 @@ class ScenarioCriterion:
             scale = 1.0 / np.maximum(units, 1e-320)
         if not (np.isfinite(scale) & (scale > 0.0)).all():
             raise ValueError(
-                f"criterion {self.name} must be a number in double precision in every "
-                "scenario, but is not in these units; give the commands in others"
+                f"criterion {self.name} exceeds double precision in a scenario; give "
+                "the commands in other units"
             )
         return (scale if optima is None else scale / optima), np.zeros(len(scale))
 
@@ -456,8 +456,8 @@ class Worst(ScenarioCriterion):
 
     Args:
         criterion: letters as "I", or an object that carries data.
-        efficiency: compare scenarios by the efficiency in each, measured by its own
-            optimum, or where that is not proven by the bound on it.
+        efficiency: compare scenarios by the efficiency in each, relative to its own
+            optimum, or to a bound if the optimum is not proven.
     """
 
     least = True
@@ -525,8 +525,7 @@ def criterion_of(criterion: Any, region: Any, default: str) -> Criterion:
         return asked
     if not asked.of_region or asked.region is not None:
         raise ValueError(
-            "region goes with criterion I or G only, and once, "
-            f"got criterion {asked.name}"
+            f"region works once, with criterion I or G only, got criterion {asked.name}"
         )
     return type(asked)(region)  # type: ignore[call-arg]  # I and G
 
@@ -547,5 +546,5 @@ def positions(
                 f"({', '.join(names)}), got {asked!r}"
             )
     if len(set(places)) < len(places) or not places:
-        raise ValueError(f"parameters must name some once each, got {parameters!r}")
+        raise ValueError(f"parameters must be names, each once, got {parameters!r}")
     return [int(at) for at in places]

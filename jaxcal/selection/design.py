@@ -1,4 +1,4 @@
-"""``Design``: what may be measured, and the questions to it; ``select`` in one call."""
+"""``Design``: a design problem and its methods; ``select`` in one call."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _PROVEN = 1e-9  # a value this near a proven optimum, relative above 1, is that 
 
 
 class Design:
-    """Which few of these candidates to measure: the problem, and its questions.
+    """The problem of choosing a few of these candidates, and its methods.
 
     Args:
         candidates: (M, n) commands that could be measured, in any unit; an array or a
@@ -58,18 +58,18 @@ class Design:
         available: (M,) bool or 0 and 1, True where a candidate may be chosen; all by
             default.
         required: (r,) candidates that must be among the chosen.
-        max_replicates: how often one candidate may be chosen, a number or (M,) of each;
-            1 keeps them distinct.
+        max_replicates: how often a candidate may be chosen, a number or (M,); 1 keeps
+            them distinct.
         blocks: (M, q, p) instead of candidates and model; candidate i gives q readings,
             ``y = B_i theta + noise`` with noise of unit variance unless ``noise`` is
             given, and adds ``B_i.T @ B_i`` to the information. Or (S, M, q, p), those
             of S scenarios.
         commands: (M, n) of the blocks, for travel between them and for tables.
-        scenarios: where the nominal is a guess, parameters that the choice is judged
-            by as well: a whole number of draws from the prior (seeded), (S, p), or
-            ``(parameters, weights)``; of blocks (S, M, q, p) their weights (S,), of sum
-            1, equal when not given. A criterion is then ``jaxcal.Mean("D")``, as
-            letters alone are, or ``jaxcal.Worst("D")``.
+        scenarios: if the nominal is uncertain, parameter values to average over: a
+            whole number of draws from the prior (seeded), (S, p), or ``(parameters,
+            weights)``; of blocks (S, M, q, p) their weights (S,), of sum 1, equal when
+            not given. A criterion is then ``jaxcal.Mean("D")``, as letters alone are,
+            or ``jaxcal.Worst("D")``.
         constraints: (A, b), A (r, M) or (M,) and b (r,) or a number: a selection must
             have ``A w <= b``, w (M,) how often each candidate is chosen. A row of costs
             and a budget; ones at some rows and "at most s of these".
@@ -101,7 +101,7 @@ class Design:
     ) -> None:
         if (candidates is None) == (blocks is None):
             got = "neither" if blocks is None else "both"
-            raise ValueError(f"either candidates or blocks must be given, got {got}")
+            raise ValueError(f"give either candidates or blocks, got {got}")
         rows: Any = candidates if blocks is None else commands
         labels: Any = names
         self.candidate_set = CandidateSet(
@@ -190,7 +190,7 @@ class Design:
         region: ArrayLike | None = None,
         **options: Any,
     ) -> Selection:
-        """The k candidates whose measurements say most about the parameters.
+        """Choose the k candidates whose measurements are most informative.
 
         Args:
             k: candidates to choose; the fewest that identify (n + 1) when not given.
@@ -240,13 +240,13 @@ class Design:
         reference: str = "bound",
         time_limit: float | None = None,
     ) -> Selection:
-        """Judge a subset made elsewhere as if a solver had returned it.
+        """Score a subset made elsewhere as if a solver had returned it.
 
         Args:
             indices: (k,) the subset; repeated entries are replicates.
             criterion: as in ``select``.
-            reference: what ``bound`` and ``efficiency`` are measured against, "bound"
-                (the cheapest bound, computed when read) or "exact" (the optimum).
+            reference: what ``bound`` and ``efficiency`` are relative to: "bound" (the
+                cheapest bound, computed when read) or "exact" (the optimum).
             time_limit: seconds for the optimum, 10 when not given.
 
         Raises:
@@ -278,17 +278,15 @@ class Design:
         times = np.bincount(subset, minlength=count)
         missing = problem.required[times[problem.required] == 0]
         if len(missing):
-            raise ValueError(
-                f"indices must hold every required candidate, got no {missing[0]}"
-            )
+            raise ValueError(f"indices lack the required candidate {missing[0]}")
         if (over := np.flatnonzero(times > problem.upper)).size:
             raise ValueError(
-                "indices must repeat a candidate at most max_replicates = "
+                "indices may repeat a candidate at most max_replicates = "
                 f"{problem.upper[over[0]]} times, got {times[over[0]]}"
             )
         if problem.constraints is not None:
             if broken := problem.constraints.broken(times):
-                raise ValueError(f"indices must keep the constraints, got {broken}")
+                raise ValueError(f"indices violate the constraints: {broken}")
         return problem
 
     plan = late("jaxcal.selection.plan:plan")
@@ -348,8 +346,8 @@ class Design:
         least = problem.criterion.kind == "least"
         if not math.isfinite(value) or (least and not value > 0.0):
             raise ValueError(
-                f"criterion {problem.criterion.name} must be a number in double "
-                f"precision, got {value} in these units; give the commands in others"
+                f"criterion {problem.criterion.name} is {value}, which exceeds double "
+                "precision; give the commands in other units"
             )
 
     def _why_singular(self, indices: Indices) -> str:
@@ -400,8 +398,8 @@ def _require_allowed(problem: Problem, indices: Indices, method: str) -> None:
         right = bool(((problem.lower <= counts) & (counts <= problem.upper)).all())
     if not right or not problem.allows(indices):
         raise RuntimeError(
-            f"method {method!r} must return {problem.k} candidates within lower "
-            f"and upper of its problem, by number, got {indices.tolist()}"
+            f"method {method!r} must return {problem.k} candidates within the bounds "
+            f"lower and upper of its problem, got {indices.tolist()}"
         )
 
 
@@ -423,7 +421,7 @@ def select(
     region: ArrayLike | None = None,
     **given: Any,
 ) -> Selection:
-    """Choose the k candidates whose measurements say most about the parameters.
+    """Choose the k candidates whose measurements are most informative.
 
     ``Design(candidates, ...).select(k, criterion, method, ...)`` in one call.
 
@@ -431,7 +429,7 @@ def select(
         candidates: (M, n) commands that could be measured, or None with blocks.
         k: candidates to choose; the fewest that identify when not given.
         method: "auto", "exact", "exchange", "greedy", "random" or "policy".
-        criterion, region: what is best, see ``Design.select``.
+        criterion, region: see ``Design.select``.
         given: model, prior, noise, measured, available, required, max_replicates,
             constraints, blocks, commands, scenarios, names: of the problem, see
             ``Design``; seed, restarts, time_limit, best, least_efficiency, checkpoint,

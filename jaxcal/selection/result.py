@@ -33,7 +33,7 @@ class Subset(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Selection:
-    """The candidates chosen, how, and how good they are; printing it shows a table.
+    """The chosen candidates, the method and their quality; ``print`` shows a table.
 
     ``bound``, ``gap``, ``efficiency`` and ``criteria`` are computed when first read.
     """
@@ -71,7 +71,7 @@ class Selection:
 
     @cached_property
     def bound(self) -> float:
-        """No selection allowed has a better value: an upper bound, of A, As, I a lower.
+        """Bound on the value of every allowed selection: upper, for A, As, I lower.
 
         The optimum where the solver proved it or ``score`` was asked to, or where
         k = n + 1 makes it cheap; otherwise the concave relaxation.
@@ -174,7 +174,7 @@ class Selection:
         """What is left of det S where one measurement fails, in words."""
         needed = np.flatnonzero(self.left_without == 0.0)
         if len(needed) == len(self.indices):
-            return "singular, whichever is lost"
+            return "singular, whichever measurement is lost"
         names = [self.labels[i] for i in needed]
         if len(names) > 1:
             return f"singular without any one of {self._noun}s {', '.join(names)}"

@@ -89,24 +89,24 @@ def _policy(
 
     if problem.candidates is None or problem.model is None:
         raise ValueError(
-            'blocks cannot be used with method "policy", which is trained on '
-            "candidates of the affine model; use auto, exact or exchange"
+            'method "policy" does not take blocks: it is trained on candidates of the '
+            "affine model; use auto, exact or exchange"
         )
     affine = problem.blocks.shape[1] == 1 and problem.raw[0, 0, -1] == 1.0
     if not affine or len(problem.root):
         raise ValueError(
-            'method must be auto, exact or exchange here: "policy" is trained on the '
-            "affine model and nothing known beforehand"
+            'use method auto, exact or exchange here: "policy" is trained on the '
+            "affine model without prior knowledge"
         )
     if problem.criterion.name != "D":
         raise ValueError(
-            'method must be auto, exact or exchange here: "policy" is trained for '
+            'use method auto, exact or exchange here: "policy" is trained for '
             f"criterion D, got {problem.criterion.name}"
         )
     if problem.constraints is not None or np.max(problem.upper) > 1:
         raise ValueError(
-            'max_replicates must be 1 with method "policy", which picks distinct '
-            f"postures and keeps no constraints, got {problem.max_replicates}"
+            'max_replicates must be 1 with method "policy", which picks different '
+            f"postures and allows no constraints, got {problem.max_replicates}"
         )
     indices = choose([problem], decoding, num, seed, checkpoint)[0]
     return Solution(np.asarray(indices, dtype=np.int64), seed=seed)
@@ -158,8 +158,8 @@ def checked_options(method: str, given: Mapping[str, Any]) -> dict[str, Any]:
         if name not in reads:
             others = [other for other in SOLVERS if name in _options(SOLVERS[other])]
             raise ValueError(
-                f'{name} is not an option of method "{method}" '
-                f"(it is of {', '.join(others)})"
+                f'{name} is not an option of method "{method}" (only of '
+                f"{', '.join(others)})"
             )
         checked[name] = value
     return checked

@@ -30,8 +30,8 @@ class Ambiguity(ValueError):
         self.place, cell = place, cells[place]
         plain = cell.replace(",", "").replace(".", "")
         super().__init__(
-            f"{cell!r} may be {plain} or have three decimals: write {plain}, or a "
-            "fourth decimal"
+            f"{cell!r} may mean {plain} or a number with three decimals: write "
+            f"{plain}, or a fourth decimal"
         )
 
 

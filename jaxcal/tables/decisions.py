@@ -113,7 +113,7 @@ def _of_numbers(
     ):
         return Decision("left out", COUNTED)
     if marked:
-        reason = f"commands are those that begin with {COMMANDS}"
+        reason = f"commands begin with {COMMANDS}"
         return Decision("left out", reason)
     if _LIKE_Y.fullmatch(name) and any(_LIKE_U.fullmatch(x) for x in header):
         return Decision("input", f"readings begin with {MEASURED}")
@@ -129,13 +129,13 @@ def _of_y(
     depth = f"z_{root}".casefold() in names
     axis = depth or (f"x_{root}".casefold() in names and not digits)
     if axis and marked:
-        return Decision("output", f"it stands beside x_{root}", asks=True)
+        return Decision("output", f"x_{root} is beside it", asks=True)
     if marked:
         return Decision("output")
     if axis or (outputs and not any(x.startswith(MEASURED) for x in outputs)):
-        return Decision("input", "an axis: no column begins with u_")
+        return Decision("input", "a coordinate: no column begins with u_")
     if outputs:
-        return Decision("left out", "other columns are the outputs")
+        return Decision("left out", "the outputs are named")
     if fit or digits or root in header:
         return Decision("output", "no column begins with u_")
     return Decision("input", "no column begins with u_")
@@ -184,17 +184,14 @@ def _count(column: Array) -> str | None:
         return None
     mean = float(steps.mean())
     if (np.abs(steps - mean) <= 0.05 * abs(mean)).all():
-        return (
-            f"goes up by {mean:.4g} from row to row, as a number of the rows or a time "
-            "does"
-        )
+        return f"rises by {mean:.4g} per row, like a row number or a time"
     for first in (0.0, 1.0):
         if count > _LEAST_ROWS and np.array_equal(
             np.sort(numbers), np.arange(count) + first
         ):
             return (
-                f"holds each number from {first:g} to {count - 1 + first:g} once, as a "
-                "running number does"
+                f"holds each number from {first:g} to {count - 1 + first:g} once, like "
+                "a row number"
             )
     return None
 

@@ -89,11 +89,11 @@ def _of_text(source: str, text: str) -> tuple[Table, list[str]]:
     elif numbers := [cell for cell in header if _is_plain(cell)]:
         name = next(cell for cell in header if not _is_plain(cell))
         raise ValueError(
-            f"{source}: line {rows[0][0]} must hold names alone or numbers alone, got "
-            f"{name!r} and {numbers[0]!r}: give every column a name"
+            f"{source}: line {rows[0][0]} mixes names and numbers, {name!r} and "
+            f"{numbers[0]!r}: give every column a name"
         )
     elif not (rows := rows[1:]):
-        raise ValueError(f"{source}: there are no rows below the header")
+        raise ValueError(f"{source}: no rows below the header")
     columns = dict[str, Sequence[str]]()
     for place, name in enumerate(header, start=1):
         cells = [row[place - 1] for _, row in rows]
@@ -106,7 +106,7 @@ def _of_text(source: str, text: str) -> tuple[Table, list[str]]:
     lines = tuple(line for line, _ in rows)
     table = table_of(source, columns, lines, mark, headed=sheet.headed)
     if not table.names:
-        raise ValueError(f"{source}: no column holds numbers: {', '.join(header)}")
+        raise ValueError(f"{source}: no column contains numbers: {', '.join(header)}")
     return table, notes
 
 
@@ -122,7 +122,7 @@ def _unnamed(
         columns["index"] = cells
         return []
     if len({*cells}) == len(cells) and all(cell.isdecimal() for cell in cells):
-        return [f"column {place} is not read: it looks like a row number"]
+        return [f"ignored column {place} (looks like a row number)"]
     raise ValueError(f"{source}: column {place} has no name")
 
 
@@ -155,7 +155,7 @@ def decoded(source: str, data: bytes) -> tuple[str, str]:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        note = f"line {line} is not UTF-8 text, it is read as Windows' cp1252"
+        note = f"line {line} is not UTF-8; read as Windows cp1252"
         text = data.decode("cp1252", errors="replace")
     if bad := re.search("[\x00-\x08\x0e-\x1f\ufffd]", text):
         line = text.count("\n", 0, bad.start()) + 1
@@ -186,13 +186,13 @@ def sheet_of(source: str, text: str) -> Sheet:
         for mark in (delimiter, " "):
             names = _cells([text], mark)[0][1]
             if len(names) == len(rows[0][1]) and not any(map(is_number, names)):
-                notes.append(f"names are those of line {line}: {', '.join(names)}")
+                notes.append(f"names are taken from line {line}: {', '.join(names)}")
                 rows.insert(0, (line, names))
                 break
     headed = not all(map(is_number, rows[0][1]))
     if headed and len(rows) > 2 and _holds_units(rows[1][1], rows[2:]):
         units = ", ".join(filter(None, rows[1][1]))
-        notes.append(f"line {rows[1][0]} is read as units: {units}")
+        notes.append(f"units are taken from line {rows[1][0]}: {units}")
         del rows[1]
     return Sheet(rows, delimiter, headed, tuple(notes))
 
@@ -215,7 +215,7 @@ def _without_comments(
     if inside:
         listed = ", ".join(str(i + 1) for i in inside[:5])
         more = ", ..." if len(inside) > 5 else ""
-        notes.append(f"a comment, begun with #, is not read: line {listed}{more}")
+        notes.append(f"ignored comment (#): line {listed}{more}")
     head = None
     if above and (names := lines[above[-1]].strip().lstrip("# \t")):
         head = (above[-1] + 1, names)

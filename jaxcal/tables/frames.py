@@ -34,7 +34,7 @@ def header_of(argument: str, values: Any) -> list[str]:
     for name in names:
         if not isinstance(name, str):
             raise ValueError(
-                f"{argument}: every column must have a name, a text, got {name!r}"
+                f"{argument}: every column needs a text as its name, got {name!r}"
             )
         if names.count(name) > 1:
             raise ValueError(f"{argument}: column {name!r} comes twice")
@@ -82,7 +82,7 @@ def _column(values: Any, name: str) -> Any:
     try:
         return values[name]
     except KeyError:
-        raise ValueError(f"every row must have {name!r}, one has not") from None
+        raise ValueError(f"a row lacks {name!r}") from None
 
 
 def _cells(values: Any) -> Any:
@@ -143,9 +143,9 @@ def say_order(commands: Any, measured: Any) -> None:
     if set(one) == set(other):
         k = next(k for k in range(len(one)) if one[k] != other[k])
         say(
-            "commands and measured have one index in two orders, and are paired by "
-            f"place: row {k} is {one[k]!r} of commands and {other[k]!r} of measured; "
-            "by index it is measured.loc[commands.index]"
+            "commands and measured have the same index in different orders. Rows are "
+            f"paired by position: row {k} is {one[k]!r} in commands and {other[k]!r} "
+            "in measured. To pair by index use measured.loc[commands.index]"
         )
 
 
@@ -187,7 +187,7 @@ def names_in(
         raise ValueError(f"{argument}: {error}") from None
     if None in names:
         raise ValueError(
-            f"{argument} must have the columns {', '.join(wanted)}, "
+            f"{argument} needs the columns {', '.join(wanted)}; "
             f"{wanted[names.index(None)]!r} is missing (columns: {', '.join(header)})"
         )
     if beside is not None:
@@ -258,5 +258,5 @@ def outputs_of(argument: str, frame: Any, beside: bool) -> Any:
     names = names or [*table.names]
     words = [name for name in table.labels if name.startswith(MEASURED)]
     if not words and (unread := [x for x in table.header if x not in names]):
-        say(f"{argument}: readings {', '.join(names)}; not read: {', '.join(unread)}")
+        say(f"{argument}: readings {', '.join(names)}; ignored: {', '.join(unread)}")
     return (*names, *words)

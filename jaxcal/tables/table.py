@@ -134,7 +134,7 @@ class Table:
             for name, column, place in zip(wanted, by_name, taken, strict=True):
                 if column not in (None, place):
                     raise ValueError(
-                        f"{self.source}: {option} has {place!r} in the place of "
+                        f"{self.source}: {option} has {place!r} at the position of "
                         f"{name!r}, and {column!r} elsewhere; the order is "
                         f"{', '.join(wanted)}"
                     )
@@ -145,7 +145,7 @@ class Table:
                     f"{self.source}: {count}, got {len(self.names)} without a header"
                 )
             say(
-                f"{self.source} has no header: its columns are read by position, as "
+                f"{self.source} has no header: columns are read by position as "
                 f"{', '.join(wanted)}"
             )
             return self.names
@@ -155,10 +155,10 @@ class Table:
             choose = f"choose with {option}" if option else "rename one of them"
             raise ValueError(f"{self.source}: {error}; {choose}") from None
         if missing := [x for x, y in zip(wanted, columns, strict=True) if y is None]:
-            advice = f"; name those of {', '.join(wanted)} in that order with {option}"
+            advice = f"; name {', '.join(wanted)} in that order with {option}"
             raise ValueError(
                 f"{self.source}: there is no column {', '.join(map(repr, missing))}, "
-                f"with {prefix} or without; columns: {', '.join(self.header)}"
+                f"with or without {prefix}; columns: {', '.join(self.header)}"
                 + (advice if option else "")
             )
         spare = "" if others is None else self.unread(columns, prefix, others)
@@ -200,11 +200,11 @@ class Table:
         names = of_role("input", decisions)
         if not names:
             raise ValueError(
-                f"{self.source}: no column holds commands "
-                f"(columns: {', '.join(self.header)}); {advice}"
+                f"{self.source}: no column contains commands (columns: "
+                f"{', '.join(self.header)}); {advice}"
             )
         if text := sentence(decisions):
-            more = f"; other columns are named with {option}" if option else ""
+            more = f"; to use other columns: {option}" if option else ""
             say(f"{self.source}: {text}{more}")
         return names
 
@@ -225,7 +225,7 @@ class Table:
         axes = axes or [name for name in self.names if name.startswith(MEASURED)]
         fault = f"no column begins with {MEASURED}"
         if axes:
-            fault = f"column {axes[0]!r} may be an axis, not what was measured"
+            fault = f"column {axes[0]!r} may be a coordinate, not a reading"
         raise ValueError(
             f"{self.source}: {fault}; name the measured columns with {option} "
             f"(columns: {', '.join(self.header)})"
@@ -289,7 +289,7 @@ class Table:
             and decisions[name].reason != COUNTED
             and decisions[name].role != AVAILABLE
         ]
-        return listed(spare, "not read: nothing asks for it") if spare else ""
+        return listed(spare, "ignored (not needed)") if spare else ""
 
 
 def table_of(

@@ -36,15 +36,15 @@ class Scale(Section):
 
     kind: Literal["rotation", "translation"] = key("what the axis does", "rotation")
     lead_mm: float | None = key(
-        "of a translation: way for one turn of its screw, pulley or pinion",
+        "of a translation: travel per turn of its screw, pulley or pinion",
         None, 1e-3, 1e4,
     )  # fmt: skip
     pulses_per_rev: int = key(
-        "omega: pulses for one motor turn, as set in the drive", ..., 1, 100_000_000
+        "omega: pulses per motor turn, as set in the drive", ..., 1, 100_000_000
     )
-    reduction: float = key("kappa: motor turns for one joint turn", 1.0, 1e-3, 1e5)
+    reduction: float = key("kappa: motor turns per joint turn", 1.0, 1e-3, 1e5)
     direction: Literal[1, -1] = key(
-        "-1: positive pulses turn the joint the negative way", 1
+        "-1: positive pulses turn the joint in the negative direction", 1
     )
 
     @classmethod
@@ -106,21 +106,21 @@ class Axis(Scale):
 
     name: str = key("of the joint", pattern="^[a-z][a-z0-9_]{0,39}$")
     rotates: Literal["X", "Y", "Z"] | None = key(
-        "of a rotation: axis of the joint in the device's frame, as a phone sees it",
+        "of a rotation: axis of the joint in the device's frame, for a phone",
         "X, Z, Y of pitch, yaw, roll",
         by=lambda made: DEFAULT_ROTATES.get(made["name"]),
     )
     unit: int = key("Modbus unit id", ..., 1, 247)
     map: Annotated[
         DriveMap, BeforeValidator(_map), WithJsonSchema({"type": "string"})
-    ] = key("of its drive: a name, or a .toml file relative to this one")
+    ] = key("map of its drive: a name, or a .toml file relative to this one")
     min_deg: JointAngle = key("soft limit", ..., -10_000, 10_000)
     max_deg: JointAngle = key("soft limit", ..., -10_000, 10_000)
     speed_deg_s: float = key("of every move", ..., 1e-3, 5000)
-    accel_deg_s2: float = key("of every move, also to brake", ..., 1e-3, 1e5)
+    accel_deg_s2: float = key("of every move, start and stop", ..., 1e-3, 1e5)
     comm_timeout_s: float | None = advanced(
-        "the drive stops itself when the line is silent for so long",
-        "of [bus], where the map has it", 0.01, 60, by=lambda made: None,
+        "the drive stops itself when the line is silent for this time",
+        "that of [bus], if the map has it", 0.01, 60, by=lambda made: None,
     )  # fmt: skip
 
     range_deg: Range | None = advanced("of the candidates; absent: the limits", None)
@@ -221,7 +221,7 @@ class Axis(Scale):
             yield f"{low}: must be under {high}, got {self.min_deg} and {self.max_deg}"
             return
         if (self.kind == "translation") != (self.lead_mm is not None):
-            yield f"lead_mm: a translation needs one, a rotation has none: {self.kind}"
+            yield f"lead_mm: a translation needs it, a rotation has none: {self.kind}"
             return
         try:
             self.motion_counts()

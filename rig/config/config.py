@@ -75,9 +75,9 @@ def units_of(described: dict[str, Any]) -> tuple[str, str]:
 
 
 def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    """``key: VALUE then, VALUE now`` of two flat tables, where they differ."""
+    """``key: was VALUE, is VALUE`` of two flat tables, where they differ."""
     return [
-        f"{key}: {then.get(key, 'not known')} then, {now.get(key, 'not known')} now"
+        f"{key}: was {then.get(key, 'not known')}, is {now.get(key, 'not known')}"
         for key in dict.fromkeys([*then, *now])
         if then.get(key) != now.get(key)
     ]
@@ -126,7 +126,7 @@ class RigConfig(Section):
     settle: SettleSettings = SettleSettings()
     motion: MotionSettings = MotionSettings()
     session: SessionSettings = SessionSettings()
-    output: str = key("every run makes its own folder in here", "runs")
+    output: str = key("every run makes a folder in this folder", "runs")
     device: str = key(
         "record of how the device was commissioned, relative to this file",
         "device.json",
@@ -366,9 +366,9 @@ class RigConfig(Section):
             yield f"session.k: must be under candidates ({session.candidates})"
         if self.k <= len(self.axes):
             fewest = len(self.axes) + 1
-            yield f"session.k: must be at least {fewest}, axes and one, got {self.k}"
+            yield f"session.k: must be at least {fewest} (axes plus one), got {self.k}"
         if (self.imu is None) == (self.readings is None):
-            yield "imu: either [imu] or [readings] is required, and not both"
+            yield "imu: give either [imu] or [readings], not both"
             return
         if self.model is not None:
             yield from self._rules_of_model(self.model)
@@ -385,9 +385,9 @@ class RigConfig(Section):
             if within or middle.rotates != self.mechanism.order[1]:
                 continue
             yield (
-                f"axes.{middle.name}: min_deg and max_deg must lie between -90 and 90: "
-                "no phone reads the middle one of mechanism.order elsewhere; got "
-                f"{middle.min_deg:g} and {middle.max_deg:g}"
+                f"axes.{middle.name}: min_deg and max_deg must be between -90 and 90, "
+                "the range in which a phone can read the middle axis of "
+                f"mechanism.order; got {middle.min_deg:g} and {middle.max_deg:g}"
             )
         for axis, ends in zip(self.axes, self.ranges, strict=True):
             yield from self._rules_of_axis(axis, *ends)
@@ -418,15 +418,15 @@ class RigConfig(Section):
         elif low - overshoot < axis.min_deg - 1e-9 or high > axis.max_deg + 1e-9:
             limits = f"[{axis.min_deg}, {axis.max_deg}]"
             yield (
-                f"{span}: [{low}, {high}] with an overshoot of {overshoot} leaves "
-                f"the axis's limits {limits}"
+                f"{span}: [{low}, {high}] with an overshoot of {overshoot} exceeds the "
+                f"axis's limits {limits}"
             )
 
     def _rules_of_model(self, model: ModelSettings) -> Iterator[str]:
         if self.session.k is None:
             yield (
-                "session.k: missing; with a [model] it says how many postures are "
-                "measured"
+                "session.k: missing; with a [model] give the number of postures to "
+                "measure"
             )
         if not model.urdf:
             return
@@ -434,10 +434,10 @@ class RigConfig(Section):
             if axis.kind != "rotation":
                 yield f"axes.{axis.name}.kind: must be rotation, of a [model] by urdf"
         if self.imu and model.sensor != "gravity":
-            yield "model.sensor: must be gravity: a phone at rest measures where up is"
+            yield "model.sensor: must be gravity: a phone at rest measures gravity"
         if self.readings and len(self.readings.names) != 3:
             count = len(self.readings.names)
-            yield f"readings.names: must be 3, of model.sensor, got {count}"
+            yield f"readings.names: must be 3 for model.sensor, got {count}"
 
 
 # Files
@@ -490,5 +490,5 @@ def example_names() -> list[str]:
 def example_text(name: str) -> str:
     """Text of a configuration that ships; ConfigError where none has the name."""
     if name not in example_names():
-        raise ConfigError(name, [f"no such example: have {', '.join(example_names())}"])
+        raise ConfigError(name, [f"examples are {', '.join(example_names())}"])
     return (EXAMPLES / f"{name}.toml").read_text(encoding="utf-8")

@@ -46,12 +46,12 @@ Names = Annotated[
 class Read(Section, registers.Value):
     """A value to read: registers, or bits."""
 
-    address: Register = key("of the register, or bit, as the protocol counts: from 0")
-    type: Kind = key("of the number, as in a map", "u16")
+    address: Register = key("address of the register or bit as in the protocol, from 0")
+    type: Kind = key("type of the number", "u16")
     function: Literal[1, 2, 3, 4] = key(
-        "3 holding or 4 input registers, 1 coils, 2 discrete inputs", 3
+        "3: holding registers, 4: input registers, 1: coils, 2: discrete inputs", 3
     )
-    bits: int = key("of function 1 or 2; 0: 16 for a register of type", 0, 0, 64)
+    bits: int = key("read by function 1 or 2; 0: 16 for a register of type", 0, 0, 64)
 
     def broken_rules(self) -> Iterator[str]:
         of_registers = self.function in registers.REGISTERS
@@ -66,13 +66,13 @@ class Position(Read, registers.Place):
     """The drive's own position in pulses."""
 
     type: Kind = "i32"
-    counts: float = key("pulses for 1 of what the registers hold", 1.0, 1e-12, 1e12)
+    counts: float = key("pulses per unit of the registers", 1.0, 1e-12, 1e12)
 
 
 class Alarm(Read):
     """The alarm's code; 0 is none."""
 
-    names: Names = key("of codes, such as 0x0001", {})
+    names: Names = key("names of codes, such as 0x0001", {})
 
 
 class Predicate(Section, registers.Bits):
@@ -178,26 +178,26 @@ class Units(Section):
 class DriveMap(Section):
     """One drive family, of whatever kind."""
 
-    schema_: Literal[1] = key("version of this schema", alias="schema")
+    schema_: Literal[1] = key("version of the schema", alias="schema")
     drive: str = key(
-        "kind of its drives: modbus, or the class of one's own as `FILE.py:CLASS`, "
-        "relative to the map, or `MODULE:CLASS`", "modbus",
+        "kind of its drives: modbus, or your own class as `FILE.py:CLASS`, relative "
+        "to the map, or `MODULE:CLASS`", "modbus",
     )  # fmt: skip
     name: str = key("name of the map", min_length=1)
     title: str = key("drives it is for", min_length=1)
-    sources: str = key("where what it says is from", min_length=1)
-    confidence: str = key("how far that was checked", "")
+    sources: str = key("source of these values", min_length=1)
+    confidence: str = key("how far the map was tested", "")
     restart_s: float = key(
-        "after a stop a drive may go on by itself within this time: it is looked at "
-        "for so long", 2.0, 2.0, 60,
+        "time after a stop within which a drive may move on; it is watched for this "
+        "long", 2.0, 2.0, 60,
     )  # fmt: skip
-    absolute_encoder: bool = key("the position outlasts a loss of power", False)
+    absolute_encoder: bool = key("the position survives a loss of power", False)
     ready_s: float = key(
-        "the drive takes at most so long to enable, and to reset an alarm", 1.0, 0, 30
+        "longest time that the drive needs to enable, or to reset an alarm", 1.0, 0, 30
     )
-    inter_frame_s: float = key("silence the drive wants between frames", 0.0, 0, 1)
+    inter_frame_s: float = key("silence that the drive needs between frames", 0.0, 0, 1)
     settings: dict[str, str | int | float | bool] = key(
-        "of a kind that is not modbus: what its class reads", {}
+        "data of your own class, for a kind other than modbus", {}
     )
     _folder: pathlib.Path = PrivateAttr(pathlib.Path())
 
@@ -232,15 +232,15 @@ class RegisterMap(DriveMap):
 
     drive: Literal["modbus"] = "modbus"
     word_order: Literal["big", "little"] = key(
-        "of 32-bit pairs; big: high word first, little: low word first"
+        "order of 32-bit pairs; big: high word first, little: low word first"
     )
-    inter_frame_s: float = key("silence the drive wants between frames", ..., 0, 1)
+    inter_frame_s: float = key("silence that the drive needs between frames", ..., 0, 1)
     settings: dict[str, str | int | float | bool] = key(
-        "none: registers are keys of their own", {}, max_length=0
+        "none: registers are keys of a class of your own", {}, max_length=0
     )
-    serial: dict[str, int | str] = key("the maker's default line format", {})
+    serial: dict[str, int | str] = key("default line format of the maker", {})
     units: Units = key(
-        "`speed`, `accel` of the registers; `speed_per_unit`, `accel_per_unit` counts"
+        "`speed`, `accel` of the registers; counts `speed_per_unit`, `accel_per_unit`"
     )
     status: StatusWord = key(
         "address, type; `done`, `moving`, `fault`, `enabled` as bits `{ set, clear }`"
@@ -253,38 +253,38 @@ class RegisterMap(DriveMap):
     )
     stop: Writes = key("`write`: frames of the quick stop; torque must stay on")
     hold: Writes | None = key(
-        "`write` with `position`: the target that the drive holds becomes the place "
-        "where it stands, so that nothing is left to go on to after a stop",
+        "`write` with `position`: the drive's target becomes its present position, "
+        "so that it does not continue a move after a stop",
         None,
     )
-    broadcast_stop: bool = key("every unit of a serial line obeys its stop to 0", False)
+    broadcast_stop: bool = key("all units of a serial line obey a stop to 0", False)
     enable: Writes | None = key("`write`: switch the power stage on", None)
     alarm_reset: Writes | None = key("`write`: reset an alarm", None)
     comm_timeout: CommTimeout | None = key(
-        "`write` with `timeout`, counts `per_s`: the drive's own watch of the line",
+        "`write` with `timeout`, counts `per_s`: the drive's watch of the line",
         None,
     )
     limits: Writes | None = key("`write` with `min` and `max` in pulses", None)
     set_zero: Writes | None = key(
-        "`write`: the present position becomes 0, or `home:i32` where the drive takes "
-        "a value: 2^30 is written, which it never counts when it is switched on",
+        "`write`: the present position becomes 0; or `home:i32` if the drive takes a "
+        "value: 2^30 is written, which it never counts when it is switched on",
         None,
     )
     identity: dict[str, Read] = key("registers that `identify` prints", {})
     recognise: dict[str, tuple[int, int]] = key(
-        "of identity registers: [lowest, highest] that a drive of this family holds", {}
+        "[lowest, highest] value of identity registers for drives of this family", {}
     )
     pulses_per_rev: Read | None = key(
-        "register of the drive's own pulses for one motor turn", None
+        "register of the drive's pulses per motor turn", None
     )
     target: Position | None = key(
-        "register that holds the last target written, read back when the reply to a "
-        "move is lost",
+        "register of the last target written; it is read back if the reply to a move "
+        "is lost",
         None,
     )
     home: Writes | None = key("`write`: start the drive's own homing", None)
     homed: Predicate | None = key(
-        "bits of the status word that are on from homing until the power fails", None
+        "bits of the status word that homing sets and a loss of power clears", None
     )
 
     @property
@@ -296,7 +296,7 @@ class RegisterMap(DriveMap):
         if self.stop.place_of("position"):
             yield "stop.write: must not write a position"
         for name in sorted(self.recognise.keys() - self.identity.keys()):
-            yield f"recognise.{name}: is no register of identity"
+            yield f"recognise.{name}: is not a register of identity"
 
 
 def available_maps() -> list[str]:
@@ -315,8 +315,8 @@ def load_map(name: str, folder: pathlib.Path | None = None) -> DriveMap:
         path = (folder or pathlib.Path()) / name
     elif name not in available_maps():
         raise ValueError(
-            f"no register map {name!r}: have {', '.join(available_maps())}, "
-            "or give the path of a .toml file"
+            f"no register map {name!r}; there are {', '.join(available_maps())}, or "
+            "give the path of a .toml file"
         )
     return parse_map(read_text(path), path.name, path.parent)
 

@@ -25,20 +25,20 @@ class BusSettings(Section):
     """One line for all drives."""
 
     transport: Literal["tcp", "rtu_tcp", "rtu", "serial", "can"] = key(
-        "rtu: Modbus on a serial port; tcp: Modbus TCP; rtu_tcp: RTU frames over TCP; "
-        "serial, can: a line of drives of one's own"
+        "rtu: Modbus on a serial port; tcp: Modbus TCP; rtu_tcp: RTU frames over "
+        "TCP; serial, can: lines of your own drives"
     )
     host: str = key("address of a tcp or rtu_tcp bus", "")
     port: int = key("TCP port of a tcp or rtu_tcp bus", 502, 1, 65535)
     device: str = key("serial port; channel of a CAN bus, such as can0", "")
-    baudrate: int = key("of a serial port or a CAN bus", 115200, 1200, 3_000_000)
+    baudrate: int = key("for a serial port or a CAN bus", 115200, 1200, 3_000_000)
     parity: Literal["N", "E", "O"] = key("of an rtu bus", "N")
     stopbits: int = key("of an rtu bus", 1, 1, 2)
     bytesize: int = key("of an rtu bus", 8, 7, 8)
-    echo: bool = key("of RTU: the adapter sends back what it is sent", False)
+    echo: bool = key("RTU: the adapter echoes what it is sent", False)
     timeout_s: float = key("for one reply", 0.3, 0.01, 5)
     read_retries: int = advanced(
-        "of reads, and of a move that the drive has not taken", 2, 0, 10
+        "retries of a read, and of a move that the drive did not take", 2, 0, 10
     )
 
     @property
@@ -59,7 +59,7 @@ class ImuSettings(Section):
     """The phone's stream."""
 
     format: Literal["hyperimu", "lines", "sensorlog", "json", "sensorlogger"] = key(
-        "app of the phone; sensorlog: lines under a header, json: an object a line"
+        "app of the phone; sensorlog: lines below a header; json: one object per line"
     )
     transport: Literal["listen", "connect", "udp"] = key(
         "listen: the phone connects to this computer; udp: it sends datagrams here",
@@ -71,23 +71,23 @@ class ImuSettings(Section):
     port: int = key("TCP port; 0: any free one", ..., 0, 65535)
     # HyperIMU sends azimuth, pitch, roll, which turn about Z, X, Y; the order is ZYX.
     columns: tuple[Column, Column, Column] = key(
-        "of the three angles, in the sequence of order",
+        "columns of the three angles, in the sequence of order",
         "[0, 1, 2]; hyperimu: [1, 3, 2]",
         by=_by_format((1, 3, 2), (0, 1, 2)),
     )
     quaternion_columns: tuple[Column, Column, Column, Column] | None = key(
-        "of x, y, z, w, in place of angles", None
+        "columns of x, y, z, w, instead of angles", None
     )
     stamp_column: int = advanced(
-        "of the phone's clock; -1: none", "-1; hyperimu: 0", -1, 200,
+        "column of the phone's clock; -1: none", "-1; hyperimu: 0", -1, 200,
         by=_by_format(0, -1),
     )  # fmt: skip
     stamp_unit: Literal["s", "ms", "us", "ns"] | None = advanced(
-        "of the phone's clock; absent: told by the first stamp, else ms (json: ns)",
+        "unit of the phone's clock; absent: from the first stamp, else ms (json: ns)",
         None,
     )
     column_count: int = advanced(
-        "a line of another width is refused; 0: as the first line", 0, 0, 200
+        "lines of another width are refused; 0: width of the first line", 0, 0, 200
     )
     separator: str = advanced("between columns", ",")
     unit: Literal["deg", "rad"] = key("of the angles", "deg")
@@ -98,7 +98,7 @@ class ImuSettings(Section):
         ),
     )  # fmt: skip
     signs: tuple[Sign, Sign, Sign] = key(
-        "of the angles, in the sequence of order",
+        "signs of the angles, in the sequence of order",
         "[1, 1, 1]; hyperimu: [-1, -1, -1]",
         by=_by_format((-1, -1, -1), (1, 1, 1)),
     )
@@ -109,11 +109,11 @@ class ImuSettings(Section):
         "addresses that may send; none: the first phone that does", ()
     )
     heading: Literal["relative", "absolute"] = advanced(
-        "absolute: the phone comes back to the same heading whenever it is started",
+        "absolute: the phone has the same heading after every start",
         "relative",
     )
-    stale_s: float = key("older than this while moving: stop", 0.4, 0.02, 10)
-    max_jump_deg: float = advanced("between two readings", 20.0, 0.1, 180)
+    stale_s: float = key("oldest reading allowed while moving", 0.4, 0.02, 10)
+    max_jump_deg: float = advanced("largest change between readings", 20.0, 0.1, 180)
 
     @property
     def by_quaternion(self) -> bool:
@@ -124,7 +124,7 @@ class ImuSettings(Section):
     def fields(self, stamp_unit: str = "") -> str:
         """What the fields of a record are taken for, in words; ``stamp_unit`` of its
         time, where that is known."""
-        stamp_unit = stamp_unit or self.stamp_unit or "a unit that the first one tells"
+        stamp_unit = stamp_unit or self.stamp_unit or "the unit of the first stamp"
         time_in = f"the time in {stamp_unit}"
         if self.format in ("json", "sensorlogger"):
             return f"the quaternion x, y, z, w of an orientation; {time_in}"
@@ -157,10 +157,10 @@ class ImuSettings(Section):
         if self.column_count and max(named) >= self.column_count:
             yield f"column_count: {self.column_count} is too few for the columns named"
         if self.order is None:
-            yield "order: missing; a line stream does not say the order of its angles"
+            yield "order: missing; a line stream does not state the order of its angles"
         if len(self.separator) != 1 or self.separator in "0123456789+-.eE\r\n":
             got = repr(self.separator)
-            yield f"separator: must be one character that no number has, got {got}"
+            yield f"separator: must be one character that is in no number, got {got}"
 
 
 class ReadingRegister(Read):
@@ -175,33 +175,33 @@ class ReadingsSettings(Section):
     """Numbers that a sensor sends, in place of a phone."""
 
     names: tuple[str, ...] = key(
-        "of what is measured, 1 to 12; one that is an axis's rises with it",
+        "of the readings, 1 to 12; a reading named like an axis rises with it",
         min_length=1,
     )
     unit: str = key("of all of them", "mm", min_length=1)
     transport: Literal["tcp", "listen", "udp", "serial", "modbus"] = key(
-        "tcp: lines of a sensor at host and port; listen: it connects here; udp: it "
-        "sends datagrams here; serial: lines on a serial port; modbus: registers"
+        "tcp: lines of a sensor at host and port; listen: the sensor connects here; "
+        "udp: it sends datagrams; serial: lines on a serial port; modbus: registers"
     )
-    host: str = key("tcp, modbus: the sensor's; else this computer's", "127.0.0.1")
+    host: str = key("tcp, modbus: of the sensor; else of this computer", "127.0.0.1")
     port: int = key("TCP or UDP port at host", 502, 0, 65535)
-    device: str = key("serial port, of serial, or of Modbus RTU", "")
+    device: str = key("serial port, for serial or Modbus RTU", "")
     baudrate: int = key("of a serial port", 115200, 1200, 3_000_000)
     parity: Literal["N", "E", "O"] = key("of a serial port", "N")
     stopbits: int = key("of a serial port", 1, 1, 2)
     bytesize: int = key("of a serial port", 8, 7, 8)
-    registers: tuple[ReadingRegister, ...] = key("of modbus, one for each name", ())
+    registers: tuple[ReadingRegister, ...] = key("modbus: one per name", ())
     columns: tuple[Column, ...] = key("of the numbers in a line", (), max_length=12)
     separator: str = key("between columns", ",", min_length=1, max_length=1)
-    factors: tuple[float, ...] = key("unit for each count that is sent", ())
-    request: str = advanced("sent before each line, where the sensor waits for one", "")
-    period_s: float = advanced("between two polls of registers", 0.02, 0.001, 1)
+    factors: tuple[float, ...] = key("units per count that is sent", ())
+    request: str = advanced("sent before each line, if the sensor needs it", "")
+    period_s: float = advanced("time between two polls of registers", 0.02, 0.001, 1)
     scale: float = key(
-        "change that is surely seen, and is sure to do no harm: nine times this is as "
-        "far as the readings may go while nothing is proved", ..., 1e-9, 1e9,
+        "change that is certainly visible and harmless. Until everything is proved, "
+        "readings may change by at most nine times this", ..., 1e-9, 1e9,
     )  # fmt: skip
-    most_jump: float = advanced("between two readings", 1e9, 1e-9, 1e12)
-    stale_s: float = key("older than this while moving: stop", 0.4, 0.02, 10)
+    most_jump: float = advanced("largest change between two readings", 1e9, 1e-9, 1e12)
+    stale_s: float = key("oldest reading allowed while moving", 0.4, 0.02, 10)
 
     def broken_rules(self) -> Iterator[str]:
         if len(set(self.names)) < len(self.names):
@@ -220,26 +220,26 @@ class ReadingsSettings(Section):
             yield "device: missing; transport 'serial' needs one"
         if self.separator in "0123456789+-.eE\r\n":
             got = repr(self.separator)
-            yield f"separator: must be a character that no number has, got {got}"
+            yield f"separator: must be a character that is in no number, got {got}"
 
 
 class ModelSettings(Section):
     """What the device does with a command, where that is not ``y = A u + b``."""
 
-    urdf: str = key("an arm: its URDF file, whose joints are the axes", "")
-    base: str = advanced("of urdf: link that is still; absent: the root", "")
+    urdf: str = key("for an arm: its URDF file, whose joints are the axes", "")
+    base: str = advanced("of urdf: the fixed link; absent: the root", "")
     tip: str = key("of urdf: link that carries phone or sensor; absent: the last", "")
     sensor: Literal["gravity", "position"] = key(
-        "of urdf: what is measured there: where up is, of a phone or an accelerometer "
-        "at rest, or the place, in the file's metres",
+        "of urdf: what is measured at that link: gravity (the direction of up, by a "
+        "phone or an accelerometer at rest), or the position in the file's metres",
         "gravity",
     )
     magnitude: float = advanced(
-        "of gravity, in the unit of [readings]", 9.81, 1e-6, 1e6
+        "magnitude of gravity in the unit of [readings]", 9.81, 1e-6, 1e6
     )
     factory: str = key(
-        "FILE.py:NAME or MODULE:NAME of a model of jaxcal.models, or of a function "
-        "that returns one",
+        "FILE.py:NAME or MODULE:NAME of a jaxcal model, or of a function that "
+        "returns one",
         "",
     )
 
@@ -251,7 +251,7 @@ class ModelSettings(Section):
 
     def broken_rules(self) -> Iterator[str]:
         if bool(self.urdf) == bool(self.factory):
-            yield "urdf: either urdf or factory is required, and not both"
+            yield "urdf: give either urdf or factory, not both"
         elif self.factory and not all(self.factory.rpartition(":")[::2]):
             yield f"factory: must be FILE.py:NAME or MODULE:NAME, got {self.factory!r}"
 
@@ -266,35 +266,35 @@ class MotionSettings(Section):
     """How the device is moved."""
 
     max_speed_deg_s: float = key(
-        "ceiling of speed_deg_s of the axes; raise it only with a reason",
+        "limit of speed_deg_s of all axes; raise it only with a reason",
         120.0, 1e-3, 5000,
     )  # fmt: skip
     max_step_deg: float = key("longer moves are split", 15.0, 0.1, 360)
     approach_overshoot_deg: float = key(
-        "> 0: come to every posture from below; play becomes pure bias", 0.0, 0, 20
+        "> 0: approach every posture from below, against backlash", 0.0, 0, 20
     )
     position_tolerance_deg: float = advanced(
-        "a drive this close is on its target", 0.05, 1e-4, 5
+        "a drive this close to its target has reached it", 0.05, 1e-4, 5
     )
-    poll_s: float = advanced("between two looks at drives and IMU", 0.05, 0.001, 0.1)
+    poll_s: float = advanced("between two polls of drives and IMU", 0.05, 0.001, 0.1)
     stall_s: float = advanced(
-        "standing so long off its target is a fault", 1.0, 0.05, 30
+        "a drive that stands still off its target this long has a fault", 1.0, 0.05, 30
     )
     envelope_margin_deg: float = advanced(
-        "the IMU may read past limits by", 15.0, 0.1, 90
+        "how far the IMU may read beyond the limits", 15.0, 0.1, 90
     )
-    mirror_limits: bool = advanced("write the soft limits to the drives too", False)
+    mirror_limits: bool = advanced("also write the soft limits to the drives", False)
 
 
 class SettleSettings(Section):
     """When a posture counts as settled, and how long it is measured."""
 
-    window_s: float = key("time over which the IMU must be quiet", 0.5, 0.01, 60)
-    min_samples: int = advanced("readings in the window, at least", 10, 3, 10_000)
-    std_deg: float = key("largest deviation over the window", 0.1, 1e-6, 10)
+    window_s: float = key("time for which the IMU must be quiet", 0.5, 0.01, 60)
+    min_samples: int = advanced("least number of readings in the window", 10, 3, 10_000)
+    std_deg: float = key("largest standard deviation over the window", 0.1, 1e-6, 10)
     slope_deg_s: float = key("largest slope over the window", 0.2, 1e-6, 100)
     timeout_s: float = advanced("to settle", 10.0, 0.05, 600)
-    samples: int = key("readings averaged for one measurement", 25, 1, 10_000)
+    samples: int = key("readings averaged per measurement", 25, 1, 10_000)
 
     def broken_rules(self) -> Iterator[str]:
         if self.timeout_s <= self.window_s:
@@ -306,26 +306,26 @@ class SessionSettings(Section):
 
     candidates: int = key("M, postures drawn", 50, 5, 100_000)
     k: int | None = key(
-        "K, postures chosen; absent: one more than axes, which leaves no residual",
+        "K, postures to choose; absent: axes plus one, which leaves no residual",
         None, 2, 10_000,
     )  # fmt: skip
     method: (
         Literal["policy", "auto", "exact", "exchange", "greedy", "random"] | None
-    ) = key("how they are chosen; absent: policy for three axes, auto for others", None)
-    min_efficiency: float = advanced("under this D-efficiency exact is used", 0.9, 0, 1)
-    seed: int = advanced("of the candidates drawn", 0, 0, 2**31 - 1)
+    ) = key("method of selection; absent: policy for three axes, auto for others", None)
+    min_efficiency: float = advanced("below this D-efficiency exact is used", 0.9, 0, 1)
+    seed: int = advanced("seed of the candidates", 0, 0, 2**31 - 1)
     pitch_range_deg: Range | None = key("range_deg of the axis pitch", None)
     yaw_range_deg: Range | None = key("range_deg of the axis yaw", None)
     roll_range_deg: Range | None = key("range_deg of the axis roll", None)
-    verify_postures: int = key("held out; each before and after", 4, 0, 1000)
-    verify_limit_deg: float = key("largest good error once compensated", 0.5, 1e-3, 45)
+    verify_postures: int = key("held out, measured before and after", 4, 0, 1000)
+    verify_limit_deg: float = key("largest good error, compensated", 0.5, 1e-3, 45)
     drift_limit_deg: float = key(
-        "of the zero in a session, of what is not linear", 0.2, 1e-3, 45
+        "largest nonlinear drift of the zero in a session", 0.2, 1e-3, 45
     )
     reference_tolerance_deg: float = advanced(
-        "the zero posture may be found so far from where it was", 0.5, 1e-3, 45
+        "largest distance of the zero posture from its earlier place", 0.5, 1e-3, 45
     )
-    max_unreachable: int = advanced("postures out of reach until a fault", 3, 0, 1000)
+    max_unreachable: int = advanced("unreachable postures until a fault", 3, 0, 1000)
     zero: Literal["here", "drive"] = key(
-        "here: the device stands in its zero posture; drive: go to pulse 0", "here"
+        "here: the device is in its zero posture; drive: move to pulse 0", "here"
     )

@@ -169,19 +169,19 @@ class Heartbeat(threading.Thread):
                 text = f"this computer slept for {slept_s:.0f} s"
                 if self._moving:
                     self._stopper.stop(
-                        f"{text} while the device moved, unseen. Switch its power "
+                        f"{text} while the device moved unobserved. Switch its power "
                         "saving off"
                     )
                     return
                 self._stopper.tell(text)
             if not self._stopper.reason and (late := self._requests.overdue(OVERDUE_S)):
-                self._stopper.stop(f"{late}, which the session did not answer")
+                self._stopper.stop(f"{late}, and the session did not answer")
                 return
             if self._moving and silence > self._silence_s:
                 self._stopper.stop(
                     f"this program paused for {silence:.2f} s while the device moved "
-                    f"(limit {self._silence_s:.2f}). Look for a computer that is "
-                    "overloaded or waits for its disk"
+                    f"(limit {self._silence_s:.2f} s). Is the computer overloaded or "
+                    "waiting for its disk?"
                 )
                 return
             if not self._moving and silence > self._keep_alive_s:
@@ -228,8 +228,8 @@ class LineWatch:
                     raise
                 raise MotionFault(
                     f"{name}: its communication timeout cannot be read, so it could "
-                    f"not be put back: {error}. Correct [comm_timeout] of the map "
-                    f"{drive.axis.map.name}, or leave it out"
+                    f"not be restored later: {error}. Correct [comm_timeout] of the "
+                    f"map {drive.axis.map.name}, or leave it out"
                 ) from None
             counts = drive.watch_counts(self._timeouts_s[name])
             taken = self._left.get(name)
@@ -357,7 +357,7 @@ class Device:
         if status.fault:
             raise MotionFault(
                 f"{axis.name} is in alarm: {drive.alarm() or 'no code given'}. Find "
-                "its cause in the drive's manual, then start with --reset-alarms"
+                "the cause in the drive's manual, then start with --reset-alarms"
             )
         if status.moving:
             raise MotionFault(
@@ -366,13 +366,13 @@ class Device:
             )
         if not (status.enabled or drive.bring(drive.arm, lambda s: s.enabled).enabled):
             raise MotionFault(
-                f"{axis.name} does not enable its power stage. Check its supply and "
+                f"{axis.name} does not enable its power stage. Check its supply, and "
                 "its enable and STO inputs"
             )
         slack = axis.pulses_within(self.config.motion.position_tolerance_deg)
         if not axis.min_pulses - slack <= status.position <= axis.max_pulses + slack:
             raise MotionFault(
-                f"{axis.name} stands at {status.position} pulses, outside its limits "
+                f"{axis.name} is at {status.position} pulses, outside its limits "
                 f"{axis.min_pulses}..{axis.max_pulses}. Run `jaxcal-rig setup home`"
             )
 
@@ -386,15 +386,15 @@ class Device:
         for drive, at, was in zip(self.drives, here, self.rest or here, strict=True):
             if abs(at - was) > drive.axis.pulses_within(tolerance):
                 raise MotionFault(
-                    f"{drive.axis.name} stands at {drive.axis.to_deg(at):.3f} "
-                    f"{drive.axis.unit_name} and was left at "
+                    f"{drive.axis.name} is at {drive.axis.to_deg(at):.3f} "
+                    f"{drive.axis.unit_name}, but was left at "
                     f"{drive.axis.to_deg(was):.3f}: something else moved it"
                 )
         for drive, held in zip(self.drives, self.targets, strict=bool(self.targets)):
             if held is not None and drive.held() not in (None, held):
                 raise MotionFault(
-                    f"the target of {drive.axis.name} was written since it arrived: "
-                    "another controller moved or stopped the drives"
+                    f"the target of {drive.axis.name} was overwritten after it "
+                    "arrived: another controller moved or stopped the drives"
                 )
 
     def untrack(self) -> None:
@@ -452,7 +452,7 @@ class Device:
                 break
             except ReadingError as error:
                 if time.monotonic() - begun > PATIENCE_S:
-                    text = f"{error}. The device stood meanwhile"
+                    text = f"{error}. The device did not move meanwhile"
                     raise PauseRequested(text) from None
             self.guard()
             if any(status.moving for status in self.statuses()):
@@ -461,7 +461,7 @@ class Device:
         if (waited_s := time.monotonic() - begun) > LOOK_S:
             self.paused_s += waited_s
             text = f"{self.imu.whose}'s stream paused for {waited_s:.1f} s more"
-            self.emit("note", text=f"{text}; the device stood meanwhile")
+            self.emit("note", text=f"{text}; the device did not move meanwhile")
         return reading
 
     def moved(self, change: Array, middle: Array) -> Array | None:

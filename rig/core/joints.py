@@ -82,20 +82,19 @@ def _compare(device: Device, j: int, turn: Array, then: Array, noise: float) -> 
     fault = ""
     if not RATIO[0] <= share <= RATIO[1]:
         fault = (
-            f"{axis.name} {geometry.changed} {size:.3g} {geometry.unit} for a {one} "
-            f"commanded, "
-            f"and by {before:.3g} when `axes` looked: its drive, its setting or its "
-            "gearbox was exchanged, or the coupling slips"
+            f"{axis.name} {geometry.changed} {size:.3g} {geometry.unit} per commanded "
+            f"{one}; `axes` measured {before:.3g}. Its drive, setting or gearbox was "
+            "exchanged, or the coupling slips"
         )
     elif aside > ASIDE_DEG + np.degrees(SURE_SIGMA * noise / before):
         fault = (
-            f"{axis.name} turned the phone about an axis {aside:.1f} deg from where "
-            "`axes` saw it: the phone or its holder was turned since"
+            f"{axis.name} turned the phone about an axis {aside:.1f} deg from the one "
+            "that `axes` measured: the phone or its holder was turned since"
         )
         if device.config.imu is None:
             fault = (
                 f"{axis.name} changed the readings in a direction {aside:.1f} deg from "
-                "that which `axes` saw: the sensor was moved since"
+                "the one that `axes` measured: the sensor was moved since"
             )
     if fault:
         device.record.void(SIGN_CHECKED, fault)

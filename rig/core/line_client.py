@@ -30,7 +30,7 @@ END_S = 2.0  # for the process to end
 GRACE_S = 0.1  # for one whose channels are closed to be gone
 # Errors that the line's process reports and this side raises again, by name.
 KINDS = {kind.__name__: kind for kind in (LimitError, NotImplementedError, ValueError)}
-GONE = "Look who ended it. Its drives are stopped by the session"
+GONE = "Find out who ended it. The session stops its drives"
 
 
 class LineClient(Line):
@@ -76,9 +76,9 @@ class LineClient(Line):
             self._channels[0].send(self._config.told)
             refused = self._channels[0].receive(NORMAL_S)["refused"]
         except (OSError, EOFError) as error:
-            self._lose(f"did not begin: {error!r}")
+            self._lose(f"did not start: {error!r}")
         if refused:
-            raise Refused(f"the process of the line does not begin: {refused}")
+            raise Refused(f"the process of the line did not start: {refused}")
 
     def close(self) -> None:
         """End the process, after what the drives were told."""

@@ -46,7 +46,7 @@ ARMS = ("arm", "move", "home")  # from here on drives are stopped when the sessi
 OF_LINE = ("open", "close", "doubts", "stop_at_once")
 TIMEOUTS = 4  # of the line, in one exchange at most: it may connect, and is emptied
 GONE = "the session has ended"
-WHY = "Look for who ended or suspended the session, or a computer that is overloaded"
+WHY = "Find out who ended or suspended the session. Is the computer overloaded?"
 IGNORED = (
     signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP, signal.SIGTTOU,
 )  # fmt: skip
@@ -129,7 +129,7 @@ class Owner:
     def _check(self) -> None:
         """Before each exchange of the session that is not of a stop."""
         if self.reason or self._here.request["epoch"] < self._epoch:
-            raise BusError(self.reason or "a stop was asked for meanwhile", WHY)
+            raise BusError(self.reason or "a stop was requested meanwhile", WHY)
         self._fed += 1
         if time.monotonic() > self._here.tell:
             self._here.tell = time.monotonic() + BUSY_S
@@ -180,10 +180,10 @@ class Owner:
         pulses = count - drive.origin
         if not here.min_pulses <= pulses <= here.max_pulses:
             within = f"{here.min_pulses}..{here.max_pulses}"
-            raise LimitError(f"{here.name}: {pulses} pulses leave the limits {within}")
+            raise LimitError(f"{here.name}: {pulses} pulses are outside {within}")
         for what, asked, most in (("s", speed, fastest), ("s^2", accel, hardest)):
             if not 0 < asked <= most * (1 + ROUNDING):
-                text = f"{asked:g} pulses/{what} are not within {most:g}"
+                text = f"{asked:g} pulses/{what} are outside {most:g}"
                 raise LimitError(f"{here.name}: {text}")
 
     def _look(self, axis: int) -> bool:

@@ -116,12 +116,12 @@ def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
     if first < 0:
         span = newest - readings[0].time if readings else 0.0
         return (
-            f"{len(readings)} readings over {span:.2f} s (wanted: settle.min_samples = "
-            f"{settle.min_samples} over {settle.window_s:g} s). {hint}"
+            f"{len(readings)} readings in {span:.2f} s (needed: settle.min_samples = "
+            f"{settle.min_samples} in {settle.window_s:g} s). {hint}"
         )
     readings = readings[first:]
     if now - readings[-1].time > device.imu.stale_s:
-        return f"{device.imu.whose}'s readings are stale. {hint}"
+        return f"{device.imu.whose}'s readings are too old. {hint}"
     names, told = device.config.output_names, device.config.output_unit
     angles = _frame(device, readings).angles([reading.value for reading in readings])
     times = np.array([reading.time for reading in readings])
@@ -135,9 +135,9 @@ def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
         if values[worst] > limit:
             return (
                 f"{names[worst]} reads {values[worst]:.3f} {unit} (settle.{what} = "
-                f"{limit:g}). Either something still shakes, or the limit is below "
-                f"{device.imu.whose}'s noise: `jaxcal-rig check imu` shows that; raise "
-                "the key above it"
+                f"{limit:g}). Either something still vibrates, or the limit is below "
+                f"{device.imu.whose}'s noise. `jaxcal-rig check imu` shows the noise; "
+                "set the limit above it"
             )
     return ""
 
@@ -160,8 +160,8 @@ def _collect(device: Device, wanted: int) -> list[Reading]:
             polled = now
             if any(status.moving for status in device.statuses()):
                 raise MotionFault(
-                    "a drive moves while the posture is measured. Stop the other "
-                    "controller"
+                    "a drive moves during the measurement of the posture. Stop the "
+                    "other controller"
                 )
         time.sleep(0.002)
 
@@ -172,9 +172,9 @@ def _check_position(device: Device, target: Pulses, feedback: list[int]) -> None
     for axis, goal, here in zip(device.config.axes, target, feedback, strict=True):
         if abs(goal - here) > axis.pulses_within(tolerance):
             raise MotionFault(
-                f"{axis.name} left its target while settling: {here} pulses "
-                f"instead of {goal}. Check holding torque and load, and that no "
-                "other controller moves it"
+                f"{axis.name} left its target while settling: it is at {here} pulses "
+                f"instead of {goal}. Check holding torque and load, and that no other "
+                "controller moves it"
             )
 
 
@@ -186,8 +186,8 @@ def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
     if (np.abs(apart) > DISAGREEMENT_DEG).any():
         worst = int(np.argmax(np.abs(apart)))
         raise MotionFault(
-            f"the IMU reads {names[worst]} {abs(apart[worst]):.1f} deg away from "
-            f"the command (limit {DISAGREEMENT_DEG:g}). Check the zero posture, then "
+            f"the IMU reads {names[worst]} {abs(apart[worst]):.1f} deg away from the "
+            f"command (limit {DISAGREEMENT_DEG:g} deg). Check the zero posture, then "
             "run `jaxcal-rig setup axes`"
         )
     way = commanded - last.commanded
@@ -206,7 +206,7 @@ def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
                 hint = f"axes.{name}.direction, its wiring, and "
                 hint += "imu.signs" if imu else "readings.factors"
             raise NotFollowing(
-                f"the drive of {name} {went} {asked[index]:.1f} {axis.unit_name}, "
+                f"the drive of {name} {went} {asked[index]:.1f} {axis.unit_name}, but "
                 f"the {'IMU' if imu else 'sensor'} saw {followed[index]:.2f}. Look for "
                 f"{hint}"
             )
@@ -225,8 +225,8 @@ def _check_predicted(device: Device, commanded: Array, measured: Array) -> None:
     off = float(np.linalg.norm(measured - device.seen.measured - expected))
     if off > FOLLOW_MODEL * largest + FOLLOW_MIN_DEG * device.geometry.scale:
         raise NotFollowing(
-            f"what is measured changed by {off:.3g} {device.config.output_unit} "
-            "otherwise than the model says; most that one axis changes it is "
-            f"{largest:.3g}. Look for a slipped coupling, a frozen stream, axes mixed "
-            "up, or a [model] of another device"
+            f"the readings differ from the model's prediction by {off:.3g} "
+            f"{device.config.output_unit}; one axis changes them by at most "
+            f"{largest:.3g}. Look for a slipped coupling, a frozen stream, exchanged "
+            "axes, or a [model] of another device"
         )

@@ -192,8 +192,8 @@ def _watch(
             return
         if time.monotonic() > begun + most_s:
             raise MotionFault(
-                f"{', '.join(late)} does not follow: the move took longer than its "
-                f"deadline, {most_s:.2f} s. Check the drives' speed and load"
+                f"{', '.join(late)} does not follow: the move took longer than "
+                f"{most_s:.2f} s. Check the drives' speed and load"
             )
         _check_attitude(device, connection)
         time.sleep(motion.poll_s)
@@ -219,9 +219,9 @@ def _require_on_way(axis: Axis, start: int, goal: int, status: Status) -> None:
     low, high = min(begin, end) - FOLLOWING_DEG, max(begin, end) + FOLLOWING_DEG
     if not low <= angle <= high:
         raise MotionFault(
-            f"{axis.name} is at {angle:.3f} {axis.unit_name} on its way from "
-            f"{begin:.3f} to {end:.3f}, more than {FOLLOWING_DEG:g} off it. "
-            "Check gearing and direction, and that no other controller moves it"
+            f"{axis.name} is at {angle:.3f} {axis.unit_name} while moving from "
+            f"{begin:.3f} to {end:.3f}, more than {FOLLOWING_DEG:g} off. Check "
+            "gearing and direction, and that no other controller moves it"
         )
 
 
@@ -233,17 +233,17 @@ def _stalled(
     short_by = abs(end - angle)
     if status.done and not status.moving and moved:
         return EndedShort(
-            f"{axis.name} ended {short_by:.3f} {axis.unit_name} short of its target, "
-            f"at {angle:.3f}, and its drive says that it is done. Look who stopped it: "
-            "another controller, an emergency stop that was released, a limit of the "
-            "drive itself",
+            f"{axis.name} stopped {short_by:.3f} {axis.unit_name} short of its "
+            f"target, at {angle:.3f}, and its drive reports the move as done. Find "
+            "out what stopped it: another controller, an emergency stop that was "
+            "released, or a limit of the drive",
             axis.name, status.position,
         )  # fmt: skip
     return MotionFault(
-        f"{axis.name} does not follow: it stands {short_by:.3f} {axis.unit_name} from "
-        f"its target for {stood_s:.2f} s (limit motion.stall_s = {stall_s:g}). Look "
-        "for an obstacle, a loose coupling, a drive that is not enabled, or whoever "
-        "stopped it"
+        f"{axis.name} does not follow: it has been {short_by:.3f} {axis.unit_name} "
+        f"from its target for {stood_s:.2f} s (limit motion.stall_s = {stall_s:g}). "
+        "Look for an obstacle, a loose coupling, a drive that is not enabled, or "
+        "something that stopped it"
     )
 
 
@@ -267,10 +267,10 @@ def _check_speed(device: Device, axis: Axis, seen: list[Status]) -> None:
     slowest = min(LEAST_TURNS_S / axis.turns_per_deg, LEAST_DEG_S)
     if speed > max(TOO_FAST * asked, slowest) and not device.simulated:
         raise MotionFault(
-            f"{axis.name} moves at {speed:.3g} {axis.unit_name}/s or faster, and was "
-            f"told to move at {asked:.3g}: the drive does not take its speed. Check "
-            "`units` and "
-            f"`move` of the map {axis.map.name}, pulses_per_rev and reduction"
+            f"{axis.name} moves at {speed:.3g} {axis.unit_name}/s or faster instead "
+            f"of the commanded {asked:.3g}: the drive does not accept its speed. "
+            f"Check `units` and `move` of the map {axis.map.name}, pulses_per_rev and "
+            "reduction"
         )
 
 
@@ -288,7 +288,7 @@ def _check_attitude(device: Device, connection: int) -> None:
         low, high = axis.min_deg - margin, axis.max_deg + margin
         if not low <= angle <= high:
             raise MotionFault(
-                f"the IMU reads {axis.name} at {angle:.2f} deg, outside its "
-                f"envelope {low:.1f}..{high:.1f}. Check the zero posture and that the "
-                "phone is fixed, then run `jaxcal-rig setup axes`"
+                f"the IMU reads {axis.name} at {angle:.2f} deg, outside the allowed "
+                f"{low:.1f}..{high:.1f}. Check the zero posture and that the phone is "
+                "fixed, then run `jaxcal-rig setup axes`"
             )

@@ -46,11 +46,11 @@ MARGIN_DEG = 1.0
 SAME = 4 / 3, 0.3  # factor and margin of one axis alone, where `axes` saw its turn
 SEEN_SHARE = 0.1  # of a checked axis's move must be seen, or the moves do not grow
 BLIND = (
-    "Nothing was seen of it: look for a loose coupling, a stream that does not "
-    "change, or a reduction that is far too small"
+    "No motion was measured. Look for a loose coupling, a stream that does not change, "
+    "or a reduction that is far too small"
 )
 NO_UNIT = (
-    "No angle of the phone is over 6.3, so imu.unit, radians or degrees, is not "
+    "No angle of the phone exceeds 6.3, so imu.unit (radians or degrees) is not "
     "proved: turn the base, or the phone's heading, by some degrees"
 )
 STEP_DEG = 0.5  # of a derivative of a model
@@ -181,8 +181,8 @@ class Reach:
             return most - gone
         raise MotionFault(
             f"the motor of {axis.name} (unit {axis.unit}) was turned by "
-            f"{gone / axis.motor_pulses(1.0):.3g} deg, and may go no further unseen. "
-            f"{BLIND if self.factor == 1 else NO_UNIT}"
+            f"{gone / axis.motor_pulses(1.0):.3g} deg and may not turn further without "
+            f"a measured motion. {BLIND if self.factor == 1 else NO_UNIT}"
         )
 
     def paced(self, pulses: float) -> Axis:
@@ -337,9 +337,9 @@ class Proof:
             geometry = self._geometry
             raise TurnedTooFar(
                 f"{reach.axis.name} {geometry.changed} {turned_deg:.2f} "
-                f"{geometry.unit} in a move that {geometry.again} {expected:.2f} when "
-                "`axes` looked: its drive, its setting or its gearbox was exchanged. "
-                "Correct it, then run `jaxcal-rig setup axes`"
+                f"{geometry.unit} in a move for which `axes` measured {geometry.again} "
+                f"{expected:.2f}: its drive, setting or gearbox was exchanged. Correct "
+                "it, then run `jaxcal-rig setup axes`"
             )
 
 

@@ -44,8 +44,8 @@ def check_drives(
         if told is not None and told != axis.pulses_per_rev:
             raise Refused(
                 f"the drive of {axis.name} (unit {axis.unit}) is set to {told} pulses "
-                f"per turn, axes.{axis.name}.pulses_per_rev says {axis.pulses_per_rev}."
-                " Correct the one that is wrong; nothing was moved"
+                f"per turn, but axes.{axis.name}.pulses_per_rev is "
+                f"{axis.pulses_per_rev}. Correct the wrong one; nothing was moved"
             )
     for state, fault in ((IDENTIFIED, _exchanged), (HOMED, _displaced)):
         axes: dict[str, list[str]] = {}  # by what is wrong with them
@@ -81,23 +81,23 @@ def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
         return f"in alarm: {drive.alarm() or 'no code given'}"
     if axis.name in homed:
         if not drive.says_homed:
-            return "the homed bit is gone, so the drive was without power"
+            return "the homed bit is cleared, so the drive was without power"
     elif left_at is None:
         return (
-            "the last session ended without reading where it stands, and the drive "
-            "does not say that it kept its power"
+            "the last session ended without reading its position, and the drive does "
+            "not report that it kept its power"
         )
     origins = (record.state(HOMED) or {}).get("origins", {})
     if drive.origin != origins.get(axis.name, drive.origin):
         return (
-            f"its origin is {drive.origin} and was {origins[axis.name]} when it was "
+            f"its origin is {drive.origin}, but was {origins[axis.name]} when it was "
             "homed, so the drive was without power"
         )
     tolerance = axis.pulses_within(config.motion.position_tolerance_deg)
     if left_at is None or abs(status.position - left_at) <= tolerance:
         return ""
     return (
-        f"it stands at {status.position} pulses, "
+        f"it is at {status.position} pulses, "
         f"{abs(axis.to_deg(status.position - left_at)):.2f} deg from {left_at}, where "
         "it was left: the drive was without power, or another controller moved it"
     )
@@ -147,9 +147,9 @@ class ZeroRecord(NamedTuple):
         if np.abs(off).max() > config.session.reference_tolerance_deg:
             told = axes_text(config.axis_names, config.axis_unit, off)
             raise MotionFault(
-                "in its zero posture the device counts other pulses than for "
-                f"{self.whose}: {told}. Either this is not the zero "
-                "posture, or the drives have lost their origin: home them"
+                f"in its zero posture the device counts other pulses than {self.whose} "
+                f"recorded: {told}. Either this is not the zero posture, or the drives "
+                "have lost their origin: home them"
             )
         return check_zero(config, self.attitude, attitude, self.whose)
 
@@ -181,16 +181,15 @@ def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:
     limit = config.session.reference_tolerance_deg
     angle, joints = moved(config, then, now)
     blind, unit = geometry_of(config).unseen(then), config.output_unit
-    but = f"; not seen: {', '.join(blind)}, about the vertical" * bool(blind)
+    but = f"; not measurable: {', '.join(blind)}, about the vertical" * bool(blind)
     if angle <= limit:
-        return f"zero posture stands {angle:.3f} {unit} from that of {whose}{but}"
+        return f"zero posture is {angle:.3f} {unit} from that of {whose}{but}"
     told = axes_text(config.output_names, unit, joints)
     raise MotionFault(
-        f"the zero posture is not that of {whose}: "
-        f"{told} (limit "
-        f"session.reference_tolerance_deg = {limit:g}){but}. Drives that were without "
-        "power have lost their origin: home them. Where phone, sensor or base were "
-        "moved, calibrate again"
+        f"the zero posture is not that of {whose}: {told} (limit "
+        f"session.reference_tolerance_deg = {limit:g}){but}. If drives were without "
+        "power, they have lost their origin: home them. If the phone, sensor or base "
+        "was moved, calibrate again"
     )
 
 
@@ -199,4 +198,4 @@ def axes_text(names: Sequence[str], unit: str, values: Sequence[float] | Array) 
     least = TOLD_SHARE * np.abs(values).max()
     pairs = zip(names, values, strict=True)
     told = [f"{name} {value:+.2f}" for name, value in pairs if abs(value) >= least]
-    return f"{', '.join(told)} {unit} from where it stood"
+    return f"{', '.join(told)} {unit} from its place before"

@@ -359,7 +359,7 @@ def _leave_out(device: Device, name: str, reason: str) -> None:
     if not all(r.standing for r in results) or not all(
         r.standing for r in device.stopper.stay()
     ):
-        raise MotionFault(f"{reason}, and not all drives stand")
+        raise MotionFault(f"{reason}, and not all drives are at rest")
     device.untrack()
     device.emit("unreachable", sync=True, name=name, reason=reason)
     _check_lost(device)
@@ -373,5 +373,5 @@ def _check_lost(device: Device) -> None:
         raise MotionFault(
             f"{len(lost)} postures are out of reach, more than session.max_unreachable "
             f"({most}). Narrow session.*_range_deg to what the device reaches, and "
-            "begin a new run"
+            "start a new run"
         )

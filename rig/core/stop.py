@@ -112,7 +112,7 @@ def _verify(pairs: Pairs) -> None:
             before[result.unit] = result.position = status.position
             if result.standing and result.acknowledged:
                 gone = time.monotonic() - begun
-                late = f"it went on for {gone:.1f} s" * (gone > WENT_ON_S)
+                late = f"it moved on for {gone:.1f} s" * (gone > WENT_ON_S)
                 result.detail = "alarm" if status.fault else late
         if time.monotonic() > end:
             return
@@ -140,7 +140,7 @@ def stay(drives: list[Drive], results: list[UnitStop], seconds: float) -> list[s
             for result in stood:
                 result.stayed = True
             break
-        words += [f"{result.axis} went on by itself after its stop" for result in again]
+        words += [f"{result.axis} moved on after its stop" for result in again]
         for new, result in zip(stop_all(drives), results, strict=True):
             vars(result).update(vars(new))
     return words

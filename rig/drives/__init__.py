@@ -80,7 +80,7 @@ def make_drives(
             kinds[axis.map.drive] = kind_of(axis.map)
     lines = {kind.line_type for kind in kinds.values()}
     if len(lines) > 1:
-        raise Refused(f"the drives of one device share a line: got {', '.join(kinds)}")
+        raise Refused(f"the drives of a device must be of one kind: {', '.join(kinds)}")
     line_type = lines.pop()
     if settings.transport not in line_type.transports:
         transports = ", ".join(line_type.transports)

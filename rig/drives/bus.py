@@ -51,7 +51,7 @@ class Rejected(BusError):
         name = EXCEPTIONS.get(code, "unknown")
         super().__init__(
             f"unit {unit} answered exception {code} ({name}) at 0x{address:04X}",
-            "See its manual, and check that the axis's map is that of this drive",
+            "See its manual, and check that the axis's map is for this drive",
         )
 
 
@@ -206,7 +206,7 @@ class Bus(Line):
             return
         with self._lock, contextlib.suppress(OSError, BusError):
             if self._client.listen(unit, self.listen_s):
-                late = f"late by over {self._timeout_s:g} s: raise bus.timeout_s"
+                late = f"late by more than {self._timeout_s:g} s: raise bus.timeout_s"
                 error.args = (f"unit {unit}: no valid reply ({late})",)
                 error.advice = LATER
 
@@ -230,7 +230,7 @@ class Bus(Line):
         (self._doubted.add if unsure else self._doubted.discard)(unit)
         if reply != (head if function == 16 else head + data):
             self._resynchronise(unit, function, 0)
-            raise BusError(f"unit {unit}: the reply to a write does not echo it")
+            raise BusError(f"unit {unit}: the reply to a write is not its echo")
 
     def _read(self, unit: int, function: int, address: int, quantity: int) -> bytes:
         """The data of one reply, of any length."""
@@ -285,7 +285,7 @@ class Bus(Line):
                 self.late.add(unit)
         if self._owed.get(unit):
             raise BusError(
-                f"unit {unit}: its replies come too late to be told apart", LATER
+                f"unit {unit}: its replies are too late to be assigned", LATER
             )
 
     def broadcast(self, address: int, function: int, words: list[int]) -> None:
@@ -317,7 +317,7 @@ class Bus(Line):
                     raise BusError(f"unit {unit}: the reply is of function {other}")
                 refused = bool(reply[0] & 0x80)
                 if refused and (len(reply) != 2 or not reply[1]):
-                    raise BusError(f"unit {unit}: the refusal holds no code")
+                    raise BusError(f"unit {unit}: the refusal has no code")
             except BusError:
                 self._resynchronise(unit, function, owed)
                 raise
@@ -377,15 +377,15 @@ class Bus(Line):
 def _why_closed(settings: BusSettings, error: Exception) -> tuple[str, str]:
     """The reason, and what to do."""
     if settings.transport != "rtu":
-        why = "nothing answers there, or all its connections are taken"
+        why = "nothing answers there, or all its connections are in use"
         return why, "Check power, cable and address"
     if not os.path.exists(settings.device):
         return "there is no such port", "Plug in the adapter, or correct bus.device"
     if not os.access(settings.device, os.R_OK | os.W_OK):
-        return "this user may not open it", "Join its group, often dialout"
+        return "you have no permission to open it", "Join its group, often dialout"
     if isinstance(error, ValueError):  # a line format that the port does not know
         return str(error), "Correct [bus]"
-    return "held by another program", "Close that program"
+    return "in use by another program", "Close that program"
 
 
 def data_size(function: int, quantity: int) -> int:

@@ -227,12 +227,12 @@ class Drive(abc.ABC):
             text = text or "fault bit set"
             raise MotionFault(
                 f"{self.axis.name}: {text}. The drive has stopped itself. Find the "
-                "cause in its manual, then go on with --reset-alarms"
+                "cause in its manual, then continue with --reset-alarms"
             )
         if not status.enabled:
             raise MotionFault(
                 f"the power stage of {self.axis.name} was switched off while armed. "
-                "Look for an emergency stop, STO, its supply or another controller"
+                "Check for an emergency stop, STO, its supply, and another controller"
             )
         return status
 
@@ -246,7 +246,7 @@ class Drive(abc.ABC):
         axis = self.axis
         if not axis.min_pulses <= pulses <= axis.max_pulses:
             raise LimitError(
-                f"{axis.name}: {pulses} pulses leave the limits "
+                f"{axis.name}: {pulses} pulses are outside the limits "
                 f"{axis.min_pulses}..{axis.max_pulses}"
             )
         per_deg = abs(axis.pulses_per_deg)

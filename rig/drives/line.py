@@ -45,7 +45,7 @@ class Refusal(BusError):
 
     def __init__(self, text: str, out_of_reach: bool = False) -> None:
         self.out_of_reach = out_of_reach
-        super().__init__(text, "See its manual, and what the axis's map says of it")
+        super().__init__(text, "See its manual, and check the axis's map")
 
 
 class Line(abc.ABC):

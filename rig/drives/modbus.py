@@ -181,9 +181,7 @@ class ModbusDrive(Drive):
         value = decoded(self.line, read, self.axis.unit, order, retries)
         if not math.isfinite(value):
             unit = self.axis.unit
-            raise BusError(
-                f"unit {unit}: 0x{read.address:04X} holds no number, {value}"
-            )
+            raise BusError(f"unit {unit}: 0x{read.address:04X} has no number, {value}")
         return round(value * getattr(read, "counts", 1))
 
 

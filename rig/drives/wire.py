@@ -190,14 +190,14 @@ class Wire:
     ) -> str:
         """Why there is no reply, by all that came."""
         if late:
-            return f"late by over {timeout_s:g} s, as others were: raise bus.timeout_s"
+            return f"late by over {timeout_s:g} s, like others: raise bus.timeout_s"
         if not came:
-            return f"silent for {timeout_s:g} s"
+            return f"no reply within {timeout_s:g} s"
         if not self._numbered and came.startswith(begun):
-            return f"not whole after {timeout_s:g} s: raise bus.timeout_s"
+            return f"incomplete after {timeout_s:g} s: raise bus.timeout_s"
         more = f" ... {len(came)} bytes" if len(came) > HEX_BYTES else ""
         self.noise = came[:HEX_BYTES].hex(" ") + more
-        return f"what came is no reply: {self.noise}"
+        return f"the bytes received are not a reply: {self.noise}"
 
     @property
     def owes(self) -> bool:

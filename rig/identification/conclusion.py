@@ -152,15 +152,15 @@ def order_residuals(
     warning = ""
     if rms[configured] > max(2.0 * rms[best], 0.02):
         warning = (
-            f"the order {best} leaves {rms[best]:.3f} deg where the configured "
-            f"{configured} leaves {rms[configured]:.3f}: check mechanism.order and the "
-            "phone's order"
+            f"the order {best} leaves residuals of {rms[best]:.3f} deg, the configured "
+            f"order {configured} {rms[configured]:.3f} deg: check mechanism.order and "
+            "the phone's order"
         )
     elif rms[configured] > max(10.0 * noise, 0.1):
         warning = (
-            f"the fit leaves {rms[configured]:.3f} deg under the configured order "
-            f"{configured}, far above the readings' scatter of {noise:.3f}: check the "
-            "phone's order and signs ([imu] order), its mounting, and play"
+            f"the fit with the configured order {configured} leaves residuals of "
+            f"{rms[configured]:.3f} deg, far above the readings' scatter of "
+            f"{noise:.3f} deg: check [imu] order and signs, mounting, backlash"
         )
     return {"rms": rms, "configured": configured, "warning": warning}
 
@@ -187,17 +187,17 @@ def check_matrix(config: RigConfig, matrix: ArrayLike) -> list[str]:
         if strongest != column:
             faults.append(
                 f"{name} follows the command of {names[strongest]} "
-                f"({gains[i, strongest]:.2f} deg for each degree) more than its own "
+                f"({gains[i, strongest]:.2f} deg per degree) more than its own "
                 f"({gain:.2f}): units, cables or `rotates` are exchanged"
             )
         elif gain <= 0:
             faults.append(
-                f"{name} turns {gain:.2f} deg for each degree commanded, the other "
-                f"way: check axes.{name}.direction, wiring and imu.signs"
+                f"{name} turns {gain:.2f} deg per commanded degree, in the wrong "
+                f"direction: check axes.{name}.direction, wiring and imu.signs"
             )
         elif not USUAL[0] <= gain <= USUAL[1]:
             warnings.append(
-                f"{name} turns {gain:.2f} deg for each degree commanded: check "
+                f"{name} turns {gain:.2f} deg per commanded degree: check "
                 f"pulses_per_rev and reduction of axes.{name}"
             )
     if faults:

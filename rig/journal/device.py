@@ -62,8 +62,8 @@ class DeviceRecord:
             pass
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise Refused(
-                f"{path}: not a device record ({error!r}). Move it away and commission "
-                "the device again: jaxcal-rig setup"
+                f"{path}: not a device record ({error!r}). Move the file away and "
+                "commission the device again: jaxcal-rig setup"
             ) from None
         return record
 
@@ -94,7 +94,7 @@ class DeviceRecord:
         if number and (text := self.missing(config, STATES[number - 1])):
             raise Refused(text)
         if self.state(name) not in (None, evidence):
-            self.void(name, f"{name} was reached again, with other evidence")
+            self.void(name, f"{name} was passed again, with new evidence")
         self._states[name] = {
             "time": _now(),
             "evidence": evidence,

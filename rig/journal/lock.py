@@ -73,7 +73,7 @@ class BusLock:
             told = _content(fd)
             self.release()
             raise Refused(
-                f"{self.where} is {held_by(told)}. Wait until it ends, or end it with "
+                f"{self.where} is {held_by(told)}. Wait until it ends, or stop it with "
                 "`jaxcal-rig stop`"
             )
         os.ftruncate(fd, 0)
@@ -205,7 +205,7 @@ def _folder(make: bool = True) -> None:
             FOLDER.mkdir(mode=0o700)
     owner = FOLDER.lstat().st_uid
     if owner != os.getuid():
-        raise Refused(f"{FOLDER} belongs to user {owner}: remove it")
+        raise Refused(f"{FOLDER} belongs to user {owner}: remove the folder")
 
 
 def armed_files() -> list[pathlib.Path]:
@@ -231,10 +231,10 @@ def read_armed(path: pathlib.Path) -> dict[str, Any] | None:
 def held_by(told: dict[str, Any]) -> str:
     """What a holder says of itself, in words."""
     if not told:
-        return "held by a process that has not said who it is"
+        return "in use by an unknown process"
     run = f" in {told['run']}" if told.get("run") else ""
     return (
-        f"held by `{told['command']}`{run} (process {told['pid']}, since "
+        f"in use by `{told['command']}`{run} (process {told['pid']}, since "
         f"{told['since']})"
     )
 

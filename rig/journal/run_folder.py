@@ -36,7 +36,7 @@ def _told(path: pathlib.Path) -> Iterator[None]:
     except OSError as error:
         raise JournalError(f"{path}: {error.strerror or error}") from None
     except DamagedError as error:
-        raise JournalError(f"{error}; begin a new run") from None
+        raise JournalError(f"{error}; start a new run") from None
     except ValueError as error:
         raise JournalError(str(error)) from None
 
@@ -158,9 +158,9 @@ class RunFolder:
         if starts := self.journal.events("start"):
             if changed := self.config.changed_since(starts[0]["config"]):
                 raise ValueError(
-                    f"{self.folder}: rig.toml differs from when this run began: "
-                    f"{'; '.join(changed)}. What is measured now would not be "
-                    "comparable. Set these keys back, or start a new run"
+                    f"{self.folder}: rig.toml has changed since this run began: "
+                    f"{'; '.join(changed)}. New measurements would not be comparable. "
+                    "Restore these keys, or start a new run"
                 )
             self.emit("resume", sync=True, **provenance)
             return

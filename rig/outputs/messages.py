@@ -20,30 +20,29 @@ UNITS = {"deg": "degrees", "mm": "millimetres"}
 ENDS = ("end", "fault", "stopped", "paused", "refused")
 REPLIES = {
     "obeyed": "the drive obeys",
-    "not taken": "the drive did not take it, so it is sent again",
-    "unknown": "whether the drive took it is unknown, so all stop",
+    "not taken": "the drive did not accept it; it is sent again",
+    "unknown": "it is unknown whether the drive accepted it; all drives stop",
 }
 
 
 def _reference(record: Record) -> str:
     worst = max(map(abs, record["angles"]))
     unit = record.get("unit", "deg")
-    good = f"reference posture reads {worst:.3f} {unit} from zero: going on"
+    good = f"reference posture is {worst:.3f} {unit} from zero; continuing"
     return good if worst <= record["limit"] else ""
 
 
 def _comm_restored(record: Record) -> str:
     return record["error"] and (
-        f"{record['axis']}: its communication timeout was not put back to "
+        f"{record['axis']}: its communication timeout was not restored to "
         f"{record['counts']} ({record['error']}); `jaxcal-rig resume` does it"
     )
 
 
 def _shown(record: Record) -> str:
     return (
-        f"  {record['axis']}: {record['ratio']:.3f} measured for each commanded, "
-        f"{record['before']:.3f} at `axes`; {record['speed_deg_s']:.3g} a second at "
-        "least"
+        f"  {record['axis']}: measured/commanded {record['ratio']:.3f}, at `axes` "
+        f"{record['before']:.3f}; at least {record['speed_deg_s']:.3g} per second"
     )
 
 
@@ -70,7 +69,7 @@ def _last_move(record: Record) -> str:
             ways.append(f"{name} from {begin:.2f} to {end:.2f} {units[i]} ({place})")
     others = [f"{name} {at:.3g}" for name, at in measured.items() if name not in names]
     told = f"; measured {', '.join(others)}" if others else ""
-    return f"moved last, to {record['label']}: {'; '.join(ways) or 'no axis'}{told}"
+    return f"last moved to {record['label']}: {'; '.join(ways) or 'no axis'}{told}"
 
 
 def _stop(record: Record) -> str:
@@ -94,16 +93,15 @@ SENTENCES: dict[str, str | Callable[[Record], str]] = {
     "armed": "armed: {drives} drives on {where}",
     "note": "{text}",
     "reference": _reference,
-    "reoriented": "the phone came back, its heading turned {turned_deg:.3f} deg: "
-    "{told}",
-    "zero": "zero taken at pulses {pulses}",
-    "void": lambda r: f"  withdrawn, to be measured again: {', '.join(r['names'])}",
+    "reoriented": "the phone is connected again, its heading changed by "
+    "{turned_deg:.3f} deg: {told}",
+    "zero": "zero measured at pulses {pulses}",
+    "void": lambda r: f"  discarded, to be measured again: {', '.join(r['names'])}",
     "replan": lambda r: (
-        "  the postures that are left were selected again: "
-        f"{choice_text(r['choice'])}; visits of candidates "
-        f"{', '.join(map(str, r['choice']['indices']))}"
+        f"  the remaining postures were selected again: {choice_text(r['choice'])}; "
+        f"visits of candidates {', '.join(map(str, r['choice']['indices']))}"
     ),
-    "pausing": "pausing after this posture; another Ctrl-C stops at once",
+    "pausing": "pausing after this posture; press Ctrl-C again to stop at once",
     "lost_reply": lambda r: (
         f"  the reply to a move of {r['axis']} was lost: {REPLIES[r['outcome']]}"
     ),
@@ -141,7 +139,7 @@ def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
     unit = summary["unit"]
     lines = [
         f"y = A u + b in {UNITS.get(unit, unit)}, +- 95 % confidence for all {number} "
-        "at once:"
+        "together:"
     ]
     for row, name in enumerate(outputs):
         a, b, wide = summary["A"][row], summary["b"][row], summary["ci95"][row]
@@ -149,15 +147,15 @@ def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
         lines.append(f"  {name:<5} [{values}]   {b:8.4f} +- {wide[-1]:.4f}")
     std = zip(outputs, summary["noise_std_deg"], strict=True)
     lines.append(
-        f"  noise of one posture {', '.join(f'{n} {v:.4f}' for n, v in std)} {unit}, "
-        f"from {summary['basis']} ({summary['dof']} degrees of freedom each)"
+        f"  noise of one posture {', '.join((f'{n} {v:.4f}' for n, v in std))} "
+        f"{unit}, from {summary['basis']} ({summary['dof']} degrees of freedom each)"
     )
     if "after" in summary:
         lines.append(f"held-out {error_text(summary, unit)}")
     elif errors := summary.get("prediction"):  # a refit: nothing was compensated by it
         lines.append(
-            f"held-out postures predicted to {errors['rms']:.4f} {unit} rms "
-            f"(max {errors['max']:.4f})"
+            f"held-out postures: prediction error {errors['rms']:.4f} {unit} rms (max "
+            f"{errors['max']:.4f})"
         )
     if summary.get("drift"):
         lines.append(f"drift: {drift_text(summary['drift'], outputs, unit)}")
@@ -173,9 +171,7 @@ def _verdict_line(summary: dict[str, Any], limit_deg: float, use: str) -> str:
             "find the cause (report.html shows each posture), then `jaxcal-rig "
             "calibrate`"
         )
-    return (
-        f"good; next: {use} for a controller, `jaxcal-rig verify` checks it again later"
-    )
+    return f"good; next: {use} for a controller; `jaxcal-rig verify` checks it later"
 
 
 def _model_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
@@ -205,8 +201,8 @@ def prediction_text(errors: dict[str, Any], unit: str) -> str:
     """Errors of predictions at held-out postures, as designed and calibrated."""
     before, after = errors["before"], errors["prediction"]
     return (
-        f"error of the prediction: as designed {before['rms']:.4f} {unit} rms (max "
-        f"{before['max']:.4f}), calibrated {after['rms']:.4f} (max {after['max']:.4f})"
+        f"prediction error before calibration {before['rms']:.4f} {unit} rms (max "
+        f"{before['max']:.4f}), after {after['rms']:.4f} (max {after['max']:.4f})"
     )
 
 
@@ -227,7 +223,7 @@ def recalibrate(summary: dict[str, Any], limit_deg: float) -> list[str]:
     if summary.get("drift") and summary["drift"]["over"]:
         most = summary["drift"]["limit_deg"]
         limit = f"session.drift_limit_deg ({most:g} {unit})"
-        reasons.append(f"the drift of the zero that is left exceeds {limit}")
+        reasons.append(f"the nonlinear drift of the zero exceeds {limit}")
     if "prediction" not in summary and not summary.get("fit", {}).get("good", True):
         reasons += summary["fit"]["reasons"]  # of a model, by its readings alone
     return reasons
@@ -237,20 +233,20 @@ def drift_text(drift: dict[str, Any], outputs: Sequence[str], unit: str = "deg")
     """How far the zero drifted, and what was done about it."""
     worst = int(np.argmax(np.abs(drift["angles_deg"]).max(axis=0)))
     text = (
-        f"the zero posture read up to {drift['size_deg']:.4f} {unit} from zero "
+        f"the zero posture was up to {drift['size_deg']:.4f} {unit} from zero "
         f"({outputs[worst]}) on later visits (limit {drift['limit_deg']:g})"
     )
     if drift["corrected"]:
         rate = drift["angles_deg"][-1][worst] / drift["minutes"][-1]
         text += (
-            f"; linear, {rate:+.4f} {unit}/min, and taken out: {drift['left_deg']:.4f} "
-            f"{unit} are left"
+            f"; linear, {rate:+.4f} {unit}/min, and removed: {drift['left_deg']:.4f} "
+            f"{unit} remain"
         )
     if drift["over"]:
         kind = "It is not linear. " if len(drift["minutes"]) == 3 else ""
         text += (
-            f". {kind}Look for a loose phone, play, or a magnetic heading near the "
-            "motors"
+            f". {kind}Check for a loose phone, backlash, or a magnetic heading near "
+            "the motors"
         )
     return text
 
@@ -259,8 +255,8 @@ def choice_text(choice: dict[str, Any]) -> str:
     """How the postures were chosen, and how good they are."""
     if choice.get("criterion", "D") != "D":
         return (
-            f"{choice['method']}: {choice['criterion']}-efficiency "
-            f"{choice['efficiency']:.4f} or more"
+            f"{choice['method']}: {choice['criterion']}-efficiency at least "
+            f"{choice['efficiency']:.4f}"
         )
     rank = "proven optimum" if choice["proven"] else "best known"
     gap = choice["best_log_det"] - choice["log_det"]

@@ -133,7 +133,7 @@ class RunState:
             case "unreachable":
                 self._lose([record["name"]], event, record["reason"], now)
             case "void":
-                note = "an axis slipped, perhaps before this was measured"
+                note = "an axis slipped, perhaps before this measurement"
                 self._lose(record["names"], "withdrawn", note, now)
             case "stop":
                 self.stop = record

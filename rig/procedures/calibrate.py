@@ -146,8 +146,8 @@ def _held_out(run: Run, calibration: Any) -> list[Any]:
     targets = draw_held_out(run.config, calibration, count)
     if len(targets) < count:
         run.say(
-            f"  note: only {len(targets)} of {count} held-out targets can be reached "
-            "compensated within the ranges"
+            f"  note: only {len(targets)} of {count} held-out targets are within the "
+            "ranges after compensation"
         )
     return run.emit("held_out", sync=True, pairs=targets)["pairs"]
 

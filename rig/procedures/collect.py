@@ -56,8 +56,8 @@ def collect(run: Run, count: int) -> int:
     limit = config.session.drift_limit_deg
     if drift > limit:
         run.say(
-            f"RECALIBRATE: the zero posture reads {drift:.3f} {config.output_unit} at "
-            f"the end (limit session.drift_limit_deg = {limit:g}). Fix "
+            f"RECALIBRATE: at the end the zero posture reads {drift:.3f} "
+            f"{config.output_unit} (limit session.drift_limit_deg = {limit:g}). Fix "
             f"{'the sensor' if config.readings else 'the phone'}, and collect again"
         )
         return EXIT_RECALIBRATE

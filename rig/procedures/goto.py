@@ -26,9 +26,9 @@ def goto(run: Run, calibration: Any, to: Sequence[float]) -> int:
     for axis, value in zip(config.axes, command, strict=True):
         if not axis.min_deg <= value <= axis.max_deg:
             raise LimitError(
-                f"{desired.tolist()} {config.output_unit} needs {axis.name} commanded "
-                f"to {value:.3f} {axis.unit_name}, outside [{axis.min_deg:g}, "
-                f"{axis.max_deg:g}]. Choose a target further inside"
+                f"{desired.tolist()} {config.output_unit} cannot be reached: "
+                f"{axis.name} would have to be {value:.3f} {axis.unit_name} (limits "
+                f"{axis.min_deg:g} to {axis.max_deg:g}). Choose a target further inside"
             )
     pulses = config.to_pulses(command)
     run.say(
@@ -43,8 +43,8 @@ def goto(run: Run, calibration: Any, to: Sequence[float]) -> int:
         if names:
             run.say(
                 f"NOT CHECKED: whether {', '.join(names)} was moved while without "
-                "power. The drive does not tell, and the phone does not see a turn "
-                "about the vertical. If in doubt: jaxcal-rig setup home"
+                "power. The drive does not report it, and a phone cannot measure "
+                "rotation about the vertical. If in doubt: jaxcal-rig setup home"
             )
     record = run.postures().get("goto")
     if record is None:

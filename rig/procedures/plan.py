@@ -93,7 +93,7 @@ def choose(
     efficiency = math.exp((chosen.log_det - best) / parameters)
     if efficiency < session.min_efficiency:
         note = (
-            f"{config.method} reached a D-efficiency of {efficiency:.3f}, under "
+            f"{config.method} reached a D-efficiency of {efficiency:.3f}, below "
             f"session.min_efficiency = {session.min_efficiency:g}; using exact"
         )
         chosen, efficiency = exact, math.exp((exact.log_det - best) / parameters)

@@ -49,13 +49,13 @@ def load_calibration(
     notes = calibration.provenance.get("notes", {})
     if notes.get("simulated") and not simulated:
         raise Refused(
-            f"{path}: made with a simulated device: it says nothing of the real one. "
-            "Calibrate the device, or use it with --simulate"
+            f"{path}: made with a simulated device, so it is not valid for the real "
+            "one. Calibrate the device, or use it with --simulate"
         )
     if lack := {"device", "zero_pulses", "zero_attitude"} - notes.keys():
         raise Refused(
-            f"{path}: does not say with which device and zero posture it was made "
-            f"(no {', '.join(sorted(lack))}). Calibrate it: jaxcal-rig calibrate"
+            f"{path}: the device and zero posture are not recorded (no "
+            f"{', '.join(sorted(lack))}). Calibrate the device: jaxcal-rig calibrate"
         )
     if changed := differences(notes["device"], config.device_fingerprint()):
         raise Refused(
@@ -84,7 +84,7 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     )["pairs"]
     if not held:
         raise Refused(
-            "no target in session.*_range_deg can be reached through this calibration. "
+            "no target in session.*_range_deg can be reached with this calibration. "
             "Widen the ranges, or calibrate again"
         )
     if run.dry_run:

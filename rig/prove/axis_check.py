@@ -45,8 +45,8 @@ SOUND_RATIO = (0.4, 1.5)
 NEAR_UNIT = (0.3, 2.0)
 UNPROVED_FACTOR = 2.0  # by which a gearing is corrected on the phone's word alone
 BY_PLATE = (
-    "Nothing was corrected. Set pulses_per_rev and reduction as the drives and the "
-    "gearboxes' plates say, then run `jaxcal-rig setup axes` again"
+    "Nothing was corrected. Set pulses_per_rev and reduction according to the drives "
+    "and the gearboxes' name plates, then run `jaxcal-rig setup axes` again"
 )
 DIGITS = 4  # of a reduction that was measured
 OF_DRIVE = ("unit", "map", "pulses_per_rev", "comm_timeout_s")  # go with the cable
@@ -176,12 +176,11 @@ def check_numbers(
         same = config.output_unit == axis.unit_name
         if same and not low <= abs(rate) <= high:
             raise MotionFault(
-                f"{axis.name} was measured to move {abs(rate):.3g} {axis.unit_name} "
-                f"for each that it was commanded; sound is {low:g} to {high:g}. "
-                f"{BY_PLATE}"
+                f"{axis.name} moves {abs(rate):.3g} {axis.unit_name} per commanded "
+                f"{axis.unit_name}; allowed is {low:g} to {high:g}. {BY_PLATE}"
             )
         if rate < 0:
-            reason = f"what is measured as {axis.name} falls as it is commanded up"
+            reason = f"the reading {axis.name} falls when the axis is commanded up"
             key = f"axes.{axis.name}.direction"
             changes.append(Change(key, axis.direction, -axis.direction, reason))
     return changes, ratios
@@ -195,11 +194,11 @@ def _against(
     cosine = float(seen @ expected) / max(size * way, 1e-12)
     low, high = SOUND_RATIO
     told = (
-        f"{axis.name} changed what is measured by {size:.3g} for each {axis.unit_name} "
-        f"commanded, the model says {way:.3g}"
+        f"{axis.name} changed the readings by {size:.3g} per commanded "
+        f"{axis.unit_name}, the model predicts {way:.3g}"
     )
     if not low * way <= size <= high * way:
-        raise MotionFault(f"{told}; sound is {low:g} to {high:g} of it. {BY_PLATE}")
+        raise MotionFault(f"{told}; allowed is {low:g} to {high:g} of it. {BY_PLATE}")
     if abs(cosine) < NEAREST:
         raise MotionFault(
             f"{told}, and in another direction: units, cables or readings are "
@@ -208,7 +207,7 @@ def _against(
     if cosine > 0:
         return []
     key = f"axes.{axis.name}.direction"
-    reason = "what is measured changes the other way than the model says"
+    reason = "the readings change in the opposite direction to the model"
     return [Change(key, axis.direction, -axis.direction, reason)]
 
 
@@ -253,7 +252,7 @@ def find(
     if inner is not None:
         if not inner:
             raise MotionFault(
-                "the phone's readings do not combine as rotations of joints do: "
+                "the phone's readings do not combine like rotations of joints: "
                 "imu.order, imu.columns or imu.signs is wrong, or the phone is loose. "
                 "Nothing was corrected"
             )
@@ -264,8 +263,8 @@ def find(
     )
     if mirrored and order is None:
         raise MotionFault(
-            "the axes are mirrored, and the phone is too noisy to tell whether a "
-            "direction is wrong or imu.signs. Raise settle.samples, then run "
+            "the axes are mirrored, and the phone is too noisy to show whether a "
+            "direction or imu.signs is wrong. Raise settle.samples, then run "
             "`jaxcal-rig setup axes` again"
         )
     turned = float(np.linalg.norm(turn(told, mounting)))
@@ -305,8 +304,8 @@ def _placed(
         unit = config.axes[int(np.abs(cosine).argmin())].unit
         raise MotionFault(
             f"unit {unit} turns the phone about an axis more than 45 deg from every "
-            "joint's, so the phone is not placed as imu.mounting_deg says. Correct "
-            "that roughly, then run `jaxcal-rig setup axes` again"
+            "joint's axis, so imu.mounting_deg is wrong. Correct it roughly, then run "
+            "`jaxcal-rig setup axes` again"
         )
     goal, turned = expected[:, joints] * signs, told @ axes
     if len(joints) == 1:  # the least turn that fits it
@@ -333,8 +332,8 @@ class Change:
 
     def __str__(self) -> str:
         if self.new is None:
-            return f"{self.key} is taken out (is {self.old!r}): {self.reason}"
-        return f"{self.key} = {self.new!r} (is {self.old!r}): {self.reason}"
+            return f"remove {self.key} (now {self.old!r}): {self.reason}"
+        return f"{self.key} = {self.new!r} (now {self.old!r}): {self.reason}"
 
 
 def ratios_of(config: RigConfig, findings: Findings) -> list[float]:
@@ -366,7 +365,7 @@ def require_unit(
     shown, (low, high) = _seen(config, ratios), NEAR_UNIT
     if all(low <= ratio * factor <= high for ratio in ratios):
         raise MotionFault(
-            f'{shown}, about {1 / factor:.3g}: rig.toml says imu.unit = "{unit}", and '
+            f'{shown}, about {1 / factor:.3g}: rig.toml has imu.unit = "{unit}", but '
             f'the phone sends {other}. Set imu.unit = "{other}", then run `jaxcal-rig '
             "axes` again"
         )
@@ -374,7 +373,7 @@ def require_unit(
     sound = sum(low <= ratio <= high for ratio in ratios)
     if not proved and sound < min(2, len(ratios)):
         raise MotionFault(
-            f"{shown}, and none of its angles is over 6.3: either imu.unit or the "
+            f"{shown}, and no angle of the phone exceeds 6.3: either imu.unit or the "
             f"gearings are wrong. {BY_PLATE}"
         )
 
@@ -401,8 +400,7 @@ def require_gearing(
         if register is None and max(ratio, 1.0 / ratio) > UNPROVED_FACTOR:
             raise MotionFault(
                 f"{_seen(config, ratios)}, and the drive of {axis.name} has no "
-                "register that says its pulses for a turn, so it is not known what is "
-                f"wrong. {BY_PLATE}"
+                f"register for its pulses per turn, so the cause is unknown. {BY_PLATE}"
             )
 
 
@@ -434,24 +432,24 @@ def proposals(
             old, new = tables[axis.name].get(name), tables[source.name].get(name)
             reason = f"unit {source.unit} turns {axis.name}"
             if name == "pulses_per_rev" and told[drive] not in (None, new):
-                new, reason = told[drive], f"unit {source.unit} says so itself"
+                new, reason = told[drive], f"unit {source.unit} reports it"
             edits[name] = old, new, reason
         rate = findings.deg_per_pulse[drive]
         pulses = told[drive] or source.pulses_per_rev
-        reason = f"positive pulses turn it the {_way(rate)} way"
+        reason = f"positive pulses turn it in the {_way(rate)} direction"
         edits["direction"] = axis.direction, 1 if rate > 0 else -1, reason
         geared = axis.model_copy(update={"pulses_per_rev": pulses})
         ratio = abs(float(rate) * geared.pulses_per_deg)
         if not low <= ratio <= high:
             new = float(f"{axis.reduction / ratio:.{DIGITS}g}")
-            reason = f"it turns {ratio:.3g} of what is commanded; sound is {low:g} to "
+            reason = f"it turns {ratio:.3g} of the command; allowed is {low:g} to "
             edits["reduction"] = axis.reduction, new, f"{reason}{high:g}"
         for name, values in edits.items():
             if values[0] != values[1]:
                 changes.append(Change(f"axes.{axis.name}.{name}", *values))
     if findings.turned_deg > MOUNTING_DEG:
         angles = matrix_to_euler(findings.mounting, "ZYX").round(2) + 0.0
-        before, reason = list(config.phone.mounting_deg), "the axes put the phone"
+        before, reason = list(config.phone.mounting_deg), "the axes place the phone"
         reason += f" {findings.turned_deg:.1f} deg from there"
         changes.append(Change("imu.mounting_deg", before, angles.tolist(), reason))
     if findings.order is not None and findings.order != config.joint_order:
@@ -483,7 +481,7 @@ def lines(config: RigConfig, findings: Findings) -> list[str]:
         f"about Z, Y, X, {findings.turned_deg:.1f} from imu.mounting_deg"
     )
     if config.is_arm:
-        text.append("  parallel joints look alike: watch that each is the one named")
+        text.append("  parallel joints look alike: watch that the right one moves")
     else:
         order = findings.order or "not clear from these moves"
         text.append(f"  joints from the base outwards: {order}")

@@ -91,12 +91,12 @@ def _conclude(
     units = {axis.name: axis.unit_name for axis in run.config.axes}
     for name, pace in device.paces.items():
         run.say(
-            f"  {name}: {pace.seen_deg_s:.3g} {units[name]}/s at least, "
-            f"{pace.asked_deg_s:.3g} asked"
+            f"  {name}: at least {pace.seen_deg_s:.3g} {units[name]}/s, commanded "
+            f"{pace.asked_deg_s:.3g}"
         )
     if not changes:
         run.record.reach(SIGN_CHECKED, run.config, **evidence, turns=turns)
-        run.say("each unit turns its own joint, the right way and about as far as told")
+        run.say("each unit turns its joint in the right direction, about as commanded")
         prove_stops(run, device)
     return changes
 
@@ -115,8 +115,8 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
     corners = corners_of(len(config.axes)) if config.imu and not config.is_arm else []
     run.say(
         f"axes: about {1 + 7 * len(start) + len(corners)} places; each axis first by "
-        f"{FIRST_MOTOR_DEG:g} deg of its motor, then as far as what is seen allows, "
-        f"{REACH_DEG:g} deg or mm at most either way"
+        f"{FIRST_MOTOR_DEG:g} deg of its motor, then as far as the measured motion "
+        f"allows, at most {REACH_DEG:g} deg or mm in either direction"
     )
     tour = _Tour(run, device, start)
     device.proof.stay_near(tour.base.attitude)
@@ -147,9 +147,9 @@ def _room_deg(axis: Axis, pulses: int) -> float:
     room = min(here - axis.min_deg, axis.max_deg - here) - ROOM_DEG
     if room < REACH_DEG:
         raise Refused(
-            f"{axis.name} stands {room + ROOM_DEG:.1f} deg from a limit; the check "
-            f"moves it {REACH_DEG:g} deg either way. Move it inwards: "
-            f"jaxcal-rig setup jog {axis.name} DEG"
+            f"{axis.name} is {room + ROOM_DEG:.1f} deg from a limit; the check moves "
+            f"it {REACH_DEG:g} deg in either direction. Move it inwards: jaxcal-rig "
+            f"setup jog {axis.name} DEG"
         )
     return room
 
@@ -194,8 +194,8 @@ class _Tour:
         """Short moves that tell degrees of the phone from radians."""
         config = self.run.config
         self.run.say(
-            "  no angle of the phone is over 6.3, so degrees are not told from "
-            "radians: shorter moves show first which they are"
+            "  no angle of the phone exceeds 6.3, so the unit (degrees or radians) is "
+            "unknown: shorter moves find it first"
         )
         ratios = []
         for j, axis in enumerate(config.axes):
@@ -218,7 +218,7 @@ class _Tour:
         if turned < max(SEEN_DEG * geometry.scale, least):
             raise MotionFault(
                 f"unit {axis.unit} turned its motor by {commanded:g} {axis.unit_name} "
-                f"of {axis.name}, and {geometry.told} {turned:.3g}. Look for a loose "
+                f"of {axis.name}, and {geometry.told} {turned:.3g}. Check for a loose "
                 "coupling, a stream that does not change, or a reduction that is far "
                 "too small"
             )

@@ -63,16 +63,16 @@ def home(run: Run, device: Device, config: RigConfig, here: bool) -> None:
 def _set_zero(run: Run, device: Device, drive: Drive) -> None:
     if not drive.can_set_zero:
         run.say(
-            f"  {drive.axis.name}: drives of the map {drive.axis.map.name} take no "
-            f"count; home is at its count of {drive.status().position}"
+            f"  {drive.axis.name}: drives of the map {drive.axis.map.name} cannot be "
+            f"set to a count; home is their count {drive.status().position}"
         )
         return
     if drive.counts_from_home:
         if _counts_from(device, drive, HOME) is None:
             return
         run.say(
-            f"  {drive.axis.name}: the drive does not take the count {HOME}; it is set "
-            "to 0, and a loss of power while it stands there is not noticed"
+            f"  {drive.axis.name}: the drive does not accept the count {HOME}, so it "
+            "is set to 0; a loss of power while it is at 0 is not detected"
         )
     if (fault := _counts_from(device, drive, 0)) is not None:
         raise MotionFault(f"{fault}. Set it with the maker's tool")
@@ -133,7 +133,7 @@ def _go_home(run: Run, device: Device, drive: Drive, range_deg: float) -> None:
         if waited > HOME_S:
             raise MotionFault(
                 f"{axis.name} is not home after {HOME_S:g} s. Check its home switch "
-                "and the homing that is set in the drive"
+                "and the homing set in the drive"
             )
         time.sleep(motion.poll_s)
     drive.forget_origin()
@@ -151,17 +151,17 @@ def _check_homing(
     # Numbers have no speed of a joint.
     if device.config.imu and turned > most * RATE_S + NOISE_DEG:
         raise MotionFault(
-            f"{axis.name} homes at {turned / RATE_S:.0f} deg a second by the phone, "
-            f"more than motion.max_speed_deg_s = {most:g}. Set the drive's homing to a "
-            "lower speed"
+            f"{axis.name} homes at {turned / RATE_S:.0f} deg per second as measured by "
+            f"the phone, more than motion.max_speed_deg_s = {most:g}. Set the drive's "
+            "homing to a lower speed"
         )
     if abs(axis.to_deg(gone)) > BLIND_DEG and (
         apart(base, reading.value) < SEEN_DEG * scale
     ):
         raise MotionFault(
-            f"the drive of {axis.name} has turned {abs(axis.to_deg(gone)):.0f} deg on "
-            f"its way home, and {device.imu.whose} saw nothing of it. Look for a "
-            "loose coupling, a stream that does not change, or units that are exchanged"
+            f"the drive of {axis.name} has turned {abs(axis.to_deg(gone)):.0f} deg "
+            f"towards home, but {device.imu.whose} measured no motion. Check for a "
+            "loose coupling, a stream that does not change, or exchanged units"
         )
 
 
@@ -179,18 +179,18 @@ def identity(drives: list[Drive]) -> dict[str, dict[str, int | str]]:
             drive.status()
         except BusError as error:
             raise Refused(
-                f"{axis.name} (unit {axis.unit}) does not answer as {axis.map.name} "
-                f"does: {error}. Run `jaxcal-rig check scan`"
+                f"{axis.name} (unit {axis.unit}) does not answer like {axis.map.name}: "
+                f"{error}. Run `jaxcal-rig check scan`"
             ) from None
         if fault := drive.foreign(values):
             raise Refused(
-                f"{axis.name} (unit {axis.unit}) is no {axis.map.name}: {fault}. Run "
+                f"{axis.name} (unit {axis.unit}) is not {axis.map.name}: {fault}. Run "
                 "`jaxcal-rig check scan`"
             )
         identities[axis.name] = drive.lasting(values)
     if len(drives) > 1 and drives[0].line.answers_for_every_unit():
         raise Refused(
-            f"{drives[0].line.settings.where} answers for every unit id: the drives "
-            "cannot be told apart. Set the gateway so that it looks at the id"
+            f"{drives[0].line.settings.where} answers for every unit id, so the drives "
+            "cannot be told apart. Set the gateway to use the unit id"
         )
     return identities

@@ -32,7 +32,7 @@ class Operator:
         """
         if self.yes:
             if not default:
-                raise Refused(f"{question}: there is no default; give it as an option")
+                raise Refused(f"{question}: no default; pass it as an option")
             self.say(f"{question} [{default}]")
             return default
         return self._answer(f"{question} [{default}]: ") or default
@@ -65,5 +65,5 @@ class Operator:
         self.say(what)
         if self.yes:
             self.say(f"confirmed by --yes: {word}")
-        elif self._answer(f"Type {word} to go on: ") != word:
-            raise Refused(f"{word!r} was not typed: not confirmed, nothing was done")
+        elif self._answer(f"Type {word} to continue: ") != word:
+            raise Refused(f"not confirmed ({word!r} was not typed); nothing was done")

@@ -43,7 +43,7 @@ def set_values(text: str, values: Mapping[str, Any]) -> str:
         if path and path[0] == "axes":
             named = [axis for axis in document.get("axes", []) if axis["name"] in path]
             if not named:
-                raise ConfigError("rig.toml", [f"{where}: there is no such axis"])
+                raise ConfigError("rig.toml", [f"{where}: no such axis"])
             table, path = named[0], []
         for part in path:
             table = table.setdefault(part, tomlkit.table())

@@ -40,7 +40,7 @@ class Answer:
 
     def __str__(self) -> str:
         if not self.families:
-            return f"unit {self.unit}: answers, of no known family"
+            return f"unit {self.unit}: answers, unknown family"
         words = ", ".join(f"{name} = {value}" for name, value in self.identity.items())
         others = ", ".join(self.families[1:])
         more = f" (or {others})" if others else ""
@@ -117,9 +117,9 @@ def scan(
     if for_all:
         del answers[1:]
         say(
-            f"{settings.where} answers for every unit id, also {NOBODY}, which no unit "
-            "has: one device, or a gateway that does not look at the id. One unit is "
-            "counted"
+            f"{settings.where} answers for every unit id, even {NOBODY}, which no unit "
+            "has: it is one device, or a gateway that ignores the id. It is counted as "
+            "one unit"
         )
     if late:
         names = ", ".join(map(str, late))
@@ -128,9 +128,9 @@ def scan(
             "bus.timeout_s"
         )
     if echo and not settings.echo:
-        say("the adapter sends back what it is sent: set bus.echo = true")
+        say("the adapter echoes what it is sent: set bus.echo = true")
     if not answers:
-        came = f", but bytes came that are no reply: {noise}" if noise else ""
+        came = f", but bytes came that are not a reply: {noise}" if noise else ""
         say(
             f"no unit answers{came}. Check power, wiring, termination, the line format "
             "(baud rate and parity) and the units' ids"

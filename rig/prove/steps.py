@@ -131,15 +131,15 @@ def go_home(site: Site, here: bool) -> int:
     if not here and not can_home(site.config):
         without = {a.map.name for a in site.config.axes if not a.map.has("home")}
         raise Refused(
-            f"the map {', '.join(sorted(without))} has no homing. Put the device into "
+            f"the map {', '.join(sorted(without))} has no homing. Move the device into "
             "its home posture, then run `jaxcal-rig setup home --here`"
         )
-    what = "nothing moves; where the device stands becomes the origin of its counts"
+    what = "nothing moves; the present position becomes the origin of the counts"
     if not here:
         what = (
             f"the drives run their own homing one after another, {', '.join(names)}, "
         )
-        what += "as far and as fast as they are set to"
+        what += "as far and as fast as they are set"
     site.operator.confirm(
         "home: the drives are armed; keep out of the device's reach, hand on the "
         f"emergency stop; {what}",
@@ -154,7 +154,7 @@ def go_home(site: Site, here: bool) -> int:
 def number_of(config: RigConfig, name: str) -> int:
     """Number of an axis by its name; Refused where there is none."""
     if name not in config.axis_names:
-        raise Refused(f"no axis {name!r}: have {', '.join(config.axis_names)}")
+        raise Refused(f"no axis {name!r}; there are {', '.join(config.axis_names)}")
     return config.axis_names.index(name)
 
 
@@ -167,7 +167,7 @@ def jog(site: Site, name: str, way_deg: float) -> int:
     unit = site.config.axes[axis].unit_name
     homed = site.record.missing(site.config, HOMED) is None
     if not homed:
-        site.say("the device is not HOMED: the soft limits are not in force")
+        site.say("the device is not HOMED: the soft limits are off")
     site.operator.confirm(f"jog: {name} will move by {way_deg:g} {unit}, slowly", "jog")
 
     def procedure(run: Run, device: Device) -> None:
@@ -187,7 +187,7 @@ def jog(site: Site, name: str, way_deg: float) -> int:
         try:
             move(device, Posture("jog", tuple(here)))
         except TurnReached as turned:
-            device.stopper.stop("far enough by what is measured", latch=False)
+            device.stopper.stop("moved far enough, as measured", latch=False)
             gone = abs(moved.to_deg(device.positions()[axis] - start))
             run.say(
                 f"  stopped: {device.geometry.told} {turned} {device.geometry.unit} "
@@ -203,10 +203,10 @@ def jog(site: Site, name: str, way_deg: float) -> int:
 def axes(site: Site) -> int:
     """Check each axis, correct rig.toml after a yes, and check again: SIGN_CHECKED."""
     site.operator.confirm(
-        "axes: the device stands in its zero posture. Each axis in turn will move a "
-        "little, then up to 3 deg either way; then all by turns, up to 6 deg. "
-        "Watch that the joint that moves is the one that is named, and keep out of the "
-        "device's reach",
+        "axes: the device must be in its zero posture. Each axis in turn moves a "
+        "little, then up to 3 deg in either direction; then all axes move by turns, up "
+        "to 6 deg. Check that the joint that moves is the one named, and keep out of "
+        "the device's reach",
         "axes",
     )
     return _check_axes(site)
@@ -217,7 +217,7 @@ def _check_axes(site: Site, again: bool = False) -> int:
     code = site.run("axes", lambda run, dev: changes.extend(check_axes(run, dev)))
     if code or not changes:
         return code
-    site.say("rig.toml does not say what the device does:")
+    site.say("rig.toml does not agree with the device:")
     for change in changes:
         site.say(f"  {change}")
     if again or site.path is None:
@@ -227,11 +227,11 @@ def _check_axes(site: Site, again: bool = False) -> int:
         )
         return EXIT_RECALIBRATE
     site.operator.confirm(
-        f"axes: write this to {site.path}, then move the axes again", "correct"
+        f"axes: write these values to {site.path}, then move the axes again", "correct"
     )
     # What was proved of the drives goes with their cables.
     site.take(edit(site.path, {change.key: change.new for change in changes}))
-    site.say(f"  written; the old file is kept beside {site.path}")
+    site.say(f"  written; the old file is next to {site.path}")
     homed = site.record.state(HOMED) or {}
     show_identity(site)
     # Which also forgets where each named axis was left: it is not what it was.
@@ -242,8 +242,8 @@ def _check_axes(site: Site, again: bool = False) -> int:
 def take_zero(site: Site) -> int:
     """Measure the zero posture: ZEROED."""
     site.operator.confirm(
-        "zero: the device stands in its zero posture (jig, level), or moves to pulse 0 "
-        'with session.zero = "drive"; what is measured there is its zero',
+        "zero: the device must be in its zero posture (jig, level), or moves to pulse "
+        '0 with session.zero = "drive"; this posture is measured as zero',
         "zero",
     )
     return site.run("zero", lambda run, device: session.take_zero(device))

@@ -97,7 +97,7 @@ def prove_stops(run: Run, device: Device) -> None:
     run.emit("stop_proved", sync=True, **more)
     run.record.reach(STOP_PROVED, run.config, **more, run=run.folder.name)
     device.proof.stops = stop_distances(run.record, run.config.axes)
-    run.say(f"the drives stop, and stay: {', '.join(evidence)}")
+    run.say(f"the drives stop and do not move on: {', '.join(evidence)}")
 
 
 def _distances(
@@ -139,10 +139,10 @@ def _distances(
             distance, unit = StopDistance.of(**point), axis.unit_name
             slowest = distance.fastest(axis, 0.0)
             run.say(
-                f"  {axis.name}: its stop takes {distance.at(speed):.2g} {unit} at "
+                f"  {axis.name}: stopping distance {distance.at(speed):.2g} {unit} at "
                 f"{speed:.4g} {unit}/s"
-                + f"; a move that ends at a limit goes at {slowest:.3g} {unit}/s, one "
-                "that ends further away goes faster" * (slowest < speed)
+                + f"; moves that end at a limit run at {slowest:.3g} {unit}/s, moves "
+                "that end further inside run faster" * (slowest < speed)
             )
     return points
 
@@ -207,8 +207,8 @@ def _prove(
         device.untrack()
     else:
         raise MotionFault(
-            "no move is slow enough to be stopped on its way: bus and computer take "
-            "too long between two looks at the drives"
+            "no move is slow enough to be stopped before its end: bus and computer "
+            "take too long between two polls of the drives"
         )
     last = [_last(drive) for drive in device.drives]
     told = [drive.axis.drive_motion[0] for drive in device.drives]
@@ -280,15 +280,15 @@ def _require_stopped(
     device.untrack()
     if went_on:
         raise MotionFault(
-            f"{', '.join(went_on)} went on to the target after {name}: this program "
+            f"{', '.join(went_on)} moved on to the target after {name}: this program "
             "cannot stop it. Correct [stop], broadcast_stop or [comm_timeout] of the "
-            "map; until then the emergency stop alone stops the device"
+            "map; until then only the emergency stop stops the device"
         )
     if moved or turned > TURNED_DEG * device.geometry.scale:
         raise MotionFault(
-            f"{', '.join(moved) or 'what is measured'} moved again after {name} "
+            f"{', '.join(moved) or 'the measured part'} moved again after {name} "
             f"({device.geometry.told} {turned:.2f} {device.geometry.unit}). Set the "
-            "drive so that it does not go on by itself after a stop"
+            "drive so that it does not move on after a stop"
         )
 
 

@@ -118,8 +118,8 @@ class Attitudes(Geometry):
 
     def too_far(self, way: float, most: float) -> str:
         return (
-            f"the phone turned {way:.1f} deg in a move that may turn it {most:.1f}. "
-            "Check pulses_per_rev and reduction, and that the phone is fixed"
+            f"the phone turned {way:.1f} deg in a move that may turn it {most:.1f} "
+            "deg. Check pulses_per_rev and reduction, and that the phone is fixed"
         )
 
     def way(self, first: Array, second: Array) -> Array:

@@ -200,7 +200,7 @@ class Receiver:
         if data and current is not connection:
             if current and now - max(current.since, current.used) <= stale_s:
                 if goes_on := current.used > connection.since + stale_s:
-                    why = f"{current.address} is connected already, and sends"
+                    why = f"{current.address} is connected and sending"
                     self.refuse(connection.address, why)
                 return not goes_on  # old once it may be heard, so it is lost
             if current:
@@ -226,7 +226,7 @@ class Receiver:
             if admitted := self._admits(connection.address):
                 used, foreign = self._imu.take_body(body)
                 if foreign:
-                    why = "another device than before sends from there"
+                    why = "another device sends from there now"
                     self.refuse(connection.address, why)
                 admitted = not foreign
                 self.phone = connection.address if used else self.phone

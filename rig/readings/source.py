@@ -108,7 +108,7 @@ class Source(abc.ABC):
         if now - reading.time > limit:
             hint = self.lost
             if now - self._arrived < limit:
-                hint = "It arrives late, or its stamps are not those configured"
+                hint = "Its readings are late, or its time stamps are wrong"
             raise ReadingError(
                 f"{self.whose}'s last reading is {now - reading.time:.2f} s old (limit "
                 f"{self.table}.stale_s = {limit:g} s). {hint}{self.dropped}"

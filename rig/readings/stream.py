@@ -163,7 +163,7 @@ class StreamParser:
             self._take_header(fields)
             raise _Dropped("a header")
         if s.format == "sensorlog" and not self._quaternion:
-            raise _Dropped("before the header, which the app sends when it begins")
+            raise _Dropped("before the header, which the app sends at the start")
         if not all(TOKEN.fullmatch(field) for field in fields):
             comma = s.separator != "," and re.search(r"\d,\d", text)
             raise _Dropped("decimal commas" if comma else "garbage")
@@ -235,7 +235,7 @@ class StreamParser:
         if s.format == "lines":
             middle = math.remainder(middle, 360.0)  # some write -10 as 350
         if max(map(abs, degrees)) > 360.0 * ROUNDED or abs(middle) > 90.0 * ROUNDED:
-            raise _Dropped("an angle no rotation has")
+            raise _Dropped("an angle that no rotation has")
         signed = [v * sign for v, sign in zip(degrees, s.signs, strict=True)]
         return euler_to_matrix(signed, str(s.order))
 
@@ -267,7 +267,7 @@ class StreamParser:
             self._odd += 1
             if self._odd < ODD_STAMPS:
                 raise _Dropped(
-                    "older than the reading before" if older else "from the future"
+                    "older than the previous reading" if older else "from the future"
                 )
             self._offset = math.inf
         self._odd, self._stamp = 0, stamp
@@ -316,5 +316,5 @@ def _quaternion(values: list[float]) -> Array:
     if len(values) != 4 or not all(math.isfinite(value) for value in values):
         raise _Dropped("not a number")
     if not 0.98 <= math.fsum(value * value for value in values) <= 1.02:
-        raise _Dropped("a quaternion that is not of length one")
+        raise _Dropped("a quaternion whose length is not one")
     return Rotation.from_quat(values).as_matrix()

@@ -49,8 +49,8 @@ def step(site: Site, name: str) -> int:
     axis = number_of(site.config, name)
     site.operator.confirm(
         f"characterise: {name} will move up to {BASE_DEG + FAR_DEG:.2f} "
-        f"{site.config.axes[axis].unit_name} from where it stands, "
-        "many times. Keep out of the device's reach",
+        f"{site.config.axes[axis].unit_name} from its present position, many times. "
+        "Keep out of the device's reach",
         "characterise",
     )
     return site.run(
@@ -73,8 +73,8 @@ class Probe:
         up, down = BASE_DEG + FAR_DEG, REACH_DEG + FAR_DEG
         if here + up > high - ROOM_DEG or here - down < low + ROOM_DEG:
             raise Refused(
-                f"{self.name} stands at {here:.2f} deg, between its limits {low:g} and "
-                f"{high:g}; {up:g} deg of room upwards and {down:g} downwards are "
+                f"{self.name} is at {here:.2f} deg, between its limits {low:g} and "
+                f"{high:g}; {up:g} deg of room upwards and {down:g} deg downwards are "
                 f"needed. Move it: jaxcal-rig setup jog {self.name} DEG"
             )
         self.count = 0  # measurements
@@ -185,8 +185,8 @@ class Probe:
     def too_much(self, what: str, deg: float, most: float) -> MotionFault:
         """What says that more was found than is looked for."""
         return MotionFault(
-            f"{self.name} has {deg:.2f} deg of {what}; at most {most:.3g} deg is "
-            "looked for. Look for a loose coupling, or a joint that binds"
+            f"{self.name} has {deg:.2f} deg of {what}; the search ends at {most:.3g} "
+            "deg. Check for a loose coupling, or a joint that binds"
         )
 
 
@@ -208,11 +208,11 @@ def characterise(run: Run, device: Device, axis: int) -> None:
     for name, estimate in told.items():
         run.say(
             f"{probe.name}: {name} {estimate.mean:.4f} deg of its commands, "
-            f"{LEVEL:.0%} in {estimate.low:.4f}..{estimate.high:.4f}"
+            f"{LEVEL:.0%} interval {estimate.low:.4f}..{estimate.high:.4f}"
         )
     run.say(
-        f"from {probe.count} measurements. Where the play is over the accuracy you "
-        "need, set motion.approach_overshoot_deg to more than it, and calibrate"
+        f"from {probe.count} measurements. If the backlash exceeds the accuracy you "
+        "need, set motion.approach_overshoot_deg above it, and calibrate"
     )
     run.emit(
         "characterised", sync=True, axis=probe.name, level=LEVEL,

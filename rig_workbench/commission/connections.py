@@ -34,15 +34,14 @@ def look_at_phone(site: Site, seconds: float = WATCH_S) -> str:
             else sensor_text(config.source, imu.port)  # type: ignore[arg-type]
         )
         site.say(
-            f"imu: {where}; then start its stream "
-            f"(waiting for it up to {STREAM_WAIT_S:g} s)"
+            f"imu: {where}; then start its stream (waiting up to {STREAM_WAIT_S:g} s)"
         )
         for listener in site.listeners:
             listener({"event": "listening", "port": imu.port})
         geometry = geometry_of(config)
         watch(imu, geometry, seconds, STREAM_WAIT_S, site.say)
         if isinstance(imu, Imu):
-            site.say(f"  it sends {imu.first[:SHOWN]}\n  taken for {imu.taken_for}")
+            site.say(f"  it sends {imu.first[:SHOWN]}\n  read as {imu.taken_for}")
         return imu.sender
 
 
@@ -95,7 +94,7 @@ def watch(
         )
     if rate < SLOW_HZ or gap > LONG_GAP_S:
         say(
-            f"  note: sessions want {SLOW_HZ:g} readings per s without gaps over "
+            f"  note: sessions need {SLOW_HZ:g} readings per s without gaps over "
             f"{LONG_GAP_S:g} s. {imu.lost}, raise its rate; or raise "
             f"{imu.table}.stale_s and settle.window_s"
         )

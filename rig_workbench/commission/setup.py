@@ -74,7 +74,7 @@ def axis_kinds(text: str) -> dict[str, str]:
                 f"must be NAME:KIND,... with a KIND of {', '.join(KINDS)}, got {word!r}"
             )
         if name in kinds:
-            raise ValueError(f"the axis {name} is there twice")
+            raise ValueError(f"the axis {name} is named twice")
         kinds[name] = kind
     return kinds
 
@@ -95,7 +95,7 @@ def asked(*, axes: str, **given: Any) -> SetupOptions:
         options["axes"] = dict.fromkeys(joint_names(urdf), "deg")
     made = SetupOptions(**options)
     if options.get("readings") and options.get("imu"):
-        raise Refused("--imu and --readings: either a phone or a sensor measures")
+        raise Refused("--imu and --readings: give only one, a phone or a sensor")
     by_phone = {"X", "Y", "Z"} | ({"deg"} if made.model else set())
     wrong = [
         f"{name}:{kind}" for name, kind in made.axes.items() if kind not in by_phone
@@ -103,7 +103,7 @@ def asked(*, axes: str, **given: Any) -> SetupOptions:
     if wrong and not made.readings:
         raise Refused(
             f"--axes {', '.join(wrong)}: a phone measures rotations about X, Y, Z; "
-            "others take --readings"
+            "other axes need --readings"
         )
     return made
 
@@ -163,7 +163,7 @@ def begin(path: pathlib.Path, options: SetupOptions, operator: Operator) -> RigC
         return write_config(path, options, operator)
     if options.values:
         raise Refused(f"{path} exists: edit it, or leave out --set")
-    operator.say(f"{path} exists and is used; delete it to begin anew")
+    operator.say(f"{path} exists and is used; delete it to start again")
     return load_config(path)
 
 
@@ -181,7 +181,7 @@ def write_config(
     bus = parse_bus(options.bus or operator.ask(question, default))
     answers: list[Answer] = []
     if options.drives:
-        say(f"2 scan: left out, --drives {options.drives} says what they are")
+        say(f"2 scan: skipped, --drives {options.drives} is given")
     else:
         say(f"2 scan: units 1 to {options.units} on {bus.where}; reads only")
         answers = scan(bus, options.units, lambda text: say(f"  {text}"))
@@ -268,11 +268,15 @@ def _ask_axes(
     if len(usable) < len(options.names):
         unknown = [answer.unit for answer in answers if not answer.families]
         raise Refused(
-            f"{len(options.names)} drives of a known family are needed, for "
+            f"{len(options.names)} drives of a known family are needed for "
             f"{', '.join(options.names)}; found {len(usable)}"
-            + (f"; units {unknown} answer, of no known family" if unknown else "")
+            + (
+                f"; units {unknown} answer, but are of no known family"
+                if unknown
+                else ""
+            )
             + ". Check power, wiring, termination, the line format, and that every "
-            "drive has a unit id of its own; another family needs a map (docs/rig.md)"
+            "drive has its own unit id; another family needs a map (docs/rig.md)"
         )
     free, axes = sorted(usable), []
     for name, kind in options.axes.items():
@@ -285,11 +289,11 @@ def _ask_axes(
             question = f"unit {unit} could be {' or '.join(answer.families)}: which"
             family = operator.choose(question, list(answer.families), family)
         pulses = answer.pulses_per_rev or int(
-            operator.number(f"{name}: pulses for one motor turn", 10000)
+            operator.number(f"{name}: pulses per motor turn", 10000)
         )
         axis = dict(name=name, kind=kind, unit=unit, family=family, pulses=pulses)
         if kind == "mm":
-            question = f"{name}: mm for one turn of its screw, pulley or pinion"
+            question = f"{name}: mm per turn of its screw, pulley or pinion"
             axis["lead"] = operator.number(question, 1.0)
         axes.append(axis)
     return axes
@@ -317,8 +321,8 @@ def go(site: steps.Site, options: SetupOptions) -> int:
         how = "here"
         if can_home(site.config):
             question = (
-                "home here (the device stands in its zero posture), or drive (each "
-                "drive runs its own homing)"
+                "here (the device is in its home posture), or drive (each drive runs "
+                "its own homing)"
             )
             how = operator.choose(question, ["here", "drive"], options.home)
         if code := steps.go_home(site, how == "here"):
@@ -343,9 +347,7 @@ def pin(site: steps.Site, sender: str) -> None:
     phone = site.config.imu
     if site.path is None or not sender or phone is None or sender in phone.allow:
         return
-    site.operator.confirm(
-        f"imu: listen to {sender} only, and to no other sender", "listen"
-    )
+    site.operator.confirm(f"imu: accept readings from {sender} only", "listen")
     site.take(edit(site.path, {"imu.allow": [sender]}))
 
 
@@ -356,9 +358,7 @@ def _ask_limits(site: steps.Site) -> None:
         for end, name in (("lowest", "min_deg"), ("highest", "max_deg")):
             now = getattr(axis, name)
             what = "place" if axis.kind == "translation" else "angle"
-            question = (
-                f"{axis.name}: {end} {what} that is safe, {axis.unit_name} from home"
-            )
+            question = f"{axis.name}: {end} safe {what}, {axis.unit_name} from home"
             if (number := site.operator.number(question, now)) != now:
                 values[f"axes.{axis.name}.{axis.key_of(name)}"] = number
     if values:

@@ -24,13 +24,13 @@ HEAD = """
 <script src="/page.js" defer></script>
 """
 NOTES = {  # of the cards, in their order: below the title
-    "Device": "Solid: as the phone measures. Ghost: as commanded. They differ by what "
+    "Device": "Solid: measured by the phone. Ghost: commanded. The difference is what "
     "is calibrated.",
     "Postures": "",
     "Angles": "Solid: phone. Dashed: drives.",
     "Settling": "Standard deviation over the settle window.",
     "Commands": "Candidates and postures.",
-    "Drift": "The zero posture, read again; it should read zero.",
+    "Drift": "The zero posture, measured again; it should read zero.",
     "What happened": "",
 }
 

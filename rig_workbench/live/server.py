@@ -58,7 +58,7 @@ def guarded(app: ASGIApp) -> ASGIApp:
             reads = scope.get("method") in ("GET", "HEAD")
             if headers.get("origin", origin if reads else "").lower() != origin.lower():
                 refusal = PlainTextResponse(
-                    "Refused: a request of another site.\n", 403
+                    "Refused: a request from another site.\n", 403
                 )
                 return await refusal(scope, receive, send)
         await app(scope, receive, sent)
@@ -94,12 +94,12 @@ def make_app(watcher: Watcher, linger_s: float | None = None) -> FastAPI:
         lines = "; ".join(map(str, units)) or "nothing was armed"
         if all(unit.acknowledged and unit.standing for unit in units):
             return PlainTextResponse(f"STOPPED: {lines}")
-        raise Fault(f"NOT ALL DRIVES STAND: use the emergency stop. {lines}")
+        raise Fault(f"NOT ALL DRIVES ARE AT REST: use the emergency stop. {lines}")
 
     @app.post("/pause")
     async def pause() -> PlainTextResponse:
         watcher.ask(PAUSE)
-        text = "pause asked for: the session finishes this posture first"
+        text = "pause requested: the session finishes this posture first"
         return PlainTextResponse(text)
 
     @app.get("/report")

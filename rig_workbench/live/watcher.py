@@ -117,7 +117,7 @@ class Watcher:
                 "If the device moves, use the emergency stop"
             )
         if number == PAUSE and self.state.phase in ("opening", "finishing"):
-            raise Refused("there is nothing to pause: nothing is moving now")
+            raise Refused("nothing to pause: nothing is moving now")
         try:
             os.kill(pid, number)
         except OSError as error:

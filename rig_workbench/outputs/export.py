@@ -48,7 +48,7 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
     if model := records[0]["config"].get("model"):
         use = "calibrated.urdf in its folder" if model["urdf"] else "calibration.json"
         raise Refused(
-            f"{folder}: the inverse map is that of an affine device, this one has a "
+            f"{folder}: the inverse map needs an affine device, this device has a "
             f"[model]. Use {use}"
         )
     calibration, matrix, summary = _calibrated(folder)
@@ -57,7 +57,7 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
     axis_unit, output_unit = units_of(config)
     for name in (*names, *outputs):
         if not NAME.fullmatch(name):  # the folder may come from another person
-            raise Refused(f"{folder}: {name!r} is no name of an axis or of a reading")
+            raise Refused(f"{folder}: {name!r} is not the name of an axis or a reading")
     of_name = {axis["name"]: axis for axis in config["axes"]}
     axes = [of_name[name] for name in names]
     scales = [Scale.of(axis) for axis in axes]
@@ -101,8 +101,8 @@ def _calibrated(folder: pathlib.Path) -> tuple[Any, Array, dict[str, Any]]:
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise Refused(
-            f"{folder}: no calibration to export: {error}. Give the run of a "
-            "`jaxcal-rig calibrate` that has ended, or its refit"
+            f"{folder}: no calibration to export: {error}. Give the run of a finished "
+            "`jaxcal-rig calibrate`, or its refit"
         ) from None
     return calibration, matrix, summary
 

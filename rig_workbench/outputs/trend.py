@@ -17,7 +17,7 @@ from rig.journal.run_folder import Record, read_journal
 from rig.outputs.messages import held_out, recalibrate
 from rig_workbench.outputs.report import draw_parameters, drawn
 
-HEAD = ["measured", "run", "mode", "held-out error", "moved since the one before"]
+HEAD = ["measured", "run", "mode", "held-out error", "moved since the previous one"]
 HOLDS = "the last calibration still holds"
 
 

@@ -21,13 +21,13 @@ SHOWN = 40  # rows of a long queue
 STALE_S = 1.0
 PHASES = {
     "opening": "Waiting for drives and phone",
-    "showing": "Looking at each axis",
+    "showing": "Checking each axis",
     "zeroing": "Taking the zero",
     "moving": "Moving to {}",
     "settling": "Waiting until {} is quiet",
     "measuring": "Measuring {}",
     "saving": "Saving",
-    "finishing": "All is measured, and the drives are at rest",
+    "finishing": "All measurements are made; the drives are at rest",
 }
 ENDED = {
     "end": ("good", "Done"),
@@ -53,7 +53,7 @@ def headline(state: RunState, running: bool) -> tuple[str, str]:
             return "warn", "Done: recalibrate"
         return ENDED[ended["event"]]
     if not running:
-        return "bad", "Ended without a last record: killed, or the power failed"
+        return "bad", "Ended without a last record: killed, or a power failure"
     if not state.candidates and state.mode == "calibrate":
         return "run", "Choosing the postures"
     posture = state.postures.get(state.current or "")
@@ -77,12 +77,12 @@ def trouble(state: RunState, running: bool, folder: str) -> list[str]:
     typed = [PLACES[typed[0]], *typed] if typed[0] in PLACES else typed
     typed = ["resume", folder] if state.mode in SESSIONS else typed
     go_on = (ended or {}).get("go_on", f"jaxcal-rig {shlex.join(typed)}")
-    go_on = f"To go on: {go_on}"
+    go_on = f"To continue: {go_on}"
     if state.damaged:
         lines.append("The journal has lines that cannot be read; some are left out.")
     if ended is None and not running and state.start:
         lines += [
-            "The session's process is gone. A move that had begun ran to its end "
+            "The session's process has ended. A move that had begun ran to its end, "
             "unless the drive watches its line. Look at the device first.",
             go_on,
         ]
@@ -139,7 +139,7 @@ def stream(sample: Record, now: float) -> str:
     late = (
         f"readings {sample['rate']:.0f} Hz, newest reading {1e3 * sample['age']:.0f} ms"
     )
-    return late + ("" if "deg" in sample else "; angles follow once the zero is taken")
+    return late + ("" if "deg" in sample else "; angles follow after the zero")
 
 
 def queue(state: RunState) -> list[PostureState]:

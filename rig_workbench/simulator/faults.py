@@ -21,15 +21,15 @@ KINDS = {
     "exception_reply": "the drive answers exception 4 and does nothing",
     "dead_drive": "one unit is silent",
     "alarm": "the drive faults and stops itself",
-    "stuck_axis": "the motor stands although it is told to move",
+    "stuck_axis": "the motor does not turn although commanded",
     "slipping_axis": "the motor turns, the joint does not",
     "halted": "another controller quick-stops a drive that moves",
     "sto": "the power stage is off for `seconds` (1.05), without an alarm",
-    "stop_ignored": "the drive acknowledges its stop and goes on",
-    "unit_stop_ignored": "the drive goes on after its own stop; a broadcast stops it",
-    "watch_ignored": "the drive does not act on its communication timeout",
-    "stop_resumes": "`seconds` (1) after a stop the drive goes on to its target",
-    "fast_drive": "the drive moves `factor` (20) times as fast as told",
+    "stop_ignored": "the drive acknowledges its stop and moves on",
+    "unit_stop_ignored": "the drive moves on after its own stop; a broadcast stops it",
+    "watch_ignored": "the drive ignores its communication timeout",
+    "stop_resumes": "`seconds` (1) after a stop the drive moves on to its target",
+    "fast_drive": "the drive moves `factor` (20) times as fast as commanded",
     "regeared": "the joint turns `factor` (2) times as far as before",
     "phone_turned": "the phone was turned by 10 deg about the vertical",
     "imu_gap": "the phone is silent for `seconds` (1)",
@@ -39,9 +39,9 @@ KINDS = {
     "imu_frozen": "the phone repeats one attitude under new stamps",
     "imu_wrong_order": "the phone's angles are in another Euler order",
     "imu_radians": "the phone sends radians",
-    "imu_columns": "the phone's lines get one column more",
-    "imu_second_sender": "in a gap another computer sends other angles",
-    "imu_reorder": "the phone's lines come out of order",
+    "imu_columns": "the phone's lines have one column more",
+    "imu_second_sender": "during a gap another computer sends other angles",
+    "imu_reorder": "the phone's lines arrive out of order",
 }
 
 OF_EVENT = ("delayed_reply", "sto", "stop_resumes")
@@ -64,7 +64,7 @@ def parse_fault(text: str, names: Sequence[str] = AXIS_NAMES) -> FaultSpec:
     head, *options = text.split(",")
     kind, _, when = head.partition("@")
     if kind not in KINDS:
-        raise ValueError(f"unknown fault {kind!r}: have {', '.join(KINDS)}")
+        raise ValueError(f"unknown fault {kind!r}; there are {', '.join(KINDS)}")
     fields: dict[str, Any] = {}
     readers: dict[str, Any] = {"count": int, "seconds": float, "share": float}
     readers["factor"] = float
@@ -77,9 +77,8 @@ def parse_fault(text: str, names: Sequence[str] = AXIS_NAMES) -> FaultSpec:
             fields[name] = readers[name](value)
     except (KeyError, ValueError):
         raise ValueError(
-            f"fault {text!r}: after @ comes one of {', '.join(PHASES)}; "
-            "options are count=N, seconds=S, share=P, factor=F, axis=NAME of "
-            f"{', '.join(names)}"
+            f"fault {text!r}: after @ write one of {', '.join(PHASES)}; options are "
+            f"count=N, seconds=S, share=P, factor=F, axis=NAME of {', '.join(names)}"
         ) from None
     return FaultSpec(kind, **fields)
 

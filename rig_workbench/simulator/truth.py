@@ -111,7 +111,7 @@ def truth_of(options: dict[str, Any], config: RigConfig) -> Truth:
     for key in ("swapped", "reversed"):
         if unknown := set(options[key] or ()) - set(names):
             axis_names = ", ".join(names)
-            raise ValueError(f"--{key}: no axis {min(unknown)!r}: have {axis_names}")
+            raise ValueError(f"--{key}: no axis {min(unknown)!r} in {axis_names}")
     if swapped := options["swapped"]:
         if len(set(swapped)) != 2:
             raise ValueError(f"--swapped must name two axes, got {','.join(swapped)}")

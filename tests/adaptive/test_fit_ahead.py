@@ -69,20 +69,20 @@ def test_the_rule_decides_where_the_tree_loses(task, monkeypatch):
 
 def test_what_lies_beyond_the_tests_is_named():
     assert outside(knee(8)) == ()
-    assert outside(knee()) == ("62 designs: measured up to 48",)
+    assert outside(knee()) == ("62 designs, tested up to 48",)
     many = GridTask.make(
         np.arange(1100.0), np.arange(3.0), np.full((3, 5, 1100), 0.2), uses=1,
         num_uses=[2, 7], horizon=40, groups=[0, 4, 1],
     )  # fmt: skip
     assert outside(many) == (
-        "1,100 states: measured up to 1,024", "5 outcomes: measured up to 4",
-        "7 uses: measured up to 5", "40 measurements: measured up to 32",
-        "5 groups: measured up to 4",
+        "1,100 states, tested up to 1,024", "5 outcomes, tested up to 4",
+        "7 uses, tested up to 5", "40 measurements, tested up to 32",
+        "5 groups, tested up to 4",
     )  # fmt: skip
     few = GridTask.make(
         np.arange(8.0), np.arange(3.0), np.full((3, 5, 8), 0.2), uses=1, horizon=2
     )
-    assert next_measurement(few).outside == ("5 outcomes: measured up to 4",)
+    assert next_measurement(few).outside == ("5 outcomes, tested up to 4",)
     assert next_measurement(few, decider=Gain()).outside == ()
 
 

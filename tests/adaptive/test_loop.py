@@ -119,9 +119,9 @@ def test_what_follows_a_spent_budget_is_refused(task):
 
 
 def test_a_drawn_budget_must_be_given(task):
-    with pytest.raises(ValueError, match=r"seconds must be given.* 8 to 32 s"):
+    with pytest.raises(ValueError, match=r"seconds is missing.* 8 to 32 s"):
         next_measurement(task, uses=2)
-    with pytest.raises(ValueError, match="uses must be given"):
+    with pytest.raises(ValueError, match="uses is missing"):
         next_measurement(task, seconds=20.0)
     with pytest.raises(ValueError, match="seconds must be"):
         next_measurement(task, seconds=0.0, uses=2)
@@ -182,7 +182,7 @@ def test_a_second_writer_is_refused(tmp_path, sharp):
     tried = []
 
     def measure(proposal):
-        with pytest.raises(ValueError, match="a running session is writing it"):
+        with pytest.raises(ValueError, match="another session is writing this file"):
             run(sharp, PRICED, tried.append, journal=path)
         return device((0.4, 0.7))(proposal)
 

@@ -163,9 +163,9 @@ def test_a_loop_with_a_budget_that_is_killed_goes_on(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"prior": Prior({"centre": 1.0})}, "nothing can be drawn of height, base"),
+        ({"prior": Prior({"centre": 1.0})}, "height, base cannot be drawn"),
         ({"prior": lambda z: z[:2]}, r"prior must return \(3,\) finite parameters"),
-        ({"noise": None}, "noise must be given"),
+        ({"noise": None}, "noise is missing"),
         ({"noise": Noise(std=1.0, command_std=np.inf)}, "command_std must be finite"),
         ({"cost": [1.0, 2.0]}, r"cost must be a number or \(7,\), at least 0"),
         ({"candidates": np.full((2, 1), np.nan)}, "must be finite"),

@@ -235,8 +235,8 @@ def test_commands_train_resume_and_compare(tmp_path, capsys):
     ("task", "arguments", "message"),
     [
         ("knee", ["--seed", "3"], "takes its configuration from"),  # not another schema
-        ("knee", ["--preset", "paper"], "--task knee does not read --preset"),
-        ("gone.py", [], "does not exist; say where it is by --task FILE"),
+        ("knee", ["--preset", "paper"], "--task knee does not use --preset"),
+        ("gone.py", [], "does not exist. Give its file: --task FILE"),
         ("a/own.py", ["--task", "{}/other.py"], "--task must be a/own.py"),
         ("a/own.py", ["--task", "{}/own.py"], "it begins"),  # the file that moved
     ],

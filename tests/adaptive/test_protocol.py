@@ -76,7 +76,7 @@ def test_an_outcome_that_is_sent_twice_counts_once_and_the_end_is_told(task):
         same = {"do": "observed", "outcome": 1, "number": 0}
         first, again = asked(loop, same, same)
         assert first == {"number": 1}
-        assert again["error"].startswith("number must be 1, the measurement that comes")
+        assert again["error"].startswith("number must be 1, the next measurement")
         *_, last, over, beyond = asked(
             loop, *[{"do": "observed", "outcome": 0}] * 4, {"do": "suggest"},
             {"do": "observed", "outcome": 0},
@@ -91,7 +91,7 @@ def test_an_outcome_that_is_sent_twice_counts_once_and_the_end_is_told(task):
         ("[1", "must be a JSON object"),
         ("[]", "do must be one of suggest, observed, state"),
         ('{"do": "stop"}', "do must be one of suggest, observed, state"),
-        ('{"do": "suggest", "seed": 3}', "suggest has no 'seed'"),
+        ('{"do": "suggest", "seed": 3}', "suggest takes no 'seed'"),
         ('{"do": "observed"}', "observed needs the outcome"),
         ('{"do": "observed", "outcome": 2}', "whole number in [0, 2), got 2"),
         ('{"do": "observed", "outcome": 0, "design": 9}', "must lie in [0, 7), got 9"),

@@ -387,7 +387,7 @@ def test_what_nothing_determines_is_named_and_has_no_interval() -> None:
     assert np.isfinite(found.standard_errors[:5]).all()
     assert np.isfinite(found.predict_std(commands)).all()
     assert found.from_data.tolist() == [1, 1, 1, 1, 1, 0]
-    assert "Not determined, held near the prior's mean: idle;" in repr(found)
+    assert "Not determined, kept near the prior's mean: idle;" in repr(found)
     assert found.identifiability().directions[0].words == "idle"
     short = Linear("x + y + x:y", 1)
     flat = commands * [1.0, 0.0]
@@ -464,7 +464,7 @@ def test_command_for_reaches_a_pose() -> None:
         np.testing.assert_allclose(reached[:, :3], poses[:, :3], atol=1e-6)
         again = arm.rotations(back, reached[:, 3:])
         np.testing.assert_allclose(again, frames, atol=1e-9)
-    with pytest.raises(ValueError, match="start must be given for an arm's pose"):
+    with pytest.raises(ValueError, match="start is missing: for an arm's pose"):
         found.command_for(desired)
 
 
@@ -479,9 +479,11 @@ def test_what_is_out_of_reach_or_beyond_the_limits_is_named() -> None:
     held = found.command_for(wanted, [[-1, 1], [-0.5, 0.5]], clip=True)
     assert held[1] == pytest.approx(0.5)
     wave = identify(*waves(9), model=WAVE, noise_std=0.05)
-    with pytest.raises(ValueError, match=r"desired \(50, 0\) is out of reach; the nea"):
+    with pytest.raises(
+        ValueError, match=r"desired \(50, 0\) cannot be reached; the nea"
+    ):
         wave.command_for([50.0, 0.0])
-    with pytest.raises(ValueError, match=r"out of reach.* at the limit of u_2"):
+    with pytest.raises(ValueError, match=r"cannot be reached.* at the limit of u_2"):
         wave.command_for([50.0, 0.0], [[-3, 3], [-2, 2]])
     with pytest.raises(ValueError, match="desired must be finite"):
         found.command_for([np.nan, 0.0])
@@ -544,7 +546,7 @@ def test_a_function_is_given_to_load(tmp_path: pathlib.Path) -> None:
     commands = np.linspace(-1, 1, 9)[:, None]
     found = identify(commands, commands + 0.1 * commands**2, model=model)
     found.save(tmp_path / "c.json")
-    with pytest.raises(ValueError, match=r"c\.json: .* give the model itself, model="):
+    with pytest.raises(ValueError, match=r"c\.json: .* pass the model, model="):
         Calibration.load(tmp_path / "c.json")
     back = Calibration.load(tmp_path / "c.json", model=model)
     np.testing.assert_array_equal(back.predict([[0.3]]), found.predict([[0.3]]))
@@ -593,14 +595,14 @@ def broken(method: str, answer: Any) -> Any:
         ),
         ({"prior": 1.0}, r"prior must be a jaxcal.Prior\(std=...\), got float"),
         ({"prior": Prior(1.0, {"a": "x"})}, "mean of the prior of a must be an array"),
-        ({"prior": Prior(1.0, fixed=WAVE.names)}, "must leave a parameter free"),
+        ({"prior": Prior(1.0, fixed=WAVE.names)}, "fixes all parameters"),
         ({"prior": Prior({"zz": 1.0})}, "parameter in std of the prior must be one of"),
-        ({"noise": Noise(1.0), "noise_std": 1.0}, "are the same: give one"),
+        ({"noise": Noise(1.0), "noise_std": 1.0}, "give noise_std or noise, not both"),
         ({"noise": Noise(np.ones((3, 2)))}, r"std of the noise must be .* \(3, 2\)"),
         ({"noise": Noise(1.0, command_std=[1, 2, 3])}, "command_std must be one"),
         ({"noise": Noise(1.0, command_std=np.inf)}, "must leave fewer unknown"),
         ({"noise": Noise(1.0, command_std=np.ones((3, 2)))}, "command_std must have"),
-        ({"noise_std": 1.0, "common_noise": True}, "give one of them"),
+        ({"noise_std": 1.0, "common_noise": True}, "not both"),
         (
             {"noise": "0.1"},
             "noise must be a jaxcal.Noise or its standard deviation, got str",
@@ -608,7 +610,7 @@ def broken(method: str, answer: Any) -> Any:
         ({"common_noise": "no"}, "common_noise must be True, False or a label"),
         ({"input_names": "ab"}, "input_names must hold 2 different names, got 'ab'"),
         ({"loss": "huber"}, "loss must be one of student, gaussian"),
-        ({"weights": np.zeros(12)}, "weights must be positive for one"),
+        ({"weights": np.zeros(12)}, "weights must be positive for at least one"),
     ],
 )
 def test_bad_arguments_are_named(options: dict[str, Any], message: str) -> None:
@@ -621,7 +623,7 @@ def test_a_search_that_fails_says_what_to_try() -> None:
     commands, measured = waves(0)
     rng = np.random.default_rng(0)
     model = broken("jacobian", lambda n: rng.normal(size=(n, 2, 6)))
-    with pytest.raises(ValueError, match=r"did not converge|must be the deriva"):
+    with pytest.raises(ValueError, match=r"did not converge|is not the deriva"):
         identify(commands, measured, model=model, loss="gaussian")
 
 
@@ -784,13 +786,13 @@ def test_trajectories_of_a_thousand_readings_are_identified():
 @pytest.mark.parametrize(
     ("given", "remedy"),
     [
-        (lambda u, theta: theta[0] * u, r"FromFunction\(f, nominal\) is one"),
-        ("1 + x", r"Linear\('1 \+ x'\) is one"),
+        (lambda u, theta: theta[0] * u, r"use FromFunction\(f, nominal\)"),
+        ("1 + x", r"use Linear\('1 \+ x'\)"),
     ],
 )
 def test_what_could_be_made_a_model_is_told_how(given, remedy):
     u = np.linspace(0.0, 1.0, 6)[:, None]
     with pytest.raises(ValueError, match=f"without predict; {remedy}"):
         jaxcal.identify(u, u, model=given)
-    with pytest.raises(ValueError, match=r"a column alone is values\[:, None\]"):
+    with pytest.raises(ValueError, match=r"one column alone is values\[:, None\]"):
         jaxcal.identify(u, u[:, 0])

@@ -86,7 +86,7 @@ def test_a_slip_is_named_with_its_size_where_it_explains_the_readings():
                            - ARM.predict(joints, TRUTH))  # fmt: skip
         what, _, size, unit = told.slipped.split()
         assert (what, unit) == (name, "deg") and abs(float(size) + 0.1) < 0.03
-        assert f"a slip of {told.slipped} would explain it" in str(told)
+        assert f"a change of {told.slipped} would explain it" in str(told)
     rough = still + np.random.default_rng(0).normal(0.0, 1.0, still.shape)
     assert FOUND.check(joints, rough).slipped == ""
     assert FOUND.check(joints, still).slipped == ""
@@ -96,7 +96,9 @@ def test_what_one_posture_cannot_tell_is_said():
     joints, measured = _new(TRUTH, 1, 3)
     result = FOUND.check(joints, measured, tolerance=0.02)
     assert result.says == "cannot be told" and result.unseen
-    assert "inconclusive: too few" in str(result) and "could hide in" in str(result)
+    assert "inconclusive: too few" in str(result) and "could be hidden in" in str(
+        result
+    )
     many = FOUND.check(*_new(TRUTH, 40, 5), tolerance=5.0)
     assert many.says == "holds" and not many.unseen
     assert str(many).startswith("the calibration holds (p = ")
@@ -158,11 +160,11 @@ def test_contacts_are_checked_as_they_are_fitted():
     once = found.check(table[40:43], np.zeros((3, 3)))
     twice = found.check(table[[40, 41, 42, 41]], np.zeros((4, 3)))
     assert twice == once
-    with pytest.raises(ValueError, match="look like radians"):
+    with pytest.raises(ValueError, match="are they radians"):
         found.check(
             np.column_stack([np.radians(joints), sockets])[:3], np.zeros((3, 3))
         )
-    with pytest.raises(ValueError, match="look like radians"):
+    with pytest.raises(ValueError, match="are they radians"):
         found.verification(np.column_stack([np.radians(joints), sockets]), 3)
 
 
@@ -261,8 +263,8 @@ def test_contacts_of_sockets_placed_anew_hold_where_enough_of_them_say_so():
     told = found.check(commands[50:56], zeros[50:56], placed_anew=True)
     assert told.says == "cannot be told"
     assert {"d1", "theta1"} <= set(told.blind) and "theta2" not in told.blind
-    assert "not judged, as things were placed anew: " in str(told)
-    assert f"about {told.enough} rows like these in all" in told.next_step
+    assert "not checked, because parts were moved: " in str(told)
+    assert f"about {told.enough} rows like these in total" in told.next_step
     assert 6 < told.enough <= 36
     rows = commands[24:][: told.enough], zeros[24:][: told.enough]
     assert found.check(*rows, placed_anew=True).says == "holds"

@@ -122,7 +122,9 @@ def test_a_urdf_file_is_fitted_without_harmonics_and_says_what_that_costs(tmp_pa
         )
     )
     assert left_out < off < naive
-    said = re.search(r"held-out error (\S+), of the calibration", str(told[0].message))
+    said = re.search(
+        r"cross-validated error (\S+), of the calibration", str(told[0].message)
+    )
     assert off < float(said[1]) < 2.0 * off
 
 

@@ -52,7 +52,10 @@ def test_an_accuracy_is_of_a_unit():
     assert _posed(accuracy=enough)[2].verdict.good
     assert _posed(accuracy=3.0)[2].verdict.good  # of lengths
     few = _posed(accuracy=enough | {"deg": 0.1})[2].verdict
-    assert not few.good and "Not the accuracy you asked for, 0.1 deg." in str(few)
+    assert (
+        not few.good
+        and "The accuracy you asked for is not reached: 0.1 deg." in str(few)
+    )
     for wrong, words in (({"m": 1.0}, "one of mm, deg"), ({"mm": -1.0}, "positive")):
         with pytest.raises(ValueError, match=words):
             _posed(accuracy=wrong)

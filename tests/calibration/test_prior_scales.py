@@ -112,7 +112,7 @@ def test_wrong_tolerances_cost_little():
 
 def test_only_arms_have_sizes():
     prior = dataclasses.replace(Prior(1.0), by_data=True)
-    with pytest.raises(ValueError, match=r"Prior\.sized\(\) is of arms"):
+    with pytest.raises(ValueError, match=r"Prior\.sized\(\) needs an arm"):
         jaxcal.identify(np.eye(4, 3), np.eye(4, 3), model=Affine(3, 3), prior=prior)
 
 
@@ -258,5 +258,5 @@ def test_a_wrong_distance_is_no_noise_of_its_direction(measured):
 
 def test_one_contact_is_refused():
     arm, commands, *_ = _made(1.0, 0, jaxcal.models.Socket(2))
-    with pytest.raises(ValueError, match="3 readings, no more than the 6 unknowns"):
+    with pytest.raises(ValueError, match="3 readings, too few for 6 unknowns"):
         jaxcal.identify(commands[:1], None, model=arm)

@@ -68,8 +68,8 @@ def test_a_socket_that_was_moved_is_named():
         verdict = _fit("dinova_1", *contacts.load("dinova_1")["front"]).verdict
     assert not verdict.explains
     text = str(verdict)
-    assert "This model does not explain these readings" in text
-    assert "times what this sensor usually does" in text
+    assert "The noise of this model does not explain" in text
+    assert "times the usual scatter of this sensor" in text
     moved = [why for why in verdict.reasons if "moved" in why]
     assert len(moved) == 1
     said = re.fullmatch(
@@ -128,7 +128,7 @@ def test_one_loose_contact_is_named_and_no_file_is_written(tmp_path, capsys):
     # To write over a file is one thing, to accept a bad fit another.
     out.write_text("a good file", encoding="utf-8")
     assert main([*flags, "--unproven"]) == 2
-    assert "--overwrite writes over it" in capsys.readouterr().err
+    assert "pass --overwrite to replace it" in capsys.readouterr().err
     assert main([*flags, "--overwrite"]) == 2
     assert "--unproven writes it" in capsys.readouterr().err
     assert out.read_text(encoding="utf-8") == "a good file"
@@ -162,11 +162,15 @@ def test_contacts_that_no_such_arm_made_are_refused():
         _fit("panda_1", *mixed)
     twice = joints[sockets == 0]
     labels = np.repeat([0.0, 1.0], len(twice))
-    with pytest.raises(ValueError, match="row 30 is row 0 with another socket"):
+    with pytest.raises(ValueError, match="rows 30 and 0 are one posture"):
         _fit("panda_1", np.vstack([twice, twice]), labels)
-    with pytest.raises(ValueError, match="have contacts of socket 1, whose distance"):
+    with pytest.raises(
+        ValueError, match="have no contacts of socket 1, whose distance"
+    ):
         _fit("panda_1", joints, 0.0 * sockets)
-    with pytest.raises(ValueError, match="have contacts of socket 1, whose distance"):
+    with pytest.raises(
+        ValueError, match="have no contacts of socket 1, whose distance"
+    ):
         _fit("panda_1", joints, 0.0 * sockets, offset=1e-4)
     few = [
         np.concatenate([each, more[:5]])
@@ -199,7 +203,7 @@ def test_sockets_as_one_are_told():
     """Without a known distance only an arm shrunk to nothing fits them exactly."""
     joints = PLACE[0][::4]
     arm = contacts.arm("panda_1").measured_with(Socket())
-    with pytest.warns(UserWarning, match="or of several sockets as one"):
+    with pytest.warns(UserWarning, match="or of several sockets numbered as one"):
         found = jaxcal.identify(joints, np.zeros((len(joints), 3)), model=arm)
     assert not found.verdict.good
 
@@ -240,7 +244,7 @@ def test_a_contact_that_is_written_twice_counts_once():
         for each in (rows, np.append(rows, rows[0]))
     )
     np.testing.assert_array_equal(once.parameters, twice.parameters)
-    assert twice.verdict.reasons[-1] == "measurement 13 is 0 again, counted once"
+    assert twice.verdict.reasons[-1] == "measurement 13 repeats 0, counted once"
 
 
 @pytest.mark.parametrize(("name", "off"), [("panda_1", -0.01), ("kuka_14", 0.01)])
@@ -300,8 +304,14 @@ def test_what_is_wrong_of_contacts_is_told_beside_other_sensors():
     other = sockets.copy()
     other[[3, 40]] = 1.0 - other[[3, 40]]
     for wrong, said in (
-        ((apart, joints, sockets), "sockets 0 and 1 are given as 0.048 m apart, but"),
-        ((placed, joints, 1.0 - sockets), "socket 0 was found where socket 1 was"),
+        (
+            (apart, joints, sockets),
+            "the distance of sockets 0 and 1 was given as 0.048 m, but",
+        ),
+        (
+            (placed, joints, 1.0 - sockets),
+            "socket 0 was found at the stated place of socket 1",
+        ),
         ((arm, joints, other), "measurement 3 fits socket 0 instead"),
     ):
         verdict = _with_gravity("panda_1", *wrong)
@@ -317,7 +327,7 @@ def test_what_is_wrong_of_contacts_is_told_of_a_chain_with_other_sensors():
     arm, (joints, sockets) = contacts.arm("panda_1"), PLACE
     apart = arm.measured_with(Socket(2, distances=[(0, 1, 0.048, 1e-4)]))
     verdict = _with_gravity("panda_1", apart, joints, sockets, in_pair=True)
-    assert "sockets 0 and 1 are given as 0.048 m apart, but" in str(verdict)
+    assert "the distance of sockets 0 and 1 was given as 0.048 m, but" in str(verdict)
     still = joints * (np.arange(7) != 6)
     verdict = _with_gravity("panda_1", arm, still, sockets, still=True, in_pair=True)
     assert "panda_joint7 is 0 in all 92" in str(verdict) and not verdict.good
@@ -326,7 +336,7 @@ def test_what_is_wrong_of_contacts_is_told_of_a_chain_with_other_sensors():
     assert re.search(
         r"socket 0 seems to have moved by 0\.01\d+ m between .* 6 and 7", said
     )
-    with pytest.raises(ValueError, match="look like radians"):
+    with pytest.raises(ValueError, match="are they radians"):
         _with_gravity("panda_1", arm, np.radians(joints), sockets)
 
 
@@ -335,7 +345,7 @@ def test_contacts_beside_gravity_leave_the_size_open():
     arm = _fit("panda_1", *PLACE).arm.measured_with(Socket(2))
     rows = np.arange(0, 62, 10)
     verdict = _with_gravity("panda_1", arm, PLACE[0][rows], PLACE[1][rows])
-    assert not verdict.good and "so the arm's size is open" in str(verdict)
+    assert not verdict.good and "so the arm's size is unknown" in str(verdict)
 
 
 @pytest.mark.parametrize("apart", [0.03, 0.048, 0.06])
@@ -346,7 +356,7 @@ def test_a_distance_that_contacts_contradict_is_named(apart):
     with pytest.warns(UserWarning, match="measure that distance again"):
         found = jaxcal.identify(np.column_stack(PLACE), np.zeros((62, 3)), model=arm)
     said = " ".join(found.verdict.reasons)
-    free = float(re.search(r"lengths say (\S+) \+-", said)[1])
+    free = float(re.search(r"lengths give (\S+) \+-", said)[1])
     assert not found.verdict.good and abs(free - 0.05) < 0.2 * abs(apart - 0.05) + 5e-4
 
 
@@ -363,7 +373,7 @@ def test_a_distance_is_freed_under_the_prior_that_was_stated():
         free = arm.measured_with(Socket(2))
         places = jaxcal.identify(commands, zeros, model=free, prior=prior).parameters
     apart = np.linalg.norm(places[-3:] - places[-6:-3])
-    told = float(re.search(r"lengths say (\S+) \+-", said)[1])
+    told = float(re.search(r"lengths give (\S+) \+-", said)[1])
     assert told == pytest.approx(apart, abs=1e-5)
 
 
@@ -397,12 +407,12 @@ def test_a_column_that_never_changes_is_named():
         _fit("panda_1", joints, PLACE[1])
     joints = PLACE[0].copy()
     joints[:, 3] = 0.0  # beyond its limits
-    with pytest.raises(ValueError, match=r"panda_joint4 .* never changes in 62 rows"):
+    with pytest.raises(ValueError, match=r"panda_joint4 .* the same in all 62 rows"):
         _fit("panda_1", joints, PLACE[1])
 
 
 def test_degrees_that_were_converted_again_are_named():
-    with pytest.raises(ValueError, match=r"leave out np\.degrees, --radians"):
+    with pytest.raises(ValueError, match=r"Leave out np\.degrees, --radians"):
         _fit("panda_1", np.degrees(PLACE[0]), PLACE[1])
 
 
@@ -415,7 +425,7 @@ def test_loud_readings_are_judged_by_the_nominal_arm_or_what_was_asked():
     measured = arm.predict(joints + rng.uniform(-0.15, 0.15, (60, 6)), truth)
     found = jaxcal.identify(joints, measured, model=arm)
     assert not found.verdict.explains and found.verdict.good
-    assert "their noise, or what no parameter explains" in str(found.verdict)
+    assert "noise, or an effect that no parameter describes" in str(found.verdict)
     for accuracy, good in ((10.0, True), (0.5, False)):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
@@ -493,7 +503,7 @@ def test_wrong_contacts_of_every_place_are_told_by_name(name, count):
         for row in wrong:
             instead = f"measurement {row} fits socket {sockets[row]:.0f} instead"
             assert instead in _told(arm, joints, other)
-        with pytest.raises(ValueError, match="look like radians"):
+        with pytest.raises(ValueError, match="are they radians"):
             _told(arm, np.radians(joints), sockets)
         for axis in range(3):
             for off in (-0.01, 0.01):
@@ -547,5 +557,5 @@ def test_contacts_of_a_reversed_joint_name_it():
         _fit("panda_1", joints, PLACE[1])
     joints = PLACE[0].copy()
     joints[:, 3] *= -1.0  # out of its limits, and all within them with the other sign
-    with pytest.raises(ValueError, match="panda_joint4 seems reversed, all rows are"):
+    with pytest.raises(ValueError, match="panda_joint4 seems reversed: with the other"):
         _fit("panda_1", joints, PLACE[1])

@@ -57,13 +57,16 @@ def test_contacts_become_a_calibrated_file(files, capsys):
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--out", "a.urdf"], "which look like radians"),
+        (["--out", "a.urdf"], "are they radians"),
         (["--radians", "--tip", "thumb"], "tip link must be one of"),
-        (["--tip", "left,right"], "--tip must be one link, got left,right: two chains"),
-        (["--tip", "left", "--tip", "right"], "must be one link, got left,right"),
+        (
+            ["--tip", "left,right"],
+            "--tip takes one link, got left,right. Several chains",
+        ),
+        (["--tip", "left", "--tip", "right"], "takes one link, got left,right"),
         (["--radians", "--play", "-1"], "play must not be negative"),
         (["--radians", "--distance", "0,1,0.05"], "distances must be rows"),
-        (["--radians", "--sensor", "plane", "--distance", "0,1,2,3"], "is of --sensor"),
+        (["--radians", "--sensor", "plane", "--distance", "0,1,2,3"], "needs --sensor"),
         (["--radians", "--base", "panda_rightfinger"], "there is no column"),
     ],
 )
@@ -109,9 +112,9 @@ def test_contacts_are_chosen_from_a_table(files, capsys):
     told = capsys.readouterr().out
     assert "log det S, worst" in told and "scenarios     2" in told
     assert main([*given, *sensor, "--worst"]) == 2
-    assert "--worst must come with --scenarios N" in capsys.readouterr().err
+    assert "--worst needs --scenarios N" in capsys.readouterr().err
     assert main([*given, *sensor[:-1]]) == 2
-    assert "which look like radians" in capsys.readouterr().err
+    assert "are they radians" in capsys.readouterr().err
     assert main(["select", str(table), "-k", "4", "--radians"]) == 2
     assert "options of an arm need --model FILE.urdf" in capsys.readouterr().err
 
@@ -125,7 +128,7 @@ def test_predictions_take_the_columns_of_the_fit(files, capsys):
     assert np.abs(off).max() < 0.002  # of contacts: zeros
     for command in ("predict", "check"):
         assert main([command, saved, str(files[1])]) == 2
-        assert "which look like radians" in capsys.readouterr().err
+        assert "are they radians" in capsys.readouterr().err
     # Contacts have no columns of readings.
     assert main(["check", saved, str(files[1]), "--radians"]) in (0, 1)
     assert "does not hold" not in capsys.readouterr().out
@@ -177,12 +180,12 @@ def test_postures_are_planned_and_the_rest_chosen_again(files, capsys):
     assert len(capsys.readouterr().out.splitlines()) == 1 + 7 - 4
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert main([*given, "-k", "4"]) == 2
-    assert "more than the 4 that were reached" in capsys.readouterr().err
+    assert "above 4, the number of postures" in capsys.readouterr().err
     given.remove("--radians")
     assert main([*given, "-k", "7"]) == 2
-    assert "which look like radians" in capsys.readouterr().err
+    assert "are they radians" in capsys.readouterr().err
     assert main([*given, *near, "--near=.4,.2", "-k", "7"]) == 2
-    assert "--near must be 3 numbers for --sensor socket" in capsys.readouterr().err
+    assert "--near takes 3 numbers for --sensor socket" in capsys.readouterr().err
 
 
 def _planned(files, sensor, *flags):
@@ -239,7 +242,7 @@ def test_a_camera_bounds_what_is_planned(files, capsys):
     assert off.max() < 0.1 < np.abs(rows[:, None] - arm.postures(12)[:, :7]).max()
     given = ["postures", str(files[0]), "--tip", "ball_link", "-k", "4"]
     assert main([*given, "--board", "0.2,0.15"]) == 2
-    assert "--board WIDTH,HEIGHT is of --sensor board" in capsys.readouterr().err
+    assert "--board WIDTH,HEIGHT needs --sensor board" in capsys.readouterr().err
     assert main([*given, "--away", "0.3,0.7"]) == 2
     assert "distance needs camera=" in capsys.readouterr().err
 
@@ -264,16 +267,16 @@ def test_a_recording_is_identified_and_checked_in_the_shell(files, capsys):
     assert main(["check", saved, str(folder / "bag")]) == 0
     assert "holds" in capsys.readouterr().out
     assert main(["check", saved, str(folder / "bag"), "--radians"]) == 2
-    assert "recordings say their unit" in capsys.readouterr().err
+    assert "recordings state their unit" in capsys.readouterr().err
     for more, message in (
-        (["--radians"], "recordings say their unit"),
-        (["--topic", "/none"], "got none of topic /none"),
-        (["--sensor", "socket", "--which", "0x3,1"], "of 8 rests which socket each"),
+        (["--radians"], "recordings state their unit"),
+        (["--topic", "/none"], "got none with topic /none"),
+        (["--sensor", "socket", "--which", "0x3,1"], "socket of each of the 8 rests"),
         (
             ["--sensor", "socket", "--which", "0x4,1x4", "--distance", "0,1,.05,.0001"],
             "contacts of socket",
         ),
-        (["--servos", "so101.json"], "servos are of a LeRobot dataset"),
+        (["--servos", "so101.json"], "servos needs a LeRobot dataset"),
         (["--servos-out", "new.json"], "--servos-out needs --servos"),
     ):
         assert main([*given, *more]) == 2, more
@@ -295,7 +298,7 @@ def test_zeros_are_written_for_lerobot_in_the_shell(files, capsys):
     assert f"saved {new}, steps: panda_joint1 +0" in capsys.readouterr().out
     assert Servos.load(new).motors["panda_joint1"] == motors["panda_joint1"]
     assert _run(files, *flags, "--out", str(folder / "a.urdf")) == 2
-    assert "both would twice" in capsys.readouterr().err
+    assert "both would correct them twice" in capsys.readouterr().err
 
 
 def test_a_dataset_in_degrees_keeps_its_servos_for_the_file_that_is_written(files):

@@ -75,11 +75,11 @@ CASES = [  # what was typed, what the line must hold
     ("select book.xlsx", "save this one as CSV"),
     ("select table.csv --out plan.xlsx", "must end in .csv or .json, got plan.xlsx"),
     ("select table.csv -k 3", "k must be at least 4"),
-    ("select table.csv -k 13", "12 candidates, got 13"),
+    ("select table.csv -k 13", "12 available candidates, got 13"),
     ("select table.csv --inputs pitch,jaw", "no column 'jaw'; columns: pitch, yaw"),
     ("select table.csv --method best", "method must be one of", "got 'best'"),
     ("select table.csv --model arm.urdf", "there is no column 'turn'"),
-    ("select table.csv --model calibration.json", "a model is needed, this is a cal"),
+    ("select table.csv --model calibration.json", "this is a calibration, and a model"),
     ("select table.csv --model table.csv", "--model takes an arm (.urdf), a saved"),
     ("select table.csv --score no.csv", "no.csv: No such file"),
     ("select masked.csv", "rows whose 'available' is 1,", "got 0"),
@@ -95,7 +95,10 @@ CASES = [  # what was typed, what the line must hold
         "0.001 cannot be reached: all",
     ),
     ("identify table.csv", "no column begins with y_", "--outputs"),
-    ("identify pairs.csv --inputs u_yaw,y_yaw", "must differ, both hold y_yaw"),
+    (
+        "identify pairs.csv --inputs u_yaw,y_yaw",
+        "--inputs and --outputs both hold y_yaw",
+    ),
     ("identify unread.csv", "unread.csv: line 3, column 'y_a' must hold a number"),
     ("identify three.csv", "4 or more rows", "got 3"),
     (
@@ -105,7 +108,7 @@ CASES = [  # what was typed, what the line must hold
     ),
     ("command calibration.json two.csv", "3 columns are needed", "got 2 without a"),
     ("command table.csv target.csv", "`jaxcal identify ... --out FILE` writes"),
-    ("command calibration.json target.csv --limits=20,-20", "a least and a greatest"),
+    ("command calibration.json target.csv --limits=20,-20", "must be LOW, HIGH"),
 ]
 
 
@@ -172,7 +175,7 @@ def test_an_import_names_its_extra(imported, missing, extra):
 def test_radians_are_named(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert main("select radians.csv -k 4 --model arm.urdf".split()) == 0
-    assert "joints are in degrees" in capsys.readouterr().err
+    assert "if these are radians" in capsys.readouterr().err
 
 
 def test_ctrl_c_is_told_in_one_line(monkeypatch, capsys):
@@ -188,7 +191,7 @@ def test_the_columns_of_an_arm_in_any_company(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert main("select joints.csv -k 4 --model arm.urdf".split()) == 0
     said = capsys.readouterr().err
-    assert said.startswith("joints.csv: column 'spare' is not read")
+    assert said.startswith("joints.csv: column 'spare' is ignored")
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])

@@ -124,7 +124,7 @@ def test_names_of_0_2_work_and_warn(candidates, capsys):
     [
         ("slect t.csv", "there is no command 'slect'; did you mean select?"),
         ("select t.csv --metod exact", "no option --metod; did you mean --method?"),
-        ("select t.csv 4", "4 is no option; a number of rows is -k 4"),
+        ("select t.csv 4", "there is no option 4; did you mean -k 4?"),
         ("select t.csv -k 2 -o c.csv", "there is no option -o; did you mean --out?"),
         ("select t.csv --criterion=As1", "did you mean As?"),
         ("select t.csv --zzz", "jaxcal select: unrecognized arguments: --zzz"),

@@ -130,7 +130,7 @@ def test_a_line_says_how_columns_were_read(ask):
     code, out, said = ask("command c.json t.csv", text_of(exact, header=False))
     assert code == 0
     np.testing.assert_allclose(parsed(out)["u_yaw"], COMMANDED["yaw"], atol=1e-8)
-    assert said.startswith("t.csv has no header: its columns are read by position")
+    assert said.startswith("t.csv has no header: columns are read by position")
 
 
 @pytest.mark.parametrize("command", ["predict", "command"])
@@ -144,7 +144,7 @@ def test_a_line_says_how_columns_were_read(ask):
         ("pitch,yaw,roll,pitch", "column 'pitch' comes twice"),
         ("Pitch,yaw,roll", "there is no column 'PREFIXpitch'"),
         ("1,2", "3 columns are needed (PREFIXpitch, PREFIXyaw, PREFIXroll), got 2"),
-        ("pitch,2,roll", "must hold names alone or numbers alone, got 'pitch' and '2'"),
+        ("pitch,2,roll", "mixes names and numbers, 'pitch' and '2'"),
     ],
 )
 def test_what_half_matches_is_refused(ask, command, header, message):
@@ -173,7 +173,7 @@ def test_check_and_report_take_both_by_name(ask, tmp_path):
     assert code == 0 and json.loads(out)["good"]
     alone = {axis: COMMANDED[axis] for axis in AXES}
     code, _, said = ask("check noisy.json t.csv", alone)
-    assert code == 2 and "both would be pitch, roll, yaw; begin their names" in said
+    assert code == 2 and "pitch, roll, yaw would be both commands and readings" in said
     code, _, said = ask("check noisy.json t.csv", alone | {"u_roll": COMMANDED["yaw"]})
     assert code == 2 and "--inputs" not in said
 
@@ -189,7 +189,7 @@ def test_columns_that_are_named_are_in_the_order_named(ask):
     half = {"a": REACHED["pitch"], "roll": REACHED["yaw"], "b": REACHED["roll"]}
     code, _, said = ask("command c.json t.csv --outputs a,roll,b", half)
     assert code == 2
-    assert "has 'b' in the place of 'y_roll', and 'roll' elsewhere" in said
+    assert "has 'b' at the position of 'y_roll', and 'roll' elsewhere" in said
     assert ask("command c.json t.csv --outputs a,a,b", half)[0] == 2
 
 
@@ -231,7 +231,7 @@ def test_letters_of_a_polynomial_are_places(ask, tmp_path):
     table = {"yaw": COMMANDED["yaw"], "pitch": COMMANDED["pitch"], "y_out": y}
     code, _, said = ask("identify t.csv --model m.json --out p.json", table)
     assert code == 0
-    assert "columns yaw, pitch are read as x, y, in their order" in said
+    assert "columns yaw, pitch are used as x, y, in their order" in said
     shuffled = {"pitch": COMMANDED["pitch"], "yaw": COMMANDED["yaw"]}
     code, out, _ = ask("predict p.json t.csv", shuffled)
     np.testing.assert_allclose(parsed(out)["y_out"], y, atol=1e-6)
@@ -261,7 +261,7 @@ def test_an_arm_takes_joints_and_readings_by_name(ask, tmp_path):
         {("y_1" if name == "y_x" else name): x for name, x in columns.items()},
     )
     assert code == 2
-    assert "there is no column 'x', with y_ or without" in said
+    assert "there is no column 'x', with or without y_" in said
 
 
 def test_a_subset_of_another_table_is_refused(ask, tmp_path):
@@ -272,7 +272,7 @@ def test_a_subset_of_another_table_is_refused(ask, tmp_path):
     other = {axis: table[axis][::-1] for axis in AXES}
     code, _, said = ask("score t.csv --subset plan.csv", other)
     assert code == 2
-    assert "it is not a choice from this table" in said
+    assert "This selection is from another table" in said
 
 
 # -- columns that number the rows or tell their time -----------------------------------
@@ -313,7 +313,7 @@ def test_a_constant_step_under_another_name_is_refused(ask, step, header, typed)
     code, _, said = ask(typed + noise, text_of(table, header))
     assert code == 2
     what = "column 'zeit'" if header else "column 1"
-    assert f"{what} goes up by {step:.4g} from row to row" in said
+    assert f"{what} rises by {step:.4g} per row" in said
     chosen = "zeit,pitch,yaw" if header else "u_1,u_2,u_3"
     assert ask(f"{typed}{noise} --inputs {chosen}", text_of(table, header))[0] == 0
 
@@ -335,7 +335,7 @@ def test_train_reads_the_same_columns(tmp_path, caplog):
     want = (want - want.min(0)) / np.ptp(want, axis=0)
     np.testing.assert_allclose(values[0], want, atol=1e-6)
     (tmp_path / "t.csv").write_text(text_of(table).replace("id", "zaehler"))
-    with pytest.raises(ValueError, match="column 'zaehler' goes up by 1"):
+    with pytest.raises(ValueError, match="column 'zaehler' rises by 1"):
         candidates_of(str(tmp_path / "t.csv"))
 
 
@@ -345,7 +345,7 @@ def test_an_unnamed_column_is_a_data_frames_index_or_refused(ask):
     text = "\n".join([rows[0], *(row.replace(".0", "", 1) for row in rows[1:])])
     code, _, said = ask("select t.csv -k 5", text)
     assert code == 0
-    assert "column 1 is not read: it looks like a row number" in said
+    assert "ignored column 1 (looks like a row number)" in said
     code, _, said = ask("select t.csv -k 5", text.replace("\n3,", "\n7,"))
     assert code == 2
     assert "column 1 has no name" in said

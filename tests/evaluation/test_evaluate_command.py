@@ -183,16 +183,16 @@ FLAT[1, :, 2] = 1.0
     ("arguments", "message"),
     [
         (["--k", "3"], "k must be at least 4"),
-        (["--k", "51"], "k must not exceed what is available"),
+        (["--k", "51"], "available candidates, got 51"),
         (["--k", "x"], "--k: must be a whole number of at least 1, got 'x'"),
         (["--episodes", "0"], "--episodes: must be a whole number"),
         (["--seed", "-1"], "--seed: must be a whole number of at least 0"),
         (["--time-limit", "nan"], "--time-limit: must be a number of at least 0.001"),
         (["--methods", "best"], "method must be one of policy, .* got 'best'"),
         (["--methods", ""], "at least one method"),
-        (["--dataset", "dataset7"], "--dataset must be one of .* got 'dataset7'"),
+        (["--dataset", "dataset7"], "--dataset takes .* got 'dataset7'"),
         (["--dataset", "{tmp}/none.npz"], "none.npz: No such file"),
-        (["--dataset", "{tmp}/torn.npz"], "torn.npz: not a .npz file, or a truncated"),
+        (["--dataset", "{tmp}/torn.npz"], "torn.npz: not a .npz file, or truncated"),
         (["--dataset", "{tmp}/key.npz"], 'key "candidates" is missing'),
         (["--dataset", "{tmp}/bad.csv"], "bad.csv: line 2, column 'u_y' must hold"),
         (["--dataset", "{tmp}/flat.npz"], "flat.npz: in set 1: .* lie in one plane"),
@@ -201,7 +201,7 @@ FLAT[1, :, 2] = 1.0
         (["--bogus"], "unrecognized arguments: --bogus"),
         (["--report", "{tmp}/torn.npz/x"], "torn.npz is not a folder"),
         (["--report", "/proc/none/x"], "/proc"),
-        (["--json", "{tmp}"], "--json must be a file"),
+        (["--json", "{tmp}"], "--json takes a file"),
     ],
 )
 def test_every_error_is_one_line_and_code_2(
@@ -302,7 +302,7 @@ def test_a_stopped_command_writes_nothing(
         *("--draws", 2),
     )
     assert done.returncode == code
-    kept = "finished parts are kept; the same command goes on"
+    kept = "finished parts are kept; run the same command again to resume"
     assert done.stderr == f"evaluate.py: {says}, {kept}\n"
     parts = {f"part-{ends}.json" for ends in ("000000000000-000000001000",
                                               "000000001000-000000001800")}  # fmt: skip
@@ -332,8 +332,8 @@ def test_a_stream_stopped_by_sigterm_says_so_and_keeps_its_parts(
     child.send_signal(signal.SIGTERM)
     _, errors = child.communicate(timeout=120)
     assert child.returncode == 143, errors
-    says = "evaluate.py: terminated, finished parts are kept; the same command goes on"
-    assert errors.splitlines()[-1] == says
+    says = "terminated, finished parts are kept; run the same command again to resume"
+    assert errors.splitlines()[-1] == f"evaluate.py: {says}"
     assert not [path for path in folder.iterdir() if path.suffix != ".json"]
 
 

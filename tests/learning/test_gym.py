@@ -45,7 +45,9 @@ def test_a_bad_option_and_a_bad_step_are_one_line():
         postures(nope=3)
     envs = JaxVector(PosturesEnv(), num_envs=3)
     for actions in (np.zeros(2, int), 0, np.zeros((3, 1), int)):
-        with pytest.raises(ValueError, match=r"^actions must be .* \(3,\), got shape"):
+        with pytest.raises(
+            ValueError, match=r"^actions must hold .* \(3,\), got shape"
+        ):
             envs.step(actions)
 
 

@@ -211,5 +211,5 @@ def test_resume_across_the_end_of_imitation_is_bit_for_bit(tmp_path):
 
 
 def test_a_missing_teacher_is_told(tmp_path):
-    with pytest.raises(ValueError, match=r"teacher must be given .* 2 updates"):
+    with pytest.raises(ValueError, match=r"teacher is missing: 2 updates"):
         training.train(CONFIG, tmp_path)

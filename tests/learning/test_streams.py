@@ -168,7 +168,9 @@ def test_a_run_that_diverges_keeps_its_last_finite_weights(tmp_path):
     """Its second task pays infinity: of that no update is finite, of the first all."""
     ppo = dataclasses.replace(SHORT, num_updates=20)
     config, tasks = Config(ppo), (jnp.float32(1.0), jnp.float32(np.inf))
-    says = "loss is nan in 5 updates in a row, the last of them 10; the weights before"
+    says = (
+        "loss is nan in 5 consecutive updates, the last of them 10. The weights before"
+    )
     with pytest.raises(DivergedError, match=says):
         run(recipe(config, *tasks), tmp_path)
     state, meta = checkpoint.restore(tmp_path, recipe(config, *tasks).init(), "probe")
@@ -207,7 +209,7 @@ def test_a_folder_is_written_by_one_training_at_a_time(tmp_path):
     said = []
 
     def second(report):
-        with pytest.raises(BlockingIOError, match="is being written by another"):
+        with pytest.raises(BlockingIOError, match="another training is writing to"):
             run(recipe(Config(), jnp.float32(1.0)), tmp_path)
         said.append(report)
 

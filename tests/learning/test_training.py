@@ -100,8 +100,8 @@ def test_an_update_that_does_not_fit_is_refused_with_what_would(
     monkeypatch.setattr(room, "memory", lambda: 4e4)
     with pytest.raises(
         ValueError,
-        match=r"--episodes-per-update 64 of 8 candidates needs [\d.e+-]+ GB of memory, "
-        r"there are 4e-05 GB: --episodes-per-update 8 should fit",
+        match=r"--episodes-per-update 64 of 8 candidates needs [\d.e+-]+ GB of memory; "
+        r"4e-05 GB are free: try --episodes-per-update 8",
     ):
         training.train(CONFIG, tmp_path)
     monkeypatch.setattr(room, "memory", lambda: 1e9)
@@ -169,7 +169,7 @@ def test_validation_of_the_optimum_itself_is_one():
             lambda step: _edit(step, network={"kind": "compact", "size": 1}),
             "no network",
         ),
-        (lambda step: _edit(step, network={"width": 16}), "do not fit its network"),
+        (lambda step: _edit(step, network={"width": 16}), "do not fit the network"),
         (lambda step: shutil.rmtree(step), "holds no checkpoint"),
         (lambda step: _truncate(step), "damaged"),
     ],
@@ -233,7 +233,7 @@ def test_a_finished_run_is_prolonged(finished, tmp_path, capsys):
     shutil.copytree(finished[0], copy)
     line = ["--resume", "--out", str(copy), "--no-validation", "--episodes"]
     assert command.main([*line, "384"]) == 2
-    assert "--episodes must be more than the run's 384, got 384" in (
+    assert "--episodes must be above 384, what the run already has, got 384" in (
         capsys.readouterr().err
     )
     assert command.main([*line, "512"]) == 0
@@ -362,7 +362,7 @@ def test_a_task_and_a_network_of_ones_own_are_in_the_checkpoint(tmp_path):
     assert again == config and type(again.tasks[0]) is Farthest
     assert isinstance(checkpoint.load(tmp_path).network, Own)
     with pytest.raises(
-        ValueError, match=r"nowhere:Net must be MODULE:NAME .* is there"
+        ValueError, match=r"nowhere:Net must name an existing MODULE:NAME"
     ):
         build(NetworkConfig(kind="nowhere:Net"))
     with pytest.raises(ValueError, match="kind must be a Network"):
@@ -385,7 +385,9 @@ def test_a_network_and_a_task_may_be_in_a_file(tmp_path):
     assert build(config.network).extra == 5
     own = named(f"{file}:Own")(SelectionConfig(8, 3, 2, 2), price=3.0)
     assert Task.from_meta(json.loads(json.dumps(own.as_meta()))) == own
-    with pytest.raises(ValueError, match=r"mine.py:Nat must be .*FILE.py:NAME that is"):
+    with pytest.raises(
+        ValueError, match=r"mine.py:Nat must name an existing .*FILE.py:NAME"
+    ):
         build(NetworkConfig(kind=f"{file}:Nat"))
 
 
@@ -527,19 +529,22 @@ BRAX = ["--trainer", "brax"]
         (["--resume"], "does not exist"),
         (["--out", "/proc/nowhere/run"], "cannot write in /proc"),
         (["--kind", "big"], "must be one of compact, observation, paper, got 'big'"),
-        ([*BRAX, "--num-epochs", "3"], "does not read --num-epochs: leave it out"),
+        ([*BRAX, "--num-epochs", "3"], "does not use --num-epochs: leave it out"),
         ([*BRAX, "--devices", "2", "--kind=paper"], "not read --devices, --kind"),
         ([*BRAX, "--preset", "general"], "trains on one task, preset general has 12"),
         ([*BRAX, "--resume"], "--resume works with --trainer jaxcal only"),
         ([*BRAX, "--seeds=2"], "--seeds works with --trainer jaxcal only"),
         (["--candidates", "nowhere.csv"], "nowhere.csv"),
-        (["--export", "folder"], "--export must be a file NAME.npz, got folder"),
+        (["--export", "folder"], "--export takes a file NAME.npz, got folder"),
         (["--num-selected=2", "--num-inputs=1"], "num_selected must be at least 3"),
-        (["--seeds", "2", "--no-validation"], "--seeds and --sweep need the valid"),
+        (
+            ["--seeds", "2", "--no-validation"],
+            "--seeds and --sweep compare runs by valid",
+        ),
         (["--sweep", "learning_rate=x"], "--sweep: must be NAME=X,Y with numbers, got"),
         (["--sweep", "num_epochs=1,2"], "sweep must be of learning_rate"),
-        (["--updates", "2"], "preset compact does not read --updates"),
-        (["--task", "knee", "--episodes", "9"], "knee does not read --episodes"),
+        (["--updates", "2"], "preset compact does not use --updates"),
+        (["--task", "knee", "--episodes", "9"], "knee does not use --episodes"),
         (["--task", "nee"], "task must be one of"),
     ],
 )
@@ -569,7 +574,7 @@ def test_help_says_what_every_number_is(capsys):
     for name in presets.field_names() - {"num_episodes", "num_seeds"} | {"sweep"}:
         assert f"--{name.replace('_', '-')}" in text
     assert "what to try first" in text
-    assert "passes over what an update has played [2]" in " ".join(text.split())
+    assert "passes over the decisions of an update [2]" in " ".join(text.split())
     for name in presets.names():
         assert f"\n  {name} " in text
 
@@ -606,7 +611,7 @@ def test_two_pools_differ_where_their_digest_is_not_given(rng):
     sets = [np.asarray(drawn(task, jax.random.key(0))) for task in tasks]
     for pool, found in zip((one, two), sets, strict=True):
         assert {*map(tuple, found)} <= {*map(tuple, pool.values[0])}
-    with pytest.raises(ValueError, match="by values or sha256, got neither"):
+    with pytest.raises(ValueError, match="values or sha256, got neither"):
         GivenCandidates("mine")
 
 
@@ -645,7 +650,7 @@ def test_ctrl_c_saves_and_resume_goes_on(tmp_path, capsys, monkeypatch):
     out = tmp_path / "run"
     monkeypatch.setattr(command, "_show", lambda *_: signal.raise_signal(signal.SIGINT))
     assert train("--out", out, "--no-validation", *SMALL) == 0
-    assert "stopped at update 1 of 6 and saved; go on" in capsys.readouterr().out
+    assert "stopped at update 1 of 6 and saved. To continue" in capsys.readouterr().out
     assert checkpoint.load(out).meta["progress"]["updates"] == 1
     assert len((out / "metrics.csv").read_text().splitlines()) - 1 == 1
     monkeypatch.undo()

@@ -72,7 +72,7 @@ def test_weights_that_do_not_fit_their_network_are_refused(tmp_path):
     held.arrays["embed.kernel"] = held.arrays["embed.kernel"][1:]
     path = tmp_path / "policy.npz"
     weights.write(path, held)
-    with pytest.raises(CheckpointError, match="do not fit its network"):
+    with pytest.raises(CheckpointError, match="do not fit the network"):
         checkpoint.load(path)
 
 

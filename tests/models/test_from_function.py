@@ -118,7 +118,9 @@ def test_processes_agree_and_a_run_that_ends_one_is_named(tmp_path, monkeypatch)
         parallel.predict(rows)[[0, 1, 3]], 2 * rows[[0, 1, 3]]
     )
     parallel.close()
-    with pytest.raises(ValueError, match="f must be a function at the top of a module"):
+    with pytest.raises(
+        ValueError, match="f must be a function at the top of an importable"
+    ):
         model(lambda u, t: decay(u, t), processes=2)
 
 
@@ -209,7 +211,7 @@ def test_runs_are_kept_on_disk_by_what_f_is(tmp_path):
     again.jacobian(U[3::-1])  # in memory
     assert len(CALLS) == made
     (tmp_path / "other").write_text("no database, but long enough to be read" * 9)
-    with pytest.raises(ValueError, match="cache must be a file of runs"):
+    with pytest.raises(ValueError, match="is not a file of runs"):
         model(cache=tmp_path / "other")
 
 
@@ -312,7 +314,7 @@ def test_bad_input_is_named():
         model(lambda u, t: np.zeros(3), batch=True).predict(U)
     with pytest.raises(ValueError, match="f must return numbers, got str"):
         model(lambda u, t: "one").predict(U)
-    with pytest.raises(ValueError, match="holds a function, which a file cannot"):
+    with pytest.raises(ValueError, match="contains a function, which cannot"):
         from_dict(model().to_dict())
     with pytest.raises(ValueError, match="f must be a program that can be run"):
         FromFunction("no-such-program {u}", [1.0], inputs=["u"])
@@ -356,7 +358,7 @@ def test_a_file_of_python_is_a_model_on_the_command_line(tmp_path, capsys):
     assert code == 2 and "it must set `model`" in capsys.readouterr().err
     (tmp_path / "signal.py").write_text("model = None")
     code = jaxcal_main(["select", str(table), "--model", str(tmp_path / "signal.py")])
-    assert code == 2 and "signal is another module's" in capsys.readouterr().err
+    assert code == 2 and "another module is named signal" in capsys.readouterr().err
     (tmp_path / "misspelt.py").write_text("import math\nmodel = math.nothing")
     code = jaxcal_main(["select", str(table), "--model", str(tmp_path / "misspelt.py")])
     assert code == 2 and "no attribute 'nothing'" in capsys.readouterr().err
@@ -395,7 +397,7 @@ def test_a_fit_that_ends_where_f_fails_says_so():
         return theta[0] * u[0]
 
     one = FromFunction(walled, [1.0], [0.1])
-    with pytest.raises(ValueError, match="fails next to the parameters"):
+    with pytest.raises(ValueError, match="fails near the parameters"):
         jaxcal.identify(U, 0.1 * U, model=one, noise_std=0.01)
 
 

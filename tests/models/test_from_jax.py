@@ -68,7 +68,7 @@ def test_a_scalar_is_one_output():
 )
 def test_the_number_of_inputs_is_that_of_the_first_commands(f):
     model = FromJax(f, [1.0])
-    with pytest.raises(ValueError, match="num_inputs of this model is not known"):
+    with pytest.raises(ValueError, match="give num_inputs"):
         model.num_inputs  # noqa: B018 (reading it is the test)
     model.predict([[1.0, 2.0, 3.0, 4.0]])
     assert model.num_inputs == 4
@@ -153,7 +153,7 @@ def test_what_is_not_finite_is_named():
 def test_a_function_cannot_come_back_from_a_file(arm):
     data = arm.to_dict()
     assert data["names"] == ["l1", "l2", "o1", "o2"] and data["kind"] == "jax"
-    with pytest.raises(ValueError, match=r"holds a function.*model=\.\.\."):
+    with pytest.raises(ValueError, match=r"contains a function.*model=\.\.\."):
         from_dict(data)
 
 

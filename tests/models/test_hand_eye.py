@@ -102,7 +102,7 @@ def test_the_command_writes_a_transform(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "eye in world: translation" in said and " deg (95 %" in said
     assert "child_frame_id: eye" in out.read_text()
-    assert main(typed) == 2 and "is there already" in capsys.readouterr().err
+    assert main(typed) == 2 and "exists" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -46,7 +46,7 @@ def test_the_ur5_shows_25_of_its_39_parameters():
     assert 50.0 < report.condition < 500.0
     text = str(report)
     assert text.startswith("25 of 39 parameters can be identified from 1000 candidates")
-    assert "\n  d2 = d3 = d4\n" in text and "Not seen at all: theta6" in text
+    assert "\n  d2 = d3 = d4\n" in text and "No effect on the readings: theta6" in text
 
 
 @hypothesis.settings(max_examples=30)
@@ -124,7 +124,7 @@ def test_what_an_unknown_command_hides_is_named():
     noise = Noise(std=0.1, command_std=np.inf)
     report = identifiability(Affine(1, 1), commands, noise=noise)
     assert report.rank == 0 and report.identifiable == ()
-    assert str(report).endswith("Not seen at all: a11, b1")
+    assert str(report).endswith("No effect on the readings: a11, b1")
 
 
 def test_encoder_pulses_far_from_zero_show_what_angles_do():

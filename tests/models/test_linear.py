@@ -117,17 +117,21 @@ def test_a_data_frame_is_read_by_its_columns():
     ("features", "options", "message"),
     [
         ("x + foo(x)", {}, r"features may hold .* got 'foo\(x\)'"),
-        ("x +* y", {}, r"must be a formula of one side, got 'x \+\* y': Operator"),
-        ("y ~ x", {}, "must be a formula of one side"),
+        (
+            "x +* y",
+            {},
+            r"must be the right-hand side of a formula, got 'x \+\* y': Operator",
+        ),
+        ("y ~ x", {}, "must be the right-hand side"),
         (
             "x + x^2",
             {},
-            r"x\^2 is the same as x in a formula; its power is I\(x\*\*2\)",
+            r"reads x\^2 as x; for a power write I\(x\*\*2\)",
         ),
-        ("x + y + y ** 3", {}, r"its power is I\(y\*\*3\)"),
-        ("x + x:x", {}, "x:x is the same as x"),
-        ("x + sin(2 * x)**2", {}, r"is I\(sin\(2 \* x\)\*\*2\)"),
-        ("angle + load", {}, "inputs must be given, .* uses angle, load"),
+        ("x + y + y ** 3", {}, r"for a power write I\(y\*\*3\)"),
+        ("x + x:x", {}, "reads x:x as x"),
+        ("x + sin(2 * x)**2", {}, r"write I\(sin\(2 \* x\)\*\*2\)"),
+        ("angle + load", {}, "inputs must be given .* uses angle, load"),
         ("angle", {"inputs": ["load"]}, "must use the inputs load, got 'angle'"),
         ("x", {"terms": ["a"]}, "terms must be left out"),
         ("x", {"num_outputs": 0}, "num_outputs must be at least 1"),
@@ -187,7 +191,7 @@ def test_a_model_comes_back_from_json(model):
 
 def test_a_model_that_a_file_cannot_hold_is_refused():
     model = Linear(lambda u: u, inputs=1)
-    with pytest.raises(ValueError, match=r"holds a function.*model=\.\.\."):
+    with pytest.raises(ValueError, match=r"contains a function.*model=\.\.\."):
         from_dict(model.to_dict())
     with pytest.raises(ValueError, match="kind of the model must be one of affine"):
         from_dict({"kind": "cubic"})

@@ -79,5 +79,5 @@ def test_the_kinematics_file_of_universal_robots_is_read_as_it_is_written(tmp_pa
     )
     assert np.abs(read.predict(JOINTS) - flange.predict(JOINTS)).max() < 1e-12
     (tmp_path / "other.yaml").write_text("kinematics:\n  shoulder:\n    x: 0\n")
-    with pytest.raises(ValueError, match="shoulder must have x, y, z, roll"):
+    with pytest.raises(ValueError, match="shoulder needs x, y, z, roll"):
         SerialChain.from_ur_kinematics(tmp_path / "other.yaml")

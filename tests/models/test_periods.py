@@ -72,7 +72,7 @@ def test_without_the_period_the_same_readings_do_not_fit():
     try:
         fit = jaxcal.identify(u, y, model=blind, noise=NOISE)
     except ValueError as error:
-        assert "must be the derivative" in str(error)
+        assert "is not the derivative" in str(error)
     else:
         assert np.abs(fit.residuals[:, 0]).max() > 300.0
 

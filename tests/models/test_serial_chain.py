@@ -237,12 +237,12 @@ def test_a_weight_bends_a_compliant_joint_by_its_torque():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"table": [(0, 1.5708, 1, 0)]}, "looks like right angles in radians"),
+        ({"table": [(0, 1.5708, 1, 0)]}, "look like right angles in radians"),
         ({"table": [(0, 90, 1)]}, r"table must have shape \(n, 4\)"),
         ({"joints": "RX"}, "joints must be 6 letters R"),
         ({"convention": "craig"}, "convention must be one of standard, modified"),
         ({"sensor": "angle"}, r"sensor must be of jaxcal.models, .* got 'angle'"),
-        ({"gears": [7]}, "gears must hold joints of 1 to 6 once"),
+        ({"gears": [7]}, "gears must be joints of 1 to 6, each once"),
         ({"compliance": [0]}, "compliance must be at least 1"),
         ({"joints": "PRRRRR", "compliance": [1]}, "joint 1 is prismatic"),
         ({"tool": (1, 2)}, r"tool must be a translation \(3,\) or a transform"),

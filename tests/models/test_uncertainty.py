@@ -129,11 +129,11 @@ def test_a_level_of_noise_for_everything_each_output_or_each_candidate():
         ({"covariance": [[1.0, 2.0], [0.0, 1.0]]}, "must be symmetric"),
         ({"covariance": -np.eye(2)}, "positive definite, got eigenvalue -1"),
         ({"command_std": -1.0}, "command_std must not be negative"),
-        ({"command_std": 1.0}, "needs std or covariance of the readings beside it"),
+        ({"command_std": 1.0}, "needs std or covariance of the readings too"),
         ({"std": 1.0, "command_std": 1.0}, "needs the derivative by the commands"),
         (
             {"std": 1.0, "command_std": [[1.0], [np.inf]]},
-            "inf in every row of a column",
+            "inf in a whole column",
         ),
     ],
 )

@@ -28,7 +28,7 @@ def test_without_noise_given_metres_select_what_millimetres_do() -> None:
 def test_measurements_in_another_unit_are_refused() -> None:
     model = arm(1.0)
     measured = model.predict(JOINTS)
-    with pytest.raises(ValueError, match="unit of the model's lengths"):
+    with pytest.raises(ValueError, match="model's unit of length"):
         jaxcal.identify(JOINTS, measured / 1000, model=model)
     with pytest.raises(ValueError, match="commands in degrees"):
         jaxcal.identify(np.radians(JOINTS), measured, model=model)

@@ -115,7 +115,9 @@ def test_a_chain_between_two_links_of_a_tree(tmp_path):
         '<link name="camera"/><joint name="mount" type="fixed">'
         '<parent link="link2"/><child link="camera"/></joint>'
     )
-    with pytest.raises(ValueError, match=r"tip must be given: .* \(link3, camera"):
+    with pytest.raises(
+        ValueError, match=r"--tip \(tip=\) is missing: .* \(link3, camera"
+    ):
         _read(tmp_path, _urdf(joints, finger))
     model = _read(tmp_path, _urdf(joints, finger), tip="link3", base="link1")
     assert model.joints == "RP"
@@ -130,12 +132,12 @@ ONE = [("revolute", (0, 0, 1), (0, 0, 0), (0, 0, 1))]
     ("text", "message"),
     [
         ("<robot>", "is not a URDF file"),
-        ("<sdf/>", r"must hold a <robot>, got <sdf>"),
+        ("<sdf/>", r"must be <robot>, got <sdf>"),
         (_urdf(ONE).replace("revolute", "floating"), "type of joint j1 .* 'floating'"),
         (_urdf(ONE).replace('"0.0 0.0 1.0"', '"0 a 1"'), "of joint j1 must be three"),
         (
             _urdf(ONE).replace("rpy=", 'quat_xyzw="0 0 0.6 0.8" other='),
-            "<origin> of joint j1 must give its turn as rpy.*got quat_xyzw='0 0 0.6",
+            "<origin> of joint j1 must give its rotation.*got quat_xyzw='0 0 0.6",
         ),
         (
             _urdf(ONE).replace('axis xyz="0.0 0.0 1.0"', 'axis xyz="0 0 0"'),
@@ -163,7 +165,7 @@ ONE = [("revolute", (0, 0, 1), (0, 0, 0), (0, 0, 1))]
                 '<joint name="j2" type="fixed"><parent link="link0"/>'
                 '<child link="link1"/></joint>',
             ),
-            "link link1 is the child of the joints j1 and j2",
+            "link link1 is the child of two joints, j1 and j2",
         ),
         (_urdf([("fixed", *ONE[0][1:])]), "no movable joint between"),
     ],
@@ -273,7 +275,7 @@ def test_links_that_do_not_fit_are_refused(tmp_path):
         _read(tmp_path, _urdf(ONE), tip="flange")
     with pytest.raises(ValueError, match="no movable joint between base 'link0' and"):
         _read(tmp_path, _urdf(ONE), tip="link0", base="link0")
-    with pytest.raises(ValueError, match="base 'b' and tip 'link1' hang on different"):
+    with pytest.raises(ValueError, match="base 'b' and tip 'link1' are not connected"):
         _read(tmp_path, _urdf(ONE, '<link name="b"/>'), tip="link1", base="b")
     with pytest.raises(ValueError, match=r"locked joint must be one of j1, got 'j9'"):
         _read(tmp_path, _urdf(ONE), locked={"j9": 0.0})

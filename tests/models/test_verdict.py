@@ -91,7 +91,7 @@ def test_readings_that_stand_still_are_named(noise_std):
     readings = commands @ A.T + 0.01 * rng.normal(size=(12, 2))
     readings[:, 1] = 2.5
     said = _reason(commands, readings, noise_std=noise_std)
-    assert said == "y_2: the reading stands still, 2.5 in all 12 rows."
+    assert said == "y_2: the reading never changes: 2.5 in all 12 rows."
 
 
 @pytest.mark.parametrize(
@@ -215,7 +215,7 @@ def test_a_search_that_stopped_short_has_not_converged():
         found, estimate=short, residuals=residuals, square=square
     )
     (said,) = [why for why in stopped.verdict.reasons if "converged" in why]
-    length = float(said.split("another step is ")[1].split()[0])
+    length = float(said.split("a step is ")[1].split()[0])
     assert length == pytest.approx(0.5, rel=0.05) and not stopped.verdict.good
 
 

@@ -288,7 +288,7 @@ def test_what_ships_is_what_its_card_says(name: str) -> None:
     ("text", "message"),
     [
         ("", "the table is empty"),
-        (POOL, "there are no rows below the header"),
+        (POOL, "no rows below the header"),
         (POOL.replace("u_deg_yaw", "yaw") + ROW, "there is no column 'u_deg_yaw'"),
         (POOL.replace("samples", "u_deg_yaw") + ROW, "'u_deg_yaw' comes twice"),
         (f"{POOL}\np,1,2,3,4,5,6", "line 2 has 7 cells, the first has 8"),
@@ -473,7 +473,7 @@ HEAD = "episode,candidate,u_x,u_y,u_z"
     [
         ("", "the table is empty"),
         ("\n", "the table is empty"),
-        (HEAD, "there are no rows below the header"),
+        (HEAD, "no rows below the header"),
         ("0,0,1,2,3", "column 'episode' is missing"),
         ("episode,u_x\n0,1", "column 'candidate' is missing; columns: episode, u_x"),
         ("episode,candidate\n0,1", "no column of commands"),
@@ -489,7 +489,7 @@ HEAD = "episode,candidate,u_x,u_y,u_z"
         (f"{HEAD}\n0,9999999999999999999,1,2,3", "whole number of at most"),
         (
             f"{HEAD}\n0,0,1,2,3\n0,0,1,2,3",
-            "line 3: candidate 0 of episode 0 was already given in line 2",
+            "line 3 repeats candidate 0 of episode 0 of line 2",
         ),
         (
             f"{HEAD}\n0,0,1,2,3\n0,1,1,2,3\n7,0,1,2,3",

@@ -142,7 +142,7 @@ def test_a_number_of_given_choices_that_leaves_none_is_named() -> None:
 def test_a_mask_and_another_number_of_inputs_are_refused_by_name(rng):
     options = {"checkpoint": SHIPPED}
     candidates, available = rng.random((50, 3)), np.arange(50) >= 20
-    with pytest.raises(ValueError, match="every candidate available, got 20"):
+    with pytest.raises(ValueError, match="all candidates available, but 20"):
         jaxcal.select(candidates, 4, "policy", available=available, **options)
     with pytest.raises(ValueError, match=r"chooses for 3 inputs, got 2$"):
         jaxcal.select(candidates[:, :2], 3, "policy", **options)

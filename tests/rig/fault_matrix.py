@@ -632,11 +632,11 @@ def _elsewhere(
     )  # fmt: skip
     said = done.stdout + done.stderr
     if fault == "second_session":
-        assert done.returncode == 2 and "held by" in said, (done.returncode, said)
+        assert done.returncode == 2 and "in use by" in said, (done.returncode, said)
         assert not (folder / "2").exists(), "a second session was begun"
     else:
         assert done.returncode == 0, said
-        assert fault != "suspended_stop" or "it is killed now" in said, said
+        assert fault != "suspended_stop" or "killing it" in said, said
 
 
 def cells() -> list[tuple[str, str]]:

@@ -80,9 +80,9 @@ def test_each_lies_in_a_narrow_interval(measured, axis, play, zone, breakaway):
 @pytest.mark.parametrize(
     ("truth", "says"),
     [
-        ({"backlash_deg": 1.45}, "of play; at most 1.5 deg is looked for"),
-        ({"dead_zone_deg": 1.1}, "of dead zone; at most 0.8 deg is looked for"),
-        ({"breakaway_deg": 0.8}, "of breakaway; at most 0.691 deg is looked for"),
+        ({"backlash_deg": 1.45}, "of play; the search ends at 1.5 deg"),
+        ({"dead_zone_deg": 1.1}, "of dead zone; the search ends at 0.8 deg"),
+        ({"breakaway_deg": 0.8}, "of breakaway; the search ends at 0.691 deg"),
     ],
 )
 def test_more_than_is_looked_for_is_said(measured, truth, says):

@@ -132,7 +132,7 @@ def test_a_declined_correction_leaves_the_file_and_the_state(at):
         told: list[str] = []
 
         def read(question):
-            word = re.search(r"Type (\w+) to go on", question)[1]
+            word = re.search(r"Type (\w+) to continue", question)[1]
             return "no" if word == "correct" else word
 
         config = load_config("rig.toml")
@@ -198,4 +198,4 @@ def test_a_count_of_0_after_a_power_cycle_is_not_home(at, name, obeys, monkeypat
             else:
                 check_drives(served, drives, record)
     assert (record.state(HOMED) is None) is obeys
-    assert any("is not noticed" in line for line in told) is not obeys
+    assert any("is not detected" in line for line in told) is not obeys

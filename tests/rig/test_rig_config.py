@@ -130,9 +130,9 @@ def test_a_run_is_resumed_with_other_addresses_and_limits_and_nothing_else():
         judged = parse_config(EXAMPLE_TEXT.replace(old, new, 1))
         assert judged.changed_since(began) == [], new
     for old, new, named in (
-        ("reduction = 10", "reduction = 11", "axes.pitch.reduction: 10.0 then"),
-        ('order = "ZXY"', 'order = "ZYX"', "mechanism.order: ZXY then, ZYX now"),
-        ("samples = 25", "samples = 26", "settle.samples: 25 then, 26 now"),
+        ("reduction = 10", "reduction = 11", "axes.pitch.reduction: was 10.0"),
+        ('order = "ZXY"', 'order = "ZYX"', "mechanism.order: was ZXY, is ZYX"),
+        ("samples = 25", "samples = 26", "settle.samples: was 25, is 26"),
         ('map = "leadshine_pr"', 'map = "generic"', "axes.pitch.map.name: leadshine"),
     ):
         changed = parse_config(EXAMPLE_TEXT.replace(old, new, 1))

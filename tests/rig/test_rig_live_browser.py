@@ -323,7 +323,7 @@ def test_pause_lets_the_posture_be_finished(rig, browse):
     driver = browse(rig)
     until(lambda: shown(driver, "#pause"))
     driver.find_element("id", "pause").click()
-    until(lambda: "pause asked for" in words(driver, "#answer"))
+    until(lambda: "pause requested" in words(driver, "#answer"))
     driver.find_element("id", "pause").click()  # and no stop
     assert rig.session.wait(PATIENT_S) == 4
     visits = rig.records("visit")

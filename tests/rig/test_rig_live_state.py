@@ -134,9 +134,9 @@ def test_places_of_a_commissioning_step_are_shown_and_what_goes_on_is_the_step()
     for running in (True, False):
         assert commanded in numbers(state, running)
     told = trouble(state, False, "runs/axes")
-    assert "To go on: jaxcal-rig setup axes<" in told and "resume" not in told
+    assert "To continue: jaxcal-rig setup axes<" in told and "resume" not in told
     killed = trouble(state_of(numbered([start, stand])), False, "runs/axes")
-    assert "To go on: jaxcal-rig setup axes<" in killed
+    assert "To continue: jaxcal-rig setup axes<" in killed
 
 
 def test_the_posture_under_way_goes_through_its_states():
@@ -249,7 +249,7 @@ def test_what_goes_on_after_a_fault_is_what_the_console_said():
     lack = "the device is not HOMED: yaw. Run `jaxcal-rig setup home`. Then resume"
     fault = {"event": "fault", "code": 3, "reason": "alarm", "go_on": lack}
     state = state_of(numbered([*begun(), fault]))
-    assert f"To go on: {lack}" in view.trouble(state, False, "runs/one")
+    assert f"To continue: {lack}" in view.trouble(state, False, "runs/one")
 
 
 def test_a_missing_record_is_told_and_a_foreign_one_harms_nothing(tmp_path):

@@ -133,7 +133,10 @@ def test_two_names_of_one_serial_port_are_one_lock(tmp_path):
     one, other = (
         BusLock(BusSettings(transport="rtu", device=str(name))) for name in (port, link)
     )
-    with one.acquire("calibrate"), pytest.raises(Refused, match="held by `calibrate`"):
+    with (
+        one.acquire("calibrate"),
+        pytest.raises(Refused, match="in use by `calibrate`"),
+    ):
         other.acquire("verify")
     with other.acquire("verify"):
         assert one.holder()["command"] == "verify"

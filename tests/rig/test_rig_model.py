@@ -126,21 +126,25 @@ def test_a_function_of_ones_own_is_the_model(tmp_path):
 def test_an_arm_whose_coupling_slips_is_stopped(tmp_path):
     fault = "slipping_axis,axis=bend"
     code, said, _ = simulated(parse_config(arm_text()), tmp_path, fault)
-    assert code == 3 and "otherwise than the model says" in said
+    assert code == 3 and "differ from the model's prediction" in said
 
 
 @pytest.mark.parametrize(
     "old, new, told",
     [
         ("k = 12\n", "", "session.k: missing; with a"),
-        ("[model]\n", '[model]\nfactory = "a:b"\n', "model.urdf: either urdf or fact"),
+        (
+            "[model]\n",
+            '[model]\nfactory = "a:b"\n',
+            "model.urdf: give either urdf or fact",
+        ),
         ("arm5.urdf", "none.urdf", "model.urdf: there is no file"),
         (
             "[model]\n",
             '[model]\nsensor = "position"\n',
             "model.sensor: must be gravity",
         ),
-        ('name = "turn"', 'name = "swing"', "its joints are turn, shoulder, elbow"),
+        ('name = "turn"', 'name = "swing"', "outwards are turn, shoulder, elbow"),
     ],
 )
 def test_wrong_models_of_arms_are_refused(old, new, told):
@@ -154,7 +158,7 @@ def test_wrong_models_of_arms_are_refused(old, new, told):
         ("bent.py:none", "it has no none"),
         (
             "bent.py:cubic",
-            "it takes 1 commands and predicts 1 readings; the device has 2",
+            "the model has 1 commands and 1 readings; the device has 2",
         ),
         ("no.such.module:it", "No module named"),
         ("bent.py", r"factory: must be FILE.py:NAME or MODULE:NAME"),
@@ -174,7 +178,7 @@ def test_check_and_refit_run_no_program_that_was_not_asked_for(tmp_path, capsys)
     path = tmp_path / "rig.toml"
     path.write_text(text)
     assert main(["check", str(path)]) == 0
-    assert "NOT run, and so not checked: bent.py:function" in capsys.readouterr().out
+    assert "NOT CHECKED: bent.py:function" in capsys.readouterr().out
     run = tmp_path / "calibrate-1"
     run.mkdir()
     shutil.copy(path, run)

@@ -137,7 +137,7 @@ def test_a_drive_that_another_controller_moves_ends_what_is_measured(monkeypatch
             return statuses
 
         monkeypatch.setattr(measuring, "_settled", then_moved)
-        with pytest.raises(MotionFault, match="moves while the posture is measured"):
+        with pytest.raises(MotionFault, match="moves during the measurement"):
             measure(Arrival(motion.device, Posture("", (0, 0, 0))), 200)
 
 
@@ -294,12 +294,12 @@ def test_readings_that_come_in_bursts_settle_over_more_than_the_window(moves):
     device = SimpleNamespace(config=config, frame=None, imu=imu, geometry=geometry)
     found = _unquiet(device, readings, now=0.35)
     assert "std_deg" in found if moves else found == ""
-    assert "10 readings over 0.00 s" in _unquiet(device, readings[-10:], now=0.35)
+    assert "10 readings in 0.00 s" in _unquiet(device, readings[-10:], now=0.35)
 
 
 def test_a_shaking_device_never_settles():
     # On a machine so busy that the phone is not heard, that is what it is told instead.
-    reason = r"did not settle.*(std_deg|readings over)"
+    reason = r"did not settle.*(std_deg|readings in)"
     with bench(fast_config(UNSETTLED), noise_deg=1.0) as motion:
         with pytest.raises(MotionFault, match=reason):
             motion.measure(motion.device.positions())
@@ -318,7 +318,7 @@ def test_a_creeping_device_never_settles():
     ("fault", "error"),
     [
         ("stuck_axis,axis=yaw@moving", "yaw does not follow"),
-        ("alarm,axis=roll", "roll: alarm 0x30. .* go on with --reset-alarms"),
+        ("alarm,axis=roll", "roll: alarm 0x30. .* continue with --reset-alarms"),
         ("sto,axis=yaw", "power stage of yaw was switched off while armed"),
         ("imu_gap@moving", "s old"),
         ("dead_drive,axis=pitch", "no valid reply"),

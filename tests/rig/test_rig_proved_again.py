@@ -76,7 +76,7 @@ def test_axes_prove_the_stop_and_a_session_shows_each_axis(at, capsys):
         told = turns(sim, load_config("rig.toml"))
         np.testing.assert_allclose(found["deg"], told["deg"], atol=0.02)
         out = capsys.readouterr().out
-        assert "the drives stop, and stay: the stop of each unit" in out
+        assert "the drives stop and do not move on: the stop of each unit" in out
         assert all(drive.stops for drive in sim.drives)
         code, said = session(capsys)
         assert code == 0, said
@@ -125,7 +125,7 @@ def test_a_session_whose_drives_were_halted_does_not_move_again(
         assert joints(sim) == stood and moves(sim) == before
         reasons = ["power stage"] if "sto" in fault else ["ended", "does not follow"]
         assert any(reason in said for reason in reasons), said
-        assert "moved last" in said
+        assert "last moved" in said
         run = run_folder(at)
         recorded = len(postures(run))
         sim.faults.clear()
@@ -213,7 +213,7 @@ def test_a_gearing_that_was_changed_since_is_found_in_small_moves(
         sim.plant.attitude = watched
         code, said = session(capsys)
         assert code == 3, said
-        assert axis in said and "when `axes` looked" in said
+        assert axis in said and "`axes` measured" in said
         assert far.max() < 5.0, far
     record = DeviceRecord.load(at / "device.json")
     assert record.state(SIGN_CHECKED) is None
@@ -251,7 +251,7 @@ def test_a_drive_that_ignores_its_speed_is_named(factor, at, capsys, monkeypatch
         (at / "rig.toml").write_text(text.replace("_s2 = 8000", "_s2 = 400"))
         code, said = session(capsys)
         assert code == 3, said
-        assert "yaw moves at" in said and "was told to move at" in said
+        assert "yaw moves at" in said and "instead of the commanded" in said
 
 
 @pytest.mark.slow
@@ -268,7 +268,7 @@ def test_axes_tell_the_speed_that_they_saw(at, capsys, monkeypatch):
         sim.faults.clear()
         assert main(["axes", "--yes"]) == 0
         out = capsys.readouterr().out
-    assert out.count("deg/s at least") == 3
+    assert out.count("deg/s") == 3
 
 
 # D, E: the stop
@@ -285,7 +285,7 @@ def test_a_stop_that_does_nothing_is_found_in_axes(axes, at, capsys):
         sim.faults.add(parse_fault(f"stop_ignored{axes}"))
         assert main(["axes", "--yes"]) == 3
         assert "pitch" in (said := capsys.readouterr().out)
-        assert "went on to the target after the stop of each unit" in said
+        assert "moved on to the target after the stop of each unit" in said
         record = DeviceRecord.load(at / "device.json")
         assert record.state(SIGN_CHECKED) and not record.state(STOP_PROVED)
         assert main(["calibrate", "--arm", "--zero"]) == 2
@@ -326,7 +326,7 @@ def test_a_session_that_was_stopped_looks_whether_its_drives_stay(
         sim.faults.add(parse_fault("stop_resumes,seconds=1.5,count=1"))
         code, said = session(capsys)
         assert code == 143 and stopped, said
-        assert "went on by itself after its stop" in said
+        assert "moved on after its stop" in said
         assert said.count("acknowledged, standing") == 3 and "at rest" in said
         time.sleep(1.0)
         stood = joints(sim)
@@ -359,5 +359,5 @@ def test_each_way_to_stop_is_tried_where_the_map_has_it(fault, told, at, capsys)
             return
         assert code == 0, said
         ways = "the stop of each unit, the broadcast stop, their watch of the line"
-        assert f"the drives stop, and stay: {ways}" in said
+        assert f"the drives stop and do not move on: {ways}" in said
         assert all(drive.comm_stops == 1 for drive in sim.drives)

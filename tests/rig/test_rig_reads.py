@@ -284,7 +284,9 @@ def test_a_reply_that_is_cut_by_the_timeout_is_told_as_such():
     server.tables[3] = dict(enumerate(range(8)))
     with server.on("rtu", timeout_s=0.2) as settings, Bus(settings) as bus:
         bus.listen_s = 0.0
-        with pytest.raises(BusError, match=r"not whole after 0.2 s: raise bus.timeout"):
+        with pytest.raises(
+            BusError, match=r"incomplete after 0.2 s: raise bus.timeout"
+        ):
             read_words(bus, 1, 0, 8)
 
 

@@ -93,7 +93,9 @@ def test_postures_after_it_are_as_right_as_those_before(phase, changes, tmp_path
 def test_a_zero_that_moved_at_the_end_of_a_collection_is_told(tmp_path):
     code, _, said = collected(tmp_path / "run", "saving", heading=0.0, drift=3.0)
     assert code == 1
-    assert any(line.startswith("RECALIBRATE: the zero posture reads") for line in said)
+    assert any(
+        line.startswith("RECALIBRATE: at the end the zero posture") for line in said
+    )
 
 
 class HeldTerminal(list):

@@ -66,7 +66,7 @@ def test_other_evidence_makes_what_was_built_on_it_void(record):
     record.reach(HOMED, CONFIG, word="HOMED")
     assert record.missing(CONFIG, ZEROED) is None
     record.reach(HOMED, CONFIG, word="somewhere else")
-    assert "HOMED was reached again" in record.missing(CONFIG)
+    assert "HOMED was passed again" in record.missing(CONFIG)
     record.reach(SIGN_CHECKED, CONFIG)
     record.reach(STOP_PROVED, CONFIG)
     assert record.missing(CONFIG) is None
@@ -76,15 +76,15 @@ def test_other_evidence_makes_what_was_built_on_it_void(record):
     ("old", "new", "key", "state"),
     [
         ("pulses_per_rev = 10000", "pulses_per_rev = 4000",
-         "axes.pitch.pulses_per_rev: 10000 then, 4000 now", SIGN_CHECKED),
+         "axes.pitch.pulses_per_rev: was 10000, is 4000", SIGN_CHECKED),
         ("direction = -1", "direction = 1",
-         "axes.yaw.direction: -1 then, 1 now", SIGN_CHECKED),
+         "axes.yaw.direction: was -1, is 1", SIGN_CHECKED),
         ('order = "ZXY"', 'order = "ZYX"',
-         "mechanism.order: ZXY then, ZYX now", SIGN_CHECKED),
+         "mechanism.order: was ZXY, is ZYX", SIGN_CHECKED),
         ("column_count = 4", "column_count = 4\nmounting_deg = [0, 0, 90]",
-         "imu.mounting_deg: [0.0, 0.0, 0.0] then, [0.0, 0.0, 90.0] now", SIGN_CHECKED),
-        ("unit = 3", "unit = 4", "axes.roll.unit: 3 then, 4 now", IDENTIFIED),
-        ('"leadshine_pr"', '"oriental_az"', "axes.pitch.map: leadshine_pr (",
+         "imu.mounting_deg: was [0.0, 0.0, 0.0], is [0.0, 0.0, 90.0]", SIGN_CHECKED),
+        ("unit = 3", "unit = 4", "axes.roll.unit: was 3, is 4", IDENTIFIED),
+        ('"leadshine_pr"', '"oriental_az"', "axes.pitch.map: was leadshine_pr (",
          IDENTIFIED),
     ],
 )  # fmt: skip
@@ -102,7 +102,7 @@ def test_keys_that_say_nothing_of_a_place_change_nothing(record):
 def test_a_fingerprint_is_the_same_once_it_was_json():
     found = CONFIG.device_fingerprint()
     assert json.loads(json.dumps(found)) == found
-    assert differences({}, {"a": 1}) == ["a: not known then, 1 now"]
+    assert differences({}, {"a": 1}) == ["a: was not known, is 1"]
 
 
 def test_where_the_drives_were_left(record):

@@ -40,7 +40,7 @@ def test_a_calibration_that_is_not_to_be_used_wants_a_word(tmp_path, capsys):
     assert config.session.verify_limit_deg == 0.001
     assert main(given) == 2
     said = capsys.readouterr()
-    assert "said not to use it: the error after compensation, 0." in said.out
+    assert "advised against using it: the error after compensation, 0." in said.out
     assert " deg, exceeds session.verify_limit_deg (0.001 deg)" in said.out
     assert "--use" in said.out
     assert "moving" not in said.out

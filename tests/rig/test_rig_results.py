@@ -122,7 +122,7 @@ def test_refit_mends_a_wrong_order_without_new_recording(run, capsys):
     assert len(beside(run)) == 2
     capsys.readouterr()
     assert main(["refit", str(folder)]) == 2
-    assert "give that run instead" in capsys.readouterr().err
+    assert "pass that run instead" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -235,7 +235,7 @@ def test_a_report_says_what_there_is_of_an_unfinished_run(run, finished, kept):
     assert main(["report", str(run)]) == 0
     page = (run / "report.html").read_text()
     if kept < len(lines):
-        assert "killed, or the power failed" in page
+        assert "killed, or a power failure" in page
         assert "y = A u + b" not in page
     else:
         assert "Done: recalibrate" in page and "session.verify_limit_deg" in page
@@ -246,7 +246,7 @@ def test_a_report_says_what_there_is_of_an_unfinished_run(run, finished, kept):
         cell = f"{summary['A'][2][1]:.5f} ± {summary['ci95'][2][1]:.5f}"
         assert f"|{cell}|" in text
     own = (finished / "report.html").read_text()  # written before the last record
-    assert "All is measured" in own and "killed" not in own
+    assert "All measurements are made" in own and "killed" not in own
     measured = sum('"event":"posture"' in line for line in lines[:kept])
     assert (f"{measured} measured" in page) == (measured > 0)
 
@@ -613,7 +613,7 @@ def test_a_folder_of_runs_is_no_run(tmp_path, capsys):
     (tmp_path / "calibrate-1").mkdir()
     for command in (["report"], ["refit"], ["export", "--to", "c"], ["watch"]):
         assert main([command[0], str(tmp_path), *command[1:]]) == 2
-        lack = f"{tmp_path} is not the folder of a run: it holds no journal.jsonl"
+        lack = f"{tmp_path} is not a run's folder: it has no journal.jsonl"
         assert lack in capsys.readouterr().err
 
 

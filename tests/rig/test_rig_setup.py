@@ -57,7 +57,7 @@ def test_setup_finds_exchanged_reversed_and_wrongly_geared_axes(at, transport, c
     assert "next: jaxcal-rig calibrate --config rig.toml" in said
     # the corrected file is the written one with other values: comments stay
     text = pathlib.Path("rig.toml").read_text()
-    assert "# omega: pulses for one motor turn, as set in the drive" in text
+    assert "# omega: pulses per motor turn, as set in the drive" in text
     assert len(list(at.glob("rig.toml.*.bak"))) == 2  # the phone's address, the axes
 
 
@@ -83,7 +83,7 @@ def test_a_gearing_that_is_off_on_all_axes_and_that_no_register_tells_is_refused
         values = [value for value in QUICK if "reduction" not in value]
         values += [f"axes.{a.name}.reduction={a.reduction}" for a in config.axes]
         assert set_up(bus, port, values=values) == 3
-    assert "has no register that says its pulses" in capsys.readouterr().out
+    assert "has no register for its pulses" in capsys.readouterr().out
     for axis, was in zip(load_config("rig.toml").axes, config.axes, strict=True):
         assert axis.reduction == was.reduction
     assert max(turned) < 9.0  # and on the way to it nothing went far
@@ -117,7 +117,7 @@ def test_setup_asks_with_defaults_and_moves_nothing_without_a_yes(at):
 
     def read(question):
         asked.append(question)
-        word = re.search(r"Type (\w+) to go on", question)
+        word = re.search(r"Type (\w+) to continue", question)
         return word[1] if word and word[1] != "axes" else ""
 
     with device() as (sim, bus, port):
@@ -177,9 +177,9 @@ def test_setup_writes_files_of_other_devices(
     [
         ({"axes": "x"}, "--axes must be NAME:KIND"),
         ({"axes": "x:mm"}, "--axes x:mm: a phone measures rotations"),
-        ({"axes": "x:mm,x:mm"}, "the axis x is there twice"),
+        ({"axes": "x:mm,x:mm"}, "the axis x is named twice"),
         ({"readings": "pipe:1"}, "--readings must be tcp:HOST:PORT"),
-        ({"readings": "udp:1", "imu": "lines"}, "either a phone or a sensor"),
+        ({"readings": "udp:1", "imu": "lines"}, "a phone or a sensor"),
     ],
 )
 def test_wrong_options_of_setup_are_refused(options, told):
@@ -233,7 +233,7 @@ def test_a_simulated_setup_leaves_the_device_of_an_existing_file_alone(at, capsy
         (at / "rig.toml").write_text(quick_text(bus, port))
         given = ["setup", "--simulate", "--yes", "--config", "rig.toml"]
         assert main(given) == 2
-        assert "--simulate writes a file of its own" in capsys.readouterr().err
+        assert "--simulate writes a new file" in capsys.readouterr().err
         assert sim.server.requests == 0
 
 
@@ -243,7 +243,7 @@ def test_a_simulated_check_of_the_axes_corrects_no_file(at, capsys):
     (at / "rig.toml").write_text(fast_text())
     given = ["--simulate", "--yes", "--config", "rig.toml", "--reversed", "roll"]
     assert main(["axes", *given]) == 1
-    assert "axes.roll.direction = -1 (is 1)" in capsys.readouterr().out
+    assert "axes.roll.direction = -1 (now 1)" in capsys.readouterr().out
     assert (at / "rig.toml").read_text() == fast_text()
 
 
@@ -258,4 +258,4 @@ def test_limits_of_a_translation_are_asked_for_in_its_unit_and_written(tmp_path)
     setup._ask_limits(site)
     x, y = load_config(path).axes
     assert (x.min_deg, y.max_deg) == (-15.0, 20.0)
-    assert "lowest place that is safe, mm from home" in said[0]
+    assert "lowest safe place, mm from home" in said[0]

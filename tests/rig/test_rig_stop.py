@@ -256,9 +256,9 @@ def test_stop_ends_the_session_that_moves_and_then_stops_every_unit(
         assert code == 2 and f"process {child.pid}" in capsys.readouterr().err
         assert main(["stop", "--config", str(rig.path)]) == 0
         said = capsys.readouterr().out
-        assert f"held by `calibrate` in {tmp_path}" in said
-        assert f"process {child.pid}" in said and "told to stop now" in said
-        assert "it reported that all its drives stand" in said
+        assert f"in use by `calibrate` in {tmp_path}" in said
+        assert f"process {child.pid}" in said and "asking it to stop" in said
+        assert "it reported that all its drives are at rest" in said
         assert said.count("acknowledged, standing") == 3
         assert child.wait(10) == 128 + signal.SIGTERM
     assert not any(drive.moving for drive in rig.drives)
@@ -291,8 +291,10 @@ def test_a_suspended_session_is_ended_and_its_drives_are_stopped(transport, tmp_
                 for drive in sim.drives
             )
             said = done.stdout
-            assert "it is killed now" in said
-            assert "it reported that all its drives stand" in said  # its line's process
+            assert "killing it" in said
+            assert (
+                "it reported that all its drives are at rest" in said
+            )  # its line's process
             assert said.count("acknowledged, standing") == 3
             assert child.wait(5) == -signal.SIGKILL
         assert not any(drive.moving for drive in sim.drives)
@@ -395,7 +397,7 @@ def test_stop_says_so_when_it_cannot_open_the_port_of_a_holder(tmp_path, capsys)
         shown = capsys.readouterr()
         assert f"process {os.getpid()}" in shown.out
         assert "NOTHING WAS STOPPED BY THIS COMMAND" in shown.err
-        assert "held by another program" in shown.err
+        assert "in use by another program" in shown.err
         assert not any(drive.stops for drive in sim.drives)
 
 
@@ -408,7 +410,7 @@ def test_what_a_dead_holder_left_is_not_believed(rig, capsys):
             stale = held.path.read_text().replace(str(os.getpid()), str(innocent.pid))
         held.path.write_text(stale)
         assert main(["stop", "--config", str(rig.path)]) == 0
-        assert "held by" not in capsys.readouterr().out
+        assert "in use by" not in capsys.readouterr().out
         assert innocent.poll() is None
     finally:
         innocent.kill()

@@ -175,4 +175,4 @@ def test_axes_measures_both_and_says_the_number(at, monkeypatch, capsys):
         assert len(known["speeds"]) == 2
         found = StopDistance.of(**known)
         np.testing.assert_allclose(found.at(90.0), 8100 / (2 * RAMP), rtol=0.4)
-        assert f"{name}: its stop takes" in said and "deg at 90 deg/s" in said
+        assert f"{name}: stopping distance" in said and "deg at 90 deg/s" in said

@@ -149,7 +149,7 @@ def test_radians_signs_and_quaternion_columns():
     settings = changed(PLAIN, quaternion_columns=(0, 1, 2, 3), column_count=4)
     readings, parser = feed(settings, "0,0,0.7071068,0.7071068", "0,0,0.5,0.5")
     assert len(readings) == 1
-    assert parser.counts["a quaternion that is not of length one"] == 1
+    assert parser.counts["a quaternion whose length is not one"] == 1
     np.testing.assert_allclose(
         readings[0].value, euler_to_matrix([90, 0, 0], "ZYX"), atol=1e-6
     )
@@ -244,7 +244,7 @@ def test_stamps_of_another_unit_are_named_as_the_cause():
     )
     with Imu(settings) as imu, connect(imu) as phone:
         begun, said = time.monotonic(), ""
-        while "stamps are not" not in said and time.monotonic() - begun < 3.0:
+        while "time stamps are" not in said and time.monotonic() - begun < 3.0:
             stamp = time.monotonic() - begun  # seconds, where ms are agreed
             phone.sendall(f"{stamp:.3f},1,2,3\n".encode())
             time.sleep(0.01)
@@ -252,7 +252,7 @@ def test_stamps_of_another_unit_are_named_as_the_cause():
                 imu.latest()
             except ReadingError as error:
                 said = str(error)
-        assert "stamps are not those configured" in said
+        assert "its time stamps are wrong" in said
 
 
 def test_a_taken_port_is_one_clear_error():
@@ -507,7 +507,7 @@ def test_a_line_of_names_that_was_moved_is_followed():
 def test_sensorlog_without_its_header_is_named():
     readings, parser = feed(SENSORLOG, sensorlog_line(TURNED.as_quat(), 0.0))
     assert not readings
-    assert parser.counts["before the header, which the app sends when it begins"] == 1
+    assert parser.counts["before the header, which the app sends at the start"] == 1
 
 
 JSON = changed(HYPER, format="json", stamp_column=-1, column_count=0)
@@ -545,7 +545,7 @@ def test_json_lines_of_apps_are_attitudes(app):
         ("{", "not JSON"),
         ('{"accelerometer": {"value": [1, 2, 3]}}', "without a rotation vector"),
         ('{"rotationVector": {"value": [1, 2, null]}}', "not a number"),
-        ('{"rotationVector": {"value": [3, 2, 1, 0]}}', "not of length one"),
+        ('{"rotationVector": {"value": [3, 2, 1, 0]}}', "length is not one"),
         ("[" * 5000, "not JSON"),
     ],
 )

@@ -144,8 +144,8 @@ def test_a_lost_origin_is_seen_in_the_tilt_of_the_zero_posture(
         code, said = run_verify(config, calibrated, tmp_path / "after", sim)
     assert code == 3
     name = ("pitch", "yaw", "roll")[axis]
-    assert re.search(rf"{name} [+-]\d\.\d\d\b.* deg from where it stood", said[-2])
-    assert "not seen: yaw, about the vertical" in said[-2]
+    assert re.search(rf"{name} [+-]\d\.\d\d\b.* deg from its place before", said[-2])
+    assert "not measurable: yaw, about the vertical" in said[-2]
     records = read_journal(tmp_path / "after/journal.jsonl")
     assert not [r for r in records if r["event"] in ("zero", "posture")]
 
@@ -177,7 +177,7 @@ def test_drives_that_are_not_where_they_were_left_have_lost_their_place(
         moves = sim.executions()
         code, said = run_verify(config, calibrated, tmp_path / "b", sim, record)
         assert code == 2 and sim.executions() == moves
-    assert "yaw: it stands at" in said[-1] and "1.40 deg from" in said[-1]
+    assert "yaw: it is at" in said[-1] and "1.40 deg from" in said[-1]
     again = DeviceRecord.load(record.path)
     assert again.state(HOMED) is None and again.state(IDENTIFIED) is not None
     assert "`jaxcal-rig setup home`" in again.missing(config)
@@ -216,7 +216,7 @@ def test_a_homed_bit_that_is_gone_voids_the_place(calibrated, tmp_path):
         assert run_verify(config, calibrated, tmp_path / "a", sim, record)[0] == 0
         sim.power_cycle()  # every count comes back as it was
         code, said = run_verify(config, calibrated, tmp_path / "b", sim, record)
-    assert code == 2 and "pitch, yaw, roll: the homed bit is gone" in said[-1]
+    assert code == 2 and "pitch, yaw, roll: the homed bit is cleared" in said[-1]
 
 
 def test_resume_says_which_axis_has_lost_its_origin(tmp_path):
@@ -266,7 +266,7 @@ def test_gravity_resolves_the_axes_it_can(rng):
 def test_the_pulses_of_the_zero_count_too():
     config = fast_config()
     kept = ZeroRecord("it", (0, 0, 0), np.eye(3))
-    assert "zero posture stands 0.000 deg" in kept.check(config, (3, 0, 0), np.eye(3))
+    assert "zero posture is 0.000 deg" in kept.check(config, (3, 0, 0), np.eye(3))
     far = config.to_pulses((0.0, LOST, 0.0))
     with pytest.raises(MotionFault, match=r"yaw \+1\.40 deg"):
         kept.check(config, far, np.eye(3))
@@ -325,18 +325,18 @@ def test_goto_with_another_gearing_is_refused_before_a_port_opens(
         assert code == 2
         error = capsys.readouterr().err
         for name in ("pitch", "yaw", "roll"):
-            assert f"axes.{name}.pulses_per_rev: 10000 then, 4000 now" in error
+            assert f"axes.{name}.pulses_per_rev: was 10000, is 4000" in error
     assert not (tmp_path / "runs").exists()
 
 
 @pytest.mark.parametrize(
     ("old", "new", "key"),
     [
-        ("direction = -1", "direction = 1", "axes.yaw.direction: -1 then, 1 now"),
-        ('"leadshine_pr"', '"generic"', "axes.pitch.map: leadshine_pr ("),
-        ('order = "ZXY"', 'order = "YXZ"', "mechanism.order: ZXY then, YXZ now"),
+        ("direction = -1", "direction = 1", "axes.yaw.direction: was -1, is 1"),
+        ('"leadshine_pr"', '"generic"', "axes.pitch.map: was leadshine_pr ("),
+        ('order = "ZXY"', 'order = "YXZ"', "mechanism.order: was ZXY, is YXZ"),
         ("column_count = 4", "column_count = 4\nmounting_deg = [90, 0, 0]",
-         "imu.mounting_deg: [0.0, 0.0, 0.0] then, [90.0, 0.0, 0.0] now"),
+         "imu.mounting_deg: was [0.0, 0.0, 0.0], is [90.0, 0.0, 0.0]"),
     ],
 )  # fmt: skip
 def test_a_calibration_is_of_one_device(calibrated, old, new, key):
@@ -358,7 +358,7 @@ def test_a_calibration_that_does_not_say_its_device_is_refused(
     old = text.replace(json.dumps(saved.provenance["notes"]), json.dumps(notes))
     assert old != text
     (tmp_path / "calibration.json").write_text(old)
-    with pytest.raises(Refused, match="does not say with which device"):
+    with pytest.raises(Refused, match="the device and zero posture are not recorded"):
         load_calibration(tmp_path, fast_config())
 
 
@@ -368,7 +368,7 @@ def test_the_drives_own_gearing_counts(tmp_path):
         assert session(sim.start(), tmp_path, sim, said) == 2
         assert not any(sim.executions())
     assert "the drive of roll (unit 3) is set to 9000 pulses per turn" in said[-1]
-    assert "axes.roll.pulses_per_rev says 10000" in said[-1]
+    assert "axes.roll.pulses_per_rev is 10000" in said[-1]
 
 
 def test_a_drive_without_a_word_on_its_gearing_is_not_asked_for_it(tmp_path):
@@ -427,7 +427,7 @@ def test_another_drive_is_another_device(tmp_path):
         record.reach(SIGN_CHECKED, served)
         record.reach(STOP_PROVED, served)
         assert run_safely(run, lambda r: collect(r, 1)) == 2
-    assert "yaw: another drive (peak_current_tenth_A: 45" in said[-1]
+    assert "yaw: another drive (peak_current_tenth_A: was 45" in said[-1]
     assert DeviceRecord.load(record.path).state(IDENTIFIED) is None
 
 

@@ -265,7 +265,7 @@ def refused(message, **change):
 
 def test_bad_blocks_are_one_clear_error():
     blocks, _ = drawn(0, 8, 2, 4)
-    refused("either candidates or blocks must be given, got neither", blocks=None)
+    refused("give either candidates or blocks, got neither", blocks=None)
     refused("got both", candidates=np.ones((8, 3)))
     refused(r"blocks must have shape \(M, q, p\).* got \(8, 4\)", blocks=blocks[:, 0])
     refused(r"none of them 0, got \(8, 0, 4\)", blocks=blocks[:, :0])
@@ -278,15 +278,15 @@ def test_bad_blocks_are_one_clear_error():
     refused("prior must be a positive semidefinite", prior=-np.eye(4))
     bare = {"blocks": None, "candidates": np.ones((8, 3))}
     refused(r"prior must be a jaxcal.Prior\(std=...\), got int", **bare, prior=1)
-    refused('blocks cannot be used with method "policy"', method="policy")
+    refused('method "policy" does not take blocks', method="policy")
     blind = blocks * [1, 1, 0, 1]
-    refused("say nothing of the direction theta3", blocks=blind)
+    refused("do not inform the direction theta3", blocks=blind)
     blind[..., 2] = 2 * blind[..., 1]
     refused(r"the direction \(\+0.8944 theta2 -0.4472 theta3\)", blocks=blind)
     prior = np.diag([0, 0, 1.0, 0])
     assert select(blocks=blind, prior=prior).proven
     refused(
-        "required must leave room .* span 2 of 4 regressors",
+        "required candidates leave too little room .* span 2 of 4 regressors",
         blocks=np.concatenate([blocks[:1], blocks[:1], blocks[1:]]), required=[0, 1],
     )  # fmt: skip
 

@@ -286,7 +286,7 @@ def test_blocks_are_visited_as_by_brute_force(seed, least, known):
     [
         ({"prior": np.eye(5), "blocks": None}, "prior must be a jaxcal.Prior"),
         ({"candidates": np.zeros((7, 3))}, r"commands must have shape \(8, n\)"),
-        ({"candidates": None}, "commands must be given with blocks"),
+        ({"candidates": None}, "blocks need the commands"),
     ],
 )
 def test_bad_requests_with_blocks_are_named(rng, change, message):

@@ -331,9 +331,9 @@ HELD = jaxcal.Prior(1.0, fixed=("a11", "a12", "a13", "b1"))
         ("there is no argument 'parameters'", {"parameters": [0]}),
         ("parameters must be indices or names", {"criterion": jaxcal.As([4])}),
         ("parameters must be indices .*'x'", {"criterion": jaxcal.As("x")}),
-        ("parameters must name some once", {"criterion": jaxcal.As([1, 1])}),
+        ("parameters must be names, each once", {"criterion": jaxcal.As([1, 1])}),
         (
-            "region goes with criterion I or G only, and once",
+            "region works once, with criterion I or G only",
             {"region": np.ones((3, 2, 4)), "criterion": jaxcal.I(np.ones((3, 2, 4)))},
         ),
         (
@@ -341,14 +341,14 @@ HELD = jaxcal.Prior(1.0, fixed=("a11", "a12", "a13", "b1"))
             {"region": np.ones((3, 4)), "criterion": "I"},
         ),
         (
-            "region goes with criterion I or G only, and once, got criterion D",
+            "region works once, with criterion I or G only, got criterion D",
             {"region": np.ones((3, 2, 4))},
         ),
         (r"measured must have shape \(N, 2, 4\)", {"measured": np.ones((3, 1, 4))}),
         ("prior must be a .* precision with blocks", {"prior": jaxcal.Prior(1.0)}),
-        ("model must come with candidates", {"model": Affine(3, 3)}),
+        ("model needs candidates", {"model": Affine(3, 3)}),
         (r"candidates must have shape \(M, 2\)", BARE | {"model": Affine(2, 2)}),
-        ("prior must leave", BARE | {"model": Affine(3, 1), "prior": HELD}),
+        ("prior fixes all", BARE | {"model": Affine(3, 1), "prior": HELD}),
         (r"measured must have shape \(N, 3\)", BARE | {"measured": U[:, :2]}),
         (
             '"policy" is trained for criterion D, got A',

@@ -171,5 +171,5 @@ def test_a_criterion_of_ones_own_is_refined_without_a_row_in_the_table():
     rows = np.stack([np.ones(4), u, u * u], axis=1)
     variance = weights @ np.linalg.solve(rows.T @ rows, weights)
     assert better.value == pytest.approx(variance) and variance <= first.value
-    with pytest.raises(ValueError, match="criterion c must be given again"):
+    with pytest.raises(ValueError, match="criterion c must be repeated"):
         design.refine(first)

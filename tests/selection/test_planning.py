@@ -344,8 +344,8 @@ def test_the_first_k_is_one_that_identifies():
     [
         ({"noise_std": 1.0}, "noise_std must be left out with blocks"),
         ({"region": np.zeros((3, 2))}, r"region must have shape \(R, m, 3\), got"),
-        ({"blocks": None, "candidates": np.eye(3)}, "noise_std must be given: the des"),
-        ({"parameters": [0]}, "parameters goes with criterion="),
+        ({"blocks": None, "candidates": np.eye(3)}, "noise_std is missing: the des"),
+        ({"parameters": [0]}, "parameters needs criterion="),
         ({"noise": Noise(1.0)}, "noise and noise_std must be left out with blocks"),
         ({"accuracy": [1.0, 2.0, 3.0]}, r"accuracy must be one number"),
     ],

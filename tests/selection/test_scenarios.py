@@ -261,7 +261,7 @@ def test_units_beyond_double_precision_are_refused_by_name() -> None:
 
 def test_bad_blocks_of_scenarios_are_named() -> None:
     blocks = np.random.default_rng(0).standard_normal((2, 6, 1, 3))
-    with pytest.raises(ValueError, match="weights must come with blocks"):
+    with pytest.raises(ValueError, match="weights need blocks"):
         Design.from_blocks(blocks[0], weights=[1.0])
     with pytest.raises(ValueError, match="measured must have shape"):
         Design.from_blocks(blocks, measured=blocks[0]).select(3)

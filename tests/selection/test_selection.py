@@ -194,13 +194,19 @@ def test_a_mask_may_be_as_tight_as_the_selection():
         ({"k": 0}, "k must be at least 1, got 0"),
         ({"k": 4.5}, "k must be a whole number, got 4.5"),
         ({"k": True}, "k must be a whole number, got True"),
-        ({"k": 21}, "k must not exceed what is available: 20 candidates, got 21"),
-        ({"k": 41, "max_replicates": 2}, "20 candidates, each at most 2 times, got 41"),
+        ({"k": 21}, "k must not exceed 20 available candidates, got 21"),
+        (
+            {"k": 41, "max_replicates": 2},
+            "20 available candidates, each at most 2 times, got 41",
+        ),
         ({"max_replicates": 0}, "max_replicates must be at least 1, got 0"),
         ({"available": np.zeros(20, bool)}, "available must leave at least 4 .* none"),
         ({"available": np.ones(19, bool)}, r"available must have shape \(20,\), got"),
         ({"available": np.full(20, 2)}, "available must hold True or 1 .* got 2"),
-        ({"available": np.arange(20) < 3}, "k must not exceed .* 3 candidates, got 4"),
+        (
+            {"available": np.arange(20) < 3},
+            "k must not exceed 3 available candidates, got 4",
+        ),
         ({"required": [20]}, r"required must lie in \[0, 20\), got 20"),
         ({"required": [-1]}, r"required must lie in \[0, 20\), got -1"),
         ({"required": [1, 2, 1]}, "required must not repeat a candidate, got 1 twice"),
@@ -248,7 +254,7 @@ def test_unknown_methods_are_answered_with_the_list():
 def test_what_only_one_method_can_do_is_refused_by_the_others():
     with pytest.raises(
         ValueError,
-        match=r'restarts is not an option of method "greedy" \(it is of exchange, '
+        match=r'restarts is not an option of method "greedy" \(only of exchange, '
         r"exact, auto\)",
     ):
         select(uniform(0), 4, "greedy", restarts=5)
@@ -300,7 +306,8 @@ def test_required_postures_that_leave_no_room_are_refused():
     candidates[:4, 1] = 0.3
     for method in SOLVERS:
         with pytest.raises(
-            ValueError, match=r"required must leave room .* span 3 of 4"
+            ValueError,
+            match=r"required candidates leave too little room .* span 3 of 4",
         ):
             select(candidates, 4, method, required=[0, 1, 2, 3])
         found = select(candidates, 5, method, required=[0, 1, 2, 3])
@@ -316,7 +323,7 @@ def test_required_postures_that_leave_no_room_are_refused():
         ([0, 1, 2, -1], r"indices must lie in \[0, 20\), got -1"),
         ([0.0, 1, 2, 3], "indices must be a .* whole numbers"),
         ([[0, 1, 2, 3]], r"indices must be .* got shape \(1, 4\)"),
-        ([0, 1, 2, 2], "indices must repeat a candidate at most max_replicates = 1"),
+        ([0, 1, 2, 2], "indices may repeat a candidate at most max_replicates = 1"),
     ],
 )
 def test_score_refuses_what_cannot_be_scored(indices, message):
@@ -332,7 +339,7 @@ def test_a_singular_subset_is_refused():
 def test_score_respects_the_mask_and_the_cap():
     with pytest.raises(ValueError, match="indices must be available, got 3"):
         score(uniform(0), [1, 2, 3, 4], available=np.arange(20) != 3)
-    with pytest.raises(ValueError, match="indices must repeat a candidate at most max"):
+    with pytest.raises(ValueError, match="indices may repeat a candidate at most max"):
         score(uniform(0), [1, 2, 3, 4, 4])
     with pytest.raises(ValueError, match="reference must be one of bound, exact, got"):
         score(uniform(0), [1, 2, 3, 4], reference="best")

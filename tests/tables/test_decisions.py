@@ -46,12 +46,12 @@ def test_y_is_an_output_where_the_table_says_so(header, inputs, outputs):
 
 def test_readings_are_named_where_y_is_an_axis():
     table = roles("x_mm,y_mm,z_mm,r")[0]
-    with pytest.raises(ValueError, match=r"'y_mm' may be an axis.* --outputs"):
+    with pytest.raises(ValueError, match=r"'y_mm' may be a coordinate.* --outputs"):
         table.outputs(None)
-    with pytest.warns(UserWarning, match="'y_mm' is read as input: an axis"):
+    with pytest.warns(UserWarning, match="'y_mm' is read as input: a coordinate"):
         assert table.commands(None, but=["r"]) == ("x_mm", "y_mm", "z_mm")
     beside = roles("u_a,u_b,x_mm,y_mm,z_mm")[0]
-    with pytest.raises(ValueError, match="'y_mm' may be an axis"):
+    with pytest.raises(ValueError, match="'y_mm' may be a coordinate"):
         beside.outputs(None)
 
 
@@ -113,5 +113,5 @@ def test_what_is_not_read_is_said_with_its_reason():
 
 def test_columns_that_nothing_asks_for_are_said():
     table = roles("j1,j2,j3,j4,x", {"j4": np.arange(12.0)})[0]
-    with pytest.warns(UserWarning, match="columns 'j3', 'j4' are not read"):
+    with pytest.warns(UserWarning, match="columns 'j3', 'j4' are ignored"):
         table.named(["j1", "j2"], "u_", others=["x"])

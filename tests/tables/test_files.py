@@ -129,8 +129,11 @@ def test_one_decimal_mark_for_all_cells(cells, numbers):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("u_a,u_b\n-838,1\n14.036,2\n", "line 3, column 'u_a': '14.036' may be 14036"),
-        ('a,b\n"1,234",1\n"2,345",2\n', "line 2, column 'a': '1,234' may be 1234"),
+        (
+            "u_a,u_b\n-838,1\n14.036,2\n",
+            "line 3, column 'u_a': '14.036' may mean 14036",
+        ),
+        ('a,b\n"1,234",1\n"2,345",2\n', "line 2, column 'a': '1,234' may mean 1234"),
         ("a;b\n1,5;2\n3.5;1\n2,5;4\n", "line 3, column 'a' must hold a number, got"),
         ("u_a,u_on\n1,fast\n2,slow\n", "line 2, column 'u_on' must .* got 'fast'"),
         ("u_a,y_b\n1,ok\n2,bad\n", "line 2, column 'y_b' must hold a number, got 'ok'"),
@@ -139,7 +142,7 @@ def test_one_decimal_mark_for_all_cells(cells, numbers):
         ("a\n1_000\n2\n3\n", "line 2, column 'a' must hold a number, got '1_000'"),
         ("u_a,u_b\n1,2\n3,4,5\n", "line 3 has 3 cells, the first has 2"),
         ("a,b\n1,2\n\x00,4\n", "line 3 is not UTF-8 text"),
-        ("words,more\na,b\n", "no column holds numbers: words, more"),
+        ("words,more\na,b\n", "no column contains numbers: words, more"),
     ],
 )
 def test_what_could_be_two_things_is_refused_with_the_cell(text, message):
@@ -191,7 +194,7 @@ def test_rows_whose_names_begin_with_a_hash_stay():
 
 
 def test_lines_are_those_of_the_file():
-    with pytest.warns(UserWarning, match="line 3 is read as units"):
+    with pytest.warns(UserWarning, match="units are taken from line 3"):
         table = parse("t.csv", b"# a\na,b\nmm,mm\n# c\n1,2\n\n3,nan\n")
     assert table.lines == (5, 7)
     with pytest.raises(ValueError, match="line 7, column 'b'"):

@@ -108,15 +108,15 @@ def test_a_table_of_both_is_identified():
 
 def test_three_axes_of_a_frame_are_three():
     frame = pandas.DataFrame(U, columns=["x_mm", "y_mm", "z_mm"])
-    with pytest.warns(UserWarning, match="'y_mm' is read as input: an axis"):
+    with pytest.warns(UserWarning, match="'y_mm' is read as input: a coordinate"):
         assert jaxcal.identify(frame, READINGS).input_names == ("x_mm", "y_mm", "z_mm")
-    with pytest.warns(UserWarning, match="'y_mm' is read as input: an axis"):
+    with pytest.warns(UserWarning, match="'y_mm' is read as input: a coordinate"):
         found = jaxcal.identify(frame, frame.copy())
     assert found.output_names == ("x_mm", "y_mm", "z_mm")
 
 
 def test_readings_leave_out_the_time():
-    with pytest.warns(UserWarning, match="not read: time"):
+    with pytest.warns(UserWarning, match="ignored: time"):
         found = jaxcal.identify(COMMANDS, READINGS.assign(time=np.arange(12.0)))
     assert found.output_names == tuple(READINGS)
 
@@ -152,8 +152,8 @@ def test_words_among_readings_are_refused():
 
 def test_names_that_are_none_are_refused():
     for frame, message in (
-        (COMMANDS.rename(columns={"yaw": 3}), "every column must have a name"),
-        (pandas.concat({"a": COMMANDS}, axis=1), "every column must have a name"),
+        (COMMANDS.rename(columns={"yaw": 3}), "every column needs a text"),
+        (pandas.concat({"a": COMMANDS}, axis=1), "every column needs a text"),
         (COMMANDS[["pitch", "pitch"]], "column 'pitch' comes twice"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -167,7 +167,7 @@ def test_available_is_given_once():
     mask = np.array([False, True] * 6)
     found = jaxcal.select(frame, 4, available=mask)
     np.testing.assert_array_equal(found.indices, jaxcal.select(frame, 4).indices)
-    with pytest.raises(ValueError, match="differs from the candidates' column"):
+    with pytest.raises(ValueError, match="the candidates' column 'available' differ"):
         jaxcal.select(frame, 4, available=~mask)
 
 
@@ -184,7 +184,7 @@ def test_an_import_loads_no_frames():
 
 def test_an_index_in_another_order_is_said():
     shuffled = COMMANDS.sample(frac=1.0, random_state=0)
-    said = "one index in two orders, and are paired by place: row 0 is"
+    said = "Rows are paired by position: row 0 is"
     with pytest.warns(UserWarning, match=said):
         jaxcal.identify(shuffled, READINGS, noise_std=0.01)
     at_hand = jaxcal.identify(shuffled, READINGS.loc[shuffled.index], noise_std=0.01)

@@ -134,6 +134,6 @@ def load(path: str | pathlib.Path | None = None) -> TaskPolicy:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(
-            f"checkpoint {source} names no policy this jaxcal knows: {error}"
+            f"checkpoint {source} has an unknown policy: {error}"
         ) from error
     return TaskPolicy(checkpoint.read(source, meta, like), config, meta)

@@ -94,6 +94,6 @@ def _horizon(seconds: float | tuple[float, float], test_s: float) -> int:
 
 ENTRY = Entry(
     knee,
-    about="two thresholds, found by tests that may trip",
+    about="two thresholds, tested by readings that may end the test",
     rules={"priced": PRICED, "state": STATE_RULE},
 )

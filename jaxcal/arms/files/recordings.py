@@ -57,7 +57,7 @@ def rests_of(
         parts, messages = _dataset(path, [*columns.values()], recording.servos), None
     else:
         if recording.servos is not None:
-            raise ValueError(f"servos are of a LeRobot dataset, {path} is none")
+            raise ValueError(f"servos needs a LeRobot dataset: {path} is none")
         times, joints, messages = _bag(path, [*columns.values()], kind, recording.topic)
         parts = [(times, np.where(turning, np.degrees(joints), joints))]
     tables, spans = [], []
@@ -68,9 +68,9 @@ def rests_of(
     postures = np.concatenate(tables)
     if not len(postures):
         raise ValueError(
-            f"{path} must hold {recording.seconds:g} s of rest: the joints jitter by "
-            f"{in_words(jitter(parts[0][1]).round(4))}; seconds= and within= say what "
-            "is a rest"
+            f"{path} has no {recording.seconds:g} s of rest: the joints jitter by "
+            f"{in_words(jitter(parts[0][1]).round(4))}; change what counts as rest "
+            "with seconds= and within="
         )
     if messages is None:
         return Rests(postures, None)
@@ -133,7 +133,7 @@ def _bag(
         there = [c for c in there if c.msgtype == there[0].msgtype]
         topics = sorted({c.topic for c in there})
         if types and len(topics) != 1:
-            listed = ", ".join(topics) or f"none of topic {topic or '(any)'}"
+            listed = ", ".join(topics) or f"none with topic {topic or '(any)'}"
             raise ValueError(
                 f"{path} must hold one topic of {' or '.join(types)}, got {listed}"
                 + ("; topic= names one" if topics else "")
@@ -152,7 +152,7 @@ def _bag(
                 rows.append([joints[name] for name in names])
     if not rows:
         raise ValueError(
-            f"{path} must hold joint states of {', '.join(names)}, got "
+            f"{path} must contain joint states of {', '.join(names)}, got "
             f"{', '.join(sorted(joints_met)) or 'none'}"
         )
     messages = (np.array(at), np.array(values)) if types else None
@@ -168,8 +168,8 @@ def _opened(path: pathlib.Path) -> Iterator[Any]:
     path.stat()  # raises where there is none
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         raise ValueError(
-            f"{path} must be a ROS bag, a folder with metadata.yaml, or a LeRobot "
-            "dataset, a folder with meta/info.json; got neither"
+            f"{path} must be a ROS bag (a folder with metadata.yaml) or a LeRobot "
+            "dataset (a folder with meta/info.json)"
         )
     try:
         with AnyReader([path], default_typestore=store) as bag:

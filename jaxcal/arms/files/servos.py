@@ -39,7 +39,7 @@ class Servos:
 
     def __post_init__(self) -> None:
         if not self.motors:
-            raise ValueError("motors must hold one motor at least")
+            raise ValueError("motors must hold at least one motor")
         for name, motor in self.motors.items():
             whole = isinstance(motor, Mapping) and all(
                 isinstance(motor.get(key), int) for key in _KEYS
@@ -76,7 +76,7 @@ class Servos:
         """Write the file that LeRobot reads; over one that is there with ``force``."""
         if not force and os.path.exists(path):
             raise FileExistsError(
-                f"{os.fspath(path)} is there already; force=True writes over it"
+                f"{os.fspath(path)} exists; pass force=True to replace it"
             )
         content = {name: dict(motor) for name, motor in self.motors.items()}
         write_text(path, json.dumps(content, indent=4) + "\n")
@@ -90,9 +90,9 @@ class Servos:
         most = float(np.abs(values).max(initial=0.0))
         if most > 100.0 + 1e-3:
             raise ValueError(
-                "values must be in -100 to 100 of each motor's range where servos are "
-                f"given, got {most:g}: where they are degrees leave out servos=, or "
-                "give --in-degrees"
+                "with servos, values must be in -100 to 100 of each motor's range, got "
+                f"{most:g}. If they are degrees, leave out servos=, or give "
+                "--in-degrees"
             )
         spans = [self._motor(name) for name in names]
         half = [0.5 * (m["range_max"] - m["range_min"]) for m in spans]
@@ -121,7 +121,7 @@ class Servos:
             if most - least < 0.5 * (high - low):
                 raise ValueError(
                     f"zero of motor {name} must be near the middle of its range, got "
-                    f"{degrees:.3g} degrees: calibrate it with LeRobot again"
+                    f"{degrees:.3g} degrees: calibrate the motor with LeRobot again"
                 )
             motors[name] |= {"range_min": least, "range_max": most}
         return dataclasses.replace(self, motors=motors)

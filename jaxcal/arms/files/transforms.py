@@ -48,11 +48,11 @@ class StaticTransform(NamedTuple):
         place = ", ".join(f"{x:.5f}" for x in self.matrix[:3, 3])
         turn = ", ".join(f"{x:.5f}" for x in self.quaternion)
         lost = ", ".join(self.hidden)
-        beside = f" but for {lost}, which the views do not show" if lost else ""
+        beside = f", except {lost}, which the views do not show" if lost else ""
         return (
             f"{self.child} in {self.parent}: translation {place} m, quaternion (x, y, "
-            f"z, w) {turn}; known to {1e3 * self.std[0]:.2g} mm and {self.std[1]:.2g} "
-            f"deg (1 sigma){beside}; with the arm as described {self.held_out}"
+            f"z, w) {turn}; uncertainty {1000.0 * self.std[0]:.2g} mm and "
+            f"{self.std[1]:.2g} deg (1 sigma){beside}; uncorrected arm: {self.held_out}"
         )
 
 
@@ -82,7 +82,7 @@ def static_transform(
     sensors = getattr(getattr(model, "sensor", None), "members", ())
     sensor = sensors[camera] if 0 <= camera < len(sensors) else None
     if not isinstance(sensor, Board):
-        raise ValueError("a static transform is of an arm with sensor=Board(...)")
+        raise ValueError("a static transform needs an arm with sensor=Board(...)")
     unit = model.length_unit(calibration.measured_unit)
     scale = _METRES[
         one_of("measured_unit, for a transform in metres,", unit, [*_METRES])
@@ -114,7 +114,7 @@ def static_transform(
         matrix,
         (float(std[0]), float(std[1])),
         places[0].hidden,
-        f"views left out are off by {off}",
+        f"left-out views are off by {off}",
         source,
     )
 
@@ -201,6 +201,6 @@ def _urdf(pose: StaticTransform) -> str:
     one_of("parent", pose.parent, links_of(text))
     if pose.child in links_of(text):
         raise ValueError(
-            f"link {pose.child} is in the file already: name another child"
+            f"the file already has a link {pose.child}: name another child"
         )
     return with_origins(text, {}, fixed_joint(pose.parent, pose.child, pose.matrix))

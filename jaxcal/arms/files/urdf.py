@@ -80,8 +80,8 @@ def walk(
     for joint in joints.values():
         if joint.child in above:
             raise ValueError(
-                f"link {joint.child} is the child of the joints "
-                f"{above[joint.child].name} and {joint.name}; a chain cannot hold loops"
+                f"link {joint.child} is the child of two joints, "
+                f"{above[joint.child].name} and {joint.name}; a chain cannot have loops"
             )
         above[joint.child] = joint
     links = links_of(text)
@@ -93,8 +93,8 @@ def walk(
         leaves = [link for link in links if link not in parents]
         if len(leaves) != 1:
             raise ValueError(
-                f"tip must be given: the file has {len(leaves)} links without a joint "
-                f"after them ({', '.join(leaves) or 'a loop'})"
+                f"--tip (tip=) is missing: the file has {len(leaves)} end links "
+                f"({', '.join(leaves) or 'a loop'})"
             )
         tip = leaves[0]
     down = _up(tip, above)
@@ -104,7 +104,7 @@ def walk(
         down.pop()
     top = {up[-1].parent if up else base, down[-1].parent if down else tip}
     if base is not None and len(top) > 1:
-        raise ValueError(f"base {base!r} and tip {tip!r} hang on different roots")
+        raise ValueError(f"base {base!r} and tip {tip!r} are not connected")
     if not up and not down:
         raise ValueError(f"no movable joint between base {base!r} and tip {tip!r}")
     yield from ((joint, False) for joint in up)
@@ -148,7 +148,7 @@ def _robot(text: str) -> ElementTree.Element:
     if any(element.tag.startswith("xacro:") for element in robot.iter()):
         raise ValueError(f"it is a {_XACRO}")
     if robot.tag != "robot":
-        raise ValueError(f"it must hold a <robot>, got <{robot.tag}>")
+        raise ValueError(f"the root element must be <robot>, got <{robot.tag}>")
     return robot
 
 
@@ -164,8 +164,8 @@ def joints_of(text: str) -> dict[str, Joint]:
         for link in (joint.parent, joint.child):
             if link not in links:
                 raise ValueError(
-                    f"joint {joint.name} names the link {link!r}, which the file does "
-                    "not hold"
+                    f"joint {joint.name} names the link {link!r}, which is not in the "
+                    "file"
                 )
         if joint.name in joints:
             raise ValueError(f"two joints are named {joint.name}")
@@ -193,8 +193,8 @@ def _read_joint(element: ElementTree.Element) -> Joint:
     place = element.find("origin")
     if place is not None and "quat_xyzw" in place.keys():
         raise ValueError(
-            f"<origin> of joint {name} must give its turn as rpy, in radians, "
-            f"got quat_xyzw={place.get('quat_xyzw')!r}"
+            f"<origin> of joint {name} must give its rotation as rpy in radians, got "
+            f"quat_xyzw={place.get('quat_xyzw')!r}"
         )
     origin = np.eye(4)
     origin[:3, 3] = _numbers(element, "origin", "xyz", (0.0, 0.0, 0.0), name)
@@ -368,8 +368,8 @@ def read_ur_kinematics(path: str | os.PathLike[str]) -> dict[str, Any]:
     for link, name in _UR.items():
         if len(poses.get(link, ())) != 6:
             raise ValueError(
-                f"{os.fspath(path)}: {link} must have x, y, z, roll, pitch, yaw, as in "
-                "the kinematics file of Universal Robots' ROS description"
+                f"{os.fspath(path)}: {link} needs x, y, z, roll, pitch, yaw, as in the "
+                "kinematics file of Universal Robots' ROS description"
             )
         origin, pose = np.eye(4), poses[link]
         angles = [pose[angle] for angle in ("roll", "pitch", "yaw")]

@@ -75,7 +75,7 @@ def save(text: str, path: str | os.PathLike[str], force: bool) -> None:
     """Write a file, over one that is there only by ``force``."""
     if not force and os.path.exists(path):
         raise FileExistsError(
-            f"{os.fspath(path)} is there already; force=True writes over it"
+            f"{os.fspath(path)} exists; pass force=True to replace it"
         )
     with atomic_write(path) as file:
         file.write(text.encode("utf-8", "surrogateescape"))
@@ -99,7 +99,7 @@ def urdf_text(chains: Sequence[tuple[Arm, Arm]]) -> tuple[str, list[str]]:
     for nominal, calibrated in chains:
         file = nominal.source or {}
         if file["text"] != text:
-            raise ValueError("the chains must come from one URDF file")
+            raise ValueError("all chains must come from the same URDF file")
         corrected, extra = _origins(nominal, calibrated)
         for joint, origin in corrected.items():
             if joint in origins and np.abs(origin - origins[joint]).max() > _AGREE:
@@ -135,7 +135,7 @@ def _dh_text(calibrated: Arm) -> str:
     names, others = _moved_by(calibrated)
     if others:
         warnings.warn(
-            f"the table does not hold how joints follow: {', '.join(others)}",
+            f"the table cannot hold coupled joints: {', '.join(others)}",
             stacklevel=4,
         )
     table = calibrated.table.copy()
@@ -175,8 +175,8 @@ def _ur_text(nominal: Arm, calibrated: Arm) -> str:
         )
     if nominal.length > 20.0:
         raise ValueError(
-            "the table must be in metres for this file, got links of "
-            f"{nominal.length:g} in all"
+            "the table must be in metres for this file, got a total length of "
+            f"{nominal.length:g}"
         )
     for follows in _moved_by(nominal)[1]:
         raise ValueError(f"{follows}, which this file cannot hold")
@@ -246,8 +246,8 @@ def _origins(nominal: Arm, calibrated: Arm) -> tuple[dict[str, Array], Array | N
             continue
         if not gap:
             raise ValueError(
-                f"base {nominal.source['base']!r} moves with its joint and cannot hold "
-                "a correction: give as base a link fixed to it, one you add if need be"
+                f"base {nominal.source['base']!r} moves with its joint and cannot be "
+                "corrected: choose or add a link fixed to it as base"
             )
         driving = [k for k, part in enumerate(gap) if part.drives]
         at = driving[-1] if driving else len(gap) - 1
@@ -300,7 +300,7 @@ def with_origins(text: str, origins: Mapping[str, Array], more: str = "") -> str
     data = text.encode("utf-8", "surrogateescape")
     if b"\0" in data:
         raise ValueError(
-            "the URDF file is in UTF-16, which is not written: save it as UTF-8"
+            "the URDF file is in UTF-16, which cannot be written: save it as UTF-8"
         )
     places, last, encoding = _places(data)
     newline = "\r\n" if "\r\n" in text else "\n"

@@ -97,9 +97,9 @@ class Board(Sensor):
             )
         object.__setattr__(self, "camera", tuple(camera.tolist()))
         if self.intrinsics and self.corners is None:
-            raise ValueError("intrinsics are of a board with corners")
+            raise ValueError("intrinsics needs a board with corners")
         if self.same_board and self.moves != "board":
-            raise ValueError('same_board is of a camera that stands: moves="board"')
+            raise ValueError('same_board needs a fixed camera: moves="board"')
         distortion = numbers("distortion", self.distortion)
         if distortion.shape not in ((0,), (4,), (5,)):
             raise ValueError(
@@ -258,8 +258,8 @@ class Board(Sensor):
             return self, None
         if len(inputs) < _FEW:
             raise ValueError(
-                f"place must be given for {len(inputs)} views of a board: {_FEW} of "
-                "one arm that has the camera or the board find it"
+                f"place is missing for {len(inputs)} views of a board; {_FEW} views by "
+                "one arm with the camera or the board determine it"
             )
         turn, shift = self._views(inputs, measured)
 
@@ -271,26 +271,24 @@ class Board(Sensor):
         off, place, new = fit(turn, shift)
         if off > _WRONG:
             others = {
-                "inverted, or with the other of camera and board on the tip": _inverse(
-                    turn, shift
-                ),
-                "with lengths 1000 times as small": (turn, shift / 1000.0),
-                "with lengths 1000 times as large": (turn, shift * 1000.0),
+                "inverted, or with camera and board exchanged": _inverse(turn, shift),
+                "with lengths divided by 1000": (turn, shift / 1000.0),
+                "with lengths multiplied by 1000": (turn, shift * 1000.0),
             }
             if self.corners is None:
                 vector = Rotation.from_rotvec(inputs[:, 3:])
                 euler = Rotation.from_euler("xyz", inputs[:, 3:], degrees=True)
                 others["with turns in degrees"] = vector.as_matrix(), shift
                 if np.isfinite(off):  # small turns are the same in both
-                    how = "with its Euler angles as rotation vectors"
+                    how = "with their Euler angles as rotation vectors"
                     others[how] = euler.as_matrix(), shift
             for how, pose in others.items():
                 if fit(*pose)[0] < 0.5 * _WRONG:
                     raise ValueError(f"views of the board fit the arm only {how}")
         if not np.isfinite(off):
             raise ValueError(
-                "views must turn the tip about two axes, or move it in two directions: "
-                "with these the board and the camera cannot be told apart"
+                "turn the tip about two axes in these views, or move it in two "
+                "directions: they do not separate the board from the camera"
             )
         towards = -np.einsum("nij,ni->nj", turn, shift)[:, 2]  # z of the camera, in it
         side = float(np.sign(np.median(towards)))

@@ -63,8 +63,8 @@ class Distance(Landmarks):
             points, far = tip.position[which == i], measured[which == i, 0]
             if len(points) < self.needed:
                 raise ValueError(
-                    f"places must be given: anchor {i} has {len(points)} lengths, and "
-                    "four are needed to find it"
+                    f"places are missing: anchor {i} has {len(points)} lengths, four "
+                    "are needed to find it"
                 )
             middle = points.mean(axis=0)
             points = points - middle
@@ -95,8 +95,8 @@ class Distance(Landmarks):
             anchor, zero = best[:3], best[3:].sum()
             if off > 0.2 * tip.length:
                 raise ValueError(
-                    f"lengths to anchor {i} fit no anchor to {off:.3g}: measured must "
-                    f"be in the unit of the arm, whose length is {tip.length:.3g}, and "
+                    f"lengths to anchor {i} do not fit by {off:.3g}: measured must be "
+                    f"in the unit of the arm, whose length is {tip.length:.3g}, and "
                     "commands in degrees"
                 )
             places[i] = *(anchor + middle), zero

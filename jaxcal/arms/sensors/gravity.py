@@ -93,8 +93,8 @@ class Gravity(Sensor):
         size = float(np.median(np.linalg.norm(measured, axis=1)))
         if abs(size / self.magnitude - 1.0) > 0.2:
             raise ValueError(
-                f"gravity readings must be of magnitude {self.magnitude:g} within 20 %,"
-                f" got {size:.4g} in the median: Gravity(magnitude=1) for readings in g"
+                f"gravity readings must have magnitude {self.magnitude:g} within 20 %, "
+                f"got {size:.4g} (median); for readings in g use Gravity(magnitude=1)"
             )
         directions = measured / size
         up = np.einsum("nij,nj->i", tip.rotation, directions) / len(directions)
@@ -102,8 +102,8 @@ class Gravity(Sensor):
             raise ValueError(
                 "gravity readings must point along up, "
                 f"{in_words(np.round(self.up, 2))}, got "
-                f"{in_words((up / np.linalg.norm(up)).round(2) + 0.0)} in the mean: "
-                "give that as up=, or change their sign where the sensor reads down"
+                f"{in_words((up / np.linalg.norm(up)).round(2) + 0.0)} on average: "
+                "give that as up=, or negate them if the sensor reads down"
             )
         felt = np.array(self.up) @ tip.rotation
         left, spread, right = np.linalg.svd(felt.T @ directions)
@@ -118,8 +118,8 @@ class Gravity(Sensor):
         if told and angle > _TURNED and off > 0.1 and other < off / 3.0:
             raise ValueError(
                 f"gravity readings fit a sensor turned by {angle:.0f} degrees on the "
-                "tool: multiply the rotation of tool= (of mounts= in Several) from the "
-                f"right by that of the vector {in_words(vector.round() + 0.0)} in "
-                "degrees"
+                "tool. Multiply the rotation of tool= (of mounts= in Several) from "
+                "the right by the rotation with the vector "
+                f"{in_words(vector.round() + 0.0)} in degrees"
             )
         return self, None

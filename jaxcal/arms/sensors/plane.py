@@ -39,7 +39,7 @@ class Plane(Landmarks):
         if self.places is not None:
             size = np.linalg.norm(self.places[:, :3], axis=1)
             if not (size > 0.0).all():
-                raise ValueError("places of planes must have normals other than zero")
+                raise ValueError("planes must have normals other than zero")
             places = np.column_stack(
                 [self.places[:, :3] / size[:, None], self.places[:, 3]]
             )

@@ -51,7 +51,7 @@ class Several(Sensor):
     def __post_init__(self) -> None:
         given = tuple(self.sensors)
         if len(given) < 2 or not all(isinstance(one, Sensor) for one in given):
-            raise ValueError(f"sensors must hold two sensors or more, got {given!r}")
+            raise ValueError(f"sensors must hold at least two sensors, got {given!r}")
         object.__setattr__(self, "sensors", given)
         frames = np.tile(np.eye(4), (len(given) - 1, 1, 1))
         if self.mounts is not None:
@@ -265,8 +265,8 @@ class Several(Sensor):
         """Commands and readings of all as one table; see ``SerialChain.together``."""
         if len(tables) != len(self.sensors):
             raise ValueError(
-                f"one pair (commands, measured) is needed for each of the "
-                f"{len(self.sensors)} sensors, got {len(tables)}"
+                f"each of the {len(self.sensors)} sensors needs a pair (commands, "
+                f"measured), got {len(tables)} pairs"
             )
         columns, q = self.inputs, len(self.outputs)
         all_commands, all_measured = [], []

@@ -55,9 +55,8 @@ class Socket(Landmarks):
         exists = (pairs == pairs.round()) & (pairs >= 0.0) & (pairs < self.count)
         if not exists.all() or (one == two).any():
             raise ValueError(
-                f"distances must name two of {self.count} sockets, from 0 (of a "
-                f"recording --which counts them), got "
-                f"{self.distances!r}"
+                f"distances must name two of {self.count} sockets, counted from 0 (in "
+                f"a recording --which numbers them), got {self.distances!r}"
             )
         object.__setattr__(self, "distances", tuple(map(tuple, rows.tolist())))
 

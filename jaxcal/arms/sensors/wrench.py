@@ -131,8 +131,8 @@ class Wrench(Sensor):
         arm = float(np.linalg.norm(torque) / (np.linalg.norm(force) + 1e-300))
         if arm > tip.length:
             raise ValueError(
-                "torques must be in newtons times the unit of the arm's lengths, got "
-                f"a load {arm:.3g} from the sensor on an arm of {tip.length:.3g}"
+                "torques must be in newtons times the arm's unit of length, but the "
+                f"load seems {arm:.3g} from the sensor; the arm has {tip.length:.3g}"
             )
         pull = self._pull(tip)
         pull = pull - pull.mean(axis=0)
@@ -145,11 +145,11 @@ class Wrench(Sensor):
         if off > _TILTED and against < off / 4.0:
             other = in_words(0.0 - np.array(self.up))
             raise ValueError(
-                "forces point against gravity. Three causes fit these readings alike: "
-                f"the arm hangs from the ceiling (give its base, or Wrench(up={other})"
-                "); the sensor reads what holds the load (negate forces and torques); "
-                "the controller subtracts a payload heavier than the load (set it to "
-                "zero and read again). Find out which it is, then identify again"
+                "forces point against gravity. Three causes are possible: the arm "
+                f"hangs from the ceiling (give its base, or Wrench(up={other})); the "
+                "sensor reads the holding force (negate forces and torques); the "
+                "controller subtracts a payload heavier than the load (set it to zero "
+                "and read again). Find the cause, then run identify again"
             )
         if off > _TILTED:
             self._require_upright(tip, force, off)
@@ -177,8 +177,8 @@ class Wrench(Sensor):
                 in_words((sign * up).round(2) + 0.0) for sign in (1.0, -1.0)
             )
             raise ValueError(
-                f"forces fit an arm that stands with up = {there}, or with up = {other}"
-                " if the sensor reads what holds the load, not one with up = "
+                f"forces fit an arm with up = {there}, or with up = {other} if the "
+                "sensor reads the holding force, not up = "
                 f"{in_words(np.round(self.up, 2))}: give its base, or Wrench(up=...)"
             )
 

@@ -29,8 +29,8 @@ Rows = NDArray[np.intp]
 
 _TURNS = 1.7453292519943295e-2  # radians in a degree
 _UNITS = {
-    "is in radians, degrees are meant": 1.0 / _TURNS,
-    "is in degrees, radians are meant": _TURNS,
+    "is in radians instead of degrees": 1.0 / _TURNS,
+    "is in degrees instead of radians": _TURNS,
     "is too small by 1000 (m for mm?)": 1000.0,
     "is too large by 1000 (mm for m?)": 0.001,
     "is too small by 10": 10.0,
@@ -109,7 +109,7 @@ def _kinds_of_columns(
                 factors = tuple(-1.0 if k in (i, j) else 1.0 for k in range(size))
                 changes.append(
                     ColumnChange(
-                        f"{names[i]} and {names[j]} have the other sign",
+                        f"{names[i]} and {names[j]} have the wrong sign",
                         of_readings, order, factors,
                     )
                 )  # fmt: skip

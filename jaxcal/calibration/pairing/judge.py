@@ -95,7 +95,7 @@ class Mispairing:
         """
         if not self.mendable:
             raise ValueError(
-                "a table of two sessions cannot be repaired: identify from each alone"
+                "a table of two sessions cannot be repaired: identify each alone"
             )
         rows = np.flatnonzero(self.match >= 0)
         paired, readings = commands[self.match[rows]], measured[rows]
@@ -166,7 +166,7 @@ def against(verdict: Verdict, found: Mispairing | None) -> Verdict:
     what = "columns" if found.kind == "columns" else "table"
     step = f"correct the {what}, then identify again"
     if found.mendable and found.kind != "columns":
-        step += " (jaxcal identify --repair FILE writes it mended)"
+        step += " (jaxcal identify --repair FILE writes the corrected table)"
     reasons = (found.reason, *verdict.reasons)
     return dataclasses.replace(verdict, good=False, reasons=reasons, next_step=step)
 

@@ -54,19 +54,19 @@ def what_is_wrong(
         return "the readings are in reverse order"
     if kind == "halves":
         return (
-            "the halves of the readings are exchanged: those from row "
+            "the halves of the readings are exchanged: the readings from row "
             f"{-starts[0][1] % count} on belong to the first commands"
         )
     if kind == "rotation" and abs(starts[0][1]) <= count // 3:
         last = "first" if starts[0][1] > 0 else "last"
         return (
             f"all readings are {_rows_late(starts[0][1])}; the {last} "
-            f"{abs(starts[0][1])} stand at the other end"
+            f"{abs(starts[0][1])} are at the other end"
         )
     if kind == "rotation":
         return (
             f"the readings from row {-starts[0][1] % count} on belong to the first "
-            "commands, those before to the last"
+            "commands, the readings before it to the last"
         )
     if kind == "commands sorted":
         return "the commands are sorted and the readings are not"
@@ -84,7 +84,7 @@ def what_is_wrong(
             size = f"{in_words(steps * table.scale)} {unit}".strip()
             another = f"offset, by {size}"
         return (
-            f"rows of two sessions seem joined: from row {starts[1][0]} on the "
+            f"the table seems to join two sessions: from row {starts[1][0]} on the "
             f"readings have another {another}"
         )
     return _path_words(starts, near, count)
@@ -113,7 +113,7 @@ def _path_words(
         if len(rows) > 1:
             where += f" (or any from {rows[0]} to {rows[-1]})"
         if by == FOREIGN:
-            parts.append(f"{where} the readings do not belong to these commands")
+            parts.append(f"{where}, readings do not belong to these commands")
         else:
             parts.append(f"{where}, readings are {_rows_late(by)}")
     return "; ".join(parts)

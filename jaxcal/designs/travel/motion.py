@@ -33,8 +33,8 @@ class Motion:
             values = numbers(name, getattr(self, name))
             if values.ndim > 1 or not values.size or (values <= 0.0).any():
                 raise ValueError(
-                    f"{name} must be positive numbers, one or one an axis, "
-                    f"got {getattr(self, name)!r}"
+                    f"{name} must be positive: one number, or one per axis, got "
+                    f"{getattr(self, name)!r}"
                 )
             object.__setattr__(self, name, tuple(np.atleast_1d(values).tolist()))
         settle = numbers("settle", self.settle)

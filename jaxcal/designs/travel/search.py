@@ -104,8 +104,8 @@ def fastest(
     answer = search.answer(least, None)
     if answer is None:
         raise ValueError(
-            f"least_efficiency must be reachable, got {least:g}; the optimum is "
-            "only bounded within the time limit: give more time, or ask for less"
+            f"least_efficiency = {least:g} cannot be reached: the optimum is only "
+            "bounded within the time limit. Give more time, or ask for less"
         )
     return answer
 
@@ -160,12 +160,12 @@ def _require_travel(offer: CandidateSet, motion: Motion) -> Array:
     if np.any(offer.max_replicates != 1) or offer.constraints is not None:
         raise ValueError(
             "max_replicates must be 1 with fastest and pareto, which visit a posture "
-            f"once and keep no constraints, got {offer.max_replicates}"
+            f"once and allow no constraints, got {offer.max_replicates}"
         )
     if offer.candidates is None:
         raise ValueError(
-            "commands must be given with blocks, Design.from_blocks(..., "
-            "commands=), for travel between them"
+            "blocks need the commands for the travel between them: "
+            "Design.from_blocks(..., commands=)"
         )
     if not isinstance(motion, Motion):
         raise ValueError(f"motion must be a Motion, got {motion!r}")

@@ -21,8 +21,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-_OWN = "every Network defines this itself; this class only declares it"
-_LAST = "a Network with num_unlearned > 0 defines this itself"
+_OWN = "every Network defines this; this class only declares it"
+_LAST = "a Network with num_unlearned > 0 defines this"
 
 
 class Network(nn.Module):
@@ -90,7 +90,7 @@ def initial(network: Network, key: jax.Array, m: int, n: int, k: int) -> Any:
     kind = type(network)
     for name in ("candidate_features", "decision_features", "encode", "decode"):
         if getattr(kind, name, None) is getattr(Network, name):
-            raise ValueError(f"a Network must define {name}, {kind.__name__} does not")
+            raise ValueError(f"a Network must define {name}; {kind.__name__} does not")
     answer, params = _initial(network, key, m, n, k)
     shapes = [leaf.shape for leaf in jax.tree.leaves(answer)]
     if shapes != [(1, m), (1,)]:

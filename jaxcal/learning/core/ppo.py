@@ -414,8 +414,8 @@ def make_train(config: Any) -> Callable[..., tuple[Any, Metrics]]:
     """
     if imitated := getattr(config, "num_imitated", 0):
         raise ValueError(
-            f"imitation must be 0, got a share with {imitated} updates: its teacher "
-            "works on the host; training.postures.train has it, or set imitation=0"
+            f"imitation must be 0, got {imitated} imitated updates: the teacher runs "
+            "on the host. Use training.postures.train, or imitation=0"
         )
     learners, ppo = config.learners, config.ppo
     updates = [make_update(ppo, learner) for learner in learners]

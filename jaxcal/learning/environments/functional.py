@@ -227,7 +227,7 @@ def _spaces() -> Any:
         from gymnax.environments import spaces
     except ImportError:
         raise ImportError(
-            "spaces are those of gymnax, which is not installed: pip install gymnax"
+            "gymnax is not installed, and spaces come from it: pip install gymnax"
         ) from None
     return spaces
 

@@ -101,9 +101,7 @@ def mixture(
     """
     unknown = [name for name in shapes if name not in SHAPES]
     if not shapes or unknown:
-        raise ValueError(
-            f"shapes must name some of {', '.join(SHAPES)}, got {list(shapes)}"
-        )
+        raise ValueError(f"shapes must be from {', '.join(SHAPES)}, got {list(shapes)}")
     if not 0.0 <= masked < 1.0:
         raise ValueError(f"masked must be in [0, 1), got {masked}")
     m, n = config.num_candidates, config.num_inputs

@@ -44,16 +44,13 @@ class GivenCandidates:
                     digest.update(np.ascontiguousarray(array).tobytes())
             object.__setattr__(self, "sha256", digest.hexdigest())
         elif not self.sha256:
-            raise ValueError(
-                "candidates must be given by values or sha256, got neither"
-            )
+            raise ValueError("give the candidates: values or sha256, got neither")
 
     def source(self, config: SelectionConfig) -> CandidateSource:
         """key -> the candidates of an episode, from the file's values."""
         if self.values is None:
             raise ValueError(
-                f"this run was trained on {self.name}: give the file again with "
-                "--candidates"
+                f"this run was trained on {self.name}: pass that file with --candidates"
             )
         from jaxcal.learning.environments import scenarios
 

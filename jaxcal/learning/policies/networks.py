@@ -27,20 +27,20 @@ class NetworkConfig:
     kind: str = setting(
         "compact", "compact, paper, observation, MODULE:NAME or FILE.py:NAME"
     )
-    width: int = setting(32, "features of a candidate; hidden width of paper")
+    width: int = setting(32, "features per candidate; for paper, hidden width")
     encoder_rounds: int = setting(3, "message rounds over the whole set, for each set")
     decoder_rounds: int = setting(
-        1, "message rounds over what is left, for each decision"
+        1, "message rounds over the remaining candidates, for each decision"
     )
-    lookahead: int = setting(12, "most greedy choices ahead that a feature shows")
-    close_up: bool = setting(False, "features that tell near-equal look-aheads apart")
+    lookahead: int = setting(12, "largest number of greedy choices ahead in a feature")
+    close_up: bool = setting(False, "features that separate near-equal look-aheads")
     initial_trust: float = setting(
-        0.0, "initial weight of the look-ahead; at 4 training begins at its rule"
+        0.0, "initial weight of the look-ahead; with 4 training starts at its rule"
     )
-    initial_actor: float = setting(0.1, "scale of the learned score before learning")
+    initial_actor: float = setting(0.1, "scale of the learned score at the start")
     mirrored: bool = setting(
         False,
-        "of observation: choose by the mean over a set's mirror images",
+        "for observation: choose by the mean over a set's mirror images",
     )
 
     def __post_init__(self) -> None:
@@ -51,9 +51,9 @@ class NetworkConfig:
         if installs and self.kind not in installed(GROUP):
             kinds = ", ".join(["compact", *installed(GROUP)])
             raise ValueError(
-                f"kind must be one of {kinds}, got "
-                f"{self.kind!r}; your own is MODULE:NAME or FILE.py:NAME, or an entry "
-                f"point in the group {GROUP}"
+                f"kind must be one of {kinds}, got {self.kind!r}; name your own as "
+                "MODULE:NAME or FILE.py:NAME, or as an entry point in the group "
+                f"{GROUP}"
             )
         require(self, "at least 1", lambda v: v >= 1, "width", "lookahead")
         rounds = ("encoder_rounds", "decoder_rounds")

@@ -30,11 +30,11 @@ class Job:
     """The flags that name a job."""
 
     TITLE: ClassVar = "several processes"
-    ABOUT: ClassVar = "found by itself under SLURM, Open MPI and on Cloud TPU"
+    ABOUT: ClassVar = "found automatically under SLURM, Open MPI and on Cloud TPU"
     RARE: ClassVar = True
 
     coordinator: Annotated[
-        str | None, "of process 0; the same everywhere", "HOST:PORT"
+        str | None, "address of process 0, the same in every process", "HOST:PORT"
     ] = None
     num_processes: int | None = None
     process_id: Annotated[int | None, "0 to N - 1", "I"] = None
@@ -114,7 +114,7 @@ def run_job(
         code = 2
     except RuntimeError as error:  # what a collective raises
         line = (str(error).splitlines() or ["no reason given"])[0][:200]
-        print(f"{program}: the job is broken off ({line}); {advice}", file=sys.stderr)
+        print(f"{program}: job aborted ({line}); {advice}", file=sys.stderr)
         code = EXIT_LOST
     if jax.distributed.is_initialized():
         sys.stdout.flush()
@@ -164,6 +164,6 @@ def _connect(job: Job) -> None:
         raise
     except RuntimeError as error:
         raise RuntimeError(
-            f"not every process came to {job.coordinator or 'the coordinator'} in "
+            f"not every process connected to {job.coordinator or 'the coordinator'} in "
             f"{_CONNECT_SECONDS} s: {str(error).splitlines()[0][:120]}"
         ) from None

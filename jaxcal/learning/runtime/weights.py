@@ -104,7 +104,7 @@ def nested(arrays: Mapping[str, Any]) -> dict[str, Any]:
 def write(path: str | pathlib.Path, weights: Weights) -> None:
     """Write a weights file, NAME.npz, atomically; an existing one is replaced."""
     if not str(path).endswith(".npz"):
-        raise ValueError(f"the policy is exported to one file NAME.npz, got {path}")
+        raise ValueError(f"the exported policy must be one file NAME.npz, got {path}")
     pathlib.Path(path).parent.mkdir(parents=True, exist_ok=True)
     header = {
         "format": _FORMAT,

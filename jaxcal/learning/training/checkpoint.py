@@ -264,7 +264,7 @@ def load(checkpoint: str | pathlib.Path | None = None) -> Policy:
         m, n, k = env["num_candidates"], env["num_inputs"], env["num_selected"]
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise CheckpointError(
-            f"checkpoint {path} names no network or task this jaxcal knows: {error}"
+            f"checkpoint {path} names an unknown network or task: {error}"
         ) from error
     like = jax.eval_shape(lambda: initial(network, jax.random.key(0), m, n, k))
     return Policy(network, read(path, meta, like), meta)
@@ -280,7 +280,7 @@ def read(path: pathlib.Path, meta: dict[str, Any], like: Any) -> Any:
     Raises:
         CheckpointError: they are damaged, of other shapes or not finite.
     """
-    what = "read: its weights are damaged or do not fit its network"
+    what = "read: its weights are damaged or do not fit the network"
     runs = len(runs_of(0, meta.get("num_seeds", 1), meta.get("sweep", ())))
     if path.is_file():
         arrays = weights.read(path).arrays
@@ -304,7 +304,7 @@ def read(path: pathlib.Path, meta: dict[str, Any], like: Any) -> Any:
     for name, array in weights.flat(params).items():
         if not np.isfinite(array).all():
             raise CheckpointError(
-                f"checkpoint {path} holds weights that are not finite, in {name}"
+                f"checkpoint {path} has weights that are not finite, in {name}"
             )
     return params
 
@@ -339,7 +339,7 @@ def restore(
         for damaged, reason in failed.items():
             aside = damaged.rename(damaged.with_name(f"damaged-{damaged.name}"))
             warnings.warn(
-                f"{reason}; it is {aside.name} now, the run goes on from {path}",
+                f"{reason}; it is now {aside.name}, and the run continues from {path}",
                 stacklevel=2,
             )
         return restored
@@ -352,7 +352,7 @@ def _restored(
     _, meta = read_meta(path, schema)
     if not (path / "state").exists():
         raise CheckpointError(
-            f"checkpoint {path} holds a policy but no training state to resume from"
+            f"checkpoint {path} cannot be resumed: it has no training state"
         )
     what = "resumed: its training state is damaged or was saved by an earlier jaxcal"
     average = _read(path / "policy", fresh.average, what)

@@ -130,13 +130,11 @@ def _require_lessons(
 ) -> None:
     """Refuse imitation without a teacher, and a task that leaves nothing to learn."""
     if teacher is None and imitated:
-        raise ValueError(
-            f"teacher must be given for the {imitated} updates that imitate, got None"
-        )
+        raise ValueError(f"teacher is missing: {imitated} updates imitate it")
     for task in config.tasks:
         if task.num_decisions <= network.num_unlearned:
             raise ValueError(
                 f"num_selected must be at least {network.num_unlearned + 1}, got "
                 f"{task.num_decisions}: the look-ahead makes the last "
-                f"{network.num_unlearned} choices, so nothing is left to learn"
+                f"{network.num_unlearned} choices, so nothing remains to be learned"
             )

@@ -37,7 +37,7 @@ class TrainConfig(RunConfig):
     ppo: EpisodesConfig = field(default_factory=EpisodesConfig)
     tasks: tuple[Task, ...] = field(default=(Task(),))  # update u: tasks[u % len]
     imitation: float = setting(
-        0.0, "share of the updates, from the first on, that imitate the solvers"
+        0.0, "share of the updates, at the beginning, that imitate the solvers"
     )
     about: str = ""  # one line for --help, of a preset
 
@@ -81,8 +81,8 @@ class TrainConfig(RunConfig):
 
 _COMPACT = TrainConfig(
     preset="compact",
-    about="one task (4 of 50), PPO alone from nothing; 0.999 of the optimum after "
-    "60,000 episodes; what to try first",
+    about="one task (4 of 50), PPO alone from scratch; 0.999 of the optimum after "
+    "60,000 episodes; try this first",
     network=NetworkConfig(close_up=True),
     ppo=EpisodesConfig(num_episodes=60_000),
 )
@@ -100,8 +100,8 @@ def _task(k: int = 4, m: int = 50, n: int = 3, **drawn: Any) -> Task:
 # candidates, masks, given postures, other numbers of postures and of inputs.
 _GENERAL = TrainConfig(
     preset="general",
-    about="what ships: twelve tasks of other sizes, shapes and masks, imitating the "
-    "solvers from the look-ahead rule on; ten minutes",
+    about="the shipped policy: twelve tasks of other sizes, shapes and masks, "
+    "imitating the solvers, starting at the look-ahead rule; ten minutes",
     network=NetworkConfig(close_up=True, initial_trust=4.0, initial_actor=0.05),
     ppo=EpisodesConfig(num_episodes=300_000, entropy_start=0.002),
     imitation=1.0,
@@ -180,7 +180,7 @@ def with_values(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
         if len(held) > 1:
             raise ValueError(
                 f"{name} cannot be changed in preset {config.preset}: its "
-                f"{len(config.tasks)} tasks have {', '.join(map(str, held))}; use a "
+                f"{len(config.tasks)} tasks have {', '.join(map(str, held))}. Use a "
                 "preset of one task, such as compact"
             )
     return dataclasses.replace(

@@ -59,8 +59,8 @@ def require_room(recipe: Recipe, mesh: Mesh | None) -> None:
     fits = max(int(ppo.episodes_per_update * room / whole) // step * step, step)
     raise ValueError(
         f"--episodes-per-update {ppo.episodes_per_update} of {m} candidates needs "
-        f"{whole / 1e9:.2g} GB of memory, there are {room / 1e9:.2g} GB: "
-        f"--episodes-per-update {fits} should fit"
+        f"{whole / 1000000000.0:.2g} GB of memory; {room / 1000000000.0:.2g} GB are "
+        f"free: try --episodes-per-update {fits}"
     )
 
 

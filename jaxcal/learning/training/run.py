@@ -299,9 +299,9 @@ def _broken(rows: Mapping[str, Any], number: int, update: int) -> str:
     ]
     name, value = next((n, v) for n, v in values if not np.isfinite(v))
     return (
-        f"diverged: {name} is {value} in {_SKIPS} updates in a row, the last of them "
-        f"{update}; the weights before are saved: begin anew with a smaller learning "
-        "rate"
+        f"diverged: {name} is {value} in {_SKIPS} consecutive updates, the last of "
+        f"them {update}. The weights before are saved; start again with a smaller "
+        "learning rate"
     )
 
 
@@ -316,7 +316,7 @@ def _locked(root: pathlib.Path) -> Iterator[None]:
     with (root / ".lock").open("a") as file:
         if not flock(file.fileno()):
             raise BlockingIOError(
-                f"{root} is being written by another training: name another folder"
+                f"another training is writing to {root}: name another folder"
             )
         yield
 

@@ -65,7 +65,7 @@ def pareto(axes: Any, fronts: dict[str, Any]) -> Any:
             label=name,
         )
     axes.set_xlabel("D-efficiency against the optimum")
-    axes.set_ylabel("time of the run (s): travel and settling")
+    axes.set_ylabel("run time (s): travel and settling")
     axes.legend(frameon=False)
     plain_axes(axes)
     return axes

@@ -94,8 +94,8 @@ def solve_auto(
         at_least = f"{article} {name} of at least {share:.6f}"
         request = f"{least_efficiency:g} was asked for"
         reason = (
-            f"the exact search ran out of time after {limit:g} s with {at_least} "
-            f"proven; {request}"
+            f"the exact search stopped after {limit:g} s with {at_least} proven; "
+            f"{request}"
         )
         if share >= least_efficiency:
             method, reason = "exchange", f"the bound proves {at_least}, and {request}"
@@ -285,7 +285,7 @@ def _solution_of(
     order = order[np.isfinite(log_det[order])]
     if not order.size:
         raise ValueError(
-            f"{problem.subject} must allow an invertible selection, but the best, "
+            f"{problem.subject} allow no invertible selection: the best, "
             f"{chosen[0].tolist()}, is singular"
         )
     subsets, worth = list(chosen[order]), value[order].tolist()
@@ -315,17 +315,15 @@ def _proof(
         bound = better(bound, float(criterion.reported(phi)))
     unsure, off = problem.uncertainty(indices), _off(problem)
     if off > _ROUGH:
-        reason = (
-            f"not proven: the model's derivatives are differences, off by {off:.1g}"
-        )
+        reason = "not proven: the model's derivatives are differences, off by {off:.1g}"
         return criterion.bettered(bound, min(2.0 * off, 1.0)), False, reason
     if unsure <= TOLERATED:
         return bound, phi is None, ""
     reason = ""
     if phi is None:
         reason = (
-            "not proven in double precision: the search is complete, but rounding "
-            f"may change the variances by a share of {unsure:.1g}"
+            "not proven in double precision: the search is complete, but rounding may "
+            f"change the variances by {unsure:.1g} (relative)"
         )
     return criterion.bettered(bound, unsure), False, reason
 

@@ -289,8 +289,7 @@ def exchange_indices(
         chosen, phi = climbs.best_of(restarts)
     if not np.isfinite(phi):
         raise ValueError(
-            f"{problem.subject} must allow an invertible selection, "
-            "but every start was singular"
+            f"{problem.subject} allow no invertible selection: every start was singular"
         )
     return chosen
 
@@ -329,7 +328,7 @@ def exchange_from(problem: Problem, indices: ArrayLike) -> Indices:
     rest = start.tolist()
     for i in problem.required.tolist():
         if i not in rest:
-            raise ValueError(f"indices must hold every required candidate, got no {i}")
+            raise ValueError(f"indices lack the required candidate {i}")
         rest.remove(i)
     start = np.array([*problem.required, *rest], dtype=np.int64)
     swaps = 2 if problem.criterion.kind == "least" else 1

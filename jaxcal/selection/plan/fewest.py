@@ -1,4 +1,4 @@
-"""How many measurements a wanted accuracy takes, with a table to judge it by.
+"""The number of measurements that a wanted accuracy needs, with a table.
 
 With noise of standard deviation sigma on an output, the fitted model predicts that
 output at z = [u, 1] with the standard error ``sigma sqrt(z.T G^-1 z)``, G = Z.T Z of
@@ -294,9 +294,9 @@ def _unreachable(
     all_of = "all " if max_k == sizes.problem.k else ""
     return ValueError(
         f"accuracy = {request.target[hardest]:g} cannot be reached: {all_of}{max_k} "
-        f"measurements give a {summary} standard error of {reached:.6g}, no choice of "
-        f"them less than {least:.6g}; repeat rows (max_replicates, --replicates) or "
-        "measure with less noise"
+        f"measurements give a {summary} standard error of {reached:.6g}, and no "
+        f"selection gives less than {least:.6g}. Repeat rows (max_replicates, "
+        "--replicates) or measure with less noise"
     )
 
 
@@ -322,9 +322,9 @@ def _request(
     """Check the arguments of ``plan``."""
     of_parameters = criterion == "parameters"
     if parameters is not None and not of_parameters:
-        raise ValueError("parameters goes with criterion='parameters' only")
+        raise ValueError("parameters needs criterion='parameters'")
     if offer.constraints is not None:
-        raise ValueError("constraints go with select and score, not with plan")
+        raise ValueError("constraints work with select and score, not with plan")
     total = max(1, int((offer.available * np.int64(offer.max_replicates)).sum()))
     model, std = offer.model, _reading_std(offer, noise_std)
     shared = False  # one regressor for all outputs?
@@ -372,7 +372,7 @@ def _reading_std(offer: CandidateSet, noise_std: ArrayLike | None) -> Array | No
         return None
     if noise_std is None:
         if noise is None:
-            raise ValueError("noise_std must be given: the design has no noise")
+            raise ValueError("noise_std is missing: the design has no noise")
         if noise.covariance is not None or noise.command_std is not None:
             return None
         noise_std = 1.0 if noise.std is None else noise.std

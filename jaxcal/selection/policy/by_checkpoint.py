@@ -71,7 +71,7 @@ def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Chooser:
         from jaxcal.selection.policy.compact import CompactScorer
 
         return CompactScorer(stored.network, stored.arrays)
-    with needs("policy", f"checkpoint {path}, whose network is not compact,"):
+    with needs("policy", f"checkpoint {path}, a network other than compact,"):
         return _ThroughJax(path if path.is_file() else path.parent)
 
 
@@ -99,8 +99,8 @@ class _ThroughJax:
         masked = max(int((~problem.available).sum()) for problem in problems)
         if masked and self._policy.network.mask_is_chosen:
             raise ValueError(
-                f"checkpoint {self._path} needs every candidate available, got "
-                f"{masked} that are not; leave them out"
+                f"checkpoint {self._path} needs all candidates available, but {masked} "
+                "are not; leave them out"
             )
 
     def __call__(

@@ -92,7 +92,7 @@ def problem_of(
             raise ValueError(f"in scenario {s}: {error}") from None
     if isinstance(of_one, G):
         if not joined.least or joined.of_efficiency:
-            raise ValueError('criterion of scenarios must be jaxcal.Worst("G") for G')
+            raise ValueError('for G in scenarios use jaxcal.Worst("G")')
         return _of_largest(members)
     compared = offer.model is not None and len(members) > 1
     nominal = _problem_of_one(offer, k, of_one) if compared else None
@@ -130,12 +130,12 @@ def _of_largest(problems: list[Problem]) -> Problem:
             of_row = one.criterion.of_rows(row[None], unit=one.criterion.unit)
             members.append(dataclasses.replace(one, k=k, criterion=of_row))
     if not members:
-        raise ValueError("criterion G needs a prediction that depends on a parameter")
+        raise ValueError("criterion G needs predictions that depend on a parameter")
     if len(members) * problems[0].blocks.size > _LARGEST:
         raise ValueError(
-            f"criterion G takes {_LARGEST:.0e} numbers at most, got {len(members)} "
-            f"predictions with {problems[0].blocks.size} of the candidates; give a "
-            "smaller region"
+            f"criterion G allows at most {_LARGEST:.0e} numbers, got {len(members)} "
+            f"predictions with {problems[0].blocks.size} numbers of the candidates; "
+            "give a smaller region"
         )
     fields = {f.name: getattr(members[0], f.name) for f in dataclasses.fields(Problem)}
     fields["criterion"] = Largest().within(members[0].criterion)
@@ -265,7 +265,7 @@ def _checked_problem(
         _check_required_rank(problem)
     if constraints is not None:
         if constraints.selection(k, problem.lower, problem.upper) is None:
-            raise ValueError(f"constraints must leave a selection of k = {k}, got none")
+            raise ValueError(f"constraints allow no selection of k = {k}")
     return problem
 
 
@@ -277,8 +277,8 @@ def _uninformed(
     return ValueError(
         "blocks must inform every parameter, but the available ones"
         + (" and what is known" if len(root) else "")
-        + directions_in_words(" say nothing of the direction{} ", null, names)
-        + "; give prior, a precision of what is known of them"
+        + directions_in_words(" do not inform the direction{} ", null, names)
+        + "; give prior, the precision known beforehand"
     )
 
 
@@ -290,7 +290,7 @@ def _require_enough(mask: Mask, k: int, cap: int | Indices) -> None:
     if int((mask * np.int64(cap)).sum()) < k:
         often = "at most max_replicates" if np.ndim(cap) else f"at most {cap}"
         raise ValueError(
-            f"k must not exceed what is available: {count} candidates"
+            f"k must not exceed {count} available candidates"
             + (f", each {often} times" if np.ndim(cap) or cap > 1 else "")
             + f", got {k}"
         )
@@ -343,8 +343,8 @@ def _check_k(
         return k
     if regressors and not prior_rank:
         raise ValueError(
-            f"k must be at least {p}, the number of regressors of {p - 1} inputs and a "
-            f"bias, got {k}"
+            f"k must be at least {p}, the number of regressors ({p - 1} inputs and an "
+            f"offset), got {k}"
         )
     least = -(-(p - prior_rank) // max(most, 1))
     raise ValueError(
@@ -380,7 +380,7 @@ def _check_required_rank(problem: Problem) -> None:
     room = (problem.k - r) * problem.blocks.shape[1]
     if p - rank > room:
         raise ValueError(
-            f"required must leave room for an invertible selection: the {r} required "
-            f"candidates span {rank} of {p} regressors, so at least {p - rank} more "
-            f"are needed, got room for {room} (k = {problem.k})"
+            "required candidates leave too little room for an invertible selection: "
+            f"the {r} required candidates span {rank} of {p} regressors, so at least "
+            f"{p - rank} more are needed, and k = {problem.k} leaves {room}"
         )

@@ -209,9 +209,9 @@ class _ModelBlocks(Blocks):
         if unknown:
             directions = "; ".join(direction.words for direction in unknown)
             raise ValueError(
-                "candidates must inform every parameter, but with what is known they "
-                f"say nothing of {directions}; give a prior (jaxcal.Prior with finite "
-                "std) or hold some (Prior with fixed=[name])"
+                "candidates must inform every parameter, but with the prior they do "
+                f"not inform {directions}; give a prior (jaxcal.Prior with finite std) "
+                "or hold some (Prior with fixed=[name])"
             )
 
 

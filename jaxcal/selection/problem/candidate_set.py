@@ -165,8 +165,8 @@ class CandidateSet:
             rows = np.flatnonzero(self.available)
             if not masked and not len(rows):
                 raise ValueError(
-                    "model must give finite readings for some candidate in every "
-                    "scenario, but fails for all"
+                    "the model fails for all candidates in some scenario; finite "
+                    "readings are needed"
                 )
             asked = self.candidates[rows]
             kept = answered(model, asked, parameters, rows, self.names)
@@ -175,7 +175,7 @@ class CandidateSet:
     def _check_blocks(self) -> None:
         """Blocks (M, q, p) or (S, M, q, p), whose scenarios are (S,) weights."""
         if self.model is not None:
-            raise ValueError("model must come with candidates, not with blocks")
+            raise ValueError("model needs candidates, not blocks")
         if isinstance(self.prior, Prior):
             raise ValueError(
                 "prior must be a (p, p) precision with blocks, got a Prior"
@@ -190,7 +190,7 @@ class CandidateSet:
             self.scenarios = Scenarios(None, weights)
             array = np.ascontiguousarray(np.moveaxis(array, 1, 0))
         elif self.scenarios is not None:
-            raise ValueError("weights must come with blocks (S, M, q, p) of scenarios")
+            raise ValueError("weights need blocks (S, M, q, p) of scenarios")
         self.blocks = array = usable_numbers("blocks", array, self.available)
         self.prior = copy.deepcopy(self.prior)
         if self.candidates is not None:
@@ -244,7 +244,7 @@ def _available(frame: Any, available: Any) -> Any:
         return available if column is None else column
     if not np.array_equal(column, np.asarray(available)):
         raise ValueError(
-            "available differs from the candidates' column 'available': leave one out"
+            "available and the candidates' column 'available' differ: leave one out"
         )
     return column
 
@@ -378,8 +378,8 @@ def check_available(available: ArrayLike | None, shape: tuple[int, ...]) -> Mask
     if mask.dtype.kind not in "biuf" or not np.isin(mask, (0, 1)).all():
         wrong = mask[~np.isin(mask, (0, 1))] if mask.dtype.kind in "iuf" else mask
         raise ValueError(
-            "available must hold True or 1 where a candidate may be chosen, else False "
-            f"or 0, got {wrong.flat[0]}"
+            "available must hold True or 1 for candidates that may be chosen, else "
+            f"False or 0, got {wrong.flat[0]}"
         )
     return mask.astype(np.bool_)
 

@@ -64,9 +64,9 @@ def _drawn(count: int, model: Model, prior: Prior | None) -> Array:
     drawn = precision > 0.0
     if not drawn.any():
         raise ValueError(
-            "a number of scenarios needs a prior with finite std, got none for "
-            f"{', '.join(map(str, model.names))}; give prior=jaxcal.Prior(...), or the "
-            "parameters (S, p) themselves"
+            "a number of scenarios needs a prior with finite std; it is missing for "
+            f"{', '.join(map(str, model.names))}. Give prior=jaxcal.Prior(...), or the "
+            "parameters (S, p)"
         )
     std = np.where(drawn, 1.0 / np.sqrt(np.where(drawn, precision, 1.0)), 0.0)
     normal = np.random.default_rng(0).standard_normal((count, len(std)))
