@@ -860,9 +860,9 @@ def test_twelve_rows_are_identified_in_few_calls(rng: np.random.Generator) -> No
 @pytest.mark.parametrize("size", [1e300, 1e155, 1e-155, 1e-300])
 def test_units_that_double_precision_cannot_square_are_refused(rng, size, capfd):
     u, noise = rng.uniform(-1.0, 1.0, (20, 2)), 0.01 * rng.standard_normal((20, 2))
-    for given in ((u * size, u + noise), (u, (u + noise) * size)):
-        with pytest.raises(ValueError, match="in size, got .* choose another unit"):
-            identify(*given)
+    for pair in ((u * size, u + noise), (u, (u + noise) * size)):
+        with pytest.raises(ValueError, match=r"in size, got .* choose another unit"):
+            identify(*pair)
     with pytest.raises(ValueError, match="noise_std must be between"):
         identify(u, u + noise, noise=size)
     assert capfd.readouterr() == ("", "")
