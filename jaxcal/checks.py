@@ -184,7 +184,8 @@ def nearest(name: str, names: Iterable[str]) -> str:
     import difflib
 
     bare = {one.lstrip("-"): one for one in names}
-    return bare.get(*difflib.get_close_matches(name.lstrip("-"), bare, 1, 0.65), "")
+    close = difflib.get_close_matches(name.lstrip("-"), bare, 1, 0.65)
+    return bare[close[0]] if close else ""
 
 
 def require_known(what: str, name: str, names: Sequence[str]) -> None:
