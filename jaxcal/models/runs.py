@@ -255,7 +255,9 @@ class Runs:
                     broken.append(futures[future])
                 else:
                     yield futures[future], answers
-            # A run that ends its process takes those beside it along: one by one.
+            # A run that ends its process takes those beside it along: one by one. What
+            # is held of the first try a cluster would give as the answer again.
+            futures, future = {}, None
             for j, rows in broken:
                 answers = []
                 for i in rows:

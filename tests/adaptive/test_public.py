@@ -88,7 +88,7 @@ def test_answers_that_cannot_be_are_named():
     with pytest.raises(ValueError, match=r"history\[0\]: outcome must have shape \(\)"):
         next_measurement(task, [(0.5, [1.0])])
     never = task.replace(model=Counts(most=1.0))
-    with pytest.raises(ValueError, match=r"\[0\]: outcome 2.0 cannot follow"):
+    with pytest.raises(ValueError, match=r"\[0\]: outcome 2.0 is impossible"):
         next_measurement(never, [(0.5, 2.0)])
 
 

@@ -318,7 +318,7 @@ def test_what_is_wrong_of_contacts_is_told_beside_other_sensors():
         assert not verdict.good and said in str(verdict)
     twice = np.append(joints, joints[:1], axis=0), np.append(sockets, sockets[0])
     verdict = _with_gravity("panda_1", arm, *twice)
-    assert verdict.good and "measurement 62 is 0 again" in str(verdict)
+    assert verdict.good and "measurement 62 repeats 0" in str(verdict)
     assert 1e-4 < verdict.anywhere < 1e-3  # of the tip, in the arm's unit
 
 

@@ -111,7 +111,7 @@ def test_processes_agree_and_a_run_that_ends_one_is_named(tmp_path, monkeypatch)
     f = importlib.import_module("ends_its_process").f
     parallel = FromFunction(f, [2.0], processes=2, quiet=True)
     rows = U[[0, 3, 6, 8]]  # the third is the one
-    with pytest.warns(UserWarning, match=r"for 2 \(its process ended\)"):
+    with pytest.warns(UserWarning, match=r"there: 2 \(its process ended\)"):
         design = jaxcal.Design(rows, parallel)
     assert design.available.tolist() == [True, True, False, True]
     np.testing.assert_array_equal(
@@ -139,7 +139,7 @@ def test_a_run_may_end_its_process_before_all_are_handed_over(tmp_path, monkeypa
     monkeypatch.setattr(ProcessPoolExecutor, "submit", waited_for)
     parallel = FromFunction(f, [2.0], processes=2, quiet=True)
     rows = U[[6, 0, 3, 8]]
-    with pytest.warns(UserWarning, match=r"for 0 \(its process ended\)"):
+    with pytest.warns(UserWarning, match=r"there: 0 \(its process ended\)"):
         design = jaxcal.Design(rows, parallel)
     assert design.available.tolist() == [False, True, True, True]
     parallel.close()
@@ -228,7 +228,7 @@ def test_candidates_that_fail_are_masked_and_named():
     assert design.select(3, "D").log_det == pytest.approx(exact.log_det, abs=1e-8)
     with pytest.warns(UserWarning, match="3 of 17"):
         assert jaxcal.identifiability(model(fails_far), U).rank == 3
-    with pytest.raises(ValueError, match=r"all 1 commands, for \(8\): RuntimeError"):
+    with pytest.raises(ValueError, match=r"all 1 commands; for \(8\): RuntimeError"):
         jaxcal.Design(U[-1:], model(fails_far))
 
 
@@ -244,7 +244,7 @@ def test_what_cannot_be_told_is_named_though_derivatives_are_rough():
     told = jaxcal.identifiability(one, U)
     assert told.rank == 2 and told.identifiable == ("g",)
     assert {d.words for d in told.directions} == {"mass with lever", "x"}
-    with pytest.raises(ValueError, match="say nothing of mass with lever; x"):
+    with pytest.raises(ValueError, match="do not inform mass with lever; x"):
         jaxcal.select(U, 2, model=one)
 
 
@@ -292,7 +292,9 @@ def test_a_program_is_a_model():
     line = [sys.executable, "-c", PROGRAM, "{u}", "{a}", "{k}"]
     one = FromFunction(line, [2.0, 3.0], names=["a", "k"], inputs=["u"], processes=2)
     np.testing.assert_array_equal(one.predict([[1.5], [2.0]]), [[3.0, 3.0], [4.0, 3.0]])
-    with pytest.raises(ValueError, match=r"must hold \{k\}, where the value of k goes"):
+    with pytest.raises(
+        ValueError, match=r"must contain \{k\}, the place of the value of k"
+    ):
         FromFunction(line[:-1], [2.0, 3.0], names=["a", "k"], inputs=["u"])
     failing = FromFunction(
         [sys.executable, "-c", "raise SystemExit('no {u} {t1}')"], [1.0], inputs=["u"]
@@ -302,7 +304,7 @@ def test_a_program_is_a_model():
 
 
 def test_bad_input_is_named():
-    with pytest.raises(ValueError, match="as c is nominally 0"):
+    with pytest.raises(ValueError, match="because c is nominally 0"):
         FromFunction(decay, NOMINAL, names=NAMES)
     with pytest.raises(ValueError, match="scale must be positive"):
         FromFunction(decay, NOMINAL, [1.0, 0.0, 1.0])

@@ -294,7 +294,7 @@ def test_what_ships_is_what_its_card_says(name: str) -> None:
         (f"{POOL}\np,1,2,3,4,5,6", "line 2 has 7 cells, the first has 8"),
         (f"{POOL}\np,1,2,x,4,5,6,7", "line 2, column 'u_deg_roll' must .* got 'x'"),
         (f"{POOL}\np,1,2,3,4,5,nan,7", "line 2, column 'y_deg_roll' must hold a num"),
-        (f"{POOL}\np,1,2,3,4,5,6,7", "takes 50 postures, the recording has 1"),
+        (f"{POOL}\np,1,2,3,4,5,6,7", "needs 50 postures, the recording has 1"),
         (f"{POOL}\np,1,25,3,4,5,6,7", r"posture 1 is commanded \[1.0, 25.0, 3.0\] deg"),
     ],
 )

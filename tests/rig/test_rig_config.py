@@ -133,7 +133,11 @@ def test_a_run_is_resumed_with_other_addresses_and_limits_and_nothing_else():
         ("reduction = 10", "reduction = 11", "axes.pitch.reduction: was 10.0"),
         ('order = "ZXY"', 'order = "ZYX"', "mechanism.order: was ZXY, is ZYX"),
         ("samples = 25", "samples = 26", "settle.samples: was 25, is 26"),
-        ('map = "leadshine_pr"', 'map = "generic"', "axes.pitch.map.name: leadshine"),
+        (
+            'map = "leadshine_pr"',
+            'map = "generic"',
+            "axes.pitch.map.name: was leadshine",
+        ),
     ):
         changed = parse_config(EXAMPLE_TEXT.replace(old, new, 1))
         assert any(text.startswith(named) for text in changed.changed_since(began))
