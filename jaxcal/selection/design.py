@@ -346,8 +346,8 @@ class Design:
         least = problem.criterion.kind == "least"
         if not math.isfinite(value) or (least and not value > 0.0):
             raise ValueError(
-                f"criterion {problem.criterion.name} is {value}, which exceeds double "
-                "precision; give the commands in other units"
+                f"criterion {problem.criterion.name} is {value} in double precision; "
+                "give the commands in other units"
             )
 
     def _why_singular(self, indices: Indices) -> str:

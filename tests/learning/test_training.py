@@ -167,7 +167,7 @@ def test_validation_of_the_optimum_itself_is_one():
         (lambda step: _edit(step, schema="other"), "not a jaxcal policy"),
         (
             lambda step: _edit(step, network={"kind": "compact", "size": 1}),
-            "no network",
+            "unknown network",
         ),
         (lambda step: _edit(step, network={"width": 16}), "do not fit the network"),
         (lambda step: shutil.rmtree(step), "holds no checkpoint"),

@@ -82,7 +82,7 @@ def test_corners_outside_the_picture_are_named():
         arm.prepared(joints, _at_left(pixels, 3, -0.01).reshape(8, -1))
     aside = joints.copy()
     aside[5, 4] += 180.0  # the camera looks away
-    with pytest.warns(UserWarning, match="1 of 8 candidates .* row 5 of those"):
+    with pytest.warns(UserWarning, match="1 of 8 candidates .* row 5 of the available"):
         arm.prepared(aside)
 
 

@@ -123,7 +123,11 @@ def test_a_session_whose_drives_were_halted_does_not_move_again(
         stood, before = joints(sim), moves(sim)
         time.sleep(1.3 if "sto" in fault else 0.3)  # longer than the power was off
         assert joints(sim) == stood and moves(sim) == before
-        reasons = ["power stage"] if "sto" in fault else ["ended", "does not follow"]
+        reasons = (
+            ["power stage"]
+            if "sto" in fault
+            else ["short of its target", "does not follow"]
+        )
         assert any(reason in said for reason in reasons), said
         assert "last moved" in said
         run = run_folder(at)
@@ -268,7 +272,7 @@ def test_axes_tell_the_speed_that_they_saw(at, capsys, monkeypatch):
         sim.faults.clear()
         assert main(["axes", "--yes"]) == 0
         out = capsys.readouterr().out
-    assert out.count("deg/s") == 3
+    assert out.count(": at least ") == 3
 
 
 # D, E: the stop
@@ -340,8 +344,8 @@ def test_a_session_that_was_stopped_looks_whether_its_drives_stay(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "told"),
-    [("", None), ("unit_stop_ignored,axis=roll", "roll went on .* stop of each unit"),
-     ("watch_ignored,axis=yaw", "yaw went on .* their watch of the line")],
+    [("", None), ("unit_stop_ignored,axis=roll", "roll moved on .* stop of each unit"),
+     ("watch_ignored,axis=yaw", "yaw moved on .* their watch of the line")],
     ids=["all", "unit", "watch"],
 )  # fmt: skip
 def test_each_way_to_stop_is_tried_where_the_map_has_it(fault, told, at, capsys):

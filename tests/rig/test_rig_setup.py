@@ -133,7 +133,7 @@ def test_setup_asks_with_defaults_and_moves_nothing_without_a_yes(at):
             setup.go(place, given)
         assert sim.executions() == [[], [], []]
     assert record.state(HOMED) and not record.state(SIGN_CHECKED)
-    assert all(re.search(r"(\[.+\]|go on): $", question) for question in asked)
+    assert all(re.search(r"(\[.+\]|to continue): $", question) for question in asked)
 
 
 OPTIONS = {"bus": "", "imu": "", "axes": "", "readings": ""}

@@ -148,14 +148,14 @@ def test_a_score_without_a_required_candidate_is_refused(rng):
 @pytest.mark.parametrize("criterion", "AE")
 def test_blocks_of_the_smallest_numbers_are_refused(criterion):
     blocks = np.array([[[1.0, 0.0]], [[0.0, 1.0]], [[1.0, 1.0]]]) * 6e-309
-    with pytest.raises(ValueError, match="exceeds double precision"):
+    with pytest.raises(ValueError, match="in double precision"):
         jaxcal.select(blocks=blocks, criterion=criterion)
 
 
 @pytest.mark.parametrize("name", ["A", "E"])
 def test_what_double_precision_cannot_hold_is_refused_by_name(name):
     u = np.random.default_rng(0).random((12, 2)) * 1e-155
-    with pytest.raises(ValueError, match=f"criterion {name} exceeds doub"):
+    with pytest.raises(ValueError, match=f"criterion {name} is .* in doub"):
         jaxcal.select(u, criterion=name)
     assert jaxcal.select(u).proven
 

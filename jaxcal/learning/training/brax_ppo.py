@@ -48,7 +48,7 @@ def require_read(given: Collection[str]) -> None:
     read |= {field.name for field in settings_of(SelectionConfig)}
     if unread := sorted(set(given) - read):
         flags = ", ".join("--" + name.replace("_", "-") for name in unread)
-        raise ValueError(f"--trainer brax does not read {flags}: leave it out")
+        raise ValueError(f"--trainer brax does not use {flags}: leave it out")
 
 
 def train(
