@@ -427,8 +427,8 @@ class ScenarioCriterion:
             scale = 1.0 / np.maximum(units, 1e-320)
         if not (np.isfinite(scale) & (scale > 0.0)).all():
             raise ValueError(
-                f"criterion {self.name} in a scenario is out of range in double precision; "
-                "give the commands in other units"
+                f"criterion {self.name} in a scenario is out of range in double "
+                "precision; give the commands in other units"
             )
         return (scale if optima is None else scale / optima), np.zeros(len(scale))
 

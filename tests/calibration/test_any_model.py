@@ -480,7 +480,7 @@ def test_what_is_out_of_reach_or_beyond_the_limits_is_named() -> None:
     assert held[1] == pytest.approx(0.5)
     wave = identify(*waves(9), model=WAVE, noise_std=0.05)
     with pytest.raises(
-        ValueError, match=r"desired \(50, 0\) cannot be reached; the nea"
+        ValueError, match=r"target 1 \(50, 0\) cannot be reached; the nea"
     ):
         wave.command_for([50.0, 0.0])
     with pytest.raises(ValueError, match=r"cannot be reached.* at the limit of u_2"):

@@ -131,7 +131,7 @@ def test_what_is_wrong_is_named(rng):
     with pytest.raises(ValueError, match="different names: 'zero'"):
         calibration.budget(sources=[Source("zero", 1.0), Source("zero", 2.0)])
     exact = jaxcal.identify(commands[:3], measured[:3])
-    with pytest.raises(ValueError, match="no uncertainty budget: 3 measurements"):
+    with pytest.raises(ValueError, match=r"no uncertainty budget, .* 3 measurements"):
         exact.budget()
     text = str(calibration.budget(sources=[Source.certificate("tracker", 0.04)]))
     assert "tracker" in text and "U (0.95)" in text

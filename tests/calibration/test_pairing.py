@@ -80,7 +80,7 @@ SPOILT = {
     ),
     "a block from elsewhere": (
         lambda u, y: (u[:20], np.vstack([y[:7], y[20:25], y[12:20]])),
-        "from row 7 to 11.* the readings do not belong",
+        "from row 7 to 11, readings do not belong",
     ),
     "two sessions": (
         lambda u, y: (u[:20], y[:20] + (np.arange(20) >= 13)[:, None]),

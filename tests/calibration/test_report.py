@@ -98,7 +98,7 @@ def test_a_pipeline_reads_the_verdict_and_the_exit_code(tmp_path, rng, capsys):
     data.write_text("".join(data.read_text().splitlines(keepends=True)[:5]))
     assert main(["identify", str(data), "--report", str(folder)]) == 1
     reasons = json.loads((folder / "verdict.json").read_text())["reasons"]
-    assert reasons[0].startswith("no intervals: 4 measurements")
+    assert reasons[0].startswith("no intervals, because the noise is unknown: 4 mea")
     assert main(["check", saved, str(tmp_path / "none.csv")]) == 2
     assert main(["identify", str(data), "--against", saved]) == 2
 

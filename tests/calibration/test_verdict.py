@@ -256,7 +256,7 @@ def test_another_tip_within_the_prior_is_named(name, off):
     commands = np.column_stack(place)
     found = jaxcal.identify(commands, np.zeros((62, 3)), model=arm)
     said = [why for why in found.verdict.reasons if "is it another tip?" in why]
-    far = float(re.match(r"the tip is (\S+) m from where", said[0])[1])
+    far = float(re.match(r"the tip is (\S+) m from its place", said[0])[1])
     assert len(said) == 1 and far == pytest.approx(0.01, rel=0.05)
     clean = _fit(name, *place).verdict
     assert not [why for why in clean.reasons if "another tip" in why]
@@ -450,10 +450,12 @@ def test_a_wrong_tip_is_named():
 
 def test_too_few_contacts_to_judge_are_said():
     rows = [0, 40, 1]
-    with pytest.warns(UserWarning, match="no intervals and no verdict: 3 measurements"):
+    with pytest.warns(
+        UserWarning, match=r"no intervals and no verdict, .* 3 measurements"
+    ):
         found = _fit("panda_1", PLACE[0][rows], PLACE[1][rows])
     assert not found.verdict.good and found.summary().count("no intervals") == 1
-    usual = float(re.search(r"usual one: (\S+)\)", found.verdict.next_step)[1])
+    usual = float(re.search(r"usual for .*?: (\S+)\)", found.verdict.next_step)[1])
     commands = np.column_stack([PLACE[0][rows], PLACE[1][rows]])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)

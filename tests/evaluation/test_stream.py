@@ -220,7 +220,7 @@ def test_damage_and_other_versions_are_named(tmp_path: pathlib.Path) -> None:
     run(tmp_path, 20)
     part = next(tmp_path.glob("part-*"))
     part.write_text(part.read_text()[:100])
-    with pytest.raises(ValueError, match=r"part-.* is damaged .* delete it"):
+    with pytest.raises(ValueError, match=r"part-.* is damaged .* Delete it"):
         run(tmp_path, 20)
     path = tmp_path / "stream.json"
     held = json.loads(path.read_text())

@@ -323,7 +323,7 @@ class _Unfinished(Network):
             r"decode of _Short must return logits .*, 5\).*got \(1, 3\), \(1,\)",
         ),
         (_NoValue(), r"value .*got \(1, 5\)$"),
-        (_Unfinished(), "must define candidate_features, _Unfinished does not"),
+        (_Unfinished(), "must define candidate_features; _Unfinished does not"),
     ],
 )
 def test_a_network_of_ones_own_that_answers_wrongly_is_named(network, says):

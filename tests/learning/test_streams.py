@@ -224,7 +224,7 @@ def test_a_damaged_checkpoint_is_put_aside_and_the_one_before_it_goes_on(tmp_pat
     for path in (tmp_path / "checkpoint" / "3" / "state").rglob("*"):
         if path.is_file():
             path.write_bytes(b"")
-    with pytest.warns(UserWarning, match=r"3 cannot be resumed.*damaged-3 now.*2$"):
+    with pytest.warns(UserWarning, match=r"3 cannot be resumed.*is now damaged-3.*2$"):
         again = run(made, tmp_path, num_updates=3, resume=True)
     for a, b in zip(leaves(whole), leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -530,7 +530,7 @@ BRAX = ["--trainer", "brax"]
         (["--out", "/proc/nowhere/run"], "cannot write in /proc"),
         (["--kind", "big"], "must be one of compact, observation, paper, got 'big'"),
         ([*BRAX, "--num-epochs", "3"], "does not use --num-epochs: leave it out"),
-        ([*BRAX, "--devices", "2", "--kind=paper"], "not read --devices, --kind"),
+        ([*BRAX, "--devices", "2", "--kind=paper"], "not use --devices, --kind"),
         ([*BRAX, "--preset", "general"], "trains on one task, preset general has 12"),
         ([*BRAX, "--resume"], "--resume works with --trainer jaxcal only"),
         ([*BRAX, "--seeds=2"], "--seeds works with --trainer jaxcal only"),
@@ -569,7 +569,7 @@ def test_brax_saves_what_it_used_and_keeps_what_is_asked_for():
 
 
 def test_help_says_what_every_number_is(capsys):
-    assert train("--help") == 0
+    assert train("--help", "all") == 0
     text = capsys.readouterr().out
     for name in presets.field_names() - {"num_episodes", "num_seeds"} | {"sweep"}:
         assert f"--{name.replace('_', '-')}" in text

@@ -446,7 +446,10 @@ def test_wrong_readings_of_one_of_several_sensors_are_refused():
     joints = np.random.default_rng(4).uniform(-120.0, 120.0, (12, 6))
     seen = ur5().predict(joints)
     contacts = np.column_stack([joints, np.arange(12) % 2])
-    for at, message in ((0.001, "measured must be in the unit"), (1.0, "at one point")):
+    for at, message in (
+        (0.001, "measured must be in the model's unit"),
+        (1.0, "at one point"),
+    ):
         together = arm.together((joints, at * seen), (contacts, None))
         with pytest.raises(ValueError, match=message):
             jaxcal.identify(*together, model=arm)

@@ -70,7 +70,7 @@ def test_a_calibration_takes_data_frames_by_name() -> None:
     np.testing.assert_allclose(back, u[["pitch", "yaw"]], atol=1e-12)
     assert found.check(u[["yaw", "pitch"]], y[["y_yaw", "y_pitch"]]).p_value > 0.99
     off = y.rename(columns={"y_yaw": "y_jaw"})
-    with pytest.raises(ValueError, match=r"desired must have .* 'y_yaw' is missing"):
+    with pytest.raises(ValueError, match=r"desired needs .* 'y_yaw' is missing"):
         found.command_for(off)
 
 
@@ -86,5 +86,5 @@ def test_what_was_measured_is_taken_by_the_candidates_names() -> None:
         for given in (measured, measured[["yaw", "pitch"]], measured.to_numpy())
     ]
     assert picks[0] == picks[1] == picks[2]
-    with pytest.raises(ValueError, match=r"measured must have .* 'yaw' is missing"):
+    with pytest.raises(ValueError, match=r"measured needs .* 'yaw' is missing"):
         jaxcal.select(frame, 2, measured=measured.rename(columns={"yaw": "roll"}))

@@ -54,7 +54,7 @@ def test_damage_in_the_middle_is_an_error_not_a_guess(tmp_path):
 
 def test_a_second_writer_is_refused(tmp_path):
     journal = Journal(tmp_path / "j")
-    with pytest.raises(JournalError, match="running session"):
+    with pytest.raises(JournalError, match="another session"):
         Journal(tmp_path / "j")
     journal.close()
     Journal(tmp_path / "j").close()

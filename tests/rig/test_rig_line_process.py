@@ -233,7 +233,7 @@ def test_a_stop_goes_before_what_was_asked_earlier():
             made._channels[0].send(asked | {"number": 10**6, "epoch": 0})
             reply = made._channels[0].receive(5.0)
         assert all(result.standing for result in results)
-        assert "a stop was asked for" in reply["error"]["text"]
+        assert "a stop was requested" in reply["error"]["text"]
         assert sim.executions() == [[], [], []]
 
 

@@ -253,7 +253,9 @@ def test_a_reply_that_comes_late_is_told_as_late(transport):
     server = Server(late_s=0.35)
     server.tables[3] = {0: 5}
     with server.on(transport, timeout_s=0.1) as settings, Bus(settings) as bus:
-        with pytest.raises(BusError, match=r"late by over 0.1 s.*raise bus.timeout_s"):
+        with pytest.raises(
+            BusError, match=r"late by more than 0.1 s.*raise bus.timeout_s"
+        ):
             read_words(bus, 1, 0, 1)
     server._closing.clear()
     with server.on(transport, timeout_s=0.9) as settings, Bus(settings) as bus:
@@ -264,7 +266,7 @@ def test_a_silent_unit_is_not_told_as_late():
     with Server(units=(2,)).on("rtu_tcp", timeout_s=0.05) as settings:
         with Bus(settings) as bus:
             bus.listen_s = 0.2
-            with pytest.raises(BusError, match=r"silent for 0.05 s"):
+            with pytest.raises(BusError, match=r"no reply within 0.05 s"):
                 read_words(bus, 1, 0, 1)
 
 

@@ -520,7 +520,7 @@ def test_a_name_that_is_no_name_is_refused(finished):
     records = read_journal(finished / "journal.jsonl")
     config = json.loads(json.dumps(records[0]["config"]))
     config["axes"][0]["name"] = "pitch; int evil"
-    with pytest.raises(Refused, match="'pitch; int evil' is no name"):
+    with pytest.raises(Refused, match="'pitch; int evil' is not the name"):
         load_inverse(finished, [records[0] | {"config": config}, *records[1:]])
 
 

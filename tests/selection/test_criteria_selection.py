@@ -232,7 +232,9 @@ def test_a_model_with_prior_noise_and_held_parameters():
     blind = FromJax(
         lambda u, t: u[:1] * t[0] + 0 * t[1], [1, 0], names=("gain", "bias")
     )
-    with pytest.raises(ValueError, match=r"every parameter.*nothing of bias; give a"):
+    with pytest.raises(
+        ValueError, match=r"every parameter.*do not inform bias; give a"
+    ):
         select(u, model=blind)
 
 

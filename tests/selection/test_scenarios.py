@@ -254,7 +254,9 @@ def test_the_fewest_by_default_identify_in_every_scenario() -> None:
 
 def test_units_beyond_double_precision_are_refused_by_name() -> None:
     blocks = np.random.default_rng(0).standard_normal((2, 6, 1, 3)) * 1e200
-    with pytest.raises(ValueError, match=r"criterion Mean.A. must be a number in dou"):
+    with pytest.raises(
+        ValueError, match=r"criterion Mean.A. in a scenario is out of range in dou"
+    ):
         Design.from_blocks(blocks).select(4, "A")
     assert Design.from_blocks(blocks * 1e-300).select(4, "D").proven
 

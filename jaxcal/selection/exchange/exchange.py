@@ -79,10 +79,10 @@ def greedy_indices(problem: Problem) -> Indices:
 
     Gains count a share of what the candidates not chosen yet will give, in the
     coordinates where all candidates together say as much of every direction: the best
-    of several shares, the last a small ridge, and of D's textbook, whose small ridge is
-    in the caller's numbers. Swaps mend a singular selection. For E
-    the gain is that in the sum of the variances, which is at most p times and at least
-    once the largest: an incomplete selection has no least eigenvalue to raise.
+    of several shares, the last a small ridge, and of D's textbook, a small ridge in
+    numbers near 1. Swaps mend a singular selection. For E the gain is that in the sum
+    of the variances, which is at most p times and at least once the largest: an
+    incomplete selection has no least eigenvalue to raise.
     """
     climbs, best, phi = Climbs(problem, 0), problem.required, -np.inf
     for share in (climbs.share, *_FURTHER, _RANK_FIRST):
@@ -94,19 +94,31 @@ def greedy_indices(problem: Problem) -> Indices:
         and problem.criterion.name == "D"
         and not problem.root.size
     ):
-        chosen, value = climbs.climbed(_textbook(problem), 0.0, 0)
-        best, phi = max((best, phi), (chosen, value), key=lambda pair: pair[1])
+        for blocks in _coordinates(problem):
+            chosen, value = climbs.climbed(_textbook(problem, blocks), 0.0, 0)
+            best, phi = max((best, phi), (chosen, value), key=lambda pair: pair[1])
     if phi > -np.inf:
         return best
     chosen, phi = climbs.climbed(problem.required, climbs.share)
     return chosen if phi > -np.inf else climbs.best_of(1 + _MENDING)[0]
 
 
-def _textbook(problem: Problem) -> Indices:
-    """The required candidates, and the largest gains from a small ridge on, in the
-    caller's numbers, until there are as many readings as parameters."""
-    raw, upper = problem.raw, problem.upper.copy()
-    _, q, p = raw.shape
+def _coordinates(problem: Problem) -> list[Array]:
+    """Blocks (M, q, p) near 1 whatever the unit: commands of the affine model in
+    [-1, 1] and in [0, 1], others over their largest entries."""
+    raw = problem.raw
+    if problem.model is None or not problem.model.multiplicity:
+        return [raw / np.abs(raw).max(axis=(0, 1), initial=0.0).clip(1e-300)]
+    low, high = (f(raw[problem.available], axis=0)[..., :-1] for f in (np.min, np.max))
+    share = (raw[..., :-1] - low) / (high - low)
+    ones = np.ones((*share.shape[:-1], 1))
+    return [np.append(u, ones, axis=-1) for u in (2.0 * share - 1.0, share)]
+
+
+def _textbook(problem: Problem, raw: Array) -> Indices:
+    """The required candidates, and the largest gains from a small ridge on, until
+    there are as many readings as parameters."""
+    upper, (_, q, p) = problem.upper.copy(), raw.shape
     ridge, chosen = _RANK_FIRST * np.mean(raw**2), [*problem.required]
     np.subtract.at(upper, problem.required, 1)
     while len(chosen) < min(problem.k, -(-p // q)):

@@ -25,6 +25,7 @@ __all__ = ["Blocks", "blocks_of", "shares_regressor"]
 Array = NDArray[np.float64]
 
 _FAR = 100.0  # spreads of the candidates, from which they are counted from their middle
+_MOVES = 1e-10  # of the size, below which a command is the same everywhere
 _OF_MODEL = " for this model"
 
 
@@ -119,7 +120,8 @@ class _ModelBlocks(Blocks):
         if invariant and offer.prior is None and len(self.used):
             low, high = self.used.min(axis=0), self.used.max(axis=0)
             middle = 0.5 * (low + high)
-            far = np.abs(middle) > _FAR * (high - low)
+            spread = high - low
+            far = (np.abs(middle) > _FAR * spread) & (spread > _MOVES * np.abs(middle))
             no_slopes = offer.noise is None or offer.noise.command_std is None
             if far.any() and no_slopes and model.centred(middle) is not None:
                 self._centre = np.where(far, middle, 0.0)
