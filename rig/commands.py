@@ -10,7 +10,7 @@ import contextlib
 import dataclasses
 import pathlib
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from jaxcal.arguments import Parser
@@ -451,9 +451,7 @@ emergency stop is required.
 class RigParser(Parser):
     """Takes ``setup home`` and ``simulate calibrate``."""
 
-    def __init__(self, **fields: Any) -> None:
-        super().__init__(**fields)
-        self.simulators: dict[argparse.Action, str | None] = {}  # with its help
+    simulators: Mapping[argparse.Action, str | None] = {}  # options, with their help
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         if self.prog == "jaxcal-rig" and args is not None:
@@ -483,10 +481,11 @@ def make_parser(only: str | None = None) -> Parser:
         prog = " ".join(filter(None, ("jaxcal-rig", place, name)))
         command = added.add_parser(name, prog=prog, description=text + more, **told)
         command.of(function)
-        for action in command._actions if name != "simulate" else ():
-            if action.dest in SIMULATOR:
-                command.simulators[action] = action.help
-                action.help = argparse.SUPPRESS
+        if name != "simulate":
+            options = [a for a in command._actions if a.dest in SIMULATOR]
+            command.simulators = {action: action.help for action in options}
+        for action in command.simulators:
+            action.help = argparse.SUPPRESS
     for name, text in absent.items():
         added.add_parser(name, help=text)
     return parser

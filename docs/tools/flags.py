@@ -15,7 +15,7 @@ import sys
 
 FLAG = re.compile(r"^  (?:-\w[ \w]*, )?(--[\w-]+)", re.MULTILINE)
 LISTED = re.compile(r"positional arguments:\n  COMMAND.*\n((?:    .*\n)+)")
-STEPS = re.compile(r"^by themselves: (.*)$", re.MULTILINE)
+STEPS = re.compile(r"^single steps: (.*)$", re.MULTILINE)
 
 
 def shown(words: list[str]) -> str:

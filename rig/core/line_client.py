@@ -28,6 +28,7 @@ NORMAL_S = 30.0  # for a reply, or word of it; a board that was reset takes seco
 URGENT_S = 1.0  # for one of a stop, besides an exchange that is under way
 END_S = 2.0  # for the process to end
 GRACE_S = 0.1  # for one whose channels are closed to be gone
+LATE = "does not answer"
 # Errors that the line's process reports and this side raises again, by name.
 KINDS = {kind.__name__: kind for kind in (LimitError, NotImplementedError, ValueError)}
 GONE = "Find out who ended it. The session stops its drives"
@@ -143,7 +144,7 @@ class LineClient(Line):
                 reply = self._reply(urgent, number)
             except (EOFError, TimeoutError, OSError) as error:
                 late = isinstance(error, TimeoutError)
-                self._lose("does not answer" if late else "has ended")
+                self._lose(LATE if late else "has ended")
         return self._result(reply, urgent)
 
     def _send(self, urgent: bool, **request: Any) -> None:
@@ -183,12 +184,14 @@ class LineClient(Line):
     def _lose(self, why: str) -> NoReturn:
         """The process is gone, or is ended here."""
         assert self._process is not None
-        code = 0  # of a process that ended by itself
+        late = why == LATE
+        if late:  # a stop must not wait for it
+            self._process.kill()
         with contextlib.suppress(subprocess.TimeoutExpired):
-            code = self._process.wait(GRACE_S)
-        by = f" by signal {-code}" if code < 0 else ""
+            self._process.wait(GRACE_S)
         self._process.kill()
-        self._process.wait()
+        code = self._process.wait()
+        by = f" by signal {-code}" if code < 0 and not late else ""
         self._gone = self._gone or f"the process of the line {why}{by}"
         raise BusError(self._gone, GONE, lost=True)
 

@@ -3,6 +3,7 @@
 import concurrent.futures
 import importlib
 import os
+import re
 import sys
 from concurrent.futures import ProcessPoolExecutor
 
@@ -443,4 +444,4 @@ def test_a_program_that_prints_few_digits(digits, size, rng):
     selection = jaxcal.select(commands, 6, model=model, criterion="D")
     assert selection.proven == (digits > 4)
     if digits == 4:
-        assert "derivatives are differences" in selection.reason
+        assert re.search(r"derivatives are differences, off by \d", selection.reason)

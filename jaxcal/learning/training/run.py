@@ -483,13 +483,9 @@ def _of_each(tree: Any, runs: int) -> list[Any]:
 def _table(path: pathlib.Path, done: int, columns: Sequence[str]) -> TextIO:
     """A CSV file opened to append, without rows of updates after ``done``."""
     lines = path.read_text().splitlines()[1:] if path.exists() else []
-    kept = [
-        line
-        for line in lines
-        if line.count(",") == len(columns) - 1
-        and line.partition(",")[0].isdigit()
-        and int(line.partition(",")[0]) <= done
-    ]
+    commas = len(columns) - 1
+    whole = [(x.partition(",")[0], x) for x in lines if x.count(",") == commas]
+    kept = [x for first, x in whole if first.isdigit() and int(first) <= done]
     write_text(path, "\n".join([",".join(columns), *kept]) + "\n")
     return path.open("a", newline="")
 

@@ -315,7 +315,8 @@ def _proof(
         bound = better(bound, float(criterion.reported(phi)))
     unsure, off = problem.uncertainty(indices), _off(problem)
     if off > _ROUGH:
-        reason = "not proven: the model's derivatives are differences, off by {off:.1g}"
+        about = "not proven: the model's derivatives are differences"
+        reason = f"{about}, off by {off:.1g}"
         return criterion.bettered(bound, min(2.0 * off, 1.0)), False, reason
     if unsure <= TOLERATED:
         return bound, phi is None, ""

@@ -104,14 +104,15 @@ def greedy_indices(problem: Problem) -> Indices:
 
 
 def _coordinates(problem: Problem) -> list[Array]:
-    """Blocks (M, q, p) near 1 whatever the unit: commands of the affine model in
-    [-1, 1] and in [0, 1], others over their largest entries."""
+    """Blocks (M, q, p) near 1 whatever the unit: rows [u, 1] with u in [-1, 1] and in
+    [0, 1], others over their largest entries."""
     raw = problem.raw
-    if problem.model is None or not problem.model.multiplicity:
-        return [raw / np.abs(raw).max(axis=(0, 1), initial=0.0).clip(1e-300)]
-    low, high = (f(raw[problem.available], axis=0)[..., :-1] for f in (np.min, np.max))
-    share = (raw[..., :-1] - low) / (high - low)
-    ones = np.ones((*share.shape[:-1], 1))
+    used = raw[problem.available]
+    low, spread = used.min(axis=0)[0], np.ptp(used, axis=0)[0]
+    if raw.shape[1] > 1 or spread[-1] or not low[-1] or not spread[:-1].all():
+        return [raw / np.abs(raw).max(axis=(0, 1)).clip(1e-300)]
+    share = (raw[..., :-1] - low[:-1]) / spread[:-1]
+    ones = np.ones((len(raw), 1, 1))
     return [np.append(u, ones, axis=-1) for u in (2.0 * share - 1.0, share)]
 
 
