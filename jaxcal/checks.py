@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 ONE_COLUMN = "one column alone is values[:, None], or frame[['name']]"
 
 
-def in_words(values: Array) -> str:
+def in_words(values: ArrayLike) -> str:
     return "(" + ", ".join(f"{value:.6g}" for value in np.atleast_1d(values)) + ")"
 
 

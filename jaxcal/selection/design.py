@@ -390,9 +390,10 @@ def _whole_numbers(indices: ArrayLike) -> Indices:
 
 def _require_allowed(problem: Problem, indices: Indices, method: str) -> None:
     """Refuse what is no selection of this problem: the solver is wrong."""
-    right = indices.ndim == 1 and indices.dtype.kind in "iu"
+    right: bool = indices.ndim == 1 and indices.dtype.kind in "iu"
     right = right and len(indices) == problem.k
-    right = right and 0 <= indices.min() and indices.max() < len(problem.available)
+    right = right and bool((0 <= indices).all())
+    right = right and bool((indices < len(problem.available)).all())
     if right:
         counts = np.bincount(indices, minlength=len(problem.available))
         right = bool(((problem.lower <= counts) & (counts <= problem.upper)).all())

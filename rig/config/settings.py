@@ -38,7 +38,10 @@ class BusSettings(Section):
     echo: bool = key("RTU: the adapter echoes what it is sent", False)
     timeout_s: float = key("for one reply", 0.3, 0.01, 5)
     read_retries: int = advanced(
-        "retries of a read, and of a move that the drive did not take", 2, 0, 10
+        "retries of a move that the drive did not take; a read has twice as many",
+        2,
+        0,
+        10,
     )
 
     @property

@@ -157,7 +157,7 @@ class Bus(Line):
         quantity: int,
         retries: int | None = None,
     ) -> bytes:
-        """Read registers, or bits, with as many more tries as configured or given.
+        """Read registers, or bits, with ``Line.read_tries`` or as many as given.
 
         Args:
             unit: that is asked.
@@ -173,7 +173,7 @@ class Bus(Line):
             BusError: no valid reply after all tries.
             Rejected: the drive answered with an exception, every time.
         """
-        tries = 1 + (self.settings.read_retries if retries is None else retries)
+        tries = self.read_tries if retries is None else 1 + retries
         size, what = data_size(function, quantity), "registers"
         for tries_left in reversed(range(tries)):
             try:

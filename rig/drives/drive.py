@@ -187,11 +187,10 @@ class Drive(abc.ABC):
         """Read status and position.
 
         Args:
-            retries: of each read. Where not given they are twice those configured:
-                spoilt frames now and then spoil all of them.
+            retries: of each read, where not ``Line.read_tries``.
         """
         if retries is None:
-            retries = 2 * self.line.settings.read_retries + 1
+            retries = self.line.read_tries - 1
         asked = time.monotonic()
         look = self.look(retries)
         if self._origin is None:

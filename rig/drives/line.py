@@ -71,6 +71,11 @@ class Line(abc.ABC):
         self._urgent = False
         self._timeout_s = settings.timeout_s
 
+    @property
+    def read_tries(self) -> int:
+        """Of a read: spoilt frames now and then spoil three replies in a row."""
+        return 1 + 2 * self.settings.read_retries
+
     # Of a kind of line
 
     @abc.abstractmethod

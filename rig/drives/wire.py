@@ -147,7 +147,7 @@ class Wire:
             else:
                 reply = self._reply_beside_echo(came, frame)
             if reply is not None:
-                self._look_for_late(came)
+                self._look_for_late(came, unit)  # this is no earlier one's
                 return reply
             if wait_s <= 0.0:
                 if self.echo and came.startswith(frame):
@@ -164,10 +164,10 @@ class Wire:
                 raise error
         return b""
 
-    def _look_for_late(self, came: bytes) -> None:
+    def _look_for_late(self, came: bytes, but: int | None = None) -> None:
         """Note units of RTU whose reply is in what came after its time."""
         for unit, function in list(self._missed.items()) if came else ():
-            if rtu_reply(came, unit, function) is not None:
+            if unit != but and rtu_reply(came, unit, function) is not None:
                 self.late.add(unit)
                 del self._missed[unit]
 
