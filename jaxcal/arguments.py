@@ -46,7 +46,8 @@ class Parser(argparse.ArgumentParser):
         if self.add_help:
             version = f"jaxcal {sys.modules['jaxcal'].__version__}"
             text = argparse.SUPPRESS if " " in self.prog else "print the version"
-            self.add_argument("--version", action="version", version=version, help=text)
+            named = "-V", "--version"
+            self.add_argument(*named, action="version", version=version, help=text)
 
     def of(self, function: Callable[..., Any]) -> Parser:
         """Itself, for the arguments of a function, or a dataclass called ``options``:

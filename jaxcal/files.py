@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import pathlib
 import secrets
@@ -11,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from typing import IO, Any
 
 _WRITTEN = {"out", "servos_out", "picture", "json"}  # arguments that are files
+_SHOWN = "/dev/stdout"  # where the shell has redirected it, that file
 _RECORDS = {".json", ".jsonl", ".toml", ".csv"}
 
 
@@ -106,17 +108,25 @@ def require_kept(given: Mapping[str, Any]) -> None:
         require_writable_folder(folder)
         pages = ("index.html", "verdict.json", "calibration.json")
         written |= {f"report {page}": os.path.join(folder, page) for page in pages}
+    read = {}
+    for name in given.keys() - _WRITTEN - {"report"}:
+        values = given[name]
+        read[name] = values if isinstance(values, list | tuple) else [values]
     for option, path in written.items():
         if not isinstance(path, str | pathlib.Path) or given.get("overwrite"):
             continue
-        for name in given.keys() - _WRITTEN - {"report"}:
-            values = given[name]
-            values = values if isinstance(values, list | tuple) else [values]
+        for name, values in read.items():
             if any(_same_file(path, value) for value in values):
                 raise ValueError(
                     f"--{option.replace('_', '-')}: {path} is what is read "
                     f"({name.replace('_', '-')}); write to another file"
                 )
+    for value in itertools.chain.from_iterable(read.values()):
+        shown = value != "-" and os.path.isfile(_SHOWN) and _same_file(_SHOWN, value)
+        if shown:
+            raise ValueError(
+                f"standard output goes to {value}, which is read; write to another file"
+            )
 
 
 def _same_file(path: Any, value: Any) -> bool:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import re
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -165,10 +167,16 @@ class ScoreOptions:
         if others := sorted({*options} - {"time_limit"}):
             flags = ", ".join(f"--{name.replace('_', '-')}" for name in others)
             raise ValueError(f"Leave out with --score: {flags}")
-        if set(self.score or "") <= set("0123456789, "):
-            rows = np.array(several(int, "whole numbers")(self.score or ""))
+        given = self.score or ""
+        if re.fullmatch(r"\s*\d+\s*(,\s*\d+\s*)*", given):
+            rows = np.array([int(row) for row in given.split(",")])
+        elif given == "-" or os.path.exists(given):
+            rows = _rows_of(read_table(given), table)
         else:
-            rows = _rows_of(read_table(self.score), table)
+            raise ValueError(
+                "--score must be rows counted from 0, such as 0,4,7, or a table "
+                f"written by --csv; {given!r} is neither: no such file"
+            )
         return design.score(rows, criterion, reference=self.reference, **options)
 
 

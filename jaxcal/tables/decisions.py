@@ -38,6 +38,10 @@ _TIMES = {"time", "uhrzeit", "elapsed", "clock"}
 _SECONDS = re.compile(r"t([ _]?[\[(]?(s|ms|us|ns|sec|seconds|min)[\])]?)?", re.I)
 COUNTED = "it looks like a row number or a time"
 _LIKE_U, _LIKE_Y = re.compile(r"[uU]\d*|U_.*"), re.compile(r"[yY]\d*|Y_.*")
+_PLURALS = {  # of a reason's begin
+    "it looks": "they look", "it holds": "they hold", "it is": "they are",
+    "rises": "they rise", "holds": "they hold", "a factor: it does": "they do",
+}  # fmt: skip
 _EPOCH = 1e8  # seconds; no factor of an experiment is so large
 
 
@@ -220,4 +224,9 @@ def of_role(role: str, decisions: Mapping[str, Decision]) -> tuple[str, ...]:
 def listed(names: Sequence[str], what: str) -> str:
     """Columns and what they are, as part of a sentence."""
     quoted = ", ".join(map(repr, names))
-    return f"columns {quoted} are {what}" if names[1:] else f"column {quoted} is {what}"
+    if not names[1:]:
+        return f"column {quoted} is {what}"
+    what = re.sub(r"^(read as \w+)", r"\1s", what)
+    for one, several in _PLURALS.items():
+        what = what.replace(f": {one} ", f": {several} ")
+    return f"columns {quoted} are {what}"

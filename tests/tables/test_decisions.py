@@ -115,3 +115,9 @@ def test_columns_that_nothing_asks_for_are_said():
     table = roles("j1,j2,j3,j4,x", {"j4": np.arange(12.0)})[0]
     with pytest.warns(UserWarning, match="columns 'j3', 'j4' are ignored"):
         table.named(["j1", "j2"], "u_", others=["x"])
+
+
+def test_several_columns_are_told_in_the_plural():
+    words = parse("t.csv", b"m,n,a,b\nfast,x,1,2\nslow,y,2,5\n")
+    with pytest.warns(UserWarning, match="'n' are read as labels: they hold words"):
+        words.commands(None)
