@@ -337,7 +337,8 @@ class Fit:
         """The calibration's columns of a data frame, in its order; else as given."""
         if name in ("desired", "measured"):
             return of_frame(name, values, self.output_names, MEASURED)
-        return of_frame(name, values, self.input_names, COMMANDS)
+        levels = getattr(self.model, "levels", ())
+        return of_frame(name, values, self.input_names, COMMANDS, levels=levels)
 
     def require_noise(self, what: str) -> Array:
         if self.noise_std is None:

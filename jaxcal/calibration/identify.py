@@ -211,7 +211,9 @@ def _measurements(
         input_names = input_names or getattr(model, "inputs", ()) or None
     say_order(commands, measured)
     inputs, outputs = _columns(model, commands, measured)
-    u = table("commands", of_frame("commands", commands, inputs or (), COMMANDS))
+    levels = getattr(model, "levels", ())
+    u = of_frame("commands", commands, inputs or (), COMMANDS, levels=levels)
+    u = table("commands", u)
     y = of_frame("measured", measured, outputs or (), MEASURED)
     y = table("measured", y, len(u))
     require_size("commands", u)

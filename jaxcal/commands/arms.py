@@ -212,7 +212,7 @@ class ArmOptions:
         used: NDArray[np.bool_] | None = None,
     ) -> Array:
         """(N, n) the columns of the commands, an arm's joints in degrees."""
-        commands = table.columns(columns, used)
+        commands = table.columns(columns, used, getattr(model, "levels", ()))
         return in_degrees(model, commands) if self.radians else commands
 
 

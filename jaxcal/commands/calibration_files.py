@@ -199,4 +199,4 @@ def commands_for(
         unit=calibration.command_unit,
         others=calibration.output_names,
     )
-    return names, table.columns(names)
+    return names, table.columns(names, None, getattr(calibration.model, "levels", ()))

@@ -208,7 +208,8 @@ def _readings(
     names = of_arm.columns(machine, table, inputs, (*columns, weights or ""))
     if both := sorted({*names} & {*columns}):
         raise ValueError(f"--inputs and --outputs both hold {both[0]}")
-    return _Readings(table.columns(names), table.columns(columns), names, columns)
+    commands = of_arm.commands(machine, table, names)
+    return _Readings(commands, table.columns(columns), names, columns)
 
 
 CalibrationPath = Annotated[str, "made by identify", "calibration.json"]

@@ -2,12 +2,17 @@
 
 formulaic splits a formula into terms (``x*y`` is ``x + y + x:y``, ``0 +`` leaves out
 the constant). The factors are evaluated here, because formulaic would run them as
-Python: only arithmetic, numbers, pi, e and the functions below are read.
+Python: only arithmetic, numbers, pi, e, the functions below and categories are read.
+
+``C(x, levels=['a', 'b', 'c'])`` is a category: a feature for each level, without the
+first where the term without the category is in the formula too (treatment coding).
 """
 
 from __future__ import annotations
 
 import ast
+import contextlib
+import itertools
 import operator
 import re
 from collections.abc import Callable, Mapping
@@ -20,6 +25,7 @@ from jaxcal.extras import needs
 
 Numbers = NDArray[Any]
 Factor = Callable[[Mapping[str, Numbers]], Any]  # values of the inputs by name
+Levels = tuple[float, ...] | tuple[str, ...]  # of a category
 
 _OPERATORS: dict[type, Callable[..., Any]] = {
     ast.Add: operator.add,
@@ -45,8 +51,11 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
 _CONSTANTS = {"pi": np.pi, "e": np.e}
 
 
-def parse(formula: str) -> tuple[dict[str, list[Factor]], set[str]]:
-    """Term -> its factors, in the order of the formula; and the names that they use.
+def parse(
+    formula: str,
+) -> tuple[dict[str, list[Factor]], set[str], dict[str, Levels]]:
+    """Term -> its factors, in the order of the formula; the names that they use; and
+    the levels of those that are categories.
 
     Raises:
         ValueError: formulaic cannot read it, or a factor holds something else.
@@ -69,9 +78,64 @@ def parse(formula: str) -> tuple[dict[str, list[Factor]], set[str]]:
         ) from error
     _require_powers(formula)
     used: set[str] = set()
-    return {
-        term: [_compile(part, used) for part in parts] for term, parts in factors
-    }, used
+    categories: dict[str, Levels] = {}
+    whole = {frozenset(parts) for _, parts in factors}
+    terms_of: dict[str, list[Factor]] = {}
+    for term, parts in factors:
+        columns: list[list[tuple[str, Factor]]] = []
+        coded = False
+        for part in parts:
+            name, levels = _category(part)
+            coded = coded or bool(levels)
+            if not levels:
+                columns.append([(part, _compile(part, used))])
+                continue
+            if categories.setdefault(name, levels) != levels:
+                raise ValueError(f"features: C({name}) has two lists of levels")
+            rest = frozenset(parts) - {part} or frozenset("1")
+            columns.append(_indicators(name, levels)[rest in whole :])
+            whole |= {rest} if len(parts) == 1 else set()  # the levels' sum
+        for chosen in itertools.product(*columns):
+            label = ":".join(label for label, _ in chosen)
+            terms_of[label if coded else term] = [factor for _, factor in chosen]
+    for name, levels in categories.items():
+        if name in used and isinstance(levels[0], str):
+            raise ValueError(
+                f"features: the levels of {name} are words, so it must be used as "
+                f"C({name}, levels=...) alone"
+            )
+    return terms_of, used | {*categories}, categories
+
+
+def _category(factor: str) -> tuple[str, Levels]:
+    """The input of ``C(name, levels=[...])`` and its levels; "" and none of others."""
+    if not re.match(r"C\s*\(", factor):
+        return "", ()
+    match ast.parse(factor.strip(), mode="eval").body:
+        case ast.Call(
+            args=[ast.Name(id=name)], keywords=[ast.keyword(arg="levels", value=given)]
+        ) if isinstance(given, ast.List | ast.Tuple):
+            with contextlib.suppress(ValueError):  # an expression
+                levels = tuple(ast.literal_eval(given))
+                words = all(isinstance(x, str) and x[:1].isalpha() for x in levels)
+                numbers = all(type(level) in (int, float) for level in levels)
+                if len({*levels}) == len(levels) > 1 and (words or numbers):
+                    return name, levels
+    raise ValueError(
+        "features: a category must be an input and its levels, two or more numbers or "
+        "words that begin with a letter, such as C(x, levels=['a', 'b', 'c']), got "
+        f"{factor}"
+    )
+
+
+def _indicators(name: str, levels: Levels) -> list[tuple[str, Factor]]:
+    """A feature for each level, with its label; levels of words are 0, 1, 2, ..."""
+
+    def at(place: int, level: Any) -> Factor:
+        value = place if isinstance(level, str) else level
+        return lambda values: (np.real(values[name]) == value).astype(np.float64)
+
+    return [(f"{name}[{level}]", at(i, level)) for i, level in enumerate(levels)]
 
 
 def _require_powers(formula: str) -> None:

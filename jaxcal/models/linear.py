@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import axis_names, numbers, whole_number
-from jaxcal.models.formula import input_names, parse
+from jaxcal.models.formula import Levels, input_names, parse
 from jaxcal.models.model import Model, as_commands, as_parameters
 
 Array = NDArray[np.float64]
@@ -26,7 +26,9 @@ class Linear(Model):
 
     Args:
         features: a formula, ``"1 + x + y + x:y + I(x**2) + sin(2*pi*x/30)"``, or a
-            function of commands (N, n) that returns (N, r).
+            function of commands (N, n) that returns (N, r). In a formula
+            ``C(x, levels=['a', 'b'])`` is a category. Frames and tables hold its
+            words, arrays 0, 1, ... for them; levels may also be numbers.
         num_outputs: m.
         inputs: names of the n commands; with a function their number will do. By
             default x, y, z or u1, u2, ... as the formula has them.
@@ -48,10 +50,11 @@ class Linear(Model):
         self.num_outputs = whole_number("num_outputs", num_outputs, 1)
         self.features = features
         self._analytic = isinstance(features, str)
+        self._categories: dict[str, Levels] = {}
         if isinstance(features, str):
             if terms is not None:
                 raise ValueError("terms must be left out: a formula has its own")
-            self._factors, used = parse(features)
+            self._factors, used, self._categories = parse(features)
             inputs = input_names(used) if inputs is None else inputs
         elif not callable(features):
             raise ValueError(
@@ -82,6 +85,14 @@ class Linear(Model):
             self.terms = axis_names("terms", labels, "f", count)
         if not self.terms:
             raise ValueError(f"features must hold at least one term, got {features!r}")
+
+    @property
+    def levels(self) -> tuple[tuple[str, ...], ...]:
+        """Of each input the words that it may be; () where it is a number."""
+        return tuple(
+            tuple(level for level in levels if isinstance(level, str))
+            for levels in (self._categories.get(name, ()) for name in self.inputs)
+        )
 
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
@@ -135,6 +146,17 @@ class Linear(Model):
 
     def _evaluate(self, commands: Array) -> Array:
         """(N, r), finite."""
+        for name, levels in self._categories.items():
+            column, words = (
+                commands[:, self.inputs.index(name)],
+                isinstance(levels[0], str),
+            )
+            offered = dict(enumerate(levels)) if words else dict.fromkeys(levels, "")
+            for i in np.flatnonzero(~np.isin(column, [*offered]))[:1]:
+                rule = ", ".join(f"{x} {word}".strip() for x, word in offered.items())
+                raise ValueError(
+                    f"{name} must be one of {rule}, got {column[i]:.6g} in row {i}"
+                )
         with np.errstate(all="ignore"):
             features = self._features(commands)
         bad = np.argwhere(~np.isfinite(features))

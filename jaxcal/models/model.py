@@ -464,7 +464,10 @@ def as_parameters(model: Model, parameters: ArrayLike | None) -> Array:
 def by_name(model: Any, commands: Any) -> Any:
     """The model's columns of a data frame, in its order; else as given."""
     inputs = getattr(model, "inputs", ())
-    return of_frame("commands", commands, inputs, COMMANDS) if inputs else commands
+    levels = getattr(model, "levels", ())
+    if not inputs:
+        return commands
+    return of_frame("commands", commands, inputs, COMMANDS, levels=levels)
 
 
 def recorded(model: Any, commands: Any, measured: Any) -> tuple[Any, Any, bool]:

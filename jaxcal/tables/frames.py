@@ -97,7 +97,12 @@ def _cells(values: Any) -> Any:
 
 
 def of_frame(
-    argument: str, frame: Any, wanted: Sequence[str], prefix: str, used: Any = None
+    argument: str,
+    frame: Any,
+    wanted: Sequence[str],
+    prefix: str,
+    used: Any = None,
+    levels: Sequence[Sequence[str]] = (),
 ) -> Any:
     """The ``wanted`` columns (..., n) of a frame, or of rows, by name; else as given.
 
@@ -107,6 +112,7 @@ def of_frame(
         wanted: names.
         prefix: that they, or the columns, may lack.
         used: (N,) rows whose numbers must be finite; all when not given.
+        levels: of each column the words that are read as 0, 1, ...; () of numbers.
 
     Raises:
         ValueError: a name is missing, or could be either of two; a cell is no number.
@@ -119,7 +125,10 @@ def of_frame(
     if hasattr(frame, "columns") and hasattr(frame, "__getitem__"):
         block = None if hasattr(frame, "column_names") else frame[[*names]]
     if block is None or np.asarray(block).dtype.kind not in "iuf":
-        columns = [_numbers(argument, name, _column(frame, name)) for name in names]
+        columns = [
+            _numbers(argument, name, _column(frame, name), words)
+            for name, words in zip(names, levels or [()] * len(names), strict=True)
+        ]
         block = np.stack(columns, axis=-1)
     bad = ~np.isfinite(np.asarray(block))
     for place in np.argwhere(bad if used is None else bad & np.c_[used])[:1]:
@@ -155,7 +164,7 @@ def _collected(frame: Any) -> Any:
     return frame.collect() if lazy else frame
 
 
-def _numbers(argument: str, name: str, values: Any) -> Any:
+def _numbers(argument: str, name: str, values: Any, levels: Sequence[str] = ()) -> Any:
     """Numbers of a column, or of a row's cell."""
     array = np.asarray(values)
     if array.dtype.kind == "b":
@@ -163,7 +172,7 @@ def _numbers(argument: str, name: str, values: Any) -> Any:
     if not isinstance(cells := _cells(values), list):
         return array
     table = table_of(argument, {name: cells}, range(len(cells)), None, row="row")
-    numbers = table.columns([name]) if table.labels else table.values
+    numbers = table.columns([name], None, [levels]) if table.labels else table.values
     return numbers.reshape(array.shape)
 
 

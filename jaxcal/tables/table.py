@@ -63,10 +63,16 @@ class Table:
         left out; where nothing but the table says it."""
         return decide(self)
 
-    def columns(self, wanted: Sequence[str], used: Mask | None = None) -> Array:
+    def columns(
+        self,
+        wanted: Sequence[str],
+        used: Mask | None = None,
+        levels: Sequence[Sequence[str]] = (),
+    ) -> Array:
         """(N, len(wanted)) the columns of these very names, in that order.
 
-        TRUE and FALSE are 1 and 0.
+        TRUE and FALSE are 1 and 0. The ``levels`` of a column are words that are read
+        as 0, 1, ...; () of numbers.
 
         Raises:
             ValueError: there is no such column, or a cell of a row that is ``used``
@@ -78,6 +84,9 @@ class Table:
                 values[:, place] = self.values[:, self.names.index(name)]
             elif name in self.labels:
                 cells = self.labels[name]
+                if levels and levels[place]:
+                    values[:, place] = _places(self, name, cells, levels[place])
+                    continue
                 truths = truths_of(cells, ("true", "false"))
                 values[:, place] = truths or _require_numbers(self, name, cells)
             else:
@@ -336,6 +345,20 @@ def table_of(
     values = np.array([*numeric.values()], dtype=np.float64)
     values = values.reshape(len(numeric), len(lines)).T
     return dataclasses.replace(table, names=tuple(numeric), values=values)
+
+
+def _places(
+    table: Table, name: str, cells: Sequence[str], levels: Sequence[str]
+) -> list[float]:
+    """The place of each word among the levels."""
+    known = {level.strip(): float(place) for place, level in enumerate(levels)}
+    for line, cell in zip(table.lines, cells, strict=True):
+        if cell.strip() not in known:
+            raise ValueError(
+                f"{table.source}: {table.row} {line}, column {name!r} must be one of "
+                f"{', '.join(levels)}, got {cell!r}"
+            )
+    return [known[cell.strip()] for cell in cells]
 
 
 def _require_numbers(

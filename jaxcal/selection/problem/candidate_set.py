@@ -123,9 +123,13 @@ class CandidateSet:
                 self.axes = names_in("candidates", given, wanted, COMMANDS, ())
             else:
                 self.axes = inputs_of("candidates", given)
-            columns = wanted or self.axes
-            self.measured = of_frame("measured", self.measured, columns, COMMANDS)
-            self.candidates = of_frame("candidates", given, self.axes, COMMANDS, mask)
+            columns, words = wanted or self.axes, getattr(self.model, "levels", ())
+            self.measured = of_frame(
+                "measured", self.measured, columns, COMMANDS, None, words
+            )
+            self.candidates = of_frame(
+                "candidates", given, self.axes, COMMANDS, mask, words
+            )
         array = filled("candidates", self.candidates, "M", "n")
         spacing = rounding_of(self.candidates)
         self.names = _names_of_rows(given, self.names, len(array))
