@@ -329,6 +329,8 @@ def _read_model(path: str) -> Model:
         OSError: the file cannot be read.
         ValueError: naming the file and what is wrong in it.
     """
+    if path.lower().endswith(".xacro"):
+        raise ValueError(f"{path}: expand it first: xacro {path} > arm.urdf")
     try:
         read = json.loads(pathlib.Path(path).read_text(encoding="utf-8-sig"))
     except ValueError:
