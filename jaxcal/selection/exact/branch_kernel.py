@@ -4,40 +4,40 @@ A node bounds the count of every candidate, ``low_i <= c_i <= high_i``, sum k. I
 relaxation lets counts be real numbers: the criterion phi is concave, so at any counts
 c, with G the gradient at the information M and leverages ``d_i = trace(B_i G B_i.T)``,
 
-    phi(any c') <= phi(c) + max over c' of sum of (c'_i - c_i) d_i
+    phi(any c') <= phi(c) + max over c' of sum of (c'_i - c_i) d_i              (1)
 
 within the bounds: true wherever the climb stops, tight at the relaxed optimum. The
 climb is Newton's, on the fractional counts and those the leverages ask to move; its
 quadratic programme is solved by an active set. With W = inverse(M) and <.,.> the
 entrywise product, the Hessian over the counts is
 
-    D       -|X|^2           X = B_i W B_j.T
-    Ds      |X|^2 - 2 <X, Y> X = B_i G B_j.T, Y = B_i W B_j.T
-    A I As  -2 <X, Y>        the same.
+    D       -|X|^2           X = B_i W B_j.T                        (2)
+    Ds      |X|^2 - 2 <X, Y> X = B_i G B_j.T, Y = B_i W B_j.T       (3)
+    A I As  -2 <X, Y>        the same.                              (4)
 
 Three bounds go by eigenvalues. E is 1 / the largest eigenvalue of V = C W C.T, which
 double precision holds where it does not hold the smallest one of inverse(V): commands
 far from zero. With v an eigenvector of V, ``y = W C.T v`` scaled to |C y| = 1 makes
 ``y.T M y`` its reciprocal at M, and at every other M a bound on E. E is smoothed over
-all reciprocals l, ``-log(sum of exp(-b l)) / b``; its gradient is a mean of such y y.T
-and so a bound too, however good the smoothing is.
+all reciprocals l, ``-log(sum of exp(-b l)) / b`` (5); its gradient is a mean of such
+y y.T and so a bound too, however good the smoothing is.
 
 D, A, I and As where what is still to be chosen has fewer readings t than there are
 parameters: with P what is chosen for certain, the rest N = M - P of a selection has
 rank t at most. Of the eigenvalues l of N in the metric of P (of H N H.T, H P H.T = I)
 the smallest are replaced by their total in equal shares among what is left of the t,
 
-    F(N) = sum over the i largest of f(l) + (t - i) f(rest / (t - i)),
+    F(N) = sum over the i largest of f(l) + (t - i) f(rest / (t - i)),          (6)
 
 which is concave where f is, exact at every selection, and nowhere below the sum of f
-over the t largest. ``f = log(1 + l)`` bounds D, beside log det P. Source: Li and Xie,
-Best principal submatrix selection (the augmented factorization bound), 2023.
+over the t largest. ``f = log(1 + l)`` bounds D, beside log det P (7). Source: Li and
+Xie, Best principal submatrix selection (the augmented factorization bound), 2023.
 
 A, I and As are trace(U inverse(I + H N H.T)) with U = H C.T C H.T. For every mu >= 0,
 U is at most (U - mu)+ + mu I, and I - inverse(I + H N H.T) is at most 1 and of rank t:
 
     trace >= trace((U - mu)+ inverse(I + H N H.T)) + sum of min(u, mu) - mu t
-             + mu (sum of 1 / (1 + l) over the t places of F).
+             + mu (sum of 1 / (1 + l) over the t places of F).                  (8)
 
 mu = 0 is the natural bound. At a given N the best mu is an eigenvalue of U, the first
 whose eigenvector no longer finds room among the t readings.
@@ -359,19 +359,21 @@ class Search:
         for a in range(p):
             length: cython.double = dot(reach + a * p, reach + a * p, p)
             for b in range(p):
+                # |C y| = 1
                 basis[a * p + b] *= 1.0 / sqrt(length) if length > 0.0 else 0.0
             apart = values[a] - values[0]
             slopes[a] = exp(-self.smoothing * apart) if apart > 0.0 else 1.0
-            total += slopes[a]
+            total += slopes[a]  # of (5), without its largest part
         multiply(False, False, p, p, p, basis, self.gram, reach)
         for a in range(p):
             slopes[a] /= total
             self.tail[a] = slopes[a]
             self.own[a] = -self.smoothing * slopes[a]
             if slopes[a] > 0.0:
+                # y.T M y
                 self.base += slopes[a] * dot(reach + a * p, basis + a * p, p)
         self.tail_weight = self.smoothing
-        return values[0] - log(total) / self.smoothing
+        return values[0] - log(total) / self.smoothing  # (5)
 
     def _shared_out(self, kind):
         """Bound F at N in the metric of P, slopes and base; f of A is -mu / (1 + l)."""
@@ -395,8 +397,8 @@ class Search:
             shares += 1.0 / (1.0 + values[p - 1 - kept])
             kept += 1
         rest /= places - kept
-        logs += (places - kept) * log1p(rest)
-        self.shares = shares + (places - kept) / (1.0 + rest)
+        logs += (places - kept) * log1p(rest)  # (6) of D
+        self.shares = shares + (places - kept) / (1.0 + rest)  # (6) of 1 / (1 + l)
         trace: cython.bint = kind == _RANK_TRACE
         mu = self.mu if trace else 1.0
         for a in range(p):
@@ -408,6 +410,7 @@ class Search:
             if not held:
                 self.tail_weight = self.own[a] / (places - kept)
                 self.own[a] = 0.0
+        # (8), but for what _covariance adds; (7)
         value = self.constant + (-mu * self.shares if trace else logs)
         # Eigenvalues are rounded by p eps of the largest.
         self.base += value + mu * p * _EPS * values[p - 1]
@@ -422,7 +425,7 @@ class Search:
                 apart = values[a] - values[b]
                 bend = 0.5 * (self.own[a] + self.own[b])
                 if apart > 1e-7 * values[a]:
-                    bend = (slopes[a] - slopes[b]) / apart
+                    bend = (slopes[a] - slopes[b]) / apart  # as eigenvectors turn
                 self.bend[a * p + b] = bend
             self.bend[a * p + a] = self.own[a]
             for b in range(p):
@@ -477,7 +480,7 @@ class Search:
         self.constant = (rounding + mu) * self.places
         for b in range(p):
             a = p - 1 - b
-            self.constant -= min(max(self.weights[a], 0.0), mu)
+            self.constant -= min(max(self.weights[a], 0.0), mu)  # of (8)
             if self.weights[a] > mu:
                 scale = sqrt(self.weights[a] - mu)
                 for c in range(p):
@@ -538,11 +541,12 @@ class Search:
                     at = (i * q + r) * wide + j * q
                     for s in range(q):
                         if kind == DET:
-                            total += y[at + s] * y[at + s]
+                            total += y[at + s] * y[at + s]  # (2)
                         elif kind == SUBSET:
+                            # (3)
                             total += (2.0 * y[at + s] - x[at + s]) * x[at + s]
                         else:
-                            total += 2.0 * x[at + s] * y[at + s]
+                            total += 2.0 * x[at + s] * y[at + s]  # (4)
                 out[i * m + j] += total
 
     def _spectral_hessian(self, m):
@@ -636,7 +640,7 @@ class Search:
             slope = self.leverage[i] - cut
             gain += ((high[i] if slope > 0.0 else low[i]) - c[i]) * slope
         self.cut = cut
-        return gain + to_choose * cut
+        return gain + to_choose * cut  # of (1)
 
     def _working_set(self, low, high, c):
         """Counts to move: the fractional ones and some of those that should move."""
@@ -841,7 +845,7 @@ class Search:
             for o in range(self.opened if self.ruled else 0):
                 self.leverage[self.open[o]] -= self.price[self.open[o]]
             gain = self._linear_gain(low, high, c)
-            bound = self.base + gain
+            bound = self.base + gain  # (1)
             if not bound > -INFINITY:  # rounding left no number
                 bound = INFINITY
             self.linear = bound

@@ -3,29 +3,30 @@
 V is the inverse information, D_jj = B_j V B_j.T. Of a candidate j that comes in and one
 i that goes out (or none), with K = (I + D_jj)^-1, Z = D_ij K,
 
-    Y = I - D_ii + Z D_ji,          det grows by det(I + D_jj) det Y,
+    Y = I - D_ii + Z D_ji, (1)      det grows by det(I + D_jj) det Y, (2)
 
 and with X = V C.T C V and H_ij = B_i X B_j.T the trace of C V C.T falls by
 
-    trace(K H_jj) - trace(Y^-1 (H_ii + Q Z.T + Z Q.T)),      Q = Z H_jj / 2 - H_ij.
+    trace(K H_jj) - trace(Y^-1 (H_ii + Q Z.T + Z Q.T)), (3)  Q = Z H_jj / 2 - H_ij. (4)
 
 The information without i is never inverted: it may be singular. For a subset of the
 parameters, log det of (C V C.T)^-1 is that of the information less that of the nuisance
-parameters, whose inverse is X = V - V C.T (C V C.T)^-1 C V: the formula for det, once
-with V and once with X. What does not depend on i (D_jj, H_jj, K, and the gain of j
+parameters, whose inverse is X = V - V C.T (C V C.T)^-1 C V (5): the formula for det,
+once with V and once with X. What does not depend on i (D_jj, H_jj, K, and the gain of j
 alone) is kept until a swap is made. A swap is made only where phi, computed from the
 chosen blocks and not from the formulas above, has risen, so rounding cannot
 make two equal candidates swap endlessly.
 
 Removing i never helps: the gain of a swap is at most that of j alone. For det, with t
-the trace of D_jj, Y <= I - D_ii / (1 + t), so det Y is at most the q-th power of the
-mean of that matrix's diagonal. A group in which no gain can be the largest is skipped.
+the trace of D_jj, Y <= I - D_ii / (1 + t) (6), so det Y is at most the q-th power of
+the mean of that matrix's diagonal. A group in which no gain can be the largest is
+skipped.
 
 E, the smallest eigenvalue in the metric of R = C.T C, has no such formula. phi is
 concave: of what is left when i goes out, with y its weakest direction, ``y.T R y = 1``,
-adding B_j gives at most ``y.T M y + |B_j y|^2``. Candidates are looked at in the order
-of that bound until it falls to the best phi found, and j is better than that where
-``M + B_j.T B_j - phi R`` has a Cholesky factor.
+adding B_j gives at most ``y.T M y + |B_j y|^2`` (7). Candidates are looked at in the
+order of that bound until it falls to the best phi found, and j is better than that
+where ``M + B_j.T B_j - phi R`` (8) has a Cholesky factor.
 
 Candidates are held in groups of ``WIDE``, arrays (q, q, WIDE) or (q, p, WIDE), with
 innermost loops over a group: their length is known to the compiler, and what belongs to
@@ -599,7 +600,7 @@ class Climber(Choice):
             self.half, self.solved, self.small, self.other, self.lower, other,
         )  # fmt: skip
         for a in range(p * p if self.kind == SUBSET else 0):
-            other[a] = into[a] - other[a]
+            other[a] = into[a] - other[a]  # X, (5)
         return value
 
     # --- gains ----------------------------------------------------------------------
@@ -650,11 +651,11 @@ class Climber(Choice):
                 diagonal = kept + m * self.size + (r * q + r) * WIDE
                 for j in range(WIDE):
                     diagonal[j] += 1.0
-            _invert(kept + m * self.size, det, q, WIDE)
+            _invert(kept + m * self.size, det, q, WIDE)  # K
             for j in range(WIDE):
-                alone[j] = alone[j] / det[j] if m else det[j]
+                alone[j] = alone[j] / det[j] if m else det[j]  # of (2)
         if self.kind == TRACE:
-            _dots(alone, kept, grown + self.size, q * q)
+            _dots(alone, kept, grown + self.size, q * q)  # trace(K H_jj) of (3)
         for j in range(WIDE):
             det[j] = 0.0
         for r in range(q):
@@ -667,8 +668,8 @@ class Climber(Choice):
         """What is kept, for V and X (``trial``) after a swap; -1: none went.
 
         With A the blocks that came and went, W = A V, U = A X and S of diagonal 1 and
-        -1, V falls by ``W.T P W``, P = inverse(S + W A.T). So does X of a subset, by U,
-        and X of a trace by ``W.T P U + U.T P W - W.T P U A.T P W``.
+        -1, V falls by ``W.T P W``, P = inverse(S + W A.T) (9). So does X of a subset,
+        by U, and X of a trace by ``W.T P U + U.T P W - W.T P U A.T P W`` (10).
         """
         q, p, changed = self.q, self.p, self.changed
         r: cython.int = q if went < 0 else 2 * q
@@ -685,7 +686,7 @@ class Climber(Choice):
                 if m < self.dets:
                     for s in range(r):
                         middle[s * r + s] += 1.0 if s < q else -1.0
-                    _invert(middle, self.det, r, 1)
+                    _invert(middle, self.det, r, 1)  # P
                 else:  # P U A.T P
                     part = self.middle + 8 * q * q
                     multiply(False, False, r, r, r, self.middle, middle, part)
@@ -708,11 +709,11 @@ class Climber(Choice):
             for a in range(r * q * WIDE):
                 mixed[a] = 0.0
             if m < self.dets:
-                _mix(mixed, 0.5, middle, cross, r, q)
+                _mix(mixed, 0.5, middle, cross, r, q)  # (9)
             else:
                 _mix(mixed, 1.0, self.middle, cross, r, q)
                 cross = self.cross
-                _mix(mixed, -0.5, middle, cross, r, q)
+                _mix(mixed, -0.5, middle, cross, r, q)  # (10)
             _lower(self.grown + (2 * c + m) * self.size, cross, mixed, r, q)
 
     def _cross(self, c, m, r):
@@ -734,21 +735,22 @@ class Climber(Choice):
         if self.rows:
             stays = 1.0 - self.at_out[0]
             for j in range(WIDE):
-                gain[j] = alone[j] * stays + cross[j] * cross[j]
+                gain[j] = alone[j] * stays + cross[j] * cross[j]  # (2)
             return
         for m in range(self.dets):
             for a in range(self.size):
                 solved[a] = 0.0
             kept = self.kept + (2 * c + m) * self.size
-            _times(solved, 1.0, cross + 2 * m * self.size, kept, False, q)
+            _times(solved, 1.0, cross + 2 * m * self.size, kept, False, q)  # Z
             for r in range(q):
                 for s in range(q):
                     stays = (1.0 if r == s else 0.0) - self.at_out[(m * q + r) * q + s]
                     for j in range(WIDE):
                         y[(r * q + s) * WIDE + j] = stays
-            _times(y, 1.0, solved, cross + 2 * m * self.size, True, q)
+            _times(y, 1.0, solved, cross + 2 * m * self.size, True, q)  # (1)
             _invert(y, det, q, WIDE)
             for j in range(WIDE):
+                # (2), of a subset divided by that of X
                 gain[j] = gain[j] / max(det[j], 1e-300) if m else alone[j] * det[j]
         if self.kind != TRACE:
             return
@@ -756,12 +758,12 @@ class Climber(Choice):
         for a in range(self.size):
             part[a] = -cross[2 * self.size + a]
         grown = self.grown + (2 * c + 1) * self.size
-        _times(part, 0.5, solved, grown, False, q)
+        _times(part, 0.5, solved, grown, False, q)  # Q, (4)
         for a in range(q * q):
             for j in range(WIDE):
                 lost[a * WIDE + j] = self.at_out[q * q + a]
-        _times(lost, 2.0, part, solved, True, q)
-        _dots(gain, y, lost, q * q)
+        _times(lost, 2.0, part, solved, True, q)  # both halves: Y is symmetric
+        _dots(gain, y, lost, q * q)  # of (3)
         for j in range(WIDE):  # none where it is singular without i
             gain[j] = alone[j] - gain[j] if det[j] > 1e-14 else -INFINITY
 
@@ -804,6 +806,7 @@ class Climber(Choice):
         for c in range(self.groups):
             bound: cython.double = self.tops[2 * c]
             if self.kind == DET:
+                # (6) by the mean of the diagonal
                 stays: cython.double = 1.0 - taken / (1.0 + self.tops[2 * c + 1])
                 for _ in range(q):
                     bound *= stays
@@ -849,7 +852,7 @@ class Climber(Choice):
             self._add(e)
             lower = self.lower
             for a in range(p * p):
-                lower[a] = gram[a] - least[0] * self.metric[a]
+                lower[a] = gram[a] - least[0] * self.metric[a]  # (8)
             if cholesky(lower, lower, p, 0.0) > -INFINITY:
                 value = self._least(False)
                 if value > least[0]:
@@ -897,7 +900,7 @@ class Climber(Choice):
                 columns = self.columns + (c * q + s) * p * WIDE
                 _weigh(part, self.weakest, columns, p)
                 for j in range(WIDE):
-                    bound[j] += part[j] * part[j]
+                    bound[j] += part[j] * part[j]  # (7)
             for j in range(WIDE):
                 bound[j] = min(bound[j], cap) - closed[j]
             self.tops[2 * c] = _largest(bound)
