@@ -151,13 +151,13 @@ def _require_powers(formula: str) -> None:
     while count:  # calls whose arguments hold none, the innermost first
         plain, count = re.subn(r"\w+\([^()]*\)", hide, plain)
     itself = r"\b([^\W\d]\w*)\s*(?:(?:\*\*|\^)\s*(\d+)|[:*]\s*\1\b(?!\())"
-    if found := re.search(itself, plain):
-        name, whole = found[1], found[0]
+    if power := re.search(itself, plain):
+        name, whole = power[1], power[0]
         for k in reversed(range(len(calls))):
             name, whole = (x.replace(f"_{k}_", calls[k]) for x in (name, whole))
         raise ValueError(
             f"features: a formula reads {whole} as {name}; for a power write "
-            f"I({name}**{found[2] or 2})"
+            f"I({name}**{power[2] or 2})"
         )
 
 

@@ -88,7 +88,7 @@ class Linear(Model):
 
     @property
     def levels(self) -> tuple[tuple[str, ...], ...]:
-        """Of each input the words that it may be; () where it is a number."""
+        """The words that each input may be; () where it is a number."""
         return tuple(
             tuple(level for level in levels if isinstance(level, str))
             for levels in (self._categories.get(name, ()) for name in self.inputs)

@@ -351,14 +351,14 @@ def _places(
     table: Table, name: str, cells: Sequence[str], levels: Sequence[str]
 ) -> list[float]:
     """The place of each word among the levels."""
-    known = {level.strip(): float(place) for place, level in enumerate(levels)}
+    places = {level.strip(): float(place) for place, level in enumerate(levels)}
     for line, cell in zip(table.lines, cells, strict=True):
-        if cell.strip() not in known:
+        if cell.strip() not in places:
             raise ValueError(
                 f"{table.source}: {table.row} {line}, column {name!r} must be one of "
                 f"{', '.join(levels)}, got {cell!r}"
             )
-    return [known[cell.strip()] for cell in cells]
+    return [places[cell.strip()] for cell in cells]
 
 
 def _require_numbers(

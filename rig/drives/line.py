@@ -73,7 +73,7 @@ class Line(abc.ABC):
 
     @property
     def read_tries(self) -> int:
-        """Of a read: spoilt frames now and then spoil three replies in a row."""
+        """Tries of a read: spoilt frames now and then spoil three replies in a row."""
         return 1 + 2 * self.settings.read_retries
 
     # Of a kind of line
