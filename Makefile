@@ -77,9 +77,8 @@ test: $(READY) ## set everything up, lint, and run the quick tests (the ones CI 
 # A part is a folder of tests/, `files`, the tests beside them, or `trainings`, those of
 # adaptive and learning that need the speed of an optimised program. Each is a run of its
 # own: what one process has compiled it keeps, and the whole suite is too much for one. The
-# rig's part, which mostly waits, runs beside the others, which give way. A device that
-# a busy machine silenced is a fault: what failed there is run once more, alone, and both
-# are shown.
+# rig's part, which mostly waits, runs beside the others, which give way. Nothing that
+# failed is run again.
 PARTS ?= $(notdir $(patsubst %/,%,$(dir $(wildcard tests/*/test_*.py)))) files trainings
 EVERY_TEST = $(BIN)/python -m pytest --hypothesis-profile=new -m 'not trains' --dist loadfile --no-loadscope-reorder \
 	--durations=5 --durations-min=60 $(ARGS)
@@ -93,7 +92,6 @@ test-all: $(READY) lint ## every test, the slow ones too, hypothesis drawing new
 	case $$part in adaptive|learning) flags="$${XLA_FLAGS-$(QUICK_XLA)}";; esac; \
 	XLA_FLAGS="$$flags" nice -n 19 $(EVERY_TEST) -n 2 $$tests || failed="$$failed $$part"; done; \
 	if [ "$$rig" ]; then wait $$rig; rig=$$?; echo "== rig"; cat $(VENV)/rig-tests.log; \
-	if [ $$rig = 1 ]; then echo "== rig: what failed, alone"; $(RIG_TESTS) -n 0 --lf; rig=$$?; fi; \
 	[ $$rig = 0 ] || failed="$$failed rig"; fi; \
 	[ -z "$$failed" ] || { echo "failed:$$failed"; exit 1; }
 

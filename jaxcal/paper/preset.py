@@ -45,7 +45,7 @@ OBSERVATION = TrainConfig(
     about="the paper's 210 numbers, a network of products, PPO alone from scratch",
     network=NetworkConfig(kind="observation", decoder_rounds=2, mirrored=True),
     ppo=EpisodesConfig(
-        num_episodes=10_000_000,
+        num_episodes=6_000_000,
         episodes_per_update=1024,
         episodes_per_set=16,
         explore_once=True,
