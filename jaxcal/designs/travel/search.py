@@ -165,7 +165,7 @@ def _require_travel(offer: CandidateSet, motion: Motion) -> Array:
     if offer.candidates is None:
         raise ValueError(
             "blocks need the commands for the travel between them: "
-            "Design.from_blocks(..., commands=)"
+            "Design(blocks=..., commands=...)"
         )
     if not isinstance(motion, Motion):
         raise ValueError(f"motion must be a Motion, got {motion!r}")
