@@ -53,7 +53,7 @@ CASES = {
         HEAVY,
         [
             (["jaxcal", "train"], 2, "[policy]'"),
-            (["jaxcal-rig", "calibrate", "--simulate"], 2, "[rig]'"),
+            (["jaxcal-rig", "calibrate", "--simulate"], 2, "[workbench]'"),
             (["jaxcal", "evaluate", "--episodes", "5"], 0, "dataset2"),
             (["python", "-c", FORMULA], 0, "[models]'"),
         ],

@@ -21,7 +21,8 @@ def check(name: str, start: int) -> None:
         warnings.simplefilter("ignore")
         of_values, of_errors, said = nist.fitted(one, start)
     if (name, start) in LOST:
-        assert of_values >= 6.0 or "converge" in said
+        lost = "converge" in said or "may have stopped on a plateau" in said
+        assert of_values >= 6.0 or lost
         return
     assert of_values >= 6.0, said
     # The residuals of Lanczos1 are the rounding of its readings, and less in doubles.
