@@ -20,7 +20,10 @@ __all__ = ["AVAILABLE", "COUNTED", "Decision", "decide", "is_available", "senten
 Array = NDArray[np.float64]
 
 AVAILABLE = "available"
-_AVAILABLE = re.compile(r"(is[ _]?)?avail(able|ability)?\W*([\[(].*)?", re.IGNORECASE)
+_AVAILABLE = re.compile(
+    r"(is[ _]?)?avail(able|ability)?([ _](rows?|flags?|mask|now))?\W*([\[(].*)?",
+    re.IGNORECASE,
+)
 _LEAST_ROWS = 5  # of which a constant step is no chance
 # Columns that number the rows, by their names; runs only where each has its own.
 _NUMBERS = re.compile(
@@ -35,7 +38,8 @@ _RUNS = re.compile(
 )
 _STAMPS = {"stamp", "timestamp", "date", "datetime", "epoch", "datum"}
 _TIMES = {"time", "uhrzeit", "elapsed", "clock"}
-_SECONDS = re.compile(r"t([ _]?[\[(]?(s|ms|us|ns|sec|seconds|min)[\])]?)?", re.I)
+# T alone is a temperature.
+_SECONDS = re.compile(r"t|[tT][ _]?[\[(]?(s|ms|us|ns|sec|seconds|min)[\])]?")
 COUNTED = "it looks like a row number or a time"
 _LIKE_U, _LIKE_Y = re.compile(r"[uU]\d*|U_.*"), re.compile(r"[yY]\d*|Y_.*")
 _PLURALS = {  # of a reason's begin

@@ -27,10 +27,12 @@ __all__ = ["csv_text", "parse", "read_table"]
 _DELIMITERS = "\t;, "  # the first of those that serve alike
 _OF_R = " \t"  # with which R names rows, and not the column of these names
 _LOOKED_AT = 20  # rows by which the delimiter is judged
+_BREAK = re.compile(r"\s*\n\s*")  # of a line, in a quoted cell
 _UNIT = re.compile(
     r"[\[(].*[\])]|[-%°‰]|(?:[/.·*^ ²³0-9-]|[pnuµμmckMGh]?(?:deg|rad|m|s|g|V|A|W|N|Hz"
     r"|Pa|bar|Ω|l|L|C|F|K|J|rpm|min|h|psi|in|inch|°C|°F|°|%|ct|cts|counts?|steps?|pulses?"
-    r"|degrees?|radians?|volts?|sec|seconds?))+"
+    r"|degrees?|radians?|volts?|sec|seconds?|T|S|Ohm|ppm|dB|lx|px|LSB|mmHg|RH|rev"
+    r"|arcsec|arcmin|a\.u\.|ε))+"
 )
 
 
@@ -260,7 +262,21 @@ def _cells(lines: Sequence[str], delimiter: str) -> list[tuple[int, list[str]]]:
                 rows.append((reader.line_num, cells))
     except csv.Error as error:
         raise ValueError(f"line {reader.line_num}: {error}") from None
-    return rows
+    if rows and any("\n" in cell for cell in rows[-1][1]):
+        _require_closed(lines, delimiter)
+    return [(line, [_BREAK.sub(" ", cell) for cell in cells]) for line, cells in rows]
+
+
+def _require_closed(lines: Sequence[str], delimiter: str) -> None:
+    """Refuse a quote that is opened and takes all that follows into one cell."""
+    texts, line = (f"{line}\n" for line in lines), 1
+    reader = csv.reader(texts, delimiter=delimiter, strict=True)
+    try:
+        for _ in reader:
+            line = reader.line_num + 1
+    except csv.Error as error:
+        if "end of data" in str(error):
+            raise ValueError(f'line {line}: a quote (") is never closed') from None
 
 
 def _rows(
@@ -298,10 +314,11 @@ def _holds_units(cells: Sequence[str], rows: Sequence[tuple[int, list[str]]]) ->
         if all(is_number(row[i]) for _, row in rows if row[i])
     ]
     units = [cell for cell in of_numbers if cell and not is_number(cell)]
+    known = sum(bool(_UNIT.fullmatch(cell)) for cell in units)
     return (
         any(cell != "-" for cell in units)
         and len(units) == sum(map(bool, of_numbers))
-        and all(map(_UNIT.fullmatch, units))
+        and 2 * known > len(units)
     )
 
 

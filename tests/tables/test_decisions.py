@@ -35,6 +35,7 @@ def roles(header: str, columns: dict[str, np.ndarray] | None = None, **asked):
         ("u_a,u_b,y_a,y_b", "u_a,u_b", "y_a,y_b"),
         ("pitch,yaw,y_pitch,y_yaw", "pitch,yaw", "y_pitch,y_yaw"),
         ("x_1,x_2,y_1", "x_1,x_2", "y_1"),
+        ("T,pH,available_rows", "T,pH", ""),
         ("u_x,u_y,u_z,y_x,y_y,y_z", "u_x,u_y,u_z", "y_x,y_y,y_z"),
     ],
 )

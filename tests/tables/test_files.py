@@ -206,3 +206,27 @@ def test_read_table_takes_what_csv_writes(tmp_path):
     with open(path, "w", newline="") as file:
         csv.writer(file, dialect="excel-tab").writerows([NAMES, *VALUES.tolist()])
     np.testing.assert_array_equal(jaxcal.read_table(str(path)).values, VALUES)
+
+
+def test_a_quote_that_is_never_closed_is_named_with_its_line():
+    with pytest.raises(ValueError, match=r"line 3: a quote .* is never closed"):
+        parse("t.csv", b'a,b\n1,2\n3,"4\n5,6\n7,8\n')
+
+
+def test_a_name_of_two_lines_is_one_name():
+    table = parse("t.csv", b'"T\n(C)","p\nH"\n1,2\n5,3\n2,9\n')
+    assert table.names == ("T (C)", "p H")
+
+
+@pytest.mark.parametrize(
+    "units", ["kN,mbar,\u00b5\u03b5", "deg,mmHg,LSB", "px,ppm,widgets"]
+)
+def test_units_need_not_all_be_known(units):
+    text = "\n".join(["u_a,u_b,y_c", units, "1,2,3", "3,4,5", "5,9,1"])
+    with pytest.warns(UserWarning, match="units are taken from line 2"):
+        assert len(parse("t.csv", text.encode())) == 3
+
+
+def test_words_below_the_header_are_no_units():
+    with pytest.raises(ValueError, match="line 2, column 'u_a' must hold a number"):
+        parse("t.csv", b"u_a,u_b\nfast,slow\n1,2\n3,4\n5,9\n").columns(["u_a"])
