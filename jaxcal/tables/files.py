@@ -314,11 +314,11 @@ def _holds_units(cells: Sequence[str], rows: Sequence[tuple[int, list[str]]]) ->
         if all(is_number(row[i]) for _, row in rows if row[i])
     ]
     units = [cell for cell in of_numbers if cell and not is_number(cell)]
-    known = sum(bool(_UNIT.fullmatch(cell)) for cell in units)
+    recognised = sum(bool(_UNIT.fullmatch(cell)) for cell in units)
     return (
         any(cell != "-" for cell in units)
         and len(units) == sum(map(bool, of_numbers))
-        and 2 * known > len(units)
+        and 2 * recognised > len(units)
     )
 
 

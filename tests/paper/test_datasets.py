@@ -497,7 +497,7 @@ HEAD = "episode,candidate,u_x,u_y,u_z"
         ),
         (f"{HEAD},available\n0,0,1,2,3,yes", "line 2, column 'available' must hold a"),
         (f"{HEAD},available\n0,0,1,2,3,2", "line 2, available must be 0 or 1"),
-        (f'{HEAD}\n0,0,1,2,"3\n0,1,1,2,3', "line 3"),
+        (f'{HEAD}\n0,0,1,2,"3\n0,1,1,2,3', "line 2"),
     ],
 )
 def test_a_malformed_csv_is_refused_by_line(
