@@ -65,6 +65,8 @@ def command_for(
     """
     n, m = fit.num_inputs, fit.num_outputs
     points = fit.points("desired", desired, m)
+    if not points.size:
+        return np.zeros((*points.shape[:-1], n))
     if m > n:
         raise ValueError(
             f"command_for needs at most as many outputs as inputs, got {m} and {n}"
@@ -291,7 +293,8 @@ class _Search(Responses):
                 )
         if far:
             warnings.warn(
-                f"{len(far)} of {len(commands)} targets are far outside the "
+                f"{len(far)} of {len(commands)} targets "
+                f"{'is' if len(far) == 1 else 'are'} far outside the "
                 f"measurements, where the calibration is untested: {worst}",
                 stacklevel=3,
             )

@@ -136,6 +136,8 @@ class SavedFiles:
             raise ValueError(f"--frames takes PARENT,CHILD, got {self.frames}")
         if self.transform and os.path.exists(self.transform) and not self.overwrite:
             raise ValueError(f"{self.transform} exists; pass --overwrite to replace it")
+        if self.transform and not of_urdf:
+            raise ValueError("--transform needs --model FILE.urdf and --sensor board")
         if self.servos_out and not servos:
             raise ValueError("--servos-out needs --servos FILE")
         if servos and not (self.servos_out or is_recording(file)):

@@ -81,6 +81,7 @@ CASES = [  # what was typed, what the line must hold
     ("select table.csv --model arm.urdf", "there is no column 'turn'"),
     ("select table.csv --model calibration.json", "this is a calibration, and a model"),
     ("select table.csv --model table.csv", "--model takes an arm (.urdf), a saved"),
+    ("identify pairs.csv --transform x.yaml", "--transform needs --model FILE.urdf"),
     ("select table.csv --model a.xacro -k 5", "expand it first: xacro a.xacro >"),
     ("select table.csv --score no.csv", "'no.csv' is neither: no such file"),
     ("select table.csv --score 1,2,x", "'1,2,x' is neither: no such file"),

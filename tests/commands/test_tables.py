@@ -144,7 +144,7 @@ def test_a_target_far_from_the_readings_is_said(ask):
     assert code == 0
     wanted = (200.0 - 3.1) / 0.43
     assert np.isclose(float(out.splitlines()[1].split(",")[0]), wanted)
-    assert "1 of 2 targets are far outside the measurements" in said
+    assert "1 of 2 targets is far outside the measurements" in said
     low, high = Y[:, 0].min(), Y[:, 0].max()
     assert f"y_a = 200, measured range {low:.6g} to {high:.6g}" in said
 

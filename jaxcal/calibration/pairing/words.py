@@ -58,10 +58,10 @@ def what_is_wrong(
             f"{-starts[0][1] % count} on belong to the first commands"
         )
     if kind == "rotation" and abs(starts[0][1]) <= count // 3:
-        last = "first" if starts[0][1] > 0 else "last"
+        last, far = "first" if starts[0][1] > 0 else "last", abs(starts[0][1])
+        these = f"{last} {far} are" if far > 1 else f"{last} is"
         return (
-            f"all readings are {_rows_late(starts[0][1])}; the {last} "
-            f"{abs(starts[0][1])} are at the other end"
+            f"all readings are {_rows_late(starts[0][1])}; the {these} at the other end"
         )
     if kind == "rotation":
         return (
