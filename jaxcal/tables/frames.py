@@ -26,7 +26,8 @@ def header_of(argument: str, values: Any) -> list[str]:
     """Names of the columns of a frame, or of a row's numbers; [] where there are none.
 
     Raises:
-        ValueError: a name comes twice, or some columns have none.
+        ValueError: a name comes twice, or some columns have none; a row has another
+            name, or the index one that begins as commands and readings do.
     """
     names = _names(values)
     if not any(isinstance(name, str | tuple) for name in names):
@@ -38,6 +39,19 @@ def header_of(argument: str, values: Any) -> list[str]:
             )
         if names.count(name) > 1:
             raise ValueError(f"{argument}: column {name!r} comes twice")
+    rows = values if isinstance(values, list | tuple) else ()
+    for i, row in enumerate(rows):
+        if isinstance(row, Mapping) and (more := row.keys() - {*names}):
+            raise ValueError(
+                f"{argument}: row {i} has {min(map(str, more))!r}, which row 0 lacks"
+            )
+    if hasattr(values, "columns"):
+        for name in getattr(getattr(values, "index", None), "names", None) or ():
+            if isinstance(name, str) and name.startswith((COMMANDS, MEASURED)):
+                raise ValueError(
+                    f"{argument}: {name!r} is in the index; frame.reset_index() makes "
+                    "it a column"
+                )
     return names
 
 
@@ -141,7 +155,7 @@ def of_frame(
 
 
 def say_order(commands: Any, measured: Any) -> None:
-    """Say that two frames whose index is in another order are paired by place."""
+    """Say that two frames whose indices differ are paired by place."""
     orders = [
         None if index is None or callable(index) else [*index]
         for index in (getattr(frame, "index", None) for frame in (commands, measured))
@@ -149,10 +163,12 @@ def say_order(commands: Any, measured: Any) -> None:
     one, other = orders
     if one is None or other is None or one == other or len(one) != len(other):
         return
-    if set(one) == set(other):
+    if set(one) & set(other):
+        same = set(one) == set(other)
+        what = "the same index in different orders" if same else "indices that differ"
         k = next(k for k in range(len(one)) if one[k] != other[k])
         say(
-            "commands and measured have the same index in different orders. Rows are "
+            f"commands and measured have {what}. Rows are "
             f"paired by position: row {k} is {one[k]!r} in commands and {other[k]!r} "
             "in measured. To pair by index use measured.loc[commands.index]"
         )

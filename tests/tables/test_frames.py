@@ -197,3 +197,20 @@ def test_an_index_in_another_order_is_said():
 def test_a_reading_in_another_spelling_is_said(names):
     with pytest.warns(UserWarning, match=f"'{names[2]}' is read as input: readings"):
         jaxcal.select(pandas.DataFrame(U, columns=names), 4)
+
+
+def test_what_is_in_the_index_or_in_later_rows_alone_is_refused():
+    frame = pandas.DataFrame({"u_a": [1.0, 2.0, 4.0], "u_b": [3.0, 1.0, 2.0]})
+    for keys in ("u_a", ["u_a", "u_b"]):
+        with pytest.raises(ValueError, match="is in the index; frame"):
+            jaxcal.select(frame.assign(u_c=[9.0, 1.0, 5.0]).set_index(keys))
+    rows = [{"u_a": 1.0, "y_1": 2.0}, {"u_a": 3.0, "y_1": 4.0, "u_b": 7.0}]
+    with pytest.raises(ValueError, match="row 1 has 'u_b', which row 0 lacks"):
+        jaxcal.read_table(rows)
+
+
+def test_indices_that_only_overlap_are_said():
+    commands = pandas.DataFrame({"a": np.arange(6.0) ** 2})
+    measured = pandas.DataFrame({"y": 2.0 * np.arange(6.0)}, index=range(1, 7))
+    with pytest.warns(UserWarning, match="indices that differ. Rows are paired"):
+        jaxcal.identify(commands, measured)
