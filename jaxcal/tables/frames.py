@@ -188,7 +188,10 @@ def _numbers(argument: str, name: str, values: Any, levels: Sequence[str] = ()) 
     if not isinstance(cells := _cells(values), list):
         return array
     table = table_of(argument, {name: cells}, range(len(cells)), None, row="row")
-    numbers = table.columns([name], None, [levels]) if table.labels else table.values
+    numbers = table.values
+    if table.labels:  # an empty cell of words is refused where its row is used
+        used = np.zeros(len(table), np.bool_) if levels else None
+        numbers = table.columns([name], used, [levels])
     return numbers.reshape(array.shape)
 
 

@@ -352,6 +352,7 @@ def _places(
 ) -> list[float]:
     """The place of each word among the levels."""
     places = {level.strip(): float(place) for place, level in enumerate(levels)}
+    places[""] = np.nan  # refused where its row is used
     for line, cell in zip(table.lines, cells, strict=True):
         if cell.strip() not in places:
             raise ValueError(

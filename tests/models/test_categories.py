@@ -65,6 +65,11 @@ def test_words_of_a_frame_are_chosen_from_fitted_and_predicted():
     assert fit.predict([[material, x]])[0] == pytest.approx(3.0)
     chosen = jaxcal.select(TABLE, 6, model=MODEL).indices
     assert {*TABLE.material[chosen]} == {*MATERIALS}
+    masked = TABLE.assign(available=TABLE.index > 0)
+    masked.loc[0, "material"] = None
+    assert 0 not in jaxcal.select(masked, 6, model=MODEL).indices
+    with pytest.raises(ValueError, match="row 0, column 'material' must be finite"):
+        jaxcal.select(masked.drop(columns="available"), 6, model=MODEL)
 
 
 @pytest.mark.parametrize(
