@@ -117,7 +117,7 @@ class Calibration(Fit):
         """
         from jaxcal.calibration.pairing import against
 
-        return against(self.model.verdict(self), self.mispairing)
+        return against(self.model.verdict(self), self)
 
     @functools.cached_property
     def mispairing(self) -> Mispairing | None:

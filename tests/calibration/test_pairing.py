@@ -315,3 +315,17 @@ def test_a_fit_leaves_out_an_outlier_and_readings_without_a_command():
     np.testing.assert_allclose(fit.solution * table.scale, slopes, rtol=1e-6)
     assert shifted(5, 2).tolist() == [2, 3, 4, -1, -1]
     assert not fitted(table, Hypothesis("shift", shifted(20, 2))).inside[18:].any()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_outliers_that_least_squares_hides_are_named(seed):
+    """Three of twenty rows are wrong: the noise grows until none is an outlier."""
+    rng = np.random.default_rng(seed)
+    commands, measured = (side[:20] for side in _table(seed))
+    assert _verdict(commands, measured).verdict.good
+    rows = np.sort(rng.choice(20, 3, replace=False))
+    off = rng.normal(size=(3, 3))
+    measured[rows] += 1.5 * off / np.abs(off).max(axis=1, keepdims=True)
+    verdict = _verdict(commands, measured).verdict
+    assert not verdict.good
+    assert "Rows " + ", ".join(map(str, rows)) in verdict.reasons[0]

@@ -22,6 +22,7 @@ from jaxcal.calibration.pairing.fit import (
     Fitted,
     fits_of,
     fitted,
+    predicted,
     top,
 )
 from jaxcal.calibration.pairing.orders import exchanged, polished, sorted_alone
@@ -35,14 +36,23 @@ from jaxcal.calibration.pairing.table import (
     path_match,
 )
 from jaxcal.calibration.pairing.words import sentence, what_is_wrong
+from jaxcal.checks import in_words
 from jaxcal.models.model import Model
+from jaxcal.models.reasons import Reason, in_rows
 from jaxcal.models.uncertainty import Prior
 from jaxcal.models.verdict import Verdict
 
 if TYPE_CHECKING:
+    from jaxcal.calibration.calibration import Calibration
     from jaxcal.calibration.fit import Fit
 
-__all__ = ["Mispairing", "against", "mispairing", "of_new_readings", "of_unfitted"]
+__all__ = [
+    "Mispairing",
+    "against",
+    "mispairing",
+    "of_new_readings",
+    "of_unfitted",
+]
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
@@ -61,6 +71,8 @@ _NAMED = 2  # other explanations
 _READINGS = 1.5  # for each parameter; of fewer another machine explains as much
 _CHANCE = 0.02  # that so many outliers stand so near one another
 _APART = "apart"  # kind: outliers that are one block
+_OFF = 6.0  # times the noise of the others
+_TURNS, _FLOOR = 6, 0.01  # rounds; noises, below which a row weighs no more
 _SORTED = ("commands sorted", "readings sorted")  # kinds
 _ROWS, _RUNS = 20_000, 400  # of more the first; of a function that is run
 
@@ -116,14 +128,41 @@ def mispairing(fit: Fit) -> Mispairing | None:
         lack = fit.lack_of_fit()
         if lack is None or lack > 1e-3:
             return None
-    prior = fit.stated_prior or fit.model.default_prior()
-    measured = fit.residuals + fit.predict(fit.commands)
-    counted = fit.loss_weights > 0.0
-    table = _table(fit.model, fit.commands, measured, counted, prior)
+    table = _of_fit(fit)
     if table is None:
         return None
-    table = dataclasses.replace(table, theta=np.asarray(fit.parameters))
     return _found(table, fit.input_names, fit.output_names, fit.measured_unit)
+
+
+def _hidden_outliers(fit: Fit) -> Reason | None:
+    """Rows that a fit of the others leaves far off, and least squares does not.
+
+    Where several are off, least squares meets them halfway: its noise grows until none
+    of them is an outlier. A model of which nothing is known before is asked, where
+    drift and curves explain the rows no better.
+    """
+    if len(fit.commands) < _LEAST or fit.noise_known or not _uneven(fit):
+        return None
+    table = _of_fit(fit)
+    if table is None or table.precision[table.free].any():
+        return None
+    plain = fitted(table, as_it_is(table))
+    rows = np.flatnonzero(~plain.inside & table.counted)
+    if len(rows) < 2 or {*rows} <= {*fit.outliers} or not _better(plain, plain):
+        return None
+    readings = (table.measured / table.scale)[rows]
+    away = np.abs(readings - predicted(table, plain)[rows]) / plain.noise
+    least = float(away.max(axis=1).min())
+    benign = max(other.evidence for other in _benign(table, plain, plain))
+    if least < _OFF or benign > plain.evidence:
+        return None
+    named = in_rows([*map(int, rows)])
+    noise = f"{in_words(plain.noise * table.scale)} {fit.measured_unit}".strip()
+    return Reason(
+        f"{named.capitalize()} are outliers, over {least:.2g} times the noise of the "
+        f"others, which is {noise} without them.",
+        f"repeat {named} (counted from 0), or leave out",
+    )
 
 
 def of_unfitted(
@@ -159,16 +198,67 @@ def of_new_readings(fit: Fit, commands: Array, measured: Array) -> Mispairing | 
     return _found(table, fit.input_names, fit.output_names, fit.measured_unit)
 
 
-def against(verdict: Verdict, found: Mispairing | None) -> Verdict:
-    """The verdict, which no calibration of a mispaired table passes."""
-    if found is None:
-        return verdict
-    what = "columns" if found.kind == "columns" else "table"
+def against(verdict: Verdict, fit: Calibration) -> Verdict:
+    """The verdict, which no calibration passes of a mispaired table or hidden outliers.
+
+    Args:
+        verdict: of the fit by itself.
+        fit: the calibration.
+    """
+    pairing = fit.mispairing
+    if pairing is None:
+        hidden = _hidden_outliers(fit)
+        if hidden is None:
+            return verdict
+        others = (text for text in verdict.reasons if "outlier" not in text)
+        return dataclasses.replace(
+            verdict,
+            good=False,
+            reasons=(hidden.fact, *others),
+            next_step=hidden.remedy,
+        )
+    what = "columns" if pairing.kind == "columns" else "table"
     step = f"correct the {what}, then identify again"
-    if found.mendable and found.kind != "columns":
+    if pairing.mendable and pairing.kind != "columns":
         step += " (jaxcal identify --repair FILE writes the corrected table)"
-    reasons = (found.reason, *verdict.reasons)
+    reasons = (pairing.reason, *verdict.reasons)
     return dataclasses.replace(verdict, good=False, reasons=reasons, next_step=step)
+
+
+def _of_fit(fit: Fit) -> Table | None:
+    """The table of a fit, linearised there."""
+    prior = fit.stated_prior or fit.model.default_prior()
+    measured = fit.residuals + fit.predict(fit.commands)
+    counted = fit.loss_weights > 0.0
+    table = _table(fit.model, fit.commands, measured, counted, prior)
+    if table is None:
+        return None
+    return dataclasses.replace(table, theta=np.asarray(fit.parameters))
+
+
+def _uneven(fit: Fit) -> bool:
+    """Whether least absolute residuals would leave rows far off.
+
+    To first order, by a few rounds of least squares whose weights fall with distance.
+    """
+    from scipy.linalg.lapack import dposv
+
+    noise, shape = fit.noise_std, fit.residuals.shape
+    if noise is None or not noise.all() or fit.prior_precision.any():
+        return False
+    slopes = fit.linear(fit.commands, misfit=False)[0] / noise[:, None]
+    first = off = (fit.residuals / noise).ravel()
+    flat = slopes.reshape(len(first), -1)
+    flat = flat / ((flat**2).sum(axis=0) ** 0.5 + 1e-300)
+    for _ in range(_TURNS):
+        away = (off.reshape(shape) ** 2).sum(axis=1) ** 0.5
+        weighted = flat.T * (1.0 / (away + _FLOOR)).repeat(shape[1])
+        step, undetermined = dposv(weighted @ flat, weighted @ first)[1:]
+        if undetermined:
+            return False
+        off = first - flat @ step
+    away = (off.reshape(shape) ** 2).sum(axis=1) ** 0.5
+    return bool(away.max() > _OFF * np.median(away))
 
 
 def _table(
