@@ -329,3 +329,21 @@ def test_outliers_that_least_squares_hides_are_named(seed):
     verdict = _verdict(commands, measured).verdict
     assert not verdict.good
     assert "Rows " + ", ".join(map(str, rows)) in verdict.reasons[0]
+
+
+@pytest.mark.parametrize("levels", [(3, 3, 3), (4, 5), (6, 6)])
+@pytest.mark.parametrize("by", [1, -1])
+def test_a_shift_of_a_grid_in_order_is_named_beside_the_reverse(levels, by):
+    """A symmetric grid in reverse order is another machine, which fits as well."""
+    axes = [np.linspace(-10.0, 10.0, count) for count in levels]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(levels))
+    n = len(levels)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        measured = grid @ MATRIX[:n, :n].T + NOISE * rng.normal(size=grid.shape)
+        assert _verdict(grid, measured).verdict.good
+        fit = _verdict(*((grid[1:], measured[:-1]), (grid[:-1], measured[1:]))[by < 0])
+        first, second = fit.mispairing.reason.split("; or ")[:2]
+        assert f"readings are one row {'late' if by > 0 else 'early'}" in first
+        assert "reverse order" in second
+        assert fit.verdict.next_step.startswith("find out which it is")

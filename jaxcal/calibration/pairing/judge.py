@@ -73,6 +73,7 @@ _CHANCE = 0.02  # that so many outliers stand so near one another
 _APART = "apart"  # kind: outliers that are one block
 _OFF = 6.0  # times the noise of the others
 _TURNS, _FLOOR = 6, 0.01  # rounds; noises, below which a row weighs no more
+_FREQUENT = ("shift", "path")  # kinds that are named first among as good ones
 _SORTED = ("commands sorted", "readings sorted")  # kinds
 _ROWS, _RUNS = 20_000, 400  # of more the first; of a function that is run
 
@@ -86,9 +87,8 @@ class Mispairing:
     noise: Array  # (q,) of the readings without it
     match: Rows  # (N,) row of the command that a reading belongs to, -1 of none
     change: ColumnChange | None = None
-    sensed: Any = (
-        None  # slice of the columns of the commands that come with the reading
-    )
+    sensed: Any = None  # slice of columns of commands that come with the reading
+    alternatives: tuple[str, ...] = ()  # what would explain the readings as well
 
     @property
     def mendable(self) -> bool:
@@ -219,7 +219,9 @@ def against(verdict: Verdict, fit: Calibration) -> Verdict:
         )
     what = "columns" if pairing.kind == "columns" else "table"
     step = f"correct the {what}, then identify again"
-    if pairing.mendable and pairing.kind != "columns":
+    if pairing.alternatives:
+        step = f"find out which it is, {step}"
+    elif pairing.mendable and pairing.kind != "columns":
         step += " (jaxcal identify --repair FILE writes the corrected table)"
     reasons = (pairing.reason, *verdict.reasons)
     return dataclasses.replace(verdict, good=False, reasons=reasons, next_step=step)
@@ -343,25 +345,50 @@ def _found(
         with contextlib.suppress(ValueError):
             at_best, rows_near = polished(table, best)
             best, near = (best, {}) if _few(at_best) else (at_best, rows_near)
+    rivals = _as_good(table, best, fits)
+    if best.hypothesis.kind not in _FREQUENT:
+        shifts = [fit for fit in rivals if fit.hypothesis.kind in _FREQUENT]
+        if shifts:
+            rivals[rivals.index(shifts[0])], best = best, shifts[0]
     reason = sentence(table, best, near, outputs, unit)
+    others: list[str] = []
+    for fit in rivals:
+        other = what_is_wrong(table, fit, {}, outputs, unit)
+        if other not in reason and other not in others and len(others) < _NAMED:
+            others.append(other)
     match = best.hypothesis.match
     if best.hypothesis.kind == _APART:
         match = path_match(len(match), best.hypothesis.starts)
-    for fit in top(fits, len(fits)):
-        other = what_is_wrong(table, fit, {}, outputs, unit)
-        kind = (fit.hypothesis.kind, fit.hypothesis.change)
-        as_good = fit.evidence > best.evidence - _AS_GOOD
-        if as_good and kind != (best.hypothesis.kind, best.hypothesis.change):
-            if other not in reason and reason.count("; or ") < _NAMED:
-                reason += f"; or {other}"
     return Mispairing(
         best.hypothesis.kind,
-        reason,
+        "; or ".join([reason, *others]),
         best.noise * table.scale,
         match,
         best.hypothesis.change,
         table.model.sensed,
+        tuple(others),
     )
+
+
+def _as_good(table: Table, best: Fitted, fits: list[Fitted]) -> list[Fitted]:
+    """Mispairings of another kind that explain the readings as well as the best.
+
+    Rows that a shift leaves unpaired do not speak against it.
+    """
+    noise = np.maximum(best.noise, 1e-300)
+    row = float((2.0 + np.log(table.width / noise).clip(0.0)).sum())
+    paired = best.hypothesis.match >= 0
+    as_good = []
+    for fit in top(fits, len(fits)):
+        kind = (fit.hypothesis.kind, fit.hypothesis.change)
+        fewer = 0
+        foreign = any(by == FOREIGN for _, by in fit.hypothesis.starts)
+        if fit.hypothesis.kind in _FREQUENT and not foreign:
+            fewer = int((paired & (fit.hypothesis.match < 0)).sum())
+        if kind != (best.hypothesis.kind, best.hypothesis.change):
+            if fit.evidence > best.evidence - _AS_GOOD - fewer * row:
+                as_good.append(fit)
+    return as_good
 
 
 def _plainly_right(fit: Fit) -> bool:
