@@ -159,7 +159,12 @@ def _repaired(
     if {*readings.outputs} <= {*table.names}:
         names, measured = [*names, *readings.outputs], table.columns(readings.outputs)
     columns = mispairing.repaired(table.columns(readings.inputs), measured)
-    write_rows(path, names, np.hstack(columns).tolist())
+    rows, match = np.hstack(columns).tolist(), mispairing.match
+    for name, cells in table.labels.items():  # words stand beside their command
+        names.append(name)
+        for row, of in zip(rows, match[match >= 0], strict=True):
+            row.append(cells[of])
+    write_rows(path, names, rows)
     return f"saved {path}, {len(columns[0])} of {len(table)} rows; {file} is unchanged"
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.tables.cells import truths_of
+from jaxcal.tables.cells import has_unit, truths_of
 from jaxcal.tables.names import COMMANDS, MEASURED
 
 __all__ = ["AVAILABLE", "COUNTED", "Decision", "decide", "is_available", "sentence"]
@@ -76,6 +76,11 @@ def decide(
             decision = Decision("available")
         elif name.startswith(COMMANDS):
             decision = Decision("input")
+        elif name in table.labels and has_unit(table.labels[name]):
+            cell = next(filter(None, table.labels[name]))
+            decision = Decision(
+                "label", f"holds numbers and units, {cell!r}", asks=True
+            )
         elif name in table.labels:
             truths = truths_of(table.labels[name], ("true", "false"))
             words = "holds words" if truths is None else "holds TRUE and FALSE"

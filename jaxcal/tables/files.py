@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal.checks import axis_letter
-from jaxcal.tables.cells import decimal_mark, is_number, numbers_of
+from jaxcal.tables.cells import UNIT, decimal_mark, is_number, numbers_of
 from jaxcal.tables.frames import table_of_frame
 from jaxcal.tables.names import say
 from jaxcal.tables.table import Table, table_of
@@ -28,12 +28,6 @@ _DELIMITERS = "\t;, "  # the first of those that serve alike
 _OF_R = " \t"  # with which R names rows, and not the column of these names
 _LOOKED_AT = 20  # rows by which the delimiter is judged
 _BREAK = re.compile(r"\s*\n\s*")  # of a line, in a quoted cell
-_UNIT = re.compile(
-    r"[\[(].*[\])]|[-%°‰]|(?:[/.·*^ ²³0-9-]|[pnuµμmckMGh]?(?:deg|rad|m|s|g|V|A|W|N|Hz"
-    r"|Pa|bar|Ω|l|L|C|F|K|J|rpm|min|h|psi|in|inch|°C|°F|°|%|ct|cts|counts?|steps?|pulses?"
-    r"|degrees?|radians?|volts?|sec|seconds?|T|S|Ohm|ppm|dB|lx|px|LSB|mmHg|RH|rev"
-    r"|arcsec|arcmin|a\.u\.|ε))+"
-)
 
 
 def read_table(path: Any) -> Table:
@@ -87,6 +81,7 @@ def _of_text(source: str, text: str) -> tuple[Table, list[str]]:
         [cell for _, row in rows for cell in row], sheet.delimiter != ","
     )
     if not sheet.headed:
+        _require_decimals(source, sheet)
         header = [f"u_{axis_letter(i, len(header))}" for i in range(len(header))]
     elif numbers := [cell for cell in header if _is_plain(cell)]:
         name = next(cell for cell in header if not _is_plain(cell))
@@ -110,6 +105,22 @@ def _of_text(source: str, text: str) -> tuple[Table, list[str]]:
     if not table.names:
         raise ValueError(f"{source}: no column contains numbers: {', '.join(header)}")
     return table, notes
+
+
+def _require_decimals(source: str, sheet: Sheet) -> None:
+    """Refuse numbers that decimal commas have cut into two cells each: -0,79."""
+    width = len(sheet.rows[0][1])
+    if sheet.delimiter != "," or width % 2:
+        return
+    cells = [cell for _, row in sheet.rows for cell in row]
+    if not all(cell.lstrip("+-").isdecimal() for cell in cells):
+        return
+    for line, row in sheet.rows:
+        if any(cell in ("-0", "+0") or re.match(r"0\d", cell) for cell in row):
+            raise ValueError(
+                f"{source}: line {line} may hold {width // 2} numbers with decimal "
+                f"commas, or {width} whole ones: separate cells with semicolons"
+            )
 
 
 def _is_plain(cell: str) -> bool:
@@ -288,8 +299,11 @@ def _rows(
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
     width = len(rows[0][1]) if rows else 0
+    numbered = [cells[0] for _, cells in rows[1:]] == [
+        str(i) for i in range(1, len(rows))
+    ]
     if (
-        delimiter in _OF_R
+        (delimiter in _OF_R or numbered)
         and {len(cells) for _, cells in rows[1:]} == {width + 1}
         and any(cells[-1] for _, cells in rows[1:])
         and not any(map(is_number, rows[0][1]))
@@ -314,7 +328,7 @@ def _holds_units(cells: Sequence[str], rows: Sequence[tuple[int, list[str]]]) ->
         if all(is_number(row[i]) for _, row in rows if row[i])
     ]
     units = [cell for cell in of_numbers if cell and not is_number(cell)]
-    recognised = sum(bool(_UNIT.fullmatch(cell)) for cell in units)
+    recognised = sum(bool(UNIT.fullmatch(cell)) for cell in units)
     return (
         any(cell != "-" for cell in units)
         and len(units) == sum(map(bool, of_numbers))

@@ -196,9 +196,15 @@ class Table:
         decisions = decide(self, {*but}, fit=bool(but))
         advice = f"begin the names of commands with {COMMANDS}"
         advice += f", or name them with {option}" if option else ""
+        or_choose = f", or choose the commands with {option}" if option else ""
         for place, (name, decision) in enumerate(decisions.items(), start=1):
             if not decision.asks or decision.role == "output":
                 continue
+            if decision.role == "label":
+                raise ValueError(
+                    f"{self.source}: column {name!r} {decision.reason}: write the "
+                    f"number alone in each cell{or_choose}"
+                )
             if self.row != "line":
                 decisions[name] = Decision("input", decision.reason)
                 continue
@@ -212,6 +218,8 @@ class Table:
                 f"{self.source}: no column contains commands (columns: "
                 f"{', '.join(self.header)}); {advice}"
             )
+        if not self.headed:
+            say(f"{self.source} has no header: its columns are {', '.join(names)}")
         if text := sentence(decisions):
             more = f"; to use other columns: {option}" if option else ""
             say(f"{self.source}: {text}{more}")
@@ -249,7 +257,14 @@ class Table:
         if not names:
             return None
         name = names[0]
-        truths = truths_of(self.labels.get(name, ()))
+        cells = self.labels.get(name, ())
+        truths = truths_of(cells)
+        for line, cell in zip(self.lines, cells, strict=False):
+            if truths is None and truths_of([cell]) is None:
+                raise ValueError(
+                    f"{self.source}: {self.row} {line}, {name} must be 1 or 0, TRUE or "
+                    f"FALSE, or yes or no, got {cell!r}"
+                )
         mask = np.array(truths or self.columns([name])[:, 0])
         for row in np.flatnonzero((mask != 0.0) & (mask != 1.0)):
             raise ValueError(

@@ -250,8 +250,9 @@ def test_a_search_that_lost_its_way_on_a_sweep_is_no_shift_of_rows():
 def _write(path, u, y):
     with path.open("w", newline="") as file:
         rows = csv.writer(file)
-        rows.writerow(["u_a", "u_b", "u_c", "y_a", "y_b", "y_c"])
-        rows.writerows(np.hstack([u, y]).tolist())
+        rows.writerow(["u_a", "u_b", "u_c", "y_a", "y_b", "y_c", "posture"])
+        numbers = np.hstack([u, y]).tolist()
+        rows.writerows([*row, f"p{i}"] for i, row in enumerate(numbers))
 
 
 def test_repair_writes_another_file_and_only_where_asked(tmp_path, capsys):
@@ -265,8 +266,10 @@ def test_repair_writes_another_file_and_only_where_asked(tmp_path, capsys):
     assert main(["identify", str(path), "--repair", str(mended)]) == 0
     assert "19 of 20 rows" in capsys.readouterr().out
     assert path.read_bytes() == before
-    written = np.loadtxt(mended, delimiter=",", skiprows=1)
+    written = np.loadtxt(mended, delimiter=",", skiprows=1, usecols=range(6))
     rows = np.delete(np.arange(20), 12)
+    postures = np.loadtxt(mended, delimiter=",", skiprows=1, usecols=6, dtype=str)
+    assert [*postures] == [f"p{row}" for row in rows]
     np.testing.assert_allclose(written, np.hstack([u[rows], y[rows]]))
     assert main(["identify", str(mended), "--report", str(tmp_path / "again")]) == 0
     capsys.readouterr()
