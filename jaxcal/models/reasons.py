@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 UNLIKELY = 1e-4  # p-value of residuals under the noise that was given
 _CHANCE = 0.01  # that readings of nothing pass for a fit
+_RARE = float(np.log(20.0))  # an outlier
 _TOO_LARGE = 3.0  # times: no caution makes a stated noise that much larger
 _SIZES = 10.0  # of a parameter: known no better, it is not known
 _STEP = 0.1  # standard errors, by which another step would move the parameters
@@ -231,10 +232,7 @@ def wrong_noise(fit: Fit) -> Reason | None:
     times = np.sqrt(np.maximum(squares, 1e-300) / dof)
     small = special.chdtrc(dof, squares) < chance
     if small.any() and 0 < 4 * len(rows := [*fit.outliers]) <= fit.num_measurements:
-        # Without an outlier the sum of squares is less by its distance.
-        rest = max(fit.square - fit.distance[rows].sum(), 0.0)
-        less = max(fit.dof - fit.num_readings * len(rows), 1.0)
-        small &= special.chdtrc(less, rest) < UNLIKELY
+        small &= _likelier_than_outliers(fit, fit.distance[rows])
     large = (special.chdtr(dof, squares) < chance) & (times < 1.0 / _TOO_LARGE)
     if not (small | large).any():
         return None
@@ -250,6 +248,24 @@ def wrong_noise(fit: Fit) -> Reason | None:
         f"times too {word}: residuals are {_each(factor * noise)}{unit}.",
         "correct noise_std, --noise, or leave it out" + pattern * bool(small[worst]),
     )
+
+
+def _likelier_than_outliers(fit: Fit, distance: Array) -> bool:
+    """Whether another noise explains the residuals better than outliers do.
+
+    By the logarithms of both likelihoods: of one scale of all, or of one scale of each
+    outlier beside the noise that was given, where one row in twenty is an outlier.
+
+    Args:
+        fit: with a noise that was given.
+        distance: (k,) squared, in that noise, of the outliers.
+    """
+    dof, q = fit.dof, fit.num_readings
+    scale = -0.5 * dof * (np.log(fit.square / dof) + 1.0)
+    of_rows = 0.5 * q * (np.log(distance / q) + 1.0) + _RARE
+    # Without an outlier the sum of squares is less by its distance.
+    rest = max(fit.square - distance.sum(), 0.0)
+    return bool(scale > -0.5 * rest - of_rows.sum())
 
 
 def outlying(fit: Fit, rows: Sequence[int]) -> Reason | None:

@@ -27,7 +27,7 @@ _AVAILABLE = re.compile(
 _LEAST_ROWS = 5  # of which a constant step is no chance
 # Columns that number the rows, by their names; runs only where each has its own.
 _NUMBERS = re.compile(
-    r"#|(.*[_ ])?(id|idx|index)|no\.?|nr\.?|row|sample|seq|unnamed: 0|level_0"
+    r"#|(.*[_ ])?(id|idx|index)|no\.?|nr\.?|row|sample|seq|unnamed: 0(\.\d+)?|level_0"
     r"|episode|candidate",
     re.IGNORECASE,
 )

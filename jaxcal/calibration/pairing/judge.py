@@ -141,15 +141,17 @@ def _hidden_outliers(fit: Fit) -> Reason | None:
     of them is an outlier. A model of which nothing is known before is asked, where
     drift and curves explain the rows no better.
     """
-    if len(fit.commands) < _LEAST or fit.noise_known or not _uneven(fit):
+    if len(fit.commands) < _LEAST or not _uneven(fit):
         return None
     table = _of_fit(fit)
     if table is None or table.precision[table.free].any():
         return None
-    plain = fitted(table, as_it_is(table))
+    plain, stated = fitted(table, as_it_is(table)), np.asarray(fit.noise_std)
     rows = np.flatnonzero(~plain.inside & table.counted)
-    if len(rows) < 2 or {*rows} <= {*fit.outliers} or not _better(plain, plain):
+    if not len(rows) or {*rows} == {*fit.outliers} or not _better(plain, plain):
         return None
+    if fit.noise_known and (plain.noise * table.scale > _RATIO * stated).any():
+        return None  # what was stated is too small for the others too
     readings = (table.measured / table.scale)[rows]
     away = np.abs(readings - predicted(table, plain)[rows]) / plain.noise
     least = float(away.max(axis=1).min())
@@ -157,9 +159,10 @@ def _hidden_outliers(fit: Fit) -> Reason | None:
     if least < _OFF or benign > plain.evidence:
         return None
     named = in_rows([*map(int, rows)])
+    verb = "are outliers" if len(rows) > 1 else "is an outlier"
     noise = f"{in_words(plain.noise * table.scale)} {fit.measured_unit}".strip()
     return Reason(
-        f"{named.capitalize()} are outliers, over {least:.2g} times the noise of the "
+        f"{named.capitalize()} {verb}, over {least:.2g} times the noise of the "
         f"others, which is {noise} without them.",
         f"repeat {named} (counted from 0), or leave out",
     )
@@ -210,7 +213,10 @@ def against(verdict: Verdict, fit: Calibration) -> Verdict:
         hidden = _hidden_outliers(fit)
         if hidden is None:
             return verdict
-        others = (text for text in verdict.reasons if "outlier" not in text)
+        of_those = ("outlier", "The noise you gave")  # they follow from these rows
+        others = (
+            text for text in verdict.reasons if not any(x in text for x in of_those)
+        )
         return dataclasses.replace(
             verdict,
             good=False,
