@@ -66,7 +66,7 @@ _EXACT = 1e-6  # of the spread: readings so near a fit have nothing to explain
 _NEXT, _LARGE = 8.0, 3.0  # times the residuals: neighbours, a row
 _USUAL = 2.0  # times the usual noise of a sensor
 _TREND = 1.4  # of a sum of residuals, over the root of their squares
-_LEAST = 6  # rows
+_LEAST, _MANY, _SAMPLE = 6, 500, 5000  # rows
 _NAMED = 2  # other explanations
 _READINGS = 1.5  # for each parameter; of fewer another machine explains as much
 _CHANCE = 0.02  # that so many outliers stand so near one another
@@ -251,11 +251,14 @@ def _uneven(fit: Fit) -> bool:
     """
     from scipy.linalg.lapack import dposv
 
-    noise, shape = fit.noise_std, fit.residuals.shape
+    noise = fit.noise_std
     if noise is None or not noise.all() or fit.prior_precision.any():
         return False
-    slopes = fit.linear(fit.commands, misfit=False)[0] / noise[:, None]
-    first = off = (fit.residuals / noise).ravel()
+    # Few rows of very many hide in no noise.
+    sample = slice(None, None, max(len(fit.commands) // _SAMPLE, 1))
+    slopes = fit.linear(fit.commands[sample], misfit=False)[0] / noise[:, None]
+    shape = fit.residuals[sample].shape
+    first = off = (fit.residuals[sample] / noise).ravel()
     flat = slopes.reshape(len(first), -1)
     flat = flat / ((flat**2).sum(axis=0) ** 0.5 + 1e-300)
     for _ in range(_TURNS):
@@ -412,7 +415,9 @@ def _plainly_right(fit: Fit) -> bool:
         return True
     # Of many normal residuals the largest is about the root of 2 log N.
     large = max(_LARGE, float(np.sqrt(2.0 * np.log(off.size))) + 0.7)
-    if (apart < _NEXT * rms).any() or (np.abs(off) > large * rms).any():
+    if (np.abs(off) > large * rms).any():
+        return False
+    if (apart < _NEXT * rms).any() and not _white(off, rms, said):
         return False
     usual = fit.model.default_noise()
     if usual is not None and (rms <= _USUAL * np.asarray(usual.std)).all():
@@ -422,6 +427,19 @@ def _plainly_right(fit: Fit) -> bool:
     scores = off[..., None] * factors[:, None]
     size = np.sqrt((scores**2).sum(axis=0))
     return bool((np.abs(scores.cumsum(axis=0)) <= _TREND * size).all())
+
+
+def _white(off: Array, rms: Array, said: Array) -> bool:
+    """Whether many residuals of a fit that explains the readings are independent.
+
+    Neighbours that noise hides leave a trace only together: a lag or a block of rows
+    from elsewhere makes residuals in a row alike.
+    """
+    count = len(off)
+    if count < _MANY or (rms > 0.1 * said.std(axis=0)).any():
+        return False
+    alike = (off[1:] * off[:-1]).mean(axis=0) / rms**2
+    return bool((np.abs(alike) < 3.0 / np.sqrt(count)).all())
 
 
 def _lost_its_way(table: Table, plain: Fitted) -> bool:
