@@ -12,10 +12,10 @@ from rig.core.device import Device, Lines
 from rig.core.line_client import line_of
 from rig.core.record_check import ZeroRecord, check_drives
 from rig.core.session import Beside, Check, open_device, take_zero
-from rig.device_model import model_of
 from rig.faults import EXIT_FAULT, JournalError, PlanOnly, Refused, ending
 from rig.journal.device import STOP_PROVED, DeviceRecord
 from rig.journal.run_folder import Record, RunFolder
+from rig.parts import model_of
 from rig.signals import Signals
 
 ONE_SPEED = (

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from jaxcal.arguments import Parser
 from jaxcal.extras import MissingExtraError
 from rig.faults import EXIT_FAULT, EXIT_OK, Refused
-from rig.parts import COMMANDS, PLACES, STEPS, offered, part
+from rig.parts import COMMANDS, PLACES, STEPS, model_of, offered, part
 
 if TYPE_CHECKING:
     from rig.config import RigConfig
     from rig.prove.steps import Site
-    from rig.sessions import SimulatedDevice
+    from rig_workbench.simulator import Simulator
 
 
 def _axes(text: str) -> list[str]:
@@ -107,10 +107,10 @@ class DeviceOptions(Simulation):
 
     def simulator(
         self, config: RigConfig, options: dict[str, Any] | None = None
-    ) -> SimulatedDevice:
+    ) -> Simulator:
         """A simulated rig as these options, or those of a run, describe it."""
         options, simulator = options or self.simulation, part("simulator", "--simulate")
-        made: SimulatedDevice = simulator.simulated(config, options, self.fault or ())
+        made: Simulator = simulator.simulated(config, options, self.fault or ())
         return made
 
 
@@ -357,9 +357,7 @@ def check(
     loaded = load_config(path)
     unrun = not_asked_for(loaded, run)
     if loaded.model is not None and loaded.model.factory not in unrun:
-        from rig.device_model import model_of  # numpy: half of this command's time
-
-        model_of(loaded)
+        model_of(loaded)  # which loads numpy: half of this command's time
     if not {axis.map.drive for axis in loaded.axes} & {*unrun}:
         make_drives(loaded.bus, loaded.axes)
     print(f"{path}: valid")

@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import importlib.util
 from importlib.metadata import EntryPoint
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxcal.extras import MissingExtraError, install, installed, needs
+
+if TYPE_CHECKING:
+    from rig.config import RigConfig
+    from rig_workbench.model import DeviceModel
 
 STEPS = {  # commands that are typed after another one
     "setup": ("home", "axes", "zero", "jog", "characterise"),
@@ -47,6 +51,18 @@ def part(name: str, purpose: str, group: str = PARTS) -> Any:
     point = offered(group)[name]
     with needs(_extra_of(point.module), purpose):
         return point.load()
+
+
+def model_of(config: RigConfig) -> DeviceModel | None:
+    """The model of a device; None where it is affine.
+
+    Raises:
+        ConfigError: it cannot be loaded, or is of other axes or readings.
+    """
+    loaded: DeviceModel | None = None
+    if config.model is not None:
+        loaded = part("model", "[model]")(config)
+    return loaded
 
 
 def require(command: str, simulated: bool = False) -> None:

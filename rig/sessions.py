@@ -6,7 +6,7 @@ import contextlib
 import functools
 import pathlib
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from rig import pages
 from rig.command_run import Run, run_safely
@@ -23,42 +23,8 @@ from rig.procedures.goto import goto
 from rig.prove import steps
 from rig.prove.operator import Operator
 
-
-class SimulatedDevice(Protocol):
-    """What a session and commissioning ask of ``rig_workbench.simulator``."""
-
-    config: RigConfig
-
-    def start(self, port: int = 0) -> RigConfig:
-        """Serve the drives; the configuration that reaches them."""
-
-    def start_phone(self, port: int) -> int:
-        """Send to the port the rig listens on, or listen; the port."""
-
-    def hear(self, record: Record) -> None:
-        """Listen to the events of a session."""
-
-    def __enter__(self) -> SimulatedDevice: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
-
-class SessionOptions(Protocol):
-    """How a session is begun and shown."""
-
-    out: pathlib.Path | None  # folder for the run's folder
-    dry_run: bool
-    arm: bool  # these three stand for the typed words
-    zero: bool
-    use: bool
-    reset_alarms: bool
-    live: bool
-    config: pathlib.Path | None
-
-    def simulator(
-        self, config: RigConfig, options: dict[str, Any] | None = None
-    ) -> SimulatedDevice:
-        """A simulated device as these options, or those of a run, describe it."""
+if TYPE_CHECKING:
+    from rig.commands import Session
 
 
 def say(text: str) -> None:
@@ -67,7 +33,7 @@ def say(text: str) -> None:
 
 
 def run_session(
-    options: SessionOptions,
+    options: Session,
     command: str,
     config: RigConfig,
     start: dict[str, Any],
@@ -149,7 +115,7 @@ def _procedure(
     return lambda run: goto(run, calibration, inputs["to"]), kept, doubts
 
 
-def _confirm(options: SessionOptions, doubts: list[str], session: Run) -> None:
+def _confirm(options: Session, doubts: list[str], session: Run) -> None:
     """Ask for what --arm, --zero and --use would have confirmed."""
     takes_zero = not session.journal.events("zero") and session.zero_at is None
     questions = {}

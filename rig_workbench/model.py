@@ -159,11 +159,7 @@ def parameters(calibration: Any) -> dict[str, Record]:
 
 
 def model_of(config: RigConfig) -> DeviceModel | None:
-    """The model of a device; None where it is affine.
-
-    Raises:
-        ConfigError: it cannot be loaded, or is of other axes or readings.
-    """
+    """``rig.parts.model_of``."""
     if config.model is None:
         return None
     key = "model.urdf" if config.is_arm else "model.factory"

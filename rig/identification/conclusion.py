@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rig.config import RigConfig
-from rig.device_model import model_of
 from rig.faults import MotionFault
 from rig.identification.drift import estimate_drift, without_drift
 from rig.identification.fit_affine import (
@@ -20,6 +19,7 @@ from rig.identification.fit_affine import (
 )
 from rig.journal.run_folder import Record, measured_postures
 from rig.outputs.messages import recalibrate
+from rig.parts import model_of
 from rig.readings.attitude import ORDERS, frame_at
 from rig.readings.geometry import Attitudes, geometry_of
 

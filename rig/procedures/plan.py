@@ -14,7 +14,7 @@ from jaxcal.designs.travel import Motion, fastest_tour, travel_times
 from jaxcal.models.affine import Affine
 from rig.config import RigConfig
 from rig.config.axis import Pulses
-from rig.device_model import DeviceModel, model_of
+from rig.parts import model_of
 from rig.readings.attitude import Array
 
 EXACT_LIMIT_S = 20.0  # for the proof that the choice is (or is not) the optimum
@@ -64,96 +64,68 @@ def choose(
             then: it is the exact solver alone, and less time.
         required: indices measured already, which stay in the choice.
     """
-    import jaxcal
+    n, m, made = len(config.axes), len(config.output_names), model_of(config)
+    given: dict[str, Any] = {"available": available, "required": list(required) or None}
+    if made is not None:
+        given |= {"model": made.model, "prior": made.prior}
+    elif m != n:
+        given["model"] = Affine(n, m)
+    limit_s = EXACT_LIMIT_S if available is None else REPLAN_LIMIT_S
 
-    session, replanning = config.session, available is not None
-    if (made := model_of(config)) is not None:
-        limit = REPLAN_LIMIT_S if replanning else EXACT_LIMIT_S
-        return _choose_by_model(
-            config, made, candidates_deg, limit, available=available,
-            required=list(required) or None,
-        )  # fmt: skip
-    n, m = len(config.axes), len(config.output_names)
-    model, parameters = None if m == n else Affine(n, m), m * (n + 1)
-    limit = REPLAN_LIMIT_S if replanning else EXACT_LIMIT_S
+    def select(method: str) -> Any:
+        import jaxcal
 
-    def select(method: str, **more: Any) -> Any:
-        if method != "greedy":  # which draws nothing
-            more["seed"] = session.seed
-        return jaxcal.select(
-            candidates_deg, config.k, method=method, model=model,
-            available=available, required=list(required) or None, **more,
-        )  # fmt: skip
+        more: dict[str, Any] = {"seed": config.session.seed}
+        if method == "greedy":  # which draws nothing
+            more = {}
+        if method in ("auto", "exact"):
+            more["time_limit"] = limit_s
+        if method == "auto":
+            more["least_efficiency"] = config.session.min_efficiency
+        return jaxcal.select(candidates_deg, config.k, method=method, **given, **more)
 
-    exact, chosen, note = select("exact", time_limit=limit), None, ""
-    if config.method != "exact" and not replanning:
-        chosen, note = _by_its_method(config, select, limit)
-    chosen = chosen or exact
-    best = max(exact.log_det, chosen.log_det)
-    efficiency = math.exp((chosen.log_det - best) / parameters)
-    if efficiency < session.min_efficiency:
-        note = (
-            f"{config.method} reached a D-efficiency of {efficiency:.3f}, below "
-            f"session.min_efficiency = {session.min_efficiency:g}; using exact"
-        )
-        chosen, efficiency = exact, math.exp((exact.log_det - best) / parameters)
+    if made is not None:  # what predicts best what any candidate measures
+        chosen = best = select(config.session.method or "auto")
+        efficiency, note = float(chosen.efficiency), str(chosen.reason)
+    else:
+        best = select("exact")
+        chosen, note = best, ""
+        if config.method != "exact" and available is None:
+            chosen, note = _by_its_method(config, select, best)
+        most, parameters = max(best.log_det, chosen.log_det), m * (n + 1)
+        efficiency = math.exp((chosen.log_det - most) / parameters)
+        if efficiency < config.session.min_efficiency:
+            note = (
+                f"{config.method} reached a D-efficiency of {efficiency:.3f}, below "
+                f"session.min_efficiency = {config.session.min_efficiency:g}; using "
+                "exact"
+            )
+            chosen, efficiency = best, math.exp((best.log_det - most) / parameters)
     return Choice(
         indices=tuple(int(i) for i in chosen.indices),
         log_det=float(chosen.log_det),
-        best_log_det=float(best),
+        best_log_det=float(max(best.log_det, chosen.log_det)),
         efficiency=efficiency,
-        proven=bool(exact.proven),
+        proven=bool(best.proven),
         method=str(chosen.method),
         note=note,
+        criterion=chosen.criterion,
     )
 
 
 def _by_its_method(
-    config: RigConfig, select: Callable[..., Any], limit_s: float
+    config: RigConfig, select: Callable[[str], Any], exact: Any
 ) -> tuple[Any, str]:
-    """What the configured method selects, and a note; None where it has no policy."""
-    more: dict[str, Any] = {}
-    if config.method == "auto":
-        least = config.session.min_efficiency
-        more = {"least_efficiency": least, "time_limit": limit_s}
+    """What the configured method selects, else the exact choice, and a note."""
     try:
-        chosen = select(config.method, **more)
+        chosen = select(config.method)
     except Exception as error:
         if config.method not in ("policy", "auto"):
             raise
         # A missing or foreign checkpoint must not keep a rig from being calibrated.
         reason = " ".join(str(error).split())[:200]
-        return None, f"no policy could be used ({reason}); exact is used instead"
+        return exact, f"no policy could be used ({reason}); exact is used instead"
     return chosen, getattr(chosen, "reason", "")
-
-
-def _choose_by_model(
-    config: RigConfig, made: DeviceModel, candidates: Array, limit_s: float, **more: Any
-) -> Choice:
-    """The postures that predict best what any candidate measures (I)."""
-    import jaxcal
-
-    session = config.session
-    design = jaxcal.Design(candidates, model=made.model, prior=made.prior, **more)
-    options: dict[str, Any] = {"seed": session.seed}
-    method = session.method or "auto"
-    if method == "auto":
-        options |= {"least_efficiency": session.min_efficiency, "time_limit": limit_s}
-    elif method == "exact":
-        options["time_limit"] = limit_s
-    elif method == "greedy":
-        options = {}
-    chosen = design.select(config.k, method=method, **options)
-    return Choice(
-        indices=tuple(int(i) for i in chosen.indices),
-        log_det=float(chosen.log_det),
-        best_log_det=float(chosen.log_det),
-        efficiency=float(chosen.efficiency),
-        proven=bool(chosen.proven),
-        method=str(chosen.method),
-        note=str(chosen.reason),
-        criterion=chosen.criterion,
-    )
 
 
 def travel_order(config: RigConfig, points_deg: Array, start_deg: Array) -> list[int]:

@@ -12,10 +12,10 @@ from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.config.config import differences
 from rig.core.record_check import ZeroRecord
-from rig.device_model import model_of
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
 from rig.identification.fit_affine import held_out_errors, pairs
 from rig.outputs.messages import error_text, numbers, prediction_text
+from rig.parts import model_of
 from rig.procedures.calibrate import pair_names, visit_pairs
 from rig.procedures.plan import draw_held_out
 

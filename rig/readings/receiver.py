@@ -1,5 +1,4 @@
-"""Who is heard on the phone's port, and who is not: one phone, whoever else "
-"connects."""
+"""Who is heard on the phone's port: one phone, whoever else connects."""
 
 from __future__ import annotations
 
@@ -11,28 +10,12 @@ import re
 import socket
 import threading
 import time
-from collections.abc import Callable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-from rig.config.settings import ImuSettings
 from rig.readings.stream import MAX_BODY, LineSplitter
 
-
-class Hearer(Protocol):
-    """Whoever takes what one phone sends."""
-
-    settings: ImuSettings
-    report: Callable[..., object]
-
-    def begin(self) -> None:
-        """Lines come over another connection from now on."""
-
-    def take_lines(self, lines: list[bytes], now: float) -> bool:
-        """Lines that came at a monotonic time; whether a reading of them was used."""
-
-    def take_body(self, body: bytes) -> tuple[bool, bool]:
-        """A message; whether it was used, and whether it is another device's."""
-
+if TYPE_CHECKING:
+    from rig.readings.phone import Imu
 
 RECONNECT_S = 0.2
 MOST_OPEN = 4  # connections at a time
@@ -66,7 +49,7 @@ class Receiver:
     connection is another sender.
     """
 
-    def __init__(self, imu: Hearer) -> None:
+    def __init__(self, imu: Imu) -> None:
         """OSError where the port cannot be opened."""
         self._imu = imu
         self._settings = s = imu.settings

@@ -8,7 +8,7 @@ import re
 import socket
 import tomllib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxcal.files import write_text
 from rig.config import RigConfig, load_config, parse_config
@@ -21,9 +21,11 @@ from rig.prove.home import can_home
 from rig.prove.operator import Operator
 from rig.prove.rig_toml import edit, set_values
 from rig.prove.scan import OF_LINE, Answer, parse_bus, scan, serial_lines
-from rig.sessions import SimulatedDevice
 from rig_workbench.commission.connections import look_at_phone
 from rig_workbench.model import joint_names
+
+if TYPE_CHECKING:
+    from rig_workbench.simulator import Simulator
 
 FORMATS = ["hyperimu", "sensorlogger", "sensorlog", "json", "lines"]
 UNITS = 16
@@ -137,7 +139,7 @@ def setting(text: str) -> tuple[str, Any]:
         return key, value
 
 
-def simulated(simulator: SimulatedDevice, options: SetupOptions) -> SetupOptions:
+def simulated(simulator: Simulator, options: SetupOptions) -> SetupOptions:
     """What an operator would answer of a simulated device, and its phone started."""
     bus = simulator.start().bus
     where = f"{bus.transport}:{bus.host}:{bus.port}"
