@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import pathlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
 
 from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.core.device import Device, Lines
 from rig.core.line_client import line_of
 from rig.core.record_check import ZeroRecord, check_drives
-from rig.core.session import Beside, Check, open_device, take_zero
+from rig.core.session import open_device, take_zero
+from rig.drives import Drive
 from rig.faults import EXIT_FAULT, JournalError, PlanOnly, Refused, ending
-from rig.journal.device import STOP_PROVED, DeviceRecord
+from rig.journal.device import DeviceRecord
 from rig.journal.run_folder import Record, RunFolder
 from rig.parts import model_of
 from rig.signals import Signals
 
-ONE_SPEED = (
-    "the stop was proved at one speed only, by an earlier version, so axes move slowly "
-    "near their limits. `jaxcal-rig setup axes` proves it at two speeds"
-)
+Check = Callable[[RigConfig, Sequence[Drive], DeviceRecord], None]
 
 
 class Run(RunFolder):
@@ -49,7 +48,8 @@ class Run(RunFolder):
     ) -> None:
         self._say = say
         self.confirm: Callable[[Run], None] = lambda run: None  # before ports open
-        self.beside: list[Beside] = []  # what runs while the ports are open
+        # What runs while the ports are open, such as telemetry.
+        self.beside: list[Callable[[Device], AbstractContextManager[None]]] = []
         self.record = record
         self.zero_at = zero_at
         self.kept_zero = kept_zero
@@ -82,17 +82,7 @@ class Run(RunFolder):
     def armed(self) -> Iterator[Device]:
         """The device, armed once the operator has confirmed it."""
         self.confirm(self)
-        with open_device(
-            self.config, self, self.record, self.signals,
-            check=self.check, beside=self.beside, simulated=self.simulated,
-            reset_alarms=self.reset_alarms,
-            predict=None if self.model is None else self.model.predict,
-            lines=self.lines,
-        ) as device:  # fmt: skip
-            if device.proof.stops and not (self.record.state(STOP_PROVED) or {}).get(
-                "distances"
-            ):
-                self.say(ONE_SPEED)
+        with open_device(self) as device:
             yield device
 
     @contextlib.contextmanager

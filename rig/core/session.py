@@ -1,6 +1,6 @@
 """A session: arm, take the zero, visit, identify; stopped on every way out.
 
-    with open_device(config, run, record) as device:
+    with open_device(run) as device:
         take_zero(device)
         found = [visit(device, posture) for posture in plan]
     calibration = identify(found)
@@ -13,78 +13,54 @@ is running the same again.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.core import record_check
-from rig.core.device import Device, Lines, Posture, check_plan
+from rig.core.device import Device, Posture, check_plan
 from rig.core.joints import show
-from rig.core.line_client import line_of
 from rig.core.measure import measure, zeroed
 from rig.core.motion import Arrival, move
-from rig.drives import Drive
 from rig.faults import (
     EndedShort,
     MotionFault,
     NotFollowing,
-    Requests,
     Unreachable,
     ending,
 )
-from rig.journal.device import ZEROED, DeviceRecord
+from rig.journal.device import ZEROED
 from rig.journal.lock import BusLock
 from rig.journal.run_folder import Record, RunFolder
 from rig.readings.attitude import Array, angle_between_deg
 from rig.readings.geometry import Attitudes
 from rig.readings.source import ReadingError
 
+if TYPE_CHECKING:
+    from rig.command_run import Run
+
 STREAM_WAIT_S = 60.0  # time to start the app on the phone
 LEAST_TURN_DEG = 0.05  # of the phone's heading: less is its noise
 ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
 SAME_PLACE_DEG = 0.5  # two places where an axis ended short of one target
-Check = Callable[[RigConfig, Sequence[Drive], DeviceRecord], None]
-Beside = Callable[[Device], contextlib.AbstractContextManager[Any]]
-Predict = Callable[[Array], Array]
 
 
 @contextlib.contextmanager
-def open_device(
-    config: RigConfig,
-    run: RunFolder,
-    record: DeviceRecord,
-    requests: Requests | None = None,
-    *,
-    check: Check = record_check.check_drives,
-    beside: Sequence[Beside] = (),
-    simulated: bool = False,
-    reset_alarms: bool = False,
-    predict: Predict | None = None,
-    lines: Lines = line_of,
-) -> Iterator[Device]:
-    """The device, armed; however this ends its drives are stopped and looked at.
-
-    Args:
-        config, run, record: how it is reached, where events go, what was proved of it.
-        requests: to pause or to stop, from outside.
-        check: what must hold of the drives before they are armed; Refused.
-        beside: what runs while the ports are open, such as telemetry.
-        simulated: it need not be slow where nothing is proved.
-        reset_alarms: of drives that are in alarm.
-        predict: (m,) that is measured at (n,) commands, by its model as designed.
-        lines: who makes its line and drives.
+def open_device(run: Run) -> Iterator[Device]:
+    """The device of a run, armed; however this ends its drives are stopped and looked
+    at.
 
     Raises:
         MotionFault, BusError, ReadingError, Refused: not fit to move.
     """
+    config, record, requests = run.config, run.record, run.signals
     device = Device(
-        config, run, record, requests,
-        simulated=simulated, predict=predict, lines=lines,
+        config, run, record, requests, simulated=run.simulated, lines=run.lines,
+        predict=None if run.model is None else run.model.predict,
     )  # fmt: skip
-    requests, lock = device.requests, BusLock(config.bus)
+    lock = BusLock(config.bus)
     # A request that came while something was computed may have been raised in a
     # callback that drops exceptions, as those of a garbage collection are.
     requests.check_stop()
@@ -96,13 +72,13 @@ def open_device(
             kind = "numbers" if config.imu is None else config.imu.format
             device.emit("listening", port=device.imu.port, format=kind)
             device.line.open()
-            check(config, device.drives, record)
-            for other in beside:
+            run.check(config, device.drives, record)
+            for other in run.beside:
                 stack.enter_context(other(device))
             device.imu.wait_for_stream(STREAM_WAIT_S)
             lock.leave(config)
             requests.armed = True
-            device.arm(reset_alarms)
+            device.arm(run.reset_alarms)
             # Where they stand is not known until they do again.
             homed = [d.axis.name for d in device.drives if d.says_homed]
             record.left_at(dict.fromkeys(config.axis_names), homed)

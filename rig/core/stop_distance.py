@@ -19,8 +19,6 @@ from rig.journal.device import STOP_PROVED, DeviceRecord
 if TYPE_CHECKING:
     from rig.config.axis import Axis
 
-BY_UNITS = "the stop of each unit"  # in the record's ways to stop
-SLOW_DEG_S = 5.0  # at which records that do not say it were measured
 UNKNOWN_S = 1.0  # from a stop of which nothing is known to its drive's obeying
 FASTER = 1.25  # times the slower speed: less tells nothing of the ramp
 MARGIN = 1.2  # times the ramp that was measured
@@ -69,22 +67,17 @@ class StopDistance(NamedTuple):
 def stop_distances(record: DeviceRecord, axes: tuple[Axis, ...]) -> dict[str, Any]:
     """Axis to StopDistance, as the record of the device says.
 
-    A record of before says how far each went on after its stop at SLOW_DEG_S alone.
     An axis whose stop was proved, and of which it says nothing, may take UNKNOWN_S.
     """
     evidence = record.state(STOP_PROVED)
     if evidence is None:
         return {}
     measured = evidence.get("distances", {})
-    once = evidence.get("ways", {}).get(BY_UNITS, {})
     distances = {}
     for axis in axes:
-        speed, accel = axis.drive_motion
+        _, accel = axis.drive_motion
         if fit := measured.get(axis.name):
             distances[axis.name] = StopDistance.of(**fit)
-        elif axis.name in once:
-            way = [abs(once[axis.name])]
-            distances[axis.name] = StopDistance.of([min(SLOW_DEG_S, speed)], way, accel)
         else:
             distances[axis.name] = StopDistance(UNKNOWN_S, 0.5 / accel, accel)
     return distances

@@ -25,7 +25,7 @@ from rig.config.axis import Pulses
 from rig.core import stop
 from rig.core.device import Device, Posture
 from rig.core.motion import move
-from rig.core.stop_distance import BY_UNITS, FASTER, StopDistance, stop_distances
+from rig.core.stop_distance import FASTER, StopDistance, stop_distances
 from rig.drives import Drive
 from rig.drives.drive import STILL_COUNTS, Status
 from rig.faults import MotionFault
@@ -43,6 +43,7 @@ REPEATS, UNSURE, UNSURE_S = 3, 1.5, 0.001  # of a stop whose times are uncertain
 SILENCE_S = 0.5  # besides the drives' own timeout
 TURNED_DEG = 0.3  # of the phone, while the drives stand
 
+BY_UNITS = "the stop of each unit"
 
 Times = list[tuple[float, float]]
 

@@ -13,7 +13,7 @@ from recorder import axis_with
 from test_rig_motion import bench
 
 from rig.__main__ import main
-from rig.core.stop_distance import BY_UNITS, StopDistance, stop_distances
+from rig.core.stop_distance import StopDistance, stop_distances
 from rig.journal.device import STOP_PROVED, DeviceRecord
 from rig_workbench.simulator import Truth
 from rig_workbench.simulator import drive as sim_drive
@@ -78,20 +78,10 @@ def test_a_gentler_ramp_of_the_moves_makes_a_stop_gentler_too():
     assert known.fastest(hard, 2.0) >= known.fastest(soft, 2.0)
 
 
-def test_a_record_of_before_is_read_with_the_bound_of_its_one_speed(tmp_path):
-    config = fast_config()
-    once = {BY_UNITS: {"pitch": 0.1, "yaw": -0.2}}
-    record = SimpleNamespace(state=lambda name: {"ways": once})
-    found = stop_distances(record, config.axes)
-    assert found["roll"].delay_s == 1.0  # of it nothing is known
-    assert found["yaw"].at(5.0) == pytest.approx(0.2)
-    assert found["yaw"].at(90.0) == pytest.approx(0.2 * 18**2)
-    empty = SimpleNamespace(state=lambda name: None)
-    assert stop_distances(empty, config.axes) == {}
-
-
 def test_a_stop_that_was_proved_without_a_distance_is_taken_for_slow():
     config = fast_config(SLOWER)
+    unproved = SimpleNamespace(state=lambda name: None)
+    assert stop_distances(unproved, config.axes) == {}
     proved = SimpleNamespace(state=lambda name: {})
     for axis in config.axes:
         known = stop_distances(proved, config.axes)[axis.name]
