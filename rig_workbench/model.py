@@ -6,8 +6,6 @@ What a session of such a device comes to, parameters and verdict, it says too.
 from __future__ import annotations
 
 import dataclasses
-import importlib
-import importlib.util
 import re
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -17,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rig.config import ConfigError, RigConfig
+from rig.drives import named
 from rig.identification.fit_affine import fit_quietly, spread
 from rig.journal.run_folder import Record
 from rig.outputs.messages import recalibrate
@@ -225,17 +224,7 @@ def _made(config: RigConfig) -> DeviceModel:
     from jaxcal.models.model import as_model
 
     assert config.model is not None
-    where, _, name = config.model.factory.rpartition(":")
-    if config.model_path is None:
-        module: Any = importlib.import_module(where)
-    else:
-        spec = importlib.util.spec_from_file_location("device_model", config.model_path)
-        assert spec is not None and spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-    if not hasattr(module, name):
-        raise ValueError(f"it has no {name}")
-    made = getattr(module, name)
+    made = named(config.model.factory, config.folder)
     if not hasattr(made, "predict") and callable(made):
         made = made()
     return DeviceModel(as_model(made))

@@ -8,8 +8,6 @@ import tomllib
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from pydantic import PrivateAttr
-
 from rig.config.axis import (
     AXIS_NAMES,
     DEFAULT_ROTATES,
@@ -131,12 +129,11 @@ class RigConfig(Section):
         "record of how the device was commissioned, relative to this file",
         "device.json",
     )
-    _folder: pathlib.Path = PrivateAttr(pathlib.Path())
 
     @property
     def device_path(self) -> pathlib.Path:
         """The device's record; ``device`` is relative to the configuration's folder."""
-        return self._folder / self.device
+        return self.folder / self.device
 
     @property
     def axis_names(self) -> tuple[str, ...]:
@@ -163,9 +160,7 @@ class RigConfig(Section):
     @property
     def model_path(self) -> pathlib.Path | None:
         """The file of its model, where it has one."""
-        return (
-            self._folder / self.model.file if self.model and self.model.file else None
-        )
+        return self.folder / self.model.file if self.model and self.model.file else None
 
     @property
     def output_unit(self) -> str:

@@ -17,7 +17,6 @@ from pydantic import (
     BeforeValidator,
     Field,
     PlainValidator,
-    PrivateAttr,
     WithJsonSchema,
 )
 
@@ -199,12 +198,6 @@ class DriveMap(Section):
     settings: dict[str, str | int | float | bool] = key(
         "data of your own class, for a kind other than modbus", {}
     )
-    _folder: pathlib.Path = PrivateAttr(pathlib.Path())
-
-    @property
-    def folder(self) -> pathlib.Path:
-        """The folder that the file of a class is relative to."""
-        return self._folder
 
     @property
     def register_units(self) -> Units | None:

@@ -33,11 +33,17 @@ class Section(BaseModel):
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False
     )
     _text: str = PrivateAttr("")
+    _folder: pathlib.Path = PrivateAttr(pathlib.Path())
 
     @property
     def text(self) -> str:
         """The TOML it came from, where it is the whole of a file."""
         return self._text
+
+    @property
+    def folder(self) -> pathlib.Path:
+        """The folder that paths in the file are relative to."""
+        return self._folder
 
     def broken_rules(self) -> Iterator[str]:
         """``key: fault`` of every rule about more than one key that is not kept."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import pathlib
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -23,23 +24,32 @@ if TYPE_CHECKING:
 KINDS = {"modbus": "rig.drives.modbus:ModbusDrive"}
 
 
+def named(text: str, folder: pathlib.Path) -> Any:
+    """What ``MODULE:NAME`` names, or ``FILE.py:NAME`` of a folder.
+
+    Raises:
+        Exception: whatever the import of foreign code raises.
+    """
+    place, _, name = text.rpartition(":")
+    if not place.endswith(".py"):
+        return getattr(importlib.import_module(place), name)
+    path = folder / place
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None  # it ends with .py
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return getattr(module, name)
+
+
 def kind_of(drive_map: DriveMap) -> type[Drive]:
     """The class of a map's drives.
 
     Raises:
         Refused: there is no such class.
     """
-    place, _, name = KINDS.get(drive_map.drive, drive_map.drive).partition(":")
+    text = KINDS.get(drive_map.drive, drive_map.drive)
     try:
-        if place.endswith(".py"):
-            path = drive_map.folder / place
-            spec = importlib.util.spec_from_file_location(path.stem, path)
-            assert spec is not None and spec.loader is not None  # it ends with .py
-            module = importlib.util.module_from_spec(spec)
-            spec.loader.exec_module(module)
-        else:
-            module = importlib.import_module(place)
-        drive_type = getattr(module, name)
+        drive_type: type[Drive] = named(text, drive_map.folder)
         _require_drive(drive_type)
     except Exception as error:  # whatever the import of foreign code raises
         raise Refused(
@@ -92,4 +102,4 @@ def make_drives(
     return line, [kinds[axis.map.drive](line, axis) for axis in axes]
 
 
-__all__ = ["Drive", "Line", "kind_of", "make_drives"]
+__all__ = ["Drive", "Line", "kind_of", "make_drives", "named"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from rig.config.axis import Axis
 from rig.config.maps import DriveMap, RegisterMap, available_maps, load_map
@@ -57,18 +57,25 @@ def parse_bus(text: str) -> BusSettings:
     Raises:
         ConfigError: not such a text, or settings that cannot be.
     """
-    transport, _, rest = text.partition(":")
-    names = OF_LINE.get(transport, ())
-    words = re.split(":" if "host" in names else ",", rest)
-    if not names or len(words) > len(names) or not all(words):
+    if (values := place_of(text, OF_LINE)) is None:
         kinds = "tcp:HOST[:PORT], rtu_tcp:HOST[:PORT], serial:DEVICE[,BAUD], "
         kinds += "can:CHANNEL[,BAUD] or rtu:DEVICE"
         must = f"must be {kinds}[,BAUD[,PARITY[,BITS[,STOPBITS]]]]"
         raise ConfigError("--bus", [f"{must}, got {text!r}"])
-    lines = [f"transport = {json.dumps(transport)}"]
-    for name, word in zip(names, words, strict=False):
-        lines.append(f"{name} = {word if word.isdecimal() else json.dumps(word)}")
+    lines = [f"{name} = {json.dumps(value)}" for name, value in values.items()]
     return parse(BusSettings, "\n".join(lines), "--bus")
+
+
+def place_of(text: str, keys: Mapping[str, Sequence[str]]) -> dict[str, Any] | None:
+    """Keys and values of ``TRANSPORT:VALUE...``, by the keys of each transport; None
+    where it is no such text. After a device follow commas, after a host colons."""
+    transport, _, rest = text.partition(":")
+    names = keys.get(transport, ())
+    words = rest.split("," if "device" in names else ":")
+    if not names or len(words) > len(names) or not all(words):
+        return None
+    values = [int(word) if word.isdecimal() else word for word in words]
+    return {"transport": transport, **dict(zip(names, values, strict=False))}
 
 
 def serial_lines() -> list[str]:

@@ -20,9 +20,17 @@ from rig.prove import steps
 from rig.prove.home import can_home
 from rig.prove.operator import Operator
 from rig.prove.rig_toml import edit, set_values
-from rig.prove.scan import OF_LINE, Answer, parse_bus, scan, serial_lines
+from rig.prove.scan import (
+    OF_LINE,
+    Answer,
+    parse_bus,
+    place_of,
+    scan,
+    serial_lines,
+)
 from rig_workbench.commission.connections import look_at_phone
 from rig_workbench.model import joint_names
+from rig_workbench.outputs import template
 
 if TYPE_CHECKING:
     from rig_workbench.simulator import Simulator
@@ -113,19 +121,14 @@ def asked(*, axes: str, **given: Any) -> SetupOptions:
 def sensor_of(text: str) -> dict[str, Any]:
     """Keys of ``[readings]`` of ``tcp:HOST:PORT``, ``listen:PORT``, ``udp:PORT``,
     ``serial:DEVICE[,BAUD]`` or ``modbus:HOST[:PORT]``."""
-    transport, _, rest = text.partition(":")
-    names = OF_READINGS.get(transport, ())
-    words = rest.split("," if transport == "serial" else ":")
-    if not names or len(words) > len(names) or not all(words):
+    if (sensor := place_of(text, OF_READINGS)) is None:
         raise Refused(
             "--readings must be tcp:HOST:PORT, listen:PORT, udp:PORT, "
             f"serial:DEVICE[,BAUD] or modbus:HOST[:PORT], got {text!r}"
         )
-    values = [int(word) if word.isdecimal() else word for word in words]
-    sensor: dict[str, Any] = {"transport": transport}
-    if transport in ("listen", "udp"):
+    if sensor["transport"] in ("listen", "udp"):
         sensor["host"] = "0.0.0.0"  # every address of this computer
-    return sensor | dict(zip(names, values, strict=False))
+    return sensor
 
 
 def setting(text: str) -> tuple[str, Any]:
@@ -245,20 +248,13 @@ def new_text(
         sensor: keys of ``[readings]`` that say where they come from.
         model: URDF file of an arm.
     """
-    import jinja2
-
     keys = OF_LINE[bus.transport] + ("echo",) * bus.echo
-    text = pathlib.Path(__file__).with_name("new.toml.j2").read_text(encoding="utf-8")
-    template = jinja2.Template(
-        text,
-        trim_blocks=True,
-        keep_trailing_newline=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    return template.render(
+    new = template(pathlib.Path(__file__).with_name("new.toml.j2"))
+    text: str = new.render(
         bus=dict(bus), keys=keys, axes=axes, form=form, port=port, names=list(names),
         unit=unit, sensor=dict(sensor or {}), model=model,
     )  # fmt: skip
+    return text
 
 
 def _ask_axes(

@@ -10,7 +10,11 @@ from __future__ import annotations
 import functools
 import pathlib
 import time
+from collections.abc import Sequence
 from typing import Any
+
+from rig_workbench.outputs import template
+from rig_workbench.outputs.view import angle
 
 
 def draw(part: str, **values: Any) -> str:
@@ -20,21 +24,11 @@ def draw(part: str, **values: Any) -> str:
 
 @functools.cache
 def _template() -> Any:
-    import jinja2
+    def angles(values: Sequence[float]) -> str:
+        return " ".join(angle(value, 2) for value in values)
 
-    from rig_workbench.outputs.view import angle
+    def clock(when: float) -> str:
+        return time.strftime("%H:%M:%S", time.localtime(when))
 
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(pathlib.Path(__file__).parent),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["angles"] = lambda values: " ".join(
-        angle(value, 2) for value in values
-    )
-    environment.filters["clock"] = lambda when: time.strftime(
-        "%H:%M:%S", time.localtime(when)
-    )
-    return environment.get_template("page.html.j2").module
+    path = pathlib.Path(__file__).with_name("page.html.j2")
+    return template(path, html=True, angles=angles, clock=clock).module

@@ -16,7 +16,6 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-import jinja2
 import numpy as np
 
 from rig.config.axis import Scale
@@ -25,6 +24,7 @@ from rig.faults import Refused
 from rig.journal.run_folder import Record
 from rig.outputs.messages import recalibrate
 from rig.readings.attitude import Array
+from rig_workbench.outputs import template
 
 NUMBERS = ("matrix", "offset_deg", "min_deg", "max_deg", "pulses_per_deg", "min_pulses",
            "max_pulses")  # fmt: skip
@@ -174,18 +174,11 @@ def _comment(text: str) -> str:
 
 def _code(name: str, inverse: dict[str, Any]) -> str:
     """A program: a template beside this file, with the numbers put in."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(pathlib.Path(__file__).parent),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters |= {"c": _c, "real": _real, "reals": _reals}
+    path = pathlib.Path(__file__).with_name(name)
+    program = template(path, c=_c, real=_real, reals=_reals)
     bits = ", ".join(str(1 << i) for i in range(len(inverse["axes"])))
-    template = environment.get_template(name)
     told = {unit: _comment(inverse[unit]) for unit in ("axis_unit", "output_unit")}
-    return template.render(**inverse | told, bits=bits, origin=_origin(inverse))
+    return str(program.render(**inverse | told, bits=bits, origin=_origin(inverse)))
 
 
 def _c(value: Any) -> str:

@@ -155,7 +155,7 @@ def test_wrong_models_of_arms_are_refused(old, new, told):
 @pytest.mark.parametrize(
     "factory, told",
     [
-        ("bent.py:none", "it has no none"),
+        ("bent.py:none", "has no attribute 'none'"),
         (
             "bent.py:cubic",
             "the model has 1 commands and 1 readings; the device has 2",
