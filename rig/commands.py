@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import functools
 import pathlib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -30,6 +31,7 @@ def _axes(text: str) -> list[str]:
 
 Path = pathlib.Path
 FILE = Path("rig.toml")  # without --config
+say = functools.partial(print, flush=True)
 AxisName = Annotated[str, "of rig.toml"]
 WIDE = (-1e6, 1e6)
 RunPath = Annotated[Path, "the run's folder"]
@@ -227,10 +229,6 @@ def place(given: DeviceOptions, state: str = "") -> Iterator[Site]:
             site = steps.Site(config, record, operator, given.config)
         site.reset_alarms = getattr(given, "reset_alarms", False)
         yield site
-
-
-def say(text: str) -> None:
-    print(text, flush=True)
 
 
 # Sessions

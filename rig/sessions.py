@@ -27,9 +27,7 @@ if TYPE_CHECKING:
     from rig.commands import Session
 
 
-def say(text: str) -> None:
-    """Print a line at once."""
-    print(text, flush=True)
+say = functools.partial(print, flush=True)
 
 
 def run_session(

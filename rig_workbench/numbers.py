@@ -66,10 +66,7 @@ class Sensor(Source):
                 self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
                 self._socket.bind((s.host, s.port))
         except OSError as error:
-            raise ReadingError(
-                f"cannot open {self.where}: {error.strerror or error}. End the program "
-                "that uses it, or change readings.host and readings.port"
-            ) from None
+            raise self.closed(error) from None
         if self._socket is not None:
             self._socket.settimeout(LOOK_S)
             self._port = int(self._socket.getsockname()[1])
@@ -117,8 +114,7 @@ class Sensor(Source):
     def _connected(
         self, stack: contextlib.ExitStack
     ) -> tuple[Callable[[], bytes | None], Callable[[bytes], object]]:
-        """How to read what came, None for nothing yet and b"" for the end; and "
-        "write."""
+        """How to read what came, None for nothing yet, b"" for the end; and write."""
         s = self.settings
         if s.transport == "serial":
             import serial  # type: ignore[import-untyped]  # no stubs

@@ -85,8 +85,10 @@ def prove_stops(run: Run, device: Device) -> None:
         slow = min(SPEED_DEG_S, left_deg / (timeout_s + SILENCE_S))
         silent = timeout_s + SILENCE_S
         ways["their watch of the line"] = (lambda: _be_silent(device, silent), slow)
+    every = [*range(len(device.drives))]
+    together = [[i] for i in every] if device.line.in_turn else [every]
     for name, (act, speed) in ways.items():
-        for moved in _together(device):
+        for moved in together:
             end = tuple(b if i in moved else a for i, (a, b) in _numbered(low, high))
             tried = _prove(run, device, name, act, speed, low, end)
             evidence[name] = evidence.get(name, {}) | tried.after_deg
@@ -174,12 +176,6 @@ def _least_s(drive: Drive) -> float:
     """Seconds that a look at a drive takes at least, its stop besides."""
     looks = [drive.status() for _ in range(REPEATS)]
     return 1.5 * min(look.time - look.asked for look in looks)
-
-
-def _together(device: Device) -> list[list[int]]:
-    """Axes that move at the same time."""
-    every = [*range(len(device.drives))]
-    return [[i] for i in every] if device.line.in_turn else [every]
 
 
 def _numbered(low: Pulses, high: Pulses) -> Iterator[tuple[int, tuple[int, int]]]:

@@ -11,7 +11,7 @@ import numpy as np
 from rig.config.settings import ImuSettings
 from rig.readings.attitude import Array, Reading
 from rig.readings.receiver import Receiver
-from rig.readings.source import ReadingError, Source
+from rig.readings.source import Source
 from rig.readings.stream import StreamParser
 
 
@@ -40,12 +40,7 @@ class Imu(Source):
         try:
             self._receiver = Receiver(self)
         except OSError as error:
-            where = f"{self.settings.host}:{self.settings.port}"
-            reason = error.strerror or error
-            raise ReadingError(
-                f"cannot open the IMU port {where}: {reason}. End the program that "
-                "uses it, or change imu.host and imu.port"
-            ) from None
+            raise self.closed(error) from None
         return self
 
     def close(self) -> None:

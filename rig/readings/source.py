@@ -115,6 +115,14 @@ class Source(abc.ABC):
             )
         return reading
 
+    def closed(self, error: OSError) -> ReadingError:
+        """Why its port cannot be opened, and what to do."""
+        return ReadingError(
+            f"cannot open the port of {self.whose}, {self.where}: "
+            f"{error.strerror or error}. End the program that uses it, or change "
+            f"{self.table}.host and {self.table}.port"
+        )
+
     def since(self, start: float) -> list[Reading]:
         """Readings measured at or after a monotonic time, oldest first."""
         with self._lock:

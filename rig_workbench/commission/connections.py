@@ -28,13 +28,9 @@ def look_at_phone(site: Site, seconds: float = WATCH_S) -> str:
     """Wait for the phone and tell what it sends; its address."""
     config = site.config
     with make_source(config) as imu:
-        where = (
-            addresses_text(config.imu, imu.port)
-            if config.imu
-            else sensor_text(config.source, imu.port)  # type: ignore[arg-type]
-        )
         site.say(
-            f"imu: {where}; then start its stream (waiting up to {STREAM_WAIT_S:g} s)"
+            f"imu: {place_text(config.source, imu.port)}; then start its "
+            f"stream (waiting up to {STREAM_WAIT_S:g} s)"
         )
         for listener in site.listeners:
             listener({"event": "listening", "port": imu.port})
@@ -45,19 +41,14 @@ def look_at_phone(site: Site, seconds: float = WATCH_S) -> str:
         return imu.sender
 
 
-def addresses_text(settings: ImuSettings, port: int) -> str:
-    """What to type into the phone's app."""
-    if settings.transport == "connect":
-        return f"connecting to the phone at {settings.host}:{port}"
-    host = reached_at(settings.host)
-    return f"type into the phone's app ({settings.format}): {host} port {port}"
-
-
-def sensor_text(settings: ReadingsSettings, port: int) -> str:
-    """Where a sensor's numbers come from."""
+def place_text(settings: ImuSettings | ReadingsSettings, port: int) -> str:
+    """What to type into the phone's app, or where a sensor's numbers come from."""
+    place = f"{reached_at(settings.host)} port {port}"
     if settings.transport in ("listen", "udp"):
-        return f"waiting for the sensor on {reached_at(settings.host)} port {port}"
-    return f"readings from {settings.device or f'{settings.host}:{settings.port}'}"
+        if isinstance(settings, ImuSettings):
+            return f"type into the phone's app ({settings.format}): {place}"
+        return f"waiting for the sensor on {place}"
+    return f"readings from {getattr(settings, 'device', '') or place}"
 
 
 def watch(

@@ -175,7 +175,11 @@ def _comment(text: str) -> str:
 def _code(name: str, inverse: dict[str, Any]) -> str:
     """A program: a template beside this file, with the numbers put in."""
     path = pathlib.Path(__file__).with_name(name)
-    program = template(path, c=_c, real=_real, reals=_reals)
+
+    def reals(values: Any) -> str:
+        return ", ".join(map(_real, np.ravel(values).tolist()))
+
+    program = template(path, c=_c, real=_real, reals=reals)
     bits = ", ".join(str(1 << i) for i in range(len(inverse["axes"])))
     told = {unit: _comment(inverse[unit]) for unit in ("axis_unit", "output_unit")}
     return str(program.render(**inverse | told, bits=bits, origin=_origin(inverse)))
@@ -191,10 +195,6 @@ def _real(value: float) -> str:
     """1e-07 with the point that YAML and Structured Text want: 1.0e-07."""
     mantissa, e, exponent = repr(float(value)).partition("e")
     return mantissa + ".0" * ("." not in mantissa) + e + exponent
-
-
-def _reals(values: Any) -> str:
-    return ", ".join(_real(value) for value in np.ravel(values).tolist())
 
 
 def _ros(inverse: dict[str, Any]) -> str:

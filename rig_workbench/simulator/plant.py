@@ -32,9 +32,8 @@ class Plant:
         self._rng = np.random.default_rng(truth.seed)
         self._matrix = np.array(truth.matrix)
         self._bias = np.array(truth.bias)
-        self._geared = [(1.0, 0.0)] * len(
-            drives
-        )  # degrees of each motor: factor and offset
+        # Degrees of each motor: factor and offset.
+        self._geared = [(1.0, 0.0)] * len(drives)
         self._drive_deg = self._commanded()
         self._loose = self._drive_deg.copy()  # behind the play
         self.slip = np.zeros(len(drives))
@@ -64,11 +63,6 @@ class Plant:
         at = (drive.position - drive.offset) / drive.pulses_per_deg
         self._geared[axis] = before * factor, offset + before * (1.0 - factor) * at
 
-    def turn_phone(self, angle_deg: float) -> None:
-        """Fault: the phone is turned on its holder, about its own vertical axis."""
-        turn = euler_to_matrix([angle_deg, 0.0, 0.0], "ZYX")
-        self._mounting = self._mounting @ turn
-
     def joints(self) -> Array:
         """(n,) joint angles in degrees now, or (m,) of an affine device's numbers.
 
@@ -82,8 +76,8 @@ class Plant:
                 fault.count = 0
                 self.regear(axis, fault.factor or 2.0)
         if fault := self._faults.take("phone_turned"):
-            fault.count = 0
-            self.turn_phone(10.0)
+            fault.count = 0  # it is turned on its holder, about its own vertical axis
+            self._mounting = self._mounting @ euler_to_matrix([10.0, 0.0, 0.0], "ZYX")
         now = self._commanded()
         for axis in range(len(self._drives)):
             if self._faults.take("slipping_axis", axis):

@@ -38,7 +38,7 @@ from rig.faults import (
 from rig.prove.home import unlimited
 from rig.readings.attitude import Reading, euler_to_matrix
 from rig.readings.geometry import geometry_of
-from rig.readings.phone import ReadingError
+from rig.readings.source import ReadingError
 from rig.signals import Signals
 from rig_workbench.simulator import Truth, parse_fault
 

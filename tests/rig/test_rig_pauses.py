@@ -12,7 +12,7 @@ from rig.core import device as devices
 from rig.core import motion as moving
 from rig.drives.drive import Status
 from rig.faults import MotionFault, PauseRequested
-from rig.readings.phone import ReadingError
+from rig.readings.source import ReadingError
 from rig_workbench.simulator import parse_fault
 
 

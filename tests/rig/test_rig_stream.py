@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from rig.readings import receiver
 from rig.readings.attitude import angle_between_deg, euler_to_matrix, matrix_to_euler
-from rig.readings.phone import Imu, ReadingError
+from rig.readings.phone import Imu
+from rig.readings.source import ReadingError
 from rig.readings.stream import MAX_LINE, LineSplitter, StreamParser
 from rig_workbench.simulator.faults import FaultInjector
 from rig_workbench.simulator.phone import Phone
@@ -258,7 +259,7 @@ def test_stamps_of_another_unit_are_named_as_the_cause():
 def test_a_taken_port_is_one_clear_error():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         settings = changed(PLAIN, port=taken.getsockname()[1])
-        with pytest.raises(ReadingError, match="cannot open the IMU port"):
+        with pytest.raises(ReadingError, match="cannot open the port of the phone"):
             Imu(settings).open()
 
 
