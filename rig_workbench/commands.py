@@ -25,11 +25,6 @@ from rig.commands import (
 )
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
 
-
-def _numbers(text: str) -> list[float]:
-    return [float(number) for number in text.split(",")]
-
-
 Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
 Angles = tuple[float, float, float]
 CIRCLE = (-360, 360)
@@ -142,7 +137,6 @@ def refit(
     imu_order: Annotated[Order, "imu.order: order of the phone's angles"] | None = None,
     signs: Annotated[tuple[int, int, int], "imu.signs", (-1, 1)] | None = None,
     mounting: Annotated[Angles, "imu.mounting_deg: Z, Y, X", CIRCLE] | None = None,
-    factors: Annotated[list[float], "readings.factors", _numbers] | None = None,
     factory: Annotated[str, "program of its [model] that may be run"] = "",
 ) -> int:
     """identify a recorded calibration anew"""
@@ -163,7 +157,6 @@ def refit(
         "imu.order": imu_order,
         "imu.signs": signs,
         "imu.mounting_deg": mounting,
-        "readings.factors": factors,
     }
     return identify_anew(run, records_of(run), then, values, print)
 

@@ -2,7 +2,7 @@
 
 The phone's angles are what was recorded, whatever was made of them: the attitude of a
 reading is taken apart under the order and signs of then and put together under those of
-now. Numbers are counts times factors.
+now. Numbers of a sensor stay as they are.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def reread(records: list[Record], then: RigConfig, now: RigConfig) -> list[Recor
     Args:
         records: of the journal of a calibration.
         then: its configuration.
-        now: the same but for orders, signs, mounting or factors.
+        now: the same but for orders, signs or mounting.
 
     Raises:
         Refused: not enough was measured to identify from.
@@ -51,7 +51,7 @@ def reread(records: list[Record], then: RigConfig, now: RigConfig) -> list[Recor
             "calibration needs. Finish it first with `jaxcal-rig resume`"
         )
     geometry, frame = geometry_of(now), None
-    values_of = _numbers(then, now) if then.imu is None else _attitudes(then, now)
+    values_of = _numbers if then.imu is None else _attitudes(then, now)
 
     def read(record: Record) -> Record:
         nonlocal frame
@@ -88,16 +88,9 @@ def _attitudes(then: RigConfig, now: RigConfig) -> Callable[[Record], Any]:
     return read
 
 
-def _numbers(then: RigConfig, now: RigConfig) -> Callable[[Record], Any]:
-    """What reads the numbers of a record, and the fields that hold them."""
-    assert then.readings is not None and now.readings is not None
-    factors = np.divide(now.readings.factors or 1.0, then.readings.factors or 1.0)
-
-    def read(record: Record) -> tuple[Array, Record]:
-        values = np.array(record["readings"]) * factors
-        return values, {"readings": values.tolist()}
-
-    return read
+def _numbers(record: Record) -> tuple[Array, Record]:
+    """(samples, m) numbers of a record, and the fields that hold them otherwise."""
+    return np.array(record["readings"]), {}
 
 
 def _changed(then: RigConfig, wanted: dict[str, Any]) -> dict[str, list[Any]]:
@@ -114,8 +107,6 @@ def _changed(then: RigConfig, wanted: dict[str, Any]) -> dict[str, list[Any]]:
         table, _, key = name.partition(".")
         if table == "imu" and imu is None:
             raise Refused(f"{name} needs a phone; this run was measured by a sensor")
-        if table == "readings" and imu is not None:
-            raise Refused(f"{name} needs a sensor; this run was measured by a phone")
         if table == "mechanism" and (imu is None or then.is_arm):
             raise Refused(f"{name} needs a phone on three joints: not this device")
         old, new = described[table][key], json.loads(json.dumps(value))
@@ -138,17 +129,12 @@ def refit(
     wanted: dict[str, Any],
     say: Callable[[str], object],
 ) -> int:
-    """Identify a recorded calibration anew, into a folder beside it.
+    """Identify a recorded calibration anew, into a folder beside it; the exit code.
 
     Args:
-        folder: of the run.
-        held: the records of its journal.
-        then: its configuration.
+        folder, held, then: of the run, the records of its journal, its configuration.
         wanted: keys of rig.toml to values; None leaves one as it was.
         say: is told what came of it.
-
-    Returns:
-        The exit code.
 
     Raises:
         Refused: the run does not allow it; nothing was written.

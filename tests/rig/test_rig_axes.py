@@ -74,15 +74,13 @@ def test_four_axes_are_calibrated_by_lines_of_numbers(tmp_path, transport):
     assert summary["unit"] == "mm" and len(summary["postures"]) == 5
     assert summary["after"]["max"] < 0.02 < summary["before"]["max"]
     assert "the phone" not in "\n".join(said)
-    # Read again with other factors, every number of the result is as much larger.
     (tmp_path / "rig.toml").write_text(config.text)
-    factors = ",".join("2.0" for _ in config.axes)
     assert main(["refit", str(tmp_path), "--order", "ZXY"]) == 2
-    assert main(["refit", str(tmp_path), "--factors", factors]) in (0, 1)
+    assert main(["refit", str(tmp_path)]) in (0, 1)
     again = max(tmp_path.parent.glob("refit-*")) / "calibration.json"
     other = jaxcal.Calibration.load(again)
-    np.testing.assert_allclose(other.matrix, 2.0 * calibration.matrix, rtol=1e-6)
-    np.testing.assert_allclose(other.bias, 2.0 * calibration.bias, atol=1e-6)
+    np.testing.assert_allclose(other.matrix, calibration.matrix, rtol=1e-6)
+    np.testing.assert_allclose(other.bias, calibration.bias, atol=1e-6)
     exported = load_inverse(tmp_path, read_journal(tmp_path / "journal.jsonl"))
     assert exported["outputs"] == exported["axes"] == list(STAGE)
     assert exported["axis_unit"] == "mm, deg" and len(exported["follow"]) == 16
