@@ -129,8 +129,7 @@ def _close(device: Device) -> None:
     """Nothing more will move: note where the drives stand, close bus and phone."""
     if device.requests.armed:
         try:
-            with device.line.urgent():  # also after a stop that latched
-                record_check.leave(device.drives, device.record)
+            record_check.leave(device.drives, device.record)
         except OSError as error:
             text = f"{device.record.path} cannot be written: {error}"
             device.emit("note", text=text)
@@ -173,7 +172,7 @@ def take_zero(
     device.emit("phase", phase="zeroing")
     zero = Posture("zero", at or device.positions())
     standing = Arrival(device, zero)
-    if at is not None or config.motion.approach_overshoot_deg:
+    if moves:
         standing = move(device, zero)  # from the side of all references
     check_plan(config, [zero.pulses])  # it is where a resumed run looks again
     while True:

@@ -259,10 +259,7 @@ def _require_stopped(
 ) -> None:
     """Refuse a stop after which an axis went on, or moved again; alarms are reset.
 
-    Args:
-        name: of the stop.
-        statuses: of the drives as they stood.
-        shares: of the way that each axis that moved had gone by then.
+    The drives stood with these statuses, the axes after these shares of their way.
     """
     went_on = [axis for axis, share in shares.items() if share > 1.0 - SHORT]
     attitude = device.attitude(time.monotonic())
@@ -380,11 +377,7 @@ def _reset_alarms(run: Run, device: Device, name: str) -> None:
     for drive in device.drives:
         if not drive.status().fault:
             continue
-        resettable = drive.can_reset
-        if (
-            not resettable
-            or drive.bring(drive.reset, lambda status: not status.fault).fault
-        ):
+        if not drive.can_reset or drive.bring(drive.reset, lambda s: not s.fault).fault:
             raise MotionFault(
                 f"{drive.axis.name} stays in alarm after {name}: {drive.alarm()}. "
                 "Reset it, then run `jaxcal-rig setup axes` again"

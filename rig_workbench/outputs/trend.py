@@ -89,31 +89,28 @@ def _device(runs: list[Record]) -> DeviceHistory:
 
 def _moved(before: Record, now: Record) -> list[str]:
     """Parameters that differ by more than their intervals allow, A before b."""
-    if "parameters" in now:
-        return _moved_parameters(before["parameters"], now["parameters"])
-    then, new = (np.column_stack([run["A"], run["b"]]) for run in (before, now))
-    change, allowed = new - then, np.hypot(now["ci95"], before["ci95"])
-    axes, last = now["axes"], len(now["axes"])
-    outputs = now["outputs"] if "outputs" in now else axes
-    names = [[f"A[{y}, {u}]" for u in axes] + [f"b[{y}]"] for y in outputs]
-    return [
-        f"{names[i][j]} {change[i, j]:+.4f} (interval {allowed[i, j]:.4f})"
-        for i, j in sorted(np.ndindex(change.shape), key=lambda at: at[1] == last)
-        if abs(change[i, j]) > allowed[i, j]
-    ]
-
-
-def _moved_parameters(before: Record, now: Record) -> list[str]:
-    """Parameters of a model that differ by more than their intervals allow."""
-    moved = []
-    for name, parameter in now.items():
-        if name not in before or parameter["half_width"] is None:
+    then, moved, form = _values(before), [], "g" if "parameters" in now else "f"
+    for name, (value, wide) in _values(now).items():
+        if name not in then or wide is None:
             continue
-        change = parameter["value"] - before[name]["value"]
-        allowed = math.hypot(parameter["half_width"], before[name]["half_width"] or 0.0)
+        change, allowed = value - then[name][0], math.hypot(wide, then[name][1] or 0.0)
         if abs(change) > allowed:
-            moved.append(f"{name} {change:+.4g} (interval {allowed:.4g})")
+            moved.append(f"{name} {change:+.4{form}} (interval {allowed:.4{form}})")
     return moved
+
+
+def _values(run: Record) -> dict[str, tuple[float, float | None]]:
+    """What a run identified by its name, with its half-width."""
+    if "parameters" in run:
+        fitted = run["parameters"].items()
+        return {name: (p["value"], p["half_width"]) for name, p in fitted}
+    axes, outputs = run["axes"], run.get("outputs", run["axes"])
+    names = [f"A[{y}, {u}]" for y in outputs for u in axes]
+    names += [f"b[{y}]" for y in outputs]
+    wide = np.array(run["ci95"])
+    values = np.concatenate([np.ravel(run["A"]), run["b"]]).tolist()
+    widths = np.concatenate([wide[:, :-1].ravel(), wide[:, -1]]).tolist()
+    return dict(zip(names, zip(values, widths, strict=True), strict=True))
 
 
 def trend_lines(device: DeviceHistory) -> list[str]:
