@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from rig_workbench.simulator import Simulator
 
 FORMATS = ["hyperimu", "sensorlogger", "sensorlog", "json", "lines"]
-UNITS = 16
 SAFETY = (
     "Research software, not a medical device. Confirm: no patient is attached, no "
     "person is within reach of the device, a hardware emergency stop is at hand."
@@ -49,7 +48,7 @@ class SetupOptions:
 
     bus: str = ""
     imu: str = ""  # FORMAT or FORMAT:PORT
-    units: int = UNITS
+    units: int = 16
     values: dict[str, Any] = dataclasses.field(default_factory=dict)  # of rig.toml
     home: str = "here"
     # Axis to X, Y or Z that it turns about, deg of a rotation, mm of a translation.
@@ -57,11 +56,6 @@ class SetupOptions:
     drives: str = ""  # map of the drives; none: Modbus drives that are found
     readings: str = ""  # where numbers come from; none: a phone
     model: str = ""  # URDF file of an arm
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the axes."""
-        return tuple(self.axes)
 
 
 KINDS = ("X", "Y", "Z", "deg", "mm")
@@ -75,16 +69,17 @@ OF_READINGS = {  # keys of [readings]
 
 
 def axis_kinds(text: str) -> dict[str, str]:
-    """``NAME:KIND,...``; ValueError where that is not what it is."""
+    """``NAME:KIND,...``; Refused where that is not what it is."""
     kinds = {}
     for word in text.split(","):
         name, _, kind = word.partition(":")
         if not re.fullmatch("[a-z][a-z0-9_]*", name) or kind not in KINDS:
-            raise ValueError(
-                f"must be NAME:KIND,... with a KIND of {', '.join(KINDS)}, got {word!r}"
+            raise Refused(
+                f"--axes must be NAME:KIND,... with a KIND of {', '.join(KINDS)}, got "
+                f"{word!r}"
             )
         if name in kinds:
-            raise ValueError(f"the axis {name} is named twice")
+            raise Refused(f"--axes: the axis {name} is named twice")
         kinds[name] = kind
     return kinds
 
@@ -97,14 +92,11 @@ def asked(*, axes: str, **given: Any) -> SetupOptions:
     """
     options = {name: value for name, value in given.items() if value}
     if axes:
-        try:
-            options["axes"] = axis_kinds(axes)
-        except ValueError as error:
-            raise Refused(f"--axes {error}") from None
+        options["axes"] = axis_kinds(axes)
     elif urdf := options.get("model"):
         options["axes"] = dict.fromkeys(joint_names(urdf), "deg")
     made = SetupOptions(**options)
-    if options.get("readings") and options.get("imu"):
+    if made.readings and made.imu:
         raise Refused("--imu and --readings: give only one, a phone or a sensor")
     by_phone = {"X", "Y", "Z"} | ({"deg"} if made.model else set())
     wrong = [
@@ -198,12 +190,12 @@ def write_config(
     if options.readings:
         say("4 sensor")
         kinds = set(options.axes.values())
-        source = {"names": options.names, "sensor": sensor_of(options.readings)}
+        source = {"names": list(options.axes), "sensor": sensor_of(options.readings)}
         source["unit"] = operator.ask(
             "unit of the readings", "mm" if "mm" in kinds else "deg"
         )
         if options.model:
-            source |= {"names": ("x", "y", "z"), "unit": "m"}
+            source |= {"names": ["x", "y", "z"], "unit": "m"}
     else:
         say("4 phone")
         form, _, port = (options.imu or "").partition(":")
@@ -213,7 +205,7 @@ def write_config(
         port = port or operator.ask("TCP port that the phone sends to", "2055")
         source = {"form": form, "port": int(port)}
     values = dict(options.values)
-    for name in options.names:
+    for name in options.axes:
         key = f"axes.{name}.reduction"
         if key not in values:
             question = f"{name}: motor turns for one turn of the joint (gearbox)"
@@ -230,11 +222,8 @@ def new_text(
     axes: Sequence[Mapping[str, Any]],
     form: str = "",
     port: int = 0,
-    *,
-    names: Sequence[str] = (),
-    unit: str = "mm",
-    sensor: Mapping[str, Any] | None = None,
     model: str = "",
+    **numbers: Any,
 ) -> str:
     """A whole configuration.
 
@@ -242,19 +231,15 @@ def new_text(
         bus: as it was reached.
         axes: name, kind (X, Y, Z, deg or mm), unit, family, pulses and, of mm, lead of
             each.
-        form: of the phone's app; none: numbers are measured.
-        port: that the phone connects to.
-        names, unit: of the numbers.
-        sensor: keys of ``[readings]`` that say where they come from.
+        form, port: of the phone's app, and that it connects to.
         model: URDF file of an arm.
+        numbers: without a phone ``names`` and ``unit`` of what is measured, and
+            ``sensor``, keys of ``[readings]`` that say where it comes from.
     """
     keys = OF_LINE[bus.transport] + ("echo",) * bus.echo
     new = template(pathlib.Path(__file__).with_name("new.toml.j2"))
-    text: str = new.render(
-        bus=dict(bus), keys=keys, axes=axes, form=form, port=port, names=list(names),
-        unit=unit, sensor=dict(sensor or {}), model=model,
-    )  # fmt: skip
-    return text
+    told = numbers | {"form": form, "port": port, "model": model}
+    return str(new.render(bus=dict(bus), keys=keys, axes=axes, **told))
 
 
 def _ask_axes(
@@ -263,16 +248,13 @@ def _ask_axes(
     usable = {answer.unit: answer for answer in answers if answer.families}
     if options.drives:
         usable = {unit: Answer(unit, (options.drives,), {}) for unit in range(1, 7)}
-    if len(usable) < len(options.names):
+    if len(usable) < len(options.axes):
         unknown = [answer.unit for answer in answers if not answer.families]
         raise Refused(
-            f"{len(options.names)} drives of a known family are needed for "
-            f"{', '.join(options.names)}; found {len(usable)}"
-            + (
-                f"; units {unknown} answer, but are of no known family"
-                if unknown
-                else ""
-            )
+            f"{len(options.axes)} drives of a known family are needed for "
+            f"{', '.join(options.axes)}; found {len(usable)}"
+            + f"; units {unknown} answer, but are of no known family"
+            * bool(unknown)
             + ". Check power, wiring, termination, the line format, and that every "
             "drive has its own unit id; another family needs a map (docs/rig.md)"
         )
