@@ -51,7 +51,9 @@ def reread(records: list[Record], then: RigConfig, now: RigConfig) -> list[Recor
             "calibration needs. Finish it first with `jaxcal-rig resume`"
         )
     geometry, frame = geometry_of(now), None
-    values_of = _numbers if then.imu is None else _attitudes(then, now)
+    values_of: Callable[[Record], Any] = _numbers
+    if then.imu is not None:
+        values_of = _attitudes(then, now)
 
     def read(record: Record) -> Record:
         nonlocal frame

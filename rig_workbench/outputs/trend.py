@@ -104,7 +104,8 @@ def _values(run: Record) -> dict[str, tuple[float, float | None]]:
     if "parameters" in run:
         fitted = run["parameters"].items()
         return {name: (p["value"], p["half_width"]) for name, p in fitted}
-    axes, outputs = run["axes"], run.get("outputs", run["axes"])
+    axes = run["axes"]
+    outputs = run["outputs"] if "outputs" in run else axes
     names = [f"A[{y}, {u}]" for y in outputs for u in axes]
     names += [f"b[{y}]" for y in outputs]
     wide = np.array(run["ci95"])
