@@ -9,12 +9,10 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 Kind = Literal["u16", "i16", "u32", "i32", "u48", "i48", "u64", "i64", "f32", "f64"]
-FORMATS: tuple[Kind, ...] = (
-    "u16", "i16", "u32", "i32", "u48", "i48", "u64", "i64", "f32", "f64",
-)  # fmt: skip
+FORMATS: tuple[Kind, ...] = get_args(Kind)
 REGISTERS = (3, 4)  # functions that read registers; 1 and 2 read bits
 FLOATS = {"f32": ">f", "f64": ">d"}
 COIL_ON = 0xFF00  # as function 5 writes it
