@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import (
+    Array,
     array_of,
     axis_names,
     in_words,
@@ -26,8 +26,6 @@ from jaxcal.models.model import Model, as_commands, as_parameters, by_name
 from jaxcal.models.periods import checked_periods
 from jaxcal.models.runs import CommandLine, Runs
 from jaxcal.models.uncertainty import Noise, Prior, as_noise
-
-Array = NDArray[np.float64]
 
 SIDES = tuple(STENCILS)
 _PILOTS = 4  # commands at which steps are chosen
@@ -61,8 +59,6 @@ class FromFunction(Model):
             one number for all.
         processes: number that run f; f must then be importable. Or an executor of
             ``concurrent.futures``, such as a cluster's, which you close.
-        cache: file in which runs are kept. It compares functions by their code, not by
-            what they call or read: delete it when that changes.
         timeout: seconds after which a run of a program has failed.
         quiet: no progress on standard error.
     """
@@ -83,7 +79,6 @@ class FromFunction(Model):
         prior: Prior | None = None,
         periods: ArrayLike | None = None,
         processes: int | Executor = 1,
-        cache: str | os.PathLike[str] | None = None,
         timeout: float | None = None,
         quiet: bool = False,
     ) -> None:
@@ -116,7 +111,7 @@ class FromFunction(Model):
         self._noise, self._prior, self._given_periods = noise, prior, periods
         if not isinstance(processes, Executor):
             processes = whole_number("processes", processes, 1)
-        self._runs = Runs(f, bool(batch), processes, cache, quiet)
+        self._runs = Runs(f, bool(batch), processes, quiet)
         self.f = f
         self._known = _Memory()
         self._steps: dict[str, Differences] = {}

@@ -1,40 +1,30 @@
-"""Runs of a caller's function: in this process or several, kept on disk, with failures.
+"""Runs of a caller's function: in this process or several, with failures.
 
 A job is some commands with one set of parameters. A run that raises, or whose numbers
 are not finite, is a failure with a reason; another shape than that of the others is an
-error. Runs that were made before are read from a file where the caller names one.
+error.
 """
 
 from __future__ import annotations
 
 import concurrent.futures
-import contextlib
-import hashlib
 import multiprocessing
-import os
-import pathlib
 import pickle
 import shlex
 import shutil
-import sqlite3
 import subprocess
-import time
-import types
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaxcal.checks import in_words
+from jaxcal.checks import Array, in_words
 from jaxcal.progress import Progress
 
-Array = NDArray[np.float64]
 Job = tuple[Array, Array]  # commands (N, n) and parameters (p,)
 Answer = Array | str  # readings (q,), or why there are none
 
-_EVERY = 2.0  # seconds between writings of runs to the disk
 _TASKS_EACH = 4  # pieces of work for each process, so that none waits long
 _TASKS = 256  # of an executor, whose size is not known
 
@@ -84,24 +74,14 @@ class CommandLine:
         except ValueError as error:
             raise _RunError(f"standard output: {error}") from None
 
-    def content(self) -> bytes:
-        """Bytes that differ where results may: the words, and the files they name."""
-        parts = [*self.words]
-        for word in self.words:
-            path = pathlib.Path(shutil.which(word) or word)
-            if path.is_file():
-                parts.append(hashlib.sha256(path.read_bytes()).hexdigest())
-        return "\0".join(parts).encode()
-
 
 class Runs:
-    """Runs of a caller's function, several at a time; made ones are read from a file.
+    """Runs of a caller's function, several at a time.
 
     Args:
         f: one command and the parameters, or with ``batch`` many commands.
         batch: f takes commands (N, n) and returns (N, q).
         processes: that run at a time, or the caller's own executor.
-        cache: file of runs, made where it does not exist; None: nothing is kept.
         quiet: no progress on standard error.
     """
 
@@ -110,7 +90,6 @@ class Runs:
         f: Callable[..., Any],
         batch: bool,
         processes: int | concurrent.futures.Executor,
-        cache: str | os.PathLike[str] | None,
         quiet: bool,
     ) -> None:
         self.f, self.batch = f, batch
@@ -122,7 +101,6 @@ class Runs:
             self.processes, self._num_tasks, self._pool = 0, _TASKS, processes
         self.num_outputs: int | None = None  # of the first run
         self._progress = Progress(quiet=quiet)
-        self._kept = None if cache is None else _Cache(cache, _content(f))
         if self.processes > 1 and not isinstance(f, CommandLine):
             try:
                 pickle.dumps(f)
@@ -134,34 +112,25 @@ class Runs:
 
     def __call__(self, jobs: Sequence[Job]) -> tuple[list[Array], list[dict[int, str]]]:
         """Readings (N, q) of each job, NaN where a run failed, and why by row."""
-        if self.batch and self.processes == 1 and self._kept is None:
+        if self.batch and self.processes == 1:
             whole = [self._whole(*job) for job in jobs]
             if all(values is not None for values in whole):
                 return [values for values in whole if values is not None], [{}] * len(
                     jobs
                 )
         answers: list[list[Answer | None]] = [[None] * len(rows) for rows, _ in jobs]
-        if self._kept is not None:
-            answers = [self._kept.read(*job) for job in jobs]
-        pieces = self._pieces(jobs, answers)
+        pieces = self._pieces(jobs)
         total, done = sum(len(rows) for _, rows in pieces), 0
         self._progress("runs of f", 0, total)
         try:
             for (j, rows), of_piece in self._answered(jobs, pieces):
                 for i, answer in zip(rows, of_piece, strict=True):
                     answers[j][i] = self._checked(answer, jobs[j][0][i])
-                if self._kept is not None:
-                    self._kept.write(jobs[j], rows, answers[j])
                 done += len(rows)
                 self._progress("runs of f", done, total)
         finally:
             self._progress.clear()
-            if self._kept is not None:
-                self._kept.flush()
         q = self.num_outputs
-        if q is None:  # known from files alone, or not at all
-            sizes = {len(x) for a in answers for x in a if isinstance(x, np.ndarray)}
-            self.num_outputs = q = sizes.pop() if sizes else None
         if q is None:
             reasons = [x for a in answers for x in a if isinstance(x, str)]
             raise ValueError(
@@ -209,21 +178,15 @@ class Runs:
             reasons.append(why)
         return values, reasons
 
-    def _pieces(
-        self, jobs: Sequence[Job], answers: list[list[Answer | None]]
-    ) -> list[tuple[int, list[int]]]:
+    def _pieces(self, jobs: Sequence[Job]) -> list[tuple[int, list[int]]]:
         """Job and rows of each piece of work."""
-        open_rows = [
-            (j, [i for i, answer in enumerate(of_job) if answer is None])
-            for j, of_job in enumerate(answers)
-        ]
-        total = sum(len(rows) for _, rows in open_rows)
+        total = sum(len(rows) for rows, _ in jobs)
         size = max(1, -(-total // self._num_tasks))
         if self.processes == 1:
             size = max(total, 1) if self.batch else 1
         return [
-            (j, rows[first : first + size])
-            for j, rows in open_rows
+            (j, [*range(first, min(first + size, len(rows)))])
+            for j, (rows, _) in enumerate(jobs)
             for first in range(0, len(rows), size)
         ]
 
@@ -356,92 +319,3 @@ def _readings(result: Any, rows: int) -> Array:
         rule = f"({rows}, q) for {rows} commands" if rows else "(q,) for one command"
         raise ValueError(f"f must return {rule}, got {array.shape}")
     return array
-
-
-class _Cache:
-    """Runs in a file of SQLite; those of another f are other runs."""
-
-    def __init__(self, path: str | os.PathLike[str], content: bytes) -> None:
-        self._path, self._content = os.fspath(path), content
-        self._waiting: list[tuple[bytes, bytes]] = []
-        self._written = time.monotonic()
-        try:
-            with self._opened() as file:
-                file.execute(
-                    "CREATE TABLE IF NOT EXISTS runs (key BLOB PRIMARY KEY, value BLOB)"
-                )
-        except sqlite3.Error as error:
-            raise ValueError(f"cache {path} is not a file of runs: {error}") from None
-
-    @contextlib.contextmanager
-    def _opened(self) -> Iterator[sqlite3.Connection]:
-        """Committed when the block succeeds."""
-        connection = sqlite3.connect(self._path, timeout=60.0)
-        with contextlib.closing(connection), connection:
-            yield connection
-
-    def _keys(self, commands: Array, parameters: Array) -> list[bytes]:
-        first = hashlib.sha256(self._content)
-        first.update(parameters.tobytes())
-        keys = []
-        for command in commands:
-            whole = first.copy()
-            whole.update(command.tobytes())
-            keys.append(whole.digest())
-        return keys
-
-    def read(self, commands: Array, parameters: Array) -> list[Answer | None]:
-        found: list[Answer | None] = []
-        with self._opened() as file:
-            for key in self._keys(commands, parameters):
-                row = file.execute("SELECT value FROM runs WHERE key = ?", (key,))
-                value = row.fetchone()
-                found.append(None if value is None else np.frombuffer(value[0]).copy())
-        return found
-
-    def write(self, job: Job, rows: list[int], answers: list[Answer | None]) -> None:
-        """Keep the answers of ``rows``; not failures, which may not be so again."""
-        commands, parameters = job
-        keys = self._keys(commands[rows], parameters)
-        self._waiting += [
-            (key, answer.tobytes())
-            for key, answer in zip(keys, (answers[i] for i in rows), strict=True)
-            if isinstance(answer, np.ndarray)
-        ]
-        if time.monotonic() > self._written + _EVERY:
-            self.flush()
-
-    def flush(self) -> None:
-        """Put what waits on the disk."""
-        if self._waiting:
-            with self._opened() as file:
-                file.executemany(
-                    "INSERT OR REPLACE INTO runs VALUES (?, ?)", self._waiting
-                )
-        self._waiting, self._written = [], time.monotonic()
-
-
-def _content(f: Any) -> bytes:
-    """What tells one f from another: its code and what it holds.
-
-    Functions that it calls, and files that it reads, are not looked at.
-    """
-    if isinstance(f, CommandLine):
-        return f.content()
-    if isinstance(f, types.FunctionType):
-        held = [f.__defaults__, *(cell.cell_contents for cell in f.__closure__ or ())]
-        code = repr(_code(f.__code__)).encode()
-        return code + b"".join(_content(one) for one in held)
-    try:
-        return pickle.dumps(f)
-    except Exception as error:
-        raise ValueError(
-            f"leave out cache: f holds data that cannot be compared: {error}"
-        ) from None
-
-
-def _code(code: types.CodeType) -> tuple[Any, ...]:
-    constants = [
-        _code(x) if isinstance(x, types.CodeType) else x for x in code.co_consts
-    ]
-    return code.co_code, code.co_names, constants

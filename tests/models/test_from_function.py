@@ -168,7 +168,7 @@ def test_a_cluster_of_dask_runs_f_and_names_what_ends_a_worker():
         ) as client,
         client.get_executor() as executor,
     ):
-        runs = Runs(f, False, executor, None, True)
+        runs = Runs(f, False, executor, True)
         (values,), (reasons,) = runs([(rows, np.array([2.0, 0.5]))])
         runs.close()  # the executor is the caller's
         assert executor.submit(abs, -1).result() == 1
@@ -199,21 +199,12 @@ def counting(factor):
     return f
 
 
-def test_runs_are_kept_on_disk_by_what_f_is(tmp_path):
-    file = tmp_path / "runs.sqlite"
-    first = model(counting(1.0), cache=file).jacobian(U[:4])
+def test_results_are_kept_in_memory():
+    one = model(counting(1.0))
+    one.jacobian(U[:4])
     made = len(CALLS)
-    again = model(counting(1.0), cache=file)
-    np.testing.assert_array_equal(again.jacobian(U[:4]), first)
+    one.jacobian(U[3::-1])
     assert len(CALLS) == made
-    twice = model(counting(2.0), cache=file).jacobian(U[:4])
-    np.testing.assert_allclose(twice, 2 * first)
-    made = len(CALLS)
-    again.jacobian(U[3::-1])  # in memory
-    assert len(CALLS) == made
-    (tmp_path / "other").write_text("no database, but long enough to be read" * 9)
-    with pytest.raises(ValueError, match="is not a file of runs"):
-        model(cache=tmp_path / "other")
 
 
 def test_candidates_that_fail_are_masked_and_named():
