@@ -7,14 +7,11 @@ the paper's [0, 1] inputs.
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from jaxcal.checks import in_words, numbers
+from jaxcal.checks import Array, in_words, numbers
 
 __all__ = ["JointRanges"]
-
-Array = NDArray[np.float64]
 
 
 class JointRanges:

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import (
+    Array,
     aligned,
     array_of,
     in_words,
@@ -53,9 +54,6 @@ from jaxcal.selection.problem import (
 )
 from jaxcal.selection.result import Selection
 
-__all__ = ["Refinement", "optimise", "refine"]
-
-Array = NDArray[np.float64]
 Allowed = Callable[[Array], Any]
 
 _POOL, _SEARCH = 512, 2048  # points that starts, and the largest d, are looked for in

@@ -20,9 +20,9 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal import compiled
+from jaxcal.checks import Array, Mask
 from jaxcal.information.singular import (
     SINGULAR,
     SMALL,
@@ -32,21 +32,6 @@ from jaxcal.information.singular import (
     rank_rule,
     significant,
 )
-
-__all__ = [
-    "WhiteBlocks",
-    "gram",
-    "largest_rank",
-    "missing_directions",
-    "prior_root",
-    "rank_of_blocks",
-    "triangle",
-    "whiten",
-    "without",
-]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _EPS = float(np.finfo(np.float64).eps)
 _LOSS = 1e-9  # of orthogonality that whitened rows may have

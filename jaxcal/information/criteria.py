@@ -33,13 +33,9 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaxcal.checks import Array
 from jaxcal.information.blocks import rank_of_blocks, whiten
-
-__all__ = ["Criteria", "criteria"]
-
-Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,8 +19,6 @@ from cython.cimports.jaxcal.information.linear_algebra import (
 from cython.cimports.jaxcal.watch import Watch, begin, late
 from cython.cimports.libc.math import INFINITY, NAN, fabs, log, sqrt
 
-__all__ = ["clear_log_dets", "factors"]
-
 _EPS = cython.declare(cython.double, 2.0**-52)
 
 

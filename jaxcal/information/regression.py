@@ -14,19 +14,10 @@ Leading axes (``...``) are batches. Source: paper, Equations 2, 9 and the D-crit
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from jaxcal.checks import numbers, require_finite, whole_number
+from jaxcal.checks import Array, numbers, require_finite, whole_number
 from jaxcal.information.blocks import rank_of_blocks
-
-__all__ = [
-    "log_det_gram",
-    "log_det_information",
-    "regression_matrix",
-    "regressors",
-]
-
-Array = NDArray[np.float64]
 
 
 def _as_commands(commands: ArrayLike) -> Array:

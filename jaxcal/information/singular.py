@@ -20,25 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal import compiled
-
-__all__ = [
-    "SINGULAR",
-    "SMALL",
-    "SURE",
-    "depends",
-    "direction_in_words",
-    "directions_in_words",
-    "exact_zeros",
-    "flat",
-    "null_directions",
-    "power_of_two",
-    "rank_rule",
-    "require_excited",
-    "significant",
-]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from jaxcal.checks import Array, Mask
 
 SINGULAR = 1e-10  # share of the largest singular value
 SMALL = 1e-100  # numbers below and above its inverse are divided by powers of two

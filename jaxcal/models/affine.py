@@ -8,13 +8,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from jaxcal.checks import axis_letter, whole_number
+from jaxcal.checks import Array, axis_letter, whole_number
 from jaxcal.information.regression import regressors
 from jaxcal.models.model import Model, as_commands, as_parameters
-
-Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True)

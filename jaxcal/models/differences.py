@@ -20,12 +20,10 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaxcal.checks import aligned
+from jaxcal.checks import Array, aligned
 from jaxcal.models.periods import within_half
 
-Array = NDArray[np.float64]
 Evaluate = Callable[[Array], Array]  # points (S, p) -> values (S, N, q), NaN: refused
 
 _FIRST, _RUNGS = 0.25, 22  # of the scale, the largest step; halvings tried

@@ -8,14 +8,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from jaxcal.checks import axis_names, numbers, table, whole_number
+from jaxcal.checks import Array, axis_names, numbers, table, whole_number
 from jaxcal.extras import needs
 from jaxcal.models.model import Model, as_commands, as_parameters
 from jaxcal.models.periods import checked_periods
-
-Array = NDArray[np.float64]
 
 
 class FromJax(Model):

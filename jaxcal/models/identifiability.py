@@ -9,13 +9,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import one_of, require_kind, table
+from jaxcal.checks import Array, one_of, require_kind, table
 from jaxcal.information.blocks import triangle
 from jaxcal.information.singular import exact_zeros, flat, significant
 from jaxcal.models.model import Model, answered, as_model, derivative, without_effect
 from jaxcal.models.uncertainty import Noise, Prior, as_noise
-
-Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

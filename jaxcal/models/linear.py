@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import axis_names, numbers, whole_number
+from jaxcal.checks import Array, axis_names, numbers, whole_number
 from jaxcal.models.formula import Levels, input_names, parse
 from jaxcal.models.model import Model, as_commands, as_parameters
-
-Array = NDArray[np.float64]
 
 
 class Linear(Model):

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import array_of, in_words
+from jaxcal.checks import Array, array_of, in_words
 from jaxcal.information.singular import flat
 from jaxcal.models.periods import within_half
 from jaxcal.models.recording import Recording
@@ -27,8 +27,6 @@ from jaxcal.tables import COMMANDS, header_of, of_frame
 if TYPE_CHECKING:
     from jaxcal.models.verdict import Verdict
 
-
-Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 _NOTHING_KNOWN = Prior(np.inf)

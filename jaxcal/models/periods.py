@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from jaxcal.checks import one_or_each, require_none
-
-Array = NDArray[np.float64]
+from jaxcal.checks import Array, one_or_each, require_none
 
 
 def within_half(off: Array, periods: ArrayLike | None) -> Array:

@@ -6,13 +6,11 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+
+from jaxcal.checks import Array
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration as Fit
-
-
-Array = NDArray[np.float64]
 
 UNLIKELY = 1e-4  # p-value of residuals under the noise that was given
 _CHANCE = 0.01  # that readings of nothing pass for a fit

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import (
+    Array,
     array_of,
     in_words,
     numbers,
@@ -20,7 +21,6 @@ from jaxcal.checks import (
 )
 from jaxcal.information.singular import significant
 
-Array = NDArray[np.float64]
 PerParameter = ArrayLike | Mapping[str, float]
 
 

@@ -13,15 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.checks import Array
 from jaxcal.late import late
 from jaxcal.models.reasons import RULES, computed, never_measured, not_invertible
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
     from jaxcal.calibration.fit import Fit
-
-
-Array = NDArray[np.float64]
 
 _CHECK = "a change of the machine (check, jaxcal check)"
 USE = (

@@ -24,13 +24,6 @@ from jaxcal.selection.problem import Problem, Solution, log_dets, make_problems
 from jaxcal.selection.result import BatchSelection
 from jaxcal.selection.solvers import checked_seed, random_indices
 
-__all__ = [
-    "exact_batch",
-    "exchange_batch",
-    "greedy_batch",
-    "random_batch",
-]
-
 
 def random_batch(
     candidates: ArrayLike, k: int, *, seed: int = 0, **rules: Any

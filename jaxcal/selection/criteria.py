@@ -33,28 +33,9 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import one_of
+from jaxcal.checks import Array, one_of
 from jaxcal.information.blocks import WhiteBlocks, triangle
 from jaxcal.information.singular import power_of_two, significant
-
-__all__ = [
-    "CRITERIA",
-    "As",
-    "Coordinates",
-    "Criterion",
-    "Ds",
-    "G",
-    "I",
-    "Largest",
-    "Mean",
-    "ScenarioCriterion",
-    "Worst",
-    "criterion_of",
-    "offered",
-    "positions",
-]
-
-Array = NDArray[np.float64]
 
 _HULL = 5  # parameters up to which qhull's facets are few
 

@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import one_of, require_known, require_none, seconds
+from jaxcal.checks import Array, Indices, one_of, require_known, require_none, seconds
 from jaxcal.deadline import Deadline
 from jaxcal.late import late
 from jaxcal.models.model import Model
@@ -28,11 +28,6 @@ from jaxcal.selection.problem import (
 )
 from jaxcal.selection.result import Selection, Subset
 from jaxcal.selection.solvers import OPTIONS, SOLVERS, checked_options
-
-__all__ = ["Design", "select"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 _REFERENCES = ("bound", "exact")
 _PROVEN = 1e-9  # a value this near a proven optimum, relative above 1, is that optimum

@@ -12,15 +12,10 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.checks import aligned
+from jaxcal.checks import Array, Indices, aligned
 from jaxcal.deadline import Deadline
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.problem import Problem, ScenarioProblem
-
-__all__ = ["ScenarioTable", "in_scenarios", "optima_of"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 _LIMIT = 2.0  # seconds for the optima of all scenarios together
 _LEAST_LIMIT = 0.02  # and at least of each

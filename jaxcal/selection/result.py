@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.checks import aligned, axis_names, lasted
+from jaxcal.checks import Indices, aligned, axis_names, lasted
 from jaxcal.information.blocks import rank_of_blocks
 from jaxcal.late import late
 from jaxcal.selection.problem import Problem
@@ -17,10 +17,6 @@ from jaxcal.selection.problem import Problem
 if TYPE_CHECKING:
     from jaxcal.information.criteria import Criteria
     from jaxcal.selection.in_scenarios import ScenarioTable
-
-__all__ = ["BatchSelection", "Selection", "Subset"]
-
-Indices = NDArray[np.int64]
 
 
 class Subset(NamedTuple):
@@ -229,9 +225,7 @@ class BatchSelection:
     seconds: float  # wall time of the whole batch
 
 
-def _shares_without(
-    problem: Problem, indices: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def _shares_without(problem: Problem, indices: Indices) -> NDArray[np.float64]:
     """(k,) det S without each of the chosen (k,), as a share of det S."""
     k = len(indices)
     others = np.tile(indices, (k, 1))[~np.eye(k, dtype=np.bool_)].reshape(k, -1)

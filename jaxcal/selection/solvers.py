@@ -19,15 +19,6 @@ from jaxcal.selection.exact import exact
 from jaxcal.selection.exchange import exchange
 from jaxcal.selection.problem import Problem, Solution, log_dets
 
-__all__ = [
-    "METHODS",
-    "OPTIONS",
-    "SOLVERS",
-    "checked_options",
-    "checked_seed",
-    "random_indices",
-]
-
 _TRIES = 200  # random selections, before the greedy one, where all are singular
 
 

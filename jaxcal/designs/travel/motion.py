@@ -13,11 +13,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import array_of, numbers
-
-__all__ = ["Motion", "fastest_tour", "travel_times"]
-
-Array = NDArray[np.float64]
+from jaxcal.checks import Array, array_of, numbers
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,9 +13,9 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from jaxcal.checks import array_of, one_of, seconds, share
+from jaxcal.checks import Array, Indices, array_of, one_of, seconds, share
 from jaxcal.deadline import Deadline
 from jaxcal.designs.travel.motion import Motion, travel_times
 from jaxcal.selection.exact.exact import solve_exact
@@ -26,11 +26,6 @@ from jaxcal.selection.problem import (
     problem_of,
 )
 from jaxcal.selection.solvers import checked_seed
-
-__all__ = ["FastSelection", "ParetoFront", "fastest", "pareto"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 SAME_TIME = 1e-9  # seconds: two runs this close take as long
 _STARTS = 12  # the D-optimum and local optima of the exchange

@@ -7,8 +7,6 @@ import numpy as np
 from cython.cimports.jaxcal.watch import Watch, begin, late
 from cython.cimports.libc.math import INFINITY
 
-__all__ = ["MOST_EXACT", "best_order"]
-
 MOST_EXACT = 12  # postures up to which the order is optimal (Held and Karp 1962)
 
 _IMPROVED = 20  # shortest nearest-neighbour tours that are improved beyond that

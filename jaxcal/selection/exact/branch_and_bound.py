@@ -15,9 +15,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal import compiled
+from jaxcal.checks import Array, Indices
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.information.blocks import gram, largest_rank
 from jaxcal.selection.criteria import Criterion, ScenarioCriterion
@@ -25,16 +25,11 @@ from jaxcal.selection.criteria import Criterion, ScenarioCriterion
 if TYPE_CHECKING:
     from jaxcal.selection.problem.constraints import Constraints
 
-__all__ = ["JointScenarios", "Scenario", "branch_and_bound"]
-
 TOLERANCE = 1e-10  # of phi of "det"; of the others a share of it
 _MEMORY = 64 * 2**20  # bytes of open nodes up to which the best bound goes first
 _USEFUL = {"trace": -0.5, "least": 2.0}  # of values near 1: an efficiency of a half
 _CUTS, _DEAR, _PRICED = 30, 1.0, 1e-5  # of prices: tries, a high one, near enough
 _FREE = 3e6  # node x M q p^2 spent on a proof although ``enough`` is reached: 10 ms
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 @dataclasses.dataclass(frozen=True)

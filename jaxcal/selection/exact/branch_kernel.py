@@ -66,8 +66,6 @@ from cython.cimports.jaxcal.selection.criterion_kinds import DET, LEAST, SUBSET,
 from cython.cimports.jaxcal.watch import begin, late
 from cython.cimports.libc.math import INFINITY, exp, fabs, floor, log, log1p, sqrt
 
-__all__ = ["JointSearch", "Search"]
-
 _KINDS = {"det": DET, "subset": SUBSET, "trace": TRACE, "least": LEAST}
 # Sharper forms of DET and TRACE, which compiled functions read.
 _RANK = declare(cython.int, 4)

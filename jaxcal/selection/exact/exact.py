@@ -14,8 +14,8 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaxcal.checks import Indices
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection.exact.volume import largest_volumes
 from jaxcal.selection.exchange.exchange import (
@@ -27,11 +27,6 @@ from jaxcal.selection.problem import Problem, Solution
 
 if TYPE_CHECKING:
     from jaxcal.selection.exact.branch_and_bound import BranchResult
-
-__all__ = ["TIME_LIMIT", "relaxed", "solve", "solve_auto", "solve_exact", "upper_bound"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 STARTING_RESTARTS = 30  # of the exchange: the search does the rest
 _SEARCHED = 0.85  # of the time, before the exchange goes on where nothing is proven

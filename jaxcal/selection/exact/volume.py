@@ -11,17 +11,12 @@ import dataclasses
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal import compiled
+from jaxcal.checks import Array, Indices
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection.exact.volume_kernel import descend
 from jaxcal.selection.exchange.exchange import rules_of
-
-__all__ = ["Volumes", "largest_volumes"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 _PREPARED = 100_000_000  # subsets from which a known volume is worth its time
 _STEPS = 5  # towards the D-optimal weights

@@ -15,8 +15,6 @@ import numpy as np
 from cython.cimports.jaxcal.watch import Watch, begin, late
 from cython.cimports.libc.math import INFINITY, M_PI, copysign, cos, fabs, sin, sqrt
 
-__all__ = ["descend"]
-
 # Relative; a node must be able to improve the volume by more.
 _TOLERANCE = cython.declare(cython.double, 5e-11)
 # Half the sides of the polygon, which is at most 1 % too large.

@@ -15,29 +15,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal import compiled
+from jaxcal.checks import Array, Indices
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection.criteria import Criterion
 from jaxcal.selection.problem import Problem, ScenarioProblem, Solution
 
 if TYPE_CHECKING:
     from jaxcal.selection.problem.constraints import Constraints
-
-__all__ = [
-    "Climbs",
-    "default_restarts",
-    "exchange_from",
-    "exchange_indices",
-    "fewest_regular",
-    "greedy_indices",
-    "solve",
-    "solve_greedy",
-]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 # (k + 8) M q^2 p of the default starts of one call, about 10 ms; swaps for a trace or a
 # subset of the parameters cost twice those for D. E, whose local optima differ more,

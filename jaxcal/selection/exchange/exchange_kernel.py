@@ -55,8 +55,6 @@ from cython.cimports.jaxcal.selection.exchange.exchange_kernel import WIDE
 from cython.cimports.jaxcal.watch import begin, late
 from cython.cimports.libc.math import INFINITY, fabs, log
 
-__all__ = ["Climber", "JointClimber"]
-
 _KINDS = {"det": DET, "subset": SUBSET, "trace": TRACE}
 
 _IMPROVES = declare(cython.double, 1e-11)  # by which a swap must raise phi

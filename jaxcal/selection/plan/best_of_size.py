@@ -18,18 +18,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaxcal.checks import Array, Indices
 from jaxcal.information.singular import significant
 from jaxcal.selection.criteria import I
 from jaxcal.selection.exact.exact import relaxed
 from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
 from jaxcal.selection.problem import Problem
-
-__all__ = ["Case", "best_design", "lower_bound", "region_root", "variances_of"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 # Over the region, of the variances of an output; of several the worst counts.
 _MEANS: dict[str, Callable[..., Any]] = {"G": np.max, "I": np.mean}

@@ -22,9 +22,9 @@ import time
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from jaxcal.checks import array_of, levels, one_of, whole_number
+from jaxcal.checks import Array, Indices, array_of, levels, one_of, whole_number
 from jaxcal.information.blocks import largest_rank
 from jaxcal.late import late
 from jaxcal.models.uncertainty import Noise
@@ -48,11 +48,6 @@ from jaxcal.selection.problem import (
 )
 from jaxcal.selection.problem.problem import joined_problem
 from jaxcal.selection.solvers import checked_seed
-
-__all__ = ["Plan", "PlanRow", "plan"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 _SUMMARIES = {"G": "largest", "I": "average", "parameters": "largest"}
 _LARGEST_K = 200  # looked for where max_k is not given

@@ -15,19 +15,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import one_of, whole_number
+from jaxcal.checks import Indices, one_of, whole_number
 from jaxcal.extras import needs
 from jaxcal.learning.runtime import weights
 from jaxcal.selection.problem import Problem, make_problems
-
-__all__ = ["DECODINGS", "choose", "load_policy", "select_batch"]
 
 DECODINGS = ("greedy", "samples", "first", "exchange")
 
 _CELLS = 4_000_000  # pairs of candidates that JAX scores at once: bounds memory alone
 _LARGEST_CALL = 512  # sets
-
-Indices = NDArray[np.int64]
 
 
 class Chooser(Protocol):

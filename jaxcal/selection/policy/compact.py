@@ -12,16 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.checks import Array, Indices, Mask
 from jaxcal.learning.policies.decoding import choose, in_pieces, log_dets
 from jaxcal.selection.policy.policy_kernel import CLOSE, describe
 from jaxcal.selection.problem import Problem
 
-__all__ = ["CompactScorer", "Memory"]
-
-Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _ROWS = 1_024  # candidates of all episodes in a piece of work: they fit a core's cache
 _RULE = 20.0  # multiple of the look-ahead in the rule that ``trust`` weighs

@@ -13,8 +13,6 @@ import numpy as np
 from cython.cimports.jaxcal.watch import Watch, begin, late
 from cython.cimports.libc.math import INFINITY, exp, log, sqrt
 
-__all__ = ["CLOSE", "describe", "look_ahead"]
-
 CLOSE = (32.0, 256.0, 2048.0)  # scales at which near-equal look-aheads differ
 
 # Compiled functions read C variables, which Python does not see.

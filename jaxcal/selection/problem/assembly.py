@@ -10,9 +10,9 @@ import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from jaxcal.checks import axis_names, require_none, whole_number
+from jaxcal.checks import Array, Indices, Mask, axis_names, require_none, whole_number
 from jaxcal.information.blocks import (
     WhiteBlocks,
     largest_rank,
@@ -51,12 +51,6 @@ from jaxcal.selection.problem.problem import Problem, ScenarioProblem, joined_pr
 
 if TYPE_CHECKING:
     from jaxcal.selection.problem.constraints import Constraints
-
-__all__ = ["make_problems", "problem_of"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _LARGEST = 3e7  # numbers of all predictions' problems: 240 MB
 
@@ -296,9 +290,7 @@ def _require_enough(mask: Mask, k: int, cap: int | Indices) -> None:
         )
 
 
-def _checked_required(
-    required: ArrayLike | None, mask: Mask, k: int
-) -> NDArray[np.int64]:
+def _checked_required(required: ArrayLike | None, mask: Mask, k: int) -> Indices:
     """(r,) candidates, at most k, each available and named once."""
     array = np.zeros(0) if required is None else one_array("required", required)
     if not array.size:

@@ -11,18 +11,14 @@ import abc
 import dataclasses
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from jaxcal.checks import array_of, numbers
+from jaxcal.checks import Array, array_of, numbers
 from jaxcal.information.blocks import prior_root
 from jaxcal.models.identifiability import identifiability
 from jaxcal.models.model import Model, derivative
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.problem.candidate_set import CandidateSet
-
-__all__ = ["Blocks", "blocks_of", "shares_regressor"]
-
-Array = NDArray[np.float64]
 
 _FAR = 100.0  # spreads of the candidates, from which they are counted from their middle
 _MOVES = 1e-10  # of the size, below which a command is the same everywhere

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import (
+    Array,
+    Mask,
     array_of,
     numbers,
     require_finite,
@@ -35,20 +37,6 @@ from jaxcal.tables import (
     of_frame,
     table_of_frame,
 )
-
-__all__ = [
-    "CandidateSet",
-    "DesignProtocol",
-    "check_available",
-    "filled",
-    "flatten_rounding",
-    "one_array",
-    "rounding_of",
-    "usable_numbers",
-]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _FILLED = ", none of them 0"
 _ROUNDED = 4.0  # units in the last place that short sums of rounded numbers are off by

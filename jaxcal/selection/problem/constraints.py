@@ -9,12 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.checks import array_of
-
-__all__ = ["Constraints", "checked_constraints"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from jaxcal.checks import Array, Indices, array_of
 
 _SLACK = 1e-9  # of the largest sum: rounding breaks no constraint
 

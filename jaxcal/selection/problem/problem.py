@@ -20,8 +20,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaxcal.checks import Array, Indices, Mask
 from jaxcal.information.blocks import WhiteBlocks, rank_of_blocks
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model
@@ -29,18 +29,6 @@ from jaxcal.selection.criteria import ScenarioCriterion
 
 if TYPE_CHECKING:
     from jaxcal.selection.problem.constraints import Constraints
-
-__all__ = [
-    "Problem",
-    "ScenarioProblem",
-    "Solution",
-    "joined_problem",
-    "log_dets",
-]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _EPS = float(np.finfo(np.float64).eps)
 _IN_PLANE = 1e-7  # of whitened rows of height one above the origin

@@ -5,15 +5,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from jaxcal.checks import array_of, whole_number
+from jaxcal.checks import Array, array_of, whole_number
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Prior
-
-__all__ = ["Scenarios", "checked_weights", "scenarios_of"]
-
-Array = NDArray[np.float64]
 
 _SUM = 1e-6  # by which weights may miss a sum of 1
 
