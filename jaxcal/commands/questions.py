@@ -263,7 +263,7 @@ def plan(
         for row in result.rows
     ]
     if not output.written(header, rows, dataclasses.asdict(result)):
-        print(result.table())
+        print(result)
         print(f"measure rows {', '.join(str(i) for i in result.indices)}")
 
 

@@ -43,10 +43,10 @@ from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, as_model
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.criteria import Criterion, ScenarioCriterion
+from jaxcal.selection.design import Design
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.problem import (
     CandidateSet,
-    DesignProtocol,
     Problem,
     ScenarioProblem,
     blocks_of,
@@ -179,7 +179,7 @@ def optimise(
 
 
 def refine(
-    design: DesignProtocol,
+    design: Design,
     selection: Selection | ArrayLike,
     limits: ArrayLike | None = None,
     *,
@@ -434,16 +434,6 @@ def _among(problem: Problem, available: NDArray[np.bool_]) -> Problem:
     return dataclasses.replace(problem, **rules)
 
 
-def _require_one_noise(noise: Noise) -> None:
-    """Refuse noise of each candidate: other commands have none."""
-    for size, axes in ((noise.std, 1), (noise.covariance, 2)):
-        if size is not None and np.ndim(size) > axes:
-            raise ValueError(
-                "noise must be the same for all commands, got one for each of the "
-                "candidates"
-            )
-
-
 class _Ascent:
     """Blocks of any command, the criterion, and the moves of a search."""
 
@@ -464,7 +454,6 @@ class _Ascent:
         self.low, self.span = box[:, 0], np.ptp(box, axis=1)
         assert offer.candidates is not None and offer.model is not None
         _require_inputs(box, offer.candidates)
-        _require_one_noise(offer.noise or Noise())
         self.asked, self.region = criterion, region
         problem = problem_of(offer, k, criterion, region)
         self.problem, self.objective = problem, problem.criterion

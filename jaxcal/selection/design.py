@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import Array, Indices, one_of, require_known, require_none, seconds
+from jaxcal.checks import Indices, one_of, require_known, require_none, seconds
 from jaxcal.deadline import Deadline
 from jaxcal.late import late
 from jaxcal.models.model import Model
@@ -117,26 +117,6 @@ class Design:
         return cls(blocks=blocks, prior=prior, scenarios=weights, **rules)
 
     @property
-    def candidates(self) -> Array | None:
-        """(M, n) in the caller's unit; None where blocks came without commands."""
-        return self.candidate_set.candidates
-
-    @property
-    def model(self) -> Model | None:
-        """What makes blocks of the candidates; None where they were given."""
-        return self.candidate_set.model
-
-    @property
-    def prior(self) -> Prior | ArrayLike | None:
-        """What was given: of blocks a (p, p) precision."""
-        return self.candidate_set.prior
-
-    @property
-    def noise(self) -> Noise | None:
-        """The noise given, else the model's own."""
-        return self.candidate_set.noise
-
-    @property
     def available(self) -> NDArray[np.bool_]:
         """(M,) True where a candidate may be chosen."""
         return self.candidate_set.available
@@ -147,17 +127,13 @@ class Design:
         return self.candidate_set.scenarios
 
     @property
-    def names(self) -> tuple[str, ...] | None:
-        """(M,) of the candidates, the caller's own."""
-        return self.candidate_set.names
-
-    @property
     def axes(self) -> tuple[str, ...] | None:
         """(n,) of the inputs, the caller's own."""
         return self.candidate_set.axes
 
     def __repr__(self) -> str:
-        what = "blocks" if self.model is None else type(self.model).__name__
+        model = self.candidate_set.model
+        what = "blocks" if model is None else type(model).__name__
         count, usable = len(self.available), int(self.available.sum())
         return (
             f"{type(self).__name__} of {count} candidates, {usable} available, {what}"
@@ -318,7 +294,7 @@ class Design:
             alternatives=_alternatives(problem, solution)
             or (Subset(indices, value, log_det),),
             known_bound=solution.bound,
-            names=self.names,
+            names=self.candidate_set.names,
             axes=self.axes,
         )
 

@@ -12,7 +12,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.checks import Array, Indices, aligned
+from jaxcal.checks import Array, Indices
 from jaxcal.deadline import Deadline
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.problem import Problem, ScenarioProblem
@@ -60,25 +60,8 @@ class ScenarioTable:
             lines.append(f"  nominal's   least {least:.4f}, mean {mean:.4f}")
         return lines
 
-    def table(self) -> str:
-        """A line each scenario."""
-        head = ["scenario", "weight", "value", "optimum", "efficiency"]
-        rows = [
-            [str(s), f"{w:.4g}", f"{v:.6g}", f"{o:.6g}", f"{e:.4f}"]
-            for s, (w, v, o, e) in enumerate(
-                zip(
-                    self.weights, self.values, self.optima, self.efficiencies,
-                    strict=True,
-                )
-            )
-        ]  # fmt: skip
-        if self.nominal_efficiencies is not None:
-            head.append("nominal's own")
-            for row, e in zip(rows, self.nominal_efficiencies, strict=True):
-                row.append(f"{e:.4f}")
-        return "\n".join(aligned([head, *rows]))
-
-    __str__ = table
+    def __str__(self) -> str:
+        return "\n".join(self.summary())
 
 
 def _optimum(problem: Problem, limit: float) -> tuple[Indices, float, bool]:

@@ -225,8 +225,7 @@ def test_bad_requests_name_argument_rule_and_value(rng, change, message):
 
 def test_the_table_and_the_figure_show_every_row(rng):
     found = plan(rng.random((15, 3)), accuracy=0.9, noise_std=1.0, more=2)
-    lines = found.table().splitlines()
-    assert str(found) == found.table()
+    lines = str(found).splitlines()
     assert len(lines) == len(found.rows) + 3
     assert sum(line.endswith("<-") for line in lines) == 1
     axes = plots.plan(Figure().add_subplot(), found)
@@ -247,10 +246,10 @@ def test_a_masked_candidate_may_hold_anything(rng):
 def test_a_plan_keeps_its_own_levels(rng):
     noise, target = np.array([0.1, 0.1, 1.0]), np.array([0.9, 0.9, 0.9])
     found = plan(rng.random((15, 3)), accuracy=target, noise_std=noise)
-    table = found.table()
+    table = str(found)
     noise[:] = 7.0
     target[:] = 7.0
-    assert found.table() == table
+    assert str(found) == table
     with pytest.raises(ValueError, match="read-only"):
         found.noise_std[0] = 2.0
 
@@ -315,7 +314,7 @@ def test_blocks_are_planned_as_by_brute_force(criterion, known):
             truth = best[row.k] * target[worst]
             assert row.least_error[worst] <= truth * (1 + 1e-9)
             assert share.max() <= best[row.k] * 1.02
-    assert "parameter" in found.table() or criterion != "parameters"
+    assert "parameter" in str(found) or criterion != "parameters"
 
 
 def test_blocks_of_affine_rows_are_planned_as_the_candidates(rng):
@@ -417,7 +416,7 @@ def test_any_model_is_planned_as_by_brute_force(make, criterion):
         np.testing.assert_allclose(row.standard_error, truth, rtol=1e-7)
         assert row.least_error.max() <= best[row.k] * (1 + 1e-9)
         assert truth.max() <= best[row.k] * 1.02
-    assert found.names[found.hardest_output] in found.table()
+    assert found.names[found.hardest_output] in str(found)
 
 
 def known_names(model, known):
@@ -436,4 +435,4 @@ def test_the_affine_model_given_is_that_which_is_meant(rng):
     assert one.k == same.k == full.k
     np.testing.assert_array_equal(one.standard_error, same.standard_error)
     np.testing.assert_allclose(one.standard_error, full.standard_error, rtol=1e-6)
-    assert full.noise_std is None and "noise" not in full.table()
+    assert full.noise_std is None and "noise" not in str(full)

@@ -18,11 +18,11 @@ from numpy.typing import ArrayLike
 from jaxcal.checks import Array, Indices, array_of, one_of, seconds, share
 from jaxcal.deadline import Deadline
 from jaxcal.designs.travel.motion import Motion, travel_times
+from jaxcal.selection.design import Design
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.problem import (
     CandidateSet,
-    DesignProtocol,
     problem_of,
 )
 from jaxcal.selection.solvers import checked_seed
@@ -64,7 +64,7 @@ class ParetoFront:
 
 
 def fastest(
-    design: DesignProtocol,
+    design: Design,
     k: int | None,
     motion: Motion,
     *,
@@ -106,7 +106,7 @@ def fastest(
 
 
 def pareto(
-    design: DesignProtocol,
+    design: Design,
     k: int | None,
     motion: Motion,
     *,

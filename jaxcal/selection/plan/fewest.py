@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,7 +40,6 @@ from jaxcal.selection.plan.best_of_size import (
 from jaxcal.selection.problem import (
     Blocks,
     CandidateSet,
-    DesignProtocol,
     Problem,
     blocks_of,
     problem_of,
@@ -48,6 +47,9 @@ from jaxcal.selection.problem import (
 )
 from jaxcal.selection.problem.problem import joined_problem
 from jaxcal.selection.solvers import checked_seed
+
+if TYPE_CHECKING:
+    from jaxcal.selection.design import Design
 
 _SUMMARIES = {"G": "largest", "I": "average", "parameters": "largest"}
 _LARGEST_K = 200  # looked for where max_k is not given
@@ -102,13 +104,10 @@ class Plan:
         share = (errors / self.accuracy).max()
         return float(share * self.accuracy[self.hardest_output])
 
-    def __str__(self) -> str:
-        return self.table()
-
     plot = late("jaxcal.reports.shown:plot_plan")
     _repr_html_ = late("jaxcal.reports.shown:as_html")
 
-    def table(self) -> str:
+    def __str__(self) -> str:
         """K against accuracy, a line each, of the output that is furthest from it."""
         worst = self.hardest_output
         what = f"{self.summary} standard error of a prediction, {self.names[worst]}"
@@ -132,7 +131,7 @@ class Plan:
 
 
 def plan(
-    design: DesignProtocol,
+    design: Design,
     accuracy: ArrayLike,
     noise_std: ArrayLike | None = None,
     criterion: str = "G",

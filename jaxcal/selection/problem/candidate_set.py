@@ -9,7 +9,7 @@ import copy
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -221,12 +221,6 @@ class CandidateSet:
                     changes["measured"] = self.measured[s]
             alone.append(dataclasses.replace(self, **changes))
         return alone
-
-
-class DesignProtocol(Protocol):
-    """A ``jaxcal.Design``, as the questions to it know it."""
-
-    candidate_set: CandidateSet
 
 
 def _available(frame: Any, available: Any) -> Any:
