@@ -18,6 +18,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from decimal import Decimal
 
 import numpy as np
 
@@ -200,19 +201,12 @@ def _printed(values: Array) -> Array:
         shown = np.unique(np.abs(column[column != 0.0]))
         if len(shown) < 2:  # a constant shows nothing
             continue
-        last, digits = [], []
-        for value in shown.tolist():
-            power = f"{value:.16e}".split("e")[1]
-            for count in range(1, 18):
-                if float(f"{value:.{count - 1}e}") == value:
-                    break
-            digits.append(count)
-            last.append(int(power) + 1 - count)
-        most = max(digits)
+        printed = [Decimal(repr(x)).normalize().as_tuple() for x in shown.tolist()]
+        most = max(len(x.digits) for x in printed)
         if most > _DIGITS:
             continue
         top = math.floor(math.log10(shown[-1]))
-        units[q] = 10.0 ** max(top + 1 - most, min(last))
+        units[q] = 10.0 ** max(top + 1 - most, min(int(x.exponent) for x in printed))
     return units
 
 

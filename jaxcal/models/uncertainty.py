@@ -148,29 +148,26 @@ class Noise:
                 "added in the readings' units"
             )
 
+    @property
+    def by_row(self) -> list[str]:
+        """Names of what is given for each of the N measurements by itself."""
+        axes = {"std": 2, "covariance": 3, "command_std": 2}
+        return [name for name, n in axes.items() if np.ndim(getattr(self, name)) == n]
+
     def of(self, rows: NDArray[np.bool_]) -> Noise:
         """The noise of some of the N candidates, ``rows`` (N,) True at each of them."""
-        std, covariance = self.std, self.covariance
-        if std is not None and np.ndim(std) == 2:
-            std = np.asarray(std)[rows]
-        if covariance is not None and np.ndim(covariance) == 3:
-            covariance = np.asarray(covariance)[rows]
-        of_commands = self.command_std
-        if of_commands is not None and np.ndim(of_commands) == 2:
-            of_commands = np.asarray(of_commands)[rows]
-        return Noise(std, covariance, of_commands)
+        values = {name: np.asarray(getattr(self, name)) for name in self.by_row}
+        return dataclasses.replace(self, **{x: values[x][rows] for x in values})
 
     def typical(self, rows: NDArray[np.bool_]) -> Noise:
         """Noise that does not differ by row: in root mean square over ``rows`` (N,)."""
-        std, covariance = self.std, self.covariance
-        if std is not None and np.ndim(std) == 2:
-            std = np.sqrt((np.asarray(std)[rows] ** 2).mean(axis=0))
-        if covariance is not None and np.ndim(covariance) == 3:
-            covariance = np.asarray(covariance)[rows].mean(axis=0)
-        of_commands = self.command_std
-        if of_commands is not None and np.ndim(of_commands) == 2:
-            of_commands = np.sqrt((np.asarray(of_commands)[rows] ** 2).mean(axis=0))
-        return Noise(std, covariance, of_commands)
+        means = {}
+        for name in self.by_row:
+            values = np.asarray(getattr(self, name))[rows]
+            squares = values if name == "covariance" else values**2
+            mean = squares.mean(axis=0)
+            means[name] = mean if name == "covariance" else np.sqrt(mean)
+        return dataclasses.replace(self, **means)
 
     def beside(self, std: float) -> Noise:
         """This noise and, independent of it, one of ``std`` in every reading."""

@@ -78,26 +78,18 @@ def _policy(
 ) -> Solution:
     from jaxcal.selection.policy import choose
 
-    if problem.candidates is None or problem.model is None:
+    taken = {
+        "blocks": problem.candidates is None or problem.model is None,
+        "another model": problem.blocks.shape[1] > 1 or problem.raw[0, 0, -1] != 1.0,
+        "a prior": len(problem.root) > 0,
+        f"criterion {problem.criterion.name}": problem.criterion.name != "D",
+        "max_replicates above 1": np.max(problem.upper) > 1,
+        "constraints": problem.constraints is not None,
+    }
+    for argument in (name for name, other in taken.items() if other):
         raise ValueError(
-            'method "policy" does not take blocks: it is trained on candidates of the '
-            "affine model; use auto, exact or exchange"
-        )
-    affine = problem.blocks.shape[1] == 1 and problem.raw[0, 0, -1] == 1.0
-    if not affine or len(problem.root):
-        raise ValueError(
-            'use method auto, exact or exchange here: "policy" is trained on the '
-            "affine model without prior knowledge"
-        )
-    if problem.criterion.name != "D":
-        raise ValueError(
-            'use method auto, exact or exchange here: "policy" is trained for '
-            f"criterion D, got {problem.criterion.name}"
-        )
-    if problem.constraints is not None or np.max(problem.upper) > 1:
-        raise ValueError(
-            'max_replicates must be 1 with method "policy", which picks different '
-            f"postures and allows no constraints, got {problem.max_replicates}"
+            'use method auto, exact or exchange here: "policy" is trained to choose '
+            f"different candidates of y = A u + b by D alone, got {argument}"
         )
     indices = choose([problem], decoding, num, seed, checkpoint)[0]
     return Solution(np.asarray(indices, dtype=np.int64), seed=seed)

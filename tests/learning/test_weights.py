@@ -107,5 +107,5 @@ def test_a_policy_that_an_earlier_version_trained_by_another_criterion_is_refuse
 
 def test_the_policy_chooses_by_d_alone():
     rows = np.random.default_rng(0).random((12, 3))
-    with pytest.raises(ValueError, match='"policy" is trained for criterion D, got A'):
+    with pytest.raises(ValueError, match=r'"policy" is trained .*got criterion A'):
         jaxcal.select(rows, 4, "policy", criterion="A")

@@ -308,7 +308,8 @@ def _proof(
     if phi is not None:
         better = max if criterion.larger_is_better else min
         bound = better(bound, float(criterion.reported(phi)))
-    unsure, off = problem.uncertainty(indices), _off(problem)
+    unsure = problem.uncertainty(indices)
+    off = float(getattr(problem.model, "resolution", 0.0))  # 0: exact derivatives
     if off > _ROUGH:
         about = "not proven: the model's derivatives are differences"
         reason = f"{about}, off by {off:.1g}"
@@ -322,11 +323,6 @@ def _proof(
             f"change the variances by {unsure:.1g} (relative)"
         )
     return criterion.bettered(bound, unsure), False, reason
-
-
-def _off(problem: Problem) -> float:
-    """Share by which the model's derivatives are off, 0 where they are exact."""
-    return float(getattr(problem.model, "resolution", 0.0))
 
 
 def _groups(problem: Problem, merge: bool) -> tuple[Indices, Indices]:

@@ -153,13 +153,11 @@ class _ModelBlocks(Blocks):
 
     def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
         noise = self._read if readings else self._noise.typical(self._available)
-        for name, axes in (("std", 1), ("covariance", 2), ("command_std", 1)):
-            shape = np.shape(getattr(noise, name))
-            if len(shape) > axes:
-                raise ValueError(
-                    "noise must be the same for all candidates where "
-                    f"{argument} is given, got {name} of shape {shape}"
-                )
+        for name in noise.by_row:
+            raise ValueError(
+                f"noise must be the same for all candidates where {argument} is given, "
+                f"got {name} of shape {np.shape(getattr(noise, name))}"
+            )
         if not readings:
             noise = dataclasses.replace(noise, command_std=None)
         size = self._model.num_inputs
@@ -181,9 +179,7 @@ class _ModelBlocks(Blocks):
     def predicted(self) -> Array | None:
         noise = self._noise
         same = self._read is noise and noise.command_std is None
-        sizes = (noise.std, 2), (noise.covariance, 3)
-        by_row = any(x is not None and np.ndim(x) == axes for x, axes in sizes)
-        return self.used if by_row or not same else None
+        return None if same and not noise.by_row else self.used
 
     def leverage_slopes(self, commands: Array, metric: Array) -> Array | None:
         if self._read.command_std is not None:

@@ -78,11 +78,6 @@ class Problem:
     @property
     def rows(self) -> Array:
         """(M, p) the blocks of a problem with one reading per candidate."""
-        if self.blocks.shape[1] != 1:
-            raise ValueError(
-                "rows exist for one reading per candidate only, but blocks have "
-                f"{self.blocks.shape[1]}"
-            )
         return self.blocks[:, 0]
 
     @property
