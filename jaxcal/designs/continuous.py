@@ -476,14 +476,14 @@ class _Ascent:
         self.weights, self.scale, self.shift = np.ones(1), np.ones(1), np.zeros(1)
         self.each, self.worst = problem.criterion, False
         if isinstance(problem, ScenarioProblem):
-            if problem.joined.of_efficiency:
+            if problem.criterion.of_efficiency:
                 raise ValueError(
                     f"refine does not support criterion {problem.criterion.name}: "
                     "between candidates no scenario's own optimum is proven"
                 )
             self.members, self.weights = problem.members, problem.weights
             self.scale, self.shift = problem.terms()
-            self.each, self.worst = problem.joined.each, problem.joined.least
+            self.each, self.worst = problem.criterion.each, problem.criterion.least
 
     # -- the criterion, of S scenarios; S is 1 where there are none --------------------
 

@@ -36,13 +36,10 @@ __all__ = [
 ]
 
 _HOME = {
-    "Differences": "jaxcal.models.differences",
-    "Direction": "jaxcal.models.identifiability",
     "FromFunction": "jaxcal.models.function",
     "FromJax": "jaxcal.models.from_jax",
     "Linear": "jaxcal.models.linear",
     "Polynomial": "jaxcal.models.linear",
-    "ResolvedPrior": "jaxcal.models.uncertainty",
 }
 
 

@@ -339,7 +339,7 @@ class Design:
 
 def _with_optima(problem: Problem) -> Problem:
     """With the optimum of each scenario, where the criterion compares by these."""
-    if (joint := problem.joint) is None or not joint.joined.of_efficiency:
+    if (joint := problem.joint) is None or not joint.criterion.of_efficiency:
         return problem
     from jaxcal.selection.in_scenarios import optima_of
 

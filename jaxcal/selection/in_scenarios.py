@@ -84,7 +84,7 @@ def in_scenarios(problem: ScenarioProblem, indices: Indices) -> ScenarioTable:
     """A selection (k,) in each scenario."""
     optima, proven = optima_of(problem)
     values = problem.scenario_values(indices[None])[0][:, 0]
-    better = np.maximum if problem.joined.each.larger_is_better else np.minimum
+    better = np.maximum if problem.criterion.each.larger_is_better else np.minimum
     optima = better(optima, values)
     nominal = nominal_efficiencies = None
     if problem.nominal is not None:

@@ -207,7 +207,9 @@ def _branched(
     ]
     judged_by: Scenario | JointScenarios = members[0]
     if (joint := problem.joint) is not None:
-        judged_by = JointScenarios(members, joint.joined, joint.weights, joint.terms())
+        judged_by = JointScenarios(
+            members, joint.criterion, joint.weights, joint.terms()
+        )
     of_counts = problem.constraints
     options["rules"] = None if of_counts is None else of_counts.of(keep)
     return branch_and_bound(judged_by, *rules, **options)

@@ -160,16 +160,16 @@ class Climbs:
         """The climbers of the scenarios, joined."""
         kernel = compiled.kernel("jaxcal.selection.exchange.exchange_kernel")
         members = [_climber(member, seed) for member in problem.members]
-        joint = kernel.JointClimber(members, problem.weights, problem.joined.least)
+        joint = kernel.JointClimber(members, problem.weights, problem.criterion.least)
         scale, shift = problem.terms()
-        if problem.joined.kind == "det":
+        if problem.criterion.kind == "det":
             lengths = [_lengths(member.criterion) for member in problem.members]
             shift = shift - 2.0 * scale * [np.log(row).sum() for row in lengths]
         else:  # values near 1
             whole = [member.criterion.root for member in problem.members]
             size = np.array([(root * root).sum() for root in whole])
             share = problem.available.sum() / problem.k
-            if problem.joined.kind == "least":
+            if problem.criterion.kind == "least":
                 of_traces = 1.0 / scale
                 of_traces = of_traces / (problem.weights @ (of_traces * size) * share)
                 scale = scale / (problem.weights @ scale / share)

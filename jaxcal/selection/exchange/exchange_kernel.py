@@ -547,10 +547,6 @@ class Climber(Choice):
         self.lapack = take(at, 1 + 6 * p + 2 * p * p)
         return room - first
 
-    def wide(self):
-        """Candidates, in whole groups."""
-        return self.groups * WIDE
-
     # --- phi ------------------------------------------------------------------------
 
     def _set_known(self, share, ridge):
@@ -944,14 +940,6 @@ class JointClimber(Choice):
         """Let phi of the scenarios count as ``scale phi + shift``, (S,) both."""
         self.scale = np.array(scale, dtype=np.float64)
         self.shift = np.array(shift, dtype=np.float64)
-
-    def value(self, chosen):
-        """The joined phi of a selection (k,), and (S,) that of each scenario."""
-        for r in range(len(chosen)):
-            self.chosen[r] = chosen[r]
-        self._set_known(0.0, 0.0)
-        value = self._evaluate(self.k, False)
-        return value, np.array(self.phi)
 
     # --- the joined phi -------------------------------------------------------------
 

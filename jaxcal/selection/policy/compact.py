@@ -82,33 +82,17 @@ class CompactScorer:
 
         def piece(part: slice) -> Indices:
             draws = range(len(problems))[part] if decoding == "samples" else ()
-            streams = [np.random.default_rng((seed, b)) for b in draws]
-            return self._choose(problems[part], decoding, num, streams)
+            rows, available, required = (
+                np.stack([getattr(problem, name) for problem in problems[part]])
+                for name in ("rows", "available", "required")
+            )
+            return choose(
+                self, rows, available, required, problems[0].k,
+                decoding=decoding, num=num,
+                generators=[np.random.default_rng((seed, b)) for b in draws],
+            )  # fmt: skip
 
         return in_pieces(piece, len(problems), size)
-
-    def _choose(
-        self,
-        problems: Sequence[Problem],
-        decoding: str,
-        num: int,
-        generators: Sequence[np.random.Generator],
-    ) -> Indices:
-        """(B, k) indices; one generator a problem for "samples", else none."""
-        rows, available, required = (
-            np.stack([getattr(problem, name) for problem in problems])
-            for name in ("rows", "available", "required")
-        )
-        return choose(
-            self,
-            rows,
-            available,
-            required,
-            problems[0].k,
-            decoding=decoding,
-            num=num,
-            generators=generators,
-        )
 
     def encode(self, rows: Array, usable: Mask) -> Memory:
         """The sets as the network sees them; 0 where not usable."""

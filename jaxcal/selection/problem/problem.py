@@ -200,12 +200,6 @@ class ScenarioProblem(Problem):
     def joint(self) -> Self:
         return self
 
-    @property
-    def joined(self) -> ScenarioCriterion:
-        """The criterion."""
-        joined: ScenarioCriterion = self.criterion
-        return joined
-
     def of_size(self, k: int) -> Self:
         """This problem with k candidates to choose."""
         members = tuple(member.of_size(k) for member in self.members)
@@ -229,7 +223,7 @@ class ScenarioProblem(Problem):
         """(R,) joined value, as reported, and mean log det S of subsets (R, k)."""
         of_members, log_dets = self.scenario_values(indices)
         regular = np.isfinite(log_dets).all(axis=0)
-        joined = self.joined
+        joined: ScenarioCriterion = self.criterion
         if joined.of_efficiency:
             assert self.optima is not None
             one, best = joined.each, self.optima
@@ -250,7 +244,8 @@ class ScenarioProblem(Problem):
     def terms(self) -> tuple[Array, Array]:
         """(S,) scale and shift of ``ScenarioCriterion.terms``."""
         criteria = [member.criterion for member in self.members]
-        return self.joined.terms(criteria, self.optima)
+        of_criteria: tuple[Array, Array] = self.criterion.terms(criteria, self.optima)
+        return of_criteria
 
 
 def joined_problem(
