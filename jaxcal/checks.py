@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import operator
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -159,17 +158,12 @@ def axis_names(
     argument: str, names: Sequence[str] | None, letter: str, count: int
 ) -> tuple[str, ...]:
     if names is None:
-        return _axis_names(letter, count)
+        return tuple(f"{letter}_{axis_letter(i, count)}" for i in range(count))
     given = () if isinstance(names, str) else tuple(names)
     texts = all(isinstance(name, str) and name for name in given)
     if len(given) != count or not texts or len(set(given)) < count:
         raise ValueError(f"{argument} must hold {count} different names, got {names!r}")
     return given
-
-
-@functools.lru_cache
-def _axis_names(letter: str, count: int) -> tuple[str, ...]:
-    return tuple(f"{letter}_{axis_letter(i, count)}" for i in range(count))
 
 
 def one_of(argument: str, value: Any, choices: Sequence[str]) -> str:

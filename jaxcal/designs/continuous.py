@@ -909,7 +909,8 @@ class _Ascent:
                     metric = self.gradient(information)
             off = float((metric * (self.prior - information)).sum())
             if certain:
-                peaks, differ = self._corners(), 0.0
+                peaks = np.array(np.meshgrid(*self.box)).reshape(len(self.box), -1).T
+                differ = 0.0
                 heights = self.leverage(self.blocks(peaks), metric)
             else:
                 peaks, heights, differ = self._peaks(metric)
@@ -976,10 +977,6 @@ class _Ascent:
                 0
             ].ravel()
         return of(x)[2]
-
-    def _corners(self) -> Array:
-        """(2^n, n) of the limits."""
-        return np.array(np.meshgrid(*self.box)).reshape(len(self.box), -1).T
 
     def _new_support(self, peaks: Array, heights: Array, support: Array) -> Array:
         """The highest peaks that are not in the support of a weighted design yet."""

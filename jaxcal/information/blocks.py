@@ -16,7 +16,6 @@ that the other rows keep their digits.
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -247,7 +246,7 @@ def rank_of_blocks(
         blocks = np.broadcast_to(root, (len(blocks), 1, *root.shape))
         root = root[:0]
     kernel = compiled.kernel("jaxcal.information.rank_kernel")
-    beside = _nothing(blocks.shape[3]) if size is None else size
+    beside = np.zeros(blocks.shape[3]) if size is None else size
     share = 0.0 if size is None else SINGULAR
     log_det, clear = kernel.clear_log_dets(blocks, root, beside, SMALL, share, SURE)
     ranks = [blocks.shape[3]] * len(blocks)
@@ -261,11 +260,6 @@ def rank_of_blocks(
         if scale is not None:
             log_det[n] += 2.0 * np.log(scale).sum()
     return ranks, log_det
-
-
-@functools.cache
-def _nothing(size: int) -> Array:
-    return np.zeros(size)
 
 
 def largest_rank(blocks: Array) -> int:

@@ -303,8 +303,8 @@ class FromFunction(Model):
     def _by_commands(self, rows: Array, theta: Array) -> Array:
         steps = self._steps_for("commands", rows, theta)
         points = []
-        for i, offsets in enumerate(self._offsets(steps)):
-            for offset in offsets:
+        for i, (side, step) in enumerate(zip(steps.sides, steps.steps, strict=True)):
+            for offset in STENCILS[side].offsets * step:
                 moved = rows.copy()
                 moved[:, i] += offset
                 points.append(moved)
@@ -318,11 +318,6 @@ class FromFunction(Model):
         """(p, N) places in ``SIDES``."""
         places = [SIDES.index(side) for side in steps.sides]
         return np.repeat(np.array(places, np.int8)[:, None], len(rows), axis=1)
-
-    @staticmethod
-    def _offsets(steps: Differences) -> list[Array]:
-        pairs = zip(steps.sides, steps.steps, strict=True)
-        return [STENCILS[side].offsets * step for side, step in pairs]
 
     def _slopes(
         self,
@@ -425,18 +420,16 @@ class _Memory:
         self, what: str, theta: Array, rows: Array, make: Callable[[Array], Array]
     ) -> Array:
         """Results (N, ...) at rows, those made that are not known."""
-        key = what, theta.tobytes()
-        if len(rows) > _LONG:  # as a whole
-            key = key[0], key[1] + rows.tobytes()
-            results = self._sets.pop(key, None) or {b"": make(rows)}
-            self._sets[key] = results
-            while len(self._sets) > 3 * _SETS:
-                del self._sets[next(iter(self._sets))]
-            return results[b""]
+        whole = len(rows) > _LONG
+        key = what, theta.tobytes() + (rows.tobytes() if whole else b"")
         results = self._sets.pop(key, {})
         self._sets[key] = results  # the newest
         while len(self._sets) > 3 * _SETS:
             del self._sets[next(iter(self._sets))]
+        if whole:
+            if not results:
+                results[b""] = make(rows)
+            return results[b""]
         labels = [row.tobytes() for row in rows]
         new = list(dict.fromkeys(x for x in labels if x not in results))
         if new:

@@ -287,10 +287,6 @@ def in_rows(rows: Sequence[int]) -> str:
     return f"row{'s' * (len(rows) > 1)} {named}{more}"
 
 
-def _outliers(fit: Fit) -> Reason | None:
-    return None if wrong_noise(fit) else outlying(fit, [*fit.outliers])
-
-
 def not_invertible(fit: Fit) -> Reason | None:
     """A fit whose inverse ``command_for`` refuses, whatever is desired."""
     why = fit.no_inverse()
@@ -324,5 +320,5 @@ RULES: tuple[Rule, ...] = (
     _unknown,
     _on_its_way,
     wrong_noise,
-    _outliers,
+    lambda fit: None if wrong_noise(fit) else outlying(fit, [*fit.outliers]),
 )

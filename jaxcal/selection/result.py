@@ -126,7 +126,7 @@ class Selection:
         """Plain numbers, text and lists, as a JSON file takes them."""
         candidates = self.problem.candidates
         chosen = None if candidates is None else candidates[self.indices].tolist()
-        return {
+        content = {
             "indices": self.indices.tolist(),
             "labels": list(self.labels),
             "candidates": chosen,
@@ -141,20 +141,13 @@ class Selection:
             "reason": self.reason,
             "seconds": self.seconds,
             "seed": self.seed,
-            **self._of_scenarios(),
         }
-
-    def _of_scenarios(self) -> dict[str, Any]:
-        """What ``to_dict`` holds of the scenarios."""
-        if self.in_scenarios is None:
-            return {}
-        fields = vars(self.in_scenarios).items()
-        return {
-            "in_scenarios": {
+        if self.in_scenarios is not None:
+            content["in_scenarios"] = {
                 name: None if value is None else value.tolist()
-                for name, value in fields
+                for name, value in vars(self.in_scenarios).items()
             }
-        }
+        return content
 
     @property
     def _noun(self) -> str:

@@ -270,7 +270,7 @@ def test_what_only_one_method_can_do_is_refused_by_the_others():
     ]:
         with pytest.raises(ValueError, match=f"{next(iter(option))} is not an option"):
             select(uniform(0), 4, method, **option)
-    with pytest.raises(ValueError, match="max_replicates must be 1 with method"):
+    with pytest.raises(ValueError, match="got max_replicates above 1"):
         select(uniform(0), 4, "policy", max_replicates=2)
 
 

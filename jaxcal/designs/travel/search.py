@@ -248,7 +248,9 @@ class _TourSearch:
             for _ in range(_STARTS - 1)
         ]
         best, least = None, np.inf
-        for start in map(self._positions, starts):
+        place = np.argsort(self.pool)  # of the candidates, in the pool
+        for indices in starts:
+            start = place[np.searchsorted(self.pool, indices, sorter=place)]
             if self._log_det(start) >= wanted:
                 chosen, travel = self._shortened(start, wanted)
                 if travel < least - SAME_TIME:
@@ -320,11 +322,6 @@ class _TourSearch:
             (float(travel[i]), np.append(kept, others[i]))
             for i in best[np.isfinite(travel[best])]
         ]
-
-    def _positions(self, indices: Indices) -> Indices:
-        """Candidates as positions in the pool."""
-        place = np.argsort(self.pool)
-        return place[np.searchsorted(self.pool, indices, sorter=place)]
 
     def _information(self, chosen: Indices) -> Array:
         """(p, p) whitened information of postures of the pool, with the prior."""

@@ -91,7 +91,9 @@ class JointScenarios(NamedTuple):
             scale, shift, largest = scale / unit, shift / unit, largest / unit
         useful = min(largest, _USEFUL.get(criterion.kind, np.inf))
         k = start.sum()
-        packs = _packs(len(scenarios), scenarios[0].blocks)
+        # Is there room to keep what every candidate adds to the information?
+        count, _, p = scenarios[0].blocks.shape
+        packs = len(scenarios) * count * p * (p + 1) * 4 <= _MEMORY
         members = [
             kernel.Search(
                 scenario.criterion.form, scenario.blocks, scenario.prior, root, k,
@@ -202,12 +204,6 @@ def _price(search: Any, rules: Constraints, begun: Array, deadline: Deadline) ->
         prices = 0.5 * (optimum.x[:-1] + cheapest)
     bound(cheapest)
     return counts
-
-
-def _packs(num_scenarios: int, blocks: Array) -> bool:
-    """Whether there is room to keep what every candidate adds to the information."""
-    count, _, p = blocks.shape
-    return num_scenarios * count * p * (p + 1) * 4 <= _MEMORY
 
 
 def _incumbents(best: int, num_blocks: int) -> tuple[Array, Array, Indices]:

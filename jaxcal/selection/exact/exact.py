@@ -129,7 +129,10 @@ def solve_exact(
         cheap = math.comb(len(pool), free) <= _CHEAP
         if best == 1 or cheap:
             if enough and not cheap:
-                relaxation = _by_relaxation(problem, best, deadline, restarts, seed)
+                part = deadline.part(0.5)
+                begun = np.sort(exchange_indices(problem, restarts, seed, part))
+                least = relaxed(problem, begun, deadline)
+                relaxation = _solution_of(problem, [begun], best, least, 1)
                 value, bound = relaxation.value, relaxation.bound
                 assert value is not None and bound is not None
                 if problem.criterion.efficiency(value, bound) >= enough:
@@ -156,15 +159,6 @@ def solve_exact(
             subsets.append(other)
     bound = None if searched.proven else searched.bound
     return _solution_of(problem, subsets, best, bound, searched.nodes)
-
-
-def _by_relaxation(
-    problem: Problem, best: int, deadline: Deadline, restarts: int, seed: int
-) -> Solution:
-    """The exchange's selection, with the bound of the relaxation at the root."""
-    start = np.sort(exchange_indices(problem, restarts, seed, deadline.part(0.5)))
-    bound = relaxed(problem, start, deadline)
-    return _solution_of(problem, [start], best, bound, 1)
 
 
 def upper_bound(problem: Problem) -> float:

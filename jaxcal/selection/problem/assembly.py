@@ -102,7 +102,9 @@ def _problem_of_one(
     raw, root = blocks.of_candidates(), blocks.root
     if offer.measured is not None:
         measured = blocks.at("measured", offer.measured, readings=True)
-        root = _with_measured(root, measured)
+        root = np.concatenate([root, measured.reshape(-1, root.shape[1])])
+        if len(root) > root.shape[1]:  # as much in fewer rows
+            root = np.linalg.qr(root)[1]
     blocks.require_identified(offer.measured)
     where = criterion.region
     if where is None and criterion.of_region:
@@ -135,12 +137,6 @@ def _of_largest(problems: list[Problem]) -> Problem:
     fields["criterion"] = Largest().within(members[0].criterion)
     weights = np.full(len(members), 1.0 / len(members))
     return ScenarioProblem(**fields, members=tuple(members), weights=weights)
-
-
-def _with_measured(root: Array, blocks: Array) -> Array:
-    """Root of a precision with the information of blocks (N, q, p) added."""
-    rows = np.concatenate([root, blocks.reshape(-1, root.shape[1])])
-    return np.linalg.qr(rows)[1] if len(rows) > root.shape[1] else rows
 
 
 def make_problems(
