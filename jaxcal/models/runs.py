@@ -23,7 +23,8 @@ from jaxcal.checks import Array, in_words
 from jaxcal.progress import Progress
 
 Job = tuple[Array, Array]  # commands (N, n) and parameters (p,)
-Answer = Array | str  # readings (q,), or why there are none
+# Readings (S, q) of the commands that have some, and why the others have none, by row.
+Answer = tuple[Array, dict[int, str]]
 
 _TASKS_EACH = 4  # pieces of work for each process, so that none waits long
 _TASKS = 256  # of an executor, whose size is not known
@@ -112,49 +113,52 @@ class Runs:
 
     def __call__(self, jobs: Sequence[Job]) -> tuple[list[Array], list[dict[int, str]]]:
         """Readings (N, q) of each job, NaN where a run failed, and why by row."""
-        if self.batch and self.processes == 1:
-            whole = [self._whole(*job) for job in jobs]
-            if all(values is not None for values in whole):
-                return [values for values in whole if values is not None], [{}] * len(
-                    jobs
-                )
-        answers: list[list[Answer | None]] = [[None] * len(rows) for rows, _ in jobs]
-        pieces = self._pieces(jobs)
-        total, done = sum(len(rows) for _, rows in pieces), 0
+        parts: list[tuple[int, slice, Array | None]] = []
+        reasons: list[dict[int, str]] = [{} for _ in jobs]
+        total, done = sum(len(rows) for rows, _ in jobs), 0
         self._progress("runs of f", 0, total)
         try:
-            for (j, rows), of_piece in self._answered(jobs, pieces):
-                for i, answer in zip(rows, of_piece, strict=True):
-                    answers[j][i] = self._checked(answer, jobs[j][0][i])
-                done += len(rows)
+            for (j, rows), answer in self._answered(jobs, self._pieces(jobs)):
+                parts.append((j, rows, self._checked(answer, jobs[j][0][rows])))
+                reasons[j] |= {rows.start + i: why for i, why in answer[1].items()}
+                done += rows.stop - rows.start
                 self._progress("runs of f", done, total)
         finally:
             self._progress.clear()
-        q = self.num_outputs
-        if q is None:
-            reasons = [x for a in answers for x in a if isinstance(x, str)]
+        if self.num_outputs is None:
+            count, first = sum(map(len, reasons)), in_words(jobs[0][0][0])
             raise ValueError(
-                f"f fails for all {len(reasons)} commands; for "
-                f"{in_words(jobs[0][0][0])}: {reasons[0]}"
+                f"f fails for all {count} commands; for {first}: {reasons[0][0]}"
             )
-        return self._arrays(answers, q)
+        tables = [np.full((len(rows), self.num_outputs), np.nan) for rows, _ in jobs]
+        for j, rows, readings in parts:
+            if readings is not None:
+                tables[j][rows] = readings
+        return tables, reasons
 
-    def _whole(self, commands: Array, parameters: Array) -> Array | None:
-        """(N, q) of a batch whose readings are as before, or the first; None: it is
-        taken apart."""
-        try:
-            with np.errstate(all="ignore"):
-                values = np.asarray(self.f(commands.copy(), parameters.copy()))
-        except Exception:
+    def _checked(self, answer: Answer, commands: Array) -> Array | None:
+        """(N, q), NaN where there is a reason; None of failures alone.
+
+        What is not finite becomes a failure of the answer.
+        """
+        values, why = answer
+        if not len(values):
             return None
-        q = values.shape[-1] if values.ndim == 2 else 0
-        if values.shape != (len(commands), self.num_outputs or q) or not q:
-            return None
-        values = values.astype(np.float64)
-        if not np.isfinite(values).all():
-            return None
-        self.num_outputs = q
-        return values
+        if self.num_outputs is None:
+            self.num_outputs = values.shape[1]
+        if why:
+            table = np.full((len(commands), values.shape[1]), np.nan)
+            table[[i for i in range(len(commands)) if i not in why]] = values
+            values = table
+        if values.shape[1] != self.num_outputs:
+            row = next(i for i in range(len(commands)) if i not in why)
+            raise ValueError(_of_shape(self.num_outputs, values[row], commands[row]))
+        bad = ~np.isfinite(values)
+        if not bad.any():
+            return values
+        for i, k in np.argwhere(bad).tolist():  # the first of each row
+            why.setdefault(i, f"reading {k + 1} is {values[i, k]}")
+        return np.where(bad.any(axis=1, keepdims=True), np.nan, values)
 
     def close(self) -> None:
         """End the processes, but for those of the caller's executor."""
@@ -162,46 +166,29 @@ class Runs:
             self._pool.shutdown(cancel_futures=True)
             self._pool = None
 
-    def _arrays(
-        self, answers: list[list[Answer | None]], q: int
-    ) -> tuple[list[Array], list[dict[int, str]]]:
-        values, reasons = [], []
-        for of_job in answers:
-            table = np.full((len(of_job), q), np.nan)
-            why = {}
-            for i, answer in enumerate(of_job):
-                if isinstance(answer, np.ndarray):
-                    table[i] = answer
-                else:
-                    why[i] = str(answer)
-            values.append(table)
-            reasons.append(why)
-        return values, reasons
-
-    def _pieces(self, jobs: Sequence[Job]) -> list[tuple[int, list[int]]]:
+    def _pieces(self, jobs: Sequence[Job]) -> list[tuple[int, slice]]:
         """Job and rows of each piece of work."""
         total = sum(len(rows) for rows, _ in jobs)
         size = max(1, -(-total // self._num_tasks))
         if self.processes == 1:
             size = max(total, 1) if self.batch else 1
         return [
-            (j, [*range(first, min(first + size, len(rows)))])
+            (j, slice(first, min(first + size, len(rows))))
             for j, (rows, _) in enumerate(jobs)
             for first in range(0, len(rows), size)
         ]
 
     def _answered(
-        self, jobs: Sequence[Job], pieces: list[tuple[int, list[int]]]
-    ) -> Iterator[tuple[tuple[int, list[int]], list[Answer]]]:
+        self, jobs: Sequence[Job], pieces: list[tuple[int, slice]]
+    ) -> Iterator[tuple[tuple[int, slice], Answer]]:
         if self.processes == 1:
             for j, rows in pieces:
                 commands, parameters = jobs[j]
                 yield (j, rows), _answer(self.f, self.batch, commands[rows], parameters)
             return
         try:
-            broken: list[tuple[int, list[int]]] = []
-            futures: dict[Any, tuple[int, list[int]]] = {}
-            answers: list[Answer]
+            broken: list[tuple[int, slice]] = []
+            futures: dict[Any, tuple[int, slice]] = {}
             for j, rows in pieces:
                 try:
                     future = self._submit(jobs[j][0][rows], jobs[j][1])
@@ -211,28 +198,27 @@ class Runs:
                     futures[future] = (j, rows)
             for future in concurrent.futures.as_completed(futures):
                 try:
-                    answers = future.result()
+                    answer: Answer = future.result()
                 except Exception as error:
                     if not _process_ended(error):
                         raise
                     broken.append(futures[future])
                 else:
-                    yield futures[future], answers
+                    yield futures[future], answer
             # A run that ends its process takes those beside it along: one by one. What
             # is held of the first try a cluster would give as the answer again.
             futures, future = {}, None
-            for j, rows in broken:
-                answers = []
-                for i in rows:
-                    self.close()
-                    try:
-                        answers += self._submit(jobs[j][0][[i]], jobs[j][1]).result()
-                    except Exception as error:
-                        if not _process_ended(error):
-                            raise
-                        answers.append("its process ended")
+            alone = [(j, i) for j, rows in broken for i in range(rows.start, rows.stop)]
+            for j, i in alone:
                 self.close()
-                yield (j, rows), answers
+                try:
+                    answer = self._submit(jobs[j][0][[i]], jobs[j][1]).result()
+                except Exception as error:
+                    if not _process_ended(error):
+                        raise
+                    answer = np.zeros((0, 0)), {0: "its process ended"}
+                self.close()
+                yield (j, slice(i, i + 1)), answer
         except BaseException:
             self.close()
             raise
@@ -254,23 +240,6 @@ class Runs:
                 ) from None
         return self._pool.submit(_answer, self.f, self.batch, commands, parameters)
 
-    def _checked(self, answer: Answer, command: Array) -> Answer:
-        """The answer, of the shape of the first; what is not finite is a failure."""
-        if isinstance(answer, str):
-            return answer
-        if self.num_outputs is None:
-            self.num_outputs = len(answer)
-        if len(answer) != self.num_outputs:
-            raise ValueError(
-                f"f must return ({self.num_outputs},) for every command, got "
-                f"({len(answer)},) for {in_words(command)}"
-            )
-        finite = np.isfinite(answer)
-        if finite.all():
-            return answer
-        bad = int(finite.argmin())
-        return f"reading {bad + 1} is {answer[bad]}"
-
 
 def _process_ended(error: Exception) -> bool:
     """Whether a run ended its process; ``KilledWorker`` is what dask calls it."""
@@ -279,8 +248,8 @@ def _process_ended(error: Exception) -> bool:
 
 def _answer(
     f: Callable[..., Any], batch: bool, commands: Array, parameters: Array
-) -> list[Answer]:
-    """The readings of each command, or why it has none."""
+) -> Answer:
+    """The readings of each command that has them, and why the others have none."""
     if batch and len(commands) > 1:
         try:
             with np.errstate(all="ignore"):
@@ -288,19 +257,29 @@ def _answer(
         except Exception:  # of which command, each by itself will say
             result = None
         if result is not None:
-            return [*_readings(result, len(commands))]
-    answers: list[Answer] = []
-    for command in commands:
+            return _readings(result, len(commands)), {}
+    rows: list[Array] = []
+    why: dict[int, str] = {}
+    for i, command in enumerate(commands):
         argument = command[None] if batch else command
         try:
             with np.errstate(all="ignore"):
                 result = f(argument.copy(), parameters.copy())
         except Exception as error:
             name = "" if isinstance(error, _RunError) else f"{type(error).__name__}: "
-            answers.append(f"{name}{error}".splitlines()[0])
+            why[i] = f"{name}{error}".splitlines()[0]
             continue
-        answers.append(_readings(result, 1 if batch else 0)[0])
-    return answers
+        rows.append(_readings(result, 1 if batch else 0)[0])
+        if len(rows[-1]) != len(rows[0]):
+            raise ValueError(_of_shape(len(rows[0]), rows[-1], command))
+    return np.array(rows), why
+
+
+def _of_shape(num_outputs: int, readings: Array, command: Array) -> str:
+    return (
+        f"f must return ({num_outputs},) for every command, got "
+        f"({len(readings)},) for {in_words(command)}"
+    )
 
 
 def _readings(result: Any, rows: int) -> Array:
