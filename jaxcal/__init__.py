@@ -53,27 +53,15 @@ _PACKAGE = pathlib.Path(__file__).parent
 if (_PACKAGE.parent / "pyproject.toml").exists():
     compiled.check(_PACKAGE)
 
-_HOME = {
-    "Calibration": "jaxcal.calibration",
-    "CalibrationWarning": "jaxcal.calibration",
-    "identify": "jaxcal.calibration",
-    "Noise": "jaxcal.models",
-    "Prior": "jaxcal.models",
-    "identifiability": "jaxcal.models",
-    "As": "jaxcal.selection",
-    "Design": "jaxcal.selection",
-    "Ds": "jaxcal.selection",
-    "I": "jaxcal.selection",
-    "Mean": "jaxcal.selection",
-    "Motion": "jaxcal.designs",
-    "Selection": "jaxcal.selection",
-    "Worst": "jaxcal.selection",
-    "optimise": "jaxcal.designs",
-    "read_table": "jaxcal.tables",
-    "select": "jaxcal.selection",
+_HOME = {  # the others are in jaxcal.information.regression
+    "jaxcal.calibration": ("Calibration", "CalibrationWarning", "identify"),
+    "jaxcal.designs": ("Motion", "optimise"),
+    "jaxcal.models": ("Noise", "Prior", "identifiability"),
+    "jaxcal.selection": (
+        *("As", "Design", "Ds", "I", "Mean", "Selection", "Worst", "select"),
+    ),
+    "jaxcal.tables": ("read_table",),
 }
-
-
 _ROOMS = (
     *("adaptive", "arms", "calibration", "candidates", "designs", "learning", "models"),
     *("reports", "selection", "tables"),
@@ -85,10 +73,9 @@ def __getattr__(name: str) -> Any:
         return importlib.import_module(f"jaxcal.{name}")
     if name not in __all__:
         raise AttributeError(f"module 'jaxcal' has no attribute {name!r}")
-    value = getattr(
-        importlib.import_module(_HOME.get(name, "jaxcal.information.regression")), name
-    )
-    globals()[name] = value
+    homes = (home for home, names in _HOME.items() if name in names)
+    home = next(homes, "jaxcal.information.regression")
+    globals()[name] = value = getattr(importlib.import_module(home), name)
     return value
 
 

@@ -47,19 +47,10 @@ class Identifiability:
             f"{self.rank} of {len(self.names)} parameters can be identified from "
             f"{self.num_candidates} candidates (condition {self.condition:.3g})."
         ]
-        alone = [
-            direction.words
-            for direction in self.directions
-            if len(direction.names) == 1
-        ]
-        tied = [
-            direction.words for direction in self.directions if len(direction.names) > 1
-        ]
+        alone = [one.words for one in self.directions if len(one.names) == 1]
+        tied = [f"  {one.words}" for one in self.directions if len(one.names) > 1]
         if tied:
-            lines += [
-                "Only in combination:",
-                *(f"  {words}" for words in tied),
-            ]
+            lines += ["Only in combination:", *tied]
         if alone:
             lines.append(f"No effect on the readings: {', '.join(alone)}")
         if self.identifiable:

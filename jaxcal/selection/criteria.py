@@ -324,6 +324,7 @@ class ScenarioCriterion:
     least: ClassVar[bool]  # the worst scenario counts
     of_efficiency: bool = False
     each: Criterion  # of the first scenario
+    kind: str  # of that
 
     def __init__(self, criterion: Any = None) -> None:
         if isinstance(criterion, ScenarioCriterion):
@@ -340,7 +341,7 @@ class ScenarioCriterion:
     def within(self, each: Criterion) -> Self:
         """The criterion of a problem whose first scenario has ``each``."""
         joined = copy.copy(self)
-        joined.each = each
+        joined.each, joined.kind = each, each.kind
         return joined
 
     @property
@@ -352,11 +353,6 @@ class ScenarioCriterion:
     def says(self) -> str:
         """What a table prints before the value."""
         return f"{self.each.says}, {self.word}"
-
-    @property
-    def kind(self) -> str:
-        """The kind of the criterion of each scenario."""
-        return self.each.kind
 
     @property
     def larger_is_better(self) -> bool:

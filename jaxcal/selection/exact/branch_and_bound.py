@@ -37,6 +37,7 @@ class BranchResult:
     """The best selections within the counts, and how far they can be from optimal."""
 
     counts: Indices  # (found, M), best first
+    values: Array  # (found,) phi
     bound: float  # on phi of every selection that is not listed, or of the best
     nodes: int
     proven: bool
@@ -260,6 +261,7 @@ def _searched(
     reached = np.isfinite(best_values)
     return BranchResult(
         best_counts[order[reached]].astype(np.int64),
+        scale * best_values[reached] + shift,
         float(scale * (bound if size else best_values[0]) + shift),
         done,
         size == 0,

@@ -107,12 +107,14 @@ cdef class Search:
     cdef void _two_sided(self, int size) noexcept nogil
     cdef double _solve(self, int m, int size) noexcept nogil
     cdef void _quadratic_step(self, int m) noexcept nogil
+    cdef void _gather(self, const double* low, const double* c) noexcept nogil
     cdef double _at(self, int kind, const double* low, const double* c) noexcept nogil
     cdef void _spread(self, const double* low, const double* high, double* c) noexcept nogil
     cdef double _relax(self, int kind, double* low, double* high, double* c, double goal, double share) except? -1.0 nogil
     cdef double _begin(self, int kind, const double* low, const double* high, double* c) noexcept nogil
     cdef double _step(self, int kind, const double* low, const double* high, double* c, double value) noexcept nogil
     cdef double _worth(self, const double* counts) noexcept nogil
+    cdef void _gather_whole(self, const double* counts) noexcept nogil
     cdef void _offer(self, const double* counts) noexcept nogil
     cdef bint _balance(self, const double* low, const double* high, double* c) noexcept nogil
     cdef void _stiffen(self, const double* c) noexcept nogil
@@ -133,8 +135,8 @@ cdef class JointSearch(Search):
     cdef double[::1] worth  # scale phi + shift
     cdef double[::1] bases  # what the bounds of the scenarios add up from
     cdef int _kind_of(self, const double* low) noexcept nogil
-    cdef double _at(self, int kind, const double* low, const double* c) noexcept nogil
-    cdef double _worth(self, const double* counts) noexcept nogil
+    cdef void _gather(self, const double* low, const double* c) noexcept nogil
+    cdef void _gather_whole(self, const double* counts) noexcept nogil
     cdef double _evaluate(self, int kind) noexcept nogil
     cdef void _leverages(self) noexcept nogil
     cdef void _hessian(self, int kind, int m) noexcept nogil

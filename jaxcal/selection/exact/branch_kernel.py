@@ -801,11 +801,14 @@ class Search:
             if size == 0:
                 self.side[other] = 0
 
-    def _at(self, kind, low, c):
-        """N and M of the counts, P being there, and the value."""
+    def _gather(self, low, c):
+        """N and M of the counts, P being there."""
         self._sum(low, c, cython.NULL, self.rest)
         for a in range(self.p * self.p):
             self.gram[a] = self.known[a] + self.rest[a]
+
+    def _at(self, kind, low, c):
+        self._gather(low, c)
         return self._evaluate(kind)
 
     def _spread(self, low, high, c):
@@ -921,9 +924,14 @@ class Search:
 
     def _worth(self, counts):
         """phi of a selection; -inf where it is singular."""
-        self._sum(cython.NULL, counts, self.prior, self.gram)
+        self._gather_whole(counts)
         self.smoothing = INFINITY  # E itself
         return self._evaluate(self.kind)
+
+    def _gather_whole(self, counts):
+        """M of a selection, to be judged by the criterion itself."""
+        self.now = self.kind
+        self._sum(cython.NULL, counts, self.prior, self.gram)
 
     def _offer(self, counts):
         """Insert a selection into the sorted list of the best, once."""
@@ -1213,32 +1221,13 @@ class JointSearch(Search):
                 smoothed = True
         return _SMOOTHED if smoothed else _JOINT
 
-    def _at(self, kind, low, c):
-        size = self.p * self.p
+    def _gather(self, low, c):
         for s in range(self.addresses.shape[0]):
-            cast(Search, self.members[s])._sum(
-                low, c, cython.NULL, cast(Search, self.members[s]).rest
-            )
-            gram, fixed, rest = (
-                cast(Search, self.members[s]).gram,
-                cast(Search, self.members[s]).known,
-                cast(Search, self.members[s]).rest,
-            )
-            for a in range(size):
-                gram[a] = fixed[a] + rest[a]
-        return self._evaluate(kind)
+            cast(Search, self.members[s])._gather(low, c)
 
-    def _worth(self, counts):
-        self.smoothing = INFINITY
+    def _gather_whole(self, counts):
         for s in range(self.addresses.shape[0]):
-            cast(Search, self.members[s]).now = cast(Search, self.members[s]).kind
-            cast(Search, self.members[s])._sum(
-                cython.NULL,
-                counts,
-                cast(Search, self.members[s]).prior,
-                cast(Search, self.members[s]).gram,
-            )
-        return self._evaluate(_JOINT)
+            cast(Search, self.members[s])._gather_whole(counts)
 
     def _evaluate(self, kind):
         """The joined value, the mixture of the scenarios, and the base of a bound."""
