@@ -27,29 +27,21 @@ def kernel(name: str) -> Any:
     the same modules in the usual way.
     """
     with _LOADING:
-        return _load(name)
+        import scipy
 
-
-def _load(name: str) -> Any:
-    import scipy
-
-    names = [
-        f"scipy.linalg.cython_{scipy_module}" for scipy_module in ("blas", "lapack")
-    ]
-    alone = [scipy_module for scipy_module in names if scipy_module not in sys.modules]
-    try:
-        for scipy_module in () if name in sys.modules else alone:
-            spec = PathFinder.find_spec(scipy_module, [f"{scipy.__path__[0]}/linalg"])
-            if spec is not None and spec.loader is not None:
-                module = importlib.util.module_from_spec(spec)
-                spec.loader.exec_module(module)
-                sys.modules[scipy_module] = (
-                    module  # whole: another thread may look for it
-                )
-        return importlib.import_module(name)
-    finally:
-        for scipy_module in alone:
-            sys.modules.pop(scipy_module, None)
+        both = "scipy.linalg.cython_blas", "scipy.linalg.cython_lapack"
+        alone = [part for part in both if part not in sys.modules]
+        try:
+            for part in () if name in sys.modules else alone:
+                spec = PathFinder.find_spec(part, [f"{scipy.__path__[0]}/linalg"])
+                if spec is not None and spec.loader is not None:
+                    module = importlib.util.module_from_spec(spec)
+                    spec.loader.exec_module(module)
+                    sys.modules[part] = module  # whole: for another thread to find
+            return importlib.import_module(name)
+        finally:
+            for part in alone:
+                sys.modules.pop(part, None)
 
 
 def check(package: pathlib.Path) -> None:

@@ -118,8 +118,12 @@ def null_directions(
 
     Axes that no row moves come first, then a basis of the rest of the null space.
     """
-    if len(columns) and _independent(columns, largest, computed):
-        return []
+    if len(columns):  # does the kernel leave no doubt that they are independent?
+        kernel = compiled.kernel("jaxcal.information.rank_kernel")
+        share = SINGULAR if computed else 0.0
+        blocks, none = columns[None, :, None], np.zeros((0, len(largest)))
+        if kernel.clear_log_dets(blocks, none, largest, SMALL, share, SURE)[1]:
+            return []
     p, scale = columns.shape[1], power_of_two(largest)
     columns, largest = columns / scale, largest / scale
     lengths, shares = _lengths(columns[None], largest[None], len(columns), computed)
@@ -140,14 +144,6 @@ def null_directions(
             direction[~still] = vector / norms[~still] * (scale.min() / scale[~still])
             null.append(direction)
     return null
-
-
-def _independent(columns: Array, largest: Array, computed: bool) -> bool:
-    """Whether ``rank_rule`` leaves no doubt that columns (R, p) are independent."""
-    kernel = compiled.kernel("jaxcal.information.rank_kernel")
-    share = SINGULAR if computed else 0.0
-    blocks, none = columns[None, :, None], np.zeros((0, len(largest)))
-    return bool(kernel.clear_log_dets(blocks, none, largest, SMALL, share, SURE)[1])
 
 
 def significant(size: NDArray[Any], squares: bool = False, off: float = 0.0) -> Mask:
