@@ -412,14 +412,8 @@ class _Adapter(Model):
     def _no_arm(self) -> ValueError:
         return ValueError(f"the model must be an arm, got {type(self._own).__name__}")
 
-    def predict(self, *given: Any) -> Array:
-        return np.asarray(self._own.predict(*given))
-
-    def jacobian(self, *given: Any) -> Array:
-        return np.asarray(self._own.jacobian(*given))
-
-    def command_jacobian(self, *given: Any) -> Array:
-        return np.asarray(self._own.command_jacobian(*given))
+    # The object has them, or ``as_model`` refuses it.
+    predict = jacobian = command_jacobian = None  # type: ignore[assignment]
 
 
 def as_model(model: Any) -> Model:
