@@ -28,7 +28,7 @@ from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.compact import CompactNetwork
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
-from jaxcal.learning.training import checkpoint, presets, room, run
+from jaxcal.learning.training import checkpoint, presets, run
 from jaxcal.learning.training import postures as training
 from jaxcal.learning.training.checkpoint import CheckpointError
 from jaxcal.learning.training.postures import Validation
@@ -90,22 +90,6 @@ def test_updates_compile_once_and_change_every_weight(finished, tmp_path):
     moved = jax.tree.map(lambda a, b: (a != b).any(), begun, finished[1].params)
     # The value reads every part of the network, the policy all but the critic.
     assert all(jax.tree.leaves(moved))
-
-
-def test_an_update_that_does_not_fit_is_refused_with_what_would(
-    finished, tmp_path, monkeypatch
-):
-    """By what XLA says of the program that trains."""
-    monkeypatch.setattr(room, "_SMALL", 0)
-    monkeypatch.setattr(room, "memory", lambda: 4e4)
-    with pytest.raises(
-        ValueError,
-        match=r"--episodes-per-update 64 of 8 candidates needs [\d.e+-]+ GB of memory; "
-        r"4e-05 GB are free: try --episodes-per-update 8",
-    ):
-        training.train(CONFIG, tmp_path)
-    monkeypatch.setattr(room, "memory", lambda: 1e9)
-    training.train(CONFIG, tmp_path, num_updates=0)
 
 
 def test_metrics_have_the_columns_that_figures_read(finished):

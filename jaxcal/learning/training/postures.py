@@ -17,7 +17,6 @@ from jaxcal.learning.policies.build import build
 from jaxcal.learning.runtime import devices
 from jaxcal.learning.training import checkpoint, imitation
 from jaxcal.learning.training.presets import TrainConfig
-from jaxcal.learning.training.room import require_room
 from jaxcal.learning.training.run import Recipe, run
 
 MEASURED = ("ratio_to_exact", "hit_rate")
@@ -79,8 +78,7 @@ def train(
     Raises:
         CheckpointError: nothing to resume from, or damaged.
         ValueError: the devices do not divide a minibatch or the seeds evenly, the
-            teacher is missing, the look-ahead makes every choice, or an update does
-            not fit the memory.
+            teacher is missing, or the look-ahead makes every choice.
         OSError: the folder cannot be written.
     """
     rows = config.ppo.rows_per_minibatch
@@ -118,7 +116,6 @@ def train(
         imitate=imitate,
     )
     with contextlib.closing(imitation.Lessons(lesson, imitated)) as lessons:
-        require_room(recipe, mesh)
         return run(recipe, folder, mesh=mesh, num_updates=last, **rest)
 
 
