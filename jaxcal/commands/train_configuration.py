@@ -123,9 +123,7 @@ def of_task(arguments: TrainOptions, out: pathlib.Path) -> PolicyConfig:
             raise ValueError(f"--task must be {config.task}, the task of {out}")
         return _prolonged(dataclasses.replace(config, task=arguments.task), budget)
     _refuse_to_overwrite(out)
-    options = entry.train_on
-    if arguments.with_:
-        options = (registry.options_from(entry, arguments.with_),)
+    options = registry.options_from(entry, arguments.with_)
     ppo, policy = (
         {
             f.name: flags[f.name]
@@ -135,7 +133,7 @@ def of_task(arguments: TrainOptions, out: pathlib.Path) -> PolicyConfig:
         for part in ("ppo", "policy")
     )
     require_writable_folder(out)
-    base = entry.rules.get("state") or _tuned(entry, options[0])
+    base = entry.rules.get("state") or _tuned(entry, options)
     config = PolicyConfig(task=arguments.task, base=base, options=options, **policy)
     changed = dataclasses.replace(config.ppo, **ppo)
     return dataclasses.replace(config, ppo=changed, sweep=tuple(arguments.sweep))

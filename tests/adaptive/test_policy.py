@@ -27,7 +27,7 @@ SMALL = {"cells": 4, "sigma": 0.05, "seconds": (5.0, 9.0)}
 CONFIG = PolicyConfig(
     task="knee",
     base=STATE_RULE,
-    options=(SMALL, SMALL | {"rho": 0.2}),
+    options=SMALL,
     per_group=2,
     width=8,
     ppo=dataclasses.replace(
@@ -75,15 +75,15 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_run_trains_what_the_pure_function_does_and_tasks_are_arguments(tmp_path):
-    one = dataclasses.replace(CONFIG, options=CONFIG.options[:1])
-    state = training.train(one, tmp_path)
-    train = jax.jit(make_train(one))
-    pure, metrics = train(jax.random.key(0), training.exercises(one)[0])
+def test_the_run_trains_what_the_pure_function_does_and_tasks_are_arguments(finished):
+    _, state = finished
+    train = jax.jit(make_train(CONFIG))
+    pure, metrics = train(jax.random.key(0), training.exercise(CONFIG))
     for a, b in zip(leaves(pure.average), leaves(state.average), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
     assert metrics["reward_mean"].shape == (4,)
-    train(jax.random.key(1), training.exercises(CONFIG)[1])
+    other = dataclasses.replace(CONFIG, options=SMALL | {"rho": 0.2})
+    train(jax.random.key(1), training.exercise(other))
     assert train._cache_size() == 1
 
 
@@ -116,7 +116,6 @@ def test_a_policy_mends_a_rule_that_ignores_trips(tmp_path):
     config = dataclasses.replace(
         CONFIG,
         base=Priced(0.1, 0.2, 0.0),
-        options=(SMALL,),
         per_group=3,
         ppo=dataclasses.replace(
             PPO, num_updates=60, decisions_per_update=1024, num_minibatches=4

@@ -338,7 +338,7 @@ def test_a_run_trains_what_the_pure_function_does(tmp_path, tasks):
     config = Probe(PROBE.ppo, tasks)
     pure = train if config == PROBE else jax.jit(ppo.make_train(config))
     pure, metrics = pure(jax.random.key(3))
-    recipe = Recipe(config, ((),), "probe", (), (), validate=None)
+    recipe = Recipe(config, (), "probe", (), (), validate=None)
     state = run(recipe, tmp_path)
     for one, other in zip(
         *map(jax.tree.leaves, (pure.average, state.average)), strict=True

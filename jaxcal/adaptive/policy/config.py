@@ -33,7 +33,7 @@ class PolicyConfig(RunConfig):
 
     task: str  # as registered
     base: Rule  # the rule that the network corrects; its constants are floats
-    options: tuple[Mapping[str, Any], ...] = ({},)  # update u trains on u modulo n
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of the task
     per_group: int = setting(6, "options of a group that the network sees")
     width: int = setting(64, "of the network's layers")
     ppo: StreamsConfig = PPO
@@ -50,7 +50,7 @@ class PolicyConfig(RunConfig):
 
     @property
     def learners(self) -> tuple[Streams, ...]:
-        """One learner: other options are other arrays of the same program."""
+        """One learner."""
         from jaxcal.adaptive.policy.network import Correction
         from jaxcal.adaptive.policy.sessions import Sessions
         from jaxcal.learning.core.streams import Streams
@@ -65,7 +65,7 @@ class PolicyConfig(RunConfig):
         }
         return super().as_meta() | {
             "task": self.task,
-            "options": [dict(options) for options in self.options],
+            "options": [dict(self.options)],
             "network": {"width": self.width, "per_group": self.per_group},
             "base": {"rule": type(self.base).__name__, **constants},
         }
@@ -73,15 +73,14 @@ class PolicyConfig(RunConfig):
     @staticmethod
     def from_meta(meta: Mapping[str, Any]) -> PolicyConfig:
         """The configuration that a checkpoint was trained with."""
-        constants = dict(meta["base"])
+        constants, (options,) = dict(meta["base"]), meta["options"]
         base = _rules()[constants.pop("rule")](**constants)
         return PolicyConfig(
             task=meta["task"],
             base=base,
-            options=tuple(
-                {k: tuple(v) if isinstance(v, list) else v for k, v in options.items()}
-                for options in meta["options"]
-            ),
+            options={
+                k: tuple(v) if isinstance(v, list) else v for k, v in options.items()
+            },
             ppo=StreamsConfig(**meta["ppo"]),
             **RunConfig.held_in(meta),
             **meta["network"],

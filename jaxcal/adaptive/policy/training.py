@@ -48,19 +48,17 @@ class TaskPolicy:
         return Weights(self.meta["network"], weights.flat(self.params), self.meta)
 
 
-def exercises(config: PolicyConfig) -> tuple[Exercise, ...]:
-    """What ``make_train(config)`` is given, one for each of the options.
+def exercise(config: PolicyConfig) -> Exercise:
+    """What ``make_train(config)`` is given.
 
     Numbers are arrays, so that other constants do not compile again.
 
     Raises:
         ValueError: the registry or the task refuses its options.
     """
-    make = registry.load(config.task).make
-    return tuple(
-        jax.tree.map(jnp.asarray, Exercise(make(**options), config.base))
-        for options in config.options
-    )
+    task = registry.load(config.task).make(**config.options)
+    made: Exercise = jax.tree.map(jnp.asarray, Exercise(task, config.base))
+    return made
 
 
 def train(
@@ -72,8 +70,8 @@ def train(
 ) -> TrainState:
     """Train until the budget is spent or ``should_stop`` says so, and save.
 
-    It is validated on fresh sessions of the first task: ``nats`` of the averaged
-    weights, and ``nats_over_base`` in pairs.
+    It is validated on fresh sessions: ``nats`` of the averaged weights, and
+    ``nats_over_base`` in pairs.
 
     Args:
         config: the run.
@@ -90,9 +88,9 @@ def train(
     """
     rows = config.ppo.rows_per_minibatch
     mesh = devices.make_mesh(rows, num_devices, config.num_runs)
-    exercises_of_run = exercises(config)
+    played = exercise(config)
     keys = jax.random.split(jax.random.key(_FRESH), _VALIDATED)
-    task, base = exercises_of_run[0].task, exercises_of_run[0].base
+    task, base = played.task, played.base
     rules: list[float] = []  # nats of the base rule, once it is played
 
     def validate(average: Any) -> dict[str, float]:
@@ -104,9 +102,7 @@ def train(
 
     recipe = Recipe(
         config=config,
-        given=tuple(
-            (devices.replicate(exercise, mesh),) for exercise in exercises_of_run
-        ),
+        given=(devices.replicate(played, mesh),),
         schema=SCHEMA,
         columns=("choices",),
         measured=MEASURED,

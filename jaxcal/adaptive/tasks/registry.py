@@ -36,8 +36,6 @@ class Entry:
     about: str = ""  # one line for --help
     rules: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Deciders with constants tuned on the default task, such as ``priced``."""
-    train_on: tuple[Mapping[str, Any], ...] = ({},)
-    """Options of the tasks that a policy is trained on: update u takes u modulo n."""
     methods: tuple[str, ...] = ()
     """What ``evaluate.py`` compares by default; all quick methods when empty."""
     episodes: int = 4096

@@ -107,7 +107,7 @@ def train(
 
     recipe = Recipe(
         config=config,
-        given=((),),
+        given=(),
         schema=checkpoint.SCHEMA,
         columns=("reward_std", "log_det_mean"),
         measured=MEASURED,

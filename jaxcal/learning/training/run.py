@@ -37,7 +37,7 @@ _LOSSES = (
     "entropy", "policy_loss", "value_loss", "kl", "kl_after", "clip_fraction",
     "explained_variance", "grad_norm", "learning_rate",
 )  # fmt: skip
-_SKIPS = 5  # updates of the same task in a row, not finite, that end a run
+_SKIPS = 5  # updates in a row, not finite, that end a run
 _LAST = 1000  # episodes whose rewards are kept
 _UPDATES = 16  # updates in one call
 _CALL_SECONDS = 2.0  # of one call: what a signal waits for
@@ -52,7 +52,7 @@ class Recipe:
     """What one kind of run trains, and how."""
 
     config: Any  # a ``TrainConfig`` or a ``PolicyConfig``
-    given: tuple[tuple[Any, ...], ...]  # arguments of update u: number u modulo theirs
+    given: tuple[Any, ...]  # arguments of every update
     schema: str  # of the checkpoints
     columns: tuple[str, ...]  # further ones of metrics.csv, in every update
     measured: tuple[str, ...]  # columns of validations; the first ranks the seeds
@@ -73,18 +73,11 @@ class Recipe:
         return runs_of(config.seed, config.num_seeds, config.sweep)
 
     def init(self) -> TrainState:
-        """The state before the first update, from seeds and swept values alone.
-
-        ``rollout_state`` is a tuple: what goes on with each of ``given``.
-        """
+        """The state before the first update, from seeds and swept values alone."""
 
         def begin(key: jax.Array, values: dict[str, jax.Array]) -> TrainState:
             ppo, learner = self.config.ppo, self.learners[0]
-            states = [
-                _begun(ppo, learner, key, *given, **values) for given in self.given
-            ]
-            rollout_state = tuple(state.rollout_state for state in states)
-            return dataclasses.replace(states[0], rollout_state=rollout_state)
+            return _begun(ppo, learner, key, *self.given, **values)
 
         keys = jnp.stack([jax.random.key(run["seed"]) for run in self.runs])
         swept = [name for name, _ in self.config.sweep]
@@ -215,8 +208,8 @@ def run(
 
     Raises:
         CheckpointError: nothing to resume from, or damaged.
-        DivergedError: losses are not finite in five updates in a row of one task, in
-            every run; the weights before are saved. Fewer are skipped.
+        DivergedError: losses are not finite in five updates in a row, in every run;
+            the weights before are saved. Fewer are skipped.
         OSError: the folder cannot be written, or another training writes it.
     """
     last = recipe.config.ppo.num_updates if num_updates is None else num_updates
@@ -242,11 +235,7 @@ def _run(
     done = int(np.max(devices.local(state.num_updates)))
     seeds = len(recipe.runs) if len(recipe.runs) > 1 else 0
     count, timed, broken = 1, False, ""
-    held = list(state.rollout_state)
-    in_row = np.zeros((len(held), len(recipe.runs)), int)  # updates skipped
-
-    def whole(state: TrainState) -> TrainState:
-        return dataclasses.replace(state, rollout_state=tuple(held))
+    in_row = np.zeros(len(recipe.runs), int)  # updates skipped
 
     with contextlib.ExitStack() as stack:
         recorder = None
@@ -255,40 +244,37 @@ def _run(
             stack.enter_context(contextlib.closing(recorder))
         while done < last and not broken and not devices.any_process(should_stop()):
             begun = time.perf_counter()
-            which = done % len(recipe.given)
-            at_most, given = _UPDATES, recipe.given[which]
+            at_most, given = _UPDATES, recipe.given
             learner = recipe.learners[done % len(recipe.learners)]
             if done < recipe.num_imitated:
                 assert recipe.imitate is not None  # there are updates that imitate
                 learner, shown = recipe.imitate(done)
                 at_most, given = 1, (devices.spread(shown, mesh),)
-            elif len(recipe.learners) > 1 or len(recipe.given) > 1:
-                at_most = 1  # the next update has another program or other arrays
+            elif len(recipe.learners) > 1:
+                at_most = 1  # the next update has another program
             count = min(count, at_most, last - done)
             update = updates(recipe.config.ppo, learner, mesh, at_most, seeds)
-            state = dataclasses.replace(state, rollout_state=held[which])
             with collective():
                 state, metrics = update(state, np.int32(count), *given)
                 # One transfer for all that these updates measured.
                 rows = jax.device_get(devices.local(metrics))
-            held[which] = state.rollout_state
             first, done = done, done + count
             for number in range(count):
                 fine = np.ravel(rows["skipped"][number]) == 0.0
-                in_row[which] = np.where(fine, 0, in_row[which] + 1)
-                if in_row[which].min() == _SKIPS:
+                in_row = np.where(fine, 0, in_row + 1)
+                if in_row.min() == _SKIPS:
                     broken = _broken(rows, number, first + number + 1)
             if recorder is not None:
-                recorder.note(whole(state), first, count, rows, save=not broken)
+                recorder.note(state, first, count, rows, save=not broken)
             seconds = (time.perf_counter() - begun) / count
             # The first call also compiled, so the second is of one update too.
             fit = int(_CALL_SECONDS / seconds) if timed else 1
             count, timed = devices.on_first(functools.partial(max, fit, 1)), True
     if recorder is not None:
-        recorder.save(whole(state), done)
+        recorder.save(state, done)
     if broken:
         raise DivergedError(broken)
-    return whole(state)
+    return state
 
 
 def _broken(rows: Mapping[str, Any], number: int, update: int) -> str:
