@@ -76,7 +76,7 @@ def ours(batch: int, episodes: int, options: dict[str, Any] | None = None) -> Ru
     config = SelectionConfig()
     see = jax.vmap(lambda state: environment.observe(state, config))
     move = jax.vmap(lambda state, action: environment.step(state, action, config))
-    again = jax.vmap(lambda state: environment.reset_from(state, config))
+    again = jax.vmap(lambda state: environment.reset(state.key, config))
     begin = jax.vmap(lambda key: environment.reset(key, config))
 
     def step(carry: Any, units: jax.Array) -> tuple[Any, None]:

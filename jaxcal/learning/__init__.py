@@ -116,19 +116,7 @@ def make_train(config: Any) -> Any:
         ValueError: it is none of these, no preset has the name, or it imitates a
             teacher.
     """
-    from types import SimpleNamespace
-
     from jaxcal.learning.core import ppo
+    from jaxcal.learning.training import presets
 
-    if isinstance(config, str):
-        from jaxcal.learning.training import presets
-
-        return ppo.make_train(presets.load(config))
-    if all(hasattr(config, name) for name in ("config", "rollout", "loss")):
-        return ppo.make_train(SimpleNamespace(ppo=config.config, learners=(config,)))
-    if not all(hasattr(config, name) for name in ("ppo", "learners")):
-        raise ValueError(
-            "config must be a preset's name, a TrainConfig or a learner, got "
-            f"{type(config).__name__}"
-        )
-    return ppo.make_train(config)
+    return ppo.make_train(presets.load(config) if isinstance(config, str) else config)

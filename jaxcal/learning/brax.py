@@ -11,6 +11,7 @@ episode; ``wrap_fresh`` draws a new one every time.
 from __future__ import annotations
 
 import contextlib
+import functools
 import types
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -26,7 +27,7 @@ from brax.training.agents.ppo import train as brax_train
 from brax.training.agents.ppo.networks import PPONetworks
 from brax.training.networks import FeedForwardNetwork
 
-from jaxcal.learning.environments.functional import FunctionalEnv, PosturesEnv
+from jaxcal.learning.environments.functional import FunctionalEnv, PosturesEnv, renewed
 from jaxcal.learning.environments.selection import CandidateSource, SelectionConfig
 from jaxcal.learning.policies.networks import NetworkConfig
 
@@ -92,19 +93,17 @@ class _FreshReset(Wrapper):
         state.info.update(steps=steps)
         state = self.env.step(state.replace(done=jnp.zeros_like(state.done)), action)
 
-        def renewed(state: State) -> State:
-            fresh = self.env.reset(state.pipeline_state.key)
-
-            def where_done(new: jax.Array, old: jax.Array) -> jax.Array:
-                shape = (*state.done.shape, *(1,) * (old.ndim - state.done.ndim))
-                return jnp.where(state.done.reshape(shape) > 0, new, old)
-
-            new, old = ((s.pipeline_state, s.obs) for s in (fresh, state))
-            episode, obs = jax.tree.map(where_done, new, old)
-            return state.replace(pipeline_state=episode, obs=obs)
+        def begin(key: jax.Array) -> tuple[Any, jax.Array]:
+            fresh = self.unwrapped.reset(key)
+            return fresh.pipeline_state, fresh.obs
 
         # Episodes of one length end together, so all steps but their last skip this.
-        return jax.lax.cond(jnp.any(state.done > 0), renewed, lambda s: s, state)
+        episode, obs = jax.vmap(functools.partial(renewed, begin))(
+            state.done > 0,
+            state.pipeline_state.key,
+            (state.pipeline_state, state.obs),
+        )
+        return state.replace(pipeline_state=episode, obs=obs)
 
 
 def wrap_fresh(

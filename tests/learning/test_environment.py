@@ -74,10 +74,10 @@ def test_every_episode_draws_fresh_candidates(key):
     config = SelectionConfig()
     seen = set()
     state = reset(key, config)
-    reset_again = jax.jit(environment.reset_from, static_argnames="config")
+    reset_again = jax.jit(environment.reset, static_argnames="config")
     for _ in range(20):
         seen.add(float(state.candidates[0, 0]))
-        state = reset_again(state, config)
+        state = reset_again(state.key, config)
     assert len(seen) == 20
 
 

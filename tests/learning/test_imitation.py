@@ -16,8 +16,7 @@ from jaxcal.learning.core import ppo
 from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.policies.build import build
-from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.policies.networks import NetworkConfig, build
 from jaxcal.learning.training import imitation
 from jaxcal.learning.training import postures as training
 from jaxcal.learning.training.presets import TrainConfig

@@ -16,8 +16,7 @@ import pytest
 from jaxcal.learning.core import network as networks
 from jaxcal.learning.core.network import Network, initial
 from jaxcal.learning.policies import scorer
-from jaxcal.learning.policies.build import build
-from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.policies.networks import NetworkConfig, build
 from jaxcal.learning.training import checkpoint
 from jaxcal.paper.network import HEADS
 

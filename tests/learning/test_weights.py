@@ -76,13 +76,6 @@ def test_weights_that_do_not_fit_their_network_are_refused(tmp_path):
         checkpoint.load(path)
 
 
-def test_names_of_arrays_become_a_tree_again():
-    tree = {"a": {"b": np.ones(2), "c": {"d": np.zeros(1)}}, "e": np.ones(())}
-    found = weights.nested(weights.flat(tree))
-    assert found.keys() == tree.keys() and found["a"]["c"].keys() == {"d"}
-    np.testing.assert_array_equal(found["a"]["b"], tree["a"]["b"])
-
-
 def test_a_policy_that_an_earlier_version_trained_by_another_criterion_is_refused(
     tmp_path,
 ):

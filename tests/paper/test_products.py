@@ -18,8 +18,7 @@ from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments import selection
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies import scorer
-from jaxcal.learning.policies.build import build
-from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.policies.networks import NetworkConfig, build
 from jaxcal.learning.training import checkpoint
 from jaxcal.paper.preset import OBSERVATION
 

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax.traverse_util import flatten_dict
 
 from jaxcal.extras import MissingExtraError
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import scorer
-from jaxcal.learning.policies.build import build
-from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.policies.networks import NetworkConfig, build
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.training import checkpoint
 from jaxcal.selection.policy import select_batch
@@ -132,7 +132,10 @@ def test_the_scores_are_those_of_jax_in_double_precision(rng, config, n, k, made
         theirs = scorer.NetworkScorer(network, double)
         memory = theirs.encode(regressors, available)
         logits = theirs.scores(memory, chosen, free, made)
-    ours = CompactScorer(dataclasses.asdict(config), weights.flat(params))
+    ours = CompactScorer(
+        dataclasses.asdict(config),
+        flatten_dict(params, sep="."),
+    )
     own = ours.encode(np.stack([p.rows for p in problems]), available)
     np.testing.assert_allclose(own.encoded, memory[1], rtol=1e-4, atol=1e-4)
     scores = ours.scores(own, chosen, free, made)

@@ -45,7 +45,7 @@ class TaskPolicy:
     @property
     def weights(self) -> Weights:
         """The policy in plain arrays, for a file of weights."""
-        return Weights(self.meta["network"], weights.flat(self.params), self.meta)
+        return checkpoint.as_weights(self.params, self.meta)
 
 
 def exercise(config: PolicyConfig) -> Exercise:

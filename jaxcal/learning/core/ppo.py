@@ -397,27 +397,21 @@ def make_update(
 
 
 def make_train(config: Any) -> Callable[..., tuple[Any, Metrics]]:
-    """A whole training as one pure function, to be jitted, scanned or vmapped.
-
-    Args:
-        config: a ``TrainConfig`` of postures or a ``PolicyConfig`` of tasks, of which
-            it reads ``ppo`` and ``learners``: update u trains number u modulo theirs.
-
-    Returns:
-        ``train(key, *given, **values)`` -> the last state, whose ``average`` is the
-        policy, and metrics with a leading axis of ``num_updates``. ``given``: none for
-        postures, the arrays of a task for streams. ``values``: () arrays by names in
-        ``TRACED``, in place of the configuration's.
-
-    Raises:
-        ValueError: the configuration imitates a teacher.
-    """
+    """``learning.make_train`` of anything but a preset's name."""
     if imitated := getattr(config, "num_imitated", 0):
         raise ValueError(
             f"imitation must be 0, got {imitated} imitated updates: the teacher runs "
             "on the host. Use training.postures.train, or imitation=0"
         )
-    learners, ppo = config.learners, config.ppo
+    if all(hasattr(config, name) for name in ("config", "rollout", "loss")):
+        learners, ppo = (config,), config.config
+    elif all(hasattr(config, name) for name in ("ppo", "learners")):
+        learners, ppo = config.learners, config.ppo
+    else:
+        raise ValueError(
+            "config must be a preset's name, a TrainConfig or a learner, got "
+            f"{type(config).__name__}"
+        )
     updates = [make_update(ppo, learner) for learner in learners]
 
     def train(key: jax.Array, *given: Any, **values: Any) -> tuple[TrainState, Metrics]:

@@ -29,8 +29,7 @@ from flax import struct
 
 from jaxcal.learning.environments import selection
 from jaxcal.learning.environments.selection import CandidateSource, SelectionConfig
-from jaxcal.learning.policies.build import build
-from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.policies.networks import NetworkConfig, build
 
 _LARGEST = float(np.finfo(np.float32).max)
 

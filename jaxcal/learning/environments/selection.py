@@ -9,8 +9,8 @@
 | version | 1 |
 
 With ``reward_gain`` the reward is the increase of log det S since the last payment.
-Functions take one episode; ``jax.vmap`` makes a batch. ``reset_from`` draws the next
-episode's candidates from the key in the state. Source: paper, Section 2.3 and Table 2;
+Functions take one episode; ``jax.vmap`` makes a batch. The key in the state draws the
+next episode's candidates. Source: paper, Section 2.3 and Table 2;
 docs/environment.md discusses the reward's range.
 """
 
@@ -34,7 +34,6 @@ __all__ = [
     "SelectionState",
     "observe",
     "reset",
-    "reset_from",
     "start",
     "step",
 ]
@@ -86,13 +85,6 @@ def reset(
     m = config.num_candidates
     candidates = randomness.uniform(key_draw, (m, config.num_inputs))
     return start(candidates, jnp.ones(m, bool), config, key_next)
-
-
-def reset_from(
-    state: SelectionState, config: SelectionConfig, draw: CandidateSource | None = None
-) -> SelectionState:
-    """The episode after this one: the state's own key draws its candidates."""
-    return reset(state.key, config, draw)
 
 
 def step(

@@ -12,12 +12,16 @@ point, as jaxcal's own pyproject.toml adds ``paper``:
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxcal.extras import installed
-from jaxcal.learning.config import path_of, require, setting
+from jaxcal.learning.config import named, path_of, require, setting
+
+if TYPE_CHECKING:
+    from jaxcal.learning.core.network import Network
 
 GROUP = "jaxcal.networks"
+_COMPACT = "jaxcal.learning.policies.compact:CompactNetwork"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,3 +62,16 @@ class NetworkConfig:
         require(self, "at least 1", lambda v: v >= 1, "width", "lookahead")
         rounds = ("encoder_rounds", "decoder_rounds")
         require(self, "0 or more", lambda v: v >= 0, *rounds)
+
+
+def build(config: NetworkConfig) -> Network:
+    """The network that a configuration names: ``compact``, one's own, a package's."""
+    from jaxcal.learning.core.network import Network
+
+    path = _COMPACT if config.kind == "compact" else config.kind
+    kind: Any = named(path) if ":" in path else installed(GROUP)[path].load()
+    if not (isinstance(kind, type) and issubclass(kind, Network)):
+        raise ValueError(f"kind must be a Network, got {config.kind}")
+    fields = [field.name for field in dataclasses.fields(kind)]
+    arguments: dict[str, Any] = {"config": config} if "config" in fields else {}
+    return kind(**arguments)

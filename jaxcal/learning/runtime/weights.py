@@ -12,7 +12,6 @@ import hashlib
 import io
 import json
 import pathlib
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -76,29 +75,6 @@ class Weights:
             digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
-
-
-def flat(tree: Mapping[str, Any], above: str = "") -> Arrays:
-    """Nested dictionaries of arrays as one, names joined by dots."""
-    arrays: Arrays = {}
-    for name, part in tree.items():
-        if isinstance(part, Mapping):
-            arrays |= flat(part, f"{above}{name}.")
-        else:
-            arrays[above + name] = np.asarray(part)
-    return arrays
-
-
-def nested(arrays: Mapping[str, Any]) -> dict[str, Any]:
-    """The inverse of ``flat``."""
-    tree: dict[str, Any] = {}
-    for name, array in arrays.items():
-        *above, last = name.split(".")
-        place = tree
-        for part in above:
-            place = place.setdefault(part, {})
-        place[last] = array
-    return tree
 
 
 def write(path: str | pathlib.Path, weights: Weights) -> None:

@@ -26,13 +26,13 @@ from typing import Any
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+from flax.traverse_util import flatten_dict, unflatten_dict
 
 from jaxcal.extras import versions
 from jaxcal.learning.config import runs_of
 from jaxcal.learning.core.network import Network, initial
 from jaxcal.learning.core.ppo import TrainState
-from jaxcal.learning.policies.build import build
-from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.policies.networks import NetworkConfig, build
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.weights import CheckpointError, Weights, locate
 
@@ -64,8 +64,15 @@ class Policy:
 
     @property
     def weights(self) -> Weights:
-        """Weights as plain arrays."""
-        return Weights(self.meta["network"], weights.flat(self.params), self.meta)
+        """The policy in plain arrays, for a file of weights."""
+        return as_weights(self.params, self.meta)
+
+
+def as_weights(params: Any, meta: dict[str, Any]) -> Weights:
+    """A policy in plain arrays, for a file of weights."""
+    arrays = flatten_dict(params, sep=".")
+    plain = {name: np.asarray(array) for name, array in arrays.items()}
+    return Weights(meta["network"], plain, meta)
 
 
 def _alone() -> Any:
@@ -284,7 +291,7 @@ def read(path: pathlib.Path, meta: dict[str, Any], like: Any) -> Any:
     runs = len(runs_of(0, meta.get("num_seeds", 1), meta.get("sweep", ())))
     if path.is_file():
         arrays = weights.read(path).arrays
-        params = jax.tree.map(jax.numpy.asarray, weights.nested(arrays))
+        params = jax.tree.map(jax.numpy.asarray, unflatten_dict(arrays, sep="."))
         held, wanted = (
             (jax.tree.structure(tree), [leaf.shape for leaf in jax.tree.leaves(tree)])
             for tree in (params, like)
@@ -301,7 +308,7 @@ def read(path: pathlib.Path, meta: dict[str, Any], like: Any) -> Any:
         params = jax.tree.map(
             lambda leaf: leaf[best], _read(path / "policy", several, what)
         )
-    for name, array in weights.flat(params).items():
+    for name, array in flatten_dict(params, sep=".").items():
         if not np.isfinite(array).all():
             raise CheckpointError(
                 f"checkpoint {path} has weights that are not finite, in {name}"

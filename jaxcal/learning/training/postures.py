@@ -13,7 +13,7 @@ import numpy as np
 from jaxcal.learning.core.network import Network
 from jaxcal.learning.core.ppo import Learner, TrainState
 from jaxcal.learning.policies import scorer
-from jaxcal.learning.policies.build import build
+from jaxcal.learning.policies.networks import build
 from jaxcal.learning.runtime import devices
 from jaxcal.learning.training import checkpoint, imitation
 from jaxcal.learning.training.presets import TrainConfig

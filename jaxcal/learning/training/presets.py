@@ -54,7 +54,7 @@ class TrainConfig(RunConfig):
     def learners(self) -> tuple[Postures, ...]:
         """Learners of the tasks; update u trains number u modulo theirs."""
         from jaxcal.learning.core.postures import Postures
-        from jaxcal.learning.policies.build import build
+        from jaxcal.learning.policies.networks import build
 
         network = build(dataclasses.replace(self.network, mirrored=False))
         return tuple(Postures(self.ppo, task, network) for task in self.tasks)
