@@ -49,7 +49,7 @@ def slot(cells: int = 24) -> GridTask:
         travel=0.5 + 2.0 * np.abs(stands[:, None] - stands[:-1]),  # seconds
         place_after=np.stack([np.arange(len(side)), middle], 1),  # a touch: back there
         extra=[0.0, 1.0], uses=[0, 1], num_uses=(1, 2, 3), seconds=(6.0, 24.0),
-        horizon=24, theta_names=["left", "right"], design_names=["place", "step"],
+        horizon=24, theta_names=["left", "right"],
     )  # fmt: skip
 
 

@@ -77,7 +77,6 @@ def breakaway(
         seconds=seconds,
         horizon=measurements,
         theta_names=["up", "down"][:directions],
-        design_names=["step", "direction"],
     )
 
 

@@ -49,7 +49,6 @@ def death_process(
         prior=prior,
         horizon=measurements,
         theta_names=["rate"],
-        design_names=["time"],
     )
 
 

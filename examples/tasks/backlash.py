@@ -169,7 +169,6 @@ def backlash(
         horizon=measurements,
         seconds=seconds,
         theta_names=["width", "offset"],
-        design_names=["posture", "direction"],
     )
 
 
@@ -240,7 +239,6 @@ def dead_zone(
         num_uses=measurements,
         horizon=measurements,
         theta_names=["width", "centre"],
-        design_names=["command"],
     )
 
 

@@ -77,7 +77,6 @@ def transmission_error(
         horizon=measurements,
         seconds=seconds,
         theta_names=["frequency", "amplitude", "phase"],
-        design_names=["posture"],
     )
 
 

@@ -143,7 +143,6 @@ class GridTask:
     horizon: int = struct.field(pytree_node=False)
     overrun: bool = struct.field(pytree_node=False)  # the last one may cost too much
     theta_names: tuple[str, ...] = struct.field(pytree_node=False)
-    design_names: tuple[str, ...] = struct.field(pytree_node=False)
 
     @staticmethod
     def make(
@@ -163,7 +162,6 @@ class GridTask:
         horizon: int,
         overrun: bool = False,
         theta_names: Sequence[str] = (),
-        design_names: Sequence[str] = (),
     ) -> GridTask:
         """Check the tables of a task.
 
@@ -197,10 +195,8 @@ class GridTask:
         weights, possible = checked.weights(prior, table)
         shape, lengths = table.shape[:2], checked.grid(grid)
         times, after, first = checked.places(travel, place_after, place, shape)
-        more, used = (
-            checked.costs("extra", extra, shape),
-            checked.costs("uses", uses, shape),
-        )
+        more = checked.costs("extra", extra, shape)
+        used = checked.costs("uses", uses, shape)
         group = checked.groups(groups, len(at))
         parts, order = _split(table, lengths)
         task = GridTask(
@@ -224,10 +220,7 @@ class GridTask:
             shape=lengths,
             horizon=whole_number("horizon", horizon, 1),
             overrun=bool(overrun),
-            theta_names=checked.names(
-                "theta_names", theta_names, "theta", grid.shape[1]
-            ),
-            design_names=checked.names("design_names", design_names, "u", at.shape[1]),
+            theta_names=checked.names(theta_names, grid.shape[1]),
         )
         _require_affordable(task)
         return task
@@ -358,11 +351,5 @@ def _split(
         mine = grid[designs][(whole, whole, *first)]
         mine = mine.reshape(len(designs), table.shape[1], -1)
         product = mine * np.log(np.where(mine > 0.0, mine, 1.0))
-        parts.append(
-            Part(
-                likelihood=checked.single(mine),
-                p_log_p=checked.single(product),
-                axes=axes,
-            )
-        )
+        parts.append(Part(checked.single(mine), checked.single(product), axes))
     return tuple(parts), np.argsort(np.concatenate(list(members.values())))

@@ -23,8 +23,7 @@ def probabilities(
         raise ValueError(
             f"likelihood must have shape ({len(at)}, Y, {len(grid)}), got {table.shape}"
         )
-    if (table < 0.0).any():
-        raise ValueError(f"likelihood must be at least 0, got {table.min():g}")
+    _require_not_negative("likelihood", table)
     total = table.sum(axis=1)
     if (bad := np.argwhere(np.abs(total - 1.0) > 1e-6)).size:
         a, s = bad[0]
@@ -49,19 +48,6 @@ def weights(prior: ArrayLike | None, table: Array) -> tuple[Array, NDArray[np.bo
     return weights, np.asarray(possible.any(axis=-1))
 
 
-def _times(travel: ArrayLike, count: int) -> Array:
-    """(P, A) seconds from each place to each design, at least 0."""
-    times = numbers("travel", travel)
-    if times.ndim < 2:
-        times = np.broadcast_to(times, (count + 1, count))
-    if times.ndim != 2 or times.shape[1] != count or len(times) < count:
-        raise ValueError(
-            f"travel must be a number, ({count},) or (P, {count}) with at least "
-            f"{count} places, got shape {times.shape}"
-        )
-    return _not_negative("travel", times)
-
-
 def places(
     travel: ArrayLike,
     place_after: ArrayLike | None,
@@ -69,33 +55,38 @@ def places(
     shape: tuple[int, int],
 ) -> tuple[Array, Array, int]:
     """(P, A) seconds of travel, (A, Y) places after outcomes, and the first place."""
-    times = _times(travel, shape[0])
+    times, count = numbers("travel", travel), shape[0]
+    if times.ndim < 2:
+        times = np.broadcast_to(times, (count + 1, count))
+    if times.ndim != 2 or times.shape[1] != count or len(times) < count:
+        raise ValueError(
+            f"travel must be a number, ({count},) or (P, {count}) with at least "
+            f"{count} places, got shape {times.shape}"
+        )
+    _require_not_negative("travel", times)
     if place_after is None:
-        place_after = np.arange(shape[0])[:, None]  # the design itself
+        place_after = np.arange(count)[:, None]  # the design itself
     after = _table("place_after", place_after, shape)
     first = len(times) - 1 if place is None else place
-    _require_places("place_after", after, len(times))
-    _require_places("place", np.asarray(first), len(times))
+    for name, values in (("place_after", after), ("place", np.asarray(first))):
+        if (values % 1 != 0).any() or values.min() < 0 or values.max() >= len(times):
+            raise ValueError(
+                f"{name} must hold places in [0, {len(times)}), "
+                f"got {values.min():g} to {values.max():g}"
+            )
     return times, after, first
 
 
 def costs(name: str, values: ArrayLike, shape: tuple[int, int]) -> Array:
     """(A, Y) costs of outcomes, at least 0."""
-    return _not_negative(name, _table(name, values, shape))
+    table = _table(name, values, shape)
+    _require_not_negative(name, table)
+    return table
 
 
-def _not_negative(name: str, values: Array) -> Array:
+def _require_not_negative(name: str, values: Array) -> None:
     if (values < 0.0).any():
         raise ValueError(f"{name} must be at least 0, got {values.min():g}")
-    return values
-
-
-def _require_places(name: str, values: Array, count: int) -> None:
-    if (values % 1 != 0).any() or values.min() < 0 or values.max() >= count:
-        raise ValueError(
-            f"{name} must hold places in [0, {count}), "
-            f"got {values.min():g} to {values.max():g}"
-        )
 
 
 def seconds(seconds: float | tuple[float, float]) -> Array:
@@ -166,10 +157,9 @@ def _table(name: str, values: ArrayLike, shape: tuple[int, int]) -> Array:
         ) from None
 
 
-def names(
-    argument: str, names: Sequence[str], stem: str, count: int
-) -> tuple[str, ...]:
-    names = tuple(names) or tuple(f"{stem}{i + 1}" for i in range(count))
+def names(given: Sequence[str], count: int) -> tuple[str, ...]:
+    """Names of the unknowns."""
+    names = tuple(given) or tuple(f"theta{i + 1}" for i in range(count))
     if len(names) != count:
-        raise ValueError(f"{argument} must hold {count} names, got {names}")
+        raise ValueError(f"theta_names must hold {count} names, got {names}")
     return names

@@ -18,6 +18,7 @@ import numpy as np
 from flax import struct
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.adaptive.grid_tables import single
 from jaxcal.adaptive.host import on_host
 from jaxcal.adaptive.session import Session
 from jaxcal.checks import numbers, table
@@ -143,12 +144,12 @@ def candidates_of(
         )
     scale = np.linalg.slogdet(white)[1] - shape[1] / 2 * np.log(2.0 * np.pi)
     return Candidates(
-        commands=_single(commands), mean=_single(mean), std=_single(std),
-        white=_single(white), noise=_single(np.linalg.inv(white)),
-        log_scale=_single(scale),
-        seconds=_single(np.broadcast_to(costs, len(commands))),
-        at_mean=_single(at_mean), slope=_single(slope), draw=draw,
-        periods=None if model.periods is None else _single(model.periods),
+        commands=single(commands), mean=single(mean), std=single(std),
+        white=single(white), noise=single(np.linalg.inv(white)),
+        log_scale=single(scale),
+        seconds=single(np.broadcast_to(costs, len(commands))),
+        at_mean=single(at_mean), slope=single(slope), draw=draw,
+        periods=None if model.periods is None else single(model.periods),
         outputs=None if linear else _outputs(model, commands, mean), names=model.names,
     )  # fmt: skip
 
@@ -252,7 +253,3 @@ class _HostReadings:
         commands, model = self._commands, self._model
         every = [predict(model, commands, row, finite=False) for row in rows]
         return np.array(every, np.float32)
-
-
-def _single(values: ArrayLike) -> jax.Array:
-    return jax.device_put(np.asarray(values, np.float32))

@@ -233,18 +233,17 @@ class ParticleBelief:
         unknowns = jax.vmap(self.model.unknowns)(z)
 
         def one(at: jax.Array, total: jax.Array) -> jax.Array:
-            design = jax.tree.map(lambda leaf: leaf[at], self.designs)
-            return total + jax.vmap(
-                lambda u: log_likelihood_of(self.model, u, design, self.answers[at])
-            )(unknowns)
+            return total + self._likelihood(unknowns, at)
 
         return jax.lax.fori_loop(0, self.made, one, jnp.zeros(len(z)))
 
     def _last(self, z: jax.Array) -> jax.Array:
         """(N,) log likelihood of the last measurement."""
-        at = self.made - 1
+        return self._likelihood(jax.vmap(self.model.unknowns)(z), self.made - 1)
+
+    def _likelihood(self, unknowns: Any, at: jax.Array) -> jax.Array:
+        """(N,) log likelihood of measurement ``at``."""
         design = jax.tree.map(lambda leaf: leaf[at], self.designs)
-        unknowns = jax.vmap(self.model.unknowns)(z)
         return jax.vmap(
             lambda u: log_likelihood_of(self.model, u, design, self.answers[at])
         )(unknowns)

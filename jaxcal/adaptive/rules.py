@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import abc
+import dataclasses
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import jax
@@ -90,14 +92,22 @@ class GainRate:
 class Rule(abc.ABC):
     """A rule by a price: the largest log (gain / price)."""
 
-    num_free: ClassVar[int]  # constants that can be tuned; the price's unit is free
+    # Constants that can be tuned, by the place in what they are moved by: prices, which
+    # are multiplied by ``exp(by)``, and exponents, which are added to. The price's unit
+    # is free.
+    prices: ClassVar[Mapping[str, int]]
+    exponents: ClassVar[Mapping[str, int]] = {}
 
-    @abc.abstractmethod
+    @property
+    def num_free(self) -> int:
+        """Numbers that a tuner tries."""
+        return len({*self.prices.values(), *self.exponents.values()})
+
     def moved(self, by: Any) -> Any:
-        """The rule with other constants, ``by`` (num_free,) away: what a tuner tries.
-
-        Prices are multiplied by ``exp(by)``, exponents are added to.
-        """
+        """The rule with other constants, ``by`` (num_free,) away."""
+        changed = {n: getattr(self, n) * np.exp(by[i]) for n, i in self.prices.items()}
+        changed |= {n: getattr(self, n) + by[i] for n, i in self.exponents.items()}
+        return dataclasses.replace(self, **changed)  # type: ignore[type-var]  # flax
 
     @abc.abstractmethod
     def judged(
@@ -127,13 +137,8 @@ class Shares(Rule):
     a: Any = 0.0
     b: Any = 0.0
     haste: Any = 0.0
-    num_free: ClassVar[int] = 4
-
-    def moved(self, by: Any) -> Shares:
-        return Shares(
-            self.time * np.exp(by[0]), self.use * np.exp(by[1]),
-            self.a + by[2], self.b + by[3], self.haste * np.exp(by[0]),
-        )  # fmt: skip
+    prices: ClassVar[Mapping[str, int]] = {"time": 0, "use": 1, "haste": 0}
+    exponents: ClassVar[Mapping[str, int]] = {"a": 2, "b": 3}
 
     def judged(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
@@ -185,10 +190,7 @@ class Priced(CostRule):
     c0: Any = 1.0
     c1: Any = 1.0
     c2: Any = 1.0
-    num_free: ClassVar[int] = 2
-
-    def moved(self, by: Any) -> Priced:
-        return Priced(self.c0 * np.exp(by[0]), self.c1, self.c2 * np.exp(by[1]))
+    prices: ClassVar[Mapping[str, int]] = {"c0": 0, "c2": 1}
 
     def price(self, session: Session, seconds: jax.Array, uses: jax.Array) -> jax.Array:
         return self.c0 + self.c1 * seconds + self.c2 * uses
@@ -208,18 +210,8 @@ class StateRule(CostRule):
     d1: Any = 0.0
     d2: Any = 0.0
     scale: Any = 20.0  # seconds
-    num_free: ClassVar[int] = 5
-
-    def moved(self, by: Any) -> StateRule:
-        return StateRule(
-            c0=self.c0 * np.exp(by[0]),
-            c1=self.c1,
-            c2=self.c2 * np.exp(by[1]),
-            d0=self.d0 + by[2],
-            d1=self.d1 + by[3],
-            d2=self.d2 + by[4],
-            scale=self.scale,
-        )
+    prices: ClassVar[Mapping[str, int]] = {"c0": 0, "c2": 1}
+    exponents: ClassVar[Mapping[str, int]] = {"d0": 2, "d1": 3, "d2": 4}
 
     def price(self, session: Session, seconds: jax.Array, uses: jax.Array) -> jax.Array:
         more = session.uses - 1.0

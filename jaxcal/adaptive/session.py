@@ -79,35 +79,6 @@ class Options:
     allowed: jax.Array  # (A,) bool
 
 
-class Belief(Protocol):
-    """What is known of the unknown."""
-
-    def gains(self, task: Any, options: Options, key: jax.Array) -> jax.Array:
-        """(A,) expected information gain of each measurement, nats; at least 0."""
-
-    def gain(self, task: Any, design: Any, key: jax.Array) -> jax.Array:
-        """() expected information gain of one measurement, nats.
-
-        With a key of its own it is unbiased for a design that was chosen by ``gains``:
-        the largest of some noisy estimates is on average too large.
-        """
-
-    def update(self, task: Any, design: Any, outcome: Any, key: jax.Array) -> Any:
-        """The belief after a measurement."""
-
-    def draw(self, key: jax.Array) -> Any:
-        """A value of the unknown, drawn."""
-
-    def outcomes(self, task: Any, design: Any, key: jax.Array) -> tuple[Any, jax.Array]:
-        """Outcomes of a design, leaves (Y, ...), and (Y,) their probabilities.
-
-        All there are where they are few; otherwise some, drawn, each 1 / Y.
-        """
-
-    def entropy(self) -> jax.Array:
-        """() nats; NaN where it is not defined."""
-
-
 class SequentialTask(Protocol):
     """What is measured. ``GridTask`` and ``ParticleTask`` are the two kinds."""
 

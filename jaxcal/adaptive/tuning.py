@@ -59,7 +59,10 @@ def tune(
         keys = jax.random.split(
             jax.random.fold_in(jax.random.key(seed), number), episodes
         )
-        return (nats_of or _nats)(task, rule, keys)
+        if nats_of is not None:
+            return nats_of(task, rule, keys)
+        arrays = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), rule)
+        return float(play(task, arrays, keys).gain.mean())
 
     return search(
         rule, generations, population, elite, seed, nats_of=nats, report=report
@@ -90,8 +93,3 @@ def search(
         spreads = (1 - _SMOOTH) * spreads + _SMOOTH * tried[best].std(axis=0)
         report(number + 1, float(nats[best].mean()), rule.moved(centre))
     return rule.moved(centre)
-
-
-def _nats(task: SequentialTask, rule: Rule, keys: jax.Array) -> float:
-    rule = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), rule)
-    return float(play(task, rule, keys).gain.mean())

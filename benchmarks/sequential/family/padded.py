@@ -121,7 +121,6 @@ def pad(task: GridTask, limits: Limits) -> Padded:
         horizon=limits.measurements,
         overrun=task.overrun,
         theta_names=(),
-        design_names=(),
         allowed=np.arange(designs) < count,
         first=np.int32(limits.measurements - task.horizon),
     )

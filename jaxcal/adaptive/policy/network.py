@@ -55,7 +55,6 @@ class PolicyDecider:
     base: Rule
     per_group: int = struct.field(pytree_node=False, default=6)
     width: int = struct.field(pytree_node=False, default=64)
-    sample: bool = struct.field(pytree_node=False, default=False)
 
     def __call__(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
@@ -64,8 +63,6 @@ class PolicyDecider:
             task, belief, session, options, key, self.base, self.per_group
         )
         logits, _ = Correction(self.width).apply(self.params, seen)
-        if self.sample:
-            return seen.index[jax.random.categorical(key, logits)]
         return seen.index[jnp.argmax(logits)]
 
 

@@ -81,15 +81,10 @@ def knee(
         uses=[0, 1],
         seconds=seconds,
         num_uses=trips,
-        horizon=_horizon(seconds, test_s),
+        horizon=int(np.ceil(np.max(seconds) / test_s)),
         overrun=overrun,
         theta_names=[f"tau{i + 1}" for i in range(joints)],
-        design_names=["joint", "u"],
     )
-
-
-def _horizon(seconds: float | tuple[float, float], test_s: float) -> int:
-    return int(np.ceil(np.max(seconds) / test_s))
 
 
 ENTRY = Entry(
