@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.particles import ParticleBelief, outcome_shape
 from jaxcal.adaptive.session import SequentialTask, Session, jit_by_class
-from jaxcal.checks import in_words, numbers, whole_number
+from jaxcal.checks import array_of, in_words, numbers, whole_number
 from jaxcal.checks import seconds as checked_seconds
 
 History = Iterable[tuple[Any, Any]]  # (design, outcome) of each measurement, in order
@@ -103,7 +103,7 @@ def replay(
         entries.append(checked_entry(task, belief, session, design, outcome, where))
         key = step_keys(seed, number).update
         belief, session = after(task, belief, session, *entries[-1], key)
-        if any(np.isnan(leaf).any() for leaf in _floats(belief)):
+        if any(np.isnan(leaf).any() for leaf in jax.tree.leaves(belief)):
             raise ValueError(
                 f"{where}: outcome {outcome!r} is impossible after the earlier ones"
             )
@@ -171,12 +171,8 @@ def _row_outcome(
 
 def _answer(belief: Any, design: Any, outcome: Any, where: str) -> jax.Array:
     """Outcome that a particle of the belief can give."""
-    values = numbers(f"{where}: outcome", outcome)
     shape = outcome_shape(belief.model)
-    if values.shape != shape:
-        raise ValueError(
-            f"{where}: outcome must have shape {shape}, got {values.shape}"
-        )
+    values = array_of(f"{where}: outcome", outcome, *shape)
     answer = jnp.asarray(values, jnp.float32)
     support = belief.model.support
     if support is not None and not (answer == support).any():
@@ -215,21 +211,19 @@ def _as_designs(
     task: SequentialTask, belief: Any, session: Session, design: Any, where: str
 ) -> Any:
     """A design in the structure, the shapes and the types of the task's options."""
-    leaves, structure = jax.tree.flatten(_like(task, belief, session))
+
+    def typed(leaf: Any, values: Any) -> jax.Array:
+        return jnp.asarray(array_of(where, values, *leaf.shape[1:]), leaf.dtype)
+
+    like = _like(task, belief, session)
     try:
-        design_leaves = structure.flatten_up_to(design)  # type: ignore[attr-defined]  # jaxlib
+        jax.tree.structure(like).flatten_up_to(design)  # type: ignore[attr-defined]  # jaxlib
     except ValueError:
         raise ValueError(
-            f"{where} must have the structure {structure}, got {design!r}"
+            f"{where} must have the structure {jax.tree.structure(like)}, got "
+            f"{design!r}"
         ) from None
-    arrays = [numbers(where, values) for values in design_leaves]
-    for array, leaf in zip(arrays, leaves, strict=True):
-        if array.shape != leaf.shape[1:]:
-            raise ValueError(
-                f"{where} must have shape {leaf.shape[1:]}, got {array.shape}"
-            )
-    typed = [jnp.asarray(x, leaf.dtype) for x, leaf in zip(arrays, leaves, strict=True)]
-    return jax.tree.unflatten(structure, typed)
+    return jax.tree.map(typed, like, design)
 
 
 def from_leaves(
@@ -277,11 +271,6 @@ def _whole(value: Any) -> int | None:
         return operator.index(value)
     except TypeError:
         return None
-
-
-def _floats(tree: Any) -> list[Any]:
-    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
-    return [leaf for leaf in leaves if leaf.dtype.kind == "f"]
 
 
 def _left(session: Session) -> str:

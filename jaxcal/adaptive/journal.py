@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import pathlib
 import re
 from typing import Any
 
@@ -27,7 +26,7 @@ def fingerprint(tree: Any) -> str:
     return digest.hexdigest()
 
 
-class SessionJournal:
+def open_journal(path: str | os.PathLike[str], header: dict[str, Any]) -> JsonLines:
     """A header, which says what is measured and how, and a record a measurement.
 
     Args:
@@ -39,50 +38,24 @@ class SessionJournal:
             process is writing it.
         OSError: it cannot be written.
     """
+    header = {"kind": _KIND, "version": 1, **header}
 
-    def __init__(self, path: str | os.PathLike[str], header: dict[str, Any]) -> None:
-        header = {"kind": _KIND, "version": 1, **header}
+    def whole(number: int, record: Record) -> bool:
+        return number == 0 or {"design", "outcome"} <= record.keys()
 
-        def check(records: list[Record]) -> None:
-            if records:
-                _require_same(pathlib.Path(path), records[0], header)
+    def check(records: list[Record]) -> None:
+        if not records:
+            return
+        if records[0].get("kind") != _KIND:
+            raise ValueError(f"{path} is not a journal of a session")
+        for name, value in header.items():
+            if (written := records[0].get(name)) != value:
+                raise ValueError(
+                    f"{path} is of a session with another {name}: {written!r}, "
+                    f"not {value!r}. Use another path, or the same {name}"
+                )
 
-        self._lines = JsonLines(path, _whole, check)
-        if not self._lines.records:
-            self._lines.append(lambda: header, sync=True)
-
-    @property
-    def entries(self) -> list[Record]:
-        """Measurements so far: dicts with ``design`` and ``outcome``."""
-        return self._lines.records[1:]
-
-    def append(self, **entry: Any) -> None:
-        """Write a measurement; it is on the disk when this returns."""
-        self._lines.append(lambda: entry, sync=True)
-
-    def close(self) -> None:
-        """Let another process go on with the session."""
-        self._lines.close()
-
-    def __enter__(self) -> SessionJournal:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-def _whole(number: int, record: Record) -> bool:
-    return number == 0 or {"design", "outcome"} <= record.keys()
-
-
-def _require_same(
-    path: pathlib.Path, written: dict[str, Any], header: dict[str, Any]
-) -> None:
-    if written.get("kind") != _KIND:
-        raise ValueError(f"{path} is not a journal of a session")
-    for name, value in header.items():
-        if written.get(name) != value:
-            raise ValueError(
-                f"{path} is of a session with another {name}: {written.get(name)!r}, "
-                f"not {value!r}. Use another path, or the same {name}"
-            )
+    lines = JsonLines(path, whole, check)
+    if not lines.records:
+        lines.append(lambda: header, sync=True)
+    return lines

@@ -24,7 +24,7 @@ from jaxcal.adaptive.history import (
     replay,
     step_keys,
 )
-from jaxcal.adaptive.journal import SessionJournal, fingerprint
+from jaxcal.adaptive.journal import fingerprint, open_journal
 from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.particles import ParticleBelief
 from jaxcal.adaptive.rules import Gain
@@ -148,18 +148,19 @@ class Loop:
     ) -> None:
         self.task, self._seed = task, seed
         belief, session = begin(task, seconds, uses, seed)
+        budget = float(session.seconds)
         header = {
             "task": fingerprint(task),
             "decider": fingerprint(decider),
-            "seconds": _budget(float(session.seconds)),
+            "seconds": budget if math.isfinite(budget) else "no limit",
             "uses": int(session.uses),
             "seed": seed,
         }
         self._outside = outside(task) if decider is None else ()
         self._decider = _default(task, session) if decider is None else decider
-        self._journal = None if journal is None else SessionJournal(journal, header)
+        self._journal = None if journal is None else open_journal(journal, header)
         try:
-            lines = [] if self._journal is None else self._journal.entries
+            lines = [] if self._journal is None else self._journal.records[1:]
             made = [
                 (from_leaves(task, belief, session, line["design"]), line["outcome"])
                 for line in lines
@@ -199,8 +200,8 @@ class Loop:
             f"measurement {number}",
         )  # fmt: skip
         if self._journal is not None:
-            leaves = _leaves(entry[0])
-            self._journal.append(design=leaves, outcome=_leaves(entry[1])[0])
+            line = {"design": _leaves(entry[0]), "outcome": _leaves(entry[1])[0]}
+            self._journal.append(lambda: line, sync=True)
         key = step_keys(self._seed, number).update
         self.belief, self.session = after(
             self.task, self.belief, self.session, *entry, key
@@ -238,14 +239,15 @@ def _proposal(
     beyond: tuple[str, ...],
 ) -> Proposal:
     number = int(session.made)
+    end = Proposal(None, None, 0.0, 0.0, 0.0, number, belief, session, beyond)
     if bool(task.over(session)):
-        return Proposal(None, None, 0.0, 0.0, 0.0, number, belief, session, beyond)
+        return end
     keys = step_keys(seed, number)
     design, gain, took, uses, any_left = _choose(task, decider, belief, session, keys)
     if not took >= 0.0:
         raise ValueError(f"a measurement costs at least 0 s, got {float(took):g}")
     if not any_left:
-        return Proposal(None, None, 0.0, 0.0, 0.0, number, belief, session, beyond)
+        return end
     table = getattr(task, "designs", None)
     design = jax.tree.map(np.asarray, design)
     coordinates = design if table is None else np.asarray(table[int(design)])
@@ -270,10 +272,6 @@ def _choose(
     draws = jax.random.split(keys.gain, _DRAWS)
     gain = jax.vmap(lambda key: belief.gain(task, design, key))(draws).mean()
     return design, gain, seconds[index], uses[index], options.allowed.any()
-
-
-def _budget(seconds: float) -> float | str:
-    return seconds if math.isfinite(seconds) else "no limit"
 
 
 def _leaves(value: Any) -> list[Any]:
