@@ -131,13 +131,6 @@ class Outputs:
                 importlib.import_module("matplotlib")
             require_writable_folder(self.report)
 
-    def write_json(self, document: str) -> None:
-        """Write ``document`` to the file of --json, if one was given."""
-        if self.json is not None:
-            self.json.parent.mkdir(parents=True, exist_ok=True)
-            write_text(self.json, document)
-            print(f"saved: {self.json}")
-
 
 @dataclasses.dataclass(kw_only=True)
 class TaskOptions(Outputs):
@@ -328,7 +321,10 @@ def _show(
         count = write_report(options.report, whole, draw, runs, command=options.command)
         drawn = "1 figure" if count == 1 else f"{count} figures"
         print(f"saved: {options.report}/index.html and {drawn}")
-    options.write_json(json_document(summaries, command=options.command))
+    if options.json is not None:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        write_text(options.json, json_document(summaries, command=options.command))
+        print(f"saved: {options.json}")
 
 
 def _whole(

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from jaxcal.arguments import refused, told, typed_line
+from jaxcal.checks import aligned
 from jaxcal.commands.train_configuration import of_postures, of_task
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.learning.runtime import cache, processes
@@ -62,9 +63,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
 
 def _run(arguments: TrainOptions, prog: str) -> int:
     """Train, say how it went; of several processes the first speaks for all."""
-    from jaxcal.commands.train_arguments import preset_of
-
-    named = pathlib.Path(arguments.task or preset_of(arguments)).stem
+    named = pathlib.Path(arguments.task or arguments.preset_name).stem
     out = pathlib.Path(arguments.out or f"runs/{named}")
     if arguments.resume and not arguments.task:
         with needs("policy", "training"):
@@ -213,12 +212,6 @@ def _num_runs(arguments: TrainOptions, out: pathlib.Path) -> int:
     return len(runs_of(0, seeds, sweep))
 
 
-# -- what to train ---------------------------------------------------------------------
-
-
-# -- what is said ----------------------------------------------------------------------
-
-
 def _introduction(config: TrainConfig, out: pathlib.Path, devices: str) -> str:
     """What will be trained, in one line."""
     import jax
@@ -306,23 +299,15 @@ def _compare_runs(
     values = np.array([[seed[name] for name in measured] for seed in progress["seeds"]])
     if not len(values):
         return
-    runs = config.runs
-    names, best = runs[0], progress["best"]
-    wide = {name: max(len(name), 9) for name in names}
-    print(
-        " ".join(f"{n:>{wide[n]}}" for n in names)
-        + "".join(f"{n:>17}" for n in measured)
-    )
-    for number, (run, row) in enumerate(zip(runs, values, strict=True)):
-        print(
-            " ".join(f"{run[n]:{wide[n]}g}" for n in names)
-            + "".join(f"{x:17.4f}" for x in row)
-            + ("  best" if number == best else "")
-        )
-    if config.sweep:
-        return
-    for name, row in (("mean", values.mean(0)), ("spread", values.std(0, ddof=1))):
-        print(f"{name:>9}" + "".join(f"{x:17.4f}" for x in row))
+    heads = [[f"{value:g}" for value in run.values()] for run in config.runs]
+    if not config.sweep:
+        heads += [["mean"], ["spread"]]
+        values = np.stack([*values, values.mean(0), values.std(0, ddof=1)])
+    table = [[*config.runs[0], *measured, ""]]
+    for number, (head, row) in enumerate(zip(heads, values, strict=True)):
+        best = "best" * (number == progress["best"])
+        table.append([*head, *(f"{x:.4f}" for x in row), best])
+    print("\n".join(aligned(table)))
 
 
 def _clock(seconds: float) -> str:

@@ -54,7 +54,7 @@ A run folder holds metrics.csv and checkpoint/. Evaluate it with
 Ctrl-C saves and stops; --resume then continues bit for bit (on the same CPU).
 All devices of all processes share each update: docs/scaling.md."""
 
-TASK_PARTS: dict[str, type] = {"ppo": StreamsConfig, "policy": PolicyConfig}
+TASK_PARTS = (StreamsConfig, PolicyConfig)
 # Settings that the first screen of the help shows; --help all shows the others.
 FIRST = {"seed", "seeds", "learning_rate", "width", "episodes", "updates", "kind"} | {
     *("num_selected", "num_candidates", "num_inputs", "imitation")
@@ -115,6 +115,11 @@ class TrainOptions:
     # What the other flags set: field of a configuration to value.
     values: dict[str, Any] = dataclasses.field(default_factory=dict, init=False)
 
+    @property
+    def preset_name(self) -> str:
+        """The preset that was given; else the smallest."""
+        return self.preset or "compact"
+
 
 def flag_of(name: str) -> str:
     """The flag that sets a field."""
@@ -149,7 +154,7 @@ def _flags(title: str, settings: Iterable[Setting]) -> type:
 
 
 _POSTURES = {f.name: f for part in presets.PARTS.values() for f in settings_of(part)}
-_TASKS = {f.name: f for part in TASK_PARTS.values() for f in settings_of(part)}
+_TASKS = {f.name: f for part in TASK_PARTS for f in settings_of(part)}
 _BOTH = [field for name, field in _POSTURES.items() if name in _TASKS]
 Shared = _flags("for postures and tasks", _BOTH)
 OfPostures = _flags(
@@ -205,11 +210,6 @@ def read(prog: str, argv: Sequence[str]) -> TrainOptions:
     return asked(**values_of(parser.parse_args(argv)))
 
 
-def preset_of(arguments: TrainOptions) -> str:
-    """Name of the preset that was given; else of the smallest."""
-    return arguments.preset or "compact"
-
-
 def given_flags(arguments: TrainOptions, task: bool) -> dict[str, Any]:
     """The fields of a configuration that were given: name to value.
 
@@ -226,7 +226,7 @@ def given_flags(arguments: TrainOptions, task: bool) -> dict[str, Any]:
     elif arguments.with_:
         unread.add("--with")
     if unread:
-        who = f"--task {arguments.task}" if task else f"preset {preset_of(arguments)}"
+        who = f"--task {arguments.task}" if task else f"preset {arguments.preset_name}"
         it = "it" if len(unread) == 1 else "them"
         raise ValueError(
             f"{who} does not use {', '.join(sorted(unread))}: leave {it} out"

@@ -24,7 +24,6 @@ def of_postures(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
     from jaxcal.commands.train_arguments import (
         candidates_of,
         given_flags,
-        preset_of,
         trained_on,
     )
     from jaxcal.learning.training import presets
@@ -32,12 +31,11 @@ def of_postures(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
     flags = given_flags(arguments, task=False)
     path = arguments.candidates
     candidates = candidates_of(path) if path else None
-    config = presets.load(preset_of(arguments))
+    config = presets.load(arguments.preset_name)
     if arguments.trainer == "brax":
         config = _for_brax(config, arguments, flags)
     if arguments.resume:
-        budget = _budget(flags)
-        _refuse_with_resume(flags | _swept(arguments), out)
+        budget = _budget(arguments, flags, out)
         return _prolonged(_configuration_of(out, candidates), budget)
     _refuse_to_overwrite(out)
     if candidates is None:
@@ -112,9 +110,7 @@ def of_task(arguments: TrainOptions, out: pathlib.Path) -> PolicyConfig:
     entry = registry.load(arguments.task)
     flags = given_flags(arguments, task=True)
     if arguments.resume:
-        more = {"with": arguments.with_} if arguments.with_ else {}
-        budget = _budget(flags)
-        _refuse_with_resume(flags | more | _swept(arguments), out)
+        budget = _budget(arguments, flags, out)
         _, meta = checkpoint.read_meta(out, training.SCHEMA)
         config = PolicyConfig.from_meta(meta)
         held, given_task = map(pathlib.Path, (config.task, arguments.task))
@@ -125,12 +121,8 @@ def of_task(arguments: TrainOptions, out: pathlib.Path) -> PolicyConfig:
     _refuse_to_overwrite(out)
     options = registry.options_from(entry, arguments.with_)
     ppo, policy = (
-        {
-            f.name: flags[f.name]
-            for f in settings_of(TASK_PARTS[part])
-            if f.name in flags
-        }
-        for part in ("ppo", "policy")
+        {f.name: flags[f.name] for f in settings_of(part) if f.name in flags}
+        for part in TASK_PARTS
     )
     require_writable_folder(out)
     base = entry.rules.get("state") or _tuned(entry, options)
@@ -148,14 +140,21 @@ def _tuned(entry: Entry, options: Mapping[str, Any]) -> StateRule:
     return tune(entry.make(**options), StateRule(), episodes=1024, seed=1)
 
 
-def _swept(arguments: TrainOptions) -> dict[str, Any]:
-    return {"sweep": arguments.sweep} if arguments.sweep else {}
+def _budget(
+    arguments: TrainOptions, flags: Mapping[str, Any], out: pathlib.Path
+) -> dict[str, int]:
+    """What a run may be prolonged to; other flags are refused beside ``--resume``."""
+    from jaxcal.commands.train_arguments import flag_of
 
-
-def _budget(flags: dict[str, Any]) -> dict[str, int]:
-    """What a run may be prolonged to, taken out of the flags."""
-    names = [name for name in ("num_episodes", "num_updates") if name in flags]
-    return {name: flags.pop(name) for name in names}
+    more = {"with": arguments.with_, "sweep": arguments.sweep}
+    given = {*flags, *(name for name, value in more.items() if value)}
+    budget = given & {"num_episodes", "num_updates"}
+    if given - budget:
+        raise ValueError(
+            f"--resume takes its configuration from {out}; leave out "
+            + ", ".join(sorted(map(flag_of, given - budget)))
+        )
+    return {name: flags[name] for name in budget}
 
 
 def _prolonged(config: Any, budget: Mapping[str, int]) -> Any:
@@ -174,16 +173,6 @@ def _prolonged(config: Any, budget: Mapping[str, int]) -> Any:
         share = imitated / config.ppo.num_updates
         config = dataclasses.replace(config, imitation=share)
     return config
-
-
-def _refuse_with_resume(given: Mapping[str, Any], out: pathlib.Path) -> None:
-    from jaxcal.commands.train_arguments import flag_of
-
-    if given:
-        raise ValueError(
-            f"--resume takes its configuration from {out}; leave out "
-            + ", ".join(sorted(map(flag_of, given)))
-        )
 
 
 def _refuse_to_overwrite(out: pathlib.Path) -> None:

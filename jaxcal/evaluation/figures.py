@@ -27,8 +27,8 @@ from jaxcal.reports.plots.style import (
     legend_below,
     legend_right,
     numbered,
+    panels,
 )
-from jaxcal.reports.plots.style import panels as _panels
 
 Array = NDArray[np.float64]
 
@@ -62,10 +62,10 @@ def first_selection(evaluation: PostureEvaluation) -> Figure:
         points = np.hstack([points, np.zeros_like(points)])
     planes = list(itertools.combinations(range(min(points.shape[1], 3)), 2))
     title = _title(evaluation, "First episode")
-    figure, panels = _panels((3.6 * len(planes), 3.9), title, (1, len(planes)))
+    figure, planar = panels((3.6 * len(planes), 3.9), title, (1, len(planes)))
     chosen = [r for r in evaluation.results if r.method != "random"]
     shown = (chosen or list(evaluation.results))[:: max(len(chosen) - 1, 1)][:2]
-    for axes, plane in zip(np.ravel(panels), planes, strict=True):
+    for axes, plane in zip(np.ravel(planar), planes, strict=True):
         names = [f"command {i + 1}" for i in plane]
         for i, result in enumerate(shown):
             look = {key: numbered(i)[key] for key in ("color", "marker")}
@@ -226,7 +226,7 @@ def variances(
 
     ``rows``: label, (P,) variances, lower and upper ends of their intervals, style.
     """
-    figure, axes = _panels((8.0, 4.0))
+    figure, axes = panels((8.0, 4.0))
     look = {"linestyle": "none", "markersize": 4.5, "elinewidth": 0.9}
     offsets = np.linspace(-0.3, 0.3, len(rows)) if len(rows) > 1 else [0.0]
     for (label, variance, ends, style), offset in zip(rows, offsets, strict=True):
@@ -253,7 +253,7 @@ def _figure(
     evaluation: PostureEvaluation, title: str, height: float
 ) -> tuple[Figure, Any]:
     """A titled figure of one panel, and its axes; height in inches."""
-    figure, axes = _panels((8.0, height))
+    figure, axes = panels((8.0, height))
     axes.set_title(_title(evaluation, title), fontsize=10)
     return figure, axes
 

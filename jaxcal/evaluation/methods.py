@@ -50,11 +50,6 @@ _CHUNK = 250  # episodes between two reports of progress
 _CHUNK_EXACT = 50  # exact is slow for k above n + 1
 
 
-def label_of(method: str, num: int = 16) -> str:
-    """A method in words, as in the table."""
-    return METHODS[method].format(num=num)
-
-
 def check_methods(methods: Sequence[str]) -> tuple[str, ...]:
     """The methods by their one name each, without repeats.
 
@@ -73,17 +68,6 @@ def check_methods(methods: Sequence[str]) -> tuple[str, ...]:
     if not chosen:
         raise ValueError("methods must name at least one method, got none")
     return tuple(dict.fromkeys(chosen))
-
-
-def rows_of(
-    methods: Sequence[str], checkpoints: Sequence[str | None]
-) -> list[tuple[str, str | None]]:
-    """(method, checkpoint) of every row: a policy has one for each checkpoint."""
-    return [
-        (method, checkpoint)
-        for method in methods
-        for checkpoint in (checkpoints if method in POLICIES else (None,))
-    ]
 
 
 def evaluate(
@@ -125,7 +109,11 @@ def evaluate(
     except ValueError as error:
         raise ValueError(f"{dataset.name}: {error}") from None
     run = _Run(dataset, k, num, seed, progress or (lambda *_: None))
-    rows = rows_of(methods, checkpoints)
+    rows = [  # a policy has one for each checkpoint
+        (method, checkpoint)
+        for method in methods
+        for checkpoint in (checkpoints if method in POLICIES else (None,))
+    ]
     policies = {row: run.policy(*row) for row in rows if row[0] in POLICIES}
     random = run.random(random_draws)
     exact, reference, proven = run.exact(time_limit)
@@ -169,37 +157,13 @@ class _Run:
             gram = np.concatenate(values)
         return PostureResult(
             method=method,
-            label=label_of(method, self.num),
+            label=METHODS[method].format(num=self.num),
             checkpoint=checkpoint,
             indices=indices,
             values=self.dataset.num_outputs * gram,
             seconds=seconds / self.dataset.num_episodes,
             parameters=estimate_parameters(self.dataset, indices),
         )
-
-    def selected(
-        self, method: str, cut: slice, deadline: Deadline = NEVER
-    ) -> list[selection.Selection]:
-        """``select`` of each of some episodes."""
-        part = self.part(cut)
-        masks, chosen = part["available"], []
-        for i, candidates in enumerate(part["candidates"]):
-            more: dict[str, Any] = {}
-            if method in ("exchange", "auto"):
-                more["seed"] = self.seed
-            if deadline is not NEVER:
-                more["time_limit"] = max(deadline.remaining_s, 1e-3)
-            chosen.append(
-                selection.select(
-                    candidates,
-                    self.k,
-                    method,
-                    model=Affine(candidates.shape[1], self.dataset.num_outputs),
-                    available=None if masks is None else masks[i],
-                    **more,
-                )
-            )
-        return chosen
 
     def pieces(self, size: int = _CHUNK) -> list[slice]:
         """All episodes in slices of at most ``size``."""
@@ -231,7 +195,7 @@ class _Run:
         """One decoding of one checkpoint."""
         from jaxcal.selection.policy import select_batch
 
-        label = label_of(method, self.num)
+        label = METHODS[method].format(num=self.num)
         if checkpoint is not None:
             label = f"{label} ({checkpoint})"
 
@@ -274,7 +238,19 @@ class _Run:
                 return selection.greedy_batch(**part).indices
             if method == "exchange":
                 return selection.exchange_batch(**part, seed=self.seed).indices
-            return np.array([one.indices for one in self.selected(method, cut)])
+            masks, m = part["available"], self.dataset.num_outputs
+            return np.array(
+                [
+                    selection.select(
+                        candidates,
+                        self.k,
+                        model=Affine(candidates.shape[1], m),
+                        available=None if masks is None else masks[i],
+                        seed=self.seed,
+                    ).indices
+                    for i, candidates in enumerate(part["candidates"])
+                ]
+            )
 
         choose(slice(0, 1))  # not timed: it may compile
         choices, seconds = self.timed(method, choose)
@@ -287,12 +263,10 @@ class _Run:
 
         def choose(cut: slice) -> tuple[NDArray[Any], ...]:
             """(E, k) indices, (E,) proven, (E,) upper bounds."""
+            limit_s = None if deadline is NEVER else max(deadline.remaining_s, 1e-3)
+            m = self.dataset.num_outputs
             batch = selection.exact_batch(
-                **self.part(cut),
-                num_outputs=self.dataset.num_outputs,
-                time_limit=(
-                    None if deadline is NEVER else max(deadline.remaining_s, 1e-3)
-                ),
+                **self.part(cut), num_outputs=m, time_limit=limit_s
             )
             return batch.indices, batch.proven, batch.bound
 

@@ -152,18 +152,14 @@ def log_mean(log_values: Array) -> float:
     return float(logsumexp(log_values) - np.log(log_values.size))
 
 
-def _det(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
+def _or_dash(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
 
 
 def _share(value: float) -> str:
     """Four decimals, and never 1.0000 for what is below it."""
     text = f"{value:.4f}"
     return "0.9999+" if text == "1.0000" and value < 1.0 - 1e-12 else text
-
-
-def _times(value: float | None) -> str:
-    return "-" if value is None else f"{value:,.0f}"
 
 
 def _time(seconds: float) -> str:
@@ -174,11 +170,11 @@ def _time(seconds: float) -> str:
 
 _COLUMNS: tuple[Column, ...] = (
     ("method", lambda row: row.numbers["label"]),
-    ("mean det S", lambda row: _det(row.numbers["det_s"]["mean"])),
-    ("median det S", lambda row: _det(row.numbers["det_s"]["median"])),
+    ("mean det S", lambda row: _or_dash(row.numbers["det_s"]["mean"], ".4g")),
+    ("median det S", lambda row: _or_dash(row.numbers["det_s"]["median"], ".4g")),
     ("det S/det S*", lambda row: _share(row.numbers["ratio_to_exact"])),
     ("hit rate", lambda row: _share(row.numbers["hit_rate"])),
     ("D-eff.", lambda row: _share(row.numbers["d_efficiency"])),
-    ("x random", lambda row: _times(row.numbers["ratio_to_random"])),
+    ("x random", lambda row: _or_dash(row.numbers["ratio_to_random"], ",.0f")),
     ("time each", lambda row: _time(row.numbers["seconds_per_selection"])),
 )
