@@ -98,7 +98,7 @@ def brax(sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
     validation = training.Validation(sets, best, 3)
 
     def watch(step: int, make_policy: Any, params: Any) -> None:
-        weights = brax_ppo.network_params(params)
+        weights = params[1]["params"]["network"]
         if clock.say(validation.measure(network, weights, 4)[0]):
             raise Done
 

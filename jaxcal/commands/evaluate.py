@@ -32,9 +32,6 @@ if TYPE_CHECKING:
     from jaxcal.progress import Progress
 
 
-EXIT_INTERRUPTED = 130
-EXIT_TERMINATED = 143
-
 _POOLED = 1000  # episodes drawn of one table
 
 _DESCRIPTION = """\
@@ -223,10 +220,9 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
         with told():
             made.function(options)
     except KeyboardInterrupt as stop:
-        terminated = isinstance(stop, _Terminated)
-        how = "terminated" if terminated else "interrupted"
+        how = str(stop) or "interrupted"
         print(f"{prog}: {how}, {kept}", file=sys.stderr)
-        return EXIT_TERMINATED if terminated else EXIT_INTERRUPTED
+        return 143 if how == "terminated" else 130
     except BrokenPipeError:
         return unread()
     except (ValueError, OSError, MissingExtraError) as error:
@@ -259,12 +255,9 @@ def _listed(abouts: Mapping[str, str]) -> str:
     return "\n".join(f"  {name:10} {about}" for name, about in abouts.items())
 
 
-class _Terminated(KeyboardInterrupt):
-    """SIGTERM, which ends the command as Ctrl-C does."""
-
-
 def _terminate(number: int, frame: object) -> NoReturn:
-    raise _Terminated
+    """SIGTERM ends the command as Ctrl-C does."""
+    raise KeyboardInterrupt("terminated")
 
 
 def _run(options: EvaluateOptions) -> None:

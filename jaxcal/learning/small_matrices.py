@@ -25,20 +25,16 @@ def cholesky(matrix: jax.Array) -> jax.Array:
     """
     p = matrix.shape[-1]
     rows = [[matrix[..., i, j] for j in range(i + 1)] for i in range(p)]
-    lower = _factored(rows)
+    lower = factored(rows)
     zero = jnp.zeros_like(matrix[..., 0, 0])
     return jnp.stack(
         [jnp.stack(row + [zero] * (p - len(row)), axis=-1) for row in lower], axis=-2
     )
 
 
-def cholesky_pivots(rows: list[list[jax.Array]]) -> list[jax.Array]:
-    """Diagonal of the lower factor of a matrix held as rows of its lower triangle."""
-    return [row[-1] for row in _factored(rows)]
-
-
-def _factored(rows: list[list[jax.Array]]) -> list[list[jax.Array]]:
-    """Lower Cholesky factor, entry by entry; pivots are kept positive."""
+def factored(rows: list[list[jax.Array]]) -> list[list[jax.Array]]:
+    """Lower Cholesky factor of a matrix held as rows of its lower triangle; pivots are
+    kept positive."""
     lower: list[list[jax.Array]] = []
     for i, row in enumerate(rows):
         done: list[jax.Array] = []

@@ -15,12 +15,6 @@ from jaxcal.learning.policies.networks import NetworkConfig
 HEADS = ("actor", "critic_1", "critic_2")  # everything else is shared
 
 
-class PaperFeatures(NamedTuple):
-    """A set, as it is."""
-
-    poses: jax.Array  # (..., M, n), in [0, 1]
-
-
 class Decision(NamedTuple):
     """What a decision adds to the set."""
 
@@ -55,19 +49,17 @@ class _Keys(nn.Module):
 class Observing(Network):
     """A network whose decisions are functions of the paper's observation alone."""
 
-    def candidate_features(
-        self, candidates: jax.Array, usable: jax.Array
-    ) -> PaperFeatures:
-        return PaperFeatures(candidates)
+    def candidate_features(self, candidates: jax.Array, usable: jax.Array) -> jax.Array:
+        return candidates
 
     def decision_features(
         self,
-        features: PaperFeatures,
+        features: jax.Array,
         chosen: jax.Array,
         available: jax.Array,
         count: jax.typing.ArrayLike,
     ) -> Decision:
-        return Decision(context_features(features.poses, chosen), available)
+        return Decision(context_features(features, chosen), available)
 
     def from_observation(
         self, observation: jax.Array, num_candidates: int, num_inputs: int
@@ -77,7 +69,7 @@ class Observing(Network):
         poses = observation[..., : n * m].reshape(*observation.shape[:-1], m, n)
         available = observation[..., n * m : (n + 1) * m] > 0.5
         decision = Decision(observation[..., (n + 1) * m :], available)
-        return self.decode(self.encode(PaperFeatures(poses)), decision)
+        return self.decode(self.encode(poses), decision)
 
 
 class PaperNetwork(Observing):
@@ -104,9 +96,9 @@ class PaperNetwork(Observing):
         self.critic_1 = nn.Dense(max(width * 2 // 3, 1))
         self.critic_2 = nn.Dense(1, kernel_init=nn.initializers.orthogonal(0.1))
 
-    def encode(self, features: PaperFeatures) -> jax.Array:
+    def encode(self, features: jax.Array) -> jax.Array:
         """The candidates (..., M, width), encoded one by one."""
-        poses = nn.relu(self.pose_1(2.0 * features.poses - 1.0))
+        poses = nn.relu(self.pose_1(2.0 * features - 1.0))
         return self.pose_norm(nn.relu(self.pose_2(poses)))
 
     def decode(

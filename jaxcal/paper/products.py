@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxcal.learning.core.network import mask_logits
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.paper.network import Decision, Observing, PaperFeatures
+from jaxcal.paper.network import Decision, Observing
 
 _STATE = 64  # numbers that the chosen postures become
 _HEADS = 4
@@ -43,9 +43,9 @@ class ProductNetwork(Observing):
     def mask_is_chosen(self) -> bool:
         return True
 
-    def encode(self, features: PaperFeatures) -> jax.Array:
+    def encode(self, features: jax.Array) -> jax.Array:
         """(..., M, n + 1) centred and scaled commands, and 1."""
-        x = (features.poses - 0.5) * _SCALE
+        x = (features - 0.5) * _SCALE
         return jnp.concatenate([x, jnp.ones_like(x[..., :1])], -1)
 
     def decode(

@@ -74,7 +74,7 @@ def test_braxs_own_ppo_trains_it(tmp_path):
     watched = []  # as a caller of brax reads them while it trains
 
     def watch(step, make_policy, params):
-        watched.append(brax_ppo.network_params(params))
+        watched.append(params[1]["params"]["network"])
 
     more = {"num_evals": 3, "policy_params_fn": watch}
     brax_ppo.train(config, tmp_path, lines.append, **more)

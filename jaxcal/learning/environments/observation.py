@@ -5,13 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from jaxcal.learning.small_matrices import (
-    cholesky_pivots,
-    picked,
-    row_dot,
-    row_parts,
-    row_sum,
-)
+from jaxcal.learning.small_matrices import factored, picked, row_dot, row_parts, row_sum
 
 
 def context_features(candidates: jax.Array, chosen: jax.Array) -> jax.Array:
@@ -45,7 +39,7 @@ def context_features(candidates: jax.Array, chosen: jax.Array) -> jax.Array:
     gram = [[row_dot(z[i], z[j]) for j in range(i + 1)] for i in range(p)]
     for i in range(p):
         gram[i][i] = gram[i][i] + 0.01
-    pivots = [jnp.log(pivot) for pivot in cholesky_pivots(gram)]
+    pivots = [jnp.log(row[-1]) for row in factored(gram)]
     trace = sum(gram[i][i] for i in range(p))
     least, largest = pivots[0], pivots[0]
     for pivot in pivots[1:]:

@@ -92,7 +92,10 @@ def decision_features(
     p, total = x.shape[-1], chosen.shape[-1]
     begins = isinstance(count, int) and count == 0
     count = jnp.asarray(count)
-    which, picked = _picked_of(x, chosen)
+    which = jax.nn.one_hot(chosen, x.shape[-2], dtype=x.dtype)  # zeros: none yet
+    picked = jnp.einsum(
+        "...km,...mp->...kp", which, x, precision=jax.lax.Precision.HIGHEST
+    )
     # A choice multiplies the determinant by |y|^2, or by 1 + |y|^2.
     if total == p and begins:  # the look-ahead of the set is that of the decision
         vectors, so_far = features.vectors, jnp.zeros(x.shape[:-2], x.dtype)
@@ -107,34 +110,16 @@ def decision_features(
             y, so_far = geometry.normalised_by(x, picked, ridge)
         depth = jnp.minimum(lookahead, total - count)
         vectors = vector_features(y, total != p, available, depth, close_up)
+    remaining = total - count
+    ends = (remaining == 1, remaining == 2, remaining == 3, 1.0 / remaining)
+    shares = (count / p, jnp.minimum(remaining / p, 3.0), total > p)
+    progress = jnp.stack([jnp.asarray(number, x.dtype) for number in (*ends, *shares)])
     return DecisionFeatures(
         vectors,
         chosen=which.sum(-2) / jnp.maximum(count, 1).astype(x.dtype),
         reached=features.offset + so_far + vectors.best[..., -1],
-        progress=_progress_of(count, total, x, so_far.shape),
+        progress=jnp.broadcast_to(progress, (*so_far.shape, len(progress))),
     )
-
-
-def _picked_of(x: jax.Array, chosen: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(..., K, M) one-hot of the chosen and their rows (..., K, p) of x (..., M, p);
-    zeros where nothing is chosen yet."""
-    which = jax.nn.one_hot(chosen, x.shape[-2], dtype=x.dtype)
-    return which, jnp.einsum(
-        "...km,...mp->...kp", which, x, precision=jax.lax.Precision.HIGHEST
-    )
-
-
-def _progress_of(
-    count: jax.typing.ArrayLike, total: int, x: jax.Array, shape: tuple[int, ...]
-) -> jax.Array:
-    """(*shape, 7) ``DecisionFeatures.progress`` after ``count`` of ``total`` choices
-    among regressors x (..., M, p)."""
-    p, count = x.shape[-1], jnp.asarray(count)
-    remaining = total - count
-    ends = (remaining == 1, remaining == 2, remaining == 3, 1.0 / remaining)
-    shares = (count / p, jnp.minimum(remaining / p, 3.0), total > p)
-    numbers = jnp.stack([jnp.asarray(number, x.dtype) for number in (*ends, *shares)])
-    return jnp.broadcast_to(numbers, (*shape, len(numbers)))
 
 
 def close_up_of(ahead: jax.Array) -> jax.Array:

@@ -132,11 +132,12 @@ def any_process(flag: bool) -> bool:
 def replicate(tree: Any, mesh: Mesh | None, *axes: str) -> Any:
     """Copy arrays that are the same in every process to every device of the mesh.
 
-    With ``axes``, leading axes of the arrays are spread over these axes of the mesh.
+    With ``axes``, leading axes of the arrays are spread over those of the mesh.
     """
     if mesh is None:
         return tree
-    sharding = NamedSharding(mesh, PartitionSpec(*axes))
+    spread = PartitionSpec(*(axis for axis in axes if axis in mesh.axis_names))
+    sharding = NamedSharding(mesh, spread)
 
     def put(leaf: Any) -> jax.Array:
         plain = np.asarray(leaf)
@@ -145,12 +146,6 @@ def replicate(tree: Any, mesh: Mesh | None, *axes: str) -> Any:
         )
 
     return jax.tree.map(put, tree)
-
-
-def spread(tree: Any, mesh: Mesh | None) -> Any:
-    """Spread rows that are the same in every process over the axis ``sets``, if any."""
-    sets = mesh is not None and "sets" in mesh.axis_names
-    return replicate(tree, mesh, *(["sets"] if sets else []))
 
 
 def local(tree: Any) -> Any:

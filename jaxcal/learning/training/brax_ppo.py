@@ -92,10 +92,5 @@ def train(
             "device": jax.devices()[0].device_kind,
         },
     }
-    policy = network_params(params)
+    policy = params[1]["params"]["network"]  # of the policy, jaxcal's network
     checkpoint.save(pathlib.Path(folder) / "checkpoint", episodes, policy, meta)
-
-
-def network_params(params: Any) -> Any:
-    """Parameters of jaxcal's network in those that brax's trainer returns."""
-    return params[1]["params"]["network"]

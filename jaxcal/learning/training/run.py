@@ -214,64 +214,50 @@ def run(
     """
     last = recipe.config.ppo.num_updates if num_updates is None else num_updates
     root = pathlib.Path(folder)
-    with contextlib.ExitStack() as held:
-        if devices.is_first():
-            held.enter_context(_locked(root))
-        return _run(recipe, root, mesh, resume, report, should_stop, last)
-
-
-def _run(
-    recipe: Recipe,
-    root: pathlib.Path,
-    mesh: Mesh | None,
-    resume: bool,
-    report: Callable[[Report], None],
-    should_stop: Callable[[], bool],
-    last: int,
-) -> TrainState:
-    state, before, recent = devices.on_first(lambda: _begin(root, recipe, resume))
-    if mesh is not None:
-        state = devices.replicate(state, mesh)
-    done = int(np.max(devices.local(state.num_updates)))
     seeds = len(recipe.runs) if len(recipe.runs) > 1 else 0
     count, timed, broken = 1, False, ""
     in_row = np.zeros(len(recipe.runs), int)  # updates skipped
-
-    with contextlib.ExitStack() as stack:
-        recorder = None
+    with contextlib.ExitStack() as held:
         if devices.is_first():
-            recorder = _Recorder(root, recipe, report, last, before, done, recent)
-            stack.enter_context(contextlib.closing(recorder))
-        while done < last and not broken and not devices.any_process(should_stop()):
-            begun = time.perf_counter()
-            at_most, given = _UPDATES, recipe.given
-            learner = recipe.learners[done % len(recipe.learners)]
-            if done < recipe.num_imitated:
-                assert recipe.imitate is not None  # there are updates that imitate
-                learner, shown = recipe.imitate(done)
-                at_most, given = 1, (devices.spread(shown, mesh),)
-            elif len(recipe.learners) > 1:
-                at_most = 1  # the next update has another program
-            count = min(count, at_most, last - done)
-            update = updates(recipe.config.ppo, learner, mesh, at_most, seeds)
-            with collective():
-                state, metrics = update(state, np.int32(count), *given)
-                # One transfer for all that these updates measured.
-                rows = jax.device_get(devices.local(metrics))
-            first, done = done, done + count
-            for number in range(count):
-                fine = np.ravel(rows["skipped"][number]) == 0.0
-                in_row = np.where(fine, 0, in_row + 1)
-                if in_row.min() == _SKIPS:
-                    broken = _broken(rows, number, first + number + 1)
-            if recorder is not None:
-                recorder.note(state, first, count, rows, save=not broken)
-            seconds = (time.perf_counter() - begun) / count
-            # The first call also compiled, so the second is of one update too.
-            fit = int(_CALL_SECONDS / seconds) if timed else 1
-            count, timed = devices.on_first(functools.partial(max, fit, 1)), True
-    if recorder is not None:
-        recorder.save(state, done)
+            held.enter_context(_locked(root))
+        state, before, recent = devices.on_first(lambda: _begin(root, recipe, resume))
+        state = devices.replicate(state, mesh)
+        done = int(np.max(devices.local(state.num_updates)))
+        with contextlib.ExitStack() as stack:
+            recorder = None
+            if devices.is_first():
+                recorder = _Recorder(root, recipe, report, last, before, done, recent)
+                stack.enter_context(contextlib.closing(recorder))
+            while done < last and not broken and not devices.any_process(should_stop()):
+                begun = time.perf_counter()
+                at_most, given = _UPDATES, recipe.given
+                learner = recipe.learners[done % len(recipe.learners)]
+                if done < recipe.num_imitated:
+                    assert recipe.imitate is not None  # there are updates that imitate
+                    learner, shown = recipe.imitate(done)
+                    at_most, given = 1, (devices.replicate(shown, mesh, "sets"),)
+                elif len(recipe.learners) > 1:
+                    at_most = 1  # the next update has another program
+                count = min(count, at_most, last - done)
+                update = updates(recipe.config.ppo, learner, mesh, at_most, seeds)
+                with collective():
+                    state, metrics = update(state, np.int32(count), *given)
+                    # One transfer for all that these updates measured.
+                    rows = jax.device_get(devices.local(metrics))
+                first, done = done, done + count
+                for number in range(count):
+                    fine = np.ravel(rows["skipped"][number]) == 0.0
+                    in_row = np.where(fine, 0, in_row + 1)
+                    if in_row.min() == _SKIPS:
+                        broken = _broken(rows, number, first + number + 1)
+                if recorder is not None:
+                    recorder.note(state, first, count, rows, save=not broken)
+                seconds = (time.perf_counter() - begun) / count
+                # The first call also compiled, so the second is of one update too.
+                fit = int(_CALL_SECONDS / seconds) if timed else 1
+                count, timed = devices.on_first(functools.partial(max, fit, 1)), True
+        if recorder is not None:
+            recorder.save(state, done)
     if broken:
         raise DivergedError(broken)
     return state
@@ -383,8 +369,13 @@ class _Recorder:
             return
         spread: dict[str, float] = {}
         if recipe.validate is not None:
-            averages = _of_each(devices.local(state.average), len(recipe.runs))
-            self._of_seeds = [recipe.validate(average) for average in averages]
+            average = devices.local(state.average)
+            of_each = [average]
+            if (number := len(recipe.runs)) > 1:
+                of_each = [
+                    jax.tree.map(lambda x, i=i: x[i], average) for i in range(number)
+                ]
+            self._of_seeds = [recipe.validate(average) for average in of_each]
             for name in self._of_seeds[0]:
                 values = [seed[name] for seed in self._of_seeds]
                 row[name] = float(np.mean(values))
@@ -458,12 +449,6 @@ def _mean(values: Any) -> float:
     """Mean of those that are finite: a run that diverged is NaN from then on."""
     finite = np.ravel(values)[np.isfinite(np.ravel(values))]
     return float(finite.mean()) if len(finite) else np.nan
-
-
-def _of_each(tree: Any, runs: int) -> list[Any]:
-    if runs == 1:
-        return [tree]
-    return [jax.tree.map(lambda leaf, run=run: leaf[run], tree) for run in range(runs)]
 
 
 def _table(path: pathlib.Path, done: int, columns: Sequence[str]) -> TextIO:
