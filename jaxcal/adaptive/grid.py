@@ -308,12 +308,6 @@ class GridTask:
         uses = (p * self.uses).sum(axis=-1)
         return options.seconds + (p * self.extra).sum(axis=-1), uses
 
-    def log_likelihood(
-        self, truth: jax.Array, design: jax.Array, outcome: jax.Array
-    ) -> jax.Array:
-        """() log probability, or density, of an outcome."""
-        return jnp.log(self.likelihood[design, outcome, truth] + _SMALL)
-
 
 def _require_affordable(task: GridTask) -> None:
     """The smallest budget must pay for a first measurement."""

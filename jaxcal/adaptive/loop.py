@@ -100,7 +100,6 @@ def run(
     seconds: float | None = None,
     uses: int | None = None,
     seed: int = 0,
-    enough: Callable[[Proposal], bool] = lambda proposal: False,
 ) -> SessionResult:
     """Propose, measure, update, until the budget is spent.
 
@@ -110,7 +109,6 @@ def run(
             the loop, and what was measured before is in the journal.
         journal: file of the session. Where it is there the session goes on as if it had
             not been interrupted.
-        enough: asked before each measurement; True ends the session.
 
     Raises:
         ValueError: the journal is of another task, decider or budget; an outcome is not
@@ -121,7 +119,7 @@ def run(
     ) as loop:
         while True:
             proposal = loop.suggest()
-            if proposal.design is None or enough(proposal):
+            if proposal.design is None:
                 return SessionResult(loop.history, loop.belief, loop.session)
             loop.observed(measure(proposal))
 

@@ -109,9 +109,6 @@ class SequentialTask(Protocol):
     ) -> tuple[jax.Array, jax.Array]:
         """(A,) seconds and (A,) uses that each measurement is expected to take."""
 
-    def log_likelihood(self, truth: Any, design: Any, outcome: Any) -> jax.Array:
-        """() log probability, or density, of an outcome."""
-
 
 class Decider(Protocol):
     """Picks the next measurement; a pytree, its numbers are leaves."""

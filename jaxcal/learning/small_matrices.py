@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 _TINY = 1e-12  # least squared pivot; float32 commands in [0, 1] resolve no smaller one
+_LEAST_SQUARE = 1e-18  # of a column after projection
 _UNROLLED_ROWS = 16  # sums over at most so many rows are written out
 
 
@@ -69,20 +70,16 @@ def solve_lower(lower: jax.Array, rows: jax.Array) -> jax.Array:
     return jnp.stack(out, axis=-1)
 
 
-def log_det_gram(
-    postures: jax.Array, present: jax.Array | None = None, floor: float = 1e-18
-) -> jax.Array:
+def log_det_gram(postures: jax.Array, present: jax.Array | None = None) -> jax.Array:
     """Log-determinant of ``Z.T @ Z`` by Gram-Schmidt about the centroid.
 
     Args:
         postures: (..., K, n) commands, K > n.
         present: (..., K) bool, the rows that count; all of them by default. At least
             one must.
-        floor: least squared length of a column after projection; it keeps the value
-            finite where the postures lie in one plane.
 
     Returns:
-        (...,) natural log.
+        (...,) natural log; finite also where the postures lie in one plane.
     """
     if present is None:
         present = jnp.ones(postures.shape[:-1], bool)
@@ -99,9 +96,10 @@ def log_det_gram(
             along = row_dot(v, e)
             v = [x - along * y for x, y in zip(v, e, strict=True)]
         square = row_dot(v, v)
-        factor = jax.lax.rsqrt(jnp.maximum(square, floor))
+        square = jnp.maximum(square, _LEAST_SQUARE)
+        factor = jax.lax.rsqrt(square)
         basis.append([x * factor for x in v])
-        value = value + jnp.log(jnp.maximum(square, floor))
+        value = value + jnp.log(square)
     return value[..., 0]
 
 

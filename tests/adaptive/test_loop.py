@@ -262,13 +262,6 @@ def test_an_outcome_that_is_none_is_not_written(tmp_path, sharp):
     assert path.read_bytes().count(b"\n") == 1
 
 
-def test_enough_ends_a_session(sharp):
-    finished = run(
-        sharp, PRICED, device((0.4, 0.7)), enough=lambda proposal: proposal.number == 2
-    )
-    assert len(finished.history) == 2
-
-
 def test_a_fingerprint_tells_tables_and_kinds_apart(task):
     assert fingerprint(task) == fingerprint(knee(**SMALL))
     assert fingerprint(task) != fingerprint(knee(**SMALL, slip=0.02))

@@ -89,9 +89,8 @@ def save(
     policy: Any,
     meta: dict[str, Any],
     state: TrainState | None = None,
-    keep: int = 3,
 ) -> None:
-    """Add a step to a checkpoint folder.
+    """Add a step to a checkpoint folder, of which the newest three are kept.
 
     Args:
         folder: made where missing.
@@ -100,7 +99,6 @@ def save(
         meta: JSON values: a configuration, and its ``schema`` if not ``SCHEMA``.
         state: of the run, whose averaged weights are ``policy``; None for a policy that
             cannot be resumed.
-        keep: newest steps to keep; older ones are deleted.
     """
     root = pathlib.Path(folder)
     root.mkdir(parents=True, exist_ok=True)
@@ -114,7 +112,7 @@ def save(
         for name, tree in trees.items()
     }
     options = ocp.CheckpointManagerOptions(
-        max_to_keep=keep,
+        max_to_keep=3,
         create=False,
         cleanup_tmp_directories=True,
         enable_async_checkpointing=False,
