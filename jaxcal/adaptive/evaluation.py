@@ -47,7 +47,6 @@ METHODS = {
 _RIVALS = ("state", "ahead", "shares", "priced", "rate", "gain")
 _GENERATIONS = 20  # of tuning
 _TIMED = 128  # sessions on which a choice is timed
-_BATCH = 1024  # sessions at once
 
 Progress = Callable[[str, int, int], None]
 
@@ -183,23 +182,23 @@ def evaluate(
     trained = policies.load(checkpoint) if "policy" in methods else None
     needed = [m for m in ("priced", "state") if m in methods]
     rules = _rules(entry, task, needed, retune, seed, progress)
+    deciders: dict[str, Any] = {
+        "random": Random(), "gain": Gain(), "rate": GainRate(), "shares": SHARES,
+        "ahead": AHEAD, **rules,
+    }  # fmt: skip
+    if trained is not None:
+        deciders["policy"] = trained.decider
+    if "ahead" in methods and isinstance(task, GridTask):
+        progress("fitting ahead", 0, 1)  # on other sessions than judge it
+        deciders["ahead"] = fit(task, seed=seed + 1).decider
     results = []
     for method in methods:
-        if method == "policy":
-            assert trained is not None  # loaded above
-            decider: Any = trained.decider
-        elif method == "ahead" and isinstance(task, GridTask):
-            progress("fitting ahead", 0, 1)
-            decider = fit(task, seed=seed + 1).decider  # other sessions than judge it
-        else:
-            decider = _decider(method, rules)
-        decider = jax.tree.map(jnp.asarray, decider)
+        decider = jax.tree.map(jnp.asarray, deciders[method])
         played = compare(
             task,
             {method: decider},
             episodes,
             seed,
-            batch=_BATCH,
             progress=lambda done, method=method: progress(method, done, episodes),  # type: ignore[misc]  # default binds the loop's value
         )
         result = DeciderResult(
@@ -253,14 +252,6 @@ def _rules(
             )
         rules[name] = rule
     return rules
-
-
-def _decider(method: str, rules: Mapping[str, CostRule]) -> Any:
-    simple = {
-        "random": Random(), "gain": Gain(), "rate": GainRate(), "shares": SHARES,
-        "ahead": AHEAD,
-    }  # fmt: skip
-    return simple[method] if method in simple else rules[method]
 
 
 @jit_by_class

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcal.learning.core.network import Network, mask_logits
-from jaxcal.learning.environments.observation import context_features
+from jaxcal.learning.environments.selection import context_features
 from jaxcal.learning.policies.networks import NetworkConfig
 
 HEADS = ("actor", "critic_1", "critic_2")  # everything else is shared

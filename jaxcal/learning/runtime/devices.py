@@ -48,18 +48,18 @@ def make_mesh(
         chosen += [d for d in jax.devices() if d.process_index == process][:number]
     if len(chosen) == 1:
         return None
-    shared, change = rows, "change one of the three, or "
+    shared = rows
     what = (
         "episodes_per_update / (episodes_per_set x num_minibatches), the sets of a "
         "minibatch (of a task decisions_per_update / (stream_length x num_minibatches))"
     )
     if num_runs > 1:
-        shared, what, change = num_runs, "--seeds (times the values of --sweep)", ""
+        shared, what = num_runs, "--seeds (times the values of --sweep)"
     if shared % len(chosen):
         fewer = max(n for n in range(1, len(chosen)) if shared % n == 0)
         raise ValueError(
             f"{what} must be a multiple of the {len(chosen)} devices, got {shared}; "
-            f"{change}use {fewer} devices (--devices {fewer})"
+            f"use {fewer} devices (--devices {fewer})"
         )
     return Mesh(np.asarray(chosen), ("seeds" if num_runs > 1 else "sets",))
 
