@@ -11,6 +11,7 @@ import dataclasses
 import importlib
 import importlib.util
 import itertools
+import pathlib
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -60,6 +61,16 @@ def path_of(thing: type) -> str:
     return f"{thing.__module__.removeprefix(_OWN)}:{thing.__qualname__}"
 
 
+def run_file(path: str | pathlib.Path, name: str) -> Any:
+    """The module ``name`` that a Python file becomes when it is run."""
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None  # it is a Python file
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look up the module there
+    spec.loader.exec_module(module)
+    return module
+
+
 def named(path: str) -> Any:
     """What ``module:Name`` or ``file.py:Name`` names.
 
@@ -69,13 +80,8 @@ def named(path: str) -> Any:
     place, _, name = path.rpartition(":")
     try:
         if place.endswith(".py"):
-            spec = importlib.util.spec_from_file_location(f"{_OWN}{place}", place)
-            assert spec is not None and spec.loader is not None  # it is a Python file
-            module = sys.modules.get(spec.name)
-            if module is None:
-                module = importlib.util.module_from_spec(spec)
-                sys.modules[spec.name] = module  # dataclasses look up the module there
-                spec.loader.exec_module(module)
+            name_of_file = f"{_OWN}{place}"
+            module = sys.modules.get(name_of_file) or run_file(place, name_of_file)
         else:
             module = importlib.import_module(place)
         return getattr(module, name)
@@ -92,11 +98,6 @@ TRACED = (
 )  # fmt: skip
 """Fields of ``PPOConfig`` that a run may have as arrays, other than its
 configuration's: runs that differ in them are one program."""
-
-_NOT_NEGATIVE = (
-    "final_learning_rate", "warmup_updates", "value_coefficient", "entropy_start",
-    "entropy_end", "advantage_limit",
-)  # fmt: skip
 
 Sweep = tuple[tuple[str, tuple[float, ...]], ...]
 """Values of fields in ``TRACED``; every combination is a run for each seed."""
@@ -150,7 +151,9 @@ class PPOConfig(abc.ABC):
         require(self, "positive", lambda v: v > 0, *positive)
         require(self, "in [0, 1]", lambda v: 0.0 <= v <= 1.0, "discount", "gae_lambda")
         require(self, "in [0, 1)", lambda v: 0.0 <= v < 1.0, "average_decay")
-        require(self, "0 or more", lambda v: v >= 0, *_NOT_NEGATIVE)
+        coefficients = ("value_coefficient", "entropy_start", "entropy_end")
+        limits = ("final_learning_rate", "warmup_updates", "advantage_limit")
+        require(self, "0 or more", lambda v: v >= 0, *coefficients, *limits)
 
     def require_sweep(self, sweep: Sweep) -> None:
         """Refuse a sweep of what cannot be swept, or of values that break a rule."""

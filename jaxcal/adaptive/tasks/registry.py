@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import importlib.metadata
-import importlib.util
 import inspect
 import pathlib
 import sys
@@ -18,11 +16,10 @@ from typing import Any
 
 from jaxcal.adaptive.rules import Priced, StateRule
 from jaxcal.extras import installed
+from jaxcal.learning.config import named, run_file
 
 _GROUP = "jaxcal.tasks"  # entry points
-_OWN = {
-    "knee": "jaxcal.adaptive.tasks.knee:ENTRY",
-}
+_OWN = {"knee": "jaxcal.adaptive.tasks.knee:ENTRY"}
 
 FREE = {"priced": Priced(1.0, 0.0, 0.0), "state": StateRule(1.0, 0.0, 0.0)}
 """Rules of a task whose measurements cost nothing: the largest gain."""
@@ -59,7 +56,7 @@ def load(name: str) -> Entry:
     if name.endswith(".py"):
         entry = _of_file(pathlib.Path(name))
     elif name in _OWN:
-        entry = importlib.metadata.EntryPoint(name, _OWN[name], _GROUP).load()
+        entry = named(_OWN[name])
     elif name in installed(_GROUP):
         entry = installed(_GROUP)[name].load()
     else:
@@ -75,13 +72,9 @@ def load(name: str) -> Entry:
 def _of_file(path: pathlib.Path) -> Any:
     if not path.is_file():
         raise ValueError(f"task file {path} does not exist")
-    spec = importlib.util.spec_from_file_location(f"{_GROUP} {path}", path)
-    assert spec is not None and spec.loader is not None  # it is a Python file
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # its dataclasses look up the module there
     sys.path.insert(0, folder := str(path.parent.resolve()))  # as Python runs a file
     try:
-        spec.loader.exec_module(module)
+        module = run_file(path, f"{_GROUP} {path}")
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
         raise ValueError(f"task file {path}: {reason}") from error
