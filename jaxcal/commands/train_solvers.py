@@ -25,16 +25,14 @@ def fixed_validation(config: TrainConfig) -> Validation:
         states = jax.vmap(task.reset)(
             jax.random.split(jax.random.key(20261121), _VALIDATED)
         )
-        candidates = np.asarray(states.candidates, np.float64)
+        sets = np.asarray(states.candidates, np.float64)
         free = np.asarray(states.available)
-        optima = exact_batch(
-            candidates, env.num_selected, available=free, num_outputs=1
-        )
-        return Validation(candidates, np.asarray(optima.log_det), env.num_outputs, free)
-    rng = np.random.default_rng([20261121, env.num_candidates, env.num_inputs])
-    sets = rng.uniform(size=(_VALIDATED, env.num_candidates, env.num_inputs))
-    best = exact_batch(sets, env.num_selected, num_outputs=1).log_det
-    return Validation(sets, np.asarray(best), env.num_outputs)
+    else:
+        rng = np.random.default_rng([20261121, env.num_candidates, env.num_inputs])
+        sets = rng.uniform(size=(_VALIDATED, env.num_candidates, env.num_inputs))
+        free = np.ones(sets.shape[:2], bool)
+    best = exact_batch(sets, env.num_selected, available=free, num_outputs=1).log_det
+    return Validation(sets, np.asarray(best), env.num_outputs, free)
 
 
 def teacher(

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax.traverse_util import flatten_dict
 
 from jaxcal.extras import MissingExtraError
 from jaxcal.learning.environments.selection import SelectionConfig
@@ -132,10 +131,8 @@ def test_the_scores_are_those_of_jax_in_double_precision(rng, config, n, k, made
         theirs = scorer.NetworkScorer(network, double)
         memory = theirs.encode(regressors, available)
         logits = theirs.scores(memory, chosen, free, made)
-    ours = CompactScorer(
-        dataclasses.asdict(config),
-        flatten_dict(params, sep="."),
-    )
+    arrays = checkpoint.as_weights(params, {"network": {}}).arrays
+    ours = CompactScorer(dataclasses.asdict(config), arrays)
     own = ours.encode(np.stack([p.rows for p in problems]), available)
     np.testing.assert_allclose(own.encoded, memory[1], rtol=1e-4, atol=1e-4)
     scores = ours.scores(own, chosen, free, made)

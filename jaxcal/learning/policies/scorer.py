@@ -113,22 +113,19 @@ def choose(
     """
     points, free = np.asarray(candidates), np.asarray(available)
     rows = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1)
-    kept = np.zeros((len(free), 0)) if required is None else required
-    drawn = decoding == "samples"
+    given = np.zeros((len(free), 0)) if required is None else required
+    seeds = range(len(free)) if seeds is None else seeds
     return decoders.choose(
         NetworkScorer(network, params),
         rows,
         free,
-        np.asarray(kept, np.int64),
+        np.asarray(given, np.int64),
         k,
         decoding=decoding,
         num=num,
         generators=[
-            np.random.default_rng(seed)
-            for seed in (range(len(free)) if seeds is None else seeds)
-        ]
-        if drawn
-        else (),
+            np.random.default_rng(seed) for seed in seeds if decoding == "samples"
+        ],
     )
 
 
