@@ -247,66 +247,38 @@ class Calibration(Fit):
         return dataclasses.replace(self, **fields, provenance=origin)
 
     def _for_file(self) -> Array:
-        """(p,) for a file: fitted without what no file holds, which is zero."""
+        """(p,) for a file: without what no file holds; a warning gives the effect."""
         plain, parameters = self.model.writable(), np.array(self.parameters)
-        kept = np.isin(self.names, plain.names)
-        if kept.all() and not self.estimate[len(self.names) :].any():
+        held = np.isin(self.names, plain.names)
+        if held.all() and not self.estimate[len(self.names) :].any():
             return parameters
-        if not kept.all():
-            return self._moved_as_a_whole(np.where(kept, parameters, 0.0))
-        parameters[kept], parameters[~kept] = self._without_harmonics(plain), 0.0
-        return parameters
-
-    def _moved_as_a_whole(self, parameters: Array) -> Array:
-        """(p,) parameters, the machine moved to where this arm is; with a warning."""
-        parameters = self.model.standing_as(self.arm, parameters, self.commands)
-        file = self.model.calibrated(parameters)
-        joints = self.commands[:, : file.num_inputs]
-        off = file.predict(joints) - self.arm.predict(joints)
         unit = f" {self.measured_unit}" if self.measured_unit else ""
-        apart = float(np.linalg.norm(off, axis=1).mean())
-        touched = self.commands[:, file.num_inputs :]  # of which all may be elsewhere
-        for place in np.unique(touched, axis=0) if touched.shape[1] else ():
-            rows = (touched == place).all(axis=1)
-            off[rows] -= off[rows].mean(axis=0)
-        scatter = float(np.linalg.norm(off, axis=1).mean())
-        told = getattr(self.verdict, "held_out", np.nan)
-        of_tip = self.num_outputs == 3 and "tool x" in self.names
-        errors = (
-            f"; cross-validated error about {np.hypot(told, scatter):.3g}{unit}, of "
-            f"the calibration {told:.3g}"
-            if of_tip and np.isfinite(told)
-            else ""
-        )
+        errors = ""
+        if held.all():
+            change = "it was fitted without harmonics"
+            again = self.again(plain, plain.default_prior())
+            parameters = again.parameters
+            off = again.predict(self.commands) - self.predict(self.commands)
+            if again.noise_std is not None and self.noise_std is not None:
+                verdicts: tuple[Any, Any] = again.verdict, self.verdict
+                errors = (
+                    f"; cross-validated error {verdicts[0].held_out:.3g}{unit}, of the "
+                    f"calibration {verdicts[1].held_out:.3g}"
+                )
+        else:
+            change = "the arm in it was moved as a whole"
+            parameters = np.where(held, parameters, 0.0)
+            parameters = self.model.standing_as(self.arm, parameters, self.commands)
+            file = self.model.calibrated(parameters)
+            joints = self.commands[:, : file.num_inputs]
+            off = file.predict(joints) - self.arm.predict(joints)
         warnings.warn(
-            "the file cannot hold compliance and gear harmonics. The arm in it, moved "
-            f"as a whole, puts the tip at the measured postures {apart:.3g}{unit} from "
-            f"the calibration's on average{errors}",
-            stacklevel=4,
+            f"the file cannot hold compliance and gear harmonics; {change}: at the "
+            "measured postures its predictions differ from the calibration's by "
+            f"{np.linalg.norm(off, axis=1).mean():.3g}{unit} on average{errors}",
+            stacklevel=3,
         )
         return parameters
-
-    def _without_harmonics(self, plain: Model) -> Array:
-        """(p,) fitted again for the ``plain`` model, with a warning how far off."""
-        again = self.again(plain, plain.default_prior())
-        moved = self.predict(self.commands) - again.predict(self.commands)
-        unit = f" {self.measured_unit}" if self.measured_unit else ""
-        effect = (
-            "at the measured postures its predictions differ from the calibration's "
-            f"by {np.linalg.norm(moved, axis=1).mean():.3g}{unit} on average"
-        )
-        if again.noise_std is not None and self.noise_std is not None:
-            of_arms: tuple[Any, Any] = again.verdict, self.verdict
-            effect += (
-                f"; cross-validated error {of_arms[0].held_out:.3g}{unit}, of the "
-                f"calibration {of_arms[1].held_out:.3g}"
-            )
-        warnings.warn(
-            "the file cannot hold compliance and gear harmonics; it was fitted "
-            f"without harmonics: {effect}",
-            stacklevel=4,
-        )
-        return again.parameters
 
     # -- from a file -------------------------------------------------------------------
 
