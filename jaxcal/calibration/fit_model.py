@@ -16,7 +16,7 @@ from jaxcal.calibration.least_squares import (
     singular,
     solve,
 )
-from jaxcal.calibration.losses import LOSSES, constants
+from jaxcal.calibration.losses import LOSSES, Loss, constants
 from jaxcal.calibration.noise_levels import are_shared, pooled
 from jaxcal.calibration.prior_scales import (
     PriorScales,
@@ -96,18 +96,9 @@ def fit_model(
     fitted = with_misfit if model.fits_misfit else model
     scaled = prior is not None or exact  # as far as the prior wants it
     prior = prior or fitted.default_prior()
+    observations = _Observations(commands, measured, weights, used, spread)
     problem, centre = _problem(
-        fitted,
-        commands,
-        measured,
-        weights,
-        used,
-        prior=prior,
-        noise=noise,
-        command_std=spread,
-        loss=loss,
-        common_noise=common_noise,
-        excited=excited,
+        observations, fitted, prior, noise, LOSSES[loss], common_noise, excited
     )
     scales, misfit_factor, shared = None, 1.0, ""
     if prior.by_data and scaled:
@@ -121,11 +112,16 @@ def fit_model(
         solution = solve(problem)
     if common_noise is None and model.default_noise() is not None:
         problem, solution = _with_levels_apart(problem, solution)
-    fields = _fields(problem, solution, _Observations(commands, measured, used, centre))
-    if fields["joint_covariance"] is not None:
-        fields |= _widened(
-            problem, solution, fields, scales, with_misfit, misfit_factor
-        )
+    fields = _fields(problem, solution, observations, centre)
+    by_noise = fields["joint_covariance"]
+    if by_noise is not None:  # count what was estimated besides: scales and misfit
+        if scales is not None:
+            added = covariance_of_scales(problem, solution, scales)
+            fields["joint_covariance"] = by_noise + added
+        if with_misfit is not problem.model:
+            fields |= _misfit(
+                with_misfit, problem, solution, fields, by_noise, misfit_factor
+            )
     return fields | {"model": model, "loss": loss, "noise_levels": shared}
 
 
@@ -136,17 +132,22 @@ def _may_pool(problem: FitProblem, common_noise: Any) -> bool:
     return problem.model.default_noise() is None and not problem.model.multiplicity
 
 
+class _Observations(NamedTuple):
+    """All measurements, of which the fit uses some."""
+
+    commands: Array  # (N, n)
+    measured: Array  # (N, q)
+    weights: Array  # (N,)
+    used: slice | NDArray[np.bool_]  # a slice: all
+    command_std: Array  # (N, n)
+
+
 def _problem(
+    observations: _Observations,
     model: Model,
-    commands: Array,
-    measured: Array,
-    weights: Array,
-    used: slice | NDArray[np.bool_],
-    *,
     prior: Prior,
     noise: Noise,
-    command_std: Array,
-    loss: str,
+    loss: Loss | None,
     common_noise: bool | Sequence[Any] | None,
     excited: tuple[str, ...],
 ) -> tuple[FitProblem, Array | None]:
@@ -155,6 +156,7 @@ def _problem(
     Returns:
         It, and (n,) what its commands are counted from, None: from zero.
     """
+    commands, measured, weights, used, command_std = observations
     exact, resolved = not command_std.any(), prior.resolve(model)
     centre, to_centred = None, None
     if exact and resolved.free.all() and not resolved.precisions.any():
@@ -182,28 +184,10 @@ def _problem(
         command_std=command_std[used],
         noise_known=noise.std is not None or noise.covariance is not None,
         levels=levels,
-        loss=LOSSES[loss],
+        loss=loss,
         first_log_size=model.log_size(counted, mean),
     )
     return problem, centre
-
-
-def _widened(
-    problem: FitProblem,
-    solution: FitSolution,
-    fields: dict[str, Any],
-    scales: PriorScales | None,
-    with_misfit: Model,
-    misfit_factor: float,
-) -> dict[str, Any]:
-    """Fields whose covariance counts what was estimated besides: scales and misfit."""
-    by_noise = fields["joint_covariance"]
-    if scales is not None:
-        added = covariance_of_scales(problem, solution, scales)
-        fields = fields | {"joint_covariance": by_noise + added}
-    if with_misfit is problem.model:
-        return fields
-    return _misfit(with_misfit, problem, solution, fields, by_noise, misfit_factor)
 
 
 def _used(weights: Array) -> slice | NDArray[np.bool_]:
@@ -456,28 +440,13 @@ def _information_shares(problem: FitProblem, solution: FitSolution) -> Array:
     return np.asarray(efficiency * np.minimum(1.0, solution.weights / mean))
 
 
-class _Observations(NamedTuple):
-    """All measurements, of which the fit used some."""
-
-    commands: Array  # (N, n)
-    measured: Array  # (N, q)
-    used: slice | NDArray[np.bool_]  # a slice: all
-    centre: Array | None  # (n,) what the fit took from the commands
-
-    @property
-    def left_out(self) -> tuple[Array, Array]:
-        """Commands, centred, and readings of those that the fit did not use."""
-        assert not isinstance(self.used, slice)
-        commands = self.commands[~self.used]
-        if self.centre is not None:
-            commands = commands - self.centre
-        return commands, self.measured[~self.used]
-
-
 def _fields(
-    problem: FitProblem, solution: FitSolution, observations: _Observations
+    problem: FitProblem,
+    solution: FitSolution,
+    observations: _Observations,
+    centre: Array | None,
 ) -> dict[str, Any]:
-    commands, _, used, centre = observations
+    commands, used = observations.commands, observations.used
     covariance, null = _covariance(problem, solution)
     noise_std, noise_dof = _noise_level(problem, solution)
     estimate, mean = solution.parameters, problem.mean
@@ -501,7 +470,7 @@ def _fields(
         "free": problem.free.astype(np.float64),
         "commands": commands,
         "estimated_commands": estimated,
-        "residuals": _residuals(problem, solution, observations),
+        "residuals": _residuals(problem, solution, observations, centre),
         "loss_weights": loss_weights,
         "distance": distance,
         "dof": max(float(solution.freedom.sum()), 0.0),
@@ -532,7 +501,10 @@ def _noise_level(
 
 
 def _residuals(
-    problem: FitProblem, solution: FitSolution, observations: _Observations
+    problem: FitProblem,
+    solution: FitSolution,
+    observations: _Observations,
+    centre: Array | None,
 ) -> Array:
     """(N, q) of all measurements, also of those that were left out of the fit."""
     used = observations.used
@@ -540,8 +512,9 @@ def _residuals(
         return solution.residuals
     residuals = np.empty_like(observations.measured)
     residuals[used] = solution.residuals
-    commands, measured = observations.left_out
-    off = measured - problem.model.predict(commands, solution.parameters)
+    commands = observations.commands[~used] - (0.0 if centre is None else centre)
+    off = observations.measured[~used]
+    off = off - problem.model.predict(commands, solution.parameters)
     residuals[~used] = problem.model.wrapped(off, commands)
     return residuals
 
@@ -555,9 +528,10 @@ def _covariance(
         ValueError: every reading is used up and parameters are still undetermined.
     """
     size, free = len(problem.mean), np.flatnonzero(problem.free)
+    covariance = np.zeros((size, size))
     if solution.root is not None:
-        covariance = solution.root @ solution.root.T
-        return _with_held(size, free, covariance), None
+        covariance[free[:, None], free] = solution.root @ solution.root.T
+        return covariance, None
     rows = (
         np.sqrt(_information_shares(problem, solution))[:, None, None] * solution.rows
     )
@@ -586,7 +560,7 @@ def _covariance(
         _require_readings(problem, solution, of_rows, len(unseen))
     directions = np.zeros((len(unseen), size))
     directions[:, free] = unseen
-    covariance = _with_held(size, free, factor.T @ factor)
+    covariance[free[:, None], free] = factor.T @ factor
     return covariance, directions if len(directions) else None
 
 
@@ -608,12 +582,3 @@ def _require_readings(
         f"them stay unknown{f' ({words})' if words else ''}. Measure more, or give a "
         "prior or fixed parameters"
     )
-
-
-def _with_held(size: int, free: NDArray[np.intp], covariance: Array) -> Array:
-    """(P, P) covariance of all ``size`` parameters, from that of the free ones."""
-    if len(free) == size:
-        return covariance
-    whole = np.zeros((size, size))
-    whole[np.ix_(free, free)] = covariance
-    return whole
