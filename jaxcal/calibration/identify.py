@@ -12,7 +12,7 @@ import platform
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -129,19 +129,28 @@ def identify(
         ValueError: naming the argument, the rule and the value; for commands that leave
             a direction unexcited, naming that direction.
     """
-    readings = _measurements(
+    u, y, weight, inputs, outputs = _measurements(
         model, commands, measured, weights, input_names, output_names
     )
-    n, m = len(readings.input_names), len(readings.output_names)
+    n, m = len(inputs), len(outputs)
     noise, plain_noise = _noise(noise, noise_std, common_noise, m)
-    about = _about(readings, command_unit, measured_unit, notes)
+    about: dict[str, Any] = {
+        "input_names": inputs,
+        "output_names": outputs,
+        "command_unit": command_unit,
+        "measured_unit": measured_unit,
+    }
+    for name in ("command_unit", "measured_unit"):
+        if not isinstance(about[name], str):
+            raise ValueError(f"{name} must be text, got {about[name]!r}")
+    provenance = about["provenance"] = _provenance((u, y, weight), notes)
     model = _affine(n, m) if model is None else model
-    model = require_fitting(model, readings.commands, readings.measured)
+    model = require_fitting(model, u, y)
     if accuracy is not None:
         units = model.accuracy_units(measured_unit)
         if not units:
             raise ValueError("accuracy needs an arm (model=)")
-        about["provenance"]["accuracy"] = by_unit("accuracy", accuracy, units)
+        provenance["accuracy"] = by_unit("accuracy", accuracy, units)
     plain = prior is None and plain_noise and loss in (None, "gaussian")
     affine = isinstance(model, Affine)
     if loss is None and prior is None:
@@ -149,32 +158,26 @@ def identify(
             loss = "gaussian"
     try:
         fields = fit_model(
-            readings.commands,
-            readings.measured,
-            readings.weights,
+            u,
+            y,
+            weight,
             model=model,
             prior=prior,
             noise=noise,
             loss=loss or "student",
             common_noise=common_noise,
-            excited=readings.input_names if plain and affine else (),
+            excited=inputs if plain and affine else (),
         )
     except ValueError as error:
-        mispaired = of_unfitted(
-            model,
-            readings.commands,
-            readings.measured,
-            prior,
-            getattr(model, "inputs", ()) or readings.input_names,
-            readings.output_names,
-        )
+        names = getattr(model, "inputs", ()) or inputs
+        mispaired = of_unfitted(model, u, y, prior, names, outputs)
         if mispaired is None:
             raise
         raise ValueError(f"{mispaired.reason}. Uncorrected: {error}") from None
     if shared := fields.pop("noise_levels"):
-        about["provenance"]["noise_levels"] = shared
+        provenance["noise_levels"] = shared
     if prior is not None and not prior.by_data:
-        about["provenance"]["prior"] = "stated"
+        provenance["prior"] = "stated"
     calibration = Calibration(**fields, **about)
     if prior is None and plain_noise:
         calibration = model.improved(calibration)
@@ -187,16 +190,6 @@ def identify(
     return calibration
 
 
-class _Measurements(NamedTuple):
-    """The measurements of a fit, checked."""
-
-    commands: Array  # (N, n)
-    measured: Array  # (N, m)
-    weights: Array  # (N,)
-    input_names: tuple[str, ...]  # n
-    output_names: tuple[str, ...]  # m
-
-
 def _measurements(
     model: Model | None,
     commands: Any,
@@ -204,8 +197,12 @@ def _measurements(
     weights: ArrayLike | None,
     input_names: Sequence[str] | None,
     output_names: Sequence[str] | None,
-) -> _Measurements:
-    """The arguments of ``identify`` as tables, of a recording its rests."""
+) -> tuple[Array, Array, Array, tuple[str, ...], tuple[str, ...]]:
+    """The arguments of ``identify``, checked; of a recording its rests.
+
+    Returns:
+        Commands (N, n), readings (N, m), weights (N,), n and m names.
+    """
     commands, measured, is_recording = recorded(model, commands, measured)
     if is_recording:
         input_names = input_names or getattr(model, "inputs", ()) or None
@@ -225,7 +222,7 @@ def _measurements(
     if weights is not None:
         weight = array_of("weights", weights, len(u))
         require_none(weight < 0.0, weight, "weights must not be negative")
-    return _Measurements(u, y, weight, inputs, outputs)
+    return u, y, weight, inputs, outputs
 
 
 def _columns(model: Any, commands: Any, measured: Any) -> tuple[Any, Any]:
@@ -241,28 +238,6 @@ def _columns(model: Any, commands: Any, measured: Any) -> tuple[Any, Any]:
     if inputs := getattr(model, "inputs", ()):
         return names_in("commands", commands, inputs, COMMANDS, beside), outputs
     return inputs_of("commands", commands, beside), outputs
-
-
-def _about(
-    readings: _Measurements,
-    command_unit: str,
-    measured_unit: str,
-    notes: Mapping[str, Any] | None,
-) -> dict[str, Any]:
-    """The fields of a ``Calibration`` that say what it is of: names, units, origin."""
-    units = {"command_unit": command_unit, "measured_unit": measured_unit}
-    for name, unit in units.items():
-        if not isinstance(unit, str):
-            raise ValueError(f"{name} must be text, got {unit!r}")
-    provenance = _provenance(
-        readings.commands, readings.measured, readings.weights, notes
-    )
-    return {
-        "input_names": readings.input_names,
-        "output_names": readings.output_names,
-        **units,
-        "provenance": provenance,
-    }
 
 
 def _with_sessions(calibration: Calibration, labels: ArrayLike) -> Calibration:
@@ -330,17 +305,8 @@ def _is_of_levels(noise: Noise) -> bool:
     return noise.std is None or np.ndim(noise.std) < 2
 
 
-@functools.cache
-def _packages() -> dict[str, str]:
-    return {
-        "jaxcal": sys.modules["jaxcal"].__version__,  # an import would be a circle
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-    }
-
-
 def _provenance(
-    commands: Array, measured: Array, weight: Array, notes: Mapping[str, Any] | None
+    data: tuple[Array, ...], notes: Mapping[str, Any] | None
 ) -> dict[str, Any]:
     try:
         noted = json.loads(json.dumps(dict(notes), allow_nan=False)) if notes else {}
@@ -348,11 +314,15 @@ def _provenance(
         raise ValueError(f"notes must be valid JSON: {error}") from None
     content = b"".join(
         str(array.shape).encode() + array.astype(_LITTLE_ENDIAN, copy=False).tobytes()
-        for array in (commands, measured, weight)
+        for array in data
     )
     return {
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "packages": _packages(),
+        "packages": {
+            "jaxcal": sys.modules["jaxcal"].__version__,  # an import would be a circle
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
         "data_sha256": hashlib.sha256(content).hexdigest(),
         "notes": noted,
     }
