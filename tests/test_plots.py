@@ -62,12 +62,10 @@ def test_errors_before_and_after_say_their_rms():
     assert [t.get_text() for t in axes.get_xticklabels()] == ["x", "y"]
 
 
-def test_residuals_and_curves_hold_every_value(rng):
+def test_residuals_hold_every_value(rng):
     values = rng.normal(size=(6, 2))
     axes = plots.residuals(Figure().add_subplot(), values, ("x", "y"))
     np.testing.assert_array_equal(axes.lines[2].get_ydata(), values[:, 1])
-    axes = plots.against_count(Figure().add_subplot(), [4, 5], {"D": [1.0, 2.0]})
-    assert axes.lines[0].get_xydata().tolist() == [[4.0, 1.0], [5.0, 2.0]]
 
 
 def test_the_postures_of_an_arm_end_where_its_tip_is():

@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.pairing import of_new_readings
-from jaxcal.checks import array_of, one_of, table, whole_number
+from jaxcal.checks import array_of, one_of, whole_number
 from jaxcal.information.blocks import without
 from jaxcal.models.model import recorded
 from jaxcal.models.recording import Recording
@@ -147,9 +147,7 @@ def check(
     names, free = calibration.names, off.free
     signal = (off.of_level @ off.by**2).T
     slips = free & np.isin(names, calibration.model.slips) & (signal.sum(axis=1) > 0.0)
-    tests = _Tests.of(
-        off.of_level.sum(axis=1), calibration, int(slips.sum()), off.least
-    )
+    tests = _Tests(off.of_level.sum(axis=1), calibration, int(slips.sum()), off.least)
     slopes_of_slips = np.linalg.norm(off.by[:, slips], axis=0)
     ways = off.by[:, slips] / slopes_of_slips  # (R, S) unit vectors
     along = ((off.by.T @ ways) ** 2).max(axis=1, initial=0.0)  # seen by the best
@@ -170,7 +168,9 @@ def check(
         most = int(np.abs(changes_of_slips).argmax())
         if _explains(changes_of_slips[most], off.white, tests):
             slip = changes_of_slips[most] / slopes_of_slips[most]
-            slipped = _slip_in_words(calibration, np.flatnonzero(slips)[most], slip)
+            at = np.flatnonzero(slips)[most]
+            unit = calibration.model.units_for("", calibration.measured_unit)[at]
+            slipped = f"{names[at]} by {slip:.2g} {unit}"
     if p_value < _ALARMS:
         says = "does not hold"
     else:
@@ -201,11 +201,6 @@ def _explains(change: float, white: Array, tests: _Tests) -> bool:
         return False
     others = _Test(np.array([len(white) - 1]), tests.whole.dof)
     return others.p_value(np.array([white @ white - change**2])) >= _ALARMS
-
-
-def _slip_in_words(calibration: Fit, parameter: int, slip: float) -> str:
-    units = calibration.model.units_for("", calibration.measured_unit)
-    return f"{calibration.names[parameter]} by {slip:.2g} {units[parameter]}"
 
 
 class _Deviations(NamedTuple):
@@ -284,7 +279,6 @@ def _whitening(calibration: Fit, commands: Array, noise: Array) -> tuple[Array, 
         (N m, N m) for noise and all uncertainty of the predictions; the variance, of 1,
         that is left where the misfit that they allow for is not there.
     """
-
     from scipy.linalg import lapack
 
     def linear(misfit: bool) -> tuple[Array, Array]:
@@ -312,30 +306,24 @@ def _require_unit(
     calibration: Fit, measured: Array, predicted: Array, noise: Array
 ) -> None:
     """Refuse readings that fit when they are taken as being in another unit."""
-    rms = np.sqrt(((measured - predicted) ** 2).mean(axis=0))
-    far = rms > 10.0 * noise
+    far = _size(measured - predicted, axis=0) > 10.0 * noise
+    if not far.any():
+        return
+    measured, predicted = measured[:, far], predicted[:, far]
+    least = min(0.2 * _size(predicted), 0.05 * _size(measured - predicted))
     for factor, what in _UNITS.items():
-        rest = _size(factor * measured[:, far] - predicted[:, far])
-        size = _size(predicted[:, far])
-        if far.any() and rest < min(
-            0.2 * size, 0.05 * _size(measured[:, far] - predicted[:, far])
-        ):
-            unit = (
-                f" ({calibration.measured_unit})" if calibration.measured_unit else ""
-            )
-            columns = [
-                y for y, f in zip(calibration.output_names, far, strict=True) if f
-            ]
+        if _size(factor * measured - predicted) < least:
+            unit = calibration.measured_unit and f" ({calibration.measured_unit})"
             raise ValueError(
                 f"measured must be in the calibration's unit{unit}: "
-                f"{', '.join(columns)} fit when multiplied by {factor:.6g}. Are they "
-                f"{what}?"
+                f"{', '.join(np.array(calibration.output_names)[far])} fit when "
+                f"multiplied by {factor:.6g}. Are they {what}?"
             )
 
 
-def _size(values: Array) -> float:
+def _size(values: Array, axis: int | None = None) -> Any:
     """Root mean square."""
-    return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
+    return np.sqrt(np.mean(values**2, axis=axis))
 
 
 def _postures(calibration: Fit, name: str, given: ArrayLike) -> Array:
@@ -476,27 +464,21 @@ class _Test:
             return np.asarray(np.sqrt(high[of_share.ravel()] / total)[:, 0])
 
 
-@dataclasses.dataclass(frozen=True)
 class _Tests:
-    """A test of all readings, and one of each slip, the largest of which counts."""
+    """A test of all readings, and one of each slip, the largest of which counts.
 
-    whole: _Test
-    slip: _Test
-    count: int  # of slips, S
+    Each kind has half of the false alarms; where nothing slips, one has all.
+    """
 
-    @classmethod
-    def of(
-        cls, counts: NDArray[np.intp], calibration: Fit, slips: int, least: float = 1.0
-    ) -> _Tests:
-        """Each kind has half of the false alarms; where nothing slips, one has all."""
+    def __init__(
+        self, counts: NDArray[np.intp], calibration: Fit, slips: int, least: float = 1.0
+    ) -> None:
         half = -np.expm1(np.log1p(-_ALARMS) / 2.0)
         dof, one = calibration.noise_dof or _KNOWN, np.ones(1, dtype=np.intp)
         of_each = -np.expm1(np.log1p(-half) / max(1, slips))
-        return cls(
-            _Test(counts, dof, least, half if slips else _ALARMS),
-            _Test(one, dof, least, of_each),
-            int(slips),
-        )
+        self.whole = _Test(counts, dof, least, half if slips else _ALARMS)
+        self.slip = _Test(one, dof, least, of_each)
+        self.count = slips
 
     def p_values(self, squares: Array, of_slips: Array) -> tuple[float, float]:
         """Chances of both kinds and of slips alone, by sums (G,), squares (S,)."""
@@ -510,11 +492,9 @@ class _Tests:
     def power(self, shifts: Array, along: Array) -> Array:
         """(...,) at least, of noncentralities (..., G) in all, (...,) along a slip."""
         whole = self.whole.power(shifts)
-        return (
-            np.maximum(whole, self.slip.power(along[..., None]))
-            if self.count
-            else whole
-        )
+        if not self.count:
+            return whole
+        return np.maximum(whole, self.slip.power(along[..., None]))
 
     def smallest(self, seen: Array, along: Array) -> Array:
         """(p,) changes that are seen with the power asked for, by either."""
@@ -529,7 +509,6 @@ def verification(
     candidates: ArrayLike,
     k: int,
     *,
-    region: ArrayLike | None = None,
     tolerance: float | Mapping[str, float] | None = None,
 ) -> NDArray[np.int64]:
     """Choose the k candidates that best detect a wrong calibration.
@@ -540,8 +519,6 @@ def verification(
         calibration: what is checked.
         candidates: (M, n) commands that could be measured.
         k: three or four are as good as six random ones.
-        region: (R, n) commands at which it is used; they weight the drift of each
-            parameter. The calibration's commands when not given.
         tolerance: the drift to detect, as in ``check``.
 
     Returns:
@@ -553,14 +530,13 @@ def verification(
     noise = calibration.require_noise("verification")
     slopes = np.asarray(calibration.model.jacobian(points, calibration.parameters))
     prediction_slopes, covariance = calibration.linear(points)
-    spread = prediction_slopes @ covariance @ np.matrix_transpose(
-        prediction_slopes
-    ) + np.diag(noise**2)
+    turned = np.matrix_transpose(prediction_slopes)
+    spread = prediction_slopes @ covariance @ turned + np.diag(noise**2)
     white = np.linalg.inv(np.linalg.cholesky(spread)) @ slopes
     levels = _levels(calibration)
     of_level = (levels == np.unique(levels)[:, None]).astype(np.float64)
     signal = (of_level @ white**2).transpose(0, 2, 1)  # (M, p, G) by a drift of one
-    where = calibration.commands if region is None else table("region", region)
+    where = calibration.commands
     change = _changes(calibration, where, _tolerances(calibration, where, tolerance))
     judged = (calibration.free[: len(change)] > 0.0) & np.isfinite(change)
     shifts = signal[:, judged] * change[judged, None] ** 2  # of one posture
@@ -570,7 +546,7 @@ def verification(
     def value(rows: list[int]) -> Array:
         """(M,) of the rows and each candidate."""
         shift = shifts[rows].sum(axis=0) + shifts
-        tests = _Tests.of(counts * (len(rows) + 1), calibration, int(slips.sum()))
+        tests = _Tests(counts * (len(rows) + 1), calibration, int(slips.sum()))
         return np.asarray(tests.power(shift, slips * shift.sum(axis=-1)).mean(axis=-1))
 
     return np.array(_best_rows(value, k))

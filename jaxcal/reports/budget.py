@@ -157,32 +157,23 @@ class Budget:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values; infinite ones are None."""
+        columns = {
+            "name": self.names,
+            "value": self.values.tolist(),
+            "contributions": [_plain(parts) for parts in self.contributions],
+            "combined": _plain(self.combined),
+            "dof": _plain(self.dof),
+            "coverage_factor": self.coverage_factor.tolist(),
+            "expanded": _plain(self.expanded),
+        }
+        rows = zip(*columns.values(), strict=True)
+        sources = zip(self.sources, _plain(self.source_dof), strict=True)
         return {
             "confidence": self.confidence,
             "unit": self.unit,
-            "sources": [
-                {"name": name, "dof": dof}
-                for name, dof in zip(
-                    self.sources, _plain(self.source_dof), strict=True
-                )
-            ],
-            "results": [
-                {
-                    "name": name,
-                    "value": float(value),
-                    "contributions": _plain(parts),
-                    "combined": combined,
-                    "dof": dof,
-                    "coverage_factor": float(factor),
-                    "expanded": expanded,
-                }
-                for name, value, parts, combined, dof, factor, expanded in zip(
-                    self.names, self.values, self.contributions, _plain(self.combined),
-                    _plain(self.dof), self.coverage_factor, _plain(self.expanded),
-                    strict=True,
-                )
-            ],
-        }  # fmt: skip
+            "sources": [{"name": name, "dof": dof} for name, dof in sources],
+            "results": [dict(zip(columns, row, strict=True)) for row in rows],
+        }
 
 
 def _plain(values: Array) -> list[float | None]:

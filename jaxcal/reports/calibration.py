@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.check import Check
 from jaxcal.calibration.fit import Fit
-from jaxcal.files import atomic_write
+from jaxcal.files import write_text
 from jaxcal.models.verdict import left_out
 from jaxcal.reports import page as pages
 from jaxcal.reports.budget import Budget, Source, budget
@@ -137,9 +137,10 @@ def report(
         OSError: the folder cannot be written, or a file not be read.
         ValueError: ``before`` has other parameters.
     """
-    hashes = {os.fspath(path): _sha256(pathlib.Path(path)) for path in files}
     content = json.dumps(calibration.to_dict(), indent=1, allow_nan=False) + "\n"
-    hashes["calibration.json"] = hashlib.sha256(content.encode()).hexdigest()
+    data = {os.fspath(path): pathlib.Path(path).read_bytes() for path in files}
+    data["calibration.json"] = content.encode()
+    hashes = {name: hashlib.sha256(of).hexdigest() for name, of in data.items()}
     document = _document(calibration, check) | {"files": hashes}
     budgets: list[Budget] = []
     if calibration.noise_std is not None:
@@ -160,8 +161,7 @@ def report(
     place = pathlib.Path(folder)
     place.mkdir(parents=True, exist_ok=True)
     for name, text in written.items():
-        with atomic_write(place / name) as file:
-            file.write(text.encode())
+        write_text(place / name, text)
     return bool(document["good"])
 
 
@@ -202,17 +202,12 @@ def _of_predictions(
     return dataclasses.replace(of_rows, names=tuple(names))
 
 
-def _sha256(path: pathlib.Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 def _numbers(calibration: Fit, check: Check | None) -> dict[str, Any]:
-    lack = calibration.lack_of_fit()
     numbers: dict[str, Any] = {
         "measurements": calibration.num_measurements,
         "parameters": len(calibration.names),
         "degrees_of_freedom": float(calibration.dof),
-        "lack_of_fit_p": lack,
+        "lack_of_fit_p": calibration.lack_of_fit(),
     }
     held_out = None if calibration.noise_std is None else left_out(calibration)
     errors = {
@@ -233,15 +228,6 @@ def _numbers(calibration: Fit, check: Check | None) -> dict[str, Any]:
             "check_p": check.p_value,
             "check_power": check.power,
         }
-        tolerances = check.tolerances.values()
-        names = named(calibration, "check_tolerance")
-        numbers |= {
-            name: size for (name, _), size in zip(names, tolerances, strict=False)
-        }
-    return {
-        name: value if value is None or isinstance(value, str | int) else float(value)
-        for name, value in numbers.items()
-    }
-
-
-# -- the page --------------------------------------------------------------------------
+        names = (name for name, _ in named(calibration, "check_tolerance"))
+        numbers |= zip(names, check.tolerances.values(), strict=False)
+    return numbers

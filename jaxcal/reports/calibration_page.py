@@ -128,22 +128,18 @@ def _new_section(
     off = np.asarray(measured, float) - calibration.predict(commands)
     off = calibration.model.wrapped(off, np.asarray(commands, float))
     std = calibration.predict_std(commands, new_measurement=True)
-    head = ["row"]
-    for name in calibration.output_names:
-        head += [f"{name} off", "standard deviations"]
-    rows = [
-        [
-            str(i),
-            *(
-                text
-                for one, size in zip(row, sizes, strict=True)
-                for text in (f"{one:.3g}", f"{one / size:+.2f}")
-            ),
-        ]
-        for i, (row, sizes) in enumerate(zip(off, std, strict=True))
-    ]
-    text = "Measured minus predicted, and the part that noise and calibration explain."
-    return pages.Section("New readings", [text, pages.Table(head, rows)], "new")
+    kinds = ("off", "off in standard deviations")
+    head = [f"{name} {kind}" for kind in kinds for name in calibration.output_names]
+    table = _by_row(head, [*off.T, *(off / std).T])
+    text = "Measured minus predicted, and in what noise and calibration explain."
+    return pages.Section("New readings", [text, table], "new")
+
+
+def _by_row(head: Sequence[str], columns: Sequence[Array]) -> pages.Table:
+    """A row for each measurement, of columns (N,)."""
+    rows = enumerate(zip(*columns, strict=True))
+    cells = [[str(i), *(f"{value:.3g}" for value in row)] for i, row in rows]
+    return pages.Table(["row", *head], cells)
 
 
 def _units(calibration: Fit) -> tuple[str, ...]:
@@ -195,18 +191,14 @@ def _residual_sections(calibration: Fit) -> list[pages.Section]:
 def _residual_table(calibration: Fit) -> pages.Table:
     """A row for each measurement: residuals, weight and, if it has one, leverage."""
     names = calibration.output_names
-    head = ["row", *(f"residual {name}" for name in names), "weight"]
+    head = [*(f"residual {name}" for name in names), "weight"]
     columns = [*calibration.residuals.T, calibration.loss_weights]
     if calibration.noise_std is not None:
         head += [
             f"{what} {name}" for what in ("leverage", "held-out") for name in names
         ]
         columns += [*leverage(calibration).T, *left_out(calibration).T]
-    rows = [
-        [str(i), *(f"{value:.3g}" for value in row)]
-        for i, row in enumerate(zip(*columns, strict=True))
-    ]
-    return pages.Table(head, rows)
+    return _by_row(head, columns)
 
 
 def _before_and_after(calibration: Fit, nominal: Array, unit: str) -> pages.Section:

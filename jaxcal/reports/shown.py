@@ -10,14 +10,16 @@ import numpy as np
 from jaxcal.extras import MissingExtraError, needs
 
 
-def _axes(given: Any, solid: bool = False) -> Any:
-    """Axes to draw on: those given, or of a new figure."""
+def _drawing(axes: Any, solid: bool = False) -> tuple[Any, Any]:
+    """Axes to draw on, those given or of a new figure, and what draws there."""
     with needs("plots", "plot()"):
         from matplotlib.figure import Figure
-    if given is not None:
-        return given
-    figure = Figure(figsize=(5.0, 4.0), layout="constrained")
-    return figure.add_subplot(projection="3d" if solid else None)
+
+        from jaxcal.reports import plots
+    if axes is None:
+        figure = Figure(figsize=(5.0, 4.0), layout="constrained")
+        axes = figure.add_subplot(projection="3d" if solid else None)
+    return axes, plots
 
 
 def plot_selection(selection: Any, axes: Any = None) -> Any:
@@ -38,9 +40,7 @@ def plot_selection(selection: Any, axes: Any = None) -> Any:
     """
     candidates, chosen = selection.problem.candidates, selection.indices
     count = 0 if candidates is None else candidates.shape[1]
-    axes = _axes(axes, solid=count == 3)
-    from jaxcal.reports import plots
-
+    axes, plots = _drawing(axes, solid=count == 3)
     if count == 0:
         axes.bar(selection.labels, selection.left_without)
         axes.set(xlabel="chosen", ylabel="share of det S left without it")
@@ -70,9 +70,7 @@ def plot_calibration(calibration: Any, axes: Any = None) -> Any:
 
     Args, returns and raises as ``Selection.plot``.
     """
-    axes = _axes(axes)
-    from jaxcal.reports import plots
-
+    axes, plots = _drawing(axes)
     names, unit = calibration.output_names, calibration.measured_unit
     return plots.residuals(axes, calibration.residuals, names, unit)
 
@@ -82,9 +80,7 @@ def plot_plan(plan: Any, axes: Any = None) -> Any:
 
     Args, returns and raises as ``Selection.plot``.
     """
-    axes = _axes(axes)
-    from jaxcal.reports import plots
-
+    axes, plots = _drawing(axes)
     return plots.plan(axes, plan)
 
 

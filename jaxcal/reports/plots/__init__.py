@@ -7,13 +7,12 @@ from jaxcal.extras import needs
 
 with needs("plots", "jaxcal.reports.plots"):
     from jaxcal.reports.plots.arm import postures
-    from jaxcal.reports.plots.curves import against_count, pareto, plan, scenarios
+    from jaxcal.reports.plots.curves import pareto, plan, scenarios
     from jaxcal.reports.plots.errors import before_after, residuals
     from jaxcal.reports.plots.scatter import ellipsoid, selection
     from jaxcal.reports.plots.style import as_bytes
 
 __all__ = [
-    "against_count",
     "as_bytes",
     "before_after",
     "ellipsoid",

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import ArrayLike
 
 from jaxcal.reports.plots.style import (
     BLACK,
@@ -17,29 +15,6 @@ from jaxcal.reports.plots.style import (
     numbered,
     plain_axes,
 )
-
-
-def against_count(
-    axes: Any, counts: Sequence[int], values: dict[str, ArrayLike], label: str = ""
-) -> Any:
-    """A criterion or an error against the number of measurements K.
-
-    Args:
-        axes: matplotlib axes.
-        counts: values of K.
-        values: label of a curve to one value for each K.
-        label: of the vertical axis.
-
-    Returns:
-        ``axes``.
-    """
-    for i, (name, curve) in enumerate(values.items()):
-        axes.plot(counts, curve, label=name, markersize=4, **numbered(i))
-    axes.set(xlabel="number of measurements K", ylabel=label)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.legend(frameon=False)
-    plain_axes(axes)
-    return axes
 
 
 def pareto(axes: Any, fronts: dict[str, Any]) -> Any:
@@ -64,11 +39,8 @@ def pareto(axes: Any, fronts: dict[str, Any]) -> Any:
             markersize=5,
             label=name,
         )
-    axes.set_xlabel("D-efficiency against the optimum")
     axes.set_ylabel("run time (s): travel and settling")
-    axes.legend(frameon=False)
-    plain_axes(axes)
-    return axes
+    return _finished(axes, "D-efficiency against the optimum")
 
 
 def scenarios(axes: Any, report: Any) -> Any:
@@ -87,11 +59,9 @@ def scenarios(axes: Any, report: Any) -> Any:
         curves["made at the nominal"] = report.nominal_efficiencies
     for i, (name, shares) in enumerate(curves.items()):
         axes.plot(count, np.sort(shares), label=name, markersize=4, **numbered(i))
-    axes.set(xlabel="scenarios, the worst first", ylabel="efficiency", ylim=(0.0, 1.05))
+    axes.set(ylabel="efficiency", ylim=(0.0, 1.05))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.legend(frameon=False)
-    plain_axes(axes)
-    return axes
+    return _finished(axes, "scenarios, the worst first")
 
 
 def plan(axes: Any, plan: Any) -> Any:
@@ -115,10 +85,14 @@ def plan(axes: Any, plan: Any) -> Any:
     target = plan.accuracy[plan.hardest_output]
     axes.axhline(target, color=BLACK, linewidth=0.8, label="target")
     axes.axvline(plan.k, color=BLACK, linewidth=0.8, linestyle=":")
-    axes.set_xlabel("number of measurements K")
     axes.set_ylabel(f"{plan.summary} standard error of a prediction (measured unit)")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_ylim(bottom=0.0)
+    return _finished(axes, "number of measurements K")
+
+
+def _finished(axes: Any, xlabel: str) -> Any:
+    axes.set_xlabel(xlabel)
     axes.legend(frameon=False)
     plain_axes(axes)
     return axes
