@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration import Calibration
-from jaxcal.commands.arms import is_recording
+from jaxcal.commands.arms import in_degrees, is_recording
 from jaxcal.tables import COMMANDS, Table, read_table
 
 Array = NDArray[np.float64]
@@ -126,16 +126,13 @@ class SavedFiles:
                 "so both would correct them twice"
             )
         files = "--out FILE.urdf, --servos-out and --transform"
-        if self.unproven and not self.corrected:
-            raise ValueError(f"--unproven needs {files}")
-        if self.overwrite and not self.corrected:
-            raise ValueError(f"--overwrite needs {files}")
+        for option in ("unproven", "overwrite"):
+            if getattr(self, option) and not self.corrected:
+                raise ValueError(f"--{option} needs {files}")
         if self.frames is not None and not self.transform:
             raise ValueError("--frames needs --transform FILE")
         if len((self.frames or "a,b").split(",")) != 2:
             raise ValueError(f"--frames takes PARENT,CHILD, got {self.frames}")
-        if self.transform and os.path.exists(self.transform) and not self.overwrite:
-            raise ValueError(f"{self.transform} exists; pass --overwrite to replace it")
         if self.transform and not of_urdf:
             raise ValueError("--transform needs --model FILE.urdf and --sensor board")
         if self.servos_out and not servos:
@@ -144,8 +141,9 @@ class SavedFiles:
             raise ValueError("--servos needs a recording or --servos-out")
         if self.as_urdf and not of_urdf:
             raise ValueError("--out FILE.urdf needs --model FILE.urdf")
-        if self.as_urdf and os.path.exists(self.out) and not self.overwrite:
-            raise ValueError(f"{self.out} exists; pass --overwrite to replace it")
+        for path in (self.transform, self.out if self.as_urdf else ""):
+            if path and os.path.exists(path) and not self.overwrite:
+                raise ValueError(f"{path} exists; pass --overwrite to replace it")
 
     def written(self, calibration: Calibration, servos: str | None) -> list[str]:
         """Write the files that were asked for; a line of each."""
@@ -191,8 +189,16 @@ def commands_for(
     table: Table,
     chosen: str | None = None,
     option: str = "--inputs",
+    *,
+    radians: bool = False,
 ) -> tuple[tuple[str, ...], Array]:
-    """The columns of the commands of a calibration in a table, and (N, n) they hold."""
+    """The columns of the commands of a calibration in a table, and (N, n) they hold.
+
+    ``radians``: of an arm, whose commands are then made degrees.
+    """
+    model: Any = calibration.model
+    if radians and not is_arm(model):
+        raise ValueError("--radians needs an arm")
     names = table.named(
         calibration.input_names,
         COMMANDS,
@@ -201,4 +207,12 @@ def commands_for(
         unit=calibration.command_unit,
         others=calibration.output_names,
     )
-    return names, table.columns(names, None, getattr(calibration.model, "levels", ()))
+    commands = table.columns(names, None, getattr(model, "levels", ()))
+    return names, in_degrees(model, commands) if radians else commands
+
+
+def is_arm(model: Any) -> bool:
+    """Whether a model is an arm, of which some options are."""
+    from jaxcal.arms import SerialChain
+
+    return isinstance(model, SerialChain)

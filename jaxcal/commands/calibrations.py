@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Sequence
-from typing import Annotated, Any, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from jaxcal.commands.arms import (
     ArmOptions,
     ModelPath,
     RecordingOptions,
-    in_degrees,
     is_recording,
 )
 from jaxcal.commands.calibration_files import (
@@ -25,6 +24,7 @@ from jaxcal.commands.calibration_files import (
     ReportOptions,
     SavedFiles,
     commands_for,
+    is_arm,
 )
 from jaxcal.commands.tables import Output, write_json, write_rows
 from jaxcal.tables import COMMANDS, MEASURED, Table, read_table
@@ -90,14 +90,13 @@ def identify(
     table = recording.table(file, lambda which: of_arm.of_recording(model, which))
     table = read_table(file) if table is None else table
     machine: Any = of_arm.machine(model, table)
-    if accuracy is not None and not _is_arm(machine):
+    if accuracy is not None and not is_arm(machine):
         raise ValueError("--accuracy needs an arm: --model FILE.urdf")
-    if of_urdf:
-        readings = _arm_readings(of_arm, machine, table, inputs, outputs, weights)
-        if machine.sensor.lengths:  # files of this format are in metres
-            measured_unit = measured_unit or "m"
-    else:
-        readings = _readings(of_arm, machine, table, inputs, outputs, weights)
+    readings = _readings(
+        of_arm, machine, table, inputs, outputs, weights, of_urdf=of_urdf
+    )
+    if of_urdf and machine.sensor.lengths:  # files of this format are in metres
+        measured_unit = measured_unit or "m"
     calibration = identified(
         readings.commands,
         readings.measured,
@@ -124,19 +123,12 @@ def identify(
     return int(not good)
 
 
-def _is_arm(model: Any) -> bool:
-    """Whether a model is an arm, of which some options are."""
-    from jaxcal.arms import SerialChain
-
-    return isinstance(model, SerialChain)
-
-
 def _noise(machine: Any, stds: list[float] | None, play: float | None) -> Any:
     """``noise`` and ``noise_std`` of ``identify``, by --noise and --play."""
     std = stds[0] if stds and len(stds) == 1 else stds
     if play is None:
         return {"noise": None, "noise_std": std}
-    if not _is_arm(machine):
+    if not is_arm(machine):
         raise ValueError("--play needs an arm: --model FILE.urdf")
     noise = machine.noise_with_play(play)
     if std is not None:
@@ -177,29 +169,6 @@ class _Readings(NamedTuple):
     outputs: Sequence[str]
 
 
-def _arm_readings(
-    of_arm: ArmOptions,
-    arm: Any,
-    table: Table,
-    inputs: str | None,
-    outputs: str | None,
-    weights: str | None,
-) -> _Readings:
-    """The columns named as the arm's joints and its sensor's; a contact has none."""
-    columns, contacts = arm.sensor.outputs, arm.sensor.contacts
-    if not contacts:
-        columns = table.named(columns, MEASURED, chosen=outputs, option="--outputs")
-    elif outputs:
-        raise ValueError(f"contacts have no readings: leave out --outputs {outputs}")
-    beside = (*columns, weights or "")
-    names = of_arm.columns(arm, table, inputs, beside)
-    commands = of_arm.commands(arm, table, names)
-    measured = np.zeros((len(table), len(columns)))
-    if not contacts:
-        measured = table.columns(columns)
-    return _Readings(commands, measured, names, columns)
-
-
 def _readings(
     of_arm: ArmOptions,
     machine: Any,
@@ -207,14 +176,28 @@ def _readings(
     inputs: str | None,
     outputs: str | None,
     weights: str | None,
+    *,
+    of_urdf: bool,
 ) -> _Readings:
-    """The columns that begin with u_ and y_, or those that were named."""
-    columns = table.outputs(outputs)
+    """The columns that begin with u_ and y_, or those that were named.
+
+    ``of_urdf``: those named as the arm's joints and its sensor's; contacts have none.
+    """
+    contacts = of_urdf and machine.sensor.contacts
+    if contacts and outputs:
+        raise ValueError(f"contacts have no readings: leave out --outputs {outputs}")
+    columns = machine.sensor.outputs if of_urdf else table.outputs(outputs)
+    if of_urdf and not contacts:
+        columns = table.named(columns, MEASURED, chosen=outputs, option="--outputs")
     names = of_arm.columns(machine, table, inputs, (*columns, weights or ""))
-    if both := sorted({*names} & {*columns}):
-        raise ValueError(f"--inputs and --outputs both hold {both[0]}")
     commands = of_arm.commands(machine, table, names)
-    return _Readings(commands, table.columns(columns), names, columns)
+    if contacts:
+        measured = np.zeros((len(table), len(columns)))
+    elif both := sorted({*names} & {*columns}):
+        raise ValueError(f"--inputs and --outputs both hold {both[0]}")
+    else:
+        measured = table.columns(columns)
+    return _Readings(commands, measured, names, columns)
 
 
 CalibrationPath = Annotated[str, "made by identify", "calibration.json"]
@@ -252,13 +235,19 @@ def check(
     if table is not None and radians:
         raise ValueError("--radians goes with tables; recordings state their unit")
     table = read_table(file) if table is None else table
-    inputs, commands = commands_for(calibrated, table, option="")
-    if radians:
-        commands = _in_degrees(calibrated, commands)
+    inputs, commands = commands_for(calibrated, table, option="", radians=radians)
     if getattr(getattr(calibrated.model, "sensor", None), "contacts", False):
         measured = np.zeros((len(commands), calibrated.num_outputs))
     else:
-        measured = _readings_for(calibrated, table, inputs)
+        outputs = table.named(
+            calibrated.output_names, MEASURED, option="", unit=calibrated.measured_unit
+        )
+        if both := sorted({*inputs} & {*outputs}):
+            raise ValueError(
+                f"{table.source}: {', '.join(both)} would be both commands and "
+                f"readings; begin the names with {COMMANDS} and {MEASURED}"
+            )
+        measured = table.columns(outputs)
     result = calibrated.check(
         commands, measured, tolerance=tolerance, placed_anew=placed_anew
     )
@@ -289,9 +278,7 @@ def predict(
     """Predict the outputs of a calibrated machine for given commands."""
     calibrated = Calibration.load(calibration)
     table = read_table(file)
-    _, commands = commands_for(calibrated, table, inputs)
-    if radians:
-        commands = _in_degrees(calibrated, commands)
+    _, commands = commands_for(calibrated, table, inputs, radians=radians)
     calibrated.model.require_commands(commands)
     names, values = calibrated.output_names, calibrated.predict(commands)
     if std:
@@ -339,31 +326,6 @@ def command(
         raise ValueError("--limits takes LOW,HIGH, once for all axes or once per axis")
     commands = calibrated.command_for(desired, limits=limits or None, clip=clip)
     _emit(output, calibrated.input_names, commands)
-
-
-def _in_degrees(calibration: Calibration, commands: Array) -> Array:
-    """Commands (N, n) of an arm whose joint columns are in radians."""
-    if not _is_arm(calibration.model):
-        raise ValueError("--radians needs an arm")
-    return in_degrees(cast("Any", calibration.model), commands)
-
-
-def _readings_for(
-    calibration: Calibration, table: Table, inputs: Sequence[str]
-) -> Array:
-    """(N, m) the readings of a calibration in a table, beside columns ``inputs``."""
-    outputs = table.named(
-        calibration.output_names,
-        MEASURED,
-        option="",
-        unit=calibration.measured_unit,
-    )
-    if both := sorted({*inputs} & {*outputs}):
-        raise ValueError(
-            f"{table.source}: {', '.join(both)} would be both commands and readings; "
-            f"begin the names with {COMMANDS} and {MEASURED}"
-        )
-    return table.columns(outputs)
 
 
 def _emit(output: Output, names: Sequence[str], values: Array) -> None:
