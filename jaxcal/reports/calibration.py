@@ -32,36 +32,9 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-SCHEMA: dict[str, Any] = {
-    "$schema": "https://json-schema.org/draft/2020-12/schema",
-    "title": "jaxcal-verdict",
-    "type": "object",
-    "required": [
-        *("format", "version", "of", "good", "exit_code", "reasons", "next_step"),
-        *("unit", "numbers", "files"),
-    ],
-    "properties": {
-        "format": {"const": "jaxcal-verdict"},
-        "version": {"const": 1},
-        "of": {"enum": ["identify", "check"]},
-        "good": {"type": "boolean"},
-        "exit_code": {"enum": [0, 1]},
-        "reasons": {"type": "array", "items": {"type": "string"}},
-        "next_step": {"type": "string"},
-        "unit": {"type": "string"},
-        "numbers": {
-            "type": "object",
-            "additionalProperties": {"type": ["number", "null", "string"]},
-        },
-        "files": {
-            "type": "object",
-            "additionalProperties": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
-        },
-        "budget": {"type": "object"},
-        "budget_of_predictions": {"type": "object"},
-        "moved": {"type": "array", "items": {"type": "object"}},
-    },
-}
+SCHEMA: dict[str, Any] = json.loads(
+    pathlib.Path(__file__).with_name("verdict.schema.json").read_text(encoding="utf-8")
+)
 """JSON Schema of ``verdict.json``."""
 
 
