@@ -6,10 +6,14 @@
 from jaxcal.extras import needs
 
 with needs("plots", "jaxcal.reports.plots"):
-    from jaxcal.reports.plots.arm import postures
-    from jaxcal.reports.plots.curves import pareto, plan, scenarios
-    from jaxcal.reports.plots.errors import before_after, residuals
-    from jaxcal.reports.plots.scatter import ellipsoid, selection
+    from jaxcal.reports.plots.curves import (
+        before_after,
+        pareto,
+        plan,
+        residuals,
+        scenarios,
+    )
+    from jaxcal.reports.plots.scatter import ellipsoid, postures, selection
     from jaxcal.reports.plots.style import as_bytes
 
 __all__ = [
