@@ -78,16 +78,11 @@ def read(path: str | os.PathLike[str]) -> Any:
     data = pathlib.Path(path).read_bytes()
     try:
         return json.loads(data.decode("utf-8-sig"), parse_constant=constant)
-    except json.JSONDecodeError as error:
-        problem = (
-            f"not JSON: {error.msg} in line {error.lineno}; `jaxcal identify ... "
-            "--out FILE` writes a calibration"
-        )
-    except (UnicodeDecodeError, RecursionError):
-        problem = "not JSON: not text"
-    except ValueError as error:
-        problem = str(error)
-    raise ValueError(f"{os.fspath(path)}: {problem}")
+    except (ValueError, RecursionError) as error:
+        raise ValueError(
+            f"{os.fspath(path)}: not JSON: {error}; `jaxcal identify ... --out FILE` "
+            "writes a calibration"
+        ) from None
 
 
 def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
