@@ -106,7 +106,7 @@ def fit_model(
             raise ValueError("Prior.sized() needs an arm, without command_std")
         fit, misfit_factor = _solve_with_misfit(problem, with_misfit)
         solution, scales, problem = fit
-    elif _may_pool(problem, common_noise) and are_shared(problem):
+    elif common_noise is None and are_shared(problem):
         problem, solution, shared = pooled(problem)
     else:
         solution = solve(problem)
@@ -123,13 +123,6 @@ def fit_model(
                 with_misfit, problem, solution, fields, by_noise, misfit_factor
             )
     return fields | {"model": model, "loss": loss, "noise_levels": shared}
-
-
-def _may_pool(problem: FitProblem, common_noise: Any) -> bool:
-    """Whether the levels of noise are not known, and of nothing but the readings."""
-    if common_noise is not None or problem.noise_known or problem.command_std.any():
-        return False
-    return problem.model.default_noise() is None and not problem.model.multiplicity
 
 
 class _Observations(NamedTuple):
@@ -396,15 +389,8 @@ def _misfit(
     """The fields with harmonics that were not fitted, but may be there.
 
     They bend what was fitted and go on where nothing was measured, so predictions err
-    by more than the noise explains.
-
-    Args:
-        with_misfit: the arm with them.
-        problem: that was solved.
-        solution: its solution.
-        fields: of it, with the covariance (P, P) that is returned.
-        within: (P, P) covariance of the parameters by the noise alone.
-        times: their size, of the default prior's.
+    by more than the noise explains. ``within`` is the covariance (P, P) of the
+    parameters by the noise alone, ``times`` the size of the default prior's harmonics.
     """
     count = len(with_misfit.names) - len(problem.mean)
     std = times * np.asarray(with_misfit.default_prior().std)[-count:]

@@ -109,13 +109,11 @@ def no_inverse(fit: Fit) -> str:
     if of_map and fit.unidentified is None:
         if _sureness(fit, responses.spread)[0] >= _SURE:
             return ""
+    require = responses.require_sure if of_map else responses.require_regular
     refusal = ""
     for command in fit.commands.mean(axis=0)[None] if of_map else fit.commands:
         try:
-            if of_map:
-                responses.require_sure(command[None])
-            else:
-                responses.require_regular(command[None])
+            require(command[None])
             responses.require_determined(command[None])
             return ""
         except ValueError as error:

@@ -16,8 +16,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -719,9 +717,7 @@ class FitSolution:
 def _deleted(readings: Array, right: Array) -> Array:
     """(N, R) residuals of each measurement from the fit without it.
 
-    Args:
-        readings: (N, R, F) roots of the hat matrix.
-        right: (N, R) residuals.
+    Of ``readings`` (N, R, F), roots of the hat matrix, and residuals ``right`` (N, R).
     """
     count, columns = readings.shape[1:]
     back = readings.transpose(0, 2, 1)
@@ -747,14 +743,6 @@ def _factor(rows: Array, damping: float, once: bool = False) -> tuple[Array, Arr
     return np.linalg.inv(triangle), whole[: len(rows)]
 
 
-@functools.cache
-def _lapack() -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Cholesky's root of a symmetric matrix, and the inverse of a triangle."""
-    from scipy.linalg.lapack import dpotrf, dtrtri
-
-    return dpotrf, dtrtri
-
-
 def _cholesky(
     rows: Array, damping: float, once: bool = False
 ) -> tuple[Array | None, Array]:
@@ -763,7 +751,8 @@ def _cholesky(
     Cholesky twice (Yamamoto et al., 2015) is as exact as Householder's reflections
     where it succeeds, and does not wait for BLAS's threads in every column.
     """
-    dpotrf, dtrtri = _lapack()
+    from scipy.linalg.lapack import dpotrf, dtrtri
+
     turned, inverse = rows, None
     for _ in range(2):
         square = gram(turned)

@@ -44,7 +44,14 @@ class _Levels(NamedTuple):
 
 
 def are_shared(problem: FitProblem) -> bool:
-    """Whether few measurements are of parameters that several readings share."""
+    """Whether few measurements are of parameters that several readings share.
+
+    Of noise that is of nothing but the readings, and whose levels are not known.
+    """
+    if problem.noise_known or problem.command_std.any():
+        return False
+    if problem.model.default_noise() is not None or problem.model.multiplicity:
+        return False
     if not 1 < len(problem.commands) < _FEW or len(problem.levels) < 2:
         return False
     slopes = derivative(problem.model, problem.commands, problem.mean)

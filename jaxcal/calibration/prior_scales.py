@@ -194,9 +194,7 @@ def misfit_scale(
 
     Args:
         with_misfit: the model with it: its last parameters, the last of its groups.
-        problem: without it, with the prior that the factors are of.
-        solution: its solution.
-        scales: of it.
+        problem, solution, scales: without it, with the prior that the factors are of.
 
     Returns:
         How much less -2 log marginal likelihood is at best with it, and the root of its

@@ -166,21 +166,16 @@ def postures(
     plan = offered[chosen]
     plan = plan[arm.in_turn(plan)]
     if picture:
-        _draw(arm, plan, picture)
+        from matplotlib.figure import Figure
+
+        from jaxcal.reports import plots
+
+        figure = Figure((8, 2.2 * -(-len(plan) // 4)), layout="constrained")
+        plots.postures(figure, arm, plan).savefig(picture)
     header, rows = _rows_of(arm, plan, one_side, of_arm.radians)
     if not output.written(header, rows):
         cells = [[f"{i + 1}", *(f"{x:.4g}" for x in r)] for i, r in enumerate(rows)]
         print("\n".join(aligned([["", *header], *cells])))
-
-
-def _draw(arm: SerialChain, plan: Array, path: pathlib.Path) -> None:
-    """A picture of the arm at each posture of the plan."""
-    from matplotlib.figure import Figure
-
-    from jaxcal.reports import plots
-
-    figure = Figure(figsize=(8, 2.2 * -(-len(plan) // 4)), layout="constrained")
-    plots.postures(figure, arm, plan).savefig(path)
 
 
 def _rows_of(
