@@ -240,11 +240,8 @@ class Calibration(Fit):
         )
         ours = ("prior", "noise_levels")
         origin = {k: v for k, v in self.provenance.items() if k not in ours}
-        if shared := fields.pop("noise_levels"):
-            origin["noise_levels"] = shared
-        if prior is not None and not prior.by_data:
-            origin["prior"] = "stated"
-        return dataclasses.replace(self, **fields, provenance=origin)
+        fields["provenance"] = origin | fields["provenance"]
+        return dataclasses.replace(self, **fields)
 
     def _for_file(self) -> Array:
         """(p,) for a file: without what no file holds; a warning gives the effect."""

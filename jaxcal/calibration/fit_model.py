@@ -77,10 +77,11 @@ def fit_model(
     common_noise: bool | Sequence[Any] | None,
     excited: tuple[str, ...] = (),
 ) -> dict[str, Any]:
-    """The fields of a ``Calibration`` but names, units and provenance.
+    """The fields of a ``Calibration`` but names and units.
 
-    With them ``noise_levels``, which readings share a level of noise, "" where each
-    has its own. ``excited`` are names of commands that must vary in every direction.
+    Of its ``provenance``: prior "stated" where one was, and ``noise_levels`` where
+    readings share a level of noise. ``excited`` are names of commands that must vary in
+    every direction.
     """
     one_of("loss", loss, tuple(LOSSES))
     require_kind("prior", prior, Prior)
@@ -95,6 +96,7 @@ def fit_model(
     with_misfit = model.with_misfit() if prior is None and exact else model
     fitted = with_misfit if model.fits_misfit else model
     scaled = prior is not None or exact  # as far as the prior wants it
+    stated = prior is not None and not prior.by_data
     prior = prior or fitted.default_prior()
     observations = _Observations(commands, measured, weights, used, spread)
     problem, centre = _problem(
@@ -122,7 +124,10 @@ def fit_model(
             fields |= _misfit(
                 with_misfit, problem, solution, fields, by_noise, misfit_factor
             )
-    return fields | {"model": model, "loss": loss, "noise_levels": shared}
+    origin = {"noise_levels": shared} if shared else {}
+    if stated:
+        origin["prior"] = "stated"
+    return fields | {"model": model, "loss": loss, "provenance": origin}
 
 
 class _Observations(NamedTuple):
@@ -444,6 +449,14 @@ def _fields(
     if problem.command_std.any():
         estimated = commands.copy()
         estimated[used] = solution.commands
+    residuals = solution.residuals
+    if not isinstance(used, slice):  # of those that were left out of the fit, too
+        others = commands[~used] - (0.0 if centre is None else centre)
+        off = observations.measured[~used]
+        off = off - problem.model.predict(others, solution.parameters)
+        residuals = np.empty_like(observations.measured)
+        residuals[used] = solution.residuals
+        residuals[~used] = problem.model.wrapped(off, others)
     loss_weights, distance = np.zeros((2, len(commands)))
     loss_weights[used], distance[used] = solution.weights, solution.deleted
     return {
@@ -456,7 +469,7 @@ def _fields(
         "free": problem.free.astype(np.float64),
         "commands": commands,
         "estimated_commands": estimated,
-        "residuals": _residuals(problem, solution, observations, centre),
+        "residuals": residuals,
         "loss_weights": loss_weights,
         "distance": distance,
         "dof": max(float(solution.freedom.sum()), 0.0),
@@ -484,25 +497,6 @@ def _noise_level(
     if solution.freedom.sum() < 1.0 or freedom <= 0.0:
         return None, 0.0
     return std, freedom
-
-
-def _residuals(
-    problem: FitProblem,
-    solution: FitSolution,
-    observations: _Observations,
-    centre: Array | None,
-) -> Array:
-    """(N, q) of all measurements, also of those that were left out of the fit."""
-    used = observations.used
-    if isinstance(used, slice):
-        return solution.residuals
-    residuals = np.empty_like(observations.measured)
-    residuals[used] = solution.residuals
-    commands = observations.commands[~used] - (0.0 if centre is None else centre)
-    off = observations.measured[~used]
-    off = off - problem.model.predict(commands, solution.parameters)
-    residuals[~used] = problem.model.wrapped(off, commands)
-    return residuals
 
 
 def _covariance(

@@ -174,10 +174,7 @@ def identify(
         if mispaired is None:
             raise
         raise ValueError(f"{mispaired.reason}. Uncorrected: {error}") from None
-    if shared := fields.pop("noise_levels"):
-        provenance["noise_levels"] = shared
-    if prior is not None and not prior.by_data:
-        provenance["prior"] = "stated"
+    provenance |= fields.pop("provenance")
     calibration = Calibration(**fields, **about)
     if prior is None and plain_noise:
         calibration = model.improved(calibration)
@@ -281,7 +278,12 @@ def _noise(
             )
     if noise is not None and noise_std is not None:
         raise ValueError("give noise_std or noise, not both")
-    plain = noise is None or _is_of_levels(noise)
+    # At most a level of each output, known or not, in every reading.
+    plain = noise is None or (
+        noise.covariance is None
+        and noise.command_std is None
+        and (noise.std is None or np.ndim(noise.std) < 2)
+    )
     if plain:
         level = noise_std if noise is None else noise.std
         noise = None
@@ -296,13 +298,6 @@ def _noise(
             "both"
         )
     return noise, plain
-
-
-def _is_of_levels(noise: Noise) -> bool:
-    """Whether each output has one level, known or not, in every reading."""
-    if noise.covariance is not None or noise.command_std is not None:
-        return False
-    return noise.std is None or np.ndim(noise.std) < 2
 
 
 def _provenance(

@@ -186,7 +186,8 @@ class _Curve:
             return self._of_line(reading)
         outputs, allowed = self.there
         grid, off = self.grid, outputs - reading
-        nearest = self._nearest(reading)
+        at_used = self.responses.outputs(self.used)[:, 0]
+        nearest = self.used[np.abs(at_used - reading).argmin(), 0]
         roots = self._crossings(grid, off, lambda x: self.at(x)[0] - reading)
         if len(roots):
             command = float(roots[np.abs(roots - nearest).argmin()])
@@ -202,7 +203,12 @@ class _Curve:
         grid = np.append(grid, roots)[order]
         beyond = np.append(np.abs(off) - allowed, -np.ones(len(roots)))[order]
         beyond = np.where(np.isnan(beyond), np.inf, beyond)
-        ends = self._crossings(grid, beyond, lambda x: self._beyond(x, reading))
+
+        def beyond_at(commands: Array) -> Array:
+            outputs, allowed = self.at(commands)
+            return np.abs(outputs - reading) - allowed
+
+        ends = self._crossings(grid, beyond, beyond_at)
         inside = beyond <= 0.0
         if not inside.any():
             least, most = np.nanmin(outputs), np.nanmax(outputs)
@@ -214,14 +220,6 @@ class _Curve:
             )
         ends = np.concatenate([grid[:1][inside[:1]], ends, grid[-1:][inside[-1:]]])
         return command, ends.reshape(-1, 2), "band"
-
-    def _beyond(self, commands: Array, reading: float) -> Array:
-        outputs, allowed = self.at(commands)
-        return np.abs(outputs - reading) - allowed
-
-    def _nearest(self, reading: float) -> float:
-        outputs = self.responses.outputs(self.used)[:, 0]
-        return float(self.used[np.abs(outputs - reading).argmin(), 0])
 
     def _crossings(self, grid: Array, values: Array, function: Any) -> Array:
         """Where a function changes its sign between points of the grid, by halving."""

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.of_readings import by_readings, inverse
-from jaxcal.checks import aligned, array_of, one_or_each
+from jaxcal.checks import aligned, one_or_each
 from jaxcal.information.singular import depends
 
 Array = NDArray[np.float64]
@@ -133,21 +133,13 @@ class Budget:
         """Cells of the table, its head first."""
         head = ["", "value", f"U ({self.confidence:.3g})"]
         head += [*self.sources, "combined", "dof", "k"]
-        columns = zip(
-            self.names, self.values, self.expanded, self.contributions, self.combined,
-            self.dof, self.coverage_factor, strict=True,
-        )  # fmt: skip
+        dof = np.where(self.dof > 1e6, np.inf, self.dof)
+        columns = self.expanded, self.contributions, self.combined, dof
+        numbers = np.column_stack([*columns, self.coverage_factor])
+        rows = zip(self.names, self.values, numbers, strict=True)
         return [head] + [
-            [
-                name,
-                f"{value:.6g}",
-                f"{expanded:.3g}",
-                *(f"{part:.3g}" for part in parts),
-                f"{combined:.3g}",
-                "inf" if dof > 1e6 else f"{dof:.3g}",
-                f"{factor:.3g}",
-            ]
-            for name, value, expanded, parts, combined, dof, factor in columns
+            [name, f"{value:.6g}", *(f"{x:.3g}" for x in row)]
+            for name, value, row in rows
         ]
 
     def __str__(self) -> str:
@@ -210,8 +202,7 @@ def budget(
         ValueError: the noise is unknown, or an argument is wrong, by name.
     """
     calibration.require_noise("uncertainty budget")
-    if not 0.0 < array_of("confidence", confidence) < 1.0:
-        raise ValueError(f"confidence must be in (0, 1), got {confidence}")
+    calibration.quantile(confidence)  # must be in (0, 1)
     if wrong := [one for one in sources if not isinstance(one, Source)]:
         raise ValueError(
             f"sources must hold jaxcal.calibration.Source, got {wrong[0]!r}"
