@@ -24,11 +24,7 @@ def pareto(axes: Any, fronts: dict[str, Any]) -> Any:
     """Time against efficiency.
 
     Args:
-        axes: matplotlib axes.
         fronts: ``ParetoFront`` by the name to show.
-
-    Returns:
-        ``axes``.
     """
     for i, (name, front) in enumerate(fronts.items()):
         colour = COLOURS[i % len(COLOURS)]
@@ -50,11 +46,7 @@ def scenarios(axes: Any, report: Any) -> Any:
     """Efficiency in each scenario, the worst first, beside that of the nominal's own.
 
     Args:
-        axes: matplotlib axes.
         report: ``Selection.in_scenarios``, of a selection over scenarios.
-
-    Returns:
-        ``axes``.
     """
     count = np.arange(1, len(report.weights) + 1)
     curves = {"this design": report.efficiencies}
@@ -71,11 +63,7 @@ def plan(axes: Any, plan: Any) -> Any:
     """Accuracy against K: the designs, what no design beats, and the target.
 
     Args:
-        axes: matplotlib axes.
         plan: a ``Plan``; the output that is furthest from its target is drawn.
-
-    Returns:
-        ``axes``.
     """
     series = (
         ("standard_error", "design found", MARKERS[0], "-", COLOURS[0]),
@@ -99,19 +87,15 @@ def before_after(
     errors: dict[str, ArrayLike],
     names: Sequence[str] = (),
     unit: str = "",
-    **look: Any,
 ) -> Any:
     """Errors of each output side by side, such as raw and calibrated.
 
+    The legend gives each root mean square.
+
     Args:
-        axes: matplotlib axes.
         errors: label to (N, q) measured less desired.
         names: q names of the outputs.
         unit: of the errors.
-        look: passed on to ``plot``.
-
-    Returns:
-        ``axes``; the legend gives each root mean square.
     """
     axes.axhline(0.0, color=BLACK, linewidth=0.8)
     places = np.linspace(-0.2, 0.2, len(errors)) if len(errors) > 1 else [0.0]
@@ -123,9 +107,7 @@ def before_after(
         at = np.arange(count) + places[i] + spread
         rms = np.sqrt(np.mean(rows**2))
         shown = f"{rms:.3g}{unit}" if unit == "°" else f"{rms:.3g} {unit}".rstrip()
-        axes.plot(
-            at.ravel(), rows.ravel(), label=f"{label}: {shown} rms", **points(i) | look
-        )
+        axes.plot(at.ravel(), rows.ravel(), label=f"{label}: {shown} rms", **points(i))
     axes.set_xticks(range(count), names or [str(i + 1) for i in range(count)])
     axes.set_ylabel(f"error ({unit})" if unit else "error")
     above = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0)}  # clear of the points
@@ -139,19 +121,13 @@ def residuals(
     values: ArrayLike,
     names: Sequence[str] = (),
     unit: str = "",
-    **look: Any,
 ) -> Any:
     """Measured less fitted, in the order of measurement.
 
     Args:
-        axes: matplotlib axes.
         values: (N, q) residuals, such as ``Calibration.residuals``.
         names: q names of the outputs.
         unit: of the residuals.
-        look: passed on to ``plot``.
-
-    Returns:
-        ``axes``.
     """
     table = np.asarray(values, dtype=np.float64)
     table = table[:, None] if table.ndim == 1 else table
@@ -159,7 +135,7 @@ def residuals(
     for i, column in enumerate(table.T):
         label = names[i] if names else f"output {i + 1}"
         places = np.arange(1, len(column) + 1)
-        axes.plot(places, column, label=label, **points(i) | look)
+        axes.plot(places, column, label=label, **points(i))
     axes.set_xlabel("measurement")
     axes.set_ylabel(f"measured - fitted ({unit})" if unit else "measured - fitted")
     if table.shape[1] > 1:

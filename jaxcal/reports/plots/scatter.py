@@ -25,9 +25,6 @@ def ellipsoid(
         covariance: (d, d) positive definite.
         scale: of the distance; ``sqrt(chi2.ppf(0.95, d))`` holds 95 % of a normal.
         look: passed on to ``plot`` or ``plot_wireframe``.
-
-    Returns:
-        ``axes``.
     """
     middle = np.asarray(centre, dtype=np.float64)
     if middle.shape not in ((2,), (3,)):
@@ -66,9 +63,6 @@ def selection(
         names: n names of the inputs, for the axes.
         label: of the chosen ones in the legend.
         look: colour and marker of the chosen ones.
-
-    Returns:
-        ``axes``.
     """
     solid = getattr(axes, "name", "") == "3d"
     count = 3 if solid else 2
