@@ -5,6 +5,7 @@ Everything under ``derived`` is for other programs to read and is ignored on loa
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import json
 import os
@@ -141,11 +142,10 @@ def _checked_values(content: Mapping[str, Any]) -> dict[str, Any]:
         require(bool((array >= least).all()), key, f"be at least {least:g}")
         values[key] = array if shape else float(array)
     for key, letter in _NAMES.items():
-        kinds = (
-            [type(x) for x in values[key]] if isinstance(values[key], list) else None
-        )
-        require(kinds == [str] * sizes[letter], key, f"hold {sizes[letter]} names")
-        values[key] = tuple(values[key])
+        names, count = values[key], sizes[letter]
+        kinds = [type(name) for name in names] if isinstance(names, list) else None
+        require(kinds == [str] * count, key, f"hold {count} names")
+        values[key] = tuple(names)
     for key, (kind, what) in _KINDS.items():
         require(isinstance(values[key], kind), key, f"be {what}")
     require(values["loss"] in LOSSES, "loss", f"be {' or '.join(LOSSES)}")
@@ -156,18 +156,12 @@ def _checked_values(content: Mapping[str, Any]) -> dict[str, Any]:
 
 def _array(key: str, value: Any, shape: str, sizes: dict[str, int]) -> Any:
     """float64 array with an axis per letter; sizes not known yet are learned."""
-    try:
+    with contextlib.suppress(ValueError):  # of rows of different lengths
         array = np.asarray(value)
-    except ValueError:
-        raise ValueError(f'"{key}" must be rows of equal length') from None
-    if array.dtype.kind not in "if":
-        raise ValueError(f'"{key}" must hold numbers')
-    if array.ndim != len(shape):
-        raise ValueError(f'"{key}" must have {len(shape)} axes, got {array.ndim}')
-    for letter, size in zip(shape, array.shape, strict=True):
-        if size < 1 or sizes.setdefault(letter, size) != size:
-            want = ", ".join(str(sizes.get(name, name)) for name in shape)
-            raise ValueError(f'"{key}" must have shape ({want}), got {array.shape}')
-    if not np.isfinite(array).all():
-        raise ValueError(f'"{key}" must be finite')
-    return array.astype(np.float64)
+        if array.dtype.kind in "if" and array.ndim == len(shape):
+            pairs = zip(shape, array.shape, strict=True)
+            fits = all(size and sizes.setdefault(x, size) == size for x, size in pairs)
+            if fits and np.isfinite(array).all():
+                return array.astype(np.float64)
+    wanted = ", ".join(str(sizes.get(letter, letter)) for letter in shape)
+    raise ValueError(f'"{key}" must hold finite numbers of shape ({wanted})')

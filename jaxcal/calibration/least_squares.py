@@ -284,19 +284,18 @@ class FitSolution:
         return self.problem.model.parameter_sizes()
 
     def _share(self, levels: NDArray[np.intp]) -> None:
-        """Let outputs of the same number in ``levels`` (q,) share one level."""
-        self.shared, self.same = levels, 1.0 * (levels[:, None] == levels)
-        self.floor = self._floor()
+        """Let outputs of the same number in ``levels`` (q,) share one level.
 
-    def _floor(self) -> Array:
-        """(q,) least level; of contacts, whose readings are zero, in usual noise."""
-        if self.problem.noise_known:
-            return np.zeros(len(self.shared))
-        readings = _times(self.problem.white, self.problem.measured)
-        largest = np.abs(readings).max(axis=0)
-        if not largest.all():
-            largest[largest == 0.0] = largest.max() or 1e7
-        return np.asarray((self.same * (1e-13 * largest)).max(axis=1))
+        The least level of contacts, whose readings are zero, is in usual noise.
+        """
+        self.shared, self.same = levels, 1.0 * (levels[:, None] == levels)
+        self.floor = np.zeros(len(levels))
+        if not self.problem.noise_known:
+            readings = _times(self.problem.white, self.problem.measured)
+            largest = np.abs(readings).max(axis=0)
+            if not largest.all():
+                largest[largest == 0.0] = largest.max() or 1e7
+            self.floor = (self.same * (1e-13 * largest)).max(axis=1)
 
     def _first_level(self) -> Array:
         """(q,) root mean square of the residuals, of the outputs that share a level."""

@@ -702,11 +702,14 @@ def remove(key: str) -> object:
         (remove("version"), "version None"),
         (remove("estimate"), 'key "estimate" is missing'),
         (remove("provenance"), 'key "provenance" is missing'),
-        (change("commands", [[1, 2], [3]]), '"commands" must be rows of equal length'),
-        (change("commands", [["a"] * 3] * 3), '"commands" must hold numbers'),
-        (change("commands", [1, 2, 3]), '"commands" must have 2 axes, got 1'),
-        (change("centre", [1, 2]), r'"commands" must have shape \(10, 2\), got'),
-        (change("free", None), '"free" must hold numbers'),
+        (change("commands", [[1, 2], [3]]), '"commands" must hold finite numbers'),
+        (
+            change("commands", [["a"] * 3] * 3),
+            r'"commands" must hold .* shape \(N, 3\)',
+        ),
+        (change("commands", [1, 2, 3]), '"commands" must hold finite numbers'),
+        (change("centre", [1, 2]), r'"commands" must hold .* shape \(10, 2\)'),
+        (change("free", None), '"free" must hold finite numbers'),
         (change("square", -1.0), '"square" must be at least 0'),
         (change("num_readings", 0), '"num_readings" must be at least 1'),
         (change("noise_std", None), '"noise_std" and "joint_covariance" contradict'),
@@ -717,7 +720,7 @@ def remove(key: str) -> object:
         (change("noise_dof", -1.0), '"noise_dof" must be at least 0'),
         (change("input_names", ["a"]), '"input_names" must hold 3 names'),
         (change("command_unit", 3), '"command_unit" must be text'),
-        (change("dof", "x"), '"dof" must hold numbers'),
+        (change("dof", "x"), '"dof" must hold finite numbers'),
     ],
 )
 def test_a_damaged_file_is_refused_by_key(
