@@ -73,7 +73,6 @@ class Table:
 
     head: Sequence[Content]
     rows: Sequence[Sequence[Content]]
-    caption: Content = ""
     numeric: bool = True  # all columns but the first are aligned to the right
 
     def __post_init__(self) -> None:
@@ -94,7 +93,6 @@ class Figure:
 
     data: bytes | str  # an SVG, PNG or GIF file
     alt: str  # what it shows, for readers who do not see it
-    caption: Content = ""
 
     @property
     def uri(self) -> str:
@@ -110,22 +108,7 @@ class Figure:
         raise ValueError(f"figure {self.alt!r} must be an SVG, PNG or GIF file")
 
 
-@dataclasses.dataclass(frozen=True)
-class Box:
-    """A titled, shaded paragraph."""
-
-    title: str
-    text: Content
-
-
-@dataclasses.dataclass(frozen=True)
-class Row:
-    """Blocks side by side, one below the other on a phone."""
-
-    blocks: Sequence[Block]
-
-
-Block = str | Text | Table | Figure | Box | Row
+Block = str | Text | Table | Figure
 
 
 @dataclasses.dataclass(frozen=True)

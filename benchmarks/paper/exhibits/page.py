@@ -69,9 +69,9 @@ def page(
 
 
 def _section(exhibit: Exhibit, images: Mapping[str, bytes]) -> pages.Section:
-    sides = {"The paper": exhibit.paper, "Ours": exhibit.ours}
+    sides = _typeset(exhibit.paper), _typeset(exhibit.ours)
     blocks: list[pages.Block] = [
-        pages.Row([pages.Box(who, _typeset(text)) for who, text in sides.items()])
+        pages.Table(("The paper", "Ours"), [sides], numeric=False)
     ]
     if exhibit.policy:
         blocks.append(pages.Text(_typeset(exhibit.policy), "note"))
