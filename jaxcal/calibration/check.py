@@ -155,7 +155,7 @@ def check(
     p_value, p_slip = tests.p_values(off.of_level @ off.white**2, changes_of_slips**2)
     size = tests.smallest(signal, along)
     tolerances = _tolerances(calibration, commands, tolerance)
-    change = _changes(calibration, calibration.commands, tolerances)
+    change = _changes(calibration, tolerances)
     judged = free & np.isfinite(change)
     hidden = judged & (size > change)
     squares = change[judged] ** 2
@@ -248,9 +248,8 @@ def _taken_up(calibration: Fit, placed: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
     At the calibration's postures: at a few that are alike any parameter would be one.
     """
-    by = np.asarray(
-        calibration.model.jacobian(calibration.commands, calibration.parameters)
-    )
+    at = calibration.commands, calibration.parameters
+    by = np.asarray(calibration.model.jacobian(*at))
     by = (by / np.asarray(calibration.noise_std)[:, None]).reshape(-1, by.shape[-1])
     remainder = by - by[:, placed] @ np.linalg.lstsq(by[:, placed], by)[0]
     return np.linalg.norm(remainder, axis=0) < _BLIND * np.linalg.norm(by, axis=0)
@@ -364,14 +363,15 @@ def _tolerances(
     }
 
 
-def _changes(calibration: Fit, where: Array, tolerances: Mapping[str, float]) -> Array:
+def _changes(calibration: Fit, tolerances: Mapping[str, float]) -> Array:
     """(p,) what each parameter may change by, infinite where that is far.
 
-    Then readings of one unit at ``where`` (R, n) change by its tolerance, root mean
-    square. Far is ten standard deviations of the prior: no machine drifts so.
+    Then readings of one unit at the calibration's commands change by its tolerance,
+    root mean square. Far is ten standard deviations of the prior: no machine drifts so.
     """
-    slopes = np.asarray(calibration.model.jacobian(where, calibration.parameters))
-    by_parameter = slopes.transpose(0, 2, 1)  # (R, p, q)
+    at = calibration.commands, calibration.parameters
+    slopes = np.asarray(calibration.model.jacobian(*at))
+    by_parameter = slopes.transpose(0, 2, 1)  # (N, p, q)
     with np.errstate(divide="ignore"):
         changes = [
             tolerances[quantity.unit]
@@ -536,8 +536,8 @@ def verification(
     levels = _levels(calibration)
     of_level = (levels == np.unique(levels)[:, None]).astype(np.float64)
     signal = (of_level @ white**2).transpose(0, 2, 1)  # (M, p, G) by a drift of one
-    where = calibration.commands
-    change = _changes(calibration, where, _tolerances(calibration, where, tolerance))
+    tolerances = _tolerances(calibration, calibration.commands, tolerance)
+    change = _changes(calibration, tolerances)
     judged = (calibration.free[: len(change)] > 0.0) & np.isfinite(change)
     shifts = signal[:, judged] * change[judged, None] ** 2  # of one posture
     counts = of_level.sum(axis=1)
