@@ -145,6 +145,7 @@ class Heartbeat(threading.Thread):
         self._keep_alive_s = min(config.comm_timeouts_s.values(), default=math.inf) / 4
         self._moving = False
         self._fed = time.monotonic()
+        self._ahead = clock_ahead_s()
         self._closing = threading.Event()
 
     def feed(self, moving: bool | None = None) -> None:
@@ -159,37 +160,41 @@ class Heartbeat(threading.Thread):
             self.join(2.0)
 
     def run(self) -> None:
-        ahead = clock_ahead_s()
-        line = self._stopper.drives[0].line
         while not self._closing.wait(TICK_S):
-            line.alive()
-            silence = time.monotonic() - self._fed
-            slept_s, ahead = clock_ahead_s() - ahead, clock_ahead_s()
-            if slept_s > SLEPT_S:
-                text = f"this computer slept for {slept_s:.0f} s"
-                if self._moving:
-                    self._stopper.stop(
-                        f"{text} while the device moved unobserved. Switch its power "
-                        "saving off"
-                    )
-                    return
-                self._stopper.tell(text)
-            if not self._stopper.reason and (late := self._requests.overdue(OVERDUE_S)):
-                self._stopper.stop(f"{late}, and the session did not answer")
+            if self.beat():
                 return
-            if self._moving and silence > self._silence_s:
+
+    def beat(self) -> bool:
+        """Look once at loop, clock and requests; whether the drives were stopped."""
+        self._stopper.drives[0].line.alive()
+        silence = time.monotonic() - self._fed
+        slept_s, self._ahead = clock_ahead_s() - self._ahead, clock_ahead_s()
+        if slept_s > SLEPT_S:
+            text = f"this computer slept for {slept_s:.0f} s"
+            if self._moving:
                 self._stopper.stop(
-                    f"this program paused for {silence:.2f} s while the device moved "
-                    f"(limit {self._silence_s:.2f} s). Is the computer overloaded or "
-                    "waiting for its disk?"
+                    f"{text} while the device moved unobserved. Switch its power "
+                    "saving off"
                 )
-                return
-            if not self._moving and silence > self._keep_alive_s:
-                for drive in self._stopper.drives:
-                    # The plan's own reads find what is wrong.
-                    with contextlib.suppress(BusError, StopRequested):
-                        drive.status(retries=0)
-                self._fed = time.monotonic()
+                return True
+            self._stopper.tell(text)
+        if not self._stopper.reason and (late := self._requests.overdue(OVERDUE_S)):
+            self._stopper.stop(f"{late}, and the session did not answer")
+            return True
+        if self._moving and silence > self._silence_s:
+            self._stopper.stop(
+                f"this program paused for {silence:.2f} s while the device moved "
+                f"(limit {self._silence_s:.2f} s). Is the computer overloaded or "
+                "waiting for its disk?"
+            )
+            return True
+        if not self._moving and silence > self._keep_alive_s:
+            for drive in self._stopper.drives:
+                # The plan's own reads find what is wrong.
+                with contextlib.suppress(BusError, StopRequested):
+                    drive.status(retries=0)
+            self._fed = time.monotonic()
+        return False
 
 
 def clock_ahead_s() -> float:
@@ -351,7 +356,7 @@ class Device:
         self.heartbeat.start()
 
     def _check_fit(self, drive: Drive, reset_alarms: bool) -> None:
-        axis, status = drive.axis, drive.status()
+        axis, before, status = drive.axis, drive.last, drive.status()
         if status.fault and reset_alarms and drive.can_reset:
             status = drive.bring(drive.reset, lambda s: not s.fault)
         if status.fault:
@@ -370,6 +375,14 @@ class Device:
                 "its enable and STO inputs"
             )
         slack = axis.pulses_within(self.config.motion.position_tolerance_deg)
+        held = before is not None and before.enabled
+        if held and abs(status.position - before.position) > slack:
+            raise MotionFault(
+                f"{axis.name} counted {before.position} pulses when this session found "
+                f"it and {status.position} now, and nothing moved it: the drive was "
+                "switched off and on, or another controller moves it. Run "
+                "`jaxcal-rig setup home`"
+            )
         if not axis.min_pulses - slack <= status.position <= axis.max_pulses + slack:
             raise MotionFault(
                 f"{axis.name} is at {status.position} pulses, outside its limits "

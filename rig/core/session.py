@@ -174,6 +174,8 @@ def take_zero(
     standing = Arrival(device, zero)
     if moves:
         standing = move(device, zero)  # from the side of all references
+    else:
+        device.rest = zero.pulses  # nothing else is to move it from here
     check_plan(config, [zero.pulses])  # it is where a resumed run looks again
     while True:
         connection = device.imu.connections

@@ -220,7 +220,9 @@ def test_names_of_rows_are_refused():
     rng = np.random.default_rng(0)
     commands = rng.normal(size=(9, 3))
     fit = jaxcal.identify(
-        commands, commands + 0.01 * rng.normal(size=(9, 3)), output_names=["a", "b", "c"]
+        commands,
+        commands + 0.01 * rng.normal(size=(9, 3)),
+        output_names=["a", "b", "c"],
     )
     targets = pandas.DataFrame(np.eye(3), columns=["c", "a", "b"])
     expected = np.stack([fit.command_for(row) for row in np.eye(3)[:, [1, 2, 0]]])
