@@ -365,43 +365,30 @@ class SerialChain(Arm, Model):
             ValueError: there are fewer, or a socket cannot be reached; the message
                 counts the reasons.
         """
-        from jaxcal.arms.postures import postures, view_and_room
-
-        rules = view_and_room(
-            self._camera(camera), distance, tilt, side, floor, approach, clear, radius
+        where = self.reachable(
+            near=near,
+            allowed=allowed,
+            camera=camera,
+            distance=distance,
+            tilt=tilt,
+            side=side,
+            floor=floor,
+            approach=approach,
+            clear=clear,
+            radius=radius,
         )
-        return postures(self, count, seed, near, allowed, *rules)
+        return np.asarray(where.drawn(count, seed))
 
-    def reachable(
-        self,
-        *,
-        near: ArrayLike | None = None,
-        allowed: Callable[[Array], bool] | None = None,
-        camera: ArrayLike | None = None,
-        distance: Sequence[float] | None = None,
-        tilt: float | None = None,
-        side: str | None = None,
-        floor: float | None = None,
-        approach: ArrayLike | None = None,
-        clear: Sequence[ArrayLike] = (),
-        radius: float | None = None,
-    ) -> Any:
+    def reachable(self, **rules: Any) -> Any:
         """Where the arm can be measured: ``allowed`` of ``Design.refine``.
 
-        Arguments as of ``postures``. Commands that a search tries are moved to where
-        the sensor reads: the ball into its socket, the board as the camera sees it.
+        Arguments as of ``postures``, from ``near`` on. Commands that a search tries are
+        moved to where the sensor reads: the ball into its socket, the board as the
+        camera sees it.
         """
-        from jaxcal.arms.postures import ReachableSet, view_and_room
+        from jaxcal.arms.postures import ReachableSet
 
-        rules = view_and_room(
-            self._camera(camera), distance, tilt, side, floor, approach, clear, radius
-        )
-        return ReachableSet(self, near, allowed, *rules)
-
-    def _camera(self, camera: ArrayLike | None) -> ArrayLike | None:
-        """The camera of postures: the sensor's where its picture is known."""
-        known = getattr(self.sensor, "picture", None) is not None
-        return self.sensor.camera if camera is None and known else camera  # type: ignore[attr-defined]
+        return ReachableSet(self, **rules)
 
     def tip_axis(self, commands: ArrayLike) -> Array:
         """(N, 3) the tip's z axis in the measuring frame, of the nominal arm."""

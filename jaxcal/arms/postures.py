@@ -12,13 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.arms.sensors import Board, Plane, Socket
 from jaxcal.arms.views import (
-    STEPS,
-    View,
-    board_of,
+    aimed,
     distances,
     in_picture,
     in_view,
-    pictured,
+    towards_zero,
+    view_of,
 )
 from jaxcal.checks import in_words, numbers, whole_number
 
@@ -46,41 +45,6 @@ class Room:
     planes: Array  # (P, 4) normal, offset: spheres stay where normal . x > offset
     boxes: Array  # (B, 6) least x, y, z, then greatest: spheres stay outside
     radius: float | None  # of the spheres
-
-    @classmethod
-    def of(
-        cls,
-        floor: float | None,
-        approach: ArrayLike | None,
-        clear: Sequence[ArrayLike],
-        radius: float | None,
-    ) -> Room:
-        """Checked; the cone of an approach without its angle is 60 degrees."""
-        cone = None
-        if approach is not None:
-            cone = numbers("approach", approach)
-            cone = np.append(cone, 60.0) if cone.shape == (3,) else cone
-            size = np.linalg.norm(cone[:3])
-            if cone.shape != (4,) or not (size > 0.0 and 0.0 < cone[3] <= 180.0):
-                raise ValueError(
-                    "approach must be a direction (x, y, z) and the largest angle "
-                    f"from it in degrees, got {in_words(numbers('approach', approach))}"
-                )
-            cone = np.append(cone[:3] / size, cone[3])
-        things: dict[int, list[Array]] = {4: [], 6: []}
-        for one in clear:
-            row = numbers("clear", one)
-            if row.shape not in ((4,), (6,)):
-                raise ValueError(
-                    "clear must hold planes (normal, offset) of 4 numbers and boxes "
-                    f"(least x, y, z, greatest) of 6, got {in_words(row)}"
-                )
-            things[len(row)].append(row)
-        for row in things[4]:
-            row /= np.linalg.norm(row[:3])
-        planes, boxes = (np.array(rows).reshape(-1, n) for n, rows in things.items())
-        height = None if floor is None else float(numbers("floor", floor))
-        return cls(height, cone, planes, boxes, radius)
 
     def require_sockets(self, arm: Chain) -> None:
         """Refuse sockets that are below the floor."""
@@ -135,98 +99,163 @@ class Room:
         return np.asarray(near.any(axis=1))
 
 
-def view_and_room(
-    camera: ArrayLike | None,
-    distance: Sequence[float] | None,
-    tilt: float | None,
-    side: str | None,
+def _room_of(
     floor: float | None,
     approach: ArrayLike | None,
     clear: Sequence[ArrayLike],
     radius: float | None,
-) -> tuple[View | None, Room | None]:
-    """What must be seen and where the arm may be, of the arguments of ``postures``."""
-    view = room = None
-    if camera is not None:
-        view = View.of(camera, distance, tilt, side)
-    else:
-        for name, value in (("distance", distance), ("tilt", tilt), ("side", side)):
-            if value is not None:
-                raise ValueError(f"{name} needs camera= and a board, got {value}")
+) -> Room | None:
+    """Checked; the cone of an approach without its angle is 60 degrees."""
     if radius is not None and not len(clear):
         raise ValueError(f"radius needs clear= (planes or boxes), got {radius}")
     if radius is not None and not numbers("radius", radius) > 0.0:
         raise ValueError(f"radius must be positive, got {radius}")
-    if floor is not None or approach is not None or len(clear):
-        room = Room.of(floor, approach, clear, radius)
-    return view, room
+    if floor is None and approach is None and not len(clear):
+        return None
+    cone = None
+    if approach is not None:
+        cone = numbers("approach", approach)
+        cone = np.append(cone, 60.0) if cone.shape == (3,) else cone
+        size = np.linalg.norm(cone[:3])
+        if cone.shape != (4,) or not (size > 0.0 and 0.0 < cone[3] <= 180.0):
+            raise ValueError(
+                "approach must be a direction (x, y, z) and the largest angle from it "
+                f"in degrees, got {in_words(numbers('approach', approach))}"
+            )
+        cone = np.append(cone[:3] / size, cone[3])
+    things: dict[int, list[Array]] = {4: [], 6: []}
+    for one in clear:
+        row = numbers("clear", one)
+        if row.shape not in ((4,), (6,)):
+            raise ValueError(
+                "clear must hold planes (normal, offset) of 4 numbers and boxes (least "
+                f"x, y, z, greatest) of 6, got {in_words(row)}"
+            )
+        things[len(row)].append(row)
+    for row in things[4]:
+        row /= np.linalg.norm(row[:3])
+    planes, boxes = (np.array(rows).reshape(-1, n) for n, rows in things.items())
+    height = None if floor is None else float(numbers("floor", floor))
+    return Room(height, cone, planes, boxes, radius)
 
 
-def postures(
-    arm: Chain,
-    count: int,
-    seed: int,
-    near: ArrayLike | None,
-    allowed: Callable[[Array], bool] | None,
-    view: View | None = None,
-    room: Room | None = None,
-) -> Array:
-    """Candidate postures (M, n) of an arm; arguments as ``SerialChain.postures``."""
-    whole_number("count", count, 1)
-    if view is not None and not arm.sensor.views:
-        raise ValueError("camera needs an arm with sensor=Board(...)")
-    if arm.sensor.joined:
-        raise ValueError(
-            "use one sensor at a time: arm.measured_with(sensor).postures()"
-        )
-    arm, targets = _aimed(arm, near)
-    if room is not None:
-        room.require_sockets(arm)
-    rng = np.random.default_rng(seed)
-    collection = _Collection(arm, count, allowed)
-    low, high = collection.low, collection.high
-    for batch in range(_ROUNDS):
-        if batch == _VAIN and not collection.reached.all():
-            break
-        commands, places = collection.starts(rng)
-        if view is not None:
-            commands, reasons = pictured(arm, commands, low, high, view, rng)
-        else:
-            commands, reasons = _reach(arm, commands, low, high, targets)
-        if room is not None:
-            beside = room.reasons(arm, commands)
+class ReachableSet:
+    """Where an arm can be measured; arguments as of ``SerialChain.postures``."""
+
+    def __init__(
+        self,
+        arm: Chain,
+        *,
+        near: ArrayLike | None = None,
+        allowed: Callable[[Array], bool] | None = None,
+        camera: ArrayLike | None = None,
+        distance: Sequence[float] | None = None,
+        tilt: float | None = None,
+        side: str | None = None,
+        floor: float | None = None,
+        approach: ArrayLike | None = None,
+        clear: Sequence[ArrayLike] = (),
+        radius: float | None = None,
+    ) -> None:
+        if camera is None and getattr(arm.sensor, "picture", None) is not None:
+            camera = arm.sensor.camera  # type: ignore[attr-defined]  # of a Board
+        self.view = view_of(camera, distance, tilt, side)
+        self.room = _room_of(floor, approach, clear, radius)
+        if self.view is not None and not arm.sensor.views:
+            raise ValueError("camera needs an arm with sensor=Board(...)")
+        if arm.sensor.joined:
+            raise ValueError("use one sensor at a time: arm.measured_with(sensor)")
+        self.near, self.allowed = near, allowed
+        self.arm, self.targets = _aimed(arm, near)
+        if self.room is not None:
+            self.room.require_sockets(self.arm)
+        self.ends = (0.0, 0.0) if self.view is None else distances(self.arm, self.view)
+        self.turning = np.array(self.arm.command_units) == "deg"
+
+    @property
+    def limits(self) -> Array:
+        """(J, 2) of the joints, 180 degrees where there are none."""
+        limits = self.arm.limits
+        return np.where(self.turning[:, None], limits.clip(-180.0, 180.0), limits)
+
+    def __call__(self, command: Array) -> bool:
+        """Whether the arm can be measured at a command (n,)."""
+        moved, there = self.onto(command[None])
+        near = np.abs(moved[0] - command) <= 1e-6 * np.maximum(np.abs(command), 1.0)
+        return bool(there[0] and near.all())
+
+    def onto(self, commands: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """(N, n) commands moved to where the sensor reads, and (N,) whether it does."""
+        commands, j = commands.copy(), self.arm.num_joints
+        commands[:, :j] = commands[:, :j].clip(*self.limits.T)
+        if (count := self.arm.sensor.num_places) > 1:
+            commands[:, j] = np.round(commands[:, j]).clip(0, count - 1)
+        moved, reasons = self.reach(commands)
+        there = np.array([not reason for reason in reasons], dtype=np.bool_)
+        if self.allowed is not None:
+            for i in np.flatnonzero(there):
+                there[i] = bool(self.allowed(moved[i, :j].copy()))
+        return moved, there
+
+    def reach(
+        self, commands: Array, rng: np.random.Generator | None = None
+    ) -> tuple[Array, list[str]]:
+        """Commands moved to where the sensor reads, of a camera to views drawn from
+        ``rng``, and why it does not ("" where it does)."""
+        arm, (low, high) = self.arm, self.limits.T
+        reasons = [""] * len(commands)
+        if self.view is not None:
+            if rng is not None:
+                commands = aimed(arm, commands, low, high, self.view, self.ends, rng)
+            commands, reasons = in_picture(arm, commands, self.view, self.ends)
+        elif arm.sensor.views:
+            commands, reasons = in_view(arm, commands)
+        elif arm.sensor.zeros:
+            limit = _REACHED * (arm.length or 1.0)
+            commands = towards_zero(arm, commands, low, high, limit)
+            reached = np.linalg.norm(arm.predict(commands), axis=1) <= limit
+            why = "cannot reach it within the limits"
+            reasons = ["" if one else why for one in reached]
+        elif self.targets is not None:
+            points = arm.nominal_tips(commands)
+            far = np.linalg.norm(points[:, None] - self.targets[:, :3], axis=-1)
+            close = (far <= self.targets[:, 3]).any(axis=1)
+            reasons = ["" if one else "are not near" for one in close]
+        if self.room is not None:
+            beside = self.room.reasons(arm, commands)
             reasons = [a or b for a, b in zip(reasons, beside, strict=True)]
-        for command, reason, place in zip(commands, reasons, places, strict=True):
-            collection.add(command, reason, place)
-        if collection.complete:
-            kept = collection.kept
-            return kept[in_turn(kept, arm.num_joints)]
-    raise ValueError(collection.shortfall(near))
+        return commands, reasons
+
+    def drawn(self, count: int, seed: int) -> Array:
+        """(count, n) commands from random starts, in an order of little travel."""
+        whole_number("count", count, 1)
+        if not np.isfinite(self.limits).all():
+            raise ValueError("limits=... is missing: the limits of sliding joints")
+        rng = np.random.default_rng(seed)
+        collection = _Collection(self, count)
+        for batch in range(_ROUNDS):
+            if batch == _VAIN and not collection.reached.all():
+                break
+            commands, places = collection.starts(rng)
+            for one in zip(*self.reach(commands, rng), places, strict=True):
+                collection.add(*one)
+            if len(collection.kept) == count and collection.reached.all():
+                return collection.kept[in_turn(collection.kept, self.arm.num_joints)]
+        raise ValueError(collection.shortfall())
 
 
 class _Collection:
     """Postures that can be measured, and what became of the others that were tried."""
 
-    def __init__(
-        self, arm: Chain, count: int, allowed: Callable[[Array], bool] | None
-    ) -> None:
-        self.arm, self.count, self.allowed = arm, count, allowed
-        turns = np.array(arm.command_units) == "deg"
-        if not np.isfinite(arm.limits[~turns]).all():
-            raise ValueError("limits=... is missing: the limits of sliding joints")
-        low, high = arm.limits.T
-        self.low, self.high = np.maximum(low, -180.0), np.minimum(high, 180.0)
+    def __init__(self, where: ReachableSet, count: int) -> None:
+        self.where, self.arm, self.count = where, where.arm, count
+        self.low, self.high = where.limits.T
         # (J,) two of these are as far as postures must be apart.
-        self.unit = np.where(turns, 1.0, (self.high - self.low) / 100.0)
-        self.kept, self.tried = np.zeros((0, arm.num_inputs)), 0
-        num_places = max(arm.sensor.num_places, 1)
+        self.unit = np.where(where.turning, 1.0, (self.high - self.low) / 100.0)
+        self.kept, self.tried = np.zeros((0, self.arm.num_inputs)), 0
+        num_places = max(self.arm.sensor.num_places, 1)
         self.reached = np.zeros(num_places, dtype=int)  # postures at each place
         self.refused: list[Counter[str]] = [Counter() for _ in self.reached]
-
-    @property
-    def complete(self) -> bool:
-        """All that were asked for are kept, and one at each place."""
-        return bool(len(self.kept) == self.count and self.reached.all())
 
     def starts(self, rng: np.random.Generator) -> tuple[Array, NDArray[np.intp]]:
         """(N, n) random commands to try next, and (N,) the place that each is for."""
@@ -252,7 +281,7 @@ class _Collection:
             apart = np.abs((self.kept[:, : len(joints)] - joints) / self.unit)
             if len(self.kept) and apart.max(axis=1).min() < _APART:
                 reason = "are too close to another"
-            elif self.allowed is not None and not self.allowed(joints.copy()):
+            elif (may := self.where.allowed) is not None and not may(joints.copy()):
                 reason = "are not allowed"
         if reason:
             self.refused[place][reason] += 1
@@ -261,7 +290,7 @@ class _Collection:
         if len(self.kept) < self.count:
             self.kept = np.vstack([self.kept, command])
 
-    def shortfall(self, near: ArrayLike | None) -> str:
+    def shortfall(self) -> str:
         """What is missing: a place that no posture reaches, or postures."""
         missed = np.flatnonzero(self.reached == 0)
         if len(self.reached) > 1 and len(missed):
@@ -277,6 +306,7 @@ class _Collection:
             )
         reasons = _counted(sum(self.refused, Counter()))
         if not len(self.kept):
+            near = self.where.near
             target = "what the sensor reads" if near is None else f"near = {near}"
             return (
                 f"no posture reaches {target} (of {self.tried} tried {reasons}). Is it "
@@ -290,64 +320,6 @@ class _Collection:
 
 def _counted(reasons: Counter[str]) -> str:
     return ", ".join(f"{number} {reason}" for reason, number in reasons.most_common())
-
-
-class ReachableSet:
-    """Where an arm can be measured, for ``refine``; see ``SerialChain.reachable``."""
-
-    def __init__(
-        self,
-        arm: Chain,
-        near: ArrayLike | None,
-        allowed: Callable[[Array], bool] | None,
-        view: View | None,
-        room: Room | None,
-    ) -> None:
-        if arm.sensor.joined:
-            raise ValueError(
-                "reachable is for one sensor at a time: "
-                "arm.measured_with(sensor).reachable()"
-            )
-        if view is not None and not arm.sensor.views:
-            raise ValueError("camera needs an arm with sensor=Board(...)")
-        self._arm, self._targets = _aimed(arm, near)
-        if room is not None:
-            room.require_sockets(self._arm)
-        self._allowed, self._view, self._room = allowed, view, room
-        self._ends = None if view is None else distances(board_of(arm), view)
-
-    @property
-    def limits(self) -> Array:
-        """(j, 2) of the joints, 180 degrees where there are none."""
-        turns = np.array(self._arm.command_units)[:, None] == "deg"
-        return np.where(turns, self._arm.limits.clip(-180.0, 180.0), self._arm.limits)
-
-    def __call__(self, command: Array) -> bool:
-        """Whether the arm can be measured at a command (n,)."""
-        moved, there = self.onto(command[None])
-        near = np.abs(moved[0] - command) <= 1e-6 * np.maximum(np.abs(command), 1.0)
-        return bool(there[0] and near.all())
-
-    def onto(self, commands: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """(N, n) commands moved to where the sensor reads, and (N,) whether it does."""
-        arm, commands = self._arm, commands.copy()
-        low, high = self.limits.T
-        j = arm.num_joints
-        commands[:, :j] = commands[:, :j].clip(low, high)
-        if (count := arm.sensor.num_places) > 1:
-            labels = np.round(commands[:, j]).clip(0, count - 1)
-            commands[:, j] = labels
-        if self._view is not None and self._ends is not None:
-            moved, reasons = in_picture(arm, commands, self._view, self._ends)
-        else:
-            moved, reasons = _reach(arm, commands, low, high, self._targets)
-        there = np.array([not reason for reason in reasons], dtype=np.bool_)
-        if self._room is not None:
-            there &= self._room.reasons(arm, moved) == ""
-        if self._allowed is not None:
-            for i in np.flatnonzero(there):
-                there[i] = bool(self._allowed(moved[i, :j].copy()))
-        return moved, there
 
 
 def _aimed(arm: Chain, near: ArrayLike | None) -> tuple[Chain, Array | None]:
@@ -379,56 +351,6 @@ def _aimed(arm: Chain, near: ArrayLike | None) -> tuple[Chain, Array | None]:
             f"{places.shape[1]} columns"
         )
     return arm, places
-
-
-def _reach(
-    arm: Chain, commands: Array, low: Array, high: Array, targets: Array | None
-) -> tuple[Array, list[str]]:
-    """Commands moved to where the sensor reads, and why not ("" where it does)."""
-    if arm.sensor.views:
-        return in_view(arm, commands)
-    if arm.sensor.zeros:
-        return _touching(arm, commands, low, high)
-    if targets is None:
-        return commands, [""] * len(commands)
-    points = arm.nominal_tips(commands)
-    far = np.linalg.norm(points[:, None] - targets[:, :3], axis=-1)
-    near = (far <= targets[:, 3]).any(axis=1)
-    return commands, ["" if one else "are not near" for one in near]
-
-
-def _touching(
-    arm: Chain, commands: Array, low: Array, high: Array
-) -> tuple[Array, list[str]]:
-    """Damped steps of least length until the readings are zero, within the limits."""
-    commands, j = commands.copy(), arm.num_joints
-    limit = _REACHED * (arm.length or 1.0)
-    # Degrees and lengths are made comparable by how far each may go.
-    scale = np.minimum(high - low, 360.0)
-    for _ in range(STEPS):
-        off = arm.predict(commands)
-        size = np.linalg.norm(off, axis=1)
-        going = size > limit
-        if not going.any():
-            break
-        slopes = arm.command_jacobian(commands[going])[..., :j] * scale
-        # A joint at its limit that is pushed on beyond it stays where it is.
-        wish = -np.einsum("nqj,nq->nj", slopes, off[going])
-        at = commands[going, :j]
-        held = ((at <= low) & (wish < 0.0)) | ((at >= high) & (wish > 0.0))
-        slopes = np.where(held[:, None], 0.0, slopes)
-        gram = slopes @ np.matrix_transpose(slopes)
-        trace = np.trace(gram, axis1=1, axis2=2)[:, None, None] + 1e-300
-        gram = gram + 1e-6 * trace * np.eye(gram.shape[-1])
-        step = np.linalg.solve(gram, -off[going][..., None])
-        with np.errstate(invalid="ignore"):  # where all joints are held
-            step = (np.matrix_transpose(slopes) @ step)[..., 0]
-        step = np.nan_to_num(step, nan=0.0, posinf=0.0, neginf=0.0)
-        step *= 0.1 / np.maximum(np.abs(step).max(axis=1, keepdims=True), 0.1)
-        commands[going, :j] = np.clip(at + step * scale, low, high)
-    reached = np.linalg.norm(arm.predict(commands), axis=1) <= limit
-    why = "cannot reach it within the limits"
-    return commands, ["" if one else why for one in reached]
 
 
 def in_turn(postures: Array, joints: int) -> NDArray[np.int64]:
