@@ -6,13 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.arms.arm import Load
 from jaxcal.arms.sensors import SENSORS, Position, Sensor
-from jaxcal.checks import array_of, in_words, numbers, one_of, whole_number
-
-Array = NDArray[np.float64]
+from jaxcal.checks import Array, array_of, in_words, numbers, one_of, whole_number
 
 
 def rows_of(table: ArrayLike) -> Array:

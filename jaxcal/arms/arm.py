@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.arms.chain_kernel import forward
 from jaxcal.arms.sensors import Reading, Sensor, Tip
-from jaxcal.checks import array_of, numbers
+from jaxcal.checks import Array, array_of, numbers
 from jaxcal.models.model import as_commands
 
-Array = NDArray[np.float64]
 Load = tuple[int, float, tuple[float, float, float]]  # link from 1, weight, its centre
 
 # The steps of the base: three shifts, three turns, its nominal rotation; five of each

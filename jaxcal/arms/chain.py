@@ -24,12 +24,10 @@ from jaxcal.arms.arguments import (
 )
 from jaxcal.arms.arm import Arm, apparent_length
 from jaxcal.arms.sensors import Position, Sensor, Several
-from jaxcal.checks import array_of, axis_names, numbers, one_of
+from jaxcal.checks import Array, array_of, axis_names, numbers, one_of
 from jaxcal.models.model import ErrorGroups, Model, Quantity, as_commands, as_parameters
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
-
-Array = NDArray[np.float64]
 
 _POSTURES = 500  # that show where an arm stands
 _BASE = ("x", "y", "z", "rx", "ry", "rz")

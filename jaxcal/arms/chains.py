@@ -17,12 +17,11 @@ from jaxcal.arms.chain import SerialChain
 from jaxcal.arms.plausible import require_touched
 from jaxcal.arms.sensors import Sensor, Tip
 from jaxcal.arms.sensors.sensor import BASE, Readings, label
-from jaxcal.checks import array_of, one_of
+from jaxcal.checks import Array, array_of, one_of
 from jaxcal.models import verdict as models
 from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
 from jaxcal.models.uncertainty import Noise, Prior
 
-Array = NDArray[np.float64]
 _SAME = 1e-9  # of lengths and degrees: one and the same link
 
 

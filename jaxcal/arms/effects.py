@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaxcal.checks import Array
 from jaxcal.models.uncertainty import Prior
 from jaxcal.models.verdict import left_out
 
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from jaxcal.arms.chain import SerialChain as Chain
     from jaxcal.arms.verdict import ArmFit as Fit
 
-
-Array = NDArray[np.float64]
 
 SCATTER = 3.0  # times the sensor's usual noise: the model does not explain that
 # Times the tolerances of the default prior: lengths, turns of the axes, zeros of the

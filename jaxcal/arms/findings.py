@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from jaxcal.arms.parts import Part, unit_after
 from jaxcal.arms.sensors import Socket, Wrench
+from jaxcal.checks import Array
 from jaxcal.models.reasons import Reason, outlying
 
 if TYPE_CHECKING:
     from jaxcal.arms.chain import SerialChain as Chain
     from jaxcal.arms.verdict import ArmFit as Fit
 
-Array = NDArray[np.float64]
 
 MORE = "measure more postures: jaxcal postures --measured chooses them"
 CLEAR_UP = "fix the problems listed above, then run identify again"

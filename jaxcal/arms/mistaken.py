@@ -6,13 +6,12 @@ import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from jaxcal.checks import Array
 
 if TYPE_CHECKING:
     from jaxcal.arms.chain import SerialChain as Chain
 
-
-Array = NDArray[np.float64]
 
 _SAME = 1.25  # times the least error: no worse
 _EXPLAINED = 0.2  # of the errors as given: what is left when the mistake is undone

@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arms.sensors import Sensor
+from jaxcal.checks import Array
 
 if TYPE_CHECKING:
     from jaxcal.arms.verdict import ArmFit as Fit
-
-Array = NDArray[np.float64]
 
 
 class Part(NamedTuple):

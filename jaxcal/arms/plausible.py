@@ -7,17 +7,15 @@ import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.arms.mistaken import mistaken_columns
 from jaxcal.arms.sensors import Board, Sensor, Socket
-from jaxcal.checks import in_words
+from jaxcal.checks import Array, in_words
 
 if TYPE_CHECKING:
     from jaxcal.arms.chain import SerialChain as Chain
 
 
-Array = NDArray[np.float64]
 _OTHER_ARM = "wrong tip, unit, sign or order of columns, or rows of another place?"
 
 _NOMINAL = 0.1  # of its length: no arm is so far off, tip included, before it is fitted

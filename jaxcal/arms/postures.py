@@ -19,13 +19,11 @@ from jaxcal.arms.views import (
     towards_zero,
     view_of,
 )
-from jaxcal.checks import in_words, numbers, whole_number
+from jaxcal.checks import Array, in_words, numbers, whole_number
 
 if TYPE_CHECKING:
     from jaxcal.arms.chain import SerialChain as Chain
 
-
-Array = NDArray[np.float64]
 
 _ROUNDS = 40  # batches of starts
 _BATCH = 2_000  # starts at a time, where few are any good

@@ -19,6 +19,7 @@ from jaxcal.arms.mistaken import mistaken_columns
 from jaxcal.arms.parts import Part, parts_of, unit_after
 from jaxcal.arms.sensors import Pose
 from jaxcal.arms.sensors.sensor import hats
+from jaxcal.checks import Array
 from jaxcal.information.singular import depends, significant
 from jaxcal.models import verdict as models
 from jaxcal.models.reasons import Reason, computed, in_rows, never_measured, wrong_noise
@@ -40,8 +41,6 @@ if TYPE_CHECKING:
 
     Fit = ArmFit
 
-
-Array = NDArray[np.float64]
 
 _LOOK = (
     "look at the residuals (report, --report); use the nominal machine until they are "

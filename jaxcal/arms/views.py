@@ -7,15 +7,14 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.arms.sensors import Board
-from jaxcal.checks import array_of, in_words, numbers
+from jaxcal.checks import Array, array_of, in_words, numbers
 
 if TYPE_CHECKING:
     from jaxcal.arms.chain import SerialChain as Chain
 
-Array = NDArray[np.float64]
 
 _STEPS = 80  # of the inverse kinematics
 _VIEW = np.cos(np.radians(25.0))  # of the board from the camera's axis, and its face

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arguments import several
-from jaxcal.checks import one_of
+from jaxcal.checks import Array, one_of
 from jaxcal.models.model import Model, as_model
 from jaxcal.models.recording import Recording
 from jaxcal.tables import COMMANDS, Table
@@ -24,8 +24,6 @@ from jaxcal.tables.names import say
 if TYPE_CHECKING:
     from jaxcal.arms import Sensor, SerialChain
 
-
-Array = NDArray[np.float64]
 
 ModelPath = Annotated[
     str | None,

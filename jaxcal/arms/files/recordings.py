@@ -13,11 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arms.files.servos import Servos
-from jaxcal.checks import in_words
+from jaxcal.checks import Array, in_words
 from jaxcal.extras import needs
 from jaxcal.models.recording import Recording
-
-Array = NDArray[np.float64]
 
 _WITHIN = 0.05  # degrees in which a resting joint stays
 _JITTER = 8.0  # standard deviations: no reading of a joint at rest is farther apart

@@ -10,11 +10,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaxcal.checks import Array
 from jaxcal.files import write_text
-
-Array = NDArray[np.float64]
 
 _KEYS = ("id", "drive_mode", "homing_offset", "range_min", "range_max")
 

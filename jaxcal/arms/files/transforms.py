@@ -6,21 +6,18 @@ import os
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.arms.arguments import pose_matrix
 from jaxcal.arms.files.urdf import joints_of, links_of, table_of, walk
 from jaxcal.arms.files.write import fixed_joint, save, with_origins
 from jaxcal.arms.sensors import Board
 from jaxcal.arms.verdict import place_of
-from jaxcal.checks import one_of
+from jaxcal.checks import Array, one_of
 from jaxcal.models.uncertainty import Prior
 
 if TYPE_CHECKING:
     from jaxcal.arms.verdict import ArmFit as Calibration
 
-
-Array = NDArray[np.float64]
 
 _FORMS = (".yaml", ".yml", ".sh", ".py", ".urdf")
 _METRES = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}

@@ -14,12 +14,9 @@ from xml.etree import ElementTree
 from xml.parsers import expat
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from jaxcal.checks import numbers, one_of
-
-Array = NDArray[np.float64]
+from jaxcal.checks import Array, numbers, one_of
 
 _PARALLEL = 0.2  # sine; below it the common normal of two axes is far away
 

@@ -15,7 +15,6 @@ from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.arms.files.urdf import (
     Joint,
@@ -28,14 +27,12 @@ from jaxcal.arms.files.urdf import (
     turn_of_z,
     walk,
 )
-from jaxcal.checks import one_of
+from jaxcal.checks import Array, one_of
 from jaxcal.files import atomic_write
 
 if TYPE_CHECKING:
     from jaxcal.arms.arm import Arm
 
-
-Array = NDArray[np.float64]
 
 _UR = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 _TAG = re.compile(rb"""(?:[^>"']+|"[^"]*"|'[^']*')*>""")

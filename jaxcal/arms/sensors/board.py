@@ -10,10 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.arms.sensors.pose import Pose, rotation_vector_rate
 from jaxcal.arms.sensors.sensor import BASE, HasNames, Reading, Sensor, Tip, hats, turns
-from jaxcal.checks import array_of, numbers, one_of
+from jaxcal.checks import Array, array_of, numbers, one_of
 from jaxcal.models.model import Quantity
-
-Array = NDArray[np.float64]
 
 _FEW = 3  # views that find where a board stands and its tool
 _ONE_AXIS = 0.999  # of the largest singular value: turns about one axis, or none

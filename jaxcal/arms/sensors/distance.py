@@ -6,11 +6,10 @@ import dataclasses
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.arms.sensors.sensor import Landmarks, Reading, Tip
-
-Array = NDArray[np.float64]
+from jaxcal.checks import Array
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -6,13 +6,11 @@ import dataclasses
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.arms.sensors.sensor import HasNames, Reading, Sensor, Tip, hats
-from jaxcal.checks import in_words, numbers
+from jaxcal.checks import Array, in_words, numbers
 from jaxcal.models.model import Quantity
-
-Array = NDArray[np.float64]
 
 _ASIDE = 0.7  # cosine: readings farther from up have another up
 _TURNED = 27.0  # degrees on the tool, from which the fit does not find them

@@ -6,12 +6,11 @@ import dataclasses
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.arms.sensors.sensor import Landmarks, Reading, Tip, hats
+from jaxcal.checks import Array
 from jaxcal.models.model import Quantity
-
-Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

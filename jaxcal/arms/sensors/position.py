@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.arms.sensors.sensor import Reading, Sensor, Tip
-
-Array = NDArray[np.float64]
+from jaxcal.checks import Array
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

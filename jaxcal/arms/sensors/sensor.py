@@ -11,11 +11,9 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import array_of, numbers, whole_number
+from jaxcal.checks import Array, array_of, numbers, whole_number
 from jaxcal.models.model import Quantity
 from jaxcal.models.periods import within_half
-
-Array = NDArray[np.float64]
 
 BASE = tuple(f"base {axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
 

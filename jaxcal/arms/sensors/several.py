@@ -19,9 +19,7 @@ from jaxcal.arms.sensors.sensor import (
     label,
     turns,
 )
-from jaxcal.checks import array_of, table
-
-Array = NDArray[np.float64]
+from jaxcal.checks import Array, array_of, table
 
 _MOUNTING = ("x", "y", "z", "rx", "ry", "rz")
 

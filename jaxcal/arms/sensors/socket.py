@@ -7,12 +7,10 @@ from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.arms.sensors.sensor import Landmarks, Reading, Tip
-from jaxcal.checks import numbers
-
-Array = NDArray[np.float64]
+from jaxcal.checks import Array, numbers
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

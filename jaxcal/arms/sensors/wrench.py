@@ -6,13 +6,11 @@ import dataclasses
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.arms.sensors.sensor import HasNames, Reading, Sensor, Tip, hats
-from jaxcal.checks import array_of, in_words, numbers
+from jaxcal.checks import Array, array_of, in_words, numbers
 from jaxcal.models.model import Quantity
-
-Array = NDArray[np.float64]
 
 _FEW = 4  # postures that show how the sensor is mounted
 _SPREAD = 0.1  # of the largest: forces along more than a line, and off a plane
