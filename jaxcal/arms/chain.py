@@ -32,7 +32,7 @@ from jaxcal.models.uncertainty import Noise, Prior
 _POSTURES = 500  # that show where an arm stands
 _BASE = ("x", "y", "z", "rx", "ry", "rz")
 
-_COLUMNS = ("a", "alpha", "d", "theta", "beta")
+COLUMNS = ("a", "alpha", "d", "theta", "beta")
 # Standard deviations of the default prior. On a UR5 (links of 1.19 m in all): 1.8 mm,
 # 0.3 degrees of the axes and 0.5 of a joint's zero, which is set by hand; 0.12 m and
 # 1.7 degrees of the base and the tool.
@@ -895,7 +895,7 @@ class SerialChain(Arm, Model):
         n = len(self.joints)
         mounting = ("x", "y", "z", "rx", "ry", "rz")
         return (
-            *(f"{column}{i + 1}" for i in range(n) for column in _COLUMNS),
+            *(f"{column}{i + 1}" for i in range(n) for column in COLUMNS),
             *(f"gear{i}" for i in self.gears),
             *(f"compliance{i}" for i in self.compliance),
             *(f"base {axis}" for axis in mounting),

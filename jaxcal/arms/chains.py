@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.arms.chain import SerialChain
+from jaxcal.arms.chain import COLUMNS, SerialChain
 from jaxcal.arms.plausible import require_touched
 from jaxcal.arms.sensors import Sensor, Tip
 from jaxcal.arms.sensors.sensor import BASE, Readings, label
@@ -133,7 +133,7 @@ class Chains(Model):
         for k, (tip, arm, shared) in enumerate(
             zip(self.tips, self.chains, self._shared, strict=True)
         ):
-            links = [f"{name}{i}" for i in range(1, shared) for name in _COLUMNS]
+            links = [f"{name}{i}" for i in range(1, shared) for name in COLUMNS]
             common = {*links, *(BASE if shared else ())}
             common |= {
                 name
@@ -207,11 +207,11 @@ class Chains(Model):
     def _parts(
         self, commands: Array
     ) -> Iterator[tuple[int, SerialChain, NDArray[np.intp], Array]]:
-        """Each chain and its number, its rows, and its commands there."""
+        """Each chain that was read and its number, its rows, its commands there."""
         which = label("chain", commands[:, len(self.joint_names)], len(self.chains))
-        for k, arm in enumerate(self.chains):
+        for k in np.unique(which).tolist():
             rows = np.flatnonzero(which == k)
-            yield k, arm, rows, commands[rows][:, self._columns[k]]
+            yield k, self.chains[k], rows, commands[rows][:, self._columns[k]]
 
     @functools.cached_property
     def _columns(self) -> tuple[list[int], ...]:
@@ -264,11 +264,8 @@ class Chains(Model):
         commands, theta = as_commands(self, commands), as_parameters(self, parameters)
         values = np.zeros((len(commands), self.num_outputs))
         for k, arm, rows, arm_commands in self._parts(commands):
-            if len(rows):
-                read = arm.predict(arm_commands, theta[self.members[k]]) / self._scale(
-                    k
-                )
-                values[rows, : arm.num_outputs] = read
+            read = arm.predict(arm_commands, theta[self.members[k]]) / self._scale(k)
+            values[rows, : arm.num_outputs] = read
         return values
 
     def jacobian(
@@ -290,12 +287,9 @@ class Chains(Model):
         width = len(self.names) if by == "jacobian" else self.num_inputs
         slopes = np.zeros((len(commands), self.num_outputs, width))
         for k, arm, rows, arm_commands in self._parts(commands):
-            if len(rows):
-                of_chain = getattr(arm, by)(arm_commands, theta[self.members[k]])
-                outputs = np.arange(arm.num_outputs)
-                slopes[np.ix_(rows, outputs, at[k])] = (
-                    of_chain / self._scale(k)[:, None]
-                )
+            of_chain = getattr(arm, by)(arm_commands, theta[self.members[k]])
+            outputs = np.arange(arm.num_outputs)
+            slopes[np.ix_(rows, outputs, at[k])] = of_chain / self._scale(k)[:, None]
         return slopes
 
     def length_unit(self, measured_unit: str) -> str:
@@ -317,9 +311,7 @@ class Chains(Model):
     def log_size(self, commands: Array, parameters: Array) -> Array | None:
         sizes, grow = np.zeros(len(commands)), False
         for k, arm, rows, arm_commands in self._parts(commands):
-            size = None
-            if len(rows):
-                size = arm.log_size(arm_commands, parameters[self.members[k]])
+            size = arm.log_size(arm_commands, parameters[self.members[k]])
             if size is not None:
                 sizes[rows], grow = size, True
         return sizes if grow else None
@@ -327,10 +319,9 @@ class Chains(Model):
     def log_size_jacobian(self, commands: Array, parameters: Array) -> Array:
         slopes = np.zeros((len(commands), len(parameters)))
         for k, arm, rows, arm_commands in self._parts(commands):
-            if len(rows):
-                at = self.members[k]
-                of_arm = arm.log_size_jacobian(arm_commands, parameters[at])
-                slopes[np.ix_(rows, at)] = of_arm
+            at = self.members[k]
+            of_arm = arm.log_size_jacobian(arm_commands, parameters[at])
+            slopes[np.ix_(rows, at)] = of_arm
         return slopes
 
     def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
@@ -425,10 +416,14 @@ class Chains(Model):
 
     @functools.cached_property
     def _bent(self) -> Self:  # kept, and what it keeps with it
-        bent = tuple(arm.with_misfit() for arm in self.chains)
-        if all(a is b for a, b in zip(bent, self.chains, strict=True)):
+        return self._each(SerialChain.with_misfit)
+
+    def _each(self, change: Callable[[SerialChain], SerialChain]) -> Self:
+        """These chains with each changed; themselves where none is."""
+        arms = tuple(change(arm) for arm in self.chains)
+        if all(a is b for a, b in zip(arms, self.chains, strict=True)):
             return self
-        return dataclasses.replace(self, chains=bent)
+        return dataclasses.replace(self, chains=arms)
 
     # -- the commands and readings of a fit or a choice --------------------------------
 
@@ -465,10 +460,9 @@ class Chains(Model):
         return np.vstack(all_commands), np.vstack(all_measured)
 
     def require_commands(self, commands: Array) -> None:
-        for k, arm, rows, arm_commands in self._parts(commands):
+        for k, arm, _, arm_commands in self._parts(commands):
             with self._naming(k):
-                if len(rows):
-                    arm.require_commands(arm_commands)
+                arm.require_commands(arm_commands)
 
     def prepared(self, commands: Array, measured: Array | None = None) -> Self:
         """These chains with their sensors where commands (and readings) put them.
@@ -477,12 +471,12 @@ class Chains(Model):
             ValueError: as of ``SerialChain.prepared``; a socket whose distance is given
                 is touched by no chain.
         """
-        tables = [
-            (k, arm_commands, self._measured(k, measured, rows))
-            for k, _, rows, arm_commands in self._parts(commands)
-            if len(rows)
-        ]
-        for k, arm_commands, read in tables:
+        tables = []
+        for k, arm, rows, arm_commands in self._parts(commands):
+            read = None
+            if measured is not None:
+                read = measured[rows, : arm.num_outputs] * self._scale(k)
+            tables.append((k, arm_commands, read))
             with self._naming(k):
                 self.chains[k].require_readings(arm_commands, read)
         arms = self._located(tables)
@@ -502,14 +496,6 @@ class Chains(Model):
             yield
         except ValueError as error:
             raise ValueError(f"{self.tips[k]}: {error}") from None
-
-    def _measured(
-        self, k: int, measured: Array | None, rows: NDArray[np.intp]
-    ) -> Array | None:
-        """Readings of a chain in its own units."""
-        if measured is None:
-            return None
-        return measured[rows, : self.chains[k].num_outputs] * self._scale(k)
 
     def _located(
         self, tables: Sequence[tuple[int, Array, Array | None]]
@@ -609,26 +595,22 @@ class Chains(Model):
         """The fields of a calibration that are of one chain, in its own units."""
         k = self.tips.index(one_of("tip", tip, self.tips))
         arm, at, scale = self.chains[k], fit.whole.members[k], self._scale(k)
-        q, (_, _, rows, arm_commands) = (
-            arm.num_outputs,
-            list(self._parts(fit.commands))[k],
-        )
+        q, rows = arm.num_outputs, fit.commands[:, len(self.joint_names)] == k
         residuals = fit.residuals[rows, :q] * scale
         noise = None if fit.noise_std is None else fit.noise_std[:q] * scale
         square = fit.square
         if noise is not None:
             weights = fit.loss_weights[rows]
             square = float((weights[:, None] * (residuals / noise) ** 2).sum())
-        share = len(rows) * q / max(len(fit.commands) * self.num_outputs, 1)
+        share = int(rows.sum()) * q / max(len(fit.commands) * self.num_outputs, 1)
         null = fit.unidentified
         if null is not None:
             null = null[:, at]
             null = null[np.abs(null).max(axis=1, initial=0.0) > 0.0]
         joint = fit.joint_covariance
-        names = arm.inputs or (*arm.joint_names, *arm.sensor.inputs)
         return {
             "model": arm,
-            "input_names": tuple(names),
+            "input_names": (*arm.joint_names, *arm.sensor.inputs),
             "output_names": tuple(arm.sensor.outputs),
             "estimate": fit.estimate[at],
             "joint_covariance": None if joint is None else joint[np.ix_(at, at)],
@@ -636,7 +618,7 @@ class Chains(Model):
             "prior_mean": fit.prior_mean[at],
             "prior_precision": fit.prior_precision[at],
             "free": fit.free[at],
-            "commands": arm_commands,
+            "commands": fit.commands[rows][:, self._columns[k]],
             "estimated_commands": None,
             "residuals": residuals,
             "loss_weights": fit.loss_weights[rows],
@@ -684,11 +666,8 @@ class Chains(Model):
         """Good where every chain that was read is, and distances that they share."""
         from jaxcal.arms.findings import CLEAR_UP, other_distances
 
-        read = {
-            self.tips[k]
-            for k, _, rows, _ in self._parts(fit.commands)
-            if (fit.loss_weights[rows] > 0.0).any()
-        }
+        used = fit.commands[fit.loss_weights > 0.0]
+        read = {self.tips[k] for k, *_ in self._parts(used)}
         of_chains = {tip: fit.of(tip).verdict for tip in self.tips if tip in read}
         bad = [tip for tip, told in of_chains.items() if not told.good]
         step = f"{bad[0]}: {of_chains[bad[0]].next_step}" if bad else models.USE
@@ -719,9 +698,7 @@ class Chains(Model):
         )
 
     def writable(self) -> Self:
-        return dataclasses.replace(
-            self, chains=tuple(arm.writable() for arm in self.chains)
-        )
+        return self._each(SerialChain.writable)
 
     def write(
         self,
@@ -781,20 +758,13 @@ class ChainsVerdict(models.Verdict):
         return float(np.mean([told.held_out for told in self.of_chains.values()]))
 
 
-_COLUMNS = ("a", "alpha", "d", "theta", "beta")
-
-
 def _common(one: SerialChain, other: SerialChain) -> int:
     """Leading joints that two chains have in common."""
-    if not np.allclose(one.base, other.base, atol=_SAME):
+    stands = np.allclose(one.base, other.base, atol=_SAME)
+    if not stands or one.convention != other.convention:
         return 0
-    if one.convention != other.convention:
-        return 0
-    count = 0
     least = min(len(one.joints), len(other.joints))
-    while count < least and _alike(one, other, count):
-        count += 1
-    return count
+    return next((i for i in range(least) if not _alike(one, other, i)), least)
 
 
 def _alike(one: SerialChain, other: SerialChain, i: int) -> bool:
