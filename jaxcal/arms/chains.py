@@ -652,6 +652,7 @@ class Chains(Model):
                 number,
                 readings[0].sensor,
                 readings[0].sensor.kind,
+                "",
                 used,
                 np.vstack([of_chain.columns for of_chain in readings]),
                 np.vstack([of_chain.tip.position for of_chain in readings]),

@@ -92,7 +92,13 @@ def findings_of(
     still, unused = _still(model, calibration.commands[used])
     reasons += moved_lines + exchanged + _far(calibration)
     reasons += tip + other_arm + apart + still + _kept(calibration)
-    reasons += _net_mass(calibration, parts)
+    reasons += [
+        f"The readings show a mass of {calibration.parameters[part.own][0]:.3g} kg. If "
+        "the controller subtracts a payload, this is the load less that payload: set "
+        "the payload to zero, or add what is subtracted."
+        for part in parts
+        if isinstance(part.sensor, Wrench)
+    ]
     doubtful |= wrong or unused
     doubtful |= bool(contradicting or exchanged or other_arm or mistaken)
     return Findings(
@@ -178,18 +184,6 @@ def _far(calibration: Fit) -> list[str]:
     ]
 
 
-def _net_mass(calibration: Fit, parts: list[Part]) -> list[str]:
-    """What is weighed may be less than what hangs there, as a sentence."""
-    weighed = [part for part in parts if isinstance(part.sensor, Wrench)]
-    masses = [calibration.parameters[part.own][0] for part in weighed]
-    return [
-        f"The readings show a mass of {mass:.3g} kg. If the controller subtracts a "
-        "payload, this is the load less that payload: set the payload to zero, or add "
-        "what is subtracted."
-        for mass in masses
-    ]
-
-
 def _kept(calibration: Fit) -> list[str]:
     """Shifts of the tool that contacts do not show, as a sentence."""
     sensor, names = calibration.model.sensor.members[0], calibration.names
@@ -197,14 +191,12 @@ def _kept(calibration: Fit) -> list[str]:
         return []
     shown = dict(zip(names, np.asarray(calibration.from_data), strict=True))
     kept = [name for name in names if name[:-1] == "tool " and shown[name] < _SHOWN]
-    return (
-        [
-            f"{', '.join(kept)}: not shown by these contacts, kept at the nominal "
-            "value. To find it, add contacts with the tool turned other ways."
-        ]
-        if kept
-        else []
-    )
+    if not kept:
+        return []
+    return [
+        f"{', '.join(kept)}: not shown by these contacts, kept at the nominal value. "
+        "To find it, add contacts with the tool turned other ways."
+    ]
 
 
 def _other_tip(calibration: Fit, model: Chain) -> tuple[list[str], bool]:

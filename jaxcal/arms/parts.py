@@ -23,6 +23,7 @@ class Part(NamedTuple):
     member: int  # number of it
     sensor: Sensor
     kind: str  # of it, for a message
+    title: str  # that, "" where there are no others
     rows: NDArray[np.intp]  # (K,) measurements that are used
     columns: Array  # (K, e) of their commands
     points: Array  # (K, 3) where the arm as described has it
@@ -46,9 +47,10 @@ def parts_of(calibration: Fit, used: NDArray[np.intp]) -> list[Part]:
     """Readings of each sensor that has some."""
     model, commands = calibration.model, calibration.commands[used]
     tip, inputs = model.nominal_tip(commands), commands[:, model.num_joints :]
-    kinds = [one.kind for one in model.sensor.members]
-    parts = []
-    for i, read in enumerate(model.sensor.of_members(tip, inputs, None)):
+    kinds, parts = [one.kind for one in model.sensor.members], []
+    several = [*model.sensor.of_members(tip, inputs, None)]
+    alone = sum(len(read.rows) > 0 for read in several) == 1
+    for i, read in enumerate(several):
         twice = kinds.count(read.sensor.kind) > 1
         kind = f"sensor {i}'s {read.sensor.kind}" if twice else read.sensor.kind
         if len(read.rows):
@@ -57,6 +59,7 @@ def parts_of(calibration: Fit, used: NDArray[np.intp]) -> list[Part]:
                     i,
                     read.sensor,
                     kind,
+                    "" if alone else kind,
                     used[read.rows],
                     read.columns,
                     read.tip.position,

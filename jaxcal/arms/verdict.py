@@ -7,7 +7,7 @@ with predicted covariance S and noise R the residual r becomes ``R (R - S)^-1 r`
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 
         @property
         def verdict(self) -> ArmVerdict: ...
-
-    Fit = ArmFit
 
 
 _LOOK = (
@@ -152,7 +150,7 @@ def _missed(
     return [one for one in errors if one.interval[1] > asked.get(one.unit, np.inf)]
 
 
-def verdict(calibration: Fit) -> ArmVerdict:
+def verdict(calibration: ArmFit) -> ArmVerdict:
     """Does its model explain the readings, does it help, what is wrong.
 
     Held-out errors with an interval beside those of the nominal arm, the scatter
@@ -161,40 +159,39 @@ def verdict(calibration: Fit) -> ArmVerdict:
     exchanged, parameters far from what was known.
     """
     model, unit = calibration.model, calibration.measured_unit
+    usual, reason = np.asarray(model.default_noise().std), None
     if calibration.noise_std is None:
-        return ArmVerdict(
-            good=False,
-            reasons=(calibration.no_noise("intervals and no verdict"),),
-            next_step="measure more postures, or state noise_std, --noise (usual for "
-            f"this sensor: {_usual_noise(calibration)})",
-            unit=unit,
+        stds = np.broadcast_to(usual, (calibration.num_outputs,))
+        stds = stds if np.ptp(stds) else stds[:1]
+        reason = Reason(
+            calibration.no_noise("intervals and no verdict"),
+            "measure more postures, or state noise_std, --noise (usual for this "
+            f"sensor: {','.join(f'{std:.2g}' for std in stds)})",
         )
-    reason = None
-    if not model.sensor.zeros:
+    elif not model.sensor.zeros:
         reason = never_measured(calibration) or computed(calibration)
     if reason is not None:
         return ArmVerdict(
             good=False, reasons=(reason.fact,), next_step=reason.remedy, unit=unit
         )
     used = np.flatnonzero(calibration.loss_weights > 0.0)
-    commands, usual = calibration.commands[used], np.asarray(model.default_noise().std)
-    measured = calibration.measured[used]
+    commands, measured = calibration.commands[used], calibration.measured[used]
     parts = parts_of(calibration, used)
-    held_out, off = _errors(calibration, used, measured, parts)
+    held_out, off = left_out(calibration), _nominal(calibration, used, parts)
     errors = [
-        one
-        for part in parts
-        for one in _in_units(calibration, part, parts, held_out, off)
+        one for part in parts for one in _in_units(calibration, part, held_out, off)
     ]
-    helps = _helps(held_out[used] / usual, off[used] / usual)
+    ratio, half = _ratio(held_out[used] / usual, off[used] / usual)
+    # Below the nominal arm's; None where not sure.
+    helps = ratio < 1.0 or (None if ratio - half < 1.0 else False)
     scatter = _scattered(calibration, usual, parts)
     explains = scatter is None
     mistaken = ""
     if not explains and errors[0].nominal > _PLAIN * model.length:
         mistaken = mistaken_columns(model, commands, measured)
     findings = findings_of(calibration, used, parts, scatter, mistaken)
-    at, anywhere = _anywhere(calibration, model, parts)
-    nominal = next(one.nominal for one in errors if one.of == _title(parts[at], parts))
+    first, anywhere = _anywhere(calibration, model, parts)
+    nominal = next(one.nominal for one in errors if one.of == first.title)
     findings = left_open(findings, parts, unit_after(calibration), anywhere, nominal)
     clean = not (findings.doubtful or (findings.moved and not explains))
     place = None
@@ -218,10 +215,10 @@ def verdict(calibration: Fit) -> ArmVerdict:
     if accuracy is not None:
         good = clean and not _missed(errors, accuracy)
     elif place is not None and place.std[0] < _PLACED * reach and explains:
-        good = clean and helps.ratio < _NO_WORSE
+        good = clean and ratio < _NO_WORSE
     else:
-        good = bool(clean and helps.helps and (explains or helps.most < _LITTLE))
-    more = accuracy is not None or helps.helps is None
+        good = bool(clean and helps and (explains or ratio + half < _LITTLE))
+    more = accuracy is not None or helps is None
     return ArmVerdict(
         good=good,
         reasons=reasons,
@@ -230,7 +227,7 @@ def verdict(calibration: Fit) -> ArmVerdict:
         else _next_step(findings, scatter, calibration.noise_known, more),
         unit=unit,
         explains=explains,
-        helps=helps.helps,
+        helps=helps,
         clean=clean,
         errors=tuple(errors),
         anywhere=anywhere,
@@ -256,7 +253,7 @@ class Place(NamedTuple):
         return " and ".join(shown) or "nothing"
 
 
-def place_of(calibration: Fit, names: Sequence[str]) -> Place:
+def place_of(calibration: ArmFit, names: Sequence[str]) -> Place:
     """How well six shifts and turns are known.
 
     Hidden are those in directions of which the readings leave half of what is usual of
@@ -277,7 +274,7 @@ def place_of(calibration: Fit, names: Sequence[str]) -> Place:
     return Place((float(std[0]), float(std[1])), named)
 
 
-def _sessions(calibration: Fit, first: HeldOut) -> str:
+def _sessions(calibration: ArmFit, first: HeldOut) -> str:
     """How sessions differ, in a sentence."""
     of_sessions = calibration.provenance.get("sessions")
     if of_sessions is None:
@@ -288,16 +285,6 @@ def _sessions(calibration: Fit, first: HeldOut) -> str:
     quantity = calibration.model.quantities(calibration.measured_unit)[0]
     size = first.says(float(quantity.size(calibration.session_std)))
     return f"Sessions differ by {size} (1 sigma); predictions include this."
-
-
-def _usual_noise(calibration: Fit) -> str:
-    """The sensor's noise as noise_std takes it: one number, or one of each output."""
-    usual = np.broadcast_to(
-        np.asarray(calibration.model.default_noise().std), (calibration.num_outputs,)
-    )
-    if np.ptp(usual) == 0.0:
-        usual = usual[:1]
-    return ",".join(f"{std:.2g}" for std in usual)
 
 
 def _next_step(
@@ -329,25 +316,12 @@ def _next_step(
     return next(step for holds, step in steps if holds)
 
 
-class _Helps(NamedTuple):
-    """Held-out errors beside the nominal arm's, readings of two units in noise."""
-
-    ratio: float  # of the means
-    most: float  # upper end of its 95 % interval
-
-    @property
-    def helps(self) -> bool | None:
-        """Whether held-out errors are below the nominal arm's; None where not sure."""
-        if self.ratio < 1.0:
-            return True
-        return None if 2.0 * self.ratio - self.most < 1.0 else False
-
-
-def _helps(held_out: Array, off: Array) -> _Helps:
-    """Held-out errors (K, q) and the nominal arm's, in noise, compared."""
+def _ratio(held_out: Array, off: Array) -> tuple[float, float]:
+    """Mean of held-out errors (K, q) by the nominal arm's, and the half-width of its
+    95 % interval; readings of two units in noise."""
     mean, half_width = _mean(np.linalg.norm(held_out, axis=1))
     nominal = float(np.linalg.norm(off, axis=1).mean()) or 1e-300
-    return _Helps(mean / nominal, (mean + half_width) / nominal)
+    return mean / nominal, half_width / nominal
 
 
 def _mean(errors: Array) -> tuple[float, float]:
@@ -356,33 +330,24 @@ def _mean(errors: Array) -> tuple[float, float]:
     return float(errors.mean()), float(half_width)
 
 
-def _errors(
-    calibration: Fit, used: NDArray[np.intp], measured: Array, parts: list[Part]
-) -> tuple[Array, Array]:
-    """(N, q) errors held out, and those of the nominal arm of the rows ``used``."""
-    commands, model = calibration.commands[used], calibration.model
-    off = np.zeros_like(calibration.residuals)
+def _nominal(calibration: ArmFit, used: NDArray[np.intp], parts: list[Part]) -> Array:
+    """(N, q) errors of the nominal arm, of the rows ``used``."""
+    commands, measured = calibration.commands[used], calibration.measured[used]
+    model, off = calibration.model, np.zeros_like(calibration.residuals)
     predicted = model.located(commands, measured).predict(commands)
     off[used] = model.wrapped(measured - predicted, commands)
     for part in parts:  # a socket's place is no merit of either
         for rows in part.groups():
             off[rows] -= off[rows].mean(axis=0) if len(rows) else 0.0
-    return left_out(calibration), off
-
-
-def _title(part: Part, parts: list[Part]) -> str:
-    """Name of a part, where there are others."""
-    return part.kind if len(parts) > 1 else ""
+    return off
 
 
 def _in_units(
-    calibration: Fit, part: Part, parts: list[Part], held_out: Array, off: Array
-) -> list[HeldOut]:
+    calibration: ArmFit, part: Part, held_out: Array, off: Array
+) -> Iterator[HeldOut]:
     """A part's mean errors, those of each unit by themselves."""
-    means = []
-    for quantity in calibration.model.quantities_of(
-        part.sensor, calibration.measured_unit
-    ):
+    unit = calibration.measured_unit
+    for quantity in calibration.model.quantities_of(part.sensor, unit):
         of_part, of_nominal = (
             quantity.size(errors[part.rows, : len(part.scale)] * part.scale)
             for errors in (held_out, off)
@@ -390,13 +355,10 @@ def _in_units(
         mean, half = _mean(of_part)
         interval = (max(mean - half, 0.0), mean + half)
         nominal = float(of_nominal.mean())
-        means.append(
-            HeldOut(_title(part, parts), quantity.unit, mean, interval, nominal)
-        )
-    return means
+        yield HeldOut(part.title, quantity.unit, mean, interval, nominal)
 
 
-def _scattered(calibration: Fit, usual: Array, parts: list[Part]) -> Reason | None:
+def _scattered(calibration: ArmFit, usual: Array, parts: list[Part]) -> Reason | None:
     """Readings that scatter by more than the noise explains."""
     if calibration.noise_known:
         return wrong_noise(calibration)
@@ -415,21 +377,18 @@ def _scattered(calibration: Fit, usual: Array, parts: list[Part]) -> Reason | No
     )
 
 
-def _anywhere(calibration: Fit, model: Chain, parts: list[Part]) -> tuple[int, float]:
-    """Standard deviation of the tip's position at postures of any kind.
+def _anywhere(
+    calibration: ArmFit, model: Chain, parts: list[Part]
+) -> tuple[Part, float]:
+    """The first part whose readings are positions, and the standard deviation of the
+    tip's position at postures of any kind, in its unit.
 
-    Beside a shift and a turn of the whole arm, which contacts do not show. NaN of
-    sensors that read no position, and where nothing determines it. Before it the
-    number of the part whose readings are positions.
+    Beside a shift and a turn of the whole arm, which contacts do not show. NaN where
+    none reads positions, and where nothing determines it.
     """
-    for at, part in enumerate(parts):
-        if part.sensor.positions or part.sensor.socketed:
-            return at, _anywhere_of(calibration, model, part)
-    return 0, np.nan
-
-
-def _anywhere_of(calibration: Fit, model: Chain, part: Part) -> float:
-    """``_anywhere`` of a sensor that reads positions, in its own unit."""
+    part = next((p for p in parts if p.sensor.positions or p.sensor.socketed), None)
+    if part is None:
+        return parts[0], np.nan
     commands = calibration.commands[calibration.loss_weights > 0.0]
     joints = commands[:, : model.num_joints]
     columns = calibration.commands[part.rows[:1], model.num_joints :]
@@ -447,7 +406,7 @@ def _anywhere_of(calibration: Fit, model: Chain, part: Part) -> float:
         calibration.unidentified is not None
         and depends(slopes, calibration.unidentified).any()
     ):
-        return np.nan
+        return part, np.nan
     points = model.nominal_tips(drawn)
     whole = np.repeat(np.eye(3, 6)[None], _DRAWN, axis=0)
     whole[..., 3:] = hats(points - points.mean(axis=0))
@@ -455,4 +414,4 @@ def _anywhere_of(calibration: Fit, model: Chain, part: Part) -> float:
     basis, size, _ = np.linalg.svd(whole, full_matrices=False)
     basis = basis[:, significant(size)]
     moves = moves - basis @ (basis.T @ moves)
-    return float(np.sqrt(((moves @ covariance) * moves).sum() / _DRAWN))
+    return part, float(np.sqrt(((moves @ covariance) * moves).sum() / _DRAWN))
