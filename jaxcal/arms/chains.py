@@ -32,9 +32,8 @@ class Chains(Model):
     Chains that begin with the same joints (a torso's) share these joints' columns, and
     the parameters of the links between them. A sensor that is given to several chains
     as one object, by itself or in ``Several``, is one: both arms touch the same
-    sockets, and what of them has no place is found from the arm that reads it most,
-    from all where each reads it too seldom (an anchor with three lengths of either).
-    All else is each chain's own, named ``left: a3``.
+    sockets, and what of them has no place is found from the arm that reads it most. All
+    else is each chain's own, named ``left: a3``.
 
     Commands are the columns of all joints, 0 where they are not of the row's chain;
     ``chain``, which says of each row whose tip was read, from 0; and the sensors'
@@ -794,17 +793,13 @@ def _numbered(members: Sequence[Sequence[Sensor]]) -> tuple[tuple[int, ...], ...
 
 
 def _placed(readings: Sequence[Readings]) -> Sensor:
-    """A sensor with each thing where the arm that reads it most has it, or all arms.
-
-    All where that arm reads it too seldom: bases that are to be found lie apart.
-    """
+    """A sensor with each thing where the arm that reads it most has it."""
     sensor = readings[0].sensor
     which = [sensor.of_rows(of_arm.columns) for of_arm in readings]
     count = 1 + max(int(rows.max()) for rows in which)
-    counts = np.array([np.bincount(rows, minlength=count) for rows in which])
-    most, seldom = counts.argmax(axis=0), counts.max(axis=0) < sensor.needed
+    most = np.argmax([np.bincount(rows, minlength=count) for rows in which], axis=0)
     kept = [
-        of_arm.at(np.flatnonzero((most[rows] == i) | seldom[rows]))
+        of_arm.at(np.flatnonzero(most[rows] == i))
         for i, (of_arm, rows) in enumerate(zip(readings, which, strict=True))
     ]
     measured = [of_arm.measured for of_arm in kept if of_arm.measured is not None]

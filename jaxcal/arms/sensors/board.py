@@ -294,9 +294,7 @@ class Board(Sensor):
 
     @property
     def standing(self) -> Board:
-        return _Standing(
-            **{f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        )
+        return dataclasses.replace(self, place=None)  # every arm has a tool of its own
 
     def _views(self, inputs: Array, measured: Array | None) -> tuple[Array, Array]:
         """Rotations (N, 3, 3) and places (N, 3) of the board in the camera."""
@@ -337,26 +335,6 @@ class Board(Sensor):
         turn = np.stack([x, y, np.cross(x, y) / scale[:, None]], axis=-1)
         left, _, right = np.linalg.svd(turn)
         return left @ right, plane[..., 2] / scale[:, None]
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Standing(Board):
-    """A board that stands where another arm's views put it: one view shows the tool."""
-
-    def located(
-        self, tip: Tip, inputs: Array, measured: Array | None
-    ) -> tuple[Self, Array | None]:
-        if self.place is None or not 0 < len(inputs) < _FEW:
-            unplaced = dataclasses.replace(self, place=None)
-            return Board.located(unplaced, tip, inputs, measured)
-        turn, shift = self._views(inputs, measured)
-        if self.moves == "camera":
-            turn, shift = _inverse(turn, shift)
-        place, tool, back = self.place, np.eye(4), np.matrix_transpose(tip.rotation)
-        tool[:3, :3] = _nearest((back @ place[:3, :3] @ turn).sum(axis=0))
-        gaps = shift @ place[:3, :3].T + place[:3, 3] - tip.position
-        tool[:3, 3] = (back @ gaps[..., None])[..., 0].mean(axis=0)
-        return self, tool
 
 
 def _hand_and_eye(tip: Tip, turn: Array, shift: Array) -> tuple[float, Array, Array]:
