@@ -170,15 +170,10 @@ class Arm:
             ]
         )
 
-    @functools.cached_property
-    def _owned(self) -> int:
-        """s, the sensor's own parameters."""
-        return len(self.sensor.names)
-
     def _split(self, parameters: Array) -> tuple[Array, Array, Array]:
         """Base (6,), tool (6,) and the sensor's own (s,)."""
         end = len(parameters) - self.waves.size
-        last = end - self._owned
+        last = end - len(self.sensor.names)
         first = last - len(self._tool)
         tool = np.concatenate([self.tool[:3, 3], np.zeros(3)])
         tool[self._tool] = parameters[first:last]

@@ -293,9 +293,12 @@ class SerialChain(Arm, Model):
     def _bent(self) -> Self:  # kept, and what it keeps with it
         if self.harmonics or "R" not in self.joints:
             return self
-        bent = tuple(i + 1 for i, kind in enumerate(self.joints) if kind == "R")
-        waves = np.zeros((len(bent), 4))
-        return dataclasses.replace(self, harmonics=bent, waves=waves)
+        return self.with_effects(harmonics=self._turning)
+
+    @property
+    def _turning(self) -> list[int]:
+        """Joints that turn, counted from 1."""
+        return [i + 1 for i, kind in enumerate(self.joints) if kind == "R"]
 
     @property
     def misfit_std(self) -> float:
@@ -387,11 +390,6 @@ class SerialChain(Arm, Model):
         from jaxcal.arms.postures import ReachableSet
 
         return ReachableSet(self, **rules)
-
-    def tip_axis(self, commands: ArrayLike) -> Array:
-        """(N, 3) the tip's z axis in the measuring frame, of the nominal arm."""
-        frame = self._chain(as_commands(self, commands), self.nominal)[0]
-        return np.ascontiguousarray(frame[2].T)
 
     def require_commands(self, commands: Array) -> None:
         """Refuse radians for degrees, and joints far beyond their limits."""

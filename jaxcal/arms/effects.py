@@ -99,11 +99,10 @@ def _held_out(fit: Fit) -> Array:
 
 def _alternatives(model: Chain) -> Iterator[tuple[str, Chain, Prior]]:
     """Effects in words, the arm with them, and its prior."""
-    turning = [i + 1 for i, kind in enumerate(model.joints) if kind == "R"]
     more = {
-        "compliance": model.compliance or turning,
+        "compliance": model.compliance or model._turning,
         "gears": model.gears or range(1, len(model.joints) + 1),
-        "harmonics": turning,
+        "harmonics": model._turning,
     }
     for names in (
         (),

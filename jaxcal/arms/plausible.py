@@ -87,15 +87,6 @@ def _require_in_picture(board: Board, pixels: Array, length: float) -> None:
     if size is None or board.corners is None:
         return
     spots = pixels.reshape(len(pixels), -1, 2)
-    focal, centre = board.lens
-    beyond = ~board.bent((spots - centre) / focal)[1]
-    for row, corner in np.argwhere(beyond)[:1]:
-        raise ValueError(
-            f"board's distortion = {board.distortion} does not fit: at corner "
-            f"{corner + 1} of row {row}, {in_words(spots[row, corner])}, its "
-            "polynomial turns back. Is it of this camera and in OpenCV's order? Are "
-            "the corners already corrected?"
-        )
     outside = ~board.in_picture(spots, _EDGE * float(board.stds(length).max()))
     for row, corner in np.argwhere(outside)[:1]:
         count = np.count_nonzero(outside.any(axis=1))
@@ -103,8 +94,8 @@ def _require_in_picture(board: Board, pixels: Array, length: float) -> None:
             f"corners must be in the camera's picture of {size[0]:g} by {size[1]:g} "
             f"pixels, but {count} of {len(spots)} board rows have some outside: corner "
             f"{corner + 1} of row {row} is at {in_words(spots[row, corner])}. Is the "
-            "width first, and is it this camera? If the corners were undistorted, "
-            "give distortion=(k1, k2, p1, p2)"
+            "width first, and is it this camera? If the corners were undistorted, give "
+            "distortion=(k1, k2, p1, p2), of this camera and in OpenCV's order"
         )
 
 

@@ -64,10 +64,9 @@ class Room:
         if self.approach is not None:
             way = points[:, -1] - points[:, -2]
             size = np.linalg.norm(way, axis=1, keepdims=True)
-            axis = arm.tip_axis(commands)
-            way = np.where(
-                size > 0.01 * (arm.length or 1.0), way / (size + 1e-300), axis
-            )
+            axis = arm.nominal_tip(commands).rotation[:, :, 2]
+            far = size > 0.01 * (arm.length or 1.0)
+            way = np.where(far, way / (size + 1e-300), axis)
             least = np.cos(np.radians(self.approach[3]))
             why[way @ self.approach[:3] < least] = "approach from another direction"
         if self.floor is not None:
@@ -79,15 +78,9 @@ class Room:
         radius = self.radius or _THICK * arm.length
         steps = max(2, int(np.ceil(arm.length / max(radius, 1e-9) / 4.0)))
         share = np.linspace(0.0, 1.0, steps)[:, None]
-        starts, ends = points[:, 2:-1, None], points[:, 3:, None]
-        ends = (
-            starts
-            + (ends - starts)
-            * np.where(np.arange(ends.shape[1]) == ends.shape[1] - 1, 0.7, 1.0)[
-                :, None, None
-            ]
-        )  # the tip's end touches
-        balls = (starts + share * (ends - starts)).reshape(len(points), -1, 3)
+        starts, ways = points[:, 2:-1, None], np.diff(points[:, 2:], axis=1)[:, :, None]
+        ways[:, -1] *= 0.7  # the tip's end touches
+        balls = (starts + share * ways).reshape(len(points), -1, 3)
         near = np.zeros(balls.shape[:2], dtype=bool)
         for plane in self.planes:
             near |= balls @ plane[:3] - plane[3] < radius

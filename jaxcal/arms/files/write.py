@@ -10,12 +10,13 @@ import os
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from jaxcal.arms.arm import Arm
 from jaxcal.arms.files.urdf import (
     Joint,
     joints_of,
@@ -29,10 +30,6 @@ from jaxcal.arms.files.urdf import (
 )
 from jaxcal.checks import Array, one_of
 from jaxcal.files import atomic_write
-
-if TYPE_CHECKING:
-    from jaxcal.arms.arm import Arm
-
 
 _UR = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 _TAG = re.compile(rb"""(?:[^>"']+|"[^"]*"|'[^']*')*>""")

@@ -8,8 +8,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.arms.sensors.sensor import HasNames, Reading, Sensor, Tip, hats
-from jaxcal.checks import Array, in_words, numbers
+from jaxcal.arms.sensors.sensor import AtRest, Reading, Tip, hats
+from jaxcal.checks import Array, in_words
 from jaxcal.models.model import Quantity
 
 _ASIDE = 0.7  # cosine: readings farther from up have another up
@@ -17,7 +17,7 @@ _TURNED = 27.0  # degrees on the tool, from which the fit does not find them
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Gravity(Sensor):
+class Gravity(AtRest):
     """Acceleration x, y, z in the tip's frame at rest: up, as accelerometers read it.
 
     Lengths, and a turn about the vertical, are not shown and held. A joint's zero
@@ -34,18 +34,9 @@ class Gravity(Sensor):
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     kind = "gravity"
-    tool = ("rx", "ry", "rz")
     outputs = ("acceleration x", "acceleration y", "acceleration z")
     names = ("gravity scale", "bias x", "bias y", "bias z")
     units = ("ratio", *["acceleration"] * 3)
-
-    def __post_init__(self) -> None:
-        up = numbers("up", self.up)
-        if up.shape != (3,) or not np.linalg.norm(up) > 0.0:
-            raise ValueError(f"up must be a direction (3,), got {in_words(up)}")
-        if not numbers("magnitude", self.magnitude) > 0.0:
-            raise ValueError(f"magnitude must be positive, got {self.magnitude}")
-        object.__setattr__(self, "up", tuple((up / np.linalg.norm(up)).tolist()))
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
@@ -60,15 +51,6 @@ class Gravity(Sensor):
 
     def usual_noise(self, length: float) -> ArrayLike:
         return 1e-3 * self.magnitude
-
-    def unseen(self, arm: HasNames) -> tuple[str, ...]:
-        about = "xyz"[int(np.abs(self.up).argmax())]
-        hidden = [
-            name
-            for name, unit in zip(arm.names, arm.units, strict=True)
-            if unit == "length"
-        ]
-        return (*hidden, f"base r{about}")
 
     def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
         up = self.magnitude * np.array(self.up)

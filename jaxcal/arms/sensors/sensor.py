@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import Array, array_of, numbers, whole_number
+from jaxcal.checks import Array, array_of, in_words, numbers, whole_number
 from jaxcal.models.model import Quantity
 from jaxcal.models.periods import within_half
 
@@ -191,10 +191,7 @@ class Sensor(abc.ABC):
 
     @property
     def standing(self) -> Sensor:
-        """This sensor, its place found by other arms: what ``located`` has to find yet.
-
-        Of one that finds its tool too, that: every arm has its own.
-        """
+        """This sensor, its place found by another arm: what ``located`` has to find."""
         return self
 
     @property
@@ -347,6 +344,31 @@ class Landmarks(Sensor):
         full = np.zeros((count, q, self.count, w))
         full[np.arange(count), :, which] = by_one
         return full.reshape(count, q, self.count * w)
+
+
+class AtRest(Sensor):
+    """A sensor at the tip that feels gravity while the arm is at rest.
+
+    Lengths of the arm, and a turn about the vertical, are not shown.
+    """
+
+    magnitude: float  # of gravity
+    up: tuple[float, float, float]  # in the measuring frame
+
+    tool = ("rx", "ry", "rz")
+
+    def __post_init__(self) -> None:
+        up = array_of("up", self.up, 3)
+        if not np.linalg.norm(up) > 0.0:
+            raise ValueError(f"up must be a direction (3,), got {in_words(up)}")
+        if not numbers("magnitude", self.magnitude) > 0.0:
+            raise ValueError(f"magnitude must be positive, got {self.magnitude}")
+        object.__setattr__(self, "up", tuple((up / np.linalg.norm(up)).tolist()))
+
+    def unseen(self, arm: HasNames) -> tuple[str, ...]:
+        lengths = zip(arm.names, arm.units, strict=True)
+        hidden = [n for n, u in lengths if u == "length" and n not in self.names]
+        return (*hidden, f"base r{'xyz'[int(np.abs(self.up).argmax())]}")
 
 
 def hats(vectors: Array) -> Array:

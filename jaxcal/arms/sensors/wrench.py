@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.arms.sensors.sensor import HasNames, Reading, Sensor, Tip, hats
+from jaxcal.arms.sensors.sensor import AtRest, Reading, Tip, hats
 from jaxcal.checks import Array, array_of, in_words, numbers
 from jaxcal.models.model import Quantity
 
@@ -22,7 +22,7 @@ _TURNED = 0.45  # radians on the tool, from which the fit does not find them
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Wrench(Sensor):
+class Wrench(AtRest):
     """Force and torque x, y, z in the tip's frame at rest: its load's weight and zeros.
 
     With R from the tip to the measuring frame and the load's mass m and centre c in the
@@ -53,7 +53,6 @@ class Wrench(Sensor):
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     kind = "wrench"
-    tool = ("rx", "ry", "rz")
     local = True
     first_unit = "N"
     outputs = tuple(f"{what} {axis}" for what in ("force", "torque") for axis in "xyz")
@@ -65,15 +64,11 @@ class Wrench(Sensor):
     units = ("kg", *["length"] * 3, *["N"] * 3, *["N length"] * 3)
 
     def __post_init__(self) -> None:
-        up = array_of("up", self.up, 3)
-        if not np.linalg.norm(up) > 0.0:
-            raise ValueError(f"up must be a direction (3,), got {in_words(up)}")
-        for name in ("mass", "magnitude"):
-            if not numbers(name, getattr(self, name)) > 0.0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        super().__post_init__()
+        if not numbers("mass", self.mass) > 0.0:
+            raise ValueError(f"mass must be positive, got {self.mass}")
         centre = array_of("centre", self.centre, 3)
         object.__setattr__(self, "centre", tuple(centre.tolist()))
-        object.__setattr__(self, "up", tuple((up / np.linalg.norm(up)).tolist()))
 
     @property
     def nominal(self) -> Array:
@@ -84,15 +79,6 @@ class Wrench(Sensor):
 
     def usual_noise(self, length: float) -> ArrayLike:
         return [0.1] * 3 + [0.1 * 0.05 * length] * 3
-
-    def unseen(self, arm: HasNames) -> tuple[str, ...]:
-        about = "xyz"[int(np.abs(self.up).argmax())]
-        hidden = [
-            name
-            for name, unit in zip(arm.names, arm.units, strict=True)
-            if unit == "length" and name not in self.names
-        ]
-        return (*hidden, f"base r{about}")
 
     def _pull(self, tip: Tip) -> Array:
         """(N, 3) force of one kilogram in the tip's frame."""
