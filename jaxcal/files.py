@@ -74,6 +74,20 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         file.write(text.encode("utf-8"))
 
 
+def write_over(path: str | os.PathLike[str], text: str, force: bool) -> None:
+    """Write a text of any bytes (surrogates), over a file that is there by ``force``.
+
+    Raises:
+        FileExistsError: there is a file and no ``force``.
+    """
+    if not force and os.path.exists(path):
+        raise FileExistsError(
+            f"{os.fspath(path)} exists; pass force=True to replace it"
+        )
+    with atomic_write(path) as file:
+        file.write(text.encode("utf-8", "surrogateescape"))
+
+
 def require_writable_folder(folder: str | os.PathLike[str]) -> None:
     """Make sure files can be written to ``folder`` before work is spent on them.
 

@@ -25,6 +25,7 @@ from jaxcal.arms.arguments import (
 from jaxcal.arms.arm import Arm, apparent_length
 from jaxcal.arms.sensors import Position, Sensor, Several
 from jaxcal.checks import Array, array_of, axis_names, numbers, one_of
+from jaxcal.files import write_over
 from jaxcal.models.model import ErrorGroups, Model, Quantity, as_commands, as_parameters
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
@@ -727,7 +728,7 @@ class SerialChain(Arm, Model):
                 others are not; a gear ratio was found, which none can hold.
             FileExistsError: there is a file and ``force`` is not given.
         """
-        from jaxcal.arms.files.write import save, written
+        from jaxcal.arms.files.write import written
 
         ratios, yields, waves = self._drives(as_parameters(self, parameters))
         for i in np.flatnonzero(ratios != 1.0):
@@ -744,7 +745,7 @@ class SerialChain(Arm, Model):
                 stacklevel=2,
             )
         text, tip = written(form, self, self.calibrated(parameters))
-        save(text, path, force)
+        write_over(path, text, force)
         return tip
 
     def together(

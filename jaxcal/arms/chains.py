@@ -18,6 +18,7 @@ from jaxcal.arms.plausible import require_touched
 from jaxcal.arms.sensors import Sensor, Tip
 from jaxcal.arms.sensors.sensor import BASE, Readings, label
 from jaxcal.checks import Array, array_of, one_of
+from jaxcal.files import write_over
 from jaxcal.models import verdict as models
 from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
 from jaxcal.models.uncertainty import Noise, Prior
@@ -638,7 +639,7 @@ class Chains(Model):
 
         Distances that one chain's contacts judge are left to its own verdict.
         """
-        from jaxcal.arms.parts import Part
+        from jaxcal.arms.findings import Part
 
         used = np.flatnonzero(fit.loss_weights > 0.0)
         tables = [(k, at, None) for k, _, _, at in self._parts(fit.commands[used])]
@@ -713,7 +714,7 @@ class Chains(Model):
         Returns:
             The tip links, with a comma between.
         """
-        from jaxcal.arms.files.write import save, urdf_text
+        from jaxcal.arms.files.write import urdf_text
 
         one_of("form", form, ("urdf",))
         theta = as_parameters(self, parameters)
@@ -722,7 +723,7 @@ class Chains(Model):
             for arm, at in zip(self.chains, self.members, strict=True)
         ]
         text, tips = urdf_text(pairs)
-        save(text, path, force)
+        write_over(path, text, force)
         return ", ".join(tips)
 
     def to_dict(self) -> dict[str, Any]:

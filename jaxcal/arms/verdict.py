@@ -14,9 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arms.effects import SCATTER, in_words, play_in_words, scatter
-from jaxcal.arms.findings import MORE, Findings, findings_of, left_open
-from jaxcal.arms.mistaken import mistaken_columns
-from jaxcal.arms.parts import Part, parts_of, unit_after
+from jaxcal.arms.findings import (
+    MORE,
+    Findings,
+    Part,
+    findings_of,
+    left_open,
+    parts_of,
+    unit_after,
+)
+from jaxcal.arms.plausible import mistaken_columns
 from jaxcal.arms.sensors import Pose
 from jaxcal.arms.sensors.sensor import hats
 from jaxcal.checks import Array

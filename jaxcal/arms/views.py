@@ -82,7 +82,7 @@ def _posed(arm: Chain) -> Chain:
     return arm.measured_with(dataclasses.replace(_board_of(arm), corners=None))
 
 
-def _seen(arm: Chain, commands: Array) -> tuple[Array, Array, Array]:
+def seen_by(arm: Chain, commands: Array) -> tuple[Array, Array, Array]:
     """Commands with the board as it is predicted; places (N, 3) and rotations
     (N, 3, 3) of the board in the camera."""
     from scipy.spatial.transform import Rotation
@@ -98,7 +98,7 @@ def _seen(arm: Chain, commands: Array) -> tuple[Array, Array, Array]:
 
 def in_view(arm: Chain, commands: Array) -> tuple[Array, list[str]]:
     """The board before the camera and turned to it; ``seen`` as it is predicted."""
-    commands, place, turn = _seen(arm, commands)
+    commands, place, turn = seen_by(arm, commands)
     face = turn[:, :, 2]
     far = np.linalg.norm(place, axis=1)
     ahead = place[:, 2] / np.where(far > 0.0, far, 1.0) > _VIEW
@@ -170,7 +170,7 @@ def in_picture(
     sensor = _board_of(arm)
     known_side = view.side or sensor.side
     width, height, fx, fy, cx, cy = view.camera
-    commands, place, rotation = _seen(arm, commands)
+    commands, place, rotation = seen_by(arm, commands)
     spots = sensor.outline @ np.matrix_transpose(rotation) + place[:, None]
     rays = spots[..., :2] / np.maximum(spots[..., 2:], 1e-9)
     inside = spots[..., 2] > 0.0

@@ -16,9 +16,8 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal.arms.findings import Findings, left_open
-from jaxcal.arms.mistaken import mistaken_columns
-from jaxcal.arms.parts import parts_of
+from jaxcal.arms.findings import Findings, left_open, parts_of
+from jaxcal.arms.plausible import mistaken_columns
 from jaxcal.commands import main
 from jaxcal.models import Chains, Gravity, Prior, Several, Socket
 

@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 
 from jaxcal.checks import Array
-from jaxcal.files import write_text
+from jaxcal.files import write_over
 
 _KEYS = ("id", "drive_mode", "homing_offset", "range_min", "range_max")
 
@@ -72,12 +72,8 @@ class Servos:
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write the file that LeRobot reads; over one that is there with ``force``."""
-        if not force and os.path.exists(path):
-            raise FileExistsError(
-                f"{os.fspath(path)} exists; pass force=True to replace it"
-            )
         content = {name: dict(motor) for name, motor in self.motors.items()}
-        write_text(path, json.dumps(content, indent=4) + "\n")
+        write_over(path, json.dumps(content, indent=4) + "\n", force)
 
     def degrees(self, names: Sequence[str], values: Array) -> Array:
         """(N, J) degrees of motors by name, of values (N, J) in -100 to 100.

@@ -9,10 +9,11 @@ import numpy as np
 
 from jaxcal.arms.arguments import pose_matrix
 from jaxcal.arms.files.urdf import joints_of, links_of, table_of, walk
-from jaxcal.arms.files.write import fixed_joint, save, with_origins
+from jaxcal.arms.files.write import fixed_joint, with_origins
 from jaxcal.arms.sensors import Board
 from jaxcal.arms.verdict import place_of
 from jaxcal.checks import Array, one_of
+from jaxcal.files import write_over
 from jaxcal.models.uncertainty import Prior
 
 if TYPE_CHECKING:
@@ -154,7 +155,7 @@ def to_transform(
     form = os.path.splitext(os.fspath(path))[1].lower()
     one_of("ending of the file", form, _FORMS)
     pose = static_transform(calibration, child, parent, camera)
-    save(_text(form, pose), path, force)
+    write_over(path, _text(form, pose), force)
     return pose
 
 

@@ -6,7 +6,6 @@ constants between its joints follow from the table: ``K = C^-1 D C'``, D a row o
 
 from __future__ import annotations
 
-import os
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -29,7 +28,6 @@ from jaxcal.arms.files.urdf import (
     walk,
 )
 from jaxcal.checks import Array, one_of
-from jaxcal.files import atomic_write
 
 _UR = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 _TAG = re.compile(rb"""(?:[^>"']+|"[^"]*"|'[^']*')*>""")
@@ -63,16 +61,6 @@ def written(form: str, nominal: Arm, calibrated: Arm) -> tuple[str, str]:
         text, tips = urdf_text([(nominal, calibrated)])
         return text, tips[0]
     return _dh_text(calibrated) if form == "dh" else _ur_text(nominal, calibrated), ""
-
-
-def save(text: str, path: str | os.PathLike[str], force: bool) -> None:
-    """Write a file, over one that is there only by ``force``."""
-    if not force and os.path.exists(path):
-        raise FileExistsError(
-            f"{os.fspath(path)} exists; pass force=True to replace it"
-        )
-    with atomic_write(path) as file:
-        file.write(text.encode("utf-8", "surrogateescape"))
 
 
 def urdf_text(chains: Sequence[tuple[Arm, Arm]]) -> tuple[str, list[str]]:

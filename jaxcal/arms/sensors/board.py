@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.arms.sensors.pose import Pose, rotation_vector_rate
-from jaxcal.arms.sensors.sensor import BASE, HasNames, Reading, Sensor, Tip, hats, turns
+from jaxcal.arms.sensors.sensor import BASE, Reading, Sensor, Tip, hats, turns
 from jaxcal.checks import Array, array_of, numbers, one_of
 from jaxcal.models.model import Quantity
 
@@ -193,7 +193,7 @@ class Board(Sensor):
     def usual_noise(self, length: float) -> ArrayLike:
         return [1e-3 * length] * 3 + [0.1] * 3 if self.corners is None else 0.3
 
-    def unseen(self, arm: HasNames) -> tuple[str, ...]:
+    def unseen(self, arm: Any) -> tuple[str, ...]:
         return BASE
 
     def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
@@ -304,13 +304,6 @@ class Board(Sensor):
             return self._poses(measured)
         turn = Rotation.from_rotvec(inputs[:, 3:], degrees=True).as_matrix()
         return turn, inputs[:, :3]
-
-    def depths(self, poses: Array) -> Array:
-        """(N, C) depth of the board's points before the camera, at poses (N, 6)."""
-        from scipy.spatial.transform import Rotation
-
-        turn = Rotation.from_rotvec(poses[:, 3:], degrees=True).as_matrix()
-        return np.asarray(turn[:, 2] @ self.outline.T + poses[:, 2:3])
 
     def _poses(self, pixels: Array) -> tuple[Array, Array]:
         """Rotations (N, 3, 3) and places (N, 3) of the board (Zhang, 2000)."""

@@ -6,7 +6,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple, Protocol, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,18 +16,6 @@ from jaxcal.models.model import Quantity
 from jaxcal.models.periods import within_half
 
 BASE = tuple(f"base {axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
-
-
-class HasNames(Protocol):
-    """An arm, by its parameters."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """p names."""
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """p units."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,8 +154,8 @@ class Sensor(abc.ABC):
     def usual_noise(self, length: float) -> ArrayLike:
         """() or (q,) standard deviation of a reading, for an arm of this length."""
 
-    def unseen(self, arm: HasNames) -> tuple[str, ...]:
-        """Parameters that no posture shows; held unless a prior says otherwise."""
+    def unseen(self, arm: Any) -> tuple[str, ...]:
+        """Parameters of ``arm`` that no posture shows; held but by a prior."""
         return ()
 
     @abc.abstractmethod
@@ -330,7 +318,7 @@ class Landmarks(Sensor):
             return np.zeros(self.count * len(self.axes))
         return self.places.ravel()
 
-    def unseen(self, arm: HasNames) -> tuple[str, ...]:
+    def unseen(self, arm: Any) -> tuple[str, ...]:
         return BASE
 
     def of_rows(self, inputs: Array) -> NDArray[np.int64]:
@@ -365,7 +353,7 @@ class AtRest(Sensor):
             raise ValueError(f"magnitude must be positive, got {self.magnitude}")
         object.__setattr__(self, "up", tuple((up / np.linalg.norm(up)).tolist()))
 
-    def unseen(self, arm: HasNames) -> tuple[str, ...]:
+    def unseen(self, arm: Any) -> tuple[str, ...]:
         lengths = zip(arm.names, arm.units, strict=True)
         hidden = [n for n, u in lengths if u == "length" and n not in self.names]
         return (*hidden, f"base r{'xyz'[int(np.abs(self.up).argmax())]}")

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.arms.sensors.sensor import (
-    HasNames,
     Reading,
     Readings,
     Sensor,
@@ -127,7 +126,7 @@ class Several(Sensor):
     def usual_noise(self, length: float) -> ArrayLike:
         return 1.0
 
-    def unseen(self, arm: HasNames) -> tuple[str, ...]:
+    def unseen(self, arm: Any) -> tuple[str, ...]:
         """Names of the parameters that no sensor sees."""
         hidden = [set(one.unseen(arm)) for one in self.sensors]
         return tuple(name for name in arm.names if all(name in h for h in hidden))
