@@ -461,7 +461,7 @@ def test_a_shared_board_takes_three_views_by_each_camera(tmp_path):
     np.testing.assert_allclose(hand, CAMERA, atol=0.03)
     np.testing.assert_allclose(arm.sensor.sensors[0].place, BOARD, atol=0.02)
     few = np.concatenate([left[:2], right])
-    with pytest.raises(ValueError, match="left_hand: .* 2 views .* 3 views by one arm"):
+    with pytest.raises(ValueError, match=r"left_hand: .* 2 views .* 3 views by one"):
         robot.prepared(commands[few], measured[few])
     commands[chain == 0, :7] = np.radians(commands[chain == 0, :7])
     with pytest.raises(ValueError, match="left_hand: commands must be in degrees"):
