@@ -519,10 +519,11 @@ class SerialChain(Arm, Model):
         Raises:
             ValueError: the arm never stood still; it says how the joints jitter.
         """
-        recording = Recording(path, seconds=seconds, within=within)
-        return self._rests(recording).joints
+        return self._rests(Recording(path, seconds=seconds, within=within))[0]
 
-    def _rests(self, recording: Recording, kind: str = "") -> Any:
+    def _rests(
+        self, recording: Recording, kind: str = ""
+    ) -> tuple[Array, Array | None]:
         from jaxcal.arms.files.recordings import rests_of
 
         turning = np.array(self.command_units) == "deg"
@@ -547,8 +548,7 @@ class SerialChain(Arm, Model):
                 "no recording has; pass the postures of at_rest"
             )
         pixels = sensor.views and not views
-        of_recording = self._rests(recording, "" if pixels else sensor.kind)
-        commands, read = of_recording.joints, of_recording.readings
+        commands, read = self._rests(recording, "" if pixels else sensor.kind)
         if views:
             from scipy.spatial.transform import Rotation
 

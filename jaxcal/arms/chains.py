@@ -108,12 +108,10 @@ class Chains(Model):
         arms = {tip: chain(tip) for tip in sensors}
         stiff = cls.of(arms)._shared
         for (tip, arm), shared in zip(arms.items(), stiff, strict=True):
-            arm_limits = {
-                n: v for n, v in (limits or {}).items() if n in arm.joint_names
-            }
+            of_arm = {n: v for n, v in (limits or {}).items() if n in arm.joint_names}
             yielding = tuple(i for i in arm.compliance if i > shared)
-            if arm_limits or yielding != arm.compliance:
-                arms[tip] = chain(tip, limits=arm_limits or None, compliance=yielding)
+            if of_arm or yielding != arm.compliance:
+                arms[tip] = chain(tip, limits=of_arm, compliance=yielding)
         return cls.of(arms)
 
     # -- what the chains share ---------------------------------------------------------
@@ -358,16 +356,15 @@ class Chains(Model):
                 fixed[k] -= set(BASE)
                 if k == cell[0] or _common(self.chains[cell[0]], self.chains[k]):
                     fixed[k] |= unseen_of_base
-        observed: set[str] = set()
-        held: dict[str, None] = {}
-        for arm, named, of_arm in zip(self.chains, self._named, fixed, strict=True):
-            for name, short in zip(named, arm.names, strict=True):
-                if short in of_arm:
-                    held[name] = None
-                else:
-                    observed.add(name)
+        observed = {
+            name
+            for arm, named, of_arm in zip(self.chains, self._named, fixed, strict=True)
+            for name, short in zip(named, arm.names, strict=True)
+            if short not in of_arm
+        }
         std = self._gather([np.asarray(prior.std) for prior in priors])
-        unseen = tuple(name for name in held if name not in observed)
+        names = dict.fromkeys(name for named in self._named for name in named)
+        unseen = tuple(name for name in names if name not in observed)
         return Prior(std, fixed=unseen, by_data=True)
 
     def parameter_sizes(self) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import json
 import pathlib
 from collections.abc import Callable, Iterator, Sequence
@@ -22,27 +21,23 @@ _JITTER = 8.0  # standard deviations: no reading of a joint at rest is farther a
 _STATES = "sensor_msgs/msg/JointState"
 
 
-@dataclasses.dataclass(frozen=True)
-class Rests:
-    """Where a recorded arm stood still, and what its sensor read there."""
-
-    joints: Array  # (N, J) means, degrees and units of length
-    readings: Array | None  # (N, r) means as recorded, None where none were asked for
-
-
 def rests_of(
     recording: Recording,
     names: Sequence[str],
     turning: NDArray[np.bool_],
     kind: str = "",
-) -> Rests:
-    """Rests of the joints with these names.
+) -> tuple[Array, Array | None]:
+    """Where a recorded arm stood still, and what its sensor read there.
 
     Args:
         recording: of them.
         names: (J,) of the joints.
         turning: (J,) which of them are in degrees.
         kind: of the sensor whose messages are asked for, "" for none.
+
+    Returns:
+        (N, J) means of the joints, degrees and units of length; (N, r) of the readings
+        as recorded, None where none were asked for.
 
     Raises:
         ValueError: no such joints or messages are in it, or the arm never stood still;
@@ -71,7 +66,7 @@ def rests_of(
             "with seconds= and within="
         )
     if messages is None:
-        return Rests(postures, None)
+        return postures, None
     at, values = messages
     readings = []
     for number, (first, last) in enumerate(np.concatenate(spans)):
@@ -79,7 +74,7 @@ def rests_of(
         if not there.any():
             raise ValueError(f"{path}: rest {number} has no reading of the sensor")
         readings.append(values[there].mean(axis=0))
-    return Rests(postures, np.array(readings))
+    return postures, np.array(readings)
 
 
 def _vector(part: Any) -> list[float]:
@@ -262,18 +257,14 @@ def rests(
             stretch = joints[first:i]
             third = -(-len(stretch) // 3)
             drift = stretch[-third:].mean(axis=0) - stretch[:third].mean(axis=0)
-            still = (
-                within is not None
-                or (np.abs(drift) <= _WITHIN + 4.0 * noise * np.sqrt(2.0 / third)).all()
-            )
+            slack = _WITHIN + 4.0 * noise * np.sqrt(2.0 / third)
+            still = within is not None or (np.abs(drift) <= slack).all()
             mean = stretch.mean(axis=0)
-            if still and not (
-                resting and (np.abs(mean - resting[-1]) <= 2.0 * most).all()
-            ):
+            again = resting and (np.abs(mean - resting[-1]) <= 2.0 * most).all()
+            if still and not again:
                 resting.append(mean)
                 spans.append((times[first], times[i - 1]))
         if i < len(joints):
             first, low, high = i, joints[i], joints[i]
-    return np.array(resting).reshape(-1, joints.shape[1]), np.array(spans).reshape(
-        -1, 2
-    )
+    means = np.array(resting).reshape(-1, joints.shape[1])
+    return means, np.array(spans).reshape(-1, 2)

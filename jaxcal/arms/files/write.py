@@ -6,6 +6,7 @@ constants between its joints follow from the table: ``K = C^-1 D C'``, D a row o
 
 from __future__ import annotations
 
+import functools
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -256,10 +257,7 @@ def _gaps(source: Mapping[str, Any]) -> list[list[_Part]]:
 
 
 def _product(gap: list[_Part]) -> Array:
-    matrix = np.eye(4)
-    for part in gap:
-        matrix = matrix @ part.matrix
-    return matrix
+    return functools.reduce(np.matmul, [part.matrix for part in gap], np.eye(4))
 
 
 def pose_words(matrix: Array) -> dict[str, str]:

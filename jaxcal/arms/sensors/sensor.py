@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import Array, array_of, in_words, numbers, whole_number
+from jaxcal.checks import Array, array_of, in_words, levels, numbers, whole_number
 from jaxcal.models.model import Quantity
 from jaxcal.models.periods import within_half
 
@@ -99,7 +99,6 @@ class Sensor(abc.ABC):
     tool: ClassVar[tuple[str, ...]] = ("x", "y", "z")  # what of the tool it sees
     zeros: ClassVar[bool] = False  # what is measured is always zero
     lengths: ClassVar[bool] = False  # every reading is a length
-    first_unit: ClassVar[str] = ""  # of the first reading, where it is always the same
     compliant: ClassVar[bool] = False  # shown to be better with joints that yield
     local: ClassVar[bool] = False  # of few places: harmonics are fitted if they gain
     stands: ClassVar[bool] = False  # what is read stands at a place that it finds
@@ -129,7 +128,7 @@ class Sensor(abc.ABC):
     @property
     def quantities(self) -> tuple[Quantity, ...]:
         """What it reads, by unit; "length" stands for the unit of the arm's lengths."""
-        return (Quantity("length" if self.lengths else self.first_unit),)
+        return (Quantity("length" if self.lengths else ""),)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -244,14 +243,7 @@ class Sensor(abc.ABC):
     def stds(self, length: float) -> Array:
         """(q,) standard deviations of the readings."""
         noise = self.usual_noise(length) if self.noise is None else self.noise
-        std = numbers("noise of the sensor", noise)
-        q = len(self.outputs)
-        if std.shape not in ((), (q,)) or not (std > 0.0).all():
-            raise ValueError(
-                f"noise of the sensor must be one positive number or ({q},), "
-                f"got {noise!r}"
-            )
-        return np.broadcast_to(std, (q,)).copy()
+        return levels("noise of the sensor", noise, len(self.outputs)).copy()
 
     def to_dict(self) -> dict[str, Any]:
         """JSON with its kind."""

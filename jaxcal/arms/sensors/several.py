@@ -19,6 +19,7 @@ from jaxcal.arms.sensors.sensor import (
     turns,
 )
 from jaxcal.checks import Array, array_of, table
+from jaxcal.models.model import Quantity
 
 _MOUNTING = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -43,7 +44,7 @@ class Several(Sensor):
 
     kind = "several"
     joined = True
-    first_unit = "times the noise"
+    quantities = (Quantity("times the noise"),)
 
     def __post_init__(self) -> None:
         given = tuple(self.sensors)

@@ -54,7 +54,6 @@ class Wrench(AtRest):
 
     kind = "wrench"
     local = True
-    first_unit = "N"
     outputs = tuple(f"{what} {axis}" for what in ("force", "torque") for axis in "xyz")
     names = (
         *("mass", "centre x", "centre y", "centre z"),
