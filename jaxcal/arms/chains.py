@@ -687,13 +687,9 @@ class Chains(Model):
     def calibrated(self, parameters: ArrayLike) -> Self:
         """The chains whose nominal is this one with ``parameters``."""
         theta = as_parameters(self, parameters)
-        return dataclasses.replace(
-            self,
-            chains=tuple(
-                arm.calibrated(theta[at], arm.sensor)
-                for arm, at in zip(self.chains, self.members, strict=True)
-            ),
-        )
+        both = zip(self.chains, self.members, strict=True)
+        arms = [arm.calibrated(theta[at], arm.sensor) for arm, at in both]
+        return dataclasses.replace(self, chains=tuple(arms))
 
     def writable(self) -> Self:
         return self._each(SerialChain.writable)
@@ -714,12 +710,8 @@ class Chains(Model):
         from jaxcal.arms.files.write import urdf_text
 
         one_of("form", form, ("urdf",))
-        theta = as_parameters(self, parameters)
-        pairs = [
-            (arm, arm.calibrated(theta[at]))
-            for arm, at in zip(self.chains, self.members, strict=True)
-        ]
-        text, tips = urdf_text(pairs)
+        calibrated = self.calibrated(parameters).chains
+        text, tips = urdf_text([*zip(self.chains, calibrated, strict=True)])
         write_over(path, text, force)
         return ", ".join(tips)
 
@@ -779,15 +771,11 @@ def _alike(one: SerialChain, other: SerialChain, i: int) -> bool:
 def _numbered(members: Sequence[Sequence[Sensor]]) -> tuple[tuple[int, ...], ...]:
     """Numbers of each chain's sensors, one for one object of different chains."""
     numbers: dict[tuple[int, int], int] = {}
-    return tuple(
-        tuple(
-            numbers.setdefault(
-                (id(one), sum(one is other for other in of_chain[:i])), len(numbers)
-            )
-            for i, one in enumerate(of_chain)
-        )
-        for of_chain in members
-    )
+    stands = []
+    for of_chain in members:
+        keys = [(id(one), of_chain[:i].count(one)) for i, one in enumerate(of_chain)]
+        stands.append(tuple(numbers.setdefault(key, len(numbers)) for key in keys))
+    return tuple(stands)
 
 
 def _placed(readings: Sequence[Readings]) -> Sensor:

@@ -108,7 +108,7 @@ class Findings(NamedTuple):
     moved: str  # kind of what seems to have moved: socket, plane
     contradicting: tuple[int, ...]  # measurements that contradict the others
     doubtful: bool  # the readings or the description of the arm may be wrong
-    remedy: str = CLEAR_UP  # of the doubt
+    remedy: str  # of the doubt
 
 
 def findings_of(
@@ -117,11 +117,14 @@ def findings_of(
     parts: list[Part],
     scatter: Reason | None,
     mistaken: str,
+    anywhere: float,
+    nominal: float,
 ) -> Findings:
     """What is wrong, by name, of the rows ``used`` (K,).
 
     ``scatter`` is what the noise does not explain, ``mistaken`` what was said of
-    columns that are reversed or exchanged.
+    columns that are reversed or exchanged, ``anywhere`` the tip's standard deviation,
+    ``nominal`` its error by the arm as described.
     """
     model = calibration.model
     swapped: dict[int, int] = {}
@@ -158,6 +161,8 @@ def findings_of(
     ]
     doubtful |= wrong or unused
     doubtful |= bool(contradicting or exchanged or other_arm or mistaken)
+    vague = _vague(parts, unit_after(calibration), anywhere, nominal)
+    reasons += [vague.fact] if vague else []
     return Findings(
         # What the fit made of mistaken columns is no reason.
         (mistaken,) if mistaken else tuple(reasons),
@@ -165,41 +170,33 @@ def findings_of(
         bool(exchanged),
         next((kind for kind, lines in moved.items() if lines), ""),
         contradicting,
-        doubtful,
+        doubtful or vague is not None,
+        vague.remedy if vague and not doubtful else CLEAR_UP,
     )
 
 
-def left_open(
-    findings: Findings,
-    parts: list[Part],
-    unit: str,
-    anywhere: float,
-    nominal: float,
-) -> Findings:
-    """The findings, and that the readings leave the arm open, where they do.
+def _vague(
+    parts: list[Part], unit: str, anywhere: float, nominal: float
+) -> Reason | None:
+    """The readings leave the arm open, where they do.
 
     Of contacts the size: an arm a tenth smaller, its sockets nearer together, touches
     them as well.
     """
     sockets = [part for part in parts if part.sensor.socketed]
     sized = any(part.touched().any() for part in sockets)
-    if findings.mistaken or sized or not anywhere > _VAGUE * nominal:
-        return findings
-    if not sockets:
-        reason, remedy = "Too few readings:", MORE
-    else:
+    if sized or not anywhere > _VAGUE * nominal:
+        return None
+    fact, remedy = "Too few readings:", MORE
+    if sockets:
         remedy = "give the distance between two sockets (distances=, --distance)"
-        reason = (
+        fact = (
             "The distance between two sockets is missing, so the arm's size is unknown:"
         )
-    reason += (
-        f" away from the measured poses the tip is uncertain by {anywhere:.2g}{unit}; "
-        f"uncalibrated it is off by {nominal:.2g}{unit}."
-    )
-    return findings._replace(
-        reasons=(*findings.reasons, reason),
-        doubtful=True,
-        remedy=findings.remedy if findings.doubtful else remedy,
+    return Reason(
+        f"{fact} away from the measured poses the tip is uncertain by {anywhere:.2g}"
+        f"{unit}; uncalibrated it is off by {nominal:.2g}{unit}.",
+        remedy,
     )
 
 

@@ -19,7 +19,6 @@ from jaxcal.arms.findings import (
     Findings,
     Part,
     findings_of,
-    left_open,
     parts_of,
     unit_after,
 )
@@ -196,10 +195,11 @@ def verdict(calibration: ArmFit) -> ArmVerdict:
     mistaken = ""
     if not explains and errors[0].nominal > _PLAIN * model.length:
         mistaken = mistaken_columns(model, commands, measured)
-    findings = findings_of(calibration, used, parts, scatter, mistaken)
     first, anywhere = _anywhere(calibration, model, parts)
     nominal = next(one.nominal for one in errors if one.of == first.title)
-    findings = left_open(findings, parts, unit_after(calibration), anywhere, nominal)
+    findings = findings_of(
+        calibration, used, parts, scatter, mistaken, anywhere, nominal
+    )
     clean = not (findings.doubtful or (findings.moved and not explains))
     place = None
     if all(part.sensor.views for part in parts):

@@ -263,14 +263,9 @@ class RecordingOptions:
         model = arm(self.which)
         if not isinstance(model, SerialChain):
             raise ValueError(f"{path}: a recording needs --model FILE.urdf")
-        commands, read = model.recorded(
-            Recording(
-                path,
-                self.which,
-                servos=None if self.in_degrees else self.servos,
-                topic=self.topic,
-            )
-        )
+        servos = None if self.in_degrees else self.servos
+        recording = Recording(path, self.which, servos=servos, topic=self.topic)
+        commands, read = model.recorded(recording)
         names = (*model.joint_names, *model.sensor.inputs)
         if read is None:
             raise ValueError(

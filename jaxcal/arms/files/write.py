@@ -171,12 +171,8 @@ def _ur_text(nominal: Arm, calibrated: Arm) -> str:
         for turn, (joint, down, _, _) in zip(turns, parts, strict=True):
             turn[:3, :3] = turn_of_z(joint.axis if down else -joint.axis)
         steps[0] = _product(gaps[0][-1:])  # what is before it is the base
-        frames = [
-            np.linalg.inv(before) @ step @ turn
-            for before, step, turn in zip(
-                [np.eye(4), *turns], steps, turns, strict=False
-            )
-        ]
+        both = zip([np.eye(4), *turns], steps, turns, strict=False)
+        frames = [np.linalg.inv(before) @ step @ turn for before, step, turn in both]
     else:
         frames, before = [], np.eye(4)
         for row in calibrated.table:
