@@ -24,6 +24,7 @@ from jaxcal.arms.arguments import (
 )
 from jaxcal.arms.arm import Arm, apparent_length
 from jaxcal.arms.sensors import Position, Sensor, Several
+from jaxcal.arms.sensors.several import in_noise
 from jaxcal.checks import Array, array_of, axis_names, numbers, one_of
 from jaxcal.files import write_over
 from jaxcal.models.model import ErrorGroups, Model, Quantity, as_commands, as_parameters
@@ -763,7 +764,23 @@ class SerialChain(Arm, Model):
         """
         if not isinstance(self.sensor, Several):
             raise ValueError("together needs an arm with sensor=Several(...)")
-        return self.sensor.rows(self.length, *tables)
+        sensors, j = self.sensor.sensors, self.num_joints
+        if len(tables) != len(sensors):
+            raise ValueError(
+                f"each of the {len(sensors)} sensors needs a pair (commands, "
+                f"measured), got {len(tables)} pairs"
+            )
+        all_commands, all_measured = [], []
+        for i, (one, (given, readings)) in enumerate(zip(sensors, tables, strict=True)):
+            columns = [j + self.sensor.inputs.index(name) for name in one.inputs]
+            columns = [*range(j), *columns]
+            given = array_of(f"commands of {one.kind}", given, "N", len(columns))
+            commands = np.zeros((len(given), self.num_inputs))
+            commands[:, j], commands[:, columns] = i, given
+            all_commands.append(commands)
+            noise, q = one.stds(self.length), self.num_outputs
+            all_measured.append(in_noise(one.kind, readings, len(given), noise, q))
+        return np.vstack(all_commands), np.vstack(all_measured)
 
     def located(self, commands: ArrayLike, measured: ArrayLike | None = None) -> Self:
         """This arm with its sensor located by nominal postures and readings.

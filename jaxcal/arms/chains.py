@@ -17,6 +17,7 @@ from jaxcal.arms.chain import COLUMNS, SerialChain
 from jaxcal.arms.plausible import require_touched
 from jaxcal.arms.sensors import Sensor, Tip
 from jaxcal.arms.sensors.sensor import BASE, Readings, label
+from jaxcal.arms.sensors.several import in_noise
 from jaxcal.checks import Array, array_of, one_of
 from jaxcal.files import write_over
 from jaxcal.models import verdict as models
@@ -440,20 +441,16 @@ class Chains(Model):
         all_commands, all_measured = [], []
         for tip, (raw_commands, readings) in tables.items():
             k = self.tips.index(one_of("tip", tip, self.tips))
-            arm, columns = self.chains[k], self._columns[k]
+            columns = self._columns[k]
             arm_commands = array_of(
                 f"commands of {tip}", raw_commands, "N", len(columns)
             )
             commands = np.zeros((len(arm_commands), self.num_inputs))
             commands[:, len(self.joint_names)] = k
             commands[:, columns] = arm_commands
-            measured = np.zeros((len(arm_commands), self.num_outputs))
-            if readings is not None:
-                what, width = f"measured of {tip}", arm.num_outputs
-                values = array_of(what, readings, len(arm_commands), width)
-                measured[:, :width] = values / self._scale(k)
             all_commands.append(commands)
-            all_measured.append(measured)
+            count, noise = len(arm_commands), self._scale(k)
+            all_measured.append(in_noise(tip, readings, count, noise, self.num_outputs))
         return np.vstack(all_commands), np.vstack(all_measured)
 
     def require_commands(self, commands: Array) -> None:

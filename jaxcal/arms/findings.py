@@ -183,7 +183,7 @@ def _vague(
     Of contacts the size: an arm a tenth smaller, its sockets nearer together, touches
     them as well.
     """
-    sockets = [part for part in parts if part.sensor.socketed]
+    sockets = [part for part in parts if isinstance(part.sensor, Socket)]
     sized = any(part.touched().any() for part in sockets)
     if sized or not anywhere > _VAGUE * nominal:
         return None
@@ -479,7 +479,7 @@ def _swapped(calibration: Fit, part: Part, explains: bool) -> dict[int, int]:
         off = np.abs(calibration.predict(trial) / noise).max(axis=-1)
         for other, row in np.argwhere((off < 4.0) & (stated != trial[..., column])):
             swaps[int(at[row])] = int(other)
-    if sensor.socketed and not explains:
+    if isinstance(sensor, Socket) and not explains:
         # So many that none is an outlier: by the arm as described, where that can tell.
         points = part.points
         labels, which = np.unique(sensor.of_rows(part.columns), return_inverse=True)

@@ -23,7 +23,7 @@ from jaxcal.arms.findings import (
     unit_after,
 )
 from jaxcal.arms.plausible import mistaken_columns
-from jaxcal.arms.sensors import Pose
+from jaxcal.arms.sensors import Pose, Socket
 from jaxcal.arms.sensors.sensor import hats
 from jaxcal.checks import Array
 from jaxcal.information.singular import depends, significant
@@ -374,7 +374,7 @@ def _scattered(calibration: ArmFit, usual: Array, parts: list[Part]) -> Reason |
         return None
     largest = float(noise[(noise / usual).argmax()])
     unit = unit_after(calibration) if np.ptp(usual) == 0.0 else ""
-    touches = any(part.sensor.socketed for part in parts)
+    touches = any(isinstance(part.sensor, Socket) for part in parts)
     several = ", or of several sockets numbered as one" * (touches and times > _LOUD)
     return Reason(
         f"the readings scatter by {largest:.3g}{unit}, {times:.3g} times the usual "
@@ -393,8 +393,10 @@ def _anywhere(
     Beside a shift and a turn of the whole arm, which contacts do not show. NaN where
     none reads positions, and where nothing determines it.
     """
-    part = next((p for p in parts if p.sensor.positions or p.sensor.socketed), None)
-    if part is None:
+    for part in parts:
+        if part.sensor.positions or isinstance(part.sensor, Socket):
+            break
+    else:
         return parts[0], np.nan
     commands = calibration.commands[calibration.loss_weights > 0.0]
     joints = commands[:, : model.num_joints]

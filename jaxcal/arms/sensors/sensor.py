@@ -105,7 +105,6 @@ class Sensor(abc.ABC):
     positions: ClassVar[bool] = False  # its first three readings are the tip's place
     relative: ClassVar[bool] = False  # the others are turns from the nominal ones
     views: ClassVar[bool] = False  # it sees a board, or is one, by a camera
-    socketed: ClassVar[bool] = False  # its contacts are of a ball in a socket
     joined: ClassVar[bool] = False  # it is several sensors in one table
     needed: ClassVar[int] = 1  # readings that find a place
     # How well the tool is known, by the arm's length: it may hang anywhere; 0.4 % where

@@ -18,7 +18,7 @@ from jaxcal.arms.sensors.sensor import (
     label,
     turns,
 )
-from jaxcal.checks import Array, array_of, table
+from jaxcal.checks import Array, array_of
 from jaxcal.models.model import Quantity
 
 _MOUNTING = ("x", "y", "z", "rx", "ry", "rz")
@@ -29,9 +29,9 @@ class Several(Sensor):
     """Readings of some sensors, each in units of its own noise.
 
     Commands have the column ``sensor``, which says of each row which one read it, and
-    then the columns of all of them (0 where they are another's); ``rows`` makes
-    such tables. The first is at the tool; where the others are on it are parameters of
-    their own, known as a tool is.
+    then the columns of all of them (0 where they are another's);
+    ``SerialChain.together`` makes such tables. The first is at the tool; where the
+    others are on it are parameters of their own, known as a tool is.
 
     Attributes:
         sensors: two or more.
@@ -257,35 +257,13 @@ class Several(Sensor):
         content = super().to_dict()
         return content | {"sensors": [one.to_dict() for one in self.sensors]}
 
-    def rows(
-        self, length: float, *tables: tuple[ArrayLike, ArrayLike | None]
-    ) -> tuple[Array, Array]:
-        """Commands and readings of all as one table; see ``SerialChain.together``."""
-        if len(tables) != len(self.sensors):
-            raise ValueError(
-                f"each of the {len(self.sensors)} sensors needs a pair (commands, "
-                f"measured), got {len(tables)} pairs"
-            )
-        columns, q = self.inputs, len(self.outputs)
-        all_commands, all_measured = [], []
-        for i, (one, (raw_commands, readings)) in enumerate(
-            zip(self.sensors, tables, strict=True)
-        ):
-            commands = table(f"commands of {one.kind}", raw_commands)
-            joints = commands.shape[1] - len(one.inputs)
-            labels = np.zeros((len(commands), len(columns)))
-            labels[:, 0] = i
-            labels[:, [columns.index(name) for name in one.inputs]] = commands[
-                :, joints:
-            ]
-            measured = np.zeros((len(commands), q))
-            width = len(one.outputs)
-            if readings is not None:
-                what = f"measured of {one.kind}"
-                values = array_of(what, readings, len(commands), width)
-                measured[:, :width] = values / one.stds(length)
-            all_commands.append(np.hstack([commands[:, :joints], labels]))
-            all_measured.append(measured)
-        if len({rows.shape[1] for rows in all_commands}) > 1:
-            raise ValueError("commands of all sensors must have the same joints")
-        return np.vstack(all_commands), np.vstack(all_measured)
+
+def in_noise(
+    what: str, readings: ArrayLike | None, count: int, noise: Array, q: int
+) -> Array:
+    """(count, q) readings in units of their noise, zeros beyond them and of none."""
+    measured = np.zeros((count, q))
+    if readings is not None:
+        values = array_of(f"measured of {what}", readings, count, len(noise))
+        measured[:, : len(noise)] = values / noise
+    return measured

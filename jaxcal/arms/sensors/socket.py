@@ -31,7 +31,6 @@ class Socket(Landmarks):
     distances: Sequence[Sequence[float]] = ()
 
     kind = "socket"
-    socketed = True
     lengths = True
     outputs = ("off x", "off y", "off z")
     zeros = True
