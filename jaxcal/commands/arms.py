@@ -290,12 +290,7 @@ def in_degrees(arm: SerialChain, commands: Array) -> Array:
 
 
 def _run_model(path: str) -> Model:
-    """What a file of Python calls ``model``, its folder importable as for a script.
-
-    Raises:
-        OSError: there is no such file.
-        ValueError: naming the file and what is wrong in it.
-    """
+    """What a file of Python calls ``model``, its folder importable as for a script."""
     file = pathlib.Path(path).resolve()
     file.read_bytes()
     sys.path.insert(0, str(file.parent))
@@ -316,12 +311,7 @@ def _run_model(path: str) -> Model:
 
 
 def _read_model(path: str) -> Model:
-    """The model in a JSON file.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: naming the file and what is wrong in it.
-    """
+    """The model in a JSON file."""
     if path.lower().endswith(".xacro"):
         raise ValueError(f"{path}: expand it first: xacro {path} > arm.urdf")
     try:

@@ -30,7 +30,7 @@ def rests_of(
     """Where a recorded arm stood still, and what its sensor read there.
 
     Args:
-        recording: of them.
+        recording: a bag or a LeRobot dataset.
         names: (J,) of the joints.
         turning: (J,) which of them are in degrees.
         kind: of the sensor whose messages are asked for, "" for none.

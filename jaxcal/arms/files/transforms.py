@@ -143,9 +143,7 @@ def to_transform(
         path: .yaml, a geometry_msgs/TransformStamped; .sh, a call of ROS 2's
             static_transform_publisher; .py, a launch file of that; .urdf, the arm's own
             file with the frame as a link and its fixed joint.
-        child: as of ``static_transform``.
-        parent: likewise.
-        camera: likewise.
+        child, parent, camera: as of ``static_transform``.
         force: write over a file that is there.
 
     Raises:

@@ -145,12 +145,7 @@ def _moved_by(arm: Arm) -> tuple[list[str], list[str]]:
 
 
 def _ur_text(nominal: Arm, calibrated: Arm) -> str:
-    """The kinematics file of Universal Robots' ROS description, in metres.
-
-    Raises:
-        ValueError: the arm is not of six revolute joints, one of them follows others,
-            or its table has lengths that are no metres.
-    """
+    """The kinematics file of Universal Robots' ROS description, in metres."""
     if nominal.joints != "RRRRRR" or nominal.convention != "standard":
         raise ValueError(
             "the arm must have six revolute joints and a standard table, got "
