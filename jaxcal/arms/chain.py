@@ -863,8 +863,8 @@ class SerialChain(Arm, Model):
                 from jaxcal.arms.files.urdf import joints_of
 
                 kind = joints_of(self.source["text"])[name].kind
-            kinds.append(kind)
-        return tuple("deg" if kind == "R" else "length" for kind in kinds)
+            kinds.append("deg" if kind == "R" else "length")
+        return tuple(kinds)
 
     def quantities(self, measured_unit: str) -> tuple[Quantity, ...]:
         """What its sensor reads, in its units."""

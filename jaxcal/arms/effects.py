@@ -91,10 +91,8 @@ def _held_out(fit: Fit) -> Array:
     used = fit.loss_weights > 0.0
     usual = np.asarray(fit.model.default_noise().std)
     off = left_out(fit)[used] * usual[0] / usual
-    first = fit.model.quantities(fit.measured_unit)[0]
-    if len(fit.model.quantities(fit.measured_unit)) == 1:
-        return np.asarray(first.size(off))
-    return np.asarray(np.linalg.norm(off, axis=1))
+    first, *others = fit.model.quantities(fit.measured_unit)
+    return np.asarray(np.linalg.norm(off, axis=1) if others else first.size(off))
 
 
 def _alternatives(model: Chain) -> Iterator[tuple[str, Chain, Prior]]:
@@ -117,11 +115,8 @@ def _alternatives(model: Chain) -> Iterator[tuple[str, Chain, Prior]]:
         table = std[: other.table.size].reshape(-1, 5)
         table *= [_LENGTHS, _TURNS, _LENGTHS, _ZEROS, _TURNS]
         for i, name in enumerate(other.names):
-            if (
-                name.startswith(("compliance", "gear"))
-                or " sin" in name
-                or " cos" in name
-            ):
+            effect = name.startswith(("compliance", "gear"))
+            if effect or " sin" in name or " cos" in name:
                 std[i] *= _EFFECTS
         words = ", ".join(names) or "wider tolerances"
         yield words, other, Prior(std, fixed=prior.fixed)
@@ -170,10 +165,8 @@ def play_in_words(fit: Fit, unit: str) -> list[str]:
     seen = size > 1e-6 * size.max(initial=1e-300)
     rows, right = rows[:, seen], (fit.residuals / noise).ravel()
     inverse = np.linalg.pinv(rows.T @ rows)
-    play, share = (
-        inverse @ rows.T @ right,
-        np.einsum("ri,ij,rj->r", rows, inverse, rows),
-    )
+    play = inverse @ rows.T @ right
+    share = np.einsum("ri,ij,rj->r", rows, inverse, rows)
     errors = ((right - rows @ play) / (1.0 - share)).reshape(-1, len(noise))
     before = np.linalg.norm(fit.residuals / noise, axis=1).mean()
     left = np.linalg.norm(errors, axis=1).mean() / before

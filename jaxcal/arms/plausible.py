@@ -60,10 +60,8 @@ def _require_tool(arm: Chain, commands: Array, poses: Array) -> None:
     nominal = arm.rotations(commands, np.zeros((len(commands), 3)))
     read = arm.rotations(commands, poses[:, 3:])
     on_tool = np.matrix_transpose(nominal) @ read
-    (turn, apart), (_, of_base) = (
-        _mean_turn(on_tool),
-        _mean_turn(read @ np.matrix_transpose(nominal)),
-    )
+    turn, apart = _mean_turn(on_tool)
+    of_base = _mean_turn(read @ np.matrix_transpose(nominal))[1]
     angle = float(np.linalg.norm(turn))
     if angle > _TURNED and apart < min(angle, of_base) / 3.0:
         raise ValueError(

@@ -351,9 +351,7 @@ def in_turn(postures: Array, joints: int) -> NDArray[np.int64]:
     while remaining:
         last = postures[order[-1]] if order else postures[remaining[0]]
         other = (postures[remaining, joints:] != last[joints:]).any(axis=1)
-        other = (
-            other if postures.shape[1] - joints == 1 else np.zeros(len(remaining), bool)
-        )
+        other &= postures.shape[1] - joints == 1
         far = np.abs(postures[remaining, :joints] - last[:joints]).max(axis=1)
         nearest = int(np.lexsort((far, other))[0])
         order.append(remaining.pop(nearest))

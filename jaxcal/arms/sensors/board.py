@@ -259,7 +259,11 @@ class Board(Sensor):
                 f"place is missing for {len(inputs)} views of a board; {_FEW} views by "
                 "one arm with the camera or the board determine it"
             )
-        turn, shift = self._views(inputs, measured)
+        if self.corners is None:
+            turn = Rotation.from_rotvec(inputs[:, 3:], degrees=True).as_matrix()
+            shift = inputs[:, :3]
+        else:
+            turn, shift = self._poses(np.asarray(measured))
 
         def fit(turn: Array, shift: Array) -> tuple[float, Array, Array]:
             if self.moves == "camera":
@@ -295,15 +299,6 @@ class Board(Sensor):
     @property
     def standing(self) -> Board:
         return dataclasses.replace(self, place=None)  # every arm has a tool of its own
-
-    def _views(self, inputs: Array, measured: Array | None) -> tuple[Array, Array]:
-        """Rotations (N, 3, 3) and places (N, 3) of the board in the camera."""
-        from scipy.spatial.transform import Rotation
-
-        if self.corners is not None and measured is not None:
-            return self._poses(measured)
-        turn = Rotation.from_rotvec(inputs[:, 3:], degrees=True).as_matrix()
-        return turn, inputs[:, :3]
 
     def _poses(self, pixels: Array) -> tuple[Array, Array]:
         """Rotations (N, 3, 3) and places (N, 3) of the board (Zhang, 2000)."""
