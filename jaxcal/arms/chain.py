@@ -22,8 +22,9 @@ from jaxcal.arms.arguments import (
     sensor_of,
     transform,
 )
-from jaxcal.arms.arm import Arm, apparent_length
+from jaxcal.arms.arm import Arm, Load, apparent_length
 from jaxcal.arms.sensors import Position, Sensor, Several
+from jaxcal.arms.sensors.sensor import BASE
 from jaxcal.arms.sensors.several import in_noise
 from jaxcal.checks import Array, array_of, axis_names, numbers, one_of
 from jaxcal.files import write_over
@@ -32,7 +33,6 @@ from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
 
 _POSTURES = 500  # that show where an arm stands
-_BASE = ("x", "y", "z", "rx", "ry", "rz")
 
 COLUMNS = ("a", "alpha", "d", "theta", "beta")
 # Standard deviations of the default prior. On a UR5 (links of 1.19 m in all): 1.8 mm,
@@ -268,10 +268,7 @@ class SerialChain(Arm, Model):
         if compliance is not None and not self.compliance:
             arm["compliance"] = tuple(compliance)
             arm["yields"] = np.zeros(len(arm["compliance"]))
-            usual = _usual_loads(len(self.joints), self.tool)
-            arm["loads"] = self.loads or tuple(
-                load(one, len(self.joints)) for one in usual
-            )
+            arm["loads"] = self.loads or _usual_loads(len(self.joints), self.tool)
         if gears is not None:
             arm["gears"] = tuple(gears)
         if harmonics is not None and not self.harmonics:
@@ -675,9 +672,8 @@ class SerialChain(Arm, Model):
         from scipy.spatial.transform import Rotation
 
         joints = commands[:, : self.num_joints]
-        turns = np.array([kind == "R" for kind in self.joints])
-        limits = np.array(self.limits, dtype=np.float64)
-        limits[turns] = np.clip(limits[turns], -180.0, 180.0)
+        turns = np.array(self.command_units)[:, None] == "deg"
+        limits = np.where(turns, self.limits.clip(-180.0, 180.0), self.limits)
         ranges = np.column_stack([joints.min(axis=0), joints.max(axis=0)])
         low, high = np.where(np.isfinite(limits), limits, ranges).T
         rng = np.random.default_rng(0)
@@ -687,7 +683,7 @@ class SerialChain(Arm, Model):
         turn, _ = Rotation.align_vectors(
             targets - targets.mean(axis=0), tips - tips.mean(axis=0)
         )
-        at = [self.names.index(f"base {axis}") for axis in _BASE]
+        at = [self.names.index(name) for name in BASE]
         base = pose_matrix(parameters[at])
         moved = parameters.copy()
         place = turn.apply(base[:3, 3] - tips.mean(axis=0)) + targets.mean(axis=0)
@@ -909,12 +905,11 @@ class SerialChain(Arm, Model):
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
         n = len(self.joints)
-        mounting = ("x", "y", "z", "rx", "ry", "rz")
         return (
             *(f"{column}{i + 1}" for i in range(n) for column in COLUMNS),
             *(f"gear{i}" for i in self.gears),
             *(f"compliance{i}" for i in self.compliance),
-            *(f"base {axis}" for axis in mounting),
+            *BASE,
             *(f"tool {axis}" for axis in self.sensor.tool),
             *self.sensor.names,
             *(f"theta{i} {wave}" for i in self.harmonics for wave in _WAVES),
@@ -1183,7 +1178,7 @@ def _waves(waves: ArrayLike | None, count: int) -> Array:
     return swings.reshape(-1, 4)
 
 
-def _usual_loads(n: int, tool: Array) -> list[tuple[int, float, ArrayLike]]:
+def _usual_loads(n: int, tool: Array) -> tuple[Load, ...]:
     """A weight of one at the end of every link but the first, the last at the tool."""
-    links = [(i, 1.0, (0.0, 0.0, 0.0)) for i in range(2, n)]
-    return [*links, (n, 1.0, tool[:3, 3])]
+    x, y, z = tool[:3, 3].tolist()
+    return (*((i, 1.0, (0.0, 0.0, 0.0)) for i in range(2, n)), (n, 1.0, (x, y, z)))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.arms.sensors.pose import Pose, rotation_vector_rate
-from jaxcal.arms.sensors.sensor import BASE, Reading, Sensor, Tip, hats, turns
+from jaxcal.arms.sensors.sensor import AXES, BASE, Reading, Sensor, Tip, hats, turns
 from jaxcal.checks import Array, array_of, numbers, one_of
 from jaxcal.models.model import Quantity
 
@@ -68,9 +68,9 @@ class Board(Sensor):
 
     kind = "board"
     views = True
-    tool = ("x", "y", "z", "rx", "ry", "rz")
+    tool = AXES
     stands = True
-    _seen: ClassVar[tuple[str, ...]] = tuple(f"seen {axis}" for axis in tool)
+    _seen: ClassVar[tuple[str, ...]] = tuple(f"seen {axis}" for axis in AXES)
 
     def __post_init__(self) -> None:
         one_of("moves", self.moves, ("camera", "board"))

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.arms.sensors.sensor import Reading, Sensor, Tip, hats
+from jaxcal.arms.sensors.sensor import AXES, Reading, Sensor, Tip, hats
 from jaxcal.checks import Array
 from jaxcal.models.model import Quantity
 
@@ -23,8 +23,7 @@ class Pose(Sensor):
     kind = "pose"
     positions = True
     relative = True
-    tool = ("x", "y", "z", "rx", "ry", "rz")
-    outputs = tool
+    tool = outputs = AXES
     quantities = (Quantity("length", slice(3)), Quantity("deg", slice(3, 6)))
 
     def usual_noise(self, length: float) -> ArrayLike:

@@ -15,7 +15,8 @@ from jaxcal.checks import Array, array_of, in_words, levels, numbers, whole_numb
 from jaxcal.models.model import Quantity
 from jaxcal.models.periods import within_half
 
-BASE = tuple(f"base {axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+BASE = tuple(f"base {axis}" for axis in AXES)
 
 
 @dataclasses.dataclass(frozen=True)

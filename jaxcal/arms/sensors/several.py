@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.arms.sensors.sensor import (
+    AXES,
     Reading,
     Readings,
     Sensor,
@@ -20,8 +21,6 @@ from jaxcal.arms.sensors.sensor import (
 )
 from jaxcal.checks import Array, array_of
 from jaxcal.models.model import Quantity
-
-_MOUNTING = ("x", "y", "z", "rx", "ry", "rz")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -113,7 +112,7 @@ class Several(Sensor):
         if not self._axes(i):
             return np.zeros(0)
         shift = np.asarray(self.mounts)[i - 1, :3, 3]
-        whole = dict(zip(_MOUNTING, [*shift, 0.0, 0.0, 0.0], strict=True))
+        whole = dict(zip(AXES, [*shift, 0.0, 0.0, 0.0], strict=True))
         return np.array([whole[axis] for axis in self.sensors[i].tool])
 
     def prior_std(self, length: float) -> Array:
@@ -153,7 +152,7 @@ class Several(Sensor):
 
     def _mount(self, i: int, given: Array) -> tuple[Array, Array, Array]:
         """Shift (3,), rotation (3, 3), and the axes of its turns as columns (3, 3)."""
-        whole = dict.fromkeys(_MOUNTING, 0.0)
+        whole = dict.fromkeys(AXES, 0.0)
         whole |= dict(zip(self.sensors[i].tool, given, strict=True))
         shift, angles = np.array([*whole.values()]).reshape(2, 3)
         turn, axes = turns(angles)
@@ -179,7 +178,7 @@ class Several(Sensor):
                 rotation = tip.rotation[rows]
                 moves, turned = scaled[..., :3] @ rotation, scaled[..., 3:] @ rotation
                 slopes = np.concatenate([moves, np.radians(turned @ axes)], axis=-1)
-                at = [_MOUNTING.index(axis) for axis in one.tool]
+                at = [AXES.index(axis) for axis in one.tool]
                 by_own[rows, :width, first : first + size] = slopes[..., at]
                 scaled[..., 3:] -= scaled[..., :3] @ hats(rotation @ shift)
             by_tip[rows, :width] = scaled
