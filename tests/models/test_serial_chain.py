@@ -325,3 +325,15 @@ def test_contacts_are_missed_by_more_by_a_larger_arm_wherever_it_stands():
     assert rail.log_size(along, rail.nominal) is not None
     along[0, 0] = 800.0
     assert rail.log_size(along, rail.nominal) is None
+
+
+def test_an_arm_whose_joint_follows_another_stands_as_one_elsewhere():
+    """The limits are of the two columns, not of the three joints."""
+    table = [(300.0, 0, 100, 0), (250, 90, 0, 0), (100, 0, 50, 0)]
+    arm = SerialChain.from_dh(table, drive=[[1, 0], [0.5, 0], [0, 1]])
+    base = np.eye(4)
+    base[:3, 3] = 10.0, -20.0, 5.0
+    there = SerialChain.from_dh(table, drive=arm.drive, base=base)
+    moved = arm.standing_as(there, arm.nominal, np.zeros((1, 2)))
+    at = arm.names.index("base x")
+    np.testing.assert_allclose(moved[at : at + 3], base[:3, 3], atol=1e-9)
