@@ -161,7 +161,7 @@ def findings_of(
     ]
     doubtful |= wrong or unused
     doubtful |= bool(contradicting or exchanged or other_arm or mistaken)
-    vague = _vague(parts, unit_after(calibration), anywhere, nominal)
+    vague = left_open(parts, unit_after(calibration), anywhere, nominal)
     reasons += [vague.fact] if vague else []
     return Findings(
         # What the fit made of mistaken columns is no reason.
@@ -175,7 +175,7 @@ def findings_of(
     )
 
 
-def _vague(
+def left_open(
     parts: list[Part], unit: str, anywhere: float, nominal: float
 ) -> Reason | None:
     """The readings leave the arm open, where they do.
