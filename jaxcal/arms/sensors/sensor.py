@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import Array, array_of, in_words, levels, numbers, whole_number
+from jaxcal.checks import Array, array_of, in_words, numbers, whole_number
 from jaxcal.models.model import Quantity
 from jaxcal.models.periods import within_half
 
@@ -243,7 +243,14 @@ class Sensor(abc.ABC):
     def stds(self, length: float) -> Array:
         """(q,) standard deviations of the readings."""
         noise = self.usual_noise(length) if self.noise is None else self.noise
-        return levels("noise of the sensor", noise, len(self.outputs)).copy()
+        std = numbers("noise of the sensor", noise)
+        q = len(self.outputs)
+        if std.shape not in ((), (q,)) or not (std > 0.0).all():
+            raise ValueError(
+                f"noise of the sensor must be one positive number or ({q},), "
+                f"got {noise!r}"
+            )
+        return np.broadcast_to(std, (q,)).copy()
 
     def to_dict(self) -> dict[str, Any]:
         """JSON with its kind."""
