@@ -11,7 +11,6 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.adaptive.episodes import compare
 from jaxcal.adaptive.fit_ahead import fit, outside
@@ -30,9 +29,8 @@ from jaxcal.adaptive.rules import (
 from jaxcal.adaptive.session import jit_by_class
 from jaxcal.adaptive.tasks.registry import Entry
 from jaxcal.adaptive.tuning import tune
+from jaxcal.checks import Array
 from jaxcal.evaluation.results import Evaluation, MethodResult, Summary, finite
-
-Array = NDArray[np.float64]
 
 METHODS = {
     "random": "any measurement",

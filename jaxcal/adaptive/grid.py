@@ -13,9 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.adaptive import grid_tables as checked
 from jaxcal.adaptive.session import Options, Session, pays
-from jaxcal.checks import whole_number
-
-Array = NDArray[np.float64]
+from jaxcal.checks import Array, whole_number
 
 _SMALL = 1e-30  # probability whose logarithm is still finite in float32
 _NO_LIMIT = 1e30  # seconds, uses

@@ -8,9 +8,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import in_words, numbers
-
-Array = NDArray[np.float64]
+from jaxcal.checks import Array, in_words, numbers
 
 
 def probabilities(

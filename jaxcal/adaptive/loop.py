@@ -10,7 +10,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.adaptive.fit_ahead import fit, outside
 from jaxcal.adaptive.grid import GridTask
@@ -29,8 +28,7 @@ from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.particles import ParticleBelief
 from jaxcal.adaptive.rules import Gain
 from jaxcal.adaptive.session import Decider, SequentialTask, Session, jit_by_class
-
-Array = NDArray[np.float64]
+from jaxcal.checks import Array
 
 _DRAWS = 32  # of the gain that is told, which a single one leaves uncertain by a third
 

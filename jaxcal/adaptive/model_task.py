@@ -16,12 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.adaptive.grid_tables import single
 from jaxcal.adaptive.host import on_host
 from jaxcal.adaptive.session import Session
-from jaxcal.checks import numbers, table
+from jaxcal.checks import Array, numbers, table
 from jaxcal.models.from_jax import FromJax
 from jaxcal.models.function import FromFunction
 from jaxcal.models.model import (
@@ -34,7 +34,6 @@ from jaxcal.models.model import (
 )
 from jaxcal.models.uncertainty import Noise, Prior
 
-Array = NDArray[np.float64]
 Draw = Callable[[jax.Array], jax.Array]  # p standard normal numbers -> parameters (p,)
 
 

@@ -18,7 +18,7 @@ from jaxcal.calibration.file import save, to_dict
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.fit_model import fit_model
 from jaxcal.calibration.inverse import command_for, no_inverse
-from jaxcal.checks import aligned, in_words
+from jaxcal.checks import Array, aligned, in_words
 from jaxcal.late import late
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from jaxcal.calibration.pairing import Mispairing
 
 __all__ = ["Calibration"]
-
-Array = NDArray[np.float64]
 
 
 class Calibration(Fit):

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.pairing import of_new_readings
-from jaxcal.checks import array_of, one_of, whole_number
+from jaxcal.checks import Array, array_of, one_of, whole_number
 from jaxcal.information.blocks import without
 from jaxcal.models.model import recorded
 from jaxcal.models.recording import Recording
@@ -20,7 +20,6 @@ from jaxcal.tables import say_order
 
 __all__ = ["Check", "check", "verification"]
 
-Array = NDArray[np.float64]
 
 _ALARMS = 0.05  # share of false alarms
 _POWER = 0.8

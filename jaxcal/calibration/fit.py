@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import array_of, numbers
+from jaxcal.checks import Array, array_of, numbers
 from jaxcal.information.singular import depends
 from jaxcal.models.identifiability import Identifiability, identifiability
 from jaxcal.models.model import Model, derivative, predict
@@ -18,8 +18,6 @@ from jaxcal.models.uncertainty import Prior
 from jaxcal.tables import COMMANDS, MEASURED, of_frame
 
 __all__ = ["Fit"]
-
-Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

@@ -24,7 +24,7 @@ from jaxcal.calibration.prior_scales import (
     group_scales,
     misfit_scale,
 )
-from jaxcal.checks import one_of, require_kind
+from jaxcal.checks import Array, one_of, require_kind
 from jaxcal.information.singular import (
     exact_zeros,
     null_directions,
@@ -37,7 +37,6 @@ from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["fit_model", "require_fitting"]
 
-Array = NDArray[np.float64]
 
 # Of -2 log likelihood, what misfit must gain where readings of one place do not tell
 # how it goes on elsewhere.

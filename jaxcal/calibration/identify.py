@@ -15,13 +15,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.calibration.calibration import Calibration
 from jaxcal.calibration.check import by_unit
 from jaxcal.calibration.fit_model import fit_model, require_fitting
 from jaxcal.calibration.pairing import of_unfitted
 from jaxcal.checks import (
+    Array,
     array_of,
     axis_names,
     levels,
@@ -48,7 +49,6 @@ from jaxcal.tables import (
 
 __all__ = ["identify"]
 
-Array = NDArray[np.float64]
 
 _LITTLE_ENDIAN = np.dtype("<f8")
 

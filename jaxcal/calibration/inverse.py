@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.fit import Fit
-from jaxcal.checks import array_of, in_words
+from jaxcal.checks import Array, array_of, in_words
 from jaxcal.information.singular import (
     depends,
     direction_in_words,
@@ -21,7 +21,6 @@ from jaxcal.models.model import derivative, predict
 
 __all__ = ["FAR", "Responses", "command_for", "limits_of", "no_inverse"]
 
-Array = NDArray[np.float64]
 
 FAR = 0.25  # of the range of what was measured, beyond it
 _NAMED = 3  # targets in a warning

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration.losses import Loss, constants
-from jaxcal.checks import in_words
+from jaxcal.checks import Array, in_words
 from jaxcal.information.blocks import gram, triangle
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model, derivative, predict, without_effect
@@ -33,7 +33,6 @@ __all__ = [
     "solve",
 ]
 
-Array = NDArray[np.float64]
 
 _LIMIT = 300  # iterations
 _PATIENCE = 20  # iterations whose gain together decides whether the search creeps

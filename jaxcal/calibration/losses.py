@@ -12,11 +12,10 @@ import abc
 import functools
 
 import numpy as np
-from numpy.typing import NDArray
+
+from jaxcal.checks import Array
 
 __all__ = ["LOSSES", "Loss", "Student", "constants"]
-
-Array = NDArray[np.float64]
 
 
 class Loss(abc.ABC):

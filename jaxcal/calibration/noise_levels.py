@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from jaxcal.calibration.least_squares import FitProblem, FitSolution, solve
 from jaxcal.calibration.losses import constants
+from jaxcal.checks import Array
 from jaxcal.models.model import derivative
 
 __all__ = ["are_shared", "pooled"]
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 _FEW = 30  # measurements from which on a level of its own costs a reading nothing

@@ -11,15 +11,14 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.inverse import FAR, Responses, command_for, limits_of
-from jaxcal.checks import aligned, numbers, whole_number
+from jaxcal.checks import Array, aligned, numbers, whole_number
 
 __all__ = ["Inverse", "inverse"]
 
-Array = NDArray[np.float64]
 
 _GRID, _HALVINGS = 257, 45
 

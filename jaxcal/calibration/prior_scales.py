@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration.least_squares import FitProblem, FitSolution
+from jaxcal.checks import Array
 from jaxcal.information.blocks import gram, triangle, without
 from jaxcal.information.singular import significant
 from jaxcal.models.model import ErrorGroups, Model, derivative
 
 __all__ = ["PriorScales", "covariance_of_scales", "group_scales", "misfit_scale"]
 
-Array = NDArray[np.float64]
 
 _LEVEL = 3.0  # factor of one standard deviation of the level, beforehand
 _MOST = 5.0  # of a logarithm

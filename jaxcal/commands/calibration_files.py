@@ -7,14 +7,10 @@ import os
 from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from jaxcal.calibration import Calibration
+from jaxcal.checks import Array
 from jaxcal.commands.arms import in_degrees, is_recording
 from jaxcal.tables import COMMANDS, Table, read_table
-
-Array = NDArray[np.float64]
 
 ReportFolder = Annotated[
     str,

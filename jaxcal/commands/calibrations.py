@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.arguments import Numbers, Was, several
 from jaxcal.calibration import Calibration
 from jaxcal.calibration import identify as identified
+from jaxcal.checks import Array
 from jaxcal.commands.arms import (
     ArmOptions,
     ModelPath,
@@ -28,8 +28,6 @@ from jaxcal.commands.calibration_files import (
 )
 from jaxcal.commands.tables import Output, write_json, write_rows
 from jaxcal.tables import COMMANDS, MEASURED, Table, read_table
-
-Array = NDArray[np.float64]
 
 RecordPath = Annotated[
     str, "CSV, or - (standard input); for an arm also a bag or a LeRobot dataset"

@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaxcal.checks import Array
 from jaxcal.tables import read_table
-
-Array = NDArray[np.float64]
 
 
 def holds_sets(path: str) -> bool:

@@ -13,14 +13,12 @@ from numpy.typing import NDArray
 from jaxcal.arguments import several
 from jaxcal.arms import SerialChain
 from jaxcal.arms.sensors import SENSORS, Board, Landmarks
-from jaxcal.checks import aligned, one_of
+from jaxcal.checks import Array, aligned, one_of
 from jaxcal.commands.arms import ArmOptions
 from jaxcal.commands.tables import Output
 from jaxcal.extras import needs
 from jaxcal.selection import Design
 from jaxcal.tables import COMMANDS, read_table
-
-Array = NDArray[np.float64]
 
 _DRAWS = 10  # random choices that a plan is compared with
 

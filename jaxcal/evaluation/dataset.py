@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges
-from jaxcal.checks import array_of, require_none
+from jaxcal.checks import Array, array_of, require_none
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 

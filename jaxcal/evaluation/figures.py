@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
-from numpy.typing import NDArray
 
+from jaxcal.checks import Array
 from jaxcal.evaluation.postures import PostureEvaluation, PostureResult, log_mean
 from jaxcal.evaluation.results import MethodResult
 from jaxcal.models.affine import Affine
@@ -29,8 +29,6 @@ from jaxcal.reports.plots.style import (
     numbered,
     panels,
 )
-
-Array = NDArray[np.float64]
 
 SHOWN_EPISODES = 200  # more than these points side by side cannot be told apart
 _CURVE_POINTS = 600  # draw any step curve

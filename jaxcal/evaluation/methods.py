@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal import selection
+from jaxcal.checks import Array
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.parameters import estimate_parameters
@@ -24,7 +25,6 @@ from jaxcal.information.regression import log_det_gram
 from jaxcal.models.affine import Affine
 from jaxcal.selection.problem import make_problems
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 T = TypeVar("T")
 Progress = Callable[[str, int, int], None]

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.checks import Array
 from jaxcal.evaluation.dataset import Dataset
-
-Array = NDArray[np.float64]
 
 
 def estimate_parameters(dataset: Dataset, indices: NDArray[np.int64]) -> Array | None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from jaxcal.checks import Array
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.results import (
     Column,
@@ -21,7 +22,6 @@ from jaxcal.evaluation.results import (
 )
 from jaxcal.models.affine import Affine
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 HIT_TOLERANCE = 1e-9  # of log det(Z.T Z): the same determinant to a billionth

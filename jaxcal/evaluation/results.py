@@ -8,9 +8,8 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from jaxcal.checks import Array
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from jaxcal.checks import Array
 from jaxcal.reports.plots.style import COLOURS, panels
 from jaxcal.tables import read_table
-
-Array = NDArray[np.float64]
 
 
 def training_curves(runs: Mapping[str, pathlib.Path]) -> Figure:

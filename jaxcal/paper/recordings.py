@@ -20,14 +20,12 @@ import pathlib
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges
+from jaxcal.checks import Array
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.paper.constants import AXES, EPISODES, NUM_CANDIDATES, RANGES
 from jaxcal.tables import parse
-
-Array = NDArray[np.float64]
 
 SHIPPED = pathlib.Path(__file__).parent / "data"
 

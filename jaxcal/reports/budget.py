@@ -14,14 +14,12 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.of_readings import by_readings, inverse
-from jaxcal.checks import aligned, one_or_each
+from jaxcal.checks import Array, aligned, one_or_each
 from jaxcal.information.singular import depends
-
-Array = NDArray[np.float64]
 
 _READING = "noise of the reading"
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.calibration.check import Check
 from jaxcal.calibration.fit import Fit
@@ -27,9 +27,6 @@ from jaxcal.reports.calibration_page import named, nominal_errors, page_of
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
-
-
-Array = NDArray[np.float64]
 
 
 SCHEMA: dict[str, Any] = json.loads(

@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.calibration.fit import Fit
+from jaxcal.checks import Array
 from jaxcal.extras import needs
 from jaxcal.models.model import Quantity
 from jaxcal.models.verdict import left_out
@@ -19,7 +20,6 @@ from jaxcal.tables import COMMANDS, MEASURED
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
 
-Array = NDArray[np.float64]
 
 _NAMED = 8  # columns beyond which no name is written
 

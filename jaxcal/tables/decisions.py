@@ -10,14 +10,13 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaxcal.checks import Array
 from jaxcal.tables.cells import has_unit, truths_of
 from jaxcal.tables.names import COMMANDS, MEASURED
 
 __all__ = ["AVAILABLE", "COUNTED", "Decision", "decide", "is_available", "sentence"]
 
-Array = NDArray[np.float64]
 
 AVAILABLE = "available"
 _AVAILABLE = re.compile(

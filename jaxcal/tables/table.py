@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.checks import Array
 from jaxcal.tables.cells import Ambiguity, decimal_mark, numbers_of, truths_of
 from jaxcal.tables.decisions import (
     AVAILABLE,
@@ -25,7 +26,6 @@ from jaxcal.tables.names import split_names as split
 
 __all__ = ["Table", "table_of"]
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 

@@ -844,7 +844,8 @@ def test_the_order_of_numbers_in_memory_does_not_matter() -> None:
 def test_twelve_rows_are_identified_in_few_calls(rng: np.random.Generator) -> None:
     commands = rng.uniform(size=(12, 3))
     measured = commands @ rng.normal(size=(3, 3)) + 0.01 * rng.normal(size=(12, 3))
-    identify(commands, measured)
+    for _ in range(2):  # the first imports what it needs
+        identify(commands, measured)
     calls = [0]
 
     def count(frame: object, event: str, what: object) -> None:

@@ -21,10 +21,10 @@ from jaxcal.calibration.pairing.table import (
     Table,
     shifted,
 )
+from jaxcal.checks import Array
 
 __all__ = ["changed_columns", "places"]
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 _TURNS = 1.7453292519943295e-2  # radians in a degree

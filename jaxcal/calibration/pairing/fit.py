@@ -20,6 +20,7 @@ from jaxcal.calibration.pairing.table import (
     Hypothesis,
     Table,
 )
+from jaxcal.checks import Array
 from jaxcal.models.model import predict
 
 __all__ = [
@@ -33,7 +34,6 @@ __all__ = [
     "top",
 ]
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 OUTLIER = np.log(20.0)  # of one row in twenty

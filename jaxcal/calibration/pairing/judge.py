@@ -36,7 +36,7 @@ from jaxcal.calibration.pairing.table import (
     path_match,
 )
 from jaxcal.calibration.pairing.words import sentence, what_is_wrong
-from jaxcal.checks import in_words
+from jaxcal.checks import Array, in_words
 from jaxcal.models.model import Model
 from jaxcal.models.reasons import Reason, in_rows
 from jaxcal.models.uncertainty import Prior
@@ -54,7 +54,6 @@ __all__ = [
     "of_unfitted",
 ]
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 _SURE = 8.0  # log of the odds at which a mispairing is said

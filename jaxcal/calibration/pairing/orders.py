@@ -18,10 +18,10 @@ from jaxcal.calibration.pairing.table import (
     as_it_is,
     path_match,
 )
+from jaxcal.checks import Array
 
 __all__ = ["exchanged", "polished", "sorted_alone"]
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 _MOST_ROWS = 150  # of a table whose lost order is looked for

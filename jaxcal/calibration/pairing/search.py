@@ -26,10 +26,10 @@ from jaxcal.calibration.pairing.table import (
     path_match,
     shifted,
 )
+from jaxcal.checks import Array
 
 __all__ = ["ranked"]
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 _SHIFTS = (0, 1, -1, 2, -2, 3, -3)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.checks import Array
 from jaxcal.models.model import Model, derivative, predict
 
 __all__ = [
@@ -21,7 +22,6 @@ __all__ = [
     "shifted",
 ]
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 AS_IT_IS = "as it is"  # kind of a hypothesis

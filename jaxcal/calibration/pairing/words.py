@@ -18,7 +18,6 @@ from jaxcal.checks import in_words
 
 __all__ = ["sentence", "what_is_wrong"]
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 
