@@ -856,7 +856,7 @@ def test_twelve_rows_are_identified_in_few_calls(rng: np.random.Generator) -> No
         identify(commands, measured)
     finally:
         sys.setprofile(None)
-    # Of 1,230 the fit takes 470 and the verdict 580, a quarter of it for the pairing of
+    # Of 1,280 the fit takes 490 and the verdict 610, a quarter of it for the pairing of
     # the rows, another for outliers that least squares hides; a fit of 1,640 took four
     # times as long as the closed form.
     assert calls[0] < 1290
