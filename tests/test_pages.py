@@ -68,7 +68,7 @@ def everything(text: str) -> Page:
             Section(
                 text,
                 [
-                    Table((text, text), [(text, inline)]),
+                    Table((text, text), [(text, inline)], caption=inline),
                     Figure(SVG, text),
                 ],
                 key="one",

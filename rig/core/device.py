@@ -375,10 +375,10 @@ class Device:
                 "its enable and STO inputs"
             )
         slack = axis.pulses_within(self.config.motion.position_tolerance_deg)
-        held = before is not None and before.enabled
-        if held and abs(status.position - before.position) > slack:
+        where = before.position if before and before.enabled else status.position
+        if abs(status.position - where) > slack:
             raise MotionFault(
-                f"{axis.name} counted {before.position} pulses when this session found "
+                f"{axis.name} counted {where} pulses when this session found "
                 f"it and {status.position} now, and nothing moved it: the drive was "
                 "switched off and on, or another controller moves it. Run "
                 "`jaxcal-rig setup home`"
