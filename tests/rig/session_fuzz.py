@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import errno
+import functools
 import heapq
 import itertools
 import os
@@ -26,7 +27,7 @@ import sys
 import tempfile
 import time
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from unittest import mock
 
 import harness
@@ -606,8 +607,14 @@ def require_told(world: World, stoppers: list, said: list[str]) -> None:
             world.breaks(f"unit {unit} was said to stand, and moved on")
 
 
-def play(number: int, folder: pathlib.Path) -> World:
-    """A session with faults, and the same run until it is done."""
+def play(
+    number: int, folder: pathlib.Path, faults: Sequence[tuple[str, float]] = ()
+) -> World:
+    """A session with faults, and the same run until it is done.
+
+    ``faults`` are kinds and seconds from the start, of the first session alone, in
+    place of what is drawn.
+    """
     world = World(number)
     with played_in(world):
         world.furnish(world.random.choice(["tcp", "rtu_tcp"]))
@@ -622,8 +629,10 @@ def play(number: int, folder: pathlib.Path) -> World:
             for i in range(POSTURES)
         ]
         for attempt in range(4):
-            if attempt < 2:
+            if attempt < 2 and not faults:
                 world.plan()
+            for kind, seconds in faults if not attempt else ():
+                world.at(seconds, functools.partial(world.happen, kind))
             code = one_session(world, folder, targets)
             world.faults.append(f"{world.now - 100.0:.3f} -- ended with {code}")
             if code is None:  # the line's own process stops the drives
@@ -658,12 +667,17 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--first", type=int, default=0, help="number of the first")
     parser.add_argument("--sessions", type=int, default=100)
+    parser.add_argument(
+        "--fault", nargs=2, action="append", default=[],
+        metavar=("KIND", "SECONDS"), help="instead of what is drawn",
+    )  # fmt: skip
     options = parser.parse_args(argv)
+    faults = [(kind, float(seconds)) for kind, seconds in options.fault]
     begun, broken = time.perf_counter(), 0
     for number in range(options.first, options.first + options.sessions):
         with tempfile.TemporaryDirectory(dir=shared_memory()) as folder:
             try:
-                world = play(number, pathlib.Path(folder))
+                world = play(number, pathlib.Path(folder), faults)
             except Broken as error:
                 broken += 1
                 print(f"session {number}: {error}")

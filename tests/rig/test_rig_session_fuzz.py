@@ -9,9 +9,9 @@ import pytest
 PROGRAM = pathlib.Path(__file__).parent / "session_fuzz.py"
 
 
-def played(first, count):
+def played(first, count, *more):
     """Those sessions, in a process whose clocks are theirs alone."""
-    numbers = ["--first", str(first), "--sessions", str(count)]
+    numbers = ["--first", str(first), "--sessions", str(count), *more]
     return subprocess.run(
         [sys.executable, str(PROGRAM), *numbers], capture_output=True, text=True
     )
@@ -31,12 +31,19 @@ def test_a_thousand_more(first):
 
 
 def test_a_session_follows_from_its_number():
-    one, again = played(8, 1), played(8, 1)
+    one, again = played(2, 1), played(2, 1)
     assert one.stdout.splitlines()[:-1] == again.stdout.splitlines()[:-1]
-    assert "killed" in one.stdout
+    assert "ended with 0" in one.stdout
 
 
-def test_a_drive_that_lost_its_origin_beside_the_first_zero_is_noticed():
+@pytest.mark.parametrize("seconds", ["0.05", "0.3", "0.5", "0.7"])
+def test_a_drive_that_lost_its_origin_beside_the_first_zero_is_noticed(seconds):
     """It stood where the zero was taken, and no move had said where it was left."""
-    done = played(37, 1)
-    assert done.returncode == 0 and "reset_lost" in done.stdout
+    done = played(0, 1, "--fault", "reset_lost", seconds)
+    assert done.returncode == 0, done.stdout
+    assert "ended with 3" in done.stdout or "ended with 2" in done.stdout
+
+
+def test_a_killed_session_goes_on():
+    done = played(0, 1, "--fault", "killed", "1.5")
+    assert done.returncode == 0 and "ended with None" in done.stdout
