@@ -35,6 +35,7 @@ from jaxcal.models.uncertainty import Noise, Prior
 _ENOUGH = 0.5  # effective share of the particles below which they are moved
 _HALVINGS = 10  # bisections for a temperature
 _STEPS = 40  # temperatures that one outcome may take
+_FEW = 8  # outcomes per design that a two-step look-ahead follows
 _AT_ONCE = 2**25  # log probabilities that sessions played at once may hold
 _DESIGNS = 512  # whose gains are computed at once
 
@@ -69,6 +70,30 @@ class ParticleBelief:
     def draw(self, key: jax.Array) -> jax.Array:
         """(d,) coordinates, drawn."""
         return self.draws(1, key)[0]
+
+    def outcomes(
+        self, task: ParticleTask, design: Any, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """(Y,) outcomes of a design and (Y,) their probabilities.
+
+        All outcomes where they are at most eight; otherwise eight draws.
+        """
+        model, support = self.model, self.model.support
+        if support is not None and len(support) <= _FEW:
+            z, weight = self.z, jnp.exp(self.log_weight)
+        else:
+            key, key_draws = jax.random.split(key)
+            z, weight = self.draws(_FEW, key_draws), jnp.full(_FEW, 1.0 / _FEW)
+        predictions = jax.vmap(
+            lambda z: model.predict(model.unknowns(z), design)
+        )(z)  # fmt: skip
+        if support is None or len(support) > _FEW:
+            keys = jax.random.split(key, _FEW)
+            return jax.vmap(model.sample)(predictions, keys), weight
+        log_p = jax.vmap(
+            lambda p: jax.vmap(lambda y: model.log_prob(p, y))(support)
+        )(predictions)  # fmt: skip
+        return support, weight @ jnp.exp(log_p)
 
     def can_answer(self, design: Any, outcome: jax.Array) -> jax.Array:
         """() bool: some particle gives the outcome a probability above 0."""

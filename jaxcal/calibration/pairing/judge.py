@@ -149,6 +149,9 @@ def _hidden_outliers(fit: Fit) -> Reason | None:
     rows = np.flatnonzero(~plain.inside & table.counted)
     if not len(rows) or {*rows} == {*fit.outliers} or not _better(plain, plain):
         return None
+    spread = (table.measured / table.scale)[plain.inside].std(axis=0)
+    if (plain.noise > 0.5 * spread)[plain.rms > _RATIO * plain.noise].any():
+        return None  # the others are not explained: a search on a plateau
     if fit.noise_known and (plain.noise * table.scale > _RATIO * stated).any():
         return None  # what was stated is too small for the others too
     readings = (table.measured / table.scale)[rows]
