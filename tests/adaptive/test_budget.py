@@ -38,9 +38,7 @@ DECIDERS = {
     "state": lambda of: RULE,
     "ahead": lambda of: AHEAD,
     "fitted": lambda of: fit(of).decider,
-    "policy": lambda of: PolicyDecider(
-        initial(jax.random.key(0), 4, 1, 8), RULE, 4, 8, sample=True
-    ),
+    "policy": lambda of: PolicyDecider(initial(jax.random.key(0), 4, 1, 8), RULE, 4, 8),
 }
 QUICK = ("random", "state")
 
