@@ -4,31 +4,24 @@ from __future__ import annotations
 
 import contextlib
 import pathlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator
 
 from rig.config import RigConfig
 from rig.config.axis import Pulses
-from rig.core.device import Device, Lines
-from rig.core.line_client import line_of
-from rig.core.record_check import ZeroRecord, check_drives
-from rig.core.session import open_device, take_zero
-from rig.drives import Drive
+from rig.core.device import Device
+from rig.core.record_check import ZeroRecord
+from rig.core.session import SessionRun, open_device, take_zero
 from rig.faults import EXIT_FAULT, JournalError, PlanOnly, Refused, ending
 from rig.journal.device import DeviceRecord
-from rig.journal.run_folder import Record, RunFolder
+from rig.journal.run_folder import Record
 from rig.parts import model_of
 from rig.signals import Signals
 
-Check = Callable[[RigConfig, Sequence[Drive], DeviceRecord], None]
 
-
-class Run(RunFolder):
+class Run(SessionRun):
     """The folder of a run, and the options of its command."""
 
-    check: Check = staticmethod(check_drives)  # of the drives, before they are armed
-    lines: Lines = staticmethod(line_of)  # who makes its line and drives
-    simulated = False  # nothing real moves: it need not be slow
+    signals: Signals
     again = ""  # the command of a run that is not resumed, but begun again
 
     def __init__(
@@ -48,14 +41,14 @@ class Run(RunFolder):
     ) -> None:
         self._say = say
         self.confirm: Callable[[Run], None] = lambda run: None  # before ports open
-        # What runs while the ports are open, such as telemetry.
-        self.beside: list[Callable[[Device], AbstractContextManager[None]]] = []
+        self.beside = []
         self.record = record
         self.zero_at = zero_at
         self.kept_zero = kept_zero
         self.dry_run = dry_run
         self.reset_alarms = reset_alarms
         self.model = model_of(config)  # None: affine
+        self.predict = None if self.model is None else self.model.predict
         self.signals = signals or Signals()
         super().__init__(config, folder, mode, start or {})
 

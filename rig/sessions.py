@@ -6,7 +6,7 @@ import contextlib
 import functools
 import pathlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rig import pages
 from rig.command_run import Run, run_safely
@@ -16,16 +16,13 @@ from rig.faults import JournalError, Refused
 from rig.journal.device import STOP_PROVED, DeviceRecord
 from rig.journal.lock import BusLock
 from rig.journal.run_folder import JOURNAL, SCHEMA, Record, new_run_folder, read_journal
+from rig.options import Session
 from rig.outputs.console import listen
 from rig.procedures import calibrate, verify
 from rig.procedures.collect import collect
 from rig.procedures.goto import goto
 from rig.prove import steps
 from rig.prove.operator import Operator
-
-if TYPE_CHECKING:
-    from rig.commands import Session
-
 
 say = functools.partial(print, flush=True)
 

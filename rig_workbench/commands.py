@@ -11,19 +11,9 @@ import sys
 import time
 from typing import Annotated, Literal
 
-from rig.commands import (
-    FILE,
-    AxisName,
-    BusName,
-    DeviceOptions,
-    Path,
-    RunPath,
-    Step,
-    Units,
-    place,
-    say,
-)
+from rig.commands import AxisName, BusName, RunPath, Units, place, say
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
+from rig.options import FILE, DeviceOptions, Path, Step
 
 Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
 Angles = tuple[float, float, float]

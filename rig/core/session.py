@@ -13,42 +13,60 @@ is running the same again.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
+from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.core import record_check
-from rig.core.device import Device, Posture, check_plan
+from rig.core.device import Device, Lines, Posture, check_plan
 from rig.core.joints import show
+from rig.core.line_client import line_of
 from rig.core.measure import measure, zeroed
 from rig.core.motion import Arrival, move
+from rig.drives import Drive
 from rig.faults import (
     EndedShort,
     MotionFault,
     NotFollowing,
+    Requests,
     Unreachable,
     ending,
 )
-from rig.journal.device import ZEROED
+from rig.journal.device import ZEROED, DeviceRecord
 from rig.journal.lock import BusLock
 from rig.journal.run_folder import Record, RunFolder
 from rig.readings.attitude import Array, angle_between_deg
 from rig.readings.geometry import Attitudes
 from rig.readings.source import ReadingError
 
-if TYPE_CHECKING:
-    from rig.command_run import Run
-
 STREAM_WAIT_S = 60.0  # time to start the app on the phone
 LEAST_TURN_DEG = 0.05  # of the phone's heading: less is its noise
 ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
 SAME_PLACE_DEG = 0.5  # two places where an axis ended short of one target
+Check = Callable[[RigConfig, Sequence[Drive], DeviceRecord], None]
+
+
+class SessionRun(RunFolder):
+    """The folder of a run, and what its session is opened with."""
+
+    record: DeviceRecord  # of what was proved of the device
+    signals: Requests  # to pause or to stop, from outside
+    reset_alarms: bool  # of drives that are in alarm
+    # (m,) that is measured at (n,) commands, by its model as designed.
+    predict: Callable[[Array], Array] | None
+    # What runs while the ports are open, such as telemetry.
+    beside: list[Callable[[Device], contextlib.AbstractContextManager[None]]]
+    # What must hold of the drives before they are armed; Refused.
+    check: Check = staticmethod(record_check.check_drives)
+    lines: Lines = staticmethod(line_of)  # who makes its line and drives
+    simulated = False  # nothing real moves: it need not be slow
 
 
 @contextlib.contextmanager
-def open_device(run: Run) -> Iterator[Device]:
+def open_device(run: SessionRun) -> Iterator[Device]:
     """The device of a run, armed; however this ends its drives are stopped and looked
     at.
 
@@ -57,8 +75,8 @@ def open_device(run: Run) -> Iterator[Device]:
     """
     config, record, requests = run.config, run.record, run.signals
     device = Device(
-        config, run, record, requests, simulated=run.simulated, lines=run.lines,
-        predict=None if run.model is None else run.model.predict,
+        config, run, record, requests,
+        simulated=run.simulated, lines=run.lines, predict=run.predict,
     )  # fmt: skip
     lock = BusLock(config.bus)
     # A request that came while something was computed may have been raised in a

@@ -9,7 +9,7 @@ import os
 import pathlib
 from collections.abc import Callable, Iterator
 
-from rig.command_run import Check, Run, run_safely
+from rig.command_run import Run, run_safely
 from rig.config import RigConfig
 from rig.core import session
 from rig.core.device import Device, Posture
@@ -89,7 +89,7 @@ class Site:
         motion = config.motion.model_copy(update={"approach_overshoot_deg": 0.0})
         config = config.model_copy(update={"axes": axes, "motion": motion})
         # Homed drives are where they were left; the gearing is still to be checked.
-        check: Check = functools.partial(check_drives, geared=False)
+        check: session.Check = functools.partial(check_drives, geared=False)
         with BusLock(config.bus).acquire(name) as lock:
             run = Run(
                 config if limits else unlimited(config),

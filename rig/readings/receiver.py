@@ -10,12 +10,28 @@ import re
 import socket
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any, Protocol
 
+from rig.config.settings import ImuSettings
 from rig.readings.stream import MAX_BODY, LineSplitter
 
-if TYPE_CHECKING:
-    from rig.readings.phone import Imu
+
+class Hearer(Protocol):
+    """Who takes what a phone sends."""
+
+    settings: ImuSettings
+    report: Callable[..., object]
+
+    def begin(self) -> None:
+        """Lines come over another connection from now on."""
+
+    def take_lines(self, lines: list[bytes], now: float) -> bool:
+        """Lines that came at a monotonic time; whether a reading of them was used."""
+
+    def take_body(self, body: bytes) -> tuple[bool, bool]:
+        """A message; whether it was used, and whether it is another device's."""
+
 
 RECONNECT_S = 0.2
 MOST_OPEN = 4  # connections at a time
@@ -49,7 +65,7 @@ class Receiver:
     connection is another sender.
     """
 
-    def __init__(self, imu: Imu) -> None:
+    def __init__(self, imu: Hearer) -> None:
         """OSError where the port cannot be opened."""
         self._imu = imu
         self._settings = s = imu.settings

@@ -449,7 +449,7 @@ class FuzzWire(Wire):
 
 
 class FuzzReceiver:
-    """A phone that is there as soon as somebody listens."""
+    """A phone that connects when the session opens its port."""
 
     world: World
     port, phone, refused = 1, "127.0.0.1", ()
