@@ -6,10 +6,7 @@ do nothing else: no JAX, no files but the callback of events.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import math
-import threading
 import time
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
@@ -18,21 +15,18 @@ import numpy as np
 
 from rig.config.axis import Pulses
 from rig.config.config import RigConfig
-from rig.core import stop
+from rig.core.heartbeat import Heartbeat, Stopper
 from rig.core.line_client import line_of
 from rig.core.proof import Proof, Turns, slopes
-from rig.core.stop import UnitStop
 from rig.core.stop_distance import stop_distances
 from rig.drives import Drive, Line
 from rig.drives.drive import Status
 from rig.drives.line import BusError
 from rig.faults import (
-    EXIT_FAULT,
     LimitError,
     MotionFault,
     PauseRequested,
     Requests,
-    StopRequested,
 )
 from rig.journal.device import SIGN_CHECKED, DeviceRecord
 from rig.journal.run_folder import Record, RunFolder
@@ -42,11 +36,8 @@ from rig.readings.geometry import Frame, geometry_of
 from rig.readings.source import ReadingError
 
 LOOK_S = 0.002  # between two looks for a reading
-OVERDUE_S = 0.3  # of a stop that was asked for and that no loop has answered
 TELLS = 0.03  # least of the singular values, of the largest: by so little an axis tells
-TICK_S = 0.05  # of the heartbeat
 PATIENCE_S = 60.0  # with a stream that pauses while nothing moves
-SLEPT_S = 1.0  # by which the clock that runs on in a computer's sleep is ahead
 
 
 Lines = Callable[[RigConfig, Callable[..., Any]], tuple[Line, list[Drive]]]
@@ -88,119 +79,6 @@ def check_plan(config: RigConfig, targets: Iterable[Pulses]) -> None:
     ]
     if faults:
         raise LimitError("outside the limits, nothing was sent: " + "; ".join(faults))
-
-
-class Stopper:
-    """The latch: after a stop for a fault only a new process, armed anew, moves."""
-
-    def __init__(self, drives: list[Drive], emit: Callable[..., Any]) -> None:
-        self.drives = drives
-        self.reason = ""  # of the stop that has latched
-        self.results: list[UnitStop] = []
-        self._emit = emit
-        self._lock = threading.RLock()
-
-    def stop(self, reason: str, latch: bool = True) -> list[UnitStop]:
-        """Stop every unit now; the first reason is the one that is kept."""
-        if latch and not self.reason:  # before the lock: whoever moves looks at it
-            self.reason = reason or "stopped"
-        with self._lock:
-            self.results = stop.stop_all(self.drives)
-            units = [dataclasses.asdict(result) for result in self.results]
-            self._emit("stop", reason=reason, units=units)
-            return self.results
-
-    def stay(self) -> list[UnitStop]:
-        """After a stop for a reason: look whether the drives stay where they stand."""
-        with self._lock:
-            stand_s = stop.stand_s(self.drives)
-            words = stop.stay(self.drives, self.results, stand_s)
-            units = [dataclasses.asdict(result) for result in self.results]
-            self._emit("stayed", went_on=words, units=units)
-            return self.results
-
-    def tell(self, text: str) -> None:
-        """Note something that stops nothing."""
-        self._emit("note", text=text)
-
-    def check(self) -> None:
-        """Raise StopRequested where a stop has latched."""
-        if self.reason:
-            raise StopRequested(self.reason, EXIT_FAULT)
-
-
-class Heartbeat(threading.Thread):
-    """A thread that stops the drives when the motion loop is silent for too long, or
-    does not answer to a stop.
-
-    It also keeps the line alive for drives that watch their communication while the
-    plan computes or writes, when nothing moves.
-    """
-
-    def __init__(self, stopper: Stopper, requests: Requests, config: RigConfig) -> None:
-        super().__init__(name="heartbeat", daemon=True)
-        self._requests = requests
-        self._stopper = stopper
-        self._silence_s = config.heartbeat_s
-        self._keep_alive_s = min(config.comm_timeouts_s.values(), default=math.inf) / 4
-        self._moving = False
-        self._fed = time.monotonic()
-        self._ahead = clock_ahead_s()
-        self._closing = threading.Event()
-
-    def feed(self, moving: bool | None = None) -> None:
-        """The motion loop is alive; ``moving``: it must be heard again soon."""
-        if moving is not None:
-            self._moving = moving
-        self._fed = time.monotonic()
-
-    def close(self) -> None:
-        self._closing.set()
-        if self.is_alive():
-            self.join(2.0)
-
-    def run(self) -> None:
-        while not self._closing.wait(TICK_S):
-            if self.beat():
-                return
-
-    def beat(self) -> bool:
-        """Look once at loop, clock and requests; whether the drives were stopped."""
-        self._stopper.drives[0].line.alive()
-        silence = time.monotonic() - self._fed
-        slept_s, self._ahead = clock_ahead_s() - self._ahead, clock_ahead_s()
-        if slept_s > SLEPT_S:
-            text = f"this computer slept for {slept_s:.0f} s"
-            if self._moving:
-                self._stopper.stop(
-                    f"{text} while the device moved unobserved. Switch its power "
-                    "saving off"
-                )
-                return True
-            self._stopper.tell(text)
-        if not self._stopper.reason and (late := self._requests.overdue(OVERDUE_S)):
-            self._stopper.stop(f"{late}, and the session did not answer")
-            return True
-        if self._moving and silence > self._silence_s:
-            self._stopper.stop(
-                f"this program paused for {silence:.2f} s while the device moved "
-                f"(limit {self._silence_s:.2f} s). Is the computer overloaded or "
-                "waiting for its disk?"
-            )
-            return True
-        if not self._moving and silence > self._keep_alive_s:
-            for drive in self._stopper.drives:
-                # The plan's own reads find what is wrong.
-                with contextlib.suppress(BusError, StopRequested):
-                    drive.status(retries=0)
-            self._fed = time.monotonic()
-        return False
-
-
-def clock_ahead_s() -> float:
-    """Seconds that this computer has slept since it was started, where it says so."""
-    clock = getattr(time, "CLOCK_BOOTTIME", None)
-    return 0.0 if clock is None else time.clock_gettime(clock) - time.monotonic()
 
 
 class LineWatch:

@@ -36,7 +36,7 @@ import numpy as np
 from rig.command_run import run_safely
 from rig.config.axis import Axis
 from rig.core import device as devices
-from rig.core import motion, stop
+from rig.core import heartbeat, motion, stop
 from rig.core.session import visit
 from rig.drives import bus, make_drives
 from rig.drives.wire import Wire, crc16
@@ -134,7 +134,7 @@ class World:
         self.faults: list[str] = []  # that happened, for the one who looks
         self.broken: list[str] = []  # promises; a session takes what is raised in it
         self.dead = self.disk_full = self.asleep = False
-        self.hearts: list[devices.Heartbeat] = []
+        self.hearts: list[heartbeat.Heartbeat] = []
         self.run: harness.Run | None = None
         self.stopped: dict[int, float] = {}  # unit: when its stop was answered
         self._beats = self._beating = False  # whether the line is free for the heart
@@ -505,7 +505,7 @@ def played_in(world: World):
             (stop, "stand_s", stand_s),
             (motion, "TOO_FAST", too_fast),
             (devices, "PATIENCE_S", 60.0),
-            (devices.Heartbeat, "start", lambda heart: world.hearts.append(heart)),
+            (heartbeat.Heartbeat, "start", lambda heart: world.hearts.append(heart)),
         ):
             stack.enter_context(mock.patch.object(place, name, value))
         write = run_folder.Journal.write

@@ -9,6 +9,7 @@ from harness import HASTY, changed, fast_config
 from test_rig_motion import bench, other_controller
 
 from rig.core import device as devices
+from rig.core import heartbeat
 from rig.core import motion as moving
 from rig.drives.drive import Status
 from rig.faults import MotionFault, PauseRequested
@@ -54,7 +55,7 @@ def test_a_drive_that_moves_while_the_stream_pauses_is_a_fault():
 @pytest.mark.parametrize("moves", [True, False])
 def test_a_computer_that_slept_is_named(monkeypatch, moves):
     ahead = [3.0]
-    monkeypatch.setattr(devices, "clock_ahead_s", lambda: ahead[0])
+    monkeypatch.setattr(heartbeat, "clock_ahead_s", lambda: ahead[0])
     told_events = []
     with bench(arm=False) as motion:
         motion.device.stopper._emit = lambda event, **f: told_events.append(f)

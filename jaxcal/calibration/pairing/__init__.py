@@ -2,11 +2,11 @@
 
 from jaxcal.calibration.pairing.judge import (
     Mispairing,
-    against,
     mispairing,
     of_new_readings,
     of_unfitted,
 )
+from jaxcal.calibration.pairing.verdict import against
 
 __all__ = [
     "Mispairing",

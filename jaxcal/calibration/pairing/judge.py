@@ -17,16 +17,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.pairing.columns import changed_columns, places
 from jaxcal.calibration.pairing.fit import (
     Fitted,
     fits_of,
     fitted,
-    predicted,
     top,
 )
-from jaxcal.calibration.pairing.orders import exchanged, polished, sorted_alone
-from jaxcal.calibration.pairing.search import ranked
 from jaxcal.calibration.pairing.table import (
     FOREIGN,
     ColumnChange,
@@ -35,29 +31,17 @@ from jaxcal.calibration.pairing.table import (
     as_it_is,
     path_match,
 )
-from jaxcal.calibration.pairing.words import sentence, what_is_wrong
-from jaxcal.checks import Array, in_words
+from jaxcal.checks import Array
 from jaxcal.models.model import Model
-from jaxcal.models.reasons import Reason, in_rows
 from jaxcal.models.uncertainty import Prior
-from jaxcal.models.verdict import Verdict
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.calibration import Calibration
     from jaxcal.calibration.fit import Fit
-
-__all__ = [
-    "Mispairing",
-    "against",
-    "mispairing",
-    "of_new_readings",
-    "of_unfitted",
-]
 
 Rows = NDArray[np.intp]
 
 _SURE = 8.0  # log of the odds at which a mispairing is said
-_RATIO = 2.0  # times the noise without it, least squares of the table as it stands
+RATIO = 2.0  # times the noise without it, least squares of the table as it stands
 _AS_GOOD = 3.0  # log of the odds within which another kind is named too
 _TRIED = 6  # hypotheses that are fitted one by one
 _WORTH = 12.0  # log of the odds: of those that are so much worse at first, none
@@ -65,13 +49,11 @@ _EXACT = 1e-6  # of the spread: readings so near a fit have nothing to explain
 _NEXT, _LARGE = 8.0, 3.0  # times the residuals: neighbours, a row
 _USUAL = 2.0  # times the usual noise of a sensor
 _TREND = 1.4  # of a sum of residuals, over the root of their squares
-_LEAST, _MANY, _SAMPLE = 6, 500, 5000  # rows
+LEAST, _MANY = 6, 500  # rows
 _NAMED = 2  # other explanations
 _READINGS = 1.5  # for each parameter; of fewer another machine explains as much
 _CHANCE = 0.02  # that so many outliers stand so near one another
 _APART = "apart"  # kind: outliers that are one block
-_OFF = 6.0  # times the noise of the others
-_TURNS, _FLOOR = 4, 0.01  # rounds; noises, below which a row weighs no more
 _FREQUENT = ("shift", "path")  # kinds that are named first among as good ones
 _SORTED = ("commands sorted", "readings sorted")  # kinds
 _ROWS, _RUNS = 20_000, 400  # of more the first; of a function that is run
@@ -121,53 +103,16 @@ class Mispairing:
 
 def mispairing(fit: Fit) -> Mispairing | None:
     """How the measurements of a calibration were mispaired; None: they were not."""
-    if len(fit.commands) < _LEAST or _plainly_right(fit):
+    if len(fit.commands) < LEAST or _plainly_right(fit):
         return None
     if fit.noise_known:
         lack = fit.lack_of_fit()
         if lack is None or lack > 1e-3:
             return None
-    table = _of_fit(fit)
+    table = of_fit(fit)
     if table is None:
         return None
     return _found(table, fit.input_names, fit.output_names, fit.measured_unit)
-
-
-def _hidden_outliers(fit: Fit) -> Reason | None:
-    """Rows that a fit of the others leaves far off, and least squares does not.
-
-    Where several are off, least squares meets them halfway: its noise grows until none
-    of them is an outlier. A model of which nothing is known before is asked, where
-    drift and curves explain the rows no better.
-    """
-    if len(fit.commands) < _LEAST or not _uneven(fit):
-        return None
-    table = _of_fit(fit)
-    if table is None or table.precision[table.free].any():
-        return None
-    plain, stated = fitted(table, as_it_is(table)), np.asarray(fit.noise_std)
-    rows = np.flatnonzero(~plain.inside & table.counted)
-    if not len(rows) or {*rows} == {*fit.outliers} or not _better(plain, plain):
-        return None
-    spread = (table.measured / table.scale)[plain.inside].std(axis=0)
-    if (plain.noise > 0.5 * spread)[plain.rms > _RATIO * plain.noise].any():
-        return None  # the others are not explained: a search on a plateau
-    if fit.noise_known and (plain.noise * table.scale > _RATIO * stated).any():
-        return None  # what was stated is too small for the others too
-    readings = (table.measured / table.scale)[rows]
-    away = np.abs(readings - predicted(table, plain)[rows]) / plain.noise
-    least = float(away.max(axis=1).min())
-    benign = max(other.evidence for other in _benign(table, plain, plain))
-    if least < _OFF or benign > plain.evidence:
-        return None
-    named = in_rows([*map(int, rows)])
-    verb = "are outliers" if len(rows) > 1 else "is an outlier"
-    noise = f"{in_words(plain.noise * table.scale)} {fit.measured_unit}".strip()
-    return Reason(
-        f"{named.capitalize()} {verb}, over {least:.2g} times the noise of the "
-        f"others, which is {noise} without them.",
-        f"repeat {named} (counted from 0), or leave out",
-    )
 
 
 def of_unfitted(
@@ -203,39 +148,7 @@ def of_new_readings(fit: Fit, commands: Array, measured: Array) -> Mispairing | 
     return _found(table, fit.input_names, fit.output_names, fit.measured_unit)
 
 
-def against(verdict: Verdict, fit: Calibration) -> Verdict:
-    """The verdict, which no calibration passes of a mispaired table or hidden outliers.
-
-    Args:
-        verdict: of the fit by itself.
-        fit: the calibration.
-    """
-    pairing = fit.mispairing
-    if pairing is None:
-        hidden = _hidden_outliers(fit)
-        if hidden is None:
-            return verdict
-        of_those = ("outlier", "The noise you gave")  # they follow from these rows
-        others = (
-            text for text in verdict.reasons if not any(x in text for x in of_those)
-        )
-        return dataclasses.replace(
-            verdict,
-            good=False,
-            reasons=(hidden.fact, *others),
-            next_step=hidden.remedy,
-        )
-    what = "columns" if pairing.kind == "columns" else "table"
-    step = f"correct the {what}, then identify again"
-    if pairing.alternatives:
-        step = f"find out which it is, {step}"
-    elif pairing.mendable and pairing.kind != "columns":
-        step += " (jaxcal identify --repair FILE writes the corrected table)"
-    reasons = (pairing.reason, *verdict.reasons)
-    return dataclasses.replace(verdict, good=False, reasons=reasons, next_step=step)
-
-
-def _of_fit(fit: Fit) -> Table | None:
+def of_fit(fit: Fit) -> Table | None:
     """The table of a fit, linearised there."""
     prior = fit.stated_prior or fit.model.default_prior()
     measured = fit.residuals + fit.predict(fit.commands)
@@ -244,34 +157,6 @@ def _of_fit(fit: Fit) -> Table | None:
     if table is None:
         return None
     return dataclasses.replace(table, theta=np.asarray(fit.parameters))
-
-
-def _uneven(fit: Fit) -> bool:
-    """Whether least absolute residuals would leave rows far off.
-
-    To first order, by a few rounds of least squares whose weights fall with distance.
-    """
-    from scipy.linalg.lapack import dposv
-
-    noise = fit.noise_std
-    if noise is None or not noise.all() or fit.prior_precision.any():
-        return False
-    # Few rows of very many hide in no noise.
-    sample = slice(None, None, max(len(fit.commands) // _SAMPLE, 1))
-    slopes = fit.linear(fit.commands[sample], misfit=False)[0] / noise[:, None]
-    shape = fit.residuals[sample].shape
-    first = off = (fit.residuals[sample] / noise).ravel()
-    flat = slopes.reshape(len(first), -1)
-    flat = flat / ((flat**2).sum(axis=0) ** 0.5 + 1e-300)
-    for _ in range(_TURNS):
-        away = (off.reshape(shape) ** 2).sum(axis=1) ** 0.5
-        weighted = flat.T * (1.0 / (away + _FLOOR)).repeat(shape[1])
-        step, undetermined = dposv(weighted @ flat, weighted @ first)[1:]
-        if undetermined:
-            return False
-        off = first - flat @ step
-    away = (off.reshape(shape) ** 2).sum(axis=1) ** 0.5
-    return bool(away.max() > _OFF * np.median(away))
 
 
 def _table(
@@ -300,7 +185,7 @@ def _table(
     counted = counted & np.isin(np.arange(len(rows)), first)
     readings = counted.sum() * measured.shape[1]
     few = not model.linear and readings < _READINGS * free.sum()
-    if counted.sum() < _LEAST or few:
+    if counted.sum() < LEAST or few:
         return None
     if shared:
         commands = commands - commands.mean(axis=0)
@@ -328,6 +213,11 @@ def _found(
     unit: str,
 ) -> Mispairing | None:
     """The mispairing of a table."""
+    # Loaded, here and below, only where a table is in doubt.
+    from jaxcal.calibration.pairing.columns import changed_columns
+    from jaxcal.calibration.pairing.orders import polished
+    from jaxcal.calibration.pairing.words import sentence, what_is_wrong
+
     plain = fitted(table, as_it_is(table))
     if (plain.rms <= _EXACT * table.width).all():
         return None
@@ -342,14 +232,14 @@ def _found(
     best = max(fits, key=lambda fit: fit.evidence)
     if best.evidence - plain.evidence <= _SURE:
         best = next((fit for fit in fits if fit.hypothesis.kind == _APART), best)
-    if not _better(plain, best):
+    if not better(plain, best):
         return None
     if best.hypothesis.kind != _APART:
-        for benign in _benign(table, plain, best):
+        for benign in benign_fits(table, plain, best):
             if best.evidence - benign.evidence < _SURE:
                 return None
             by_itself = benign is not plain and not benign.hypothesis.code
-            if by_itself and not _better(benign, best):
+            if by_itself and not better(benign, best):
                 return None
     near: dict[int, list[int]] = {}
     if best.hypothesis.kind == "path":
@@ -500,9 +390,9 @@ def _apart(table: Table, plain: Fitted) -> list[Fitted]:
     return []
 
 
-def _better(fit: Fitted, best: Fitted) -> bool:
+def better(fit: Fitted, best: Fitted) -> bool:
     """Whether an output's residuals are far larger than the noise of the best."""
-    return bool((fit.rms > _RATIO * best.noise).any())
+    return bool((fit.rms > RATIO * best.noise).any())
 
 
 def _explains(plain: Fitted, fit: Fitted) -> bool:
@@ -513,6 +403,10 @@ def _explains(plain: Fitted, fit: Fitted) -> bool:
 
 def _alternatives(table: Table, plain: Fitted) -> list[Fitted]:
     """Other pairings of rows, fitted."""
+    from jaxcal.calibration.pairing.columns import places
+    from jaxcal.calibration.pairing.orders import exchanged, polished, sorted_alone
+    from jaxcal.calibration.pairing.search import ranked
+
     tables = [table]
     if not (table.shared or table.model.linear) and table.free.any():
         at_fit = dataclasses.replace(table, theta=plain.theta)
@@ -536,7 +430,7 @@ def _alternatives(table: Table, plain: Fitted) -> list[Fitted]:
     return fits
 
 
-def _benign(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
+def benign_fits(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
     """The table as it is, with what machines do: drift, curves, another machine."""
     count = len(table.commands)
     time = np.linspace(-1.0, 1.0, count)[:, None]

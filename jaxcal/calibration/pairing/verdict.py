@@ -1,0 +1,126 @@
+"""What a mispaired table, or outliers that hide in its noise, do to a verdict."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxcal.calibration.pairing.fit import fitted, predicted
+from jaxcal.calibration.pairing.judge import (
+    LEAST,
+    RATIO,
+    benign_fits,
+    better,
+    of_fit,
+)
+from jaxcal.calibration.pairing.table import as_it_is
+from jaxcal.checks import in_words
+from jaxcal.models.reasons import Reason, in_rows
+from jaxcal.models.verdict import Verdict
+
+if TYPE_CHECKING:
+    from jaxcal.calibration.calibration import Calibration
+    from jaxcal.calibration.fit import Fit
+
+_OFF = 6.0  # times the noise of the others
+_TURNS, _FLOOR = 4, 0.01  # rounds; noises, below which a row weighs no more
+_SAMPLE = 5000  # rows
+
+
+def against(verdict: Verdict, fit: Calibration) -> Verdict:
+    """The verdict, which no calibration passes of a mispaired table or hidden outliers.
+
+    Args:
+        verdict: of the fit by itself.
+        fit: the calibration.
+    """
+    pairing = fit.mispairing
+    if pairing is None:
+        hidden = _hidden_outliers(fit)
+        if hidden is None:
+            return verdict
+        of_those = ("outlier", "The noise you gave")  # they follow from these rows
+        others = (
+            text for text in verdict.reasons if not any(x in text for x in of_those)
+        )
+        return dataclasses.replace(
+            verdict,
+            good=False,
+            reasons=(hidden.fact, *others),
+            next_step=hidden.remedy,
+        )
+    what = "columns" if pairing.kind == "columns" else "table"
+    step = f"correct the {what}, then identify again"
+    if pairing.alternatives:
+        step = f"find out which it is, {step}"
+    elif pairing.mendable and pairing.kind != "columns":
+        step += " (jaxcal identify --repair FILE writes the corrected table)"
+    reasons = (pairing.reason, *verdict.reasons)
+    return dataclasses.replace(verdict, good=False, reasons=reasons, next_step=step)
+
+
+def _hidden_outliers(fit: Fit) -> Reason | None:
+    """Rows that a fit of the others leaves far off, and least squares does not.
+
+    Where several are off, least squares meets them halfway: its noise grows until none
+    of them is an outlier. A model of which nothing is known before is asked, where
+    drift and curves explain the rows no better.
+    """
+    if len(fit.commands) < LEAST or not _uneven(fit):
+        return None
+    table = of_fit(fit)
+    if table is None or table.precision[table.free].any():
+        return None
+    plain, stated = fitted(table, as_it_is(table)), np.asarray(fit.noise_std)
+    rows = np.flatnonzero(~plain.inside & table.counted)
+    if not len(rows) or {*rows} == {*fit.outliers} or not better(plain, plain):
+        return None
+    spread = (table.measured / table.scale)[plain.inside].std(axis=0)
+    if (plain.noise > 0.5 * spread)[plain.rms > RATIO * plain.noise].any():
+        return None  # the others are not explained: a search on a plateau
+    if fit.noise_known and (plain.noise * table.scale > RATIO * stated).any():
+        return None  # what was stated is too small for the others too
+    readings = (table.measured / table.scale)[rows]
+    away = np.abs(readings - predicted(table, plain)[rows]) / plain.noise
+    least = float(away.max(axis=1).min())
+    benign = max(other.evidence for other in benign_fits(table, plain, plain))
+    if least < _OFF or benign > plain.evidence:
+        return None
+    named = in_rows([*map(int, rows)])
+    verb = "are outliers" if len(rows) > 1 else "is an outlier"
+    noise = f"{in_words(plain.noise * table.scale)} {fit.measured_unit}".strip()
+    return Reason(
+        f"{named.capitalize()} {verb}, over {least:.2g} times the noise of the "
+        f"others, which is {noise} without them.",
+        f"repeat {named} (counted from 0), or leave out",
+    )
+
+
+def _uneven(fit: Fit) -> bool:
+    """Whether least absolute residuals would leave rows far off.
+
+    To first order, by a few rounds of least squares whose weights fall with distance.
+    """
+    from scipy.linalg.lapack import dposv
+
+    noise = fit.noise_std
+    if noise is None or not noise.all() or fit.prior_precision.any():
+        return False
+    # Few rows of very many hide in no noise.
+    sample = slice(None, None, max(len(fit.commands) // _SAMPLE, 1))
+    slopes = fit.linear(fit.commands[sample], misfit=False)[0] / noise[:, None]
+    shape = fit.residuals[sample].shape
+    first = off = (fit.residuals[sample] / noise).ravel()
+    flat = slopes.reshape(len(first), -1)
+    flat = flat / ((flat**2).sum(axis=0) ** 0.5 + 1e-300)
+    for _ in range(_TURNS):
+        away = (off.reshape(shape) ** 2).sum(axis=1) ** 0.5
+        weighted = flat.T * (1.0 / (away + _FLOOR)).repeat(shape[1])
+        step, undetermined = dposv(weighted @ flat, weighted @ first)[1:]
+        if undetermined:
+            return False
+        off = first - flat @ step
+    away = (off.reshape(shape) ** 2).sum(axis=1) ** 0.5
+    return bool(away.max() > _OFF * np.median(away))
