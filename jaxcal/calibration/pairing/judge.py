@@ -213,14 +213,12 @@ def _found(
     unit: str,
 ) -> Mispairing | None:
     """The mispairing of a table."""
-    # Loaded, here and below, only where a table is in doubt.
-    from jaxcal.calibration.pairing.columns import changed_columns
-    from jaxcal.calibration.pairing.orders import polished
-    from jaxcal.calibration.pairing.words import sentence, what_is_wrong
-
     plain = fitted(table, as_it_is(table))
     if (plain.rms <= _EXACT * table.width).all():
         return None
+    # Loaded, here and below, only where a table is in doubt.
+    from jaxcal.calibration.pairing.columns import changed_columns
+
     fits = _alternatives(table, plain)
     if not any(_explains(plain, fit) for fit in fits):
         fits += changed_columns(table, plain, inputs, outputs)
@@ -241,6 +239,9 @@ def _found(
             by_itself = benign is not plain and not benign.hypothesis.code
             if by_itself and not better(benign, best):
                 return None
+    from jaxcal.calibration.pairing.orders import polished
+    from jaxcal.calibration.pairing.words import sentence, what_is_wrong
+
     near: dict[int, list[int]] = {}
     if best.hypothesis.kind == "path":
         with contextlib.suppress(ValueError):
