@@ -38,6 +38,7 @@ _CLEAR = 1e6  # share of its digits that a column may lose by centring
 _FAR = 1e5  # times the distance of neighbours: such a row hides what these differ by
 _SOME = 256  # candidates, or a few less, of which neighbours are looked at
 _UNTHREADED = 240_000  # multiplications up to which BLAS starts no threads
+_ROWS = 200  # of fewer a product takes less time than its sum
 
 
 class _CentredBlocks(NamedTuple):
@@ -169,7 +170,7 @@ def gram(rows: Array) -> Array:
     if rows.size * rows.shape[-1] <= _UNTHREADED:
         return np.asarray(rows.mT @ rows)
     if rows.ndim == 2:  # each product symmetric, which takes half of the operations
-        part = max(1, _UNTHREADED // rows.shape[1] ** 2)
+        part = max(_ROWS, _UNTHREADED // rows.shape[1] ** 2)
         square = rows[:part].T @ rows[:part]
         for first in range(part, len(rows), part):
             some = rows[first : first + part]

@@ -18,6 +18,7 @@ _RARE = float(np.log(20.0))  # an outlier
 _TOO_LARGE = 3.0  # times: no caution makes a stated noise that much larger
 _SIZES = 10.0  # of a parameter: known no better, it is not known
 _STEP = 0.1  # standard errors, by which another step would move the parameters
+_BENT, _SAMPLE = 2.0, 2000  # times the noise without squares; rows
 _EXACT = 1e-12  # of the largest reading: rounding, and no noise of a sensor
 _UNITS = np.outer([1.0, -1.0], [1.0, np.pi / 180.0, 180.0 / np.pi, 1e3, 1e-3]).ravel()
 _NAMED, _DIGITS = 6, 7  # rows in one sentence; decimals of a table
@@ -264,6 +265,52 @@ def _likelier_than_outliers(fit: Fit, distance: Array) -> bool:
     # Without an outlier the sum of squares is less by its distance.
     rest = max(fit.square - distance.sum(), 0.0)
     return bool(scale > -0.5 * rest - of_rows.sum())
+
+
+def bends(fit: Fit) -> Reason | None:
+    """Residuals that follow squares and products of the commands.
+
+    By an F test of these terms beside the model's own, to first order, where the noise
+    without them is at most half.
+    """
+    (count, n), m = fit.commands.shape, fit.measured.shape[1]
+    if count <= n * (n + 3):  # twice these terms
+        return None
+    from scipy import special
+
+    noise = np.asarray(fit.noise_std)  # 0-d of none
+    if noise.ndim == 0 or not noise.all() or fit.prior_precision.any():
+        return None
+    sample = slice(None, None, max(count // _SAMPLE, 1))
+    commands = fit.commands[sample]
+    i, j = np.triu_indices(n)
+    unit = commands - commands.mean(axis=0)
+    unit /= np.fmax(np.abs(unit).max(axis=0), 1e-300)
+    terms = np.hstack([unit, unit[:, i] * unit[:, j]])
+    root = np.outer(fit.loss_weights[sample] ** 0.5, 1.0 / noise).ravel()
+    white = root * fit.residuals[sample].ravel()
+    slopes = fit.linear(commands, misfit=False)[0].reshape(len(white), -1)
+    both = np.hstack([slopes, np.kron(terms, np.eye(m))])
+
+    def unexplained(columns: Array) -> tuple[float, int]:
+        step, _, rank, _ = np.linalg.lstsq(root[:, None] * columns, white, rcond=1e-9)
+        off = white - root * (columns @ step)
+        return max(float(off @ off), 1e-300), len(white) - int(rank)
+
+    (before, more), (after, rest) = unexplained(slopes), unexplained(both)
+    if rest < 1 or more == rest or _BENT**2 * after / rest > before / more:
+        return None
+    ratio = (before - after) / (more - rest) / (after / rest)
+    if special.fdtrc(more - rest, rest, ratio) > UNLIKELY:
+        return None
+    of_unit = f" {fit.measured_unit}".rstrip()
+    return Reason(
+        f"Residuals follow a curve: of a noise of {_each(noise)}{of_unit}, squares and "
+        f"products of the commands would leave {_each(noise * (after / rest) ** 0.5)}"
+        f"{of_unit}.",
+        "identify with a model that has these terms (Polynomial or another), or "
+        "measure over a smaller range",
+    )
 
 
 def outlying(fit: Fit, rows: Sequence[int]) -> Reason | None:

@@ -559,3 +559,20 @@ def test_contacts_of_a_reversed_joint_name_it():
     joints[:, 3] *= -1.0  # out of its limits, and all within them with the other sign
     with pytest.raises(ValueError, match="panda_joint4 seems reversed: with the other"):
         _fit("panda_1", joints, PLACE[1])
+
+
+def test_a_straight_line_through_a_curve_is_told(rng):
+    told = 0
+    for _ in range(20):
+        u = rng.uniform(0.1, 3.0, (20, 1))
+        y = np.sqrt(u) + 0.002 * rng.standard_normal(u.shape)
+        bent = jaxcal.identify(u, y).verdict
+        quadratic = jaxcal.identify(u, y, model=jaxcal.models.Polynomial(3, 1)).verdict
+        told += "Residuals follow a curve" in str(bent) and not bent.good
+        assert "curve" not in str(quadratic)
+    assert told >= 19
+    for count in range(300):
+        n, m = rng.integers(1, 4, 2)
+        u = rng.uniform(-20.0, 20.0, (int(rng.integers(8, 60)), n))
+        y = u @ rng.normal(size=(n, m)) + 0.05 * rng.standard_t(5, (len(u), m))
+        assert "curve" not in str(jaxcal.identify(u, y).verdict), count

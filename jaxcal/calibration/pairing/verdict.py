@@ -17,7 +17,7 @@ from jaxcal.calibration.pairing.judge import (
 )
 from jaxcal.calibration.pairing.table import as_it_is
 from jaxcal.checks import in_words
-from jaxcal.models.reasons import Reason, in_rows
+from jaxcal.models.reasons import Reason, bends, in_rows
 from jaxcal.models.verdict import Verdict
 
 if TYPE_CHECKING:
@@ -38,18 +38,18 @@ def against(verdict: Verdict, fit: Calibration) -> Verdict:
     """
     pairing = fit.mispairing
     if pairing is None:
-        hidden = _hidden_outliers(fit)
-        if hidden is None:
-            return verdict
-        of_those = ("outlier", "The noise you gave")  # they follow from these rows
-        others = (
-            text for text in verdict.reasons if not any(x in text for x in of_those)
+        follow = ("outlier", "The noise you gave")  # from these rows, or the curve
+        others = tuple(
+            text for text in verdict.reasons if not any(x in text for x in follow)
         )
+        reason = _hidden_outliers(fit) or (None if others else bends(fit))
+        if reason is None:
+            return verdict
         return dataclasses.replace(
             verdict,
             good=False,
-            reasons=(hidden.fact, *others),
-            next_step=hidden.remedy,
+            reasons=(reason.fact, *others),
+            next_step=reason.remedy,
         )
     what = "columns" if pairing.kind == "columns" else "table"
     step = f"correct the {what}, then identify again"
