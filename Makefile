@@ -58,8 +58,8 @@ reproduce: $(READY) ## the paper's figures, tables and claims from our own runs,
 test: export PYTHONDONTWRITEBYTECODE =
 # The rig's tests mostly wait for a device and import no JAX: three processes of them run
 # beside the linters and two processes of the others, which compile and give way: a device
-# that is silent for a tenth of a second is a fault, so what failed there is run once more,
-# alone, and both are shown. Files stay in order:
+# that is silent for a tenth of a second is a fault. Nothing that failed is run again. Files
+# stay in order:
 # xdist would put the files of few long tests last. Each process would compile everything
 # that the tests import: one does it before, while mypy runs.
 QUICK_TESTS = $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -m 'not slow' $(ARGS)
@@ -71,7 +71,6 @@ test: $(READY) ## set everything up, lint, and run the quick tests (the ones CI 
 	export XLA_FLAGS="$${XLA_FLAGS-$(QUICK_XLA)}"; \
 	nice $(QUICK_TESTS) -n 2 tests --ignore tests/rig; others=$$?; \
 	wait $$rig; rig=$$?; cat $(VENV)/rig-tests.log; \
-	if [ $$rig = 1 ]; then echo "== rig: what failed, alone"; $(QUICK_RIG_TESTS) -n 0 --lf; rig=$$?; fi; \
 	exit $$((rig | others))
 
 # A part is a folder of tests/, `files`, the tests beside them, or `trainings`, those of

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -220,3 +220,15 @@ def _number(argument: str, value: Any, most: float, rule: str) -> float:
     if not number or isinstance(value, bool) or not 0.0 < value <= most:
         raise ValueError(f"{argument} must be {rule}, got {value!r}")
     return float(value)
+
+
+def by_unit(
+    name: str, given: float | Mapping[str, float], units: tuple[str, ...]
+) -> dict[str, float]:
+    """Positive sizes by unit; a number alone is of the first of the units."""
+    asked = given if isinstance(given, Mapping) else {units[0]: given}
+    for unit, size in asked.items():
+        one_of(f"unit of {name}", unit, units)
+        if not array_of(name, size) > 0.0:
+            raise ValueError(f"{name} must be positive, got {size}")
+    return {unit: float(size) for unit, size in asked.items()}

@@ -24,14 +24,8 @@ from jaxcal.adaptive.session import Session
 from jaxcal.checks import Array, numbers, table
 from jaxcal.models.from_jax import FromJax
 from jaxcal.models.function import FromFunction
-from jaxcal.models.model import (
-    Model,
-    as_commands,
-    as_model,
-    by_name,
-    derivative,
-    predict,
-)
+from jaxcal.models.model import Model, as_commands, as_model, by_name
+from jaxcal.models.predictions import derivative, predict
 from jaxcal.models.uncertainty import Noise, Prior
 
 Draw = Callable[[jax.Array], jax.Array]  # p standard normal numbers -> parameters (p,)

@@ -13,7 +13,6 @@ import importlib
 from typing import Any
 
 from jaxcal.calibration.calibration import Calibration
-from jaxcal.calibration.check import Check
 from jaxcal.calibration.identify import identify
 from jaxcal.models.verdict import CalibrationWarning, Verdict
 
@@ -30,6 +29,7 @@ __all__ = [
 
 _HOME = {
     "Budget": "jaxcal.reports.budget",
+    "Check": "jaxcal.calibration.check",
     "Mispairing": "jaxcal.calibration.pairing",
     "Source": "jaxcal.reports.budget",
 }

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration import file
-from jaxcal.calibration.check import check, verification
 from jaxcal.calibration.file import save, to_dict
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.fit_model import fit_model
@@ -43,12 +42,12 @@ class Calibration(Fit):
     command_for = command_for
     inverse = late("jaxcal.calibration.of_readings:inverse")
     no_inverse = no_inverse
-    check = check
+    check = late("jaxcal.calibration.check:check")
     budget = late("jaxcal.reports.budget:budget")
     report = late("jaxcal.reports.calibration:report")
     plot = late("jaxcal.reports.shown:plot_calibration")
     _repr_html_ = late("jaxcal.reports.shown:as_html")
-    verification = verification
+    verification = late("jaxcal.calibration.check:verification")
     to_dict = to_dict
     save = save
 

@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.calibration.change_tests import ALARMS, Test, Tests
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.pairing import of_new_readings
-from jaxcal.checks import Array, array_of, one_of, whole_number
+from jaxcal.checks import Array, array_of, by_unit, whole_number
 from jaxcal.information.blocks import without
 from jaxcal.models.model import recorded
 from jaxcal.models.recording import Recording
@@ -21,12 +22,7 @@ from jaxcal.tables import say_order
 __all__ = ["Check", "check", "verification"]
 
 
-_ALARMS = 0.05  # share of false alarms
-_POWER = 0.8
-_KNOWN = 1e9  # degrees of freedom of noise that was given
 _DRIFT = 10.0  # standard deviations of the prior: no parameter drifts by more
-_RATIOS = 16  # quantiles of how far noise that was estimated is off
-_HALVINGS = 26  # of a search for the smallest change
 _MANY = 1000.0  # rows; advice to measure as many or more is not given
 _BLIND = 0.01  # of a parameter's effect, what is left of it where it cannot be seen
 _SWEEPS = 20  # of swaps, at most
@@ -146,7 +142,7 @@ def check(
     names, free = calibration.names, off.free
     signal = (off.of_level @ off.by**2).T
     slips = free & np.isin(names, calibration.model.slips) & (signal.sum(axis=1) > 0.0)
-    tests = _Tests(off.of_level.sum(axis=1), calibration, int(slips.sum()), off.least)
+    tests = Tests(off.of_level.sum(axis=1), calibration, int(slips.sum()), off.least)
     slopes_of_slips = np.linalg.norm(off.by[:, slips], axis=0)
     ways = off.by[:, slips] / slopes_of_slips  # (R, S) unit vectors
     along = ((off.by.T @ ways) ** 2).max(axis=1, initial=0.0)  # seen by the best
@@ -163,14 +159,14 @@ def check(
     # What is seen grows with the root of the rows.
     enough = len(commands) * float((size[hidden] / change[hidden]).max(initial=0)) ** 2
     slipped = ""
-    if p_slip < _ALARMS:
+    if p_slip < ALARMS:
         most = int(np.abs(changes_of_slips).argmax())
         if _explains(changes_of_slips[most], off.white, tests):
             slip = changes_of_slips[most] / slopes_of_slips[most]
             at = np.flatnonzero(slips)[most]
             unit = calibration.model.units_for("", calibration.measured_unit)[at]
             slipped = f"{names[at]} by {slip:.2g} {unit}"
-    if p_value < _ALARMS:
+    if p_value < ALARMS:
         says = "does not hold"
     else:
         says = "cannot be told" if hidden.any() or not free.any() else "holds"
@@ -194,12 +190,12 @@ def check(
     )
 
 
-def _explains(change: float, white: Array, tests: _Tests) -> bool:
+def _explains(change: float, white: Array, tests: Tests) -> bool:
     """Whether a slip that changes readings (R,) so much leaves nothing unusual."""
     if len(white) < 2:
         return False
-    others = _Test(np.array([len(white) - 1]), tests.whole.dof)
-    return others.p_value(np.array([white @ white - change**2])) >= _ALARMS
+    others = Test(np.array([len(white) - 1]), tests.whole.dof)
+    return others.p_value(np.array([white @ white - change**2])) >= ALARMS
 
 
 class _Deviations(NamedTuple):
@@ -334,18 +330,6 @@ def _postures(calibration: Fit, name: str, given: ArrayLike) -> Array:
     return rows
 
 
-def by_unit(
-    name: str, given: float | Mapping[str, float], units: tuple[str, ...]
-) -> dict[str, float]:
-    """Positive sizes by unit; a number alone is of the first of the units."""
-    asked = given if isinstance(given, Mapping) else {units[0]: given}
-    for unit, size in asked.items():
-        one_of(f"unit of {name}", unit, units)
-        if not array_of(name, size) > 0.0:
-            raise ValueError(f"{name} must be positive, got {size}")
-    return {unit: float(size) for unit, size in asked.items()}
-
-
 def _tolerances(
     calibration: Fit, where: Array, given: float | Mapping[str, float] | None
 ) -> dict[str, float]:
@@ -394,115 +378,6 @@ def _levels(calibration: Fit) -> NDArray[np.intp]:
     return np.unique(noise, return_inverse=True)[1]
 
 
-@dataclasses.dataclass(frozen=True)
-class _Test:
-    """Tests of whitened readings, one for each of G levels of noise, and their power.
-
-    Each level was estimated by itself, so each has an F test (chi-square where the
-    noise is known). The least of their p-values counts, by Sidak.
-    """
-
-    counts: NDArray[np.intp]  # (G,) readings of each level
-    dof: float  # of the noise of a level
-    least: float = 1.0  # mean square of a reading without a change; 1 in the test
-    alarms: float = _ALARMS  # share of false alarms
-
-    def p_value(self, squares: Array) -> float:
-        """Chance of sums (G,) of squared readings at least this large, unchanged."""
-        from scipy import special
-
-        of_levels = special.fdtrc(self.counts, self.dof, squares / self.counts)
-        return float(-np.expm1(len(self.counts) * special.log1p(-of_levels.min())))
-
-    def power(self, shifts: Array) -> Array:
-        """(...,) chance that changes with noncentralities (..., G) are seen.
-
-        Noise that was estimated is as uncertain here as in the test: the ratio of the
-        squared estimate to the true variance is a chi-square over its dof.
-        """
-        from scipy import special
-
-        alarms = -np.expm1(np.log1p(-self.alarms) / len(self.counts))  # of each level
-        limit = special.fdtri(self.counts, self.dof, 1.0 - alarms) / self.least
-        ratio = np.ones(1)
-        if self.dof < _KNOWN:
-            chance = (np.arange(_RATIOS) + 0.5) / _RATIOS
-            ratio = special.gammaincinv(self.dof / 2.0, chance) * 2.0 / self.dof
-        shifts = np.asarray(shifts) / self.least
-        counts, limit = (np.broadcast_to(v, shifts.shape) for v in (self.counts, limit))
-        missed = np.full(shifts.shape, 1.0 - alarms)
-        moved = (shifts > 0.0) | (self.least != 1.0)
-        of_ratios = special.chndtr(
-            (limit * counts)[moved, None] * ratio,
-            counts[moved, None],
-            shifts[moved, None] * ratio,
-        )
-        missed[moved] = np.nan_to_num(of_ratios, nan=0.0).mean(axis=-1)  # too large
-        return np.asarray(1.0 - missed.prod(axis=-1))
-
-    def smallest(self, seen: Array) -> Array:
-        """(p,) changes that are seen with the power asked for, infinite where none is.
-
-        ``seen`` are noncentralities (p, G) of a change by one.
-        """
-        total = seen.sum(axis=1, keepdims=True)
-        shares = np.divide(seen, total, out=np.ones_like(seen), where=total > 0.0)
-        shares, of_share = np.unique(shares.round(12), axis=0, return_inverse=True)
-        low, high = np.zeros((2, len(shares), 1))
-        high += 1.0
-        while True:
-            short = (self.power(high * shares) < _POWER)[:, None] & (high < 1e12)
-            if not short.any():
-                break
-            low, high = np.where(short, high, low), np.where(short, 4.0 * high, high)
-        for _ in range(_HALVINGS):
-            middle = 0.5 * (low + high)
-            short = (self.power(middle * shares) < _POWER)[:, None]
-            low, high = np.where(short, middle, low), np.where(short, high, middle)
-        with np.errstate(divide="ignore"):
-            return np.asarray(np.sqrt(high[of_share.ravel()] / total)[:, 0])
-
-
-class _Tests:
-    """A test of all readings, and one of each slip, the largest of which counts.
-
-    Each kind has half of the false alarms; where nothing slips, one has all.
-    """
-
-    def __init__(
-        self, counts: NDArray[np.intp], calibration: Fit, slips: int, least: float = 1.0
-    ) -> None:
-        half = -np.expm1(np.log1p(-_ALARMS) / 2.0)
-        dof, one = calibration.noise_dof or _KNOWN, np.ones(1, dtype=np.intp)
-        of_each = -np.expm1(np.log1p(-half) / max(1, slips))
-        self.whole = _Test(counts, dof, least, half if slips else _ALARMS)
-        self.slip = _Test(one, dof, least, of_each)
-        self.count = slips
-
-    def p_values(self, squares: Array, of_slips: Array) -> tuple[float, float]:
-        """Chances of both kinds and of slips alone, by sums (G,), squares (S,)."""
-        whole = self.whole.p_value(squares)
-        if not self.count:
-            return whole, 1.0
-        of_one = self.slip.p_value(of_slips.max(keepdims=True))
-        of_any = 1.0 - (1.0 - of_one) ** self.count
-        return 1.0 - (1.0 - min(whole, of_any)) ** 2, 1.0 - (1.0 - of_any) ** 2
-
-    def power(self, shifts: Array, along: Array) -> Array:
-        """(...,) at least, of noncentralities (..., G) in all, (...,) along a slip."""
-        whole = self.whole.power(shifts)
-        if not self.count:
-            return whole
-        return np.maximum(whole, self.slip.power(along[..., None]))
-
-    def smallest(self, seen: Array, along: Array) -> Array:
-        """(p,) changes that are seen with the power asked for, by either."""
-        whole = self.whole.smallest(seen)
-        if not self.count:
-            return whole
-        return np.minimum(whole, self.slip.smallest(along[:, None]))
-
-
 def verification(
     calibration: Fit,
     candidates: ArrayLike,
@@ -545,7 +420,7 @@ def verification(
     def value(rows: list[int]) -> Array:
         """(M,) of the rows and each candidate."""
         shift = shifts[rows].sum(axis=0) + shifts
-        tests = _Tests(counts * (len(rows) + 1), calibration, int(slips.sum()))
+        tests = Tests(counts * (len(rows) + 1), calibration, int(slips.sum()))
         return np.asarray(tests.power(shift, slips * shift.sum(axis=-1)).mean(axis=-1))
 
     return np.array(_best_rows(value, k))

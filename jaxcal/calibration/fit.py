@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import Array, array_of, numbers
 from jaxcal.information.singular import depends
 from jaxcal.models.identifiability import Identifiability, identifiability
-from jaxcal.models.model import Model, derivative, predict
+from jaxcal.models.model import Model
+from jaxcal.models.predictions import derivative, predict
 from jaxcal.models.uncertainty import Prior
 from jaxcal.tables import COMMANDS, MEASURED, of_frame
 

@@ -17,7 +17,7 @@ from jaxcal.calibration.least_squares import (
     solve,
 )
 from jaxcal.calibration.losses import LOSSES, Loss, constants
-from jaxcal.calibration.noise_levels import are_shared, pooled
+from jaxcal.calibration.noise_levels import are_shared, levels_differ, pooled
 from jaxcal.calibration.prior_scales import (
     PriorScales,
     covariance_of_scales,
@@ -32,8 +32,15 @@ from jaxcal.information.singular import (
     significant,
 )
 from jaxcal.models.identifiability import unknown
-from jaxcal.models.model import Model, as_model, derivative
-from jaxcal.models.uncertainty import Noise, Prior
+from jaxcal.models.model import Model, as_model
+from jaxcal.models.predictions import derivative
+from jaxcal.models.uncertainty import (
+    Noise,
+    Prior,
+    command_noise,
+    reading_noise,
+    with_play,
+)
 
 __all__ = ["fit_model", "require_fitting"]
 
@@ -86,11 +93,11 @@ def fit_model(
     require_kind("prior", prior, Prior)
     weights, used = _distinct_weights(model, commands, measured, weights)
     noise = noise or Noise()
-    spread = _command_noise(noise, commands, measured.shape[1])
+    spread = command_noise(noise, commands, measured.shape[1])
     exact = not spread.any()
     model = model.prepared(commands[used], measured[used])
     if not exact and model.error_groups() is not None:
-        noise, exact = _with_play(model, noise, commands, spread), True
+        noise, exact = with_play(model, noise, commands, spread), True
         spread = np.zeros_like(spread)
     with_misfit = model.with_misfit() if prior is None and exact else model
     fitted = with_misfit if model.fits_misfit else model
@@ -158,9 +165,7 @@ def _problem(
     centre, to_centred = None, None
     if exact and resolved.free.all() and not resolved.precisions.any():
         centre, to_centred = _centre(model, commands[used], weights[used], excited)
-    white, reading_std, levels = _reading_noise(
-        model, noise, weights, measured.shape[1]
-    )
+    white, reading_std, levels = reading_noise(model, noise, weights, measured.shape[1])
     if not (common_noise is None or isinstance(common_noise, bool)):
         levels = np.unique(np.asarray(common_noise), return_inverse=True)[1]
     elif common_noise or not exact:
@@ -240,7 +245,7 @@ def _with_levels_apart(
     problem: FitProblem, solution: FitSolution
 ) -> tuple[FitProblem, FitSolution]:
     """The fit with a level of noise for each output where the residuals ask for it."""
-    if _levels_differ(problem, solution):
+    if levels_differ(problem, solution):
         levels = np.arange(len(problem.levels))
         apart = dataclasses.replace(problem, levels=levels)
         other = solve(apart, solution)
@@ -282,104 +287,6 @@ def _centre(
             require_excited(commands, excited)
         return None, None
     return centre, to_centred
-
-
-def _reading_noise(
-    model: Model, noise: Noise, weights: Array, q: int
-) -> tuple[Array, Array, NDArray[np.intp]]:
-    """The noise of the readings.
-
-    Returns:
-        Whitening (N, q, q) at these weights, or its diagonal (N, q) of independent
-        readings; standard deviations (N, q) at weight 1; and (q,) which outputs share a
-        level, from 0.
-    """
-    count, levels = len(weights), np.arange(q)
-    if noise.covariance is None:
-        std = noise.reading_std(count, q)
-        white = 1.0 / std
-    else:
-        white = Noise(covariance=noise.covariance).whitening(count, q)
-        std = np.sqrt((np.linalg.inv(white) ** 2).sum(axis=2))
-    usual = model.default_noise()
-    if usual is not None and noise.std is None and noise.covariance is None:
-        usual_std = np.broadcast_to(np.asarray(usual.std), (q,))
-        white = white / usual_std
-        std = std * usual_std
-        levels = np.unique(usual_std, return_inverse=True)[1]  # positions and turns
-    root = np.sqrt(weights)[:, None]
-    return white * (root if white.ndim == 2 else root[..., None]), std, levels
-
-
-def _command_noise(noise: Noise, commands: Array, q: int) -> Array:
-    """(N, n) command_std, zero where it is not given."""
-    spread = noise.of_commands(*commands.shape)
-    unknown = int(np.isinf(spread[0]).sum())
-    if unknown and unknown >= q:
-        raise ValueError(
-            f"command_std must leave fewer unknown commands than the {q} readings of a "
-            f"measurement, got {unknown}"
-        )
-    return spread
-
-
-def _with_play(model: Model, noise: Noise, commands: Array, spread: Array) -> Noise:
-    """The noise of an arm's readings, that of its joints in it, to first order.
-
-    Joints are off by little, and by their own unknowns the arm's errors could not be
-    sized from the readings.
-    """
-    if not np.isfinite(spread).all():
-        raise ValueError("command_std of an arm must be finite")
-    slopes = model.command_jacobian(commands) * spread[:, None]
-    plain = Noise(std=noise.std, covariance=noise.covariance)
-    root = np.linalg.inv(plain.whitening(len(commands), model.num_outputs))
-    covariance = root @ np.matrix_transpose(root)
-    return Noise(covariance=covariance + slopes @ np.matrix_transpose(slopes))
-
-
-def _levels_differ(problem: FitProblem, solution: FitSolution) -> bool:
-    """Whether levels that are shared contradict the residuals (F test, 0.1 %).
-
-    Those without what is known besides: a wrong distance of two sockets is no noise
-    along it.
-    """
-    q = len(solution.freedom)
-    if (
-        problem.noise_known
-        or q == 1
-        or solution.freedom.min() < 1.0
-        or problem.command_std.any()
-    ):
-        return False
-    from scipy import special
-
-    white = solution.white / solution.level - _by_facts(problem, solution)
-    variance = solution.weights @ white**2 / solution.freedom
-    high, low = int(variance.argmax()), int(variance.argmin())
-    ratio = variance[high] / max(variance[low], np.finfo(np.float64).tiny)
-    chance = special.fdtrc(solution.freedom[high], solution.freedom[low], ratio)
-    return bool(chance * q * (q - 1) < 1e-3)
-
-
-def _by_facts(problem: FitProblem, solution: FitSolution) -> Array:
-    """(N, q) how far residuals are off by facts (``Model.facts``), in their noise."""
-    off, _ = problem.model.facts(solution.parameters)
-    if not len(off):
-        return np.zeros_like(solution.white)
-    slopes = solution.by_theta / solution.level[:, None]
-    prior = np.sqrt(problem.precision[problem.free])
-    root = np.sqrt(solution.weights)[:, None]
-    rows = np.concatenate(
-        [(root[..., None] * slopes).reshape(-1, len(prior)), np.diag(prior)]
-    )
-    right = np.append(
-        root * solution.white / solution.level,
-        prior * (problem.mean - solution.parameters)[problem.free],
-    )
-    size = np.linalg.norm(rows, axis=0) + 1e-300
-    step = np.linalg.lstsq(rows / size, right, rcond=1e-10)[0] / size
-    return np.asarray(slopes @ step)
 
 
 def _misfit(

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxcal.calibration.calibration import Calibration
-from jaxcal.calibration.check import by_unit
 from jaxcal.calibration.fit_model import fit_model, require_fitting
 from jaxcal.calibration.pairing import of_unfitted
 from jaxcal.checks import (
     Array,
     array_of,
     axis_names,
+    by_unit,
     levels,
     require_none,
     require_size,

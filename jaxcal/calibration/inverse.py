@@ -17,7 +17,7 @@ from jaxcal.information.singular import (
     significant,
 )
 from jaxcal.models.identifiability import unknown
-from jaxcal.models.model import derivative, predict
+from jaxcal.models.predictions import derivative, predict
 
 __all__ = ["FAR", "Responses", "command_for", "limits_of", "no_inverse"]
 

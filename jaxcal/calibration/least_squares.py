@@ -24,7 +24,8 @@ from jaxcal.calibration.losses import Loss, constants
 from jaxcal.checks import Array, in_words
 from jaxcal.information.blocks import gram, triangle
 from jaxcal.information.singular import significant
-from jaxcal.models.model import Model, derivative, predict, without_effect
+from jaxcal.models.model import Model
+from jaxcal.models.predictions import derivative, predict, without_effect
 
 __all__ = [
     "FitProblem",

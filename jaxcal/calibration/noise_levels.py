@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from jaxcal.calibration.least_squares import FitProblem, FitSolution, solve
 from jaxcal.calibration.losses import constants
 from jaxcal.checks import Array
-from jaxcal.models.model import derivative
+from jaxcal.models.predictions import derivative
 
-__all__ = ["are_shared", "pooled"]
+__all__ = ["are_shared", "levels_differ", "pooled"]
 
 Rows = NDArray[np.intp]
 
@@ -79,6 +79,50 @@ def pooled(problem: FitProblem) -> tuple[FitProblem, FitSolution, str]:
         levels, fitted = better, _with(problem, better)
         solution = solve(fitted, solution)
     return fitted, solution, levels.says
+
+
+def levels_differ(problem: FitProblem, solution: FitSolution) -> bool:
+    """Whether levels that are shared contradict the residuals (F test, 0.1 %).
+
+    Those without what is known besides: a wrong distance of two sockets is no noise
+    along it.
+    """
+    q = len(solution.freedom)
+    if (
+        problem.noise_known
+        or q == 1
+        or solution.freedom.min() < 1.0
+        or problem.command_std.any()
+    ):
+        return False
+    from scipy import special
+
+    white = solution.white / solution.level - _by_facts(problem, solution)
+    variance = solution.weights @ white**2 / solution.freedom
+    high, low = int(variance.argmax()), int(variance.argmin())
+    ratio = variance[high] / max(variance[low], np.finfo(np.float64).tiny)
+    chance = special.fdtrc(solution.freedom[high], solution.freedom[low], ratio)
+    return bool(chance * q * (q - 1) < 1e-3)
+
+
+def _by_facts(problem: FitProblem, solution: FitSolution) -> Array:
+    """(N, q) how far residuals are off by facts (``Model.facts``), in their noise."""
+    off, _ = problem.model.facts(solution.parameters)
+    if not len(off):
+        return np.zeros_like(solution.white)
+    slopes = solution.by_theta / solution.level[:, None]
+    prior = np.sqrt(problem.precision[problem.free])
+    root = np.sqrt(solution.weights)[:, None]
+    rows = np.concatenate(
+        [(root[..., None] * slopes).reshape(-1, len(prior)), np.diag(prior)]
+    )
+    right = np.append(
+        root * solution.white / solution.level,
+        prior * (problem.mean - solution.parameters)[problem.free],
+    )
+    size = np.linalg.norm(rows, axis=0) + 1e-300
+    step = np.linalg.lstsq(rows / size, right, rcond=1e-10)[0] / size
+    return np.asarray(slopes @ step)
 
 
 def _alike(new: Array | None, old: Array | None) -> bool:

@@ -22,7 +22,8 @@ from jaxcal.calibration.least_squares import FitProblem, FitSolution
 from jaxcal.checks import Array
 from jaxcal.information.blocks import gram, triangle, without
 from jaxcal.information.singular import significant
-from jaxcal.models.model import ErrorGroups, Model, derivative
+from jaxcal.models.model import ErrorGroups, Model
+from jaxcal.models.predictions import derivative
 
 __all__ = ["PriorScales", "covariance_of_scales", "group_scales", "misfit_scale"]
 

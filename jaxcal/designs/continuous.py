@@ -42,7 +42,7 @@ from jaxcal.deadline import Deadline
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, as_model
 from jaxcal.models.uncertainty import Noise, Prior
-from jaxcal.selection.criteria import Criterion, ScenarioCriterion
+from jaxcal.selection.criteria import Criterion
 from jaxcal.selection.design import Design
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.problem import (
@@ -52,6 +52,7 @@ from jaxcal.selection.problem import (
     blocks_of,
     problem_of,
 )
+from jaxcal.selection.problem.scenarios import ScenarioCriterion
 from jaxcal.selection.result import Selection
 
 Allowed = Callable[[Array], Any]

@@ -23,7 +23,7 @@ from decimal import Decimal
 import numpy as np
 
 from jaxcal.checks import Array, aligned
-from jaxcal.models.periods import within_half
+from jaxcal.models.predictions import within_half
 
 Evaluate = Callable[[Array], Array]  # points (S, p) -> values (S, N, q), NaN: refused
 

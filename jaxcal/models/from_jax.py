@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from jaxcal.checks import Array, axis_names, numbers, table, whole_number
 from jaxcal.extras import needs
 from jaxcal.models.model import Model, as_commands, as_parameters
-from jaxcal.models.periods import checked_periods
+from jaxcal.models.predictions import checked_periods
 
 
 class FromJax(Model):

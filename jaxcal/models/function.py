@@ -23,7 +23,7 @@ from jaxcal.checks import (
 )
 from jaxcal.models.differences import STENCILS, Differences, combined, look
 from jaxcal.models.model import Model, as_commands, as_parameters, by_name
-from jaxcal.models.periods import checked_periods
+from jaxcal.models.predictions import checked_periods
 from jaxcal.models.runs import CommandLine, Runs
 from jaxcal.models.uncertainty import Noise, Prior, as_noise
 

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import Array, one_of, require_kind, table
 from jaxcal.information.blocks import triangle
 from jaxcal.information.singular import exact_zeros, flat, significant
-from jaxcal.models.model import Model, answered, as_model, derivative, without_effect
+from jaxcal.models.model import Model, as_model
+from jaxcal.models.predictions import answered, derivative, without_effect
 from jaxcal.models.uncertainty import Noise, Prior, as_noise
 
 

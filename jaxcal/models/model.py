@@ -2,7 +2,7 @@
 
 A model gives its names, outputs and derivatives; everything else that ``select`` and
 ``identify`` ask has a default here. ``as_model`` gives the defaults to an object that
-is not of this class; ``predict`` and ``derivative`` ask a model and check the answer.
+is not of this class.
 """
 
 from __future__ import annotations
@@ -10,16 +10,14 @@ from __future__ import annotations
 import abc
 import functools
 import os
-import warnings
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import Array, array_of, in_words
-from jaxcal.information.singular import flat
-from jaxcal.models.periods import within_half
+from jaxcal.checks import Array, array_of
+from jaxcal.models.predictions import within_half
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.tables import COMMANDS, header_of, of_frame
@@ -30,7 +28,6 @@ if TYPE_CHECKING:
 Rows = NDArray[np.intp]
 
 _NOTHING_KNOWN = Prior(np.inf)
-_NAMED = 5  # candidates that a warning names
 
 
 class ErrorGroups(NamedTuple):
@@ -489,105 +486,3 @@ def recorded(model: Any, commands: Any, measured: Any) -> tuple[Any, Any, bool]:
     if measured is None:
         raise ValueError("measured is missing: the readings at each of the commands")
     return commands, measured, is_recording
-
-
-def predict(
-    model: Model, commands: Array, parameters: Array, *, finite: bool = True
-) -> Array:
-    """(N, q) outputs; with ``finite`` a ValueError names the first that is not.
-
-    Without it, as for trial steps, NaN stands for what the model refuses to answer.
-    """
-    shape = (len(commands), model.num_outputs)
-    with np.errstate(all="ignore"):
-        try:
-            outputs = np.asarray(model.predict(commands, parameters), dtype=np.float64)
-        except ValueError:
-            if finite:
-                raise
-            return np.full(shape, np.nan)
-    _require_shape("predict", outputs, shape)
-    if finite and not np.isfinite(outputs).all():
-        bad = np.isfinite(outputs).all(axis=1).argmin()
-        raise ValueError(
-            f"model.predict must be finite, got {in_words(outputs[bad])} for the "
-            f"command {in_words(commands[bad])}"
-        )
-    return outputs
-
-
-def derivative(
-    model: Model, commands: Array, parameters: Array, names: tuple[str, ...] = ()
-) -> Array:
-    """(N, q, p) by the parameters, or (N, q, n) by commands with these ``names``."""
-    method = "command_jacobian" if names else "jacobian"
-    names = names or model.names
-    with np.errstate(all="ignore"):
-        slopes = getattr(model, method)(commands, parameters)
-    slopes = np.asarray(slopes, dtype=np.float64)
-    _require_shape(method, slopes, (len(commands), model.num_outputs, len(names)))
-    if not np.isfinite(slopes).all():
-        bad = ~np.isfinite(slopes)
-        row, output, column = np.argwhere(bad)[0]
-        # A forward derivative may spoil the columns beside that of the one to blame.
-        by = ", ".join(np.array(names)[bad[row, output]])
-        raise ValueError(
-            f"model.{method} must be finite, got {slopes[row, output, column]} by {by} "
-            f"for the command {in_words(commands[row])}"
-        )
-    return slopes
-
-
-def answered(
-    model: Model,
-    commands: Array,
-    parameters: Array | None,
-    rows: Rows | None = None,
-    names: Sequence[str] | None = None,
-) -> NDArray[np.bool_]:
-    """(N,) where the model has a prediction; a warning names the others.
-
-    Args:
-        model: any.
-        commands: (N, n).
-        parameters: (p,), the nominal ones for None.
-        rows: (N,) their numbers; counted when not given.
-        names: of all rows, where they have some.
-    """
-    lost = model.unanswered(commands, parameters) if len(commands) else {}
-    mask = np.ones(len(commands), dtype=np.bool_)
-    if lost:
-        mask[list(lost)] = False
-        named = []
-        for i, reason in lost.items():
-            row = i if rows is None else int(rows[i])
-            named.append(f"{row if names is None else names[row]} ({reason})")
-        more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
-        warnings.warn(
-            f"{len(lost)} of {len(commands)} candidates are left out because the model "
-            f"fails there: {', '.join(named[:_NAMED])}{more}",
-            stacklevel=4,
-        )
-    return mask
-
-
-def without_effect(jacobian: Array, sizes: Array) -> NDArray[np.bool_]:
-    """(p,) parameters by which a derivative (N, q, p) is zero, or rounding.
-
-    Args:
-        jacobian: (N, q, p); outputs are judged one by one, whatever their units.
-        sizes: (p,) of the parameters, as ``Model.parameter_sizes`` has them.
-    """
-    largest = np.abs(jacobian).max(axis=0, initial=0.0)
-    zero = ~largest.any(axis=0)
-    sized = np.isfinite(sizes)
-    if not sized.any():
-        return np.asarray(zero)
-    effect = largest * np.where(sized, sizes, 0.0)
-    beside = effect.max(axis=1, keepdims=True)
-    return np.asarray(zero | (sized & flat(effect, beside).all(axis=0)))
-
-
-def _require_shape(method: str, found: Array, shape: tuple[int, ...]) -> None:
-    if found.shape != shape:
-        raise ValueError(f"model.{method} must return {shape}, got {found.shape}")

@@ -297,3 +297,57 @@ def as_noise(noise: Any) -> Noise | None:
             f"{type(noise).__name__}"
         )
     return Noise(noise)
+
+
+def reading_noise(
+    model: Any, noise: Noise, weights: Array, q: int
+) -> tuple[Array, Array, NDArray[np.intp]]:
+    """The noise of the readings.
+
+    Returns:
+        Whitening (N, q, q) at these weights, or its diagonal (N, q) of independent
+        readings; standard deviations (N, q) at weight 1; and (q,) which outputs share a
+        level, from 0.
+    """
+    count, levels = len(weights), np.arange(q)
+    if noise.covariance is None:
+        std = noise.reading_std(count, q)
+        white = 1.0 / std
+    else:
+        white = Noise(covariance=noise.covariance).whitening(count, q)
+        std = np.sqrt((np.linalg.inv(white) ** 2).sum(axis=2))
+    usual = model.default_noise()
+    if usual is not None and noise.std is None and noise.covariance is None:
+        usual_std = np.broadcast_to(np.asarray(usual.std), (q,))
+        white = white / usual_std
+        std = std * usual_std
+        levels = np.unique(usual_std, return_inverse=True)[1]  # positions and turns
+    root = np.sqrt(weights)[:, None]
+    return white * (root if white.ndim == 2 else root[..., None]), std, levels
+
+
+def command_noise(noise: Noise, commands: Array, q: int) -> Array:
+    """(N, n) command_std, zero where it is not given."""
+    spread = noise.of_commands(*commands.shape)
+    unknown = int(np.isinf(spread[0]).sum())
+    if unknown and unknown >= q:
+        raise ValueError(
+            f"command_std must leave fewer unknown commands than the {q} readings of a "
+            f"measurement, got {unknown}"
+        )
+    return spread
+
+
+def with_play(model: Any, noise: Noise, commands: Array, spread: Array) -> Noise:
+    """The noise of an arm's readings, that of its joints in it, to first order.
+
+    Joints are off by little, and by their own unknowns the arm's errors could not be
+    sized from the readings.
+    """
+    if not np.isfinite(spread).all():
+        raise ValueError("command_std of an arm must be finite")
+    slopes = model.command_jacobian(commands) * spread[:, None]
+    plain = Noise(std=noise.std, covariance=noise.covariance)
+    root = np.linalg.inv(plain.whitening(len(commands), model.num_outputs))
+    covariance = root @ np.matrix_transpose(root)
+    return Noise(covariance=covariance + slopes @ np.matrix_transpose(slopes))

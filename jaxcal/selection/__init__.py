@@ -5,8 +5,9 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from jaxcal.selection.criteria import As, Ds, I, Mean, Worst
+from jaxcal.selection.criteria import As, Ds, I
 from jaxcal.selection.design import Design, select
+from jaxcal.selection.problem.scenarios import Mean, Worst
 from jaxcal.selection.result import Selection
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxcal.models import FromJax, Model, SerialChain, from_dict, identifiability
-from jaxcal.models.model import derivative, predict
+from jaxcal.models.predictions import derivative, predict
 
 from .arms import UR5_TABLE, differences, ur5_data
 

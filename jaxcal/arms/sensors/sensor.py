@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import Array, array_of, in_words, numbers, whole_number
 from jaxcal.models.model import Quantity
-from jaxcal.models.periods import within_half
+from jaxcal.models.predictions import within_half
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 BASE = tuple(f"base {axis}" for axis in AXES)

@@ -21,7 +21,7 @@ from jaxcal.calibration.pairing.table import (
     Table,
 )
 from jaxcal.checks import Array
-from jaxcal.models.model import predict
+from jaxcal.models.predictions import predict
 
 __all__ = [
     "OUTLIER",

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.checks import Array
-from jaxcal.models.model import Model, derivative, predict
+from jaxcal.models.model import Model
+from jaxcal.models.predictions import derivative, predict
 
 __all__ = [
     "AS_IT_IS",

@@ -20,7 +20,8 @@ from jaxcal import compiled
 from jaxcal.checks import Array, Indices
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.information.blocks import gram, largest_rank
-from jaxcal.selection.criteria import Criterion, ScenarioCriterion
+from jaxcal.selection.criteria import Criterion
+from jaxcal.selection.problem.scenarios import ScenarioCriterion
 
 if TYPE_CHECKING:
     from jaxcal.selection.problem.constraints import Constraints

@@ -28,7 +28,7 @@ from jaxcal.checks import Array, Indices, array_of, levels, one_of, whole_number
 from jaxcal.information.blocks import largest_rank
 from jaxcal.late import late
 from jaxcal.models.uncertainty import Noise
-from jaxcal.selection.criteria import Mean, positions
+from jaxcal.selection.criteria import positions
 from jaxcal.selection.exchange.exchange import greedy_indices
 from jaxcal.selection.plan.best_of_size import (
     Case,
@@ -46,6 +46,7 @@ from jaxcal.selection.problem import (
     shares_regressor,
 )
 from jaxcal.selection.problem.problem import joined_problem
+from jaxcal.selection.problem.scenarios import Mean
 from jaxcal.selection.solvers import checked_seed
 
 if TYPE_CHECKING:

@@ -27,16 +27,7 @@ from jaxcal.information.singular import (
 )
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model
-from jaxcal.selection.criteria import (
-    CRITERIA,
-    Coordinates,
-    Criterion,
-    G,
-    Largest,
-    Mean,
-    ScenarioCriterion,
-    criterion_of,
-)
+from jaxcal.selection.criteria import CRITERIA, Coordinates, Criterion, G, criterion_of
 from jaxcal.selection.problem.blocks import blocks_of
 from jaxcal.selection.problem.candidate_set import (
     CandidateSet,
@@ -48,6 +39,7 @@ from jaxcal.selection.problem.candidate_set import (
     usable_numbers,
 )
 from jaxcal.selection.problem.problem import Problem, ScenarioProblem, joined_problem
+from jaxcal.selection.problem.scenarios import Largest, Mean, ScenarioCriterion
 
 if TYPE_CHECKING:
     from jaxcal.selection.problem.constraints import Constraints

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 from jaxcal.checks import Array, array_of, numbers
 from jaxcal.information.blocks import prior_root
 from jaxcal.models.identifiability import identifiability
-from jaxcal.models.model import Model, derivative
+from jaxcal.models.model import Model
+from jaxcal.models.predictions import derivative
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.problem.candidate_set import CandidateSet
 

@@ -26,7 +26,8 @@ from jaxcal.checks import (
     whole_number,
 )
 from jaxcal.models.affine import Affine
-from jaxcal.models.model import Model, answered, as_model
+from jaxcal.models.model import Model, as_model
+from jaxcal.models.predictions import answered
 from jaxcal.models.uncertainty import Prior, as_noise
 from jaxcal.selection.problem.scenarios import Scenarios, checked_weights, scenarios_of
 from jaxcal.tables import (

@@ -25,7 +25,7 @@ from jaxcal.checks import Array, Indices, Mask
 from jaxcal.information.blocks import WhiteBlocks, rank_of_blocks
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model
-from jaxcal.selection.criteria import ScenarioCriterion
+from jaxcal.selection.problem.scenarios import ScenarioCriterion
 
 if TYPE_CHECKING:
     from jaxcal.selection.problem.constraints import Constraints

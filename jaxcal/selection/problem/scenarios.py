@@ -1,8 +1,12 @@
-"""Scenarios of a model's parameters: what they may be, and how likely each is."""
+"""Scenarios of a model's parameters: what they may be, how likely each is, and criteria
+over them: their mean, the worst of them, and G, as one of these.
+"""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import copy
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,6 +14,7 @@ from numpy.typing import ArrayLike
 from jaxcal.checks import Array, array_of, whole_number
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Prior
+from jaxcal.selection.criteria import Criterion
 
 _SUM = 1e-6  # by which weights may miss a sum of 1
 
@@ -82,3 +87,158 @@ def checked_weights(weights: ArrayLike | None, count: int) -> Array:
     if abs(total - 1.0) > _SUM:
         raise ValueError(f"weights must sum to 1, got a sum of {total:.6g}")
     return checked / total
+
+
+class ScenarioCriterion:
+    """A criterion over scenarios: ``Mean`` or ``Worst``.
+
+    As it is asked for it carries the criterion of each scenario. ``within`` gives that
+    of one problem, with what tells its values: they are read as those of a Criterion.
+
+    Args:
+        criterion: letters of ``CRITERIA`` or an object of it; when not given the
+            design's own.
+    """
+
+    word: str
+    efficiency_name = "efficiency"
+    least: ClassVar[bool]  # the worst scenario counts
+    of_efficiency: bool = False
+    each: Criterion  # of the first scenario
+    kind: str  # of that
+
+    def __init__(self, criterion: Any = None) -> None:
+        if isinstance(criterion, ScenarioCriterion):
+            raise ValueError(
+                f"{type(self).__name__} needs a criterion of one scenario, got "
+                f"{type(criterion).__name__}"
+            )
+        self.criterion = criterion
+
+    def __repr__(self) -> str:
+        given = "" if self.criterion is None else repr(self.criterion)
+        return f"{type(self).__name__}({given})"
+
+    def within(self, each: Criterion) -> Self:
+        """The criterion of a problem whose first scenario has ``each``."""
+        joined = copy.copy(self)
+        joined.each, joined.kind = each, each.kind
+        return joined
+
+    @property
+    def name(self) -> str:
+        """The name as it is written: "Mean(D)"."""
+        return f"{type(self).__name__}({self.each.name})"
+
+    @property
+    def says(self) -> str:
+        """What a table prints before the value."""
+        return f"{self.each.says}, {self.word}"
+
+    @property
+    def larger_is_better(self) -> bool:
+        """Whether a larger reported value is better."""
+        return self.of_efficiency or self.each.larger_is_better
+
+    def efficiency(self, value: float, bound: float) -> float:
+        """Share in (0, 1] of the best possible, of reported values."""
+        if self.of_efficiency:
+            return value / bound
+        return self.each.efficiency(value, bound)
+
+    def bettered(self, value: float, share: float) -> float:
+        """A reported value where every variance is smaller by ``share`` of itself."""
+        if self.of_efficiency:
+            return min(1.0, value * (1.0 + share))
+        return self.each.bettered(value, share)
+
+    def enough(self, efficiency: float) -> tuple[float, float]:
+        """A bound of at most the first times the value, plus the second, proves it."""
+        if self.of_efficiency and self.kind == "det":
+            return 1.0, -float(np.log(efficiency))
+        slope, shift = self.each.enough(efficiency)
+        return slope, self.each.times * shift
+
+    def terms(
+        self, criteria: Sequence[Criterion], optima: Array | None
+    ) -> tuple[Array, Array]:
+        """(S,) scale and shift: ``scale phi + shift`` of a scenario is what is joined.
+
+        It is the reported value, of a trace its negative. Of efficiencies e it is
+        log e (det), -1 / e (trace) or e (least), which are concave in the information.
+
+        Args:
+            criteria: (S,) of the scenarios.
+            optima: (S,) reported values that efficiencies are measured by.
+        """
+        if self.kind == "det":
+            scale = np.array([float(one.times) for one in criteria])
+            shift = scale * [one.offset for one in criteria]
+            if optima is None:
+                return scale, shift
+            rows = scale * len(criteria[0].root)
+            return scale / rows, (shift - optima) / rows
+        units = np.array([one.unit for one in criteria])
+        if self.kind == "trace":
+            scale = units * criteria[0].times
+        else:
+            scale = 1.0 / np.maximum(units, 1e-320)
+        if not (np.isfinite(scale) & (scale > 0.0)).all():
+            raise ValueError(
+                f"criterion {self.name} in a scenario is out of range in double "
+                "precision; give the commands in other units"
+            )
+        return (scale if optima is None else scale / optima), np.zeros(len(scale))
+
+    def reported(self, joined: Array | float) -> Any:
+        """The value as the caller reads it, of what ``terms`` make."""
+        if not self.of_efficiency:
+            return -joined if self.kind == "trace" else joined
+        if self.kind == "det":
+            return np.exp(joined)
+        return -1.0 / np.asarray(joined) if self.kind == "trace" else joined
+
+
+class Mean(ScenarioCriterion):
+    """The weighted mean over the scenarios of a criterion.
+
+    Args:
+        criterion: letters as "D", or an object that carries data, as ``I(region)``.
+    """
+
+    word, least = "mean", False
+
+
+class Worst(ScenarioCriterion):
+    """The criterion in the scenario where it is worst.
+
+    Args:
+        criterion: letters as "I", or an object that carries data.
+        efficiency: compare scenarios by the efficiency in each, relative to its own
+            optimum, or to a bound if the optimum is not proven.
+    """
+
+    least = True
+
+    def __init__(self, criterion: Any = None, efficiency: bool = False) -> None:
+        super().__init__(criterion)
+        self.of_efficiency = bool(efficiency)
+
+    word = "worst"
+
+    @property
+    def name(self) -> str:
+        more = ", efficiency" if self.of_efficiency else ""
+        return f"Worst({self.each.name}{more})"
+
+    @property
+    def says(self) -> str:
+        if self.of_efficiency:
+            return f"least {self.each.name}-efficiency"
+        return super().says
+
+
+class Largest(Worst):
+    """G: the worst of the predictions, each of which stands for a scenario."""
+
+    word, efficiency_name, name, says = "", "G-efficiency", "G", "largest variance"
