@@ -55,8 +55,10 @@ class Calibration(Fit):
         """The parameters with their 95 % intervals, the noise and the fit, as text."""
         fixed = int((self.free[: len(self.parameters)] == 0).sum())
         lines = [
-            f"Calibration {self.model.title}: {self.num_inputs} inputs "
-            f"({', '.join(self.input_names)}), {self.num_outputs} outputs "
+            f"Calibration {self.model.title}: "
+            f"{self.num_inputs} input{'s' * (self.num_inputs > 1)} "
+            f"({', '.join(self.input_names)}), "
+            f"{self.num_outputs} output{'s' * (self.num_outputs > 1)} "
             f"({', '.join(self.output_names)}), {self.num_measurements} measurements, "
             f"{len(self.parameters)} parameters"
             + (f" ({fixed} fixed)" if fixed else "")

@@ -188,7 +188,7 @@ def test_a_frozen_phone_lets_no_axis_go_far(slow, capsys):
 def test_a_drives_own_homing_is_watched_by_the_phone(
     at, away_deg, fault, values, said, capsys, monkeypatch
 ):
-    with device(speedup=0.3 if fault else 3.0) as (sim, bus, port):
+    with device(speedup=0.3 if fault else 1.0) as (sim, bus, port):
         drive = sim.drives[1]
         drive.position = float(sim.config.axes[1].to_pulses(away_deg))
         drive.target = round(drive.position)

@@ -53,6 +53,10 @@ def against(verdict: Verdict, fit: Calibration) -> Verdict:
         )
     what = "columns" if pairing.kind == "columns" else "table"
     step = f"correct the {what}, then identify again"
+    if not pairing.mendable:
+        step = "identify each session by itself"
+        if pairing.kind == "offset":
+            step = f"take the offset off the readings of one session, or {step}"
     if pairing.alternatives:
         step = f"find out which it is, {step}"
     elif pairing.mendable and pairing.kind != "columns":
