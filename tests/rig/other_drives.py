@@ -45,7 +45,7 @@ def stage_text(bus, family, port, counts=1000, speed=100, session=SESSION):
         AXIS.format(name=n, unit=u, family=family, counts=counts, speed=speed)
         for u, n in enumerate("xy", 1)
     )
-    head = f'output = "runs"\n\n[bus]\n{bus}\ntimeout_s = 0.3\n'
+    head = f'output = "runs"\n\n[bus]\n{bus}\ntimeout_s = 0.6\n'
     return head + axes + READINGS.format(port=port) + text[text.index("[motion]") :]
 
 
