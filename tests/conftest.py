@@ -30,13 +30,13 @@ hypothesis.settings.load_profile("same")
 
 
 # Folders of tests in which a warning that no test expects is an error; wanted: all.
-MENDED = ("commands",)
+MENDED = ("commands", "information", "selection", "tables")
 
 
 def pytest_collection_modifyitems(items):
-    for folder in {item.getparent(pytest.Module).parent for item in items}:
-        if folder.path.name in MENDED:
-            folder.add_marker(pytest.mark.filterwarnings("error"))
+    for item in items:
+        if item.path.parent.name in MENDED:  # before what tests and modules say
+            item.add_marker(pytest.mark.filterwarnings("error"), append=False)
 
 
 @pytest.fixture(autouse=True, scope="module")

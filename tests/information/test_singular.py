@@ -47,6 +47,7 @@ def test_coplanar_candidates_are_refused_by_the_same_direction(
     assert words in refusal(question, coplanar(rng), None)
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")  # exact readings, and far away
 def test_the_parameters_of_that_direction_are_named_and_not_used(
     rng: np.random.Generator,
 ) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxcal
+from jaxcal.designs import continuous
 from jaxcal.models import (
     Affine,
     Board,
@@ -15,7 +16,6 @@ from jaxcal.models import (
     SerialChain,
     Socket,
 )
-from jaxcal.selection import continuous
 
 jnp = pytest.importorskip("jax.numpy")
 

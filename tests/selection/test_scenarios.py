@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from jaxcal import Design, I, Mean, Prior, Worst, plots, select
+from jaxcal import Design, I, Mean, Prior, Worst, select
 from jaxcal.models import Affine
 from jaxcal.models.model import Model
+from jaxcal.reports import plots
 from jaxcal.selection.problem import ScenarioProblem
 
 Array = np.ndarray
