@@ -301,7 +301,8 @@ def bends(fit: Fit) -> Reason | None:
     if rest < 1 or more == rest or _BENT**2 * after / rest > before / more:
         return None
     ratio = (before - after) / (more - rest) / (after / rest)
-    if special.fdtrc(more - rest, rest, ratio) > UNLIKELY:
+    # As of one output: the outputs of a row may err alike.
+    if special.fdtrc((more - rest) / m, rest / m, ratio) > UNLIKELY:
         return None
     of_unit = f" {fit.measured_unit}".rstrip()
     return Reason(
