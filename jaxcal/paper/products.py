@@ -43,6 +43,21 @@ class ProductNetwork(Observing):
     def mask_is_chosen(self) -> bool:
         return True
 
+    def decision_features(
+        self,
+        features: jax.Array,
+        chosen: jax.Array,
+        available: jax.Array,
+        count: jax.typing.ArrayLike,
+    ) -> Decision:
+        n, k = features.shape[-1], chosen.shape[-1]
+        if k > n + 1:
+            raise ValueError(
+                f"kind observation reads at most {n} chosen postures: num_selected "
+                f"must be at most num_inputs + 1 = {n + 1}, got {k}"
+            )
+        return super().decision_features(features, chosen, available, count)
+
     def encode(self, features: jax.Array) -> jax.Array:
         """(..., M, n + 1) centred and scaled commands, and 1."""
         x = (features - 0.5) * _SCALE

@@ -109,6 +109,8 @@ def test_another_number_of_inputs_and_candidates_runs() -> None:
     network = build(NetworkConfig(kind="observation", decoder_rounds=1, width=8))
     weights = initial(network, jax.random.key(0), 12, 2, 3)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(weights))
+    with pytest.raises(ValueError, match=r"at most num_inputs \+ 1 = 3, got 4"):
+        initial(network, jax.random.key(0), 12, 2, 4)
 
 
 @pytest.mark.parametrize("given", [0, 2])

@@ -183,11 +183,18 @@ def with_values(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
                 f"{len(config.tasks)} tasks have {', '.join(map(str, held))}. Use a "
                 "preset of one task, such as compact"
             )
+    once = config.ppo.explore_once and "num_selected" in changed
+    tasks = tuple(_changed(task, changed) for task in config.tasks[-1 if once else 0 :])
+    if once:  # each decision in turn
+        tasks = tuple(
+            dataclasses.replace(tasks[-1], num_given=given)
+            for given in reversed(range(changed["num_selected"]))
+        )
     return dataclasses.replace(
         config,
         network=dataclasses.replace(config.network, **network),
         ppo=dataclasses.replace(config.ppo, **ppo),
-        tasks=tuple(_changed(task, changed) for task in config.tasks),
+        tasks=tasks,
         **run,
     )
 
