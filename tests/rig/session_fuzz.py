@@ -680,11 +680,14 @@ def main(argv: list[str] | None = None) -> int:
                 world = play(number, pathlib.Path(folder), faults)
             except Broken as error:
                 broken += 1
-                print(f"session {number}: {error}")
+                print(f"session {number}: {error}", flush=True)
                 continue
             if world.broken:
                 broken += 1
-                print(f"session {number}: {world.broken[0]} (of {len(world.broken)})")
+                print(
+                    f"session {number}: {world.broken[0]} (of {len(world.broken)})",
+                    flush=True,
+                )
             if options.sessions == 1:
                 print("\n".join(world.faults))
     seconds = time.perf_counter() - begun
