@@ -18,7 +18,8 @@ _RARE = float(np.log(20.0))  # an outlier
 _TOO_LARGE = 3.0  # times: no caution makes a stated noise that much larger
 _SIZES = 10.0  # of a parameter: known no better, it is not known
 _STEP = 0.1  # standard errors, by which another step would move the parameters
-_BENT, _SAMPLE = 2.0, 2000  # times the noise without squares; rows
+_BENT = 2.0  # times the noise without squares and products of the commands
+_SAMPLE, _TERMS = 2000, 600  # readings; twice these terms
 _EXACT = 1e-12  # of the largest reading: rounding, and no noise of a sensor
 _UNITS = np.outer([1.0, -1.0], [1.0, np.pi / 180.0, 180.0 / np.pi, 1e3, 1e-3]).ravel()
 _NAMED, _DIGITS = 6, 7  # rows in one sentence; decimals of a table
@@ -274,14 +275,15 @@ def bends(fit: Fit) -> Reason | None:
     without them is at most half.
     """
     (count, n), m = fit.commands.shape, fit.measured.shape[1]
-    if count <= n * (n + 3):  # twice these terms
+    every = max(count * m // _SAMPLE, 1)
+    if count // every <= n * (n + 3) or n * (n + 3) * m > _TERMS:  # twice the terms
         return None
     from scipy import special
 
     noise = np.asarray(fit.noise_std)  # 0-d of none
     if noise.ndim == 0 or not noise.all() or fit.prior_precision.any():
         return None
-    sample = slice(None, None, max(count // _SAMPLE, 1))
+    sample = slice(None, None, every)
     commands = fit.commands[sample]
     i, j = np.triu_indices(n)
     unit = commands - commands.mean(axis=0)
