@@ -48,7 +48,7 @@ _WORTH = 12.0  # log of the odds: of those that are so much worse at first, none
 _EXACT = 1e-6  # of the spread: readings so near a fit have nothing to explain
 _NEXT, _LARGE = 8.0, 3.0  # times the residuals: neighbours, a row
 _USUAL = 2.0  # times the usual noise of a sensor
-_TREND = 1.4  # of a sum of residuals, over the root of their squares
+_TREND, _TREND_OF_MANY = 1.4, 2.0  # of a sum of residuals, over their squares' root
 LEAST, _MANY = 6, 500  # rows
 _NAMED = 2  # other explanations
 _READINGS = 1.5  # for each parameter; of fewer another machine explains as much
@@ -319,20 +319,23 @@ def _plainly_right(fit: Fit) -> bool:
     factors = np.concatenate([np.ones((len(off), 1)), moved], axis=1)
     scores = off[..., None] * factors[:, None]
     size = np.sqrt((scores**2).sum(axis=0))
-    return bool((np.abs(scores.cumsum(axis=0)) <= _TREND * size).all())
+    trend = _TREND if len(off) < _MANY else _TREND_OF_MANY
+    return bool((np.abs(scores.cumsum(axis=0)) <= trend * size).all())
 
 
 def _white(off: Array, rms: Array, said: Array) -> bool:
     """Whether many residuals of a fit that explains the readings are independent.
 
     Neighbours that noise hides leave a trace only together: a lag or a block of rows
-    from elsewhere makes residuals in a row alike.
+    from elsewhere makes residuals in a row alike, or larger than the others.
     """
     count = len(off)
-    if count < _MANY or (rms > 0.1 * said.std(axis=0)).any():
+    if count < _MANY or (rms > 0.5 * said.std(axis=0)).any():
         return False
     alike = (off[1:] * off[:-1]).mean(axis=0) / rms**2
-    return bool((np.abs(alike) < 3.0 / np.sqrt(count)).all())
+    larger = np.abs((off**2 / rms**2 - 1.0).cumsum(axis=0)).max(axis=0)
+    calm = larger < _TREND_OF_MANY * np.sqrt(2.0 * count)  # of normal residuals
+    return bool((np.abs(alike) < 3.0 / np.sqrt(count)).all() and calm.all())
 
 
 def _lost_its_way(table: Table, plain: Fitted) -> bool:
