@@ -66,10 +66,10 @@ QUICK_TESTS = $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -m 
 QUICK_RIG_TESTS = $(QUICK_TESTS) -o cache_dir=$(VENV)/rig-cache tests/rig
 test: $(READY) ## set everything up, lint, and run the quick tests (the ones CI runs)
 	@$(QUICK_RIG_TESTS) -n 2 >$(VENV)/rig-tests.log 2>&1 & rig=$$!; \
-	nice -n 19 $(BIN)/python -m pytest --collect-only -qq >/dev/null & imports=$$!; \
-	nice -n 19 $(MAKE) --no-print-directory lint || { kill $$rig $$imports; exit 1; }; wait $$imports; \
+	nice $(BIN)/python -m pytest --collect-only -qq >/dev/null & imports=$$!; \
+	nice $(MAKE) --no-print-directory lint || { kill $$rig $$imports; exit 1; }; wait $$imports; \
 	export XLA_FLAGS="$${XLA_FLAGS-$(QUICK_XLA)}"; \
-	nice -n 19 $(QUICK_TESTS) -n 2 tests --ignore tests/rig; others=$$?; \
+	nice $(QUICK_TESTS) -n 2 tests --ignore tests/rig; others=$$?; \
 	wait $$rig; rig=$$?; cat $(VENV)/rig-tests.log; \
 	exit $$((rig | others))
 
