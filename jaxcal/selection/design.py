@@ -30,6 +30,7 @@ from jaxcal.selection.result import Selection, Subset
 from jaxcal.selection.solvers import OPTIONS, SOLVERS, checked_options
 
 _REFERENCES = ("bound", "exact")
+_LARGE_S = 0.1  # to make a problem: of a larger one time_limit takes account
 _PROVEN = 1e-9  # a value this near a proven optimum, relative above 1, is that optimum
 
 
@@ -200,6 +201,9 @@ class Design:
         start = time.perf_counter()
         problem = self.problem(k, criterion, region)
         problem = _with_optima(fewest_regular(problem) if k is None else problem)
+        spent = time.perf_counter() - start
+        if spent > _LARGE_S and (limit := checked.get("time_limit")):
+            checked["time_limit"] = round(max(limit - spent, 0.1 * limit), 3)
         solution = SOLVERS[method](problem, **checked)
         return self._judged(problem, solution, method, start)
 

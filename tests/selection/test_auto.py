@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
+import time
 
 import numpy as np
 import pytest
@@ -11,7 +13,9 @@ from hypothesis import strategies as st
 from questions import make_problem
 
 import jaxcal
+from jaxcal.selection import design
 from jaxcal.selection.exact.exact import solve_auto as solve
+from jaxcal.selection.solvers import SOLVERS
 
 OPTIONS = {"seed": 0, "restarts": None, "time_limit": None}
 
@@ -127,3 +131,22 @@ def test_the_search_is_no_worse_than_the_exchange(rng):
             found = design.select(14, criterion, method, time_limit=0.3)
             value = found.value if criterion == "D" else -found.value
             assert value >= better - 1e-9 * abs(better)
+
+
+def test_the_time_that_a_problem_takes_is_part_of_the_limit(monkeypatch, rng):
+    asked, exchange, make = [], SOLVERS["exchange"], design.problem_of
+
+    @functools.wraps(exchange)  # whose options it has
+    def solver(problem, **options):
+        asked.append(options["time_limit"])
+        return exchange(problem, **options)
+
+    def problem_of(*arguments):
+        time.sleep(0.2)
+        return make(*arguments)
+
+    monkeypatch.setitem(SOLVERS, "exchange", solver)
+    monkeypatch.setattr(design, "problem_of", problem_of)
+    for limit in (50.0, 0.1):
+        jaxcal.select(rng.random((20, 2)), 4, method="exchange", time_limit=limit)
+    assert asked[0] <= 49.8 and asked[1] == pytest.approx(0.01)
