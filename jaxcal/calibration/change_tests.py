@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from jaxcal.calibration.fit import Fit
 from jaxcal.checks import Array
 
-__all__ = ["ALARMS", "POWER", "Test", "Tests"]
+__all__ = ["ALARMS", "POWER", "ChangeTests", "LevelTests"]
 
 ALARMS = 0.05  # share of false alarms
 POWER = 0.8
@@ -20,7 +20,7 @@ _HALVINGS = 26  # of a search for the smallest change
 
 
 @dataclasses.dataclass(frozen=True)
-class Test:
+class LevelTests:
     """Tests of whitened readings, one for each of G levels of noise, and their power.
 
     Each level was estimated by itself, so each has an F test (chi-square where the
@@ -88,7 +88,7 @@ class Test:
             return np.asarray(np.sqrt(high[of_share.ravel()] / total)[:, 0])
 
 
-class Tests:
+class ChangeTests:
     """A test of all readings, and one of each slip, the largest of which counts.
 
     Each kind has half of the false alarms; where nothing slips, one has all.
@@ -100,8 +100,8 @@ class Tests:
         half = -np.expm1(np.log1p(-ALARMS) / 2.0)
         dof, one = calibration.noise_dof or KNOWN, np.ones(1, dtype=np.intp)
         of_each = -np.expm1(np.log1p(-half) / max(1, slips))
-        self.whole = Test(counts, dof, least, half if slips else ALARMS)
-        self.slip = Test(one, dof, least, of_each)
+        self.whole = LevelTests(counts, dof, least, half if slips else ALARMS)
+        self.slip = LevelTests(one, dof, least, of_each)
         self.count = slips
 
     def p_values(self, squares: Array, of_slips: Array) -> tuple[float, float]:

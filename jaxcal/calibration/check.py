@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration.change_tests import ALARMS, Test, Tests
+from jaxcal.calibration.change_tests import ALARMS, ChangeTests, LevelTests
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.pairing import of_new_readings
 from jaxcal.checks import Array, array_of, by_unit, whole_number
@@ -142,7 +142,9 @@ def check(
     names, free = calibration.names, off.free
     signal = (off.of_level @ off.by**2).T
     slips = free & np.isin(names, calibration.model.slips) & (signal.sum(axis=1) > 0.0)
-    tests = Tests(off.of_level.sum(axis=1), calibration, int(slips.sum()), off.least)
+    tests = ChangeTests(
+        off.of_level.sum(axis=1), calibration, int(slips.sum()), off.least
+    )
     slopes_of_slips = np.linalg.norm(off.by[:, slips], axis=0)
     ways = off.by[:, slips] / slopes_of_slips  # (R, S) unit vectors
     along = ((off.by.T @ ways) ** 2).max(axis=1, initial=0.0)  # seen by the best
@@ -190,11 +192,11 @@ def check(
     )
 
 
-def _explains(change: float, white: Array, tests: Tests) -> bool:
+def _explains(change: float, white: Array, tests: ChangeTests) -> bool:
     """Whether a slip that changes readings (R,) so much leaves nothing unusual."""
     if len(white) < 2:
         return False
-    others = Test(np.array([len(white) - 1]), tests.whole.dof)
+    others = LevelTests(np.array([len(white) - 1]), tests.whole.dof)
     return others.p_value(np.array([white @ white - change**2])) >= ALARMS
 
 
@@ -420,7 +422,7 @@ def verification(
     def value(rows: list[int]) -> Array:
         """(M,) of the rows and each candidate."""
         shift = shifts[rows].sum(axis=0) + shifts
-        tests = Tests(counts * (len(rows) + 1), calibration, int(slips.sum()))
+        tests = ChangeTests(counts * (len(rows) + 1), calibration, int(slips.sum()))
         return np.asarray(tests.power(shift, slips * shift.sum(axis=-1)).mean(axis=-1))
 
     return np.array(_best_rows(value, k))

@@ -59,7 +59,11 @@ class Observing(Network):
         available: jax.Array,
         count: jax.typing.ArrayLike,
     ) -> Decision:
+        self.require_choices(features.shape[-1], chosen.shape[-1])
         return Decision(context_features(features, chosen), available)
+
+    def require_choices(self, num_inputs: int, num_selected: int) -> None:
+        """Refuse more choices than the network can read; here it reads any number."""
 
     def from_observation(
         self, observation: jax.Array, num_candidates: int, num_inputs: int

@@ -43,20 +43,13 @@ class ProductNetwork(Observing):
     def mask_is_chosen(self) -> bool:
         return True
 
-    def decision_features(
-        self,
-        features: jax.Array,
-        chosen: jax.Array,
-        available: jax.Array,
-        count: jax.typing.ArrayLike,
-    ) -> Decision:
-        n, k = features.shape[-1], chosen.shape[-1]
-        if k > n + 1:
+    def require_choices(self, num_inputs: int, num_selected: int) -> None:
+        if num_selected > num_inputs + 1:
             raise ValueError(
-                f"kind observation reads at most {n} chosen postures: num_selected "
-                f"must be at most num_inputs + 1 = {n + 1}, got {k}"
+                f"kind observation reads at most {num_inputs} chosen postures: "
+                f"num_selected must be at most num_inputs + 1 = {num_inputs + 1}, got "
+                f"{num_selected}"
             )
-        return super().decision_features(features, chosen, available, count)
 
     def encode(self, features: jax.Array) -> jax.Array:
         """(..., M, n + 1) centred and scaled commands, and 1."""

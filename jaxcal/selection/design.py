@@ -203,7 +203,7 @@ class Design:
         problem = _with_optima(fewest_regular(problem) if k is None else problem)
         spent = time.perf_counter() - start
         if spent > _LARGE_S and (limit := checked.get("time_limit")):
-            checked["time_limit"] = round(max(limit - spent, 0.1 * limit), 3)
+            checked["time_limit"] = float(f"{max(limit - spent, 0.1 * limit):.3g}")
         solution = SOLVERS[method](problem, **checked)
         return self._judged(problem, solution, method, start)
 

@@ -350,3 +350,12 @@ def test_a_shift_of_a_grid_in_order_is_named_beside_the_reverse(levels, by):
         assert f"readings are one row {'late' if by > 0 else 'early'}" in first
         assert "reverse order" in second
         assert fit.verdict.next_step.startswith("find out which it is")
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_many_rows_of_which_one_output_stands_still_divide_by_no_zero(rng):
+    u = rng.uniform(-1.0, 1.0, (800, 2))
+    y = np.column_stack(
+        [u @ [1.0, 2.0] + 0.3 * rng.standard_normal(800), np.zeros(800)]
+    )
+    assert "never changes" in str(jaxcal.identify(u, y).verdict)

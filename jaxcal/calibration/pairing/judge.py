@@ -332,8 +332,9 @@ def _white(off: Array, rms: Array, said: Array) -> bool:
     count = len(off)
     if count < _MANY or (rms > 0.5 * said.std(axis=0)).any():
         return False
-    alike = (off[1:] * off[:-1]).mean(axis=0) / rms**2
-    larger = np.abs((off**2 / rms**2 - 1.0).cumsum(axis=0)).max(axis=0)
+    square = np.where(rms > 0.0, rms, 1.0) ** 2  # a reading may stand still
+    alike = (off[1:] * off[:-1]).mean(axis=0) / square
+    larger = np.abs((off**2 - rms**2).cumsum(axis=0)).max(axis=0) / square
     calm = larger < _TREND_OF_MANY * np.sqrt(2.0 * count)  # of normal residuals
     return bool((np.abs(alike) < 3.0 / np.sqrt(count)).all() and calm.all())
 

@@ -1,4 +1,4 @@
-"""What a mispaired table, or outliers that hide in its noise, do to a verdict."""
+"""What a mispaired table, hidden outliers or a curve do to a verdict."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ _SAMPLE = 5000  # rows
 
 
 def against(verdict: Verdict, fit: Calibration) -> Verdict:
-    """The verdict, which no calibration passes of a mispaired table or hidden outliers.
+    """The verdict, which no calibration passes of a mispaired table, outliers that hide
+    in its noise, or a curve.
 
     Args:
         verdict: of the fit by itself.

@@ -185,7 +185,7 @@ def with_values(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
             )
     once = config.ppo.explore_once and "num_selected" in changed
     tasks = tuple(_changed(task, changed) for task in config.tasks[-1 if once else 0 :])
-    if once:  # each decision in turn
+    if once:  # each decision in turn; the last task is of the first
         tasks = tuple(
             dataclasses.replace(tasks[-1], num_given=given)
             for given in reversed(range(changed["num_selected"]))
