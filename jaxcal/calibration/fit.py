@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -18,7 +19,9 @@ from jaxcal.models.predictions import derivative, predict
 from jaxcal.models.uncertainty import Prior
 from jaxcal.tables import COMMANDS, MEASURED, of_frame
 
-__all__ = ["Fit"]
+__all__ = ["FAR", "Fit", "say_far"]
+
+FAR = 0.25  # of the range of what was measured, beyond it
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -239,6 +242,8 @@ class Fit:
         """Outputs (..., m) at commands (..., n)."""
         points = self.points("commands", commands, self.num_inputs)
         rows = points.reshape(-1, self.num_inputs)
+        sides = [(self.input_names, rows, self.commands)]
+        say_far("command", self.loss_weights > 0.0, sides)
         found = predict(self.whole, rows, self.estimate)
         return found.reshape(*points.shape[:-1], self.num_outputs)
 
@@ -334,7 +339,7 @@ class Fit:
 
     def by_name(self, name: str, values: ArrayLike) -> Any:
         """The calibration's columns of a data frame, in its order; else as given."""
-        if name in ("desired", "measured"):
+        if name in ("desired", "measured", "readings"):
             return of_frame(name, values, self.output_names, MEASURED)
         levels = getattr(self.model, "levels", ())
         return of_frame(name, values, self.input_names, COMMANDS, levels=levels)
@@ -386,3 +391,38 @@ def _copied(content: Any) -> Any:
     if isinstance(content, Mapping):
         return {key: _copied(value) for key, value in content.items()}
     return [*map(_copied, content)] if isinstance(content, list) else content
+
+
+def say_far(
+    what: str,
+    used: Any,
+    sides: Sequence[tuple[Sequence[str], Array, Array]],
+    stacklevel: int = 3,
+) -> None:
+    """Warn of points far outside of what was measured.
+
+    Args:
+        what: a point, in words.
+        used: (N,) measurements that count.
+        sides: names of columns, (P, k) the points, (N, k) what was measured.
+        stacklevel: as of ``warnings.warn``.
+    """
+    far, worst, count = set(), "", 0
+    for names, values, measured in sides:
+        low, high = measured[used].min(axis=0), measured[used].max(axis=0)
+        width = np.where(high > low, high - low, np.inf)
+        beyond = np.maximum(low - values, values - high) / width
+        far |= {*np.flatnonzero((beyond > FAR).any(axis=1))}
+        if far and not worst:
+            i, j = np.unravel_index(beyond.argmax(), beyond.shape)
+            worst = (
+                f"{what} {i + 1} has {names[j]} = {values[i, j]:.6g}, measured "
+                f"range {low[j]:.6g} to {high[j]:.6g}"
+            )
+        count = len(values)
+    if far:
+        warnings.warn(
+            f"{len(far)} of {count} {what}s {'is' if len(far) == 1 else 'are'} far "
+            f"outside the measurements, where the calibration is untested: {worst}",
+            stacklevel=stacklevel,
+        )

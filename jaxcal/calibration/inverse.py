@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration.fit import Fit
+from jaxcal.calibration.fit import Fit, say_far
 from jaxcal.checks import Array, array_of, in_words
 from jaxcal.information.singular import (
     depends,
@@ -19,10 +19,9 @@ from jaxcal.information.singular import (
 from jaxcal.models.identifiability import unknown
 from jaxcal.models.predictions import derivative, predict
 
-__all__ = ["FAR", "Responses", "command_for", "limits_of", "no_inverse"]
+__all__ = ["Responses", "command_for", "limits_of", "no_inverse"]
 
 
-FAR = 0.25  # of the range of what was measured, beyond it
 _NAMED = 3  # targets in a warning
 _STARTS, _STEPS, _REACHED = 6, 60, 1e-9  # of the outputs' spread over the measurements
 _SURE = 3.0  # standard deviations from zero: a direction that the outputs respond to
@@ -272,29 +271,12 @@ class _Search(Responses):
 
     def say_far(self, commands: Array) -> None:
         """Warn of targets that are reached (P, n) far from what was measured."""
-        fit, used, far, worst = self.fit, self.fit.loss_weights > 0.0, set(), ""
+        fit = self.fit
         sides = [(fit.input_names, commands, fit.commands)]
         if not fit.model.relative:
             readings = predict(self.model, fit.commands, fit.estimate) + fit.residuals
             sides.insert(0, (fit.output_names, self.wanted, readings))
-        for names, values, measured in sides:
-            low, high = measured[used].min(axis=0), measured[used].max(axis=0)
-            width = np.where(high > low, high - low, np.inf)
-            beyond = np.maximum(low - values, values - high) / width
-            far |= {*np.flatnonzero((beyond > FAR).any(axis=1))}
-            if far and not worst:
-                i, j = np.unravel_index(beyond.argmax(), beyond.shape)
-                worst = (
-                    f"target {i + 1} has {names[j]} = {values[i, j]:.6g}, measured "
-                    f"range {low[j]:.6g} to {high[j]:.6g}"
-                )
-        if far:
-            warnings.warn(
-                f"{len(far)} of {len(commands)} targets "
-                f"{'is' if len(far) == 1 else 'are'} far outside the "
-                f"measurements, where the calibration is untested: {worst}",
-                stacklevel=3,
-            )
+        say_far("target", fit.loss_weights > 0.0, sides, stacklevel=4)
 
     def gap(self, commands: Array, rows: NDArray[np.intp]) -> Array:
         """(R, q) of points ``rows`` from the outputs at ``commands``, in sizes."""

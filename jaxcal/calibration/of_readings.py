@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.calibration.fit import Fit
-from jaxcal.calibration.inverse import FAR, Responses, command_for, limits_of
+from jaxcal.calibration.fit import FAR, Fit
+from jaxcal.calibration.inverse import Responses, command_for, limits_of
 from jaxcal.checks import Array, aligned, numbers, whole_number
 
 __all__ = ["Inverse", "inverse"]
@@ -93,9 +93,9 @@ def inverse(
         raise ValueError(f"inverse needs as many inputs as outputs, got {n} and {m}")
     variance = noise**2 / whole_number("repeats", repeats, 1)
     factor = fit.quantile(confidence)
-    given: Any = fit.by_name("measured", readings)
-    if m == 1 and (not np.ndim(given) or np.shape(given)[-1] != 1):
-        given = numbers("readings", given)[..., None]
+    given: Any = numbers("readings", fit.by_name("readings", readings))
+    if m == 1 and (not given.ndim or given.shape[-1] != 1):
+        given = given[..., None]
     points = fit.points("readings", given, m)
     flat, shape = points.reshape(-1, m), points.shape[:-1]
     bounds = limits_of(limits, fit.input_names)

@@ -80,7 +80,9 @@ class SavedFiles:
         "save the calibration (.json) or an arm's corrected file (.urdf)",
         "FILE",
     ] = ""
-    overwrite: Annotated[bool, "overwrite an existing .urdf or servos file"] = False
+    overwrite: Annotated[
+        bool, "overwrite an existing .urdf, servos or --repair file"
+    ] = False
     unproven: Annotated[bool, "write the .urdf even if the calibration is not good"] = (
         False
     )
@@ -123,7 +125,8 @@ class SavedFiles:
             )
         files = "--out FILE.urdf, --servos-out and --transform"
         for option in ("unproven", "overwrite"):
-            if getattr(self, option) and not self.corrected:
+            of_table = self.repair and option == "overwrite"
+            if getattr(self, option) and not (self.corrected or of_table):
                 raise ValueError(f"--{option} needs {files}")
         if self.frames is not None and not self.transform:
             raise ValueError("--frames needs --transform FILE")
@@ -137,7 +140,7 @@ class SavedFiles:
             raise ValueError("--servos needs a recording or --servos-out")
         if self.as_urdf and not of_urdf:
             raise ValueError("--out FILE.urdf needs --model FILE.urdf")
-        for path in (self.transform, self.out if self.as_urdf else ""):
+        for path in (self.transform, self.out if self.as_urdf else "", self.repair):
             if path and os.path.exists(path) and not self.overwrite:
                 raise ValueError(f"{path} exists; pass --overwrite to replace it")
 

@@ -79,12 +79,12 @@ def identify(
     dataset may replace the table; the postures are then those where the arm rested.
     """
     of_urdf = (model or "").lower().endswith(".urdf")
+    if saved.repair and os.path.realpath(saved.repair) == os.path.realpath(file):
+        raise ValueError(f"--repair must name another file than {file}")
     saved.require(file, of_urdf, recording.servos)
     page.require()
     if saved.repair and weights:
         raise ValueError("--repair writes no weights: leave out --repair or --weights")
-    if saved.repair and os.path.realpath(saved.repair) == os.path.realpath(file):
-        raise ValueError(f"--repair must name another file than {file}")
     table = recording.table(file, lambda which: of_arm.of_recording(model, which))
     table = read_table(file) if table is None else table
     machine: Any = of_arm.machine(model, table)

@@ -284,6 +284,6 @@ class _Ladder:
                 best = (error, step, slope)
         error, step, slope = best
         size = float(np.sqrt(((slope * weights) ** 2).mean()))
-        if not (np.abs(slope) > 4.0 * amplifies * self.noise / step).any():
+        if not size or not (np.abs(slope) > 4.0 * amplifies * self.noise / step).any():
             return step, self.side, np.nan
         return step, self.side, error / size

@@ -18,7 +18,8 @@ _RARE = float(np.log(20.0))  # an outlier
 _TOO_LARGE = 3.0  # times: no caution makes a stated noise that much larger
 _SIZES = 10.0  # of a parameter: known no better, it is not known
 _STEP = 0.1  # standard errors, by which another step would move the parameters
-_BENT = 2.0  # times the noise without squares and products of the commands
+_BENT, _BENT_MORE = 2.0, 3.0  # times the noise without squares and products of the
+# commands; of a model that is a curve itself
 _SAMPLE, _TERMS = 2000, 600  # readings; twice these terms
 _EXACT = 1e-12  # of the largest reading: rounding, and no noise of a sensor
 _UNITS = np.outer([1.0, -1.0], [1.0, np.pi / 180.0, 180.0 / np.pi, 1e3, 1e-3]).ravel()
@@ -300,7 +301,8 @@ def bends(fit: Fit) -> Reason | None:
         return max(float(off @ off), 1e-300), len(white) - int(rank)
 
     (before, more), (after, rest) = unexplained(slopes), unexplained(both)
-    if rest < 1 or more == rest or _BENT**2 * after / rest > before / more:
+    least = _BENT if fit.model.linear else _BENT_MORE
+    if rest < 1 or more == rest or least**2 * after / rest > before / more:
         return None
     ratio = (before - after) / (more - rest) / (after / rest)
     # As of one output: the outputs of a row may err alike.

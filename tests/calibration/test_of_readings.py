@@ -138,3 +138,18 @@ def test_what_cannot_be_inverted_is_refused():
     bent = jaxcal.identify(x, x**2 + wave, model=Polynomial(2, 1, 1))
     with pytest.raises(ValueError, match="of a command between -3 and 3"):
         bent.inverse(-5.0)
+
+
+def test_readings_of_a_frame_are_read_by_the_names_of_the_outputs():
+    pandas = pytest.importorskip("pandas")
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-5.0, 5.0, (12, 2))
+    y = u @ [[1.1, 0.2], [-0.1, 0.9]] + 0.01 * rng.normal(size=(12, 2))
+    calibration = jaxcal.identify(
+        pandas.DataFrame(u, columns=["pitch", "roll"]),
+        pandas.DataFrame(y, columns=["y_pitch", "y_roll"]),
+    )
+    by_name = calibration.inverse(pandas.DataFrame({"y_roll": [1.0], "y_pitch": [2.0]}))
+    np.testing.assert_allclose(
+        by_name.commands, calibration.inverse([[2.0, 1.0]]).commands
+    )

@@ -274,6 +274,8 @@ def test_repair_writes_another_file_and_only_where_asked(tmp_path, capsys):
     assert main(["identify", str(mended), "--report", str(tmp_path / "again")]) == 0
     capsys.readouterr()
     assert main(["identify", str(mended), "--repair", str(path)]) == 2
+    assert "exists; pass --overwrite" in capsys.readouterr().err
+    assert main(["identify", str(mended), "--repair", str(tmp_path / "new.csv")]) == 2
     assert "no mispaired rows" in capsys.readouterr().err
     assert path.read_bytes() == before
     assert main(["identify", str(path), "--repair", str(path)]) == 2
@@ -359,3 +361,38 @@ def test_many_rows_of_which_one_output_stands_still_divide_by_no_zero(rng):
         [u @ [1.0, 2.0] + 0.3 * rng.standard_normal(800), np.zeros(800)]
     )
     assert "never changes" in str(jaxcal.identify(u, y).verdict)
+
+
+@pytest.mark.parametrize(
+    ("words", "commands_times", "readings_times"),
+    [
+        ("y_1 is too small by 1000", 1.0, 1e-3),
+        ("y_1 is in radians", 1.0, np.pi / 180.0),
+        ("every column of the commands is too small by 1000", 1e-3, 1.0),
+        ("y_1 has the other sign", 1.0, -1.0),
+        ("", 1.0, 1.0),
+    ],
+)
+def test_what_parameters_take_up_is_told_by_the_nominal(
+    words, commands_times, readings_times
+):
+    def saturating(commands, theta):
+        one, other = commands.T
+        return (theta[0] * (1 - np.exp(-theta[1] * one)) + theta[2] * other)[:, None]
+
+    nominal = np.array([120.0, 0.4, 3.0])
+    model = jaxcal.models.FromFunction(saturating, nominal=nominal, batch=True)
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        commands = rng.uniform(0.0, 5.0, (20, 2))
+        truth = nominal * (1.0 + rng.normal(0.0, 0.15, 3))
+        measured = saturating(commands, truth) + rng.normal(0.0, 0.3, (20, 1))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", jaxcal.CalibrationWarning)
+            calibration = jaxcal.identify(
+                commands * commands_times, measured * readings_times, model=model
+            )
+        assert calibration.verdict.good == (not words)
+        assert calibration.verdict.reasons[:1] == () or words in str(
+            calibration.verdict.reasons[0]
+        )

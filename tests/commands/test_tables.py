@@ -193,3 +193,11 @@ def test_joints_beside_those_of_the_arm_are_said(ask, tmp_path):
         found = jaxcal.identify(frame[["elbow", "turn"]], read[["y_z", "y_x"]].join(
             read["y_y"]), model=arm)  # fmt: skip
     np.testing.assert_allclose(found.predict(joints[:, :2]), read, atol=1e-6)
+
+
+def test_a_prediction_far_from_the_measurements_is_said(ask, tmp_path):
+    (tmp_path / "far.csv").write_text("u_a,u_b\n900,0\n")
+    code, _, said = ask("predict c.json far.csv")
+    assert code == 0
+    assert "1 of 1 commands is far outside the measurements" in said
+    assert "u_a = 900" in said

@@ -5,6 +5,7 @@ import importlib
 import os
 import re
 import sys
+import warnings
 from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
@@ -436,3 +437,21 @@ def test_a_program_that_prints_few_digits(digits, size, rng):
     assert selection.proven == (digits > 4)
     if digits == 4:
         assert re.search(r"derivatives are differences, off by \d", selection.reason)
+
+
+@pytest.mark.parametrize("loss", ["student", "gaussian"])
+def test_a_function_that_underflows_has_no_effect(loss):
+    """A peak so far from every reading that none of them feels it."""
+
+    def peak(u, theta):
+        height, width, centre = theta
+        return (height * np.exp(-0.5 * ((u[:, 0] - centre) / width) ** 2))[:, None]
+
+    x = np.linspace(400.0, 500.0, 35)[:, None]
+    y = peak(x, [0.4, 4.1, 451.5]) + 0.002 * np.random.default_rng(2).normal(
+        size=(35, 1)
+    )
+    model = FromFunction(peak, [1.0, 5.0, 900.0], batch=True, quiet=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert not jaxcal.identify(x, y, model=model, loss=loss).verdict.good

@@ -172,7 +172,8 @@ class World:
 
     def advance(self, seconds: float, beats: bool = False) -> None:
         """The world goes on for so long, or until the session is killed in it."""
-        end, self._beats = self.now + seconds, beats
+        # A wait below the last digit of a clock would never end.
+        end, self._beats = self.now + (seconds and max(seconds, 1e-6)), beats
         while True:
             due = self.events[0][0] if self.events else end
             self.now = max(self.now, min(end, due, self.next_line, self.now + 0.01))

@@ -19,11 +19,13 @@ from jaxcal.calibration.pairing.table import (
     ColumnChange,
     Hypothesis,
     Table,
+    as_it_is,
     shifted,
 )
 from jaxcal.checks import Array
+from jaxcal.models.predictions import predict
 
-__all__ = ["changed_columns", "places"]
+__all__ = ["by_nominal", "changed_columns", "places"]
 
 Rows = NDArray[np.intp]
 
@@ -41,6 +43,8 @@ _UNITS = {
 _COLUMNS = 6  # changes of columns that are fitted one by one
 _PLACES = 2  # of a sensor, that are tried
 _KINDS = np.log(10.0)
+_ROWS = 50  # that are predicted in each unit
+_FACTOR, _LEFT_OVER = 1.5, 0.6  # between machine and nominal; of the readings' squares
 
 
 def changed_columns(
@@ -62,6 +66,48 @@ def changed_columns(
         for _, anew, hypothesis in tables[:_COLUMNS]
         for fit in fits_of(anew, [hypothesis])
     ]
+
+
+def by_nominal(
+    table: Table, inputs: Sequence[str], outputs: Sequence[str]
+) -> ColumnChange | None:
+    """A change by which the prior's mean explains readings that it does not without.
+
+    A nonlinear fit may take up a unit or a sign in a parameter and leave nothing over.
+    """
+    rows = np.flatnonzero(table.counted)[:_ROWS]
+    if (_unexplained(table, as_it_is(table), rows) < 1.0).all():
+        return None
+    kinds = [
+        hypothesis
+        for hypothesis in _kinds_of_columns(table, inputs, outputs)
+        if hypothesis.change
+        and not hypothesis.change.words.endswith(("by 10", "by 100"))
+    ]
+    shares = [_unexplained(table, hypothesis, rows) for hypothesis in kinds]
+    best = min(range(len(kinds)), key=lambda i: shares[i].sum())
+    if (shares[best] >= _LEFT_OVER).any():
+        return None
+    nominal = dataclasses.replace(table, theta=table.mean)
+    for fit in fits_of(nominal, [kinds[best]]):  # whose parameters are near it
+        if (np.abs(fit.theta - table.mean) <= np.abs(table.mean)).all():
+            return kinds[best].change
+    return None
+
+
+def _unexplained(table: Table, hypothesis: Hypothesis, rows: Rows) -> Array:
+    """(q,) share of the readings' squares about their means left by the prior's mean.
+
+    Its outputs may be larger or smaller by a factor.
+    """
+    readings = table.readings_of(hypothesis, rows)
+    commands = table.commands_of(hypothesis, rows)
+    outputs = predict(table.model, commands, table.mean, finite=False)
+    with np.errstate(all="ignore"):
+        ratio = (readings * outputs).sum(axis=0) / (outputs**2).sum(axis=0)
+        off = readings - outputs * np.clip(ratio, 1.0 / _FACTOR, _FACTOR)
+        share = (off**2).sum(axis=0) / (readings.var(axis=0) * len(rows))
+    return np.nan_to_num(share, nan=np.inf, posinf=np.inf)
 
 
 def _kinds_of_columns(

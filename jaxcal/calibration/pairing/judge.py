@@ -42,6 +42,7 @@ Rows = NDArray[np.intp]
 
 _SURE = 8.0  # log of the odds at which a mispairing is said
 RATIO = 2.0  # times the noise without it, least squares of the table as it stands
+_SURE_BESIDE, _BENIGN = 6.0, 1.4  # both, beside what machines do
 _AS_GOOD = 3.0  # log of the odds within which another kind is named too
 _TRIED = 6  # hypotheses that are fitted one by one
 _WORTH = 12.0  # log of the odds: of those that are so much worse at first, none
@@ -103,7 +104,12 @@ class Mispairing:
 
 def mispairing(fit: Fit) -> Mispairing | None:
     """How the measurements of a calibration were mispaired; None: they were not."""
-    if len(fit.commands) < LEAST or _plainly_right(fit):
+    if len(fit.commands) < LEAST:
+        return None
+    if not fit.model.linear and fit.model.default_noise() is None:
+        if other := _taken_up(fit):
+            return other
+    if _plainly_right(fit):
         return None
     if fit.noise_known:
         lack = fit.lack_of_fit()
@@ -113,6 +119,22 @@ def mispairing(fit: Fit) -> Mispairing | None:
     if table is None:
         return None
     return _found(table, fit.input_names, fit.output_names, fit.measured_unit)
+
+
+def _taken_up(fit: Fit) -> Mispairing | None:
+    """A unit, a sign or a place that a nonlinear fit took up in its parameters."""
+    from jaxcal.calibration.pairing.columns import by_nominal
+
+    table = of_fit(fit)
+    change = table and by_nominal(table, fit.input_names, fit.output_names)
+    if not change or fit.noise_std is None:
+        return None
+    noise = fit.noise_std
+    if change.of_readings:
+        noise = noise * np.abs(change.factors)
+    match = np.arange(len(fit.commands))
+    reason = f"{change.words}, for the nominal parameters explain it then and not now"
+    return Mispairing("columns", reason, noise, match, change, fit.model.sensed)
 
 
 def of_unfitted(
@@ -234,10 +256,10 @@ def _found(
         return None
     if best.hypothesis.kind != _APART:
         for benign in benign_fits(table, plain, best):
-            if best.evidence - benign.evidence < _SURE:
+            if best.evidence - benign.evidence < _SURE_BESIDE:
                 return None
             by_itself = benign is not plain and not benign.hypothesis.code
-            if by_itself and not better(benign, best):
+            if by_itself and not better(benign, best, _BENIGN):
                 return None
     from jaxcal.calibration.pairing.orders import polished
     from jaxcal.calibration.pairing.words import sentence, what_is_wrong
@@ -395,9 +417,9 @@ def _apart(table: Table, plain: Fitted) -> list[Fitted]:
     return []
 
 
-def better(fit: Fitted, best: Fitted) -> bool:
+def better(fit: Fitted, best: Fitted, ratio: float = RATIO) -> bool:
     """Whether an output's residuals are far larger than the noise of the best."""
-    return bool((fit.rms > RATIO * best.noise).any())
+    return bool((fit.rms > ratio * best.noise).any())
 
 
 def _explains(plain: Fitted, fit: Fitted) -> bool:

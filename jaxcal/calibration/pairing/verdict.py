@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 _OFF = 6.0  # times the noise of the others
 _TURNS, _FLOOR = 4, 0.01  # rounds; noises, below which a row weighs no more
 _SAMPLE = 5000  # rows
+_READINGS = 3  # for each parameter
 
 
 def against(verdict: Verdict, fit: Calibration) -> Verdict:
@@ -73,7 +74,8 @@ def _hidden_outliers(fit: Fit) -> Reason | None:
     of them is an outlier. A model of which nothing is known before is asked, where
     drift and curves explain the rows no better.
     """
-    if len(fit.commands) < LEAST or not _uneven(fit):
+    few = fit.residuals.size < _READINGS * fit.free.sum()
+    if len(fit.commands) < LEAST or few or not _uneven(fit):
         return None
     table = of_fit(fit)
     if table is None or table.precision[table.free].any():
