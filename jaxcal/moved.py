@@ -29,6 +29,7 @@ MOVED = {  # longer names first
     "rig.simulator": "rig_workbench.simulator",
     "rig.workbench.commission.characterise": "rig_workbench.commission.characterise",
     "rig.workbench.commission.setup": "rig_workbench.commission.setup",
+    "rig.workbench.commission.operator": "rig.prove.steps",
     "rig.workbench.commission": "rig.prove",
     "rig.workbench.identification.refit": "rig_workbench.refit",
     "rig.workbench.live": "rig_workbench.live",
@@ -36,7 +37,7 @@ MOVED = {  # longer names first
     "rig.workbench.outputs.report": "rig_workbench.outputs.report",
     "rig.workbench.outputs.trend": "rig_workbench.outputs.trend",
     "rig.workbench.outputs.view": "rig_workbench.outputs.view",
-    "rig.workbench.rig_toml": "rig.prove.rig_toml",
+    "rig.workbench.rig_toml": "rig.prove.steps",
     "rig.workbench": "rig",
 }
 

@@ -80,11 +80,7 @@ class Run(SessionRun):
 
     @contextlib.contextmanager
     def device(self) -> Iterator[Device]:
-        """The device, armed and its zero taken.
-
-        Raises:
-            PlanOnly: this is a dry run. Refused: it is not known well enough.
-        """
+        """The device, armed and its zero taken; PlanOnly of a dry run, or Refused."""
         if self.dry_run:
             raise PlanOnly
         if text := self.record.missing(self.config):
@@ -99,10 +95,9 @@ class Run(SessionRun):
         if self.again:
             return self.again
         resume = f"jaxcal-rig resume {self.folder}"
-        if self.journal.records[0].get("simulated") is None:  # or it begins anew
-            if lack := self.record.missing(self.config):
-                return f"{lack}. Then {resume}"
-        return resume
+        real = self.journal.records[0].get("simulated") is None  # or it begins anew
+        lack = self.record.missing(self.config) if real else None
+        return f"{lack}. Then {resume}" if lack else resume
 
 
 def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:

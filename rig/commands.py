@@ -118,6 +118,7 @@ def _step(given: Step, state: str, name: str, *options: Any) -> int:
 def place(given: DeviceOptions, state: str = "") -> Iterator[Site]:
     """The device that a command is about, which has reached a state."""
     from rig.journal.device import DeviceRecord
+    from rig.journal.run_folder import new_run_folder
     from rig.prove import steps
 
     config, operator = given.load(), steps.Operator(getattr(given, "yes", False), say)
@@ -125,8 +126,8 @@ def place(given: DeviceOptions, state: str = "") -> Iterator[Site]:
         if given.simulate:
             simulator = given.simulator(config)
             config = stack.enter_context(simulator).start()
-            path = steps.own_folder(config) / "device.json"
-            record = steps.commissioned(path, config, state)
+            folder = new_run_folder(Path(config.output), "simulated")
+            record = steps.commissioned(folder / "device.json", config, state)
             site = steps.Site(
                 config, record, operator, full_speed=True, listeners=(simulator.hear,)
             )

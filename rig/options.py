@@ -75,9 +75,9 @@ class DeviceOptions(Simulation):
             if self.simulate or simulated:
                 return parse_config(example_text("simulate"))
             if not FILE.exists():
-                lack = "no rig.toml in this folder: give --config FILE or --simulate"
-                setup = "`jaxcal-rig setup` writes one"
-                raise ConfigError("configuration", [f"{lack}; {setup}"])
+                lack = "no rig.toml in this folder: give --config FILE or --simulate; "
+                lack += "`jaxcal-rig setup` writes one"
+                raise ConfigError("configuration", [lack])
             self.config = FILE
         return load_config(self.config)
 

@@ -57,9 +57,8 @@ def start(folder: pathlib.Path) -> str:
 def write_report(folder: pathlib.Path) -> None:
     """Have ``report.html`` of a run written.
 
-    Raises:
-        MissingExtraError: what writes it is not installed.
-        Fault: it was not written.
+    Raises MissingExtraError: what writes it is not installed. Fault: it was not
+    written.
     """
     require("report")
     try:

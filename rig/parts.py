@@ -90,11 +90,7 @@ class DeviceModel(Protocol):
 
 
 def offered(group: str) -> dict[str, EntryPoint]:
-    """What is installed of a group, by name.
-
-    Raises:
-        MissingExtraError: nothing, as where an earlier version was installed.
-    """
+    """What is installed of a group, by name, or MissingExtraError."""
     if not (points := installed(group)):
         raise MissingExtraError(
             f"the installed jaxcal is missing or too old: {install('rig')}"
@@ -103,38 +99,24 @@ def offered(group: str) -> dict[str, EntryPoint]:
 
 
 def part(name: str, purpose: str, group: str = PARTS) -> Any:
-    """A part of the rig by its name, loaded.
-
-    Raises:
-        MissingExtraError: its package is not installed; in one line, with the command
-            that installs it for this ``purpose``.
-    """
+    """A part of the rig, loaded; MissingExtraError says what installs it."""
     point = offered(group)[name]
     with needs(_extra_of(point.module), purpose):
         return point.load()
 
 
 def model_of(config: RigConfig) -> DeviceModel | None:
-    """The model of a device; None where it is affine.
-
-    Raises:
-        ConfigError: it cannot be loaded, or is of other axes or readings.
-    """
-    loaded: DeviceModel | None = None
-    if config.model is not None:
-        loaded = part("model", "[model]")(config)
+    """The model of a device, None where it is affine, or ConfigError."""
+    if config.model is None:
+        return None
+    loaded: DeviceModel = part("model", "[model]")(config)
     return loaded
 
 
 def require(command: str, simulated: bool = False) -> None:
-    """Refuse a command of which a package is not installed.
+    """MissingExtraError, with what installs all that a command lacks.
 
-    Args:
-        command: its name.
-        simulated: its device is, which needs the simulator.
-
-    Raises:
-        MissingExtraError: in one line, with what installs all that is missing.
+    ``simulated``: its device is, which needs the simulator.
     """
     module = offered(COMMANDS)[command].module
     extra = "workbench" if simulated else _extra_of(module)

@@ -19,10 +19,7 @@ from rig.journal.run_folder import JOURNAL, SCHEMA, Record, new_run_folder, read
 from rig.options import Session
 from rig.outputs.console import listen
 from rig.procedures import calibrate, verify
-from rig.procedures.collect import collect
-from rig.procedures.goto import goto
 from rig.prove import steps
-from rig.prove.operator import Operator
 
 say = functools.partial(print, flush=True)
 
@@ -36,12 +33,8 @@ def run_session(
 ) -> int:
     """Run a session under the lock of its bus; returns the exit code.
 
-    Args:
-        options: the options of the command.
-        command: its name, told to whoever finds the bus locked.
-        config: of the device.
-        start: mode, inputs and simulation, as the journal's first record keeps them.
-        folder: of the run that is resumed; a new one without it.
+    ``command`` is told to whoever finds the bus locked; ``start`` has mode, inputs and
+    simulation, as the journal's first record; ``folder`` is that of a resumed run.
     """
     real = start["simulated"] is None
     procedure, kept_zero, doubts = _procedure(start, config)
@@ -89,13 +82,12 @@ def run_session(
 def _procedure(
     start: dict[str, Any], config: RigConfig
 ) -> tuple[Callable[[Run], int], ZeroRecord | None, list[str]]:
-    """What a session does, the zero posture that it must find, and why the calibration
-    that it moves by is not to be used."""
+    """What a session does, the zero it must find, and doubts of its calibration."""
     mode, inputs = start["mode"], start["inputs"]
     if mode == "calibrate":
         return calibrate.calibrate, None, []
     if mode == "collect":
-        return lambda run: collect(run, inputs["count"]), None, []
+        return lambda run: calibrate.collect(run, inputs["count"]), None, []
     if mode == "goto" and config.is_arm:
         raise Refused(
             "goto does not move an arm; its own controller does. Give it "
@@ -107,28 +99,22 @@ def _procedure(
     if mode == "verify":
         return lambda run: verify.verify(run, calibration, inputs["count"]), kept, []
     doubts = verify.doubts(calibration)
-    return lambda run: goto(run, calibration, inputs["to"]), kept, doubts
+    return lambda run: verify.goto(run, calibration, inputs["to"]), kept, doubts
 
 
 def _confirm(options: Session, doubts: list[str], session: Run) -> None:
     """Ask for what --arm, --zero and --use would have confirmed."""
     takes_zero = not session.journal.events("zero") and session.zero_at is None
-    questions = {}
-    if doubts:
-        questions["use"] = (
-            "the session that made this calibration advised against using it: "
-            f"{' and '.join(doubts)}"
-        )
-    if not session.simulated:
-        questions["arm"] = (
-            "the device will move; its path is clear, no patient is attached, the "
-            "emergency stop is at hand"
-        )
-        if takes_zero and session.config.session.zero == "here":
-            questions["zero"] = "the device is in its zero posture"
-    for word, text in questions.items():
-        if not getattr(options, word):
-            Operator(say=say, option=f"--{word}").confirm(text, word)
+    takes_zero &= session.config.session.zero == "here" and not session.simulated
+    why = "the session that made this calibration advised against using it: "
+    clear = "the device will move; its path is clear, no patient is attached, the "
+    for needed, word, text in (
+        (bool(doubts), "use", why + " and ".join(doubts)),
+        (not session.simulated, "arm", clear + "emergency stop is at hand"),
+        (takes_zero, "zero", "the device is in its zero posture"),
+    ):
+        if needed and not getattr(options, word):
+            steps.Operator(say=say, option=f"--{word}").confirm(text, word)
 
 
 def recorded(

@@ -23,12 +23,10 @@ HANDLED_S = 0.2  # until the main thread has run a handler, unless it hangs
 class Signals(Requests):
     """Ctrl-C once: finish the posture and pause. Twice, or any other signal: stop now.
 
-    While armed, a signal only sets a flag, so that no frame on the bus and no line of
-    the journal is cut in two. While nothing can move, it ends the program at once, but
-    not a run that is ending. Nothing is written here.
-
-    Python runs handlers on the main thread. Where that hangs, on a disk that does not
-    answer, a second thread sets the flag, and the heartbeat stops the drives.
+    While armed, a signal only sets a flag, so that no frame and no line of the journal
+    is cut in two. While nothing can move it ends the program at once, but not a run
+    that is ending. Python runs handlers on the main thread. Where that hangs, on a disk
+    say, a second thread sets the flag, and the heartbeat stops the drives.
     """
 
     def __init__(self) -> None:

@@ -41,6 +41,7 @@ def setup(
 ) -> int:
     """from cables to a device that may be calibrated; writes rig.toml"""
     from rig.journal.device import DeviceRecord
+    from rig.journal.run_folder import new_run_folder
     from rig.prove import steps
     from rig_workbench.commission import setup as wizard
 
@@ -60,7 +61,8 @@ def setup(
             device = dataclasses.replace(given, config=None)
             simulator = stack.enter_context(device.simulator(device.load()))
             asked = wizard.simulated(simulator, asked)
-            path = given.config or steps.own_folder(simulator.config) / "rig.toml"
+            output = Path(simulator.config.output)
+            path = given.config or new_run_folder(output, "simulated") / "rig.toml"
             if path.exists():  # its bus may be that of a real device
                 raise Refused(
                     f"{path} exists: --simulate writes a new file. Name a new file, or "

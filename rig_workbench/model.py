@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from rig.config import ConfigError, RigConfig
 from rig.drives import named
-from rig.identification.fit_affine import fit_quietly, spread
+from rig.identification.conclusion import fit_quietly, spread
 from rig.journal.run_folder import Record
 from rig.outputs.messages import recalibrate
 from rig.readings.geometry import RADIAN, geometry_of

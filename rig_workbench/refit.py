@@ -20,8 +20,8 @@ from rig.config import RigConfig, parse_config
 from rig.faults import EXIT_OK, MotionFault, Refused
 from rig.identification.conclusion import check_matrix, conclude
 from rig.journal.run_folder import Record, RunFolder, measured_postures, new_run_folder
-from rig.outputs.results import save_result
-from rig.prove.rig_toml import set_values
+from rig.outputs.messages import save_result
+from rig.prove.steps import set_values
 from rig.readings.attitude import DIGITS, Array, euler_to_matrix, matrix_to_euler
 from rig.readings.geometry import geometry_of
 

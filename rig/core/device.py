@@ -1,14 +1,13 @@
 """The device as one object: its drives, its phone, and the guards around them.
 
-The loops of moving and measuring read it and ask ``guard``; they look at the clock and
-do nothing else: no JAX, no files but the callback of events.
+The loops of moving and measuring read it, ask ``guard`` and look at the clock alone.
 """
 
 from __future__ import annotations
 
-import dataclasses
+import contextlib
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,8 +16,8 @@ from rig.config.axis import Pulses
 from rig.config.config import RigConfig
 from rig.core.heartbeat import Heartbeat, Stopper
 from rig.core.line_client import line_of
-from rig.core.proof import Proof, Turns, slopes
-from rig.core.stop_distance import stop_distances
+from rig.core.proof import Proof, Turns, slopes, stop_distances
+from rig.core.record_check import check_drives
 from rig.drives import Drive, Line
 from rig.drives.drive import Status
 from rig.drives.line import BusError
@@ -40,6 +39,7 @@ TELLS = 0.03  # least of the singular values, of the largest: by so little an ax
 PATIENCE_S = 60.0  # with a stream that pauses while nothing moves
 
 
+Check = Callable[[RigConfig, Sequence[Drive], DeviceRecord], None]
 Lines = Callable[[RigConfig, Callable[..., Any]], tuple[Line, list[Drive]]]
 
 
@@ -82,10 +82,9 @@ def check_plan(config: RigConfig, targets: Iterable[Pulses]) -> None:
 
 
 class LineWatch:
-    """The communication timeout of the drives that have one: lent, and given back.
+    """The communication timeout of drives that have one: lent, and given back.
 
-    What the register held is journalled before it is changed, so that a later process
-    can put it back for one that was killed.
+    The register is journalled before it is changed: a later process can put it back.
     """
 
     def __init__(self, drives: list[Drive], run: RunFolder) -> None:
@@ -96,12 +95,7 @@ class LineWatch:
         self._before: dict[str, int] = {}
 
     def apply(self) -> None:
-        """Set the timeouts.
-
-        Raises:
-            MotionFault: a register cannot be read, so it could not be put back.
-            BusError: no valid reply.
-        """
+        """Set the timeouts; MotionFault where one could not be put back."""
         for drive in self._drives:
             name = drive.axis.name
             try:
@@ -116,9 +110,7 @@ class LineWatch:
                 ) from None
             counts = drive.watch_counts(self._timeouts_s[name])
             taken = self._left.get(name)
-            if (
-                taken and before == taken["counts"]
-            ):  # a killed session's, not the drive's
+            if taken and before == taken["counts"]:  # a killed session's
                 before = taken["before"]
             lent = {"axis": name, "before": before, "counts": counts}
             self._emit("comm_timeout", sync=True, **lent)
@@ -155,47 +147,40 @@ def timeouts_left(records: list[Record]) -> dict[str, Record]:
     return left
 
 
-@dataclasses.dataclass
-class Observation:
-    """What the phone has shown of the axes at the last posture, since the zero."""
+class SessionRun(RunFolder):
+    """The folder of a run, and what its session is opened with."""
 
-    commanded: Array  # (n,) degrees of the axes
-    measured: Array  # (m,) of what is measured
+    record: DeviceRecord  # of what was proved of the device
+    signals: Requests  # to pause or to stop, from outside
+    reset_alarms: bool  # of drives that are in alarm
+    # (m,) that is measured at (n,) commands, by its model as designed.
+    predict: Callable[[Array], Array] | None
+    # What runs while the ports are open, such as telemetry.
+    beside: list[Callable[[Device], contextlib.AbstractContextManager[None]]]
+    # What must hold of the drives before they are armed; Refused.
+    check: Check = staticmethod(check_drives)
+    lines: Lines = staticmethod(line_of)  # who makes its line and drives
+    simulated = False  # nothing real moves: it need not be slow
 
 
 class Device:
     """Drives and what they are measured with: armed explicitly, and never moved once
     stopped."""
 
-    def __init__(
-        self,
-        config: RigConfig,
-        run: RunFolder,
-        record: DeviceRecord,
-        requests: Requests | None = None,
-        *,
-        simulated: bool = False,
-        predict: Callable[[Array], Array] | None = None,
-        lines: Lines = line_of,
-    ) -> None:
-        """``simulated``: it need not be slow where nothing is proved. ``predict``:
-        what is measured at (n,) commands by its model as designed, where it has one.
-        ``lines``: who makes its line and drives."""
-        self.config = config
-        self.run = run
-        self.record = record
-        self.emit = run.emit
-        self.line, self.drives = lines(config, run.emit)
+    def __init__(self, run: SessionRun) -> None:
+        self.run, self.emit, self.record = run, run.emit, run.record
+        self.config = config = run.config
+        self.requests, self.predict = run.signals, run.predict
+        self.simulated = run.simulated
+        self.line, self.drives = run.lines(config, run.emit)
         self.imu = make_source(config, run.emit)
         self.geometry = geometry_of(config)
         self.stopper = Stopper(self.drives, run.emit)
-        self.requests = requests or Requests()
-        self.simulated = simulated
-        self.predict = predict
-        turns, checked = Turns.of(record), not record.missing(config, SIGN_CHECKED)
+        turns = Turns.of(self.record)
+        checked = not self.record.missing(config, SIGN_CHECKED)
         gains = turns.gains if turns and checked else None
-        self.proof = Proof(config.axes, self.geometry, checked, simulated, gains)
-        self.proof.stops = stop_distances(record, config.axes)
+        self.proof = Proof(config.axes, self.geometry, checked, run.simulated, gains)
+        self.proof.stops = stop_distances(self.record, config.axes)
         self.shown = False  # each axis has turned the phone as `axes` saw it
         self.paces: dict[str, Pace] = {}  # by axis
         self.last_move: tuple[str, Pulses, Pulses] | None = None  # label, from, to
@@ -209,20 +194,14 @@ class Device:
         self.zero: Posture | None = None  # once it is taken,
         self.frame: Frame | None = None  # and what the phone reads against it
         self.heard = 0  # connection of the phone by which the frame holds
-        self.seen = Observation(
-            np.zeros(len(config.axes)), np.zeros(len(config.output_names))
-        )
+        # (n,) commanded at the last posture, and (m,) measured, since the zero.
+        self.seen = np.zeros(len(config.axes)), np.zeros(len(config.output_names))
         self.line_watch = LineWatch(self.drives, run)
         self.heartbeat = Heartbeat(self.stopper, self.requests, config)
         self.line.check = self._before_exchange
 
     def arm(self, reset_alarms: bool = False) -> None:
-        """Check everything that must hold before anything may move.
-
-        Raises:
-            MotionFault: an alarm, a moving or disabled drive, a position outside the
-                limits. ReadingError: no fresh reading.
-        """
+        """Check everything that must hold before anything may move, or raise."""
         self.stopper.check()
         for drive in self.drives:
             self._check_fit(drive, reset_alarms)
@@ -237,49 +216,44 @@ class Device:
         axis, before, status = drive.axis, drive.last, drive.status()
         if status.fault and reset_alarms and drive.can_reset:
             status = drive.bring(drive.reset, lambda s: not s.fault)
-        if status.fault:
-            raise MotionFault(
-                f"{axis.name} is in alarm: {drive.alarm() or 'no code given'}. Find "
-                "the cause in the drive's manual, then start with --reset-alarms"
-            )
-        if status.moving:
-            raise MotionFault(
-                f"{axis.name} is already moving. Stop the other controller, then run "
-                "`jaxcal-rig stop`"
-            )
-        if not (status.enabled or drive.bring(drive.arm, lambda s: s.enabled).enabled):
-            raise MotionFault(
-                f"{axis.name} does not enable its power stage. Check its supply, and "
-                "its enable and STO inputs"
-            )
         slack = axis.pulses_within(self.config.motion.position_tolerance_deg)
-        where = before.position if before and before.enabled else status.position
-        if abs(status.position - where) > slack:
-            raise MotionFault(
-                f"{axis.name} counted {where} pulses when this session found "
-                f"it and {status.position} now, and nothing moved it: the drive was "
-                "switched off and on, or another controller moves it. Run "
-                "`jaxcal-rig setup home`"
+        here = status.position
+        where = before.position if before and before.enabled else here
+        fault = ""
+        if status.fault:
+            fault = f"is in alarm: {drive.alarm() or 'no code given'}. Find the cause "
+            fault += "in the drive's manual, then start with --reset-alarms"
+        elif status.moving:
+            fault = "is already moving. Stop the other controller, then run "
+            fault += "`jaxcal-rig stop`"
+        elif not (
+            status.enabled or drive.bring(drive.arm, lambda s: s.enabled).enabled
+        ):
+            fault = "does not enable its power stage. Check its supply, and its enable "
+            fault += "and STO inputs"
+        elif abs(here - where) > slack:
+            fault = (
+                f"counted {where} pulses when this session found it and {here} now, "
             )
-        if not axis.min_pulses - slack <= status.position <= axis.max_pulses + slack:
-            raise MotionFault(
-                f"{axis.name} is at {status.position} pulses, outside its limits "
-                f"{axis.min_pulses}..{axis.max_pulses}. Run `jaxcal-rig setup home`"
-            )
+            fault += "and nothing moved it: the drive was switched off and on, or "
+            fault += "another controller moves it. Run `jaxcal-rig setup home`"
+        elif not axis.min_pulses - slack <= here <= axis.max_pulses + slack:
+            limits = f"{axis.min_pulses}..{axis.max_pulses}"
+            fault = f"is at {here} pulses, outside its limits {limits}. Run "
+            fault += "`jaxcal-rig setup home`"
+        if fault:
+            raise MotionFault(f"{axis.name} {fault}")
 
     def check_untouched(self, here: Pulses) -> None:
-        """Nobody else has moved or stopped a drive since the last arrival.
-
-        Raises:
-            MotionFault: its position, or the target that it holds, is another.
-        """
+        """MotionFault where another moved or stopped a drive since the last arrival."""
         tolerance = self.config.motion.position_tolerance_deg
-        for drive, at, was in zip(self.drives, here, self.rest or here, strict=True):
-            if abs(at - was) > drive.axis.pulses_within(tolerance):
+        for axis, at, was in zip(
+            self.config.axes, here, self.rest or here, strict=True
+        ):
+            if abs(at - was) > axis.pulses_within(tolerance):
                 raise MotionFault(
-                    f"{drive.axis.name} is at {drive.axis.to_deg(at):.3f} "
-                    f"{drive.axis.unit_name}, but was left at "
-                    f"{drive.axis.to_deg(was):.3f}: something else moved it"
+                    f"{axis.name} is at {axis.to_deg(at):.3f} {axis.unit_name}, but "
+                    f"was left at {axis.to_deg(was):.3f}: something else moved it"
                 )
         for drive, held in zip(self.drives, self.targets, strict=bool(self.targets)):
             if held is not None and drive.held() not in (None, held):
@@ -316,12 +290,7 @@ class Device:
         return [drive.sound() for drive in self.drives]
 
     def attitude(self, since: float = 0.0) -> Array:
-        """A reading, (3, 3) of a phone, measured at or after a monotonic time, of a
-        device that stands: a stream that pauses is waited for.
-
-        Raises:
-            PauseRequested: it does not come back. StopRequested: a stop was asked for.
-        """
+        """A reading, (3, 3) of a phone, since a monotonic time; the device stands."""
         while (reading := self.await_stream()).time < since:
             self.guard()
             time.sleep(LOOK_S)
@@ -331,10 +300,7 @@ class Device:
         """The newest reading, once it is fresh, while nothing moves.
 
         A phone that saves power holds its Wi-Fi now and then; ``paused_s`` counts it.
-
-        Raises:
-            PauseRequested: not within PATIENCE_S. MotionFault: a drive moves, or is in
-                alarm. StopRequested: a stop was asked for.
+        PauseRequested: not within PATIENCE_S. MotionFault: a drive moves.
         """
         begun = time.monotonic()
         while True:
@@ -358,17 +324,16 @@ class Device:
     def moved(self, change: Array, middle: Array) -> Array | None:
         """(n,) by which the axes moved, of an (m,) change of what is measured.
 
-        Of a phone these are its joint angles; of numbers, what `axes` saw explains
-        them by, or a model does at the ``middle`` (n,) of the way. None where that is
-        not known, or does not tell.
+        Of numbers by what `axes` saw, or a model says at the ``middle`` (n,) of the
+        way; None where that is not known, or does not tell.
         """
         if self.geometry.of_joints:
             return change
-        turns = Turns.of(self.record)
-        rates = None if turns is None else turns.deg
         if self.predict is not None:
             rates = slopes(self.predict, middle)
-        if rates is None:
+        elif turns := Turns.of(self.record):
+            rates = turns.deg
+        else:
             return None
         size = np.linalg.svd(rates, compute_uv=False)
         if len(rates) < len(self.config.axes) or size[-1] < TELLS * size[0]:

@@ -66,11 +66,9 @@ class Stopper:
 
 
 class Heartbeat(threading.Thread):
-    """A thread that stops the drives when the motion loop is silent for too long, or
-    does not answer to a stop.
+    """Stops the drives when the motion loop is silent, or does not answer a stop.
 
-    It also keeps the line alive for drives that watch their communication while the
-    plan computes or writes, when nothing moves.
+    It also keeps the line alive for drives that watch it while nothing moves.
     """
 
     def __init__(self, stopper: Stopper, requests: Requests, config: RigConfig) -> None:
@@ -105,24 +103,22 @@ class Heartbeat(threading.Thread):
         self._stopper.drives[0].line.alive()
         silence = time.monotonic() - self._fed
         slept_s, self._ahead = clock_ahead_s() - self._ahead, clock_ahead_s()
-        if slept_s > SLEPT_S:
-            text = f"this computer slept for {slept_s:.0f} s"
-            if self._moving:
-                self._stopper.stop(
-                    f"{text} while the device moved unobserved. Switch its power "
-                    "saving off"
-                )
-                return True
-            self._stopper.tell(text)
+        reason, slept = "", f"this computer slept for {slept_s:.0f} s"
+        if slept_s > SLEPT_S and not self._moving:
+            self._stopper.tell(slept)
+        elif slept_s > SLEPT_S:
+            reason = f"{slept} while the device moved unobserved. Switch its power "
+            reason += "saving off"
         if not self._stopper.reason and (late := self._requests.overdue(OVERDUE_S)):
-            self._stopper.stop(f"{late}, and the session did not answer")
-            return True
+            reason = reason or f"{late}, and the session did not answer"
         if self._moving and silence > self._silence_s:
-            self._stopper.stop(
+            reason = reason or (
                 f"this program paused for {silence:.2f} s while the device moved "
                 f"(limit {self._silence_s:.2f} s). Is the computer overloaded or "
                 "waiting for its disk?"
             )
+        if reason:
+            self._stopper.stop(reason)
             return True
         if not self._moving and silence > self._keep_alive_s:
             for drive in self._stopper.drives:

@@ -126,8 +126,7 @@ class LineClient(Line):
     def ask(self, axis: int | None, method: str, *args: Any) -> Any:
         """What a method of the line, or of the drive of an axis, returns there.
 
-        Raises:
-            BusError: as there; or the process has ended, or does not answer.
+        Raises BusError: as there; or the process has ended, or does not answer.
         """
         urgent = self._urgent and self._owner == threading.get_ident()
         if self._gone and urgent:
@@ -142,9 +141,10 @@ class LineClient(Line):
                     self._send(urgent, axis=axis, method=method, args=args)
                     number = self._number
                 reply = self._reply(urgent, number)
-            except (EOFError, TimeoutError, OSError) as error:
-                late = isinstance(error, TimeoutError)
-                self._lose(LATE if late else "has ended")
+            except TimeoutError:
+                self._lose(LATE)
+            except (EOFError, OSError):
+                self._lose("has ended")
         return self._result(reply, urgent)
 
     def _send(self, urgent: bool, **request: Any) -> None:
@@ -240,11 +240,6 @@ class DriveClient(Drive):
 def line_of(
     config: RigConfig, emit: Callable[..., Any]
 ) -> tuple[LineClient, list[Drive]]:
-    """The line of a session, to be opened, and the drive of each axis on it.
-
-    Raises:
-        Refused: the drives are of several kinds of line, or of none on this bus.
-    """
+    """The line of a session, to be opened, and the drive of each axis on it."""
     line = LineClient(config, emit)
-    made = enumerate(line.own_drives)
-    return line, [DriveClient(line, number, drive) for number, drive in made]
+    return line, [DriveClient(line, *made) for made in enumerate(line.own_drives)]

@@ -1,13 +1,10 @@
 """The process that owns a session's port, and stops the drives when the session dies.
 
-A session asks it over JSON lines: ``status`` of a drive, ``move``, ``stop`` and the
-rest of ``METHODS``, those of a stop over a channel of their own. It has its own reading
-of bus, units, maps, limits and pace, and refuses what leaves them. A thread of the
-session writes a sign of life every 50 ms. Where that ends while a drive moves, or its
-pipe is closed, the drives are stopped here, and the lock is held until they were.
-
-Nothing is loaded but the standard library, the lock, the drives and, of a serial port,
-pyserial.
+A session asks it over JSON lines for ``METHODS``, those of a stop over a channel of
+their own. It refuses what leaves its own reading of bus, units, maps, limits and pace.
+A thread of the session writes a sign of life every 50 ms; where that ends while a drive
+moves, or its pipe is closed, the drives are stopped here, and the lock is held till
+then. It loads the standard library, lock and drives alone, and pyserial for its ports.
 """
 
 from __future__ import annotations
@@ -155,19 +152,18 @@ class Owner:
 
     def _answer(self, request: dict[str, Any], urgent: bool) -> Any:
         axis, method, args = (request[key] for key in ("axis", "method", "args"))
-        call = self.line, self.drives, axis, method, args
-        if urgent:
-            self._epoch = request["epoch"]
-            with self.line.urgent(request["wait_s"]):
-                result = perform(*call)
-        else:
-            self._armed |= method in ARMS
-            if method == "move":
-                self._require(axis, *args)
-            if method in ("move", "home"):
-                # A homing may seem to stand on its way.
-                self._begun[axis] = time.monotonic() if method == "move" else math.inf
-            result = perform(*call)
+        with contextlib.ExitStack() as stack:
+            if urgent:
+                self._epoch = request["epoch"]
+                stack.enter_context(self.line.urgent(request["wait_s"]))
+            else:
+                self._armed |= method in ARMS
+                if method == "move":
+                    self._require(axis, *args)
+                    self._begun[axis] = time.monotonic()
+                elif method == "home":  # which may seem to stand on its way
+                    self._begun[axis] = math.inf
+            result = perform(self.line, self.drives, axis, method, args)
         if method == "status":
             self._look(axis)
         self.closed |= method == "close"
@@ -181,10 +177,10 @@ class Owner:
         if not here.min_pulses <= pulses <= here.max_pulses:
             within = f"{here.min_pulses}..{here.max_pulses}"
             raise LimitError(f"{here.name}: {pulses} pulses are outside {within}")
-        for what, asked, most in (("s", speed, fastest), ("s^2", accel, hardest)):
+        for per, asked, most in (("s", speed, fastest), ("s^2", accel, hardest)):
             if not 0 < asked <= most * (1 + ROUNDING):
-                text = f"{asked:g} pulses/{what} are outside {most:g}"
-                raise LimitError(f"{here.name}: {text}")
+                text = f"{here.name}: {asked:g} pulses/{per} are outside {most:g}"
+                raise LimitError(text)
 
     def _look(self, axis: int) -> bool:
         """Whether a drive that was moved was now seen to stand."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rig.config.axis import Pulses
-from rig.core.device import Device, Observation, Posture
+from rig.core.device import Device, Posture
 from rig.core.motion import Arrival
 from rig.drives.drive import Status
 from rig.faults import MotionFault, NotFollowing
@@ -26,15 +26,11 @@ def zeroed(device: Device, frame: Frame, zero: Posture) -> None:
     """Measure against this zero posture from now on."""
     device.frame, device.zero, device.heard = frame, zero, device.imu.connections
     at_deg = device.config.to_deg(zero.pulses)
-    device.seen = Observation(at_deg, np.zeros(len(device.config.output_names)))
+    device.seen = at_deg, np.zeros(len(device.config.output_names))
 
 
 def measure(standing: Arrival, samples: int | None = None) -> dict[str, Any]:
-    """Wait until the device has settled where it stands, then average fresh readings.
-
-    Args:
-        standing: the device at a posture.
-        samples: readings to average; as configured when not given.
+    """Wait until a device at a posture has settled, then average so many readings.
 
     Returns:
         For the journal: ``pulses`` commanded and ``feedback`` of the drives;
@@ -42,9 +38,8 @@ def measure(standing: Arrival, samples: int | None = None) -> dict[str, Any]:
         ``samples``; ``attitude`` (3, 3), the mean of the phone's; ``quaternions`` and
         ``stamps`` of every reading.
 
-    Raises:
-        MotionFault: it does not settle in time, or the IMU disagrees with the drives.
-        ReadingError, BusError, StopRequested: stop everything.
+    Raises MotionFault: it does not settle in time, or the IMU disagrees with the
+    drives. ReadingError, BusError, StopRequested: stop everything.
     """
     device, target = standing.device, standing.posture.pulses
     settle = device.config.settle
@@ -180,7 +175,7 @@ def _check_position(device: Device, target: Pulses, feedback: list[int]) -> None
 
 def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
     """The joints are where the drives say, roughly, and moved when they moved."""
-    names, last = device.config.axis_names, device.seen
+    names, (start, first) = device.config.axis_names, device.seen
     # What are no angles of joints is compared by how it changes alone.
     apart = measured - commanded if device.geometry.of_joints else np.zeros(1)
     if (np.abs(apart) > DISAGREEMENT_DEG).any():
@@ -190,9 +185,9 @@ def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
             f"command (limit {DISAGREEMENT_DEG:g} deg). Check the zero posture, then "
             "run `jaxcal-rig setup axes`"
         )
-    way = commanded - last.commanded
+    way = commanded - start
     asked = np.abs(way)
-    moved = device.moved(measured - last.measured, last.commanded + way / 2.0)
+    moved = device.moved(measured - first, start + way / 2.0)
     if moved is None:
         _check_predicted(device, commanded, measured)
     followed = np.sign(way) * (way if moved is None else moved)
@@ -210,7 +205,7 @@ def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
                 f"the {'IMU' if imu else 'sensor'} saw {followed[index]:.2f}. Look for "
                 f"{hint}"
             )
-    last.commanded, last.measured = commanded, measured
+    device.seen = commanded, measured
 
 
 def _check_predicted(device: Device, commanded: Array, measured: Array) -> None:
@@ -218,11 +213,12 @@ def _check_predicted(device: Device, commanded: Array, measured: Array) -> None:
     of each axis how far that moved."""
     if device.predict is None:
         return
-    before, place = device.predict(device.seen.commanded), device.seen.commanded
+    place, first = device.seen
+    before = device.predict(place)
     alone = place + np.diag(commanded - place)  # each axis by itself
     largest = max(np.linalg.norm(device.predict(at) - before) for at in alone)
     expected = device.predict(commanded) - before
-    off = float(np.linalg.norm(measured - device.seen.measured - expected))
+    off = float(np.linalg.norm(measured - first - expected))
     if off > FOLLOW_MODEL * largest + FOLLOW_MIN_DEG * device.geometry.scale:
         raise NotFollowing(
             f"the readings differ from the model's prediction by {off:.3g} "

@@ -33,11 +33,9 @@ class Arrival(NamedTuple):
 def move(device: Device, posture: Posture) -> Arrival:
     """Move all axes to a posture, in pieces, from the chosen side.
 
-    Raises:
-        LimitError: the target leaves the limits; nothing was sent.
-        Unreachable: a drive refused the target.
-        EndedShort: a drive ended short of it.
-        MotionFault, BusError, ReadingError, StopRequested: stop everything.
+    Raises LimitError: the target leaves the limits; nothing was sent. Unreachable: a
+    drive refused the target. EndedShort: a drive ended short of it. MotionFault,
+    BusError, ReadingError, StopRequested: stop everything.
     """
     if not device.armed:
         raise MotionFault("not armed")
@@ -102,11 +100,7 @@ def _look(device: Device) -> tuple[int, Array]:
 
 
 def _send(device: Device, drive: Drive, start: Status, pulses: int) -> None:
-    """Start one drive's move.
-
-    Where the reply is lost the drive is read: it obeys, or it does not and is sent
-    the same absolute target again, or that is unknown and everything stops.
-    """
+    """Start one drive's move."""
     motion, axis = device.config.motion, drive.axis
     tolerance = axis.pulses_within(motion.position_tolerance_deg)
     for tries_left in reversed(range(1 + device.config.bus.read_retries)):
@@ -133,10 +127,7 @@ def took(drive: Drive, pulses: int, start: Status, tolerance: int) -> bool | Non
 
     A drive that obeys moves, has left ``start`` by more than ``tolerance`` pulses,
     or stands at its target. One that does not holds another target, or has stood
-    idle at ``start`` for START_S.
-
-    Raises:
-        MotionFault: it is in alarm. BusError: it does not answer.
+    idle at ``start`` for START_S. MotionFault: it is in alarm.
     """
     begun = time.monotonic()
     while True:
@@ -210,11 +201,7 @@ def _most_s(device: Device, here: Pulses, target: Pulses) -> float:
 
 
 def _require_on_way(axis: Axis, start: int, goal: int, status: Status) -> None:
-    """An axis is between its start and its goal.
-
-    Raises:
-        MotionFault: it is not.
-    """
+    """An axis is between its start and its goal."""
     begin, end, angle = map(axis.to_deg, (start, goal, status.position))
     low, high = min(begin, end) - FOLLOWING_DEG, max(begin, end) + FOLLOWING_DEG
     if not low <= angle <= high:
@@ -248,20 +235,17 @@ def _stalled(
 
 
 def _check_speed(device: Device, axis: Axis, seen: list[Status]) -> None:
-    """A drive is no faster than it was told to be.
-
-    It was where it was at some time after it was asked and before it answered, so that
-    a slow reply makes no speed; nor do counts by which two readings may differ.
-    """
+    """A drive is no faster than it was told to be."""
+    # It was where it was at some time after it was asked and before it answered, so
+    # that a slow reply makes no speed; nor do counts by which two readings may differ.
     (first, *_, last), asked = seen, axis.drive_motion[0]
     marks = [s for s in seen[1:-1] if last.time - s.asked > SPAN_S]
-    ways = [
-        (abs(axis.to_deg(max(0, counts - STILL_COUNTS))), last.time - s.asked)
-        for s in (first, *marks[-1:])
-        for counts in [abs(last.position - s.position)]
-    ]
-    speed = max(way / seconds for way, seconds in ways)
-    before, way = device.paces.get(axis.name), ways[0][0]
+    speed = way = 0.0
+    for mark in (*marks[-1:], first):
+        counts = abs(last.position - mark.position) - STILL_COUNTS
+        way = abs(axis.to_deg(max(0, counts)))
+        speed = max(speed, way / (last.time - mark.asked))
+    before = device.paces.get(axis.name)
     if before is None or way > before.way_deg:
         device.paces[axis.name] = Pace(way, asked, speed)
     slowest = min(LEAST_TURNS_S / axis.turns_per_deg, LEAST_DEG_S)

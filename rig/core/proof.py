@@ -1,15 +1,11 @@
 """What the moves so far have proved of a device, and how far and fast the next may go.
 
-What is not proved limits pulses and the drive's own speed, never degrees: degrees are
-what is not known. Of an axis of which nothing is proved the first move turns the motor
-by FIRST_MOTOR_DEG, as slowly as the drive's registers go. After each move the phone is
-looked at: the next is at most GROWTH times as long, and no longer than it takes to turn
-the phone as far as it may, by what it was seen to turn for each pulse. Nothing seen, or
-seen in a unit that is not proved, allows UNSEEN_MOTOR_DEG of the motor and no more.
-
-An axis that was checked with this same file (SIGN_CHECKED) has its gearing, direction
-and the phone's unit from there. In a new session it still begins with FIRST_DEG of its
-joint, and grows while the phone turns no further than `axes` saw it turn.
+What is not proved limits pulses and the drive's own speed, never degrees. The first
+move of an unproved axis turns its motor by FIRST_MOTOR_DEG, as slowly as its registers
+go. Each next is at most GROWTH times as long, and no longer than turns the phone as far
+as it may, by what a pulse was seen to turn. Nothing seen, or in a unit that is not
+proved, allows UNSEEN_MOTOR_DEG and no more. A checked axis (SIGN_CHECKED) begins a
+session with FIRST_DEG of its joint, and grows while the phone turns as `axes` saw.
 
 `motion` asks before every frame that moves, and looks after it; there is no other way.
 """
@@ -18,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -26,9 +22,8 @@ from scipy.spatial.transform import Rotation
 from rig.config import RigConfig
 from rig.config.axis import Axis, Pulses
 from rig.config.settings import ImuSettings, ReadingsSettings
-from rig.core.stop_distance import StopDistance
 from rig.faults import MotionFault, TurnedTooFar
-from rig.journal.device import SIGN_CHECKED, DeviceRecord
+from rig.journal.device import SIGN_CHECKED, STOP_PROVED, DeviceRecord
 from rig.readings.attitude import Array, matrix_to_euler
 from rig.readings.geometry import Geometry
 from rig.readings.source import Source
@@ -56,6 +51,68 @@ NO_UNIT = (
 STEP_DEG = 0.5  # of a derivative of a model
 RADIANS = 180.0 / math.pi
 LARGEST_RAD = 2.0 * math.pi + 0.1  # no larger number is an angle in radians
+UNKNOWN_S = 1.0  # from a stop of which nothing is known to its drive's obeying
+FASTER = 1.25  # times the slower speed: less tells nothing of the ramp
+MARGIN = 1.2  # times the ramp that was measured
+LEAST_ROOM_DEG = 0.1  # a target on the limit itself is gone to
+
+
+class StopDistance(NamedTuple):
+    """The stopping distance of an axis, ``d(v) = v t + k v^2``, in degrees or mm.
+
+    A drive obeys ``t`` after its stop was sent and brakes by ``a``, ``k = 1 / (2 a)``;
+    `axes` measures both, by stops at two speeds. Without a stop it brakes by the ramp
+    ``b`` of its move and ends at its target. Stopped at ``u`` it ends beyond that by at
+    most ``u t + u^2 (k - 1 / (2 b))``; the largest of these has to fit between the
+    target and the soft limit.
+    """
+
+    delay_s: float
+    per_square: float  # degrees for (deg/s)^2: 1 / (2 a)
+    accel: float  # deg/s^2 of the moves that were stopped
+
+    @classmethod
+    def of(
+        cls, speeds: list[float], distances: list[float], accel: float
+    ) -> StopDistance:
+        """From stops at one or two speeds; of one all is ascribed to the ramp."""
+        points = sorted(zip(speeds, distances, strict=True))
+        (v1, d1), (v2, d2) = points[0], points[-1]
+        delay, square = 0.0, max(d / v**2 for v, d in points)
+        if v2 >= FASTER * v1:
+            square = min(square, max(0.0, (d2 / v2 - d1 / v1) / (v2 - v1)))
+            delay = max(0.0, *(d / v - square * v for v, d in points))
+        return cls(delay, square, accel)
+
+    def at(self, speed: float) -> float:
+        """Degrees from where the stop was sent to where it stands."""
+        return speed * self.delay_s + speed**2 * self.per_square
+
+    def fastest(self, axis: Axis, room: float) -> float:
+        """Speed of a move that ends so far before a limit, whenever it is stopped.
+
+        A quick stop may brake by the move's ramp: where that is gentler now, so is it.
+        """
+        speed, accel = axis.drive_motion
+        square = MARGIN * self.per_square * max(1.0, self.accel / accel)
+        excess, room = square - 0.5 / accel, max(room, LEAST_ROOM_DEG)
+        root = self.delay_s**2 + 4.0 * excess * room
+        if root < 0.0 or self.delay_s + math.sqrt(root) <= 0.0:
+            return speed  # it never goes so far beyond its target
+        return min(speed, 2.0 * room / (self.delay_s + math.sqrt(root)))
+
+
+def stop_distances(record: DeviceRecord, axes: tuple[Axis, ...]) -> dict[str, Any]:
+    """Axis to StopDistance, by the record; what it does not say may take UNKNOWN_S."""
+    if (evidence := record.state(STOP_PROVED)) is None:
+        return {}
+    distances = {}
+    for axis in axes:
+        _, accel = axis.drive_motion
+        fit = evidence.get("distances", {}).get(axis.name)
+        unknown = StopDistance(UNKNOWN_S, 0.5 / accel, accel)
+        distances[axis.name] = StopDistance.of(**fit) if fit else unknown
+    return distances
 
 
 class Turns(NamedTuple):
@@ -76,15 +133,10 @@ class Turns(NamedTuple):
         return [float(size) for size in np.linalg.norm(self.deg, axis=0)]
 
     def at(self, config: RigConfig, pulses: Pulses) -> Array:
-        """The proof's columns where the device counts other pulses.
-
-        In the phone's frame a joint's axis turns with the joints that it carries.
-        Numbers are taken to change alike everywhere.
-        """
+        """The columns at other pulses: a joint's axis turns with those it carries."""
         turns, away = self.deg.copy(), config.to_deg(np.subtract(pulses, self.pulses))
-        chain = config.chain
-        for place, joint in enumerate(chain):
-            for inner in chain[place + 1 :]:
+        for place, joint in enumerate(config.chain):  # of numbers none
+            for inner in config.chain[place + 1 :]:
                 turn = Rotation.from_rotvec(self.deg[:, inner] * away[inner], True)
                 turns[:, joint] = turn.inv().apply(turns[:, joint])
         return turns
@@ -100,9 +152,8 @@ def slopes(predict: Callable[[Array], Array], at_deg: Array) -> Array:
 def unit_proved(imu: ImuSettings | ReadingsSettings, attitude: Array) -> bool:
     """Whether a phone's (3, 3) attitude can only have come in the configured unit.
 
-    Numbers of a sensor have the unit that they are given, quaternions have none: both
-    are proved. A number over 2 pi is no angle in radians. Degrees that are read as
-    radians turn 57.3 times too far, which the first move shows.
+    Numbers have the unit that they are given, quaternions none. A number over 2 pi is
+    no angle in radians; degrees read as radians show in the first move, 57.3 times.
     """
     if isinstance(imu, ReadingsSettings) or imu.by_quaternion or imu.unit == "rad":
         return True
@@ -116,16 +167,13 @@ class Reach:
     def __init__(
         self,
         axis: Axis,
-        factor: float = 1.0,
+        factor: float = 1.0,  # RADIANS where the phone's unit is not proved
         checked: bool = False,
-        gain: float | None = None,
-        scale: float = 1.0,
+        gain: float | None = None,  # degrees of the phone for one, as `axes` saw
+        scale: float = 1.0,  # of a degree, in the unit of the readings
     ) -> None:
-        self.axis = axis
-        self.scale = scale  # of a degree, in the unit of the readings
-        self.gain = gain  # degrees of the phone for a commanded one, as `axes` saw
-        self.checked = checked
-        self.factor = factor  # RADIANS where the phone's unit is not proved
+        self.axis, self.factor, self.checked = axis, factor, checked
+        self.gain, self.scale = gain, scale
         self.seen = checked  # the phone has turned, in a unit that is proved
         # Pulses of the longest move so far; degrees per pulse that the phone turned at
         # most in that move.
@@ -135,10 +183,7 @@ class Reach:
             self.longest = FIRST_DEG * abs(axis.pulses_per_deg) / GROWTH
 
     def pulses(self, wanted: float, most_deg: float = math.inf) -> int:
-        """Pulses, at least 1, of the next move towards a wanted count.
-
-        Where that or ``most_deg`` of the joint takes several moves, they grow evenly.
-        """
+        """Pulses, at least 1, of the next of evenly growing moves to a wanted count."""
         if not self.longest:
             first = self.axis.motor_pulses(FIRST_MOTOR_DEG)
             return max(1, math.floor(min(abs(wanted), first)))
@@ -169,8 +214,7 @@ class Reach:
     def unseen(self, begun: int, here: int, goal: int) -> int:
         """Pulses towards a goal that may be gone without the phone's word.
 
-        Raises:
-            MotionFault: so many were gone already.
+        Raises MotionFault: so many were gone already.
         """
         axis = self.axis
         most = max(1, int(axis.motor_pulses(UNSEEN_MOTOR_DEG)))
@@ -240,10 +284,9 @@ class Proof:
         self._start = None
 
     def begin(self, imu: Source, attitude: Array, here: Pulses, goal: Pulses) -> Pulses:
-        """The next piece of the way from here to a goal; it ends where it may end.
+        """The end of the next piece of the way from here to a goal.
 
-        Raises:
-            MotionFault: an axis was moved as far as may be, and nothing was seen.
+        MotionFault: an axis was moved as far as may be, and nothing was seen.
         """
         unproved = [reach for reach in self.reaches if not reach.checked]
         if unproved and self._near is None:
@@ -268,12 +311,11 @@ class Proof:
         if share < 1.0:
             pairs = zip(here, goal, strict=True)
             goal = tuple(a + round((b - a) * share) for a, b in pairs)
-        ways = zip(self.reaches, here, goal, strict=True)
         way = sum(
-            abs(reach.axis.to_deg(b - a)) * (reach.gain or 1.0) for reach, a, b in ways
+            abs(reach.axis.to_deg(b - a)) * (reach.gain or 1.0)
+            for reach, a, b in zip(self.reaches, here, goal, strict=True)
         )
-        connection, world = self._heading
-        same = imu.connections == connection and imu.world is world
+        same = imu.connections == self._heading[0] and imu.world is self._heading[1]
         if unproved or not self._gained:
             self._last = None
         elif self._last and same:  # or its heading is another one
@@ -306,9 +348,8 @@ class Proof:
         """At every poll of a move; MotionFault where the phone turns too far in it."""
         limits = [self._near] if self._near else []
         if self._last:
-            limits.append(
-                (self._last[0], TOO_FAR * self._last[1] + MARGIN_DEG * self._scale)
-            )
+            since, way, _ = self._last
+            limits.append((since, TOO_FAR * way + MARGIN_DEG * self._scale))
         for since, most in limits:
             turned = self._geometry.apart(since, attitude)
             if turned > most:
@@ -327,14 +368,10 @@ class Proof:
 
     def _compare(self, index: int, pulses: int, turned_deg: float) -> None:
         """A move of one checked axis turned the phone no further than `axes` saw."""
-        reach, (most, margin) = self.reaches[index], SAME
+        reach, (most, margin), geometry = self.reaches[index], SAME, self._geometry
         expected = pulses * reach.deg_per_pulse
-        if (
-            reach.checked
-            and reach.gain
-            and turned_deg > (most * expected + margin * self._scale)
-        ):
-            geometry = self._geometry
+        allowed = most * expected + margin * self._scale
+        if reach.checked and reach.gain and turned_deg > allowed:
             raise TurnedTooFar(
                 f"{reach.axis.name} {geometry.changed} {turned_deg:.2f} "
                 f"{geometry.unit} in a move for which `axes` measured {geometry.again} "

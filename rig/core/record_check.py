@@ -1,10 +1,8 @@
 """Whether it is the device of the record, and stands where it stood.
 
 Before it is armed: its drives, and their counts. Once it is measured: the attitude of
-its zero posture against gravity, then and now. The phone's world stands upright (its Z
-axis is the vertical), so a change of tilt is seen whatever the phone calls north. Where
-it has a heading to be trusted (``imu.heading = "absolute"``) turns about the vertical
-are seen too.
+its zero posture. The phone's world stands upright, so a change of tilt is seen whatever
+it calls north; turns about the vertical too where ``imu.heading = "absolute"``.
 """
 
 from __future__ import annotations
@@ -35,9 +33,8 @@ def check_drives(
 ) -> None:
     """The drives are those of the record, where they were, and geared as configured.
 
-    Raises:
-        Refused: they are not. What no longer holds of the record is voided.
-        BusError: a drive does not answer.
+    Raises Refused: they are not. What no longer holds of the record is voided.
+    BusError: a drive does not answer.
     """
     for drive in drives if geared else ():
         axis, told = drive.axis, drive.pulses_per_rev()
@@ -53,9 +50,7 @@ def check_drives(
             axes.setdefault(fault(config, drive, record), []).append(drive.axis.name)
         axes.pop("", None)
         if axes:
-            reasons = (
-                f"{', '.join(names)}: {reason}" for reason, names in axes.items()
-            )
+            reasons = [f"{', '.join(names)}: {why}" for why, names in axes.items()]
             record.void(state, "; ".join(reasons))
         if lack := record.missing(config, state):
             raise Refused(lack)
@@ -106,8 +101,7 @@ def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
 def leave(drives: Sequence[Drive], record: DeviceRecord) -> None:
     """Keep where the drives stand, as far as they say; an alarm takes their place.
 
-    Raises:
-        OSError: the record cannot be written.
+    Raises OSError: the record cannot be written.
     """
     positions: dict[str, int | None] = {}
     homed: list[str] = []
@@ -140,8 +134,7 @@ class ZeroRecord(NamedTuple):
     def check(self, config: RigConfig, pulses: Pulses, attitude: Array) -> str:
         """The zero posture taken now is this one; returns what was compared, in words.
 
-        Raises:
-            MotionFault: it is not, by more than ``session.reference_tolerance_deg``.
+        Raises MotionFault: it is not, by more than ``session.reference_tolerance_deg``.
         """
         off = config.to_deg(np.subtract(pulses, self.pulses))
         if np.abs(off).max() > config.session.reference_tolerance_deg:
@@ -155,12 +148,9 @@ class ZeroRecord(NamedTuple):
 
 
 def moved(config: RigConfig, then: Array, now: Array) -> tuple[float, Array]:
-    """How far one reading of the zero posture stands from another.
+    """How far two readings of the zero posture are apart, and (m,) of that.
 
-    Returns:
-        How far they are apart, in the unit of what is measured, and (m,) of that.
-        Without an absolute heading the turn of a phone about the vertical that comes
-        last is taken out of both.
+    Without an absolute heading a turn about the vertical is taken out of both.
     """
     geometry = geometry_of(config)
     now = geometry.aligned(then, now)
@@ -168,15 +158,10 @@ def moved(config: RigConfig, then: Array, now: Array) -> tuple[float, Array]:
 
 
 def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:
-    """The zero posture stands as it stood; returns what was compared, in words.
+    """The zero posture stands as it stood: what was compared, in words.
 
-    Args:
-        config: names tolerance, mounting and axes.
-        then, now: (3, 3) attitude of the phone, as kept and as measured.
-        whose: for the words.
-
-    Raises:
-        MotionFault: they differ by more than ``session.reference_tolerance_deg``.
+    MotionFault: the phone's (3, 3) attitudes ``then`` and ``now`` differ by more than
+    ``session.reference_tolerance_deg``.
     """
     limit = config.session.reference_tolerance_deg
     angle, joints = moved(config, then, now)

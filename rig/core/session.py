@@ -13,29 +13,27 @@ is running the same again.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.core import record_check
-from rig.core.device import Device, Lines, Posture, check_plan
-from rig.core.joints import show
-from rig.core.line_client import line_of
+from rig.core.device import Device, Posture, SessionRun, check_plan
 from rig.core.measure import measure, zeroed
 from rig.core.motion import Arrival, move
-from rig.drives import Drive
+from rig.core.proof import Turns, slopes
+from rig.core.record_check import ZeroRecord
 from rig.faults import (
     EndedShort,
     MotionFault,
     NotFollowing,
-    Requests,
+    TurnedTooFar,
     Unreachable,
     ending,
 )
-from rig.journal.device import ZEROED, DeviceRecord
+from rig.journal.device import SIGN_CHECKED, ZEROED
 from rig.journal.lock import BusLock
 from rig.journal.run_folder import Record, RunFolder
 from rig.readings.attitude import Array, angle_between_deg
@@ -46,23 +44,10 @@ STREAM_WAIT_S = 60.0  # time to start the app on the phone
 LEAST_TURN_DEG = 0.05  # of the phone's heading: less is its noise
 ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
 SAME_PLACE_DEG = 0.5  # two places where an axis ended short of one target
-Check = Callable[[RigConfig, Sequence[Drive], DeviceRecord], None]
-
-
-class SessionRun(RunFolder):
-    """The folder of a run, and what its session is opened with."""
-
-    record: DeviceRecord  # of what was proved of the device
-    signals: Requests  # to pause or to stop, from outside
-    reset_alarms: bool  # of drives that are in alarm
-    # (m,) that is measured at (n,) commands, by its model as designed.
-    predict: Callable[[Array], Array] | None
-    # What runs while the ports are open, such as telemetry.
-    beside: list[Callable[[Device], contextlib.AbstractContextManager[None]]]
-    # What must hold of the drives before they are armed; Refused.
-    check: Check = staticmethod(record_check.check_drives)
-    lines: Lines = staticmethod(line_of)  # who makes its line and drives
-    simulated = False  # nothing real moves: it need not be slow
+SHOWN_DEG = 3.0  # that each axis is moved, from a third of it to the whole
+RATIO = (2 / 3, 4 / 3)  # of what `axes` saw
+ASIDE_DEG = 4.0  # between the axes of two turns, and ...
+SURE_SIGMA = 4.0  # ... of what the noise of the readings makes
 
 
 @contextlib.contextmanager
@@ -70,15 +55,10 @@ def open_device(run: SessionRun) -> Iterator[Device]:
     """The device of a run, armed; however this ends its drives are stopped and looked
     at.
 
-    Raises:
-        MotionFault, BusError, ReadingError, Refused: not fit to move.
+    Raises MotionFault, BusError, ReadingError, Refused: not fit to move.
     """
     config, record, requests = run.config, run.record, run.signals
-    device = Device(
-        config, run, record, requests,
-        simulated=run.simulated, lines=run.lines, predict=run.predict,
-    )  # fmt: skip
-    lock = BusLock(config.bus)
+    device, lock = Device(run), BusLock(config.bus)
     # A request that came while something was computed may have been raised in a
     # callback that drops exceptions, as those of a garbage collection are.
     requests.check_stop()
@@ -159,19 +139,13 @@ def _close(device: Device) -> None:
 
 
 def take_zero(
-    device: Device,
-    at: Pulses | None = None,
-    kept: record_check.ZeroRecord | None = None,
+    device: Device, at: Pulses | None = None, kept: ZeroRecord | None = None
 ) -> None:
     """Measure the zero posture, that all others are measured against.
 
-    Where postures were measured already, as in a run that is resumed, it must still
-    read zero.
-
-    Args:
-        device: armed.
-        at: pulses of the zero; where it stands when not given, or 0 as configured.
-        kept: what a calibration keeps of it, to be found again; else MotionFault.
+    In a run that is resumed it must still read zero. It is ``at`` these pulses, or
+    where the device stands, or 0 as configured; ``kept``: as a calibration kept it,
+    else MotionFault.
     """
     config, run = device.config, device.run
     if zeros := run.journal.events("zero"):
@@ -210,10 +184,7 @@ def take_zero(
 
 
 def _compare_zero(
-    device: Device,
-    pulses: Pulses,
-    attitude: Array,
-    kept: record_check.ZeroRecord | None,
+    device: Device, pulses: Pulses, attitude: Array, kept: ZeroRecord | None
 ) -> None:
     """With the calibration's zero posture, or else with the last one taken."""
     config, last = device.config, device.record.state(ZEROED)
@@ -221,10 +192,9 @@ def _compare_zero(
         device.emit("note", text=kept.check(config, pulses, attitude))
     elif last:
         then = np.array(last["attitude"])
+        before = ZeroRecord("the last session", last["pulses"], then)
         try:
-            record_check.ZeroRecord("the last session", last["pulses"], then).check(
-                config, pulses, attitude
-            )
+            before.check(config, pulses, attitude)
         except MotionFault as fault:  # a phone mounted anew is calibrated anew
             device.emit("note", text=f"WARNING: {fault}")
     evidence = {"pulses": list(pulses), "attitude": attitude.tolist()}
@@ -233,31 +203,20 @@ def _compare_zero(
 
 def _check_reference(device: Device, zero: Posture) -> None:
     """Before a resumed run goes on: the zero posture must still read zero."""
-    angles = measure(move(device, zero))["measured_deg"]
-    limit = device.config.session.reference_tolerance_deg
-    unit = device.config.output_unit
+    angles, config = measure(move(device, zero))["measured_deg"], device.config
+    limit, unit = config.session.reference_tolerance_deg, config.output_unit
     device.emit("reference", sync=True, angles=angles, limit=limit, unit=unit)
     if max(map(abs, angles)) > limit:
-        config = device.config
-        moved = record_check.axes_text(config.output_names, config.output_unit, angles)
+        moved = record_check.axes_text(config.output_names, unit, angles)
         raise MotionFault(
-            "the zero posture of this run has moved: "
-            f"{moved} (limit {limit:g}): the "
+            f"the zero posture of this run has moved: {moved} (limit {limit:g}): the "
             f"drives lost their origin, or {device.imu.whose} or the device was moved. "
-            "Start a "
-            "new run"
+            "Start a new run"
         )
 
 
 def _reorient(device: Device) -> None:
-    """Read the zero again where the phone came back on a new connection.
-
-    Its world may have turned about the vertical since; later readings are turned back,
-    so that one frame holds for the whole run.
-
-    Raises:
-        MotionFault: the zero posture is elsewhere in another way than that.
-    """
+    """Read the zero again where the phone came back on a new connection."""
     config, frame, zero = device.config, device.frame, device.zero
     while not device.oriented:
         assert frame is not None and zero is not None
@@ -284,10 +243,7 @@ def _reorient(device: Device) -> None:
 
 
 def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
-    """Move, measure and record, once in the life of a run; None where out of reach.
-
-    The record has the posture's name, and ``fields`` besides what is measured.
-    """
+    """Move, measure and record with ``fields``, once in a run; None: out of reach."""
     run, name = device.run, posture.name
     if name in (measured := run.postures()):
         return measured[name]
@@ -298,9 +254,7 @@ def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
     device.emit("visit", name=name, pulses=list(posture.pulses))
     measurement = None
     try:
-        while (
-            measurement is None or not device.oriented
-        ):  # the phone came back in between
+        while measurement is None or not device.oriented:  # the phone came back
             _reorient(device)
             measurement = measure(move(device, posture))
     except NotFollowing:
@@ -336,24 +290,19 @@ def _withdraw(run: RunFolder) -> None:
 def _ended_there(device: Device, ended: Record) -> bool:
     """Whether this axis ended short at this place before, on the way to a posture."""
     axis = next(axis for axis in device.config.axes if axis.name == ended["axis"])
+    near, same = axis.pulses_within(SAME_PLACE_DEG), (ended["name"], ended["axis"])
     return any(
-        (record["name"], record["axis"]) == (ended["name"], ended["axis"])
-        and abs(record["pulses"] - ended["pulses"])
-        <= axis.pulses_within(SAME_PLACE_DEG)
+        (record["name"], record["axis"]) == same
+        and abs(record["pulses"] - ended["pulses"]) <= near
         for record in device.run.journal.events("ended_short")
     )
 
 
 def _leave_out(device: Device, name: str, reason: str) -> None:
-    """Go on without a posture that is out of reach, once all drives stand.
-
-    Raises:
-        MotionFault: they do not, or that is one more than may be.
-    """
-    results = device.stopper.stop(reason, latch=False)
-    if not all(r.standing for r in results) or not all(
-        r.standing for r in device.stopper.stay()
-    ):
+    """Go on without a posture that is out of reach, once all drives stand."""
+    stopper = device.stopper
+    stand = all(r.standing for r in stopper.stop(reason, latch=False))
+    if not (stand and all(r.standing for r in stopper.stay())):
         raise MotionFault(f"{reason}, and not all drives are at rest")
     device.untrack()
     device.emit("unreachable", sync=True, name=name, reason=reason)
@@ -370,3 +319,77 @@ def _check_lost(device: Device) -> None:
             f"({most}). Narrow session.*_range_deg to what the device reaches, and "
             "start a new run"
         )
+
+
+# What each axis turns
+
+
+def show(device: Device) -> None:
+    """Each axis by itself turns the phone as `axes` saw it, or SIGN_CHECKED is void."""
+    turns, config, start = Turns.of(device.record), device.config, device.positions()
+    if turns is None or device.shown:
+        return
+    device.emit("phase", phase="showing")
+    expected = turns.at(config, start)
+    if device.predict and not config.chain:  # numbers may change otherwise elsewhere
+        at_start, then = (config.to_deg(place) for place in (start, turns.pulses))
+        change = slopes(device.predict, at_start) - slopes(device.predict, then)
+        expected = expected + change
+    for j, axis in enumerate(config.axes):
+        here = axis.to_deg(start[j])
+        middle = (axis.min_deg + axis.max_deg) / 2.0  # a limit may be why it is here
+        room = axis.max_deg - here if here <= middle else axis.min_deg - here
+        way = min(max(room, -SHOWN_DEG), SHOWN_DEG)
+        # Over the first third its play is taken up.
+        near, far = (axis.to_pulses(here + share * way) for share in (1 / 3, 1.0))
+        measurements = []
+        for pulses in (near, far):
+            place = tuple(pulses if i == j else p for i, p in enumerate(start))
+            posture = Posture(f"show {axis.name}", place)
+            try:
+                measurements.append(measure(move(device, posture)))
+            except TurnedTooFar as fault:
+                device.record.void(SIGN_CHECKED, str(fault))
+                raise
+        attitudes = [np.array(m["attitude"]) for m in measurements]
+        turn = device.geometry.way(*attitudes) / axis.to_deg(far - near)
+        noise = max(max(m["std_deg"]) / m["samples"] ** 0.5 for m in measurements)
+        _compare(device, j, turn, expected[:, j], noise / abs(axis.to_deg(far - near)))
+        move(device, Posture("where it began", start))
+    device.shown = True
+
+
+def _compare(device: Device, j: int, turn: Array, then: Array, noise: float) -> None:
+    """(3,) turns for a degree of axis j, or (m,) of numbers, now and at `axes`; the
+    noise of each part."""
+    size, before = float(np.linalg.norm(turn)), float(np.linalg.norm(then))
+    share, axis, geometry = size / before, device.config.axes[j], device.geometry
+    one = "degree" if axis.unit_name == "deg" else axis.unit_name
+    along = float(turn @ then)
+    across = max(size**2 * before**2 - along**2, 0.0) ** 0.5
+    aside = np.degrees(np.arctan2(across, along))
+    device.emit(
+        "shown", sync=True, axis=axis.name, ratio=round(size, 4),
+        before=round(before, 4), aside_deg=round(float(aside), 2),
+        speed_deg_s=round(device.paces[axis.name].seen_deg_s, 2),
+    )  # fmt: skip
+    fault = ""
+    if not RATIO[0] <= share <= RATIO[1]:
+        fault = (
+            f"{axis.name} {geometry.changed} {size:.3g} {geometry.unit} per commanded "
+            f"{one}; `axes` measured {before:.3g}. Its drive, setting or gearbox was "
+            "exchanged, or the coupling slips"
+        )
+    elif aside > ASIDE_DEG + np.degrees(SURE_SIGMA * noise / before):
+        fault = (
+            f"{axis.name} turned the phone about an axis {aside:.1f} deg from the one "
+            "that `axes` measured: the phone or its holder was turned since"
+        )
+        if device.config.imu is None:
+            fault = (
+                f"{axis.name} changed the readings in a direction {aside:.1f} deg from "
+                "the one that `axes` measured: the sensor was moved since"
+            )
+    if fault:
+        device.record.void(SIGN_CHECKED, fault)
+        raise MotionFault(f"{fault}. Correct it, then run `jaxcal-rig setup axes`")

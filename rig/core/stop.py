@@ -1,8 +1,7 @@
 """Stopping: every unit, whatever happened, and proof that it stands.
 
-Nothing here touches JAX, the IMU or the plan. A stop goes to each unit by itself, to
-those that answered last first, and goes on past units that fail. It is repeated (a stop
-may be sent twice, unlike a move) and is verified by reading the status back.
+A stop goes to each unit by itself, to those that answered last first, and goes on past
+units that fail. It is repeated (unlike a move) and verified by reading the status back.
 """
 
 from __future__ import annotations
@@ -48,11 +47,8 @@ def stop_all(drives: list[Drive]) -> list[UnitStop]:
     """Quick-stop every drive of one bus, and wait for them to come to rest.
 
     The first round waits a short time for each reply, so that a dead unit delays the
-    others by no more than that; units that did not answer before come last. The next
-    rounds wait as long as configured for those that have not acknowledged.
-
-    Never raises, never leaves one out: one that fails does not keep the others from
-    their stop.
+    others by no more than that; the next as long as configured, for those that have not
+    acknowledged. Never raises, never leaves one out.
     """
     results = [UnitStop(d.axis.name, d.axis.unit) for d in drives]
     if not drives:
@@ -120,13 +116,10 @@ def _verify(pairs: Pairs) -> None:
 
 
 def stay(drives: list[Drive], results: list[UnitStop], seconds: float) -> list[str]:
-    """Look whether drives that stand go on by themselves; one that does is stopped.
+    """What goes on by itself after a stop, in words; it is stopped, as ``results`` say.
 
-    Where the map can, what they stand at becomes their target first. A drive without
+    Where the map can, what drives stand at becomes their target first. A drive without
     power may sink; that is no restart.
-
-    Returns:
-        What went on, in words. ``results`` are of the end of the look.
     """
     pairs = list(zip(drives, results, strict=True))
     words: list[str] = []

@@ -2,28 +2,203 @@
 
 from __future__ import annotations
 
+import dataclasses
+import warnings
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import special
 
 from rig.config import RigConfig
 from rig.faults import MotionFault
-from rig.identification.drift import estimate_drift, without_drift
-from rig.identification.fit_affine import (
-    held_out_errors,
-    identify_affine,
-    mispaired,
-    pairs,
-    uncertainty,
-)
 from rig.journal.run_folder import Record, measured_postures
 from rig.outputs.messages import recalibrate
 from rig.parts import model_of
-from rig.readings.attitude import ORDERS, frame_at
-from rig.readings.geometry import Attitudes, geometry_of
+from rig.readings.attitude import ORDERS, Array, frame_at
+from rig.readings.geometry import Attitudes, Geometry, geometry_of
 
 USUAL = (1 / 3, 3.0)  # degrees of a joint for one commanded; outside it is told
+SIGNIFICANT = 3.0  # standard deviations, of a drift
+LEAST = 0.1  # of session.drift_limit_deg: a smaller drift is left alone
+STRAIGHT = 0.25  # of a drift: what a line leaves of it, and it is still linear
+
+
+def pairs(records: list[Record]) -> tuple[Array, Array]:
+    """(N, n) commands and (N, m) measurements of N posture records, N >= 1."""
+    commands = np.array([r["commanded_deg"] for r in records], dtype=np.float64)
+    return commands, np.array([r["measured_deg"] for r in records], dtype=np.float64)
+
+
+def fit_quietly(*measurements: Array, **options: Any) -> Any:
+    """``jaxcal.identify`` without its warning: the summary holds the verdict."""
+    import jaxcal
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return jaxcal.identify(*measurements, **options)
+
+
+def identify_affine(
+    config: RigConfig,
+    records: list[Record],
+    noise_std: Array | None = None,
+    notes: Record | None = None,
+    zero_share: float = 0.0,
+) -> Any:
+    """Slopes A and bias b of ``y = A u + b`` from posture records: a ``Calibration``.
+
+    ``noise_std`` (m,) is of one recorded mean, where it is known; ``zero_share`` the
+    variance of the zero posture's mean over that of another's, which shifts every
+    posture equally and so adds to the variance of the bias.
+    """
+    fitted = fit_quietly(
+        *pairs(records),
+        noise_std=noise_std,
+        input_names=config.axis_names,
+        output_names=config.output_names,
+        command_unit=config.axis_unit,
+        measured_unit=config.output_unit,
+        notes=notes,
+    )
+    if noise_std is None:
+        return fitted
+    covariance = np.array(fitted.joint_covariance)
+    bias = range(-len(noise_std), 0)
+    covariance[bias, bias] += zero_share * noise_std**2
+    return dataclasses.replace(fitted, joint_covariance=covariance)
+
+
+def mispaired(config: RigConfig, records: list[Record]) -> list[str]:
+    """How readings and postures were mispaired, in the order in which they were
+    measured; nothing where they belong together."""
+    in_order = sorted(records, key=lambda record: record["seq"])
+    found = identify_affine(config, in_order).mispairing
+    return [found.reason] if found else []
+
+
+def uncertainty(
+    chosen: list[Record], held_out: list[Record], zero_share: float
+) -> dict[str, Any]:
+    """Noise of one recorded mean, and 95 % half-widths of A and b, axis by axis.
+
+    The noise is that of a fit of all postures, those held out too: it holds play, slow
+    noise and drift, and the parameters' errors, which makes Student's t a little wide.
+    Without held-out postures only the scatter of single readings is known, which is too
+    optimistic where they are correlated; ``basis`` says which it was.
+
+    Returns:
+        noise_std_deg (m,), dof of an axis, basis, and ci95 (m, n + 1), half-widths of
+        [A | b], which hold all of these at once (Bonferroni).
+    """
+    everything, count = [*chosen, *held_out], len(chosen[0]["commanded_deg"]) + 1
+    basis, dof = f"the fit of all {len(everything)} postures", len(everything) - count
+    if dof:
+        noise = np.array(fit_quietly(*pairs(everything)).noise_std)
+    else:
+        basis = "scatter of single readings only"
+        dof = (chosen[0]["samples"] - 1) * len(chosen)
+        scatter = np.mean([np.square(r["std_deg"]) for r in chosen], axis=0)
+        noise = np.sqrt(scatter / chosen[0]["samples"])
+    rows = np.column_stack([pairs(chosen)[0], np.ones(len(chosen))])
+    variances = np.diag(np.linalg.inv(rows.T @ rows)).copy()
+    variances[-1] += zero_share
+    tail = 0.025 / (count * len(noise))
+    width = special.stdtrit(max(1, dof), 1.0 - tail) * np.sqrt(variances)
+    return {
+        "noise_std_deg": noise.tolist(),
+        "dof": dof,
+        "basis": basis,
+        "ci95": np.outer(noise, width).tolist(),
+    }
+
+
+def spread(off: Array) -> dict[str, Any]:
+    """(N, m) errors, and how large they are."""
+    return {
+        "rms_axis": np.sqrt((off**2).mean(axis=0)).tolist(),
+        "rms": float(np.sqrt((off**2).mean())),
+        "max": float(np.abs(off).max()),
+        "each": off.tolist(),
+    }
+
+
+def held_out_errors(
+    config: RigConfig, held: list[Any], postures: dict[str, Record], calibration: Any
+) -> tuple[list[Record], dict[str, Any]]:
+    """Records of held-out pairs that were both reached, and their errors in degrees.
+
+    ``before`` and ``after`` compensation, and of the ``prediction``; of postures by the
+    names ``before:0``, ``after:0``, ... Nothing where there are none.
+    """
+    roles, names = ("before", "after"), postures.keys()
+    both = [i for i in range(len(held)) if names >= {f"{r}:{i}" for r in roles}]
+    if not both:
+        return [], {}
+    desired: Array = config.to_deg([held[i][0] for i in both])
+    if len(config.output_names) != len(config.axes):  # no device is ideal
+        desired = np.asarray(calibration.predict(desired), dtype=np.float64)
+    visited = {role: [postures[f"{role}:{i}"] for i in both] for role in roles}
+    errors = {role: spread(pairs(r)[1] - desired) for role, r in visited.items()}
+    records = visited["before"] + visited["after"]
+    commands, measured = pairs(records)
+    errors["prediction"] = spread(measured - calibration.predict(commands))
+    return records, errors
+
+
+def estimate_drift(
+    visits: list[Record], geometry: Geometry, limit_deg: float
+) -> dict[str, Any] | None:
+    """How far the phone's zero drifted; None where it was visited once.
+
+    The zero posture is visited first, in the middle and last. A heading that drifts
+    turns the phone's world, so a linear drift is taken out of the attitudes, never of
+    angles: ``R' = exp(-w t) R`` with w (3,) in that world. Three visits tell a linear
+    drift from any other, which cannot be taken out.
+
+    Returns:
+        Of the ``visits``, the zero and then postures measured there: minutes (V,) and
+        angles_deg (V, m); size_deg, the largest angle; turn_deg_per_min (3,), w;
+        corrected: it is linear and to be taken out; left_deg, what is in the
+        measurements then; limit_deg, and whether left is over it.
+    """
+    zero = visits[0]
+    if len(visits) < 2:
+        return None
+    minutes = np.array([visit["time"] - zero["time"] for visit in visits]) / 60.0
+    later = [visit["measured_deg"] for visit in visits[1:]]
+    angles = np.array([np.zeros(len(later[0])), *later])
+    attitudes = np.array([visit["attitude"] for visit in visits])
+    turn = geometry.drift(attitudes, minutes)
+    rest = [without_drift(visit, turn, zero, geometry) for visit in visits[1:]]
+    bend = np.abs([visit["measured_deg"] for visit in rest]).max(axis=0)
+    noise = sum(np.square(v["std_deg"]) / v["samples"] for v in (zero, visits[-1]))
+    least = np.maximum(SIGNIFICANT * np.sqrt(noise), LEAST * limit_deg)
+    size, end = float(np.abs(angles).max()), np.abs(angles[-1])
+    straight = bool((bend <= np.maximum(least, STRAIGHT * end.max())).all())
+    corrected = len(visits) == 3 and straight and bool((end > least).any())
+    remaining = float(bend.max()) if corrected else size
+    return {
+        "minutes": minutes.round(4).tolist(),
+        "angles_deg": angles.tolist(),
+        "size_deg": size,
+        "turn_deg_per_min": turn.tolist(),
+        "corrected": corrected,
+        "left_deg": remaining,
+        "limit_deg": limit_deg,
+        "over": remaining > limit_deg,
+    }
+
+
+def without_drift(
+    record: Record, turn: ArrayLike, zero: Record, geometry: Geometry
+) -> Record:
+    """A record without a drift: (3,) degrees a minute of the phone's world, or (m,)."""
+    minutes = (record["time"] - zero["time"]) / 60.0
+    attitude = geometry.without(np.array(record["attitude"]), turn, minutes)
+    frame = geometry.frame(np.array(zero["attitude"]))
+    measured = frame.angles(attitude).tolist()
+    return {**record, "attitude": attitude.tolist(), "measured_deg": measured}
 
 
 def conclude(
@@ -32,13 +207,9 @@ def conclude(
     notes: dict[str, Any],
     compensated: bool = True,
 ) -> tuple[Any, dict[str, Any]]:
-    """The calibration, with ``notes`` in its file, and what its summary says of it.
+    """The calibration, with ``notes`` in its file, and its summary, of a run's records.
 
-    Args:
-        config: of the device.
-        records: of the run's journal: the zero, the pairs held out, the postures.
-        notes: for the calibration's file.
-        compensated: the held-out targets were, by this very calibration.
+    ``compensated``: the held-out targets were, by this very calibration.
     """
     last = {record["event"]: record for record in records}
     zero, held = last["zero"], last.get("held_out", {"pairs": []})["pairs"]
@@ -53,7 +224,7 @@ def conclude(
             n: without_drift(r, turn, zero, geometry) for n, r in postures.items()
         }
     chosen = [r for r in postures.values() if r["role"] == "select"]
-    shared = {
+    shared = {  # by summary and notes
         "zero_pulses": zero["pulses"],
         "zero_attitude": zero["attitude"],
         "device": config.device_fingerprint(),
@@ -75,14 +246,24 @@ def conclude(
     }
     if model is not None:
         return model.conclude(config, postures, notes, told)
-    held_out, errors = held_out_errors(
-        config, held, postures, identify_affine(config, chosen)
-    )
+    first = identify_affine(config, chosen)
+    held_out, errors = held_out_errors(config, held, postures, first)
     if not compensated:
         errors.pop("after", None)
-    calibration, limits = _judged_affine(
-        config, zero, chosen, held_out, {**errors, "drift": drift}, notes
-    )
+    # The noise is that which the held-out postures show.
+    zero_share = chosen[0]["samples"] / zero["samples"]
+    limits = uncertainty(chosen, held_out, zero_share)
+    reasons = [
+        *mispaired(config, [*chosen, *held_out]),
+        *recalibrate({**errors, "drift": drift}, config.session.verify_limit_deg),
+    ]
+    notes |= {
+        "mechanism_order": config.mechanism.order,
+        "noise_from": limits["basis"],
+        "verdict": {"good": not reasons, "reasons": reasons},
+    }
+    noise = np.maximum(1e-9, limits["noise_std_deg"])
+    calibration = identify_affine(config, chosen, noise, notes, zero_share)
     return calibration, {
         **told,
         "A": np.asarray(calibration.matrix).tolist(),
@@ -91,33 +272,6 @@ def conclude(
         "orders": order_residuals(config, zero, chosen + held_out),
         **errors,
     }
-
-
-def _judged_affine(
-    config: RigConfig,
-    zero: Record,
-    chosen: list[Record],
-    held_out: list[Record],
-    errors: dict[str, Any],
-    notes: dict[str, Any],
-) -> tuple[Any, dict[str, Any]]:
-    """The affine calibration of the chosen postures, its verdict in ``notes``.
-
-    With the uncertainty that the held-out postures show.
-    """
-    zero_share = chosen[0]["samples"] / zero["samples"]
-    limits = uncertainty(chosen, held_out, zero_share)
-    reasons = [
-        *mispaired(config, [*chosen, *held_out]),
-        *recalibrate(errors, config.session.verify_limit_deg),
-    ]
-    notes |= {
-        "mechanism_order": config.mechanism.order,
-        "noise_from": limits["basis"],
-        "verdict": {"good": not reasons, "reasons": reasons},
-    }
-    noise = np.maximum(1e-9, limits["noise_std_deg"])
-    return identify_affine(config, chosen, noise, notes, zero_share), limits
 
 
 def order_residuals(
@@ -131,22 +285,20 @@ def order_residuals(
     Returns:
         rms (order to degrees), configured, warning (empty where all is well).
     """
-    configured, geometry = config.mechanism.order, geometry_of(config)
-    if not isinstance(geometry, Attitudes):
+    configured, dof = config.mechanism.order, len(records) - len(config.axes) - 1
+    if not isinstance(geometry_of(config), Attitudes):
         return {"rms": {}, "configured": "", "warning": ""}
-    frame = frame_at(config, np.array(zero["attitude"]))
-    count = len(config.axes) + 1
-    if len(records) < count + 2:
+    if dof < 2:
         return {"rms": {}, "configured": configured, "warning": ""}
+    frame = frame_at(config, np.array(zero["attitude"]))
     design = np.column_stack([pairs(records)[0], np.ones(len(records))])
     across = np.eye(len(records)) - design @ np.linalg.pinv(design)
     attitudes = np.array([r["attitude"] for r in records])
     rms: dict[str, float] = {}
     for order in ORDERS:
         residual = across @ frame.angles(attitudes, order)
-        rms[order] = float(
-            np.sqrt((residual**2).sum() / (residual.shape[1] * (len(records) - count)))
-        )
+        mean_square = (residual**2).sum() / (residual.shape[1] * dof)
+        rms[order] = float(np.sqrt(mean_square))
     best = min(rms, key=lambda order: rms[order])
     noise = float(np.mean([r["std_deg"] for r in records]))
     warning = ""
@@ -166,15 +318,9 @@ def order_residuals(
 
 
 def check_matrix(config: RigConfig, matrix: ArrayLike) -> list[str]:
-    """An (m, n) fitted matrix A is one of a device whose axes turn as they are named.
+    """Warnings of gains that are far from 1, of an (m, n) fitted matrix A.
 
-    What is measured under the name of an axis follows that axis, its way.
-
-    Returns:
-        Warnings: gains that are far from 1.
-
-    Raises:
-        MotionFault: an axis answers the other way, or another axis's command.
+    Raises MotionFault: an axis answers the other way, or another axis's command.
     """
     gains = np.asarray(matrix, dtype=np.float64)
     faults, warnings = [], []

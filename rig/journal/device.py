@@ -2,10 +2,9 @@
 
 A device is trusted in steps: IDENTIFIED (these drives answer at these units), HOMED
 (the pulses mean a place), SIGN_CHECKED (each axis turns the joint it is named after,
-the way and about as far as it is told), STOP_PROVED (every way to stop them was tried
-in a slow move, and stopped it), ZEROED (the zero posture's attitude is known).
-ARMED lives in a running process only. No step stands without those before it. A
-session needs all but the last, which it reaches itself before it measures.
+the way and about as far as it is told), STOP_PROVED (every way to stop was tried in a
+slow move), ZEROED (the zero posture's attitude is known). No step stands without those
+before it. A session needs all but the last, which it reaches itself.
 """
 
 from __future__ import annotations
@@ -45,11 +44,7 @@ class DeviceRecord:
 
     @classmethod
     def load(cls, path: pathlib.Path) -> DeviceRecord:
-        """The record of a file; an empty one where there is no file yet.
-
-        Raises:
-            Refused: the file cannot be read or is not a device record.
-        """
+        """The record of a file, empty where there is none; Refused: it is no record."""
         record = cls(path)
         try:
             data = json.loads(path.read_text(encoding="utf-8"))
@@ -83,12 +78,9 @@ class DeviceRecord:
         return None if known is None else known["evidence"]
 
     def reach(self, name: str, config: RigConfig, **evidence: Any) -> None:
-        """A state was reached, with JSON values as evidence.
+        """A state was reached, with JSON values as evidence; Refused: none before it.
 
         Where the evidence is not the one known before, the states after it are void.
-
-        Raises:
-            Refused: a state before it is missing.
         """
         number = STATES.index(name)
         if number and (text := self.missing(config, STATES[number - 1])):
@@ -143,24 +135,15 @@ class DeviceRecord:
     # Where the drives stand between sessions
 
     def left_at(
-        self,
-        positions: Mapping[str, int | None],
-        homed: Sequence[str] = (),
+        self, positions: Mapping[str, int | None], homed: Sequence[str] = ()
     ) -> None:
-        """Where the drives are left.
-
-        Args:
-            positions: pulses by axis; None where it is not known, as while armed.
-            homed: names of the axes whose drives say that they are homed.
-        """
-        standing = {"pulses": dict(positions), "homed": list(homed)}
-        self._left = {"time": _now(), **standing}
+        """Where the drives are left, in pulses, None while armed; which say homed."""
+        pulses = dict(positions)
+        self._left = {"time": _now(), "pulses": pulses, "homed": list(homed)}
         self.save()
 
     def left(self) -> tuple[dict[str, int | None], list[str]]:
-        """Pulses at which the last session left each axis, None where it armed the axis
-        and did not say afterwards where it stands; and names of the axes whose drives
-        said then that they are homed."""
+        """What `left_at` kept: pulses of each axis or None, and names of homed axes."""
         return self._left.get("pulses", {}), self._left.get("homed", [])
 
 

@@ -3,9 +3,7 @@
 The lock is an flock on a file in a folder of this user, so the kernel frees it however
 its holder ends. The file says who holds it; what it says without the flock is stale.
 Beside it lies what a stop needs, written before the drives are armed: bus, units and
-register maps. So a stop needs no configuration file.
-
-Nothing heavy is imported here: ``stop`` asks the holder before it loads anything.
+register maps. ``stop`` asks the holder before it loads anything heavy.
 """
 
 from __future__ import annotations
@@ -56,19 +54,17 @@ class BusLock:
     def acquire(self, what: str) -> BusLock:
         """Take the lock for the command ``what``.
 
-        Raises:
-            Refused: another process, or this one, holds it; names the holder.
+        Raises Refused: another process, or this one, holds it; names the holder.
         """
         self._fd = fd = self._open(os.O_RDWR | os.O_CREAT)
 
-        def taken() -> bool:
-            return flock(fd, fcntl.LOCK_EX)
+        def taken(seconds: float) -> bool:
+            return until(seconds, lambda: flock(fd, fcntl.LOCK_EX))
 
-        free = until(PATIENCE_S, taken)
-        if not free and not (told := _content(fd)):
-            free = until(_ASKERS_S, taken)
-        elif not free and told["command"] == ENDING:
-            free = until(ENDING_S, taken)
+        if not (free := taken(PATIENCE_S)):
+            told = _content(fd) or {"command": ""}
+            more = {"": _ASKERS_S, ENDING: ENDING_S}.get(told["command"], 0.0)
+            free = taken(more)
         if not free:
             told = _content(fd)
             self.release()
@@ -119,9 +115,8 @@ class BusLock:
     def holder(self) -> dict[str, Any] | None:
         """Who holds the lock now (pid, command, since, run), None where it is free.
 
-        Never the word of a dead holder: the flock is tried first. The dictionary is
-        empty where the holder has not said yet who it is. Where the file is gone, or
-        says nothing of use, the kernel is asked who has it open.
+        The flock is tried first, so never the word of a dead holder; empty where it has
+        not said who it is. Where the file is gone or of no use the kernel is asked.
         """
         try:
             fd = self._open(os.O_RDONLY)
@@ -140,11 +135,7 @@ class BusLock:
             os.close(fd)
 
     def signal_holder(self, number: int) -> dict[str, Any] | None:
-        """Send SIGTERM (stop now) or SIGINT (pause) to the holder; who that is.
-
-        None where the lock is free. No signal goes to a holder that has ended since
-        or is this process.
-        """
+        """Send a signal to the holder, unless it is this process; who that is."""
         told = self.holder()
         if told and told["pid"] != os.getpid():
             with contextlib.suppress(ProcessLookupError):
@@ -152,18 +143,13 @@ class BusLock:
         return told
 
     def leave(self, config: RigConfig) -> None:
-        """Write what a stop of these drives needs; before they are armed.
-
-        Raises:
-            Refused: the folder cannot be written.
-        """
+        """Write what a stop of these drives needs, before they are armed; Refused."""
         self._write_armed(config.told)
 
     def stood(self, forget: bool = False, standing: bool = True) -> None:
-        """All drives were seen standing: nothing has to be stopped any more.
+        """All drives were seen standing, or, not ``standing``, one to go on.
 
-        ``forget``: they are gone as well, as simulated ones are. Not ``standing``: one
-        was seen to go on.
+        ``forget``: they are gone as well, as simulated ones are.
         """
         with contextlib.suppress(Refused, OSError):  # they stand, whatever is written
             if forget:
@@ -178,10 +164,8 @@ class BusLock:
             new.write_text(json.dumps(told), encoding="utf-8")
             new.replace(self.armed_path)
         except OSError as error:
-            reason = error.strerror or error
-            raise Refused(
-                f"cannot write {self.armed_path}, which `stop` needs: {reason}"
-            ) from None
+            text = f"cannot write {self.armed_path}, which `stop` needs"
+            raise Refused(f"{text}: {error.strerror or error}") from None
 
     def freed(self, seconds: float) -> bool:
         """Wait so long for the holder to let go; whether it did."""

@@ -81,8 +81,7 @@ class Journal:
     def write(self, event: str, *, sync: bool = False, **fields: Any) -> Record:
         """Append one record; with ``sync`` it is on the disk when this returns.
 
-        Raises:
-            JournalError: the disk is full or gone; the journal keeps its whole lines.
+        JournalError: the disk is full or gone; the journal keeps its whole lines.
         """
 
         def make() -> Record:
@@ -93,9 +92,8 @@ class Journal:
         try:
             return self._lines.append(make, sync=sync)
         except OSError as error:
-            raise JournalError(
-                f"cannot write {self.path}: {error.strerror or error}"
-            ) from None
+            text = f"cannot write {self.path}: {error.strerror or error}"
+            raise JournalError(text) from None
 
     def events(self, event: str) -> list[Record]:
         return [record for record in self.records if record["event"] == event]
@@ -169,10 +167,9 @@ class RunFolder:
         self.emit("start", sync=True, schema=SCHEMA, mode=mode, **start)
 
     def emit(self, event: str, *, sync: bool = False, **fields: Any) -> Record:
-        """Journal an event, then tell the listeners: the one stream of a run.
+        """Journal an event, on the disk with ``sync``, then tell the listeners.
 
-        With ``sync`` it is on the disk before anything follows. Where the disk is full
-        JournalError is raised, but not for a stop and its frames.
+        Where the disk is full JournalError is raised, but not for a stop's records.
         """
         record: Record = {"event": event, **fields}
         try:

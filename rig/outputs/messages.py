@@ -6,14 +6,18 @@ Console, page and report say the same.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
+from jaxcal.extras import MissingExtraError
 from rig.config import AXIS_NAMES
 from rig.core.stop import UnitStop
-from rig.journal.run_folder import Record
+from rig.faults import EXIT_OK, EXIT_RECALIBRATE
+from rig.journal.run_folder import Record, RunFolder
+from rig.pages import REPORT, write_report
 
 NUMBERS = {2: "two", 4: "four", 6: "six", 12: "twelve"}
 UNITS = {"deg": "degrees", "mm": "millimetres"}
@@ -130,13 +134,31 @@ def numbers(values: Any, width: int = 9, digits: int = 4) -> str:
 
 
 def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
-    """A and b with their intervals, the errors and any warning."""
+    """The parameters with their intervals, the errors, any warning and the verdict."""
+    outputs, drift = summary.get("outputs") or summary["axes"], summary.get("drift")
     if "parameters" in summary:
-        return _model_lines(summary, limit_deg)
-    outputs = summary.get("outputs", summary["axes"])
-    count = np.size(summary["ci95"])
+        lines, use = _model_lines(summary)
+    else:
+        lines, use = _affine_lines(summary, outputs), "`jaxcal-rig export` writes it"
+    if drift:
+        lines.append(f"drift: {drift_text(drift, outputs, summary['unit'])}")
+    if warning := summary.get("orders", {}).get("warning"):
+        lines.append(f"WARNING: {warning}")
+    if reasons := recalibrate(summary, limit_deg):
+        verdict = (
+            f"RECALIBRATE: {' and '.join(reasons)}. Do not use this calibration; next: "
+            "find the cause (report.html shows each posture), then `jaxcal-rig "
+            "calibrate`"
+        )
+    else:
+        verdict = f"good; next: {use} for a controller; `jaxcal-rig verify` checks it "
+        verdict += "later"
+    return [*lines, verdict]
+
+
+def _affine_lines(summary: dict[str, Any], outputs: Sequence[str]) -> list[str]:
+    count, unit = np.size(summary["ci95"]), summary["unit"]
     number = NUMBERS.get(count, count)
-    unit = summary["unit"]
     lines = [
         f"y = A u + b in {UNITS.get(unit, unit)}, +- 95 % confidence for all {number} "
         "together:"
@@ -157,25 +179,10 @@ def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
             f"held-out postures: prediction error {errors['rms']:.4f} {unit} rms (max "
             f"{errors['max']:.4f})"
         )
-    if summary.get("drift"):
-        lines.append(f"drift: {drift_text(summary['drift'], outputs, unit)}")
-    if summary["orders"]["warning"]:
-        lines.append(f"WARNING: {summary['orders']['warning']}")
-    return [*lines, _verdict_line(summary, limit_deg, "`jaxcal-rig export` writes it")]
+    return lines
 
 
-def _verdict_line(summary: dict[str, Any], limit_deg: float, use: str) -> str:
-    if reasons := recalibrate(summary, limit_deg):
-        return (
-            f"RECALIBRATE: {' and '.join(reasons)}. Do not use this calibration; next: "
-            "find the cause (report.html shows each posture), then `jaxcal-rig "
-            "calibrate`"
-        )
-    return f"good; next: {use} for a controller; `jaxcal-rig verify` checks it later"
-
-
-def _model_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
-    """Parameters of a model with their intervals, the errors and the verdict."""
+def _model_lines(summary: dict[str, Any]) -> tuple[list[str], str]:
     unit, count = summary["unit"], len(summary["postures"])
     lines = [f"model {summary['model']}, fitted to {count} postures, +- 95 % each:"]
     for name, parameter in summary["parameters"].items():
@@ -188,21 +195,27 @@ def _model_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
     if "prediction" in summary:
         lines.append(f"held-out {prediction_text(summary, unit)}")
     lines += [f"  note: {reason}" for reason in summary["fit"]["reasons"]]
-    if summary.get("drift"):
-        told = drift_text(summary["drift"], summary["outputs"], unit)
-        lines.append(f"drift: {told}")
-    use = "calibration.json (jaxcal command, jaxcal predict)"
     if summary.get("urdf"):
-        use = f"{summary['urdf']} in the run's folder"
-    return [*lines, _verdict_line(summary, limit_deg, use)]
+        return lines, f"{summary['urdf']} in the run's folder"
+    return lines, "calibration.json (jaxcal command, jaxcal predict)"
 
 
 def prediction_text(errors: dict[str, Any], unit: str) -> str:
     """Errors of predictions at held-out postures, as designed and calibrated."""
-    before, after = errors["before"], errors["prediction"]
-    return (
-        f"prediction error before calibration {before['rms']:.4f} {unit} rms (max "
-        f"{before['max']:.4f}), after {after['rms']:.4f} (max {after['max']:.4f})"
+    text = "prediction error before calibration {}, after {}"
+    return _compared(text, errors["before"], errors["prediction"], unit)
+
+
+def error_text(errors: dict[str, Any], unit: str = "deg") -> str:
+    """Errors at held-out postures, raw and compensated."""
+    text = "error before {}, after compensation {}"
+    return _compared(text, errors["before"], errors["after"], unit)
+
+
+def _compared(text: str, before: Record, after: Record, unit: str) -> str:
+    first, second = (f"(max {errors['max']:.4f})" for errors in (before, after))
+    return text.format(
+        f"{before['rms']:.4f} {unit} rms {first}", f"{after['rms']:.4f} {second}"
     )
 
 
@@ -267,10 +280,29 @@ def choice_text(choice: dict[str, Any]) -> str:
     )
 
 
-def error_text(found: dict[str, Any], unit: str = "deg") -> str:
-    """Errors at held-out postures, raw and compensated."""
-    before, after = found["before"], found["after"]
-    return (
-        f"error before {before['rms']:.4f} {unit} rms (max {before['max']:.4f}), after "
-        f"compensation {after['rms']:.4f} (max {after['max']:.4f})"
-    )
+def save_result(
+    run: RunFolder, calibration: Any, summary: Record, say: Callable[[str], object]
+) -> int:
+    """Write what a calibration comes to, say what it holds; returns the exit code."""
+    calibration.save(run.folder / "calibration.json")
+    saved = ["calibration.json", "pairs.csv", "summary.json"]
+    if run.config.is_arm:
+        summary["urdf"] = "calibrated.urdf"
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            calibration.to_urdf(run.folder / summary["urdf"], force=True)
+        for warning in caught:
+            say(f"  note: {warning.message}")
+        saved.insert(1, summary["urdf"])
+    run.save_pairs()
+    run.save_summary(summary)
+    limit = run.config.session.verify_limit_deg
+    for line in summary_lines(summary, limit):
+        say(line)
+    try:
+        write_report(run.folder)
+        saved.append(REPORT)
+    except MissingExtraError as lack:
+        say(f"  note: no report: {lack}")
+    say(f"saved: {run.folder}/{', '.join(saved)}")
+    return EXIT_RECALIBRATE if recalibrate(summary, limit) else EXIT_OK

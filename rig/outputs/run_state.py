@@ -1,7 +1,7 @@
 """What console, page and report show of a run, from the records of its journal.
 
-``RunState`` takes the records one by one and touches neither files nor clocks, so that
-a page that is opened late shows the same as one that was there from the beginning.
+``RunState`` takes the records one by one and touches neither files nor clocks: a page
+that is opened late shows the same.
 """
 
 from __future__ import annotations

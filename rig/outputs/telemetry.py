@@ -1,9 +1,8 @@
 """telemetry.jsonl: what phone and drives say while a session runs, for the live page.
 
 A thread takes what others have received already, at most 20 times a second, and appends
-a line. It never uses the bus, never makes the session wait, and where it fails it ends
-by itself: a session has no need of this file. The file is not fsynced, and no results
-are computed from it.
+a line. It never uses the bus, never makes the session wait, and ends where it fails.
+The file is not fsynced, and no results are computed from it.
 """
 
 from __future__ import annotations
@@ -54,14 +53,8 @@ def _record(device: Device, closing: threading.Event) -> None:
 
 
 def sample(device: Device) -> dict[str, Any]:
-    """What is known now.
-
-    Returns:
-        ``time``; ``drives`` (3,) degrees as last polled, None where never; ``age`` of
-        the newest reading in seconds and ``rate`` of readings in Hz; once there is a
-        zero ``deg`` (3,) of the newest reading, and over the settle window ``std`` (3,)
-        in degrees.
-    """
+    """What is known now: time; drives, (n,) degrees as last polled, None where never;
+    age in seconds and rate in Hz of readings; with a zero deg (m,) and std (m,)."""
     now = time.monotonic()
     window = min(1.0, max(0.2, device.config.settle.window_s))
     readings = device.imu.since(now - window)[-MOST_READINGS:]

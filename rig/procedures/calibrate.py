@@ -1,4 +1,4 @@
-"""The calibration session: choose, visit, identify, verify, save."""
+"""The calibration session: choose, visit, identify, verify, save; and collecting."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from typing import Any
 
 import numpy as np
 
+from jaxcal.files import atomic_write
 from rig.command_run import Run
 from rig.core.device import Device, Posture, check_plan
 from rig.core.session import visit
-from rig.faults import MotionFault
-from rig.identification.conclusion import check_matrix, conclude
-from rig.identification.fit_affine import identify_affine
+from rig.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault
+from rig.identification.conclusion import check_matrix, conclude, identify_affine, pairs
 from rig.journal.device import SIGN_CHECKED
 from rig.outputs.console import plan_lines
-from rig.outputs.results import save_result
+from rig.outputs.messages import numbers, save_result
 from rig.outputs.run_state import roles_of
 from rig.procedures.plan import (
     Choice,
     choose,
+    draw,
     draw_candidates,
     draw_held_out,
     travel_order,
@@ -68,10 +69,8 @@ def _plan(run: Run) -> tuple[Array, Choice]:
         candidates = draw_candidates(config)
         choice = choose(config, config.to_deg(candidates))
         choice = _ordered(run, choice, candidates, config.to_deg(run.zero_pulses))
-        return {
-            "candidates": candidates.tolist(),
-            "choice": dataclasses.asdict(choice),
-        }
+        chosen = dataclasses.asdict(choice)
+        return {"candidates": candidates.tolist(), "choice": chosen}
 
     record = run.remember("plan", make)
     candidates, choice = np.array(record["candidates"]), Choice(**record["choice"])
@@ -126,11 +125,7 @@ def _check_gains(run: Run, matrix: Any) -> None:
 
 
 def _held_out(run: Run, calibration: Any) -> list[Any]:
-    """Pairs of pulses, raw and compensated; drawn once for one set of chosen postures.
-
-    Where a chosen posture was withdrawn since, the compensated commands came from a
-    wrong calibration: they are drawn again, and what was measured there is withdrawn.
-    """
+    """Pairs of pulses, raw and compensated, drawn once for a set of chosen postures."""
     drawn = run.journal.events("held_out")
     voids = [
         record["seq"]
@@ -152,24 +147,26 @@ def _held_out(run: Run, calibration: Any) -> list[Any]:
     return run.emit("held_out", sync=True, pairs=targets)["pairs"]
 
 
-def pair_names(held: list[Any]) -> list[str]:
-    """Names of the visits of held-out targets, all raw and then all compensated."""
+def pair_targets(held: list[Any]) -> dict[str, Any]:
+    """Pulses of held-out targets by name, all raw and then all compensated."""
     roles = roles_of(held[0]) if held else ()
-    return [f"{role}:{i}" for role in roles for i in range(len(held))]
+    return {
+        f"{role}:{i}": pair[number]
+        for number, role in enumerate(roles)
+        for i, pair in enumerate(held)
+    }
 
 
 def visit_pairs(run: Run, device: Device, held: list[Any]) -> None:
     """Visit held-out targets raw and compensated, in the order of least travel."""
-    names = pair_names(held)
-    visits = range(len(held[0])) if held else ()
-    targets = [pair[number] for number in visits for pair in held]
-    points = run.config.to_deg(targets or np.empty((0, len(run.config.axes))))
-    start = run.config.to_deg(run.zero_pulses)
-    queue = travel_order(run.config, points, start)
-    run.emit("queue", names=[names[number] for number in queue])
-    for number in queue:
-        role = names[number].partition(":")[0]
-        visit(device, Posture(names[number], tuple(targets[number])), role=role)
+    targets, config = pair_targets(held), run.config
+    points = config.to_deg([*targets.values()]) if targets else np.empty((0, 0))
+    order = travel_order(config, points, config.to_deg(run.zero_pulses))
+    queue = [[*targets][number] for number in order]
+    run.emit("queue", names=queue)
+    for name in queue:
+        role = name.partition(":")[0]
+        visit(device, Posture(name, tuple(targets[name])), role=role)
 
 
 def _identify(run: Run) -> int:
@@ -180,3 +177,53 @@ def _identify(run: Run) -> int:
     choice = [*run.journal.events("plan"), *run.journal.events("replan")][-1]["choice"]
     told = {"mode": "calibrate", "simulated": simulated, "choice": choice}
     return save_result(run, calibration, summary | told, run.say)
+
+
+def collect(run: Run, count: int) -> int:
+    """Record ``count`` random postures: the paper's Datasets 4 and 5.
+
+    Writes pairs.csv and dataset.npz with ``candidates`` (episodes, M, n) and
+    ``measured`` (episodes, M, m), M as configured; an unfinished episode is in the CSV.
+    """
+    config = run.config
+
+    def make() -> dict[str, Any]:
+        return {"pulses": draw(config, count, 2).tolist()}
+
+    targets = run.remember("collection", make)["pulses"]
+    if run.dry_run:
+        for number, target in enumerate(targets):
+            run.say(f"  {number:>5}   {numbers(config.to_deg(target))}   {target}")
+    names = [f"collect:{number}" for number in range(len(targets))]
+    if run.lacks([*names, END]):
+        with run.device() as device:
+            for name, target in zip(names, targets, strict=True):
+                visit(device, Posture(name, tuple(target)), role="collect")
+            visit(device, Posture(END, run.zero_pulses), role="reference")
+            run.emit("phase", phase="saving")
+    closing = run.postures().get(END)
+    collected = [r for r in run.postures().values() if r["role"] == "collect"]
+    commands, measured = pairs(collected)
+    size = min(config.session.candidates, len(commands))
+    episodes = len(commands) // max(1, size)
+    run.save_pairs()
+    inputs, outputs = (
+        rows[: episodes * size].reshape(episodes, size, -1)
+        for rows in (commands, measured)
+    )
+    with atomic_write(run.folder / "dataset.npz") as file:
+        np.savez(file, candidates=inputs, measured=outputs)
+    run.say(
+        f"saved: {run.folder}/pairs.csv ({len(commands)} postures), dataset.npz "
+        f"({episodes} x {size})"
+    )
+    drift = np.abs(closing["measured_deg"]).max() if closing else 0.0
+    limit = config.session.drift_limit_deg
+    if drift > limit:
+        run.say(
+            f"RECALIBRATE: at the end the zero posture reads {drift:.3f} "
+            f"{config.output_unit} (limit session.drift_limit_deg = {limit:g}). Fix "
+            f"{'the sensor' if config.readings else 'the phone'}, and collect again"
+        )
+        return EXIT_RECALIBRATE
+    return EXIT_OK

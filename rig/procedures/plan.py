@@ -57,12 +57,9 @@ def choose(
 ) -> Choice:
     """The K postures to measure of (M, n) candidates.
 
-    Args:
-        config: names K, the method and the efficiency under which exact replaces it.
-        candidates_deg: (M, n).
-        available: (M,) False where a posture cannot be reached. The drives stand armed
-            then: it is the exact solver alone, and less time.
-        required: indices measured already, which stay in the choice.
+    ``available`` (M,) is False where a posture cannot be reached; the drives stand
+    armed then: it is the exact solver alone, and less time. ``required``: indices
+    measured already, which stay in the choice.
     """
     n, m, made = len(config.axes), len(config.output_names), model_of(config)
     given: dict[str, Any] = {"available": available, "required": list(required) or None}
@@ -75,9 +72,10 @@ def choose(
     def select(method: str) -> Any:
         import jaxcal
 
-        more: dict[str, Any] = {"seed": config.session.seed}
-        if method == "greedy":  # which draws nothing
-            more = {}
+        # Greedy draws nothing.
+        more: dict[str, Any] = (
+            {} if method == "greedy" else {"seed": config.session.seed}
+        )
         if method in ("auto", "exact"):
             more["time_limit"] = limit_s
         if method == "auto":
@@ -95,11 +93,9 @@ def choose(
         most, parameters = max(best.log_det, chosen.log_det), m * (n + 1)
         efficiency = math.exp((chosen.log_det - most) / parameters)
         if efficiency < config.session.min_efficiency:
-            note = (
-                f"{config.method} reached a D-efficiency of {efficiency:.3f}, below "
-                f"session.min_efficiency = {config.session.min_efficiency:g}; using "
-                "exact"
-            )
+            least = config.session.min_efficiency
+            note = f"{config.method} reached a D-efficiency of {efficiency:.3f}, below "
+            note += f"session.min_efficiency = {least:g}; using exact"
             chosen, efficiency = best, math.exp((best.log_det - most) / parameters)
     return Choice(
         indices=tuple(int(i) for i in chosen.indices),
@@ -131,8 +127,7 @@ def _by_its_method(
 def travel_order(config: RigConfig, points_deg: Array, start_deg: Array) -> list[int]:
     """Order of visits of (N, n) points of least travel time from (n,), ending anywhere.
 
-    The axes move at the same time, so the slowest of them sets the time. Optimal for N
-    up to 12; above 200 each next point is the nearest.
+    The slowest axis sets the time. Optimal for N up to 12; above 200 nearest first.
     """
     if not len(points_deg):
         return []
@@ -157,8 +152,7 @@ def draw_held_out(
     """Held-out targets in pulses, each as it is and as its compensated command.
 
     Fewer than ``count`` where little of the range can be reached compensated. By a
-    ``[model]`` they are predicted, and visited once. Of other numbers than axes what
-    the calibration says there is the target, and both are the same.
+    ``[model]`` they are visited once; of other numbers than axes both are the same.
     """
     if config.model is not None:
         return [(tuple(pulses.tolist()),) for pulses in draw(config, count, 1)]

@@ -1,8 +1,9 @@
-"""verify: does a saved calibration still hold? Also reading it, for ``goto`` too."""
+"""What uses a saved calibration: verify, whether it still holds, and goto."""
 
 from __future__ import annotations
 
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,17 @@ from rig.command_run import Run
 from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.config.config import differences
+from rig.core.device import Posture
 from rig.core.record_check import ZeroRecord
-from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
-from rig.identification.fit_affine import held_out_errors, pairs
+from rig.core.session import visit
+from rig.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
+from rig.identification.conclusion import held_out_errors, pairs
 from rig.outputs.messages import error_text, numbers, prediction_text
 from rig.parts import model_of
-from rig.procedures.calibrate import pair_names, visit_pairs
+from rig.procedures.calibrate import pair_targets, visit_pairs
 from rig.procedures.plan import draw_held_out
+from rig.readings.attitude import Array
+from rig.readings.geometry import Frame, geometry_of
 
 _OFFERED = 10  # targets to choose each posture of a check from
 
@@ -27,14 +32,8 @@ def load_calibration(
 ) -> tuple[Any, ZeroRecord]:
     """A calibration made with a device configured as this one, and its zero posture.
 
-    Args:
-        path: of the file, or of its run's folder.
-        config: of the device.
-        simulated: so is the device that is to be moved.
-
-    Raises:
-        Refused: not a calibration, or of another device (names the keys), or made with
-            a simulated one, and that to be moved is real.
+    Raises Refused: not a calibration's file or run, or of another device (names the
+    keys), or made with a simulated one, and that to be moved is not ``simulated``.
     """
     import jaxcal
 
@@ -88,12 +87,9 @@ def verify(run: Run, calibration: Any, count: int) -> int:
             "Widen the ranges, or calibrate again"
         )
     if run.dry_run:
-        for target in held:
-            run.say(
-                f"  target {numbers(config.to_deg(target[0]))}  command "
-                f"{list(target[-1])}"
-            )
-    if run.lacks(pair_names(held)):
+        for raw, command in ((target[0], target[-1]) for target in held):
+            run.say(f"  target {numbers(config.to_deg(raw))}  command {list(command)}")
+    if run.lacks(pair_targets(held)):
         with run.device() as device:
             visit_pairs(run, device, held)
             run.emit("phase", phase="saving")
@@ -132,3 +128,77 @@ def telling(
         return offered[:count]
     at = np.array([config.to_deg(target[-1]) for target in offered])
     return [offered[i] for i in calibration.verification(at, count)]
+
+
+def goto(run: Run, calibration: Any, to: Sequence[float]) -> int:
+    """Move the end-effector to (m,) desired measurements through a calibration."""
+    config, desired = run.config, np.array(to, dtype=np.float64)
+    if len(desired) != len(config.output_names):
+        outputs = ", ".join(config.output_names)
+        raise Refused(f"--to must be {outputs}, got {len(desired)} numbers")
+    command = _command(config, calibration, desired)
+    for axis, value in zip(config.axes, command, strict=True):
+        if not axis.min_deg <= value <= axis.max_deg:
+            raise LimitError(
+                f"{desired.tolist()} {config.output_unit} cannot be reached: "
+                f"{axis.name} would have to be {value:.3f} {axis.unit_name} (limits "
+                f"{axis.min_deg:g} to {axis.max_deg:g}). Choose a target further inside"
+            )
+    pulses = config.to_pulses(command)
+    run.say(
+        f"desired {desired.tolist()} {config.output_unit}: command "
+        f"{command.round(4).tolist()} {config.axis_unit}, pulses {list(pulses)}"
+    )
+    if run.lacks(["goto"]):
+        with run.device() as device:
+            visit(device, Posture("goto", pulses), role="goto")
+            counted = [drive.axis.name for drive in device.drives if drive.origin]
+            names = unchecked(config, device.frame, counted)
+        if names:
+            run.say(
+                f"NOT CHECKED: whether {', '.join(names)} was moved while without "
+                "power. The drive does not report it, and a phone cannot measure "
+                "rotation about the vertical. If in doubt: jaxcal-rig setup home"
+            )
+    record = run.postures().get("goto")
+    if record is None:
+        return EXIT_RECALIBRATE
+    reached = np.array(record["measured_deg"])
+    if run.model is not None:
+        reached = run.model.outputs(config, [record])[1][0]
+    run.say(
+        f"reached {reached.round(4).tolist()} {config.output_unit}, off by "
+        f"{(reached - desired).round(4).tolist()}"
+    )
+    return EXIT_OK
+
+
+def _command(config: RigConfig, calibration: Any, desired: Array) -> Array:
+    """(n,) what gives (m,) desired measurements."""
+    if config.model is not None:
+        limits = [(axis.min_deg, axis.max_deg) for axis in config.axes]
+        try:
+            return np.asarray(calibration.command_for(desired, limits=limits))
+        except ValueError as error:
+            text = f"goto: no command gives {desired.tolist()}: {error}"
+            raise Refused(text) from None
+    if len(desired) > len(config.axes):  # as near as they can
+        at_zero, *others = calibration.predict(np.eye(len(config.axes) + 1)[:, 1:])
+        matrix = np.transpose(others) - at_zero[:, None]
+        return np.asarray(np.linalg.lstsq(matrix, desired - at_zero)[0])
+    return np.asarray(calibration.command_for(desired), dtype=np.float64)
+
+
+def unchecked(
+    config: RigConfig, frame: Frame | None, told: Sequence[str] = ()
+) -> list[str]:
+    """Axes of which neither drive nor phone tells that they were moved when off.
+
+    A drive without homed bit and absolute encoder counts from 0 when it is switched on,
+    but for ``told`` axes, whose home is at a count of its own.
+    """
+    unseen = [] if frame is None else geometry_of(config).unseen(frame.zero)
+    telling = [a.name for a in config.axes if a.map.has("homed")]
+    telling += [a.name for a in config.axes if a.map.absolute_encoder]
+    names = [name for name in config.axis_names if name in unseen]
+    return [name for name in names if name not in (*telling, *told)]

@@ -1,13 +1,10 @@
 """What small moves of the drives say about a device: axes, signs, gearing, placement.
 
-Everything is taken from rotations of the phone against its attitude at the start, so
-neither the heading of the phone's world nor the zero posture enters. A rotation vector
-is (3,) degrees in the phone's own frame at the start.
-
-A drive's axis there, with its sign, is the direction of its rotation vector for
-positive pulses. With these axes alone, a phone that is placed differently cannot be
-told from drives whose names and signs are exchanged, so the configured placement is
-taken as known, as good as ``NEAREST``.
+Everything is taken from rotations of the phone against its attitude at the start, in
+(3,) degrees of its own frame there: neither its heading nor the zero posture enters. A
+drive's axis, with its sign, is the direction of its rotation vector for positive
+pulses. By these alone a phone placed differently looks like drives whose names and
+signs are exchanged, so the configured placement is known, as good as ``NEAREST``.
 """
 
 from __future__ import annotations
@@ -115,12 +112,10 @@ def _inner(
     """For each drive how many joints its own carries; [] where nothing fits.
 
     With A nearer to the base the phone turns by exp(a) exp(b), otherwise by exp(b)
-    exp(a). The two differ by a x b: half of it, up or down, in the direction in which
-    neither turns alone. It changes its sign with either move, so its mean over the
-    corners, each with the product of the two signs, is free of what A or B turn
-    alone, of play and of a steady drift. Angles read in a wrong order or with wrong
-    signs turn like a mirror image, and combine like nothing. None: the phone is too
-    noisy to tell.
+    exp(a). The two differ by a x b: half of it, up or down, where neither turns alone.
+    Its mean over the corners, each with the product of the two signs, is free of what
+    A or B turn alone, of play and of a steady drift. Angles read in a wrong order or
+    with wrong signs combine like nothing. None: the phone is too noisy to tell.
     """
     count, base = rates.shape[1], stands["start"]
     corners = [stands[corner_name(config, signs)] for signs in corners_of(count)]
@@ -129,9 +124,7 @@ def _inner(
     turned = np.array([turn(base.attitude, corner.attitude) for corner in corners])
     ways = np.array([corner.pulses - base.pulses for corner in corners])
     number = len(corners)
-    noise = (
-        base.std_deg * np.sqrt(sum(1 / corner.samples for corner in corners)) / number
-    )
+    noise = base.std_deg * sum(1 / corner.samples for corner in corners) ** 0.5 / number
     inner = [0] * count
     for a, b in itertools.combinations(range(count), 2):
         product = ways[:, a] * ways[:, b]  # as large at each
@@ -150,17 +143,11 @@ def _inner(
 def check_numbers(
     config: RigConfig, stands: Mapping[str, Stand], expected: Array | None = None
 ) -> tuple[list[Change], list[float]]:
-    """What the places say of axes that are measured by numbers.
+    """Corrections of directions, and what numbers change for a unit of each axis.
 
     A number of the name of an axis rises with that axis; where it has its unit too, it
     changes about as far. Or they change as a model says, ``expected`` (m, n) for a unit
-    of each axis.
-
-    Returns:
-        Corrections of directions, and what a commanded unit of each axis changes.
-
-    Raises:
-        MotionFault: it changes by far more, or less.
+    of each axis. MotionFault: by far more, or less.
     """
     rates, changes, low, high = rates_of(config, stands), [], *SOUND_RATIO
     ratios = []
@@ -181,9 +168,13 @@ def check_numbers(
             )
         if rate < 0:
             reason = f"the reading {axis.name} falls when the axis is commanded up"
-            key = f"axes.{axis.name}.direction"
-            changes.append(Change(key, axis.direction, -axis.direction, reason))
+            changes.append(_turned(axis, reason))
     return changes, ratios
+
+
+def _turned(axis: Axis, reason: str) -> Change:
+    key = f"axes.{axis.name}.direction"
+    return Change(key, axis.direction, -axis.direction, reason)
 
 
 def _against(
@@ -204,11 +195,8 @@ def _against(
             f"{told}, and in another direction: units, cables or readings are "
             "exchanged, or [model] is of another device. Nothing was corrected"
         )
-    if cosine > 0:
-        return []
-    key = f"axes.{axis.name}.direction"
     reason = "the readings change in the opposite direction to the model"
-    return [Change(key, axis.direction, -axis.direction, reason)]
+    return [] if cosine > 0 else [_turned(axis, reason)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -227,28 +215,28 @@ def find(
     stands: Mapping[str, Stand],
     expected: Array | None = None,
 ) -> Findings:
-    """Read the findings from the places that ``axes.measure`` went to.
+    """Read the findings from the places that ``measure_axes`` went to.
 
     Args:
         config: as the moves were made.
         stands: ``start``; of each axis NAME ``NAME:look``, ``:plus``, ``:back``,
             ``:minus``; of each of ``corners_of`` its ``corner_name``.
-        expected: (3, n) axes of an arm's joints in its tip's frame at the start, of
-            which the order of the joints is known.
+        expected: (3, n) axes of an arm's joints in its tip's frame at the start.
 
-    Raises:
-        MotionFault: the axes fit no joints, or the readings are no rotations.
+    Raises MotionFault: the axes fit no joints, or the readings are no rotations.
     """
     rates = rates_of(config, stands)
     size = np.linalg.norm(rates, axis=0)
     axes = rates / size
     told = euler_to_matrix(config.phone.mounting_deg, "ZYX")
-    if expected is not None:
-        joints, signs, mounting = _placed(config, axes, expected)
-        turned = float(np.linalg.norm(turn(told, mounting)))
-        return Findings(joints, signs * size, mounting, turned, None)
-    joints, signs, mounting = _placed(config, axes, _expected(config))
-    order, inner = None, _inner(config, stands, rates)
+    named = np.eye(3)[:, [LETTERS.index(letter) for letter in config.letters]]
+    joints, signs, mounting = _placed(
+        config, axes, named if expected is None else expected
+    )
+    turned, order = float(np.linalg.norm(turn(told, mounting))), None
+    if expected is not None:  # the order of an arm's joints is known
+        return Findings(joints, signs * size, mounting, turned, order)
+    inner = _inner(config, stands, rates)
     if inner is not None:
         if not inner:
             raise MotionFault(
@@ -257,38 +245,22 @@ def find(
                 "Nothing was corrected"
             )
         order = "".join(config.letters[joints[i]] for i in np.argsort(inner)[::-1])
-    turned_as_told = axes * _directions(config)  # of fewer axes nothing is a mirror
-    mirrored = rates.shape[1] == 3 and (
-        np.linalg.det(turned_as_told @ _expected(config)) < 0
-    )
+    as_told = axes * [axis.direction for axis in config.axes]
+    # Of fewer axes nothing is a mirror.
+    mirrored = rates.shape[1] == 3 and np.linalg.det(as_told @ named) < 0
     if mirrored and order is None:
         raise MotionFault(
             "the axes are mirrored, and the phone is too noisy to show whether a "
             "direction or imu.signs is wrong. Raise settle.samples, then run "
             "`jaxcal-rig setup axes` again"
         )
-    turned = float(np.linalg.norm(turn(told, mounting)))
     return Findings(joints, signs * size, mounting, turned, order)
-
-
-def _expected(config: RigConfig) -> Array:
-    """(3, n) columns: axis of each joint in the end-effector's frame."""
-    return np.eye(3)[:, [LETTERS.index(letter) for letter in config.letters]]
-
-
-def _directions(config: RigConfig) -> Array:
-    """(n,) the configured ones of the drives."""
-    return np.array([float(axis.direction) for axis in config.axes])
 
 
 def _placed(
     config: RigConfig, axes: Array, expected: Array
 ) -> tuple[tuple[int, ...], Array, Array]:
-    """Joint and sign of each drive, and the mounting that fits them best.
-
-    Joints whose axes are parallel cannot be told apart: where as much is explained
-    otherwise, drives turn the joints that they are named after.
-    """
+    """Joint and sign of each drive, and the mounting that fits them best."""
     told = euler_to_matrix(config.phone.mounting_deg, "ZYX")
     cosines = expected.T @ told @ axes  # rows: joints
     joints: tuple[int, ...] = max(
@@ -331,9 +303,9 @@ class Change:
     reason: str
 
     def __str__(self) -> str:
-        if self.new is None:
-            return f"remove {self.key} (now {self.old!r}): {self.reason}"
-        return f"{self.key} = {self.new!r} (now {self.old!r}): {self.reason}"
+        what = f"{self.key} = {self.new!r}"
+        what = f"remove {self.key}" if self.new is None else what
+        return f"{what} (now {self.old!r}): {self.reason}"
 
 
 def ratios_of(config: RigConfig, findings: Findings) -> list[float]:
@@ -345,20 +317,12 @@ def ratios_of(config: RigConfig, findings: Findings) -> list[float]:
 def require_unit(
     config: RigConfig, ratios: Sequence[float], proved: bool = False
 ) -> None:
-    """The unit of the phone's angles is the configured one, by what the axes turned.
+    """MotionFault where the phone's unit is not the configured one, or not clear.
 
     Two gearings of the file that agree with the phone prove it (of a single axis the
     one): both would have to be wrong by 57.3. A gearing is corrected only where the
-    unit is proved, so that no phone's radians are taken for a gearbox.
-
-    Args:
-        config: names the unit.
-        ratios: of the axes, measured against commanded, by the drives' own registers
-            where they have one.
-        proved: only that not all turn as if the unit were the other.
-
-    Raises:
-        MotionFault: it is the other unit, or that is not clear.
+    unit is proved. ``ratios`` are measured against commanded, by the drives' own
+    registers where they have one; ``proved``: not all turn as if it were the other.
     """
     unit = config.phone.unit
     other, factor = ("rad", RADIANS) if unit == "deg" else ("deg", 1.0 / RADIANS)
@@ -381,17 +345,10 @@ def require_unit(
 def require_gearing(
     config: RigConfig, ratios: Sequence[float], told: Sequence[int | None]
 ) -> None:
-    """A gearing that is off by more than a factor of 2 has a second proof.
+    """MotionFault where a gearing off by more than 2 has no second proof.
 
-    That is the drive's own register, or another axis that turns as it is told: what is
-    off by as much on all of them may be the phone, or what the file says of all drives.
-
-    Args:
-        config, ratios: as of ``require_unit``.
-        told: pulses for one turn by each drive's own word, None where it has none.
-
-    Raises:
-        MotionFault: there is none.
+    That is the drive's own register (``told`` pulses for one turn, or None), or another
+    axis that turns as it is told: what is off on all may be the phone, or the file.
     """
     low, high = SOUND_RATIO
     if any(low <= ratio <= high for ratio in ratios):
@@ -414,12 +371,9 @@ def _seen(config: RigConfig, ratios: Sequence[float]) -> str:
 def proposals(
     config: RigConfig, findings: Findings, told: Sequence[int | None]
 ) -> list[Change]:
-    """Corrections of the configuration.
+    """Corrections of a configuration whose phone's unit is proved.
 
-    Args:
-        config: as the moves were made, with a phone whose unit is proved.
-        findings: what they showed.
-        told: pulses for one turn by each drive's own word, None where it has none.
+    ``told``: pulses for one turn by each drive's own word, None where it has none.
     """
     tables = {table["name"]: table for table in tomllib.loads(config.text)["axes"]}
     changes: list[Change] = []

@@ -46,56 +46,43 @@ def check_axes(run: Run, device: Device) -> list[Change]:
     Where nothing is to be corrected the device is SIGN_CHECKED, and once every way to
     stop it has been tried, STOP_PROVED.
     """
-    stands = measure_axes(run, device)
+    config, stands = run.config, measure_axes(run, device)
     start, model, expected = stands["start"].pulses, run.model, None
-    if run.config.imu is None:
+    more: dict[str, float] = {}
+    if config.imu is None:
         if model is not None:
-            expected = slopes(model.predict, run.config.to_deg(start))
-        changes, ratios = check_numbers(run.config, stands, expected)
-        return _conclude(run, device, stands, changes, ratios, {})
-    if model is not None and model.rotations is not None:
-        expected = model.axes_at(run.config.to_deg(start))
-    findings = find(run.config, stands, expected)
-    told = [drive.pulses_per_rev() for drive in device.drives]
-    ratios = ratios_of(run.config, findings)
-    if run.config.phone.unit == "rad":
-        require_unit(run.config, ratios, proved=True)
-    require_gearing(run.config, ratios, told)
-    changes = proposals(run.config, findings, told)
-    run.say(*lines(run.config, findings))
-    more = {"phone_turned_deg": round(findings.turned_deg, 2)}
-    return _conclude(run, device, stands, changes, ratios, more)
-
-
-def _conclude(
-    run: Run,
-    device: Device,
-    stands: dict[str, Stand],
-    changes: list[Change],
-    ratios: list[float],
-    more: dict[str, float],
-) -> list[Change]:
-    """Keep what was seen, where nothing is to be corrected, and prove the stops."""
-    names = run.config.axis_names
+            expected = slopes(model.predict, config.to_deg(start))
+        changes, ratios = check_numbers(config, stands, expected)
+    else:
+        if model is not None and model.rotations is not None:
+            expected = model.axes_at(config.to_deg(start))
+        findings = find(config, stands, expected)
+        told = [drive.pulses_per_rev() for drive in device.drives]
+        ratios = ratios_of(config, findings)
+        if config.phone.unit == "rad":
+            require_unit(config, ratios, proved=True)
+        require_gearing(config, ratios, told)
+        changes = proposals(config, findings, told)
+        run.say(*lines(config, findings))
+        more = {"phone_turned_deg": round(findings.turned_deg, 2)}
+    rounded = np.round(ratios, 4).tolist()
     evidence = {
-        "ratio": dict(zip(names, np.round(ratios, 4).tolist(), strict=True)),
+        "ratio": dict(zip(config.axis_names, rounded, strict=True)),
         **more,
         "run": run.folder.name,
     }
-    scales = np.array([axis.pulses_per_deg for axis in run.config.axes])
-    turns = {
-        "pulses": stands["start"].pulses.tolist(),
-        "deg": (rates_of(run.config, stands) * scales).round(6).tolist(),
-    }
     run.emit("axes", sync=True, **evidence, changes=[str(change) for change in changes])
-    units = {axis.name: axis.unit_name for axis in run.config.axes}
-    for name, pace in device.paces.items():
+    for axis in config.axes:
+        pace = device.paces[axis.name]
         run.say(
-            f"  {name}: at least {pace.seen_deg_s:.3g} {units[name]}/s, commanded "
-            f"{pace.asked_deg_s:.3g}"
+            f"  {axis.name}: at least {pace.seen_deg_s:.3g} {axis.unit_name}/s, "
+            f"commanded {pace.asked_deg_s:.3g}"
         )
     if not changes:
-        run.record.reach(SIGN_CHECKED, run.config, **evidence, turns=turns)
+        scales = [axis.pulses_per_deg for axis in config.axes]
+        turned = (rates_of(config, stands) * scales).round(6).tolist()
+        turns = {"pulses": start.tolist(), "deg": turned}
+        run.record.reach(SIGN_CHECKED, config, **evidence, turns=turns)
         run.say("each unit turns its joint in the right direction, about as commanded")
         prove_stops(run, device)
     return changes
@@ -104,10 +91,9 @@ def _conclude(
 def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
     """Visit the places that ``axis_check.find`` reads from, and come back.
 
-    Raises:
-        Refused: an axis stands too near to a limit.
-        MotionFault: an axis does not turn the phone, or turns it too far, or the unit
-            of the phone's angles is not the one that is configured.
+    Raises Refused: an axis stands too near to a limit. MotionFault: an axis does not
+    turn the phone, or turns it too far, or the unit of the phone's angles is not the
+    one that is configured.
     """
     config, start = run.config, device.positions()
     room = [_room_deg(axis, at) for axis, at in zip(config.axes, start, strict=True)]
@@ -138,11 +124,7 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
 
 
 def _room_deg(axis: Axis, pulses: int) -> float:
-    """Degrees from here to the nearer limit, less what is left to it.
-
-    Raises:
-        Refused: it is less than the check needs.
-    """
+    """Degrees from here to the nearer limit, less what is left to it."""
     here = axis.to_deg(pulses)
     room = min(here - axis.min_deg, axis.max_deg - here) - ROOM_DEG
     if room < REACH_DEG:

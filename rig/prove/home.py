@@ -39,13 +39,10 @@ def can_home(config: RigConfig) -> bool:
 
 
 def home(run: Run, device: Device, config: RigConfig, here: bool) -> None:
-    """Make the drives' counts mean a place; the device is HOMED.
+    """Make the counts of ``unlimited`` drives mean a place; the device is HOMED.
 
-    Args:
-        run, device: with ``unlimited`` axes.
-        config: with the limits, by which a homing is watched.
-        here: where the device stands is home: each drive is told so, and its count is
-            noted where it cannot be told. Otherwise each drive homes itself.
+    ``config`` has the limits, by which a homing is watched. ``here``: the device stands
+    at home, and each drive is told so, or its count is noted; else it homes itself.
     """
     for drive, axis in zip(device.drives, config.axes, strict=True):
         if here:
@@ -104,12 +101,7 @@ def _counts_from(device: Device, drive: Drive, origin: int) -> str | None:
 
 
 def _go_home(run: Run, device: Device, drive: Drive, range_deg: float) -> None:
-    """Let a drive home itself, as far and as fast as it is set to, under the phone.
-
-    Raises:
-        MotionFault: it takes too long; or the phone turned further than the joint may,
-            or faster, or not at all.
-    """
+    """Let a drive home itself, as far and as fast as it is set to, under the phone."""
     axis, motion = drive.axis, device.config.motion
     run.say(f"  {axis.name} goes home")
     run.emit("command", label="home", axis=axis.name, pulses=None)
@@ -166,25 +158,19 @@ def _check_homing(
 
 
 def identity(drives: list[Drive]) -> dict[str, dict[str, int | str]]:
-    """What tells the drive of each axis from another, and does not change.
-
-    Raises:
-        Refused: a unit does not answer as the family that is configured.
-    """
+    """What tells the drive of each axis from others; Refused: of another family."""
     identities: dict[str, dict[str, int | str]] = {}
     for drive in drives:
-        axis = drive.axis
+        axis, verb = drive.axis, "is not"
         try:
             values = drive.ids()
             drive.status()
+            fault = drive.foreign(values)
         except BusError as error:
+            fault, verb = str(error), "does not answer like"
+        if fault:
             raise Refused(
-                f"{axis.name} (unit {axis.unit}) does not answer like {axis.map.name}: "
-                f"{error}. Run `jaxcal-rig check scan`"
-            ) from None
-        if fault := drive.foreign(values):
-            raise Refused(
-                f"{axis.name} (unit {axis.unit}) is not {axis.map.name}: {fault}. Run "
+                f"{axis.name} (unit {axis.unit}) {verb} {axis.map.name}: {fault}. Run "
                 "`jaxcal-rig check scan`"
             )
         identities[axis.name] = drive.lasting(values)

@@ -48,14 +48,9 @@ class Answer:
 
 
 def parse_bus(text: str) -> BusSettings:
-    """Settings of ``tcp:HOST[:PORT]``, ``rtu_tcp:HOST[:PORT]`` or ``rtu:DEVICE,...``;
-    of drives of other kinds ``serial:DEVICE[,BAUD]`` or ``can:CHANNEL[,BAUD]``.
+    """Settings of ``tcp:HOST[:PORT]``, ``rtu:/dev/ttyUSB0,115200,N,8,1`` and the like.
 
-    After the device follow baud rate, parity, data bits and stop bits, as far as they
-    are given: ``rtu:/dev/ttyUSB0,115200,N,8,1``.
-
-    Raises:
-        ConfigError: not such a text, or settings that cannot be.
+    Raises ConfigError: not such a text, or settings that cannot be.
     """
     if (values := place_of(text, OF_LINE)) is None:
         kinds = "tcp:HOST[:PORT], rtu_tcp:HOST[:PORT], serial:DEVICE[,BAUD], "
@@ -103,11 +98,9 @@ def scan(
     every = [*maps, *(load_map(name) for name in available_maps())]
     named = {drive_map.name: drive_map for drive_map in every}.values()
     families = [drive_map for drive_map in named if isinstance(drive_map, RegisterMap)]
+    timeout_s = min(settings.timeout_s, SCAN_TIMEOUT_S)
     short = settings.model_copy(
-        update={
-            "timeout_s": min(settings.timeout_s, SCAN_TIMEOUT_S),
-            "read_retries": RETRIES,
-        }
+        update={"timeout_s": timeout_s, "read_retries": RETRIES}
     )
     answers: list[Answer] = []
     silence_s = max(family.inter_frame_s for family in families)
@@ -130,10 +123,7 @@ def scan(
         )
     if late:
         names = ", ".join(map(str, late))
-        say(
-            f"units {names} answer late, after {short.timeout_s:g} s: raise "
-            "bus.timeout_s"
-        )
+        say(f"units {names} answer late, after {timeout_s:g} s: raise bus.timeout_s")
     if echo and not settings.echo:
         say("the adapter echoes what it is sent: set bus.echo = true")
     if not answers:
@@ -165,11 +155,8 @@ def _ask(bus: Bus, unit: int, families: list[RegisterMap]) -> Answer | None:
         with contextlib.suppress(BusError):  # registers that a model lacks are left out
             told = drive.ids().items()
             identity = {name: value for name, value in told if isinstance(value, int)}
-        proofs = [
-            (identity[n], *family.recognise[n])
-            for n in family.recognise
-            if n in identity
-        ]
+        ranges = family.recognise.items()
+        proofs = [(identity[n], *span) for n, span in ranges if n in identity]
         if all(low <= value <= high for value, low, high in proofs):
             # Registers that are not there read as 0 in some drives.
             proved = sum(value != 0 for value, *_ in proofs)

@@ -1,18 +1,24 @@
-"""The steps of commissioning, each a run with a folder of its own, or reads alone."""
+"""The steps of commissioning, each a run or reads alone, and who is asked."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import datetime
 import functools
 import os
 import pathlib
-from collections.abc import Callable, Iterator
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
+from jaxcal.files import write_text
 from rig.command_run import Run, run_safely
-from rig.config import RigConfig
+from rig.config import ConfigError, RigConfig, parse_config
+from rig.config.schema import read_text
 from rig.core import session
-from rig.core.device import Device, Posture
+from rig.core.device import Check, Device, Posture
 from rig.core.motion import move
 from rig.core.proof import ALLOWED_DEG, slowed
 from rig.core.record_check import check_drives
@@ -26,10 +32,67 @@ from rig.parts import PLACES
 from rig.prove.axis_check import Change
 from rig.prove.axis_moves import check_axes
 from rig.prove.home import can_home, home, identity, unlimited
-from rig.prove.operator import Operator
-from rig.prove.rig_toml import edit
 
 MOST_JOG_DEG = 10.0  # in one step
+
+
+class Operator:
+    """Questions with a default; ``yes`` takes every default and confirms everything."""
+
+    def __init__(
+        self,
+        yes: bool = False,
+        say: Callable[[str], None] = print,
+        read: Callable[[str], str] = input,
+        option: str = "--yes",  # that confirms
+    ) -> None:
+        self.yes = yes
+        self.say = say
+        self._read = read
+        self._option = option
+
+    def ask(self, question: str, default: str = "") -> str:
+        """An answer, or the default where none is given.
+
+        Raises Refused: there is no terminal to ask on and no --yes, or no default.
+        """
+        if self.yes and not default:
+            raise Refused(f"{question}: no default; pass it as an option")
+        if self.yes:
+            self.say(f"{question} [{default}]")
+            return default
+        return self._answer(f"{question} [{default}]: ") or default
+
+    def _answer(self, prompt: str) -> str:
+        if self._read is input and not sys.stdin.isatty():
+            raise Refused(f"{prompt}no terminal: pass {self._option} to confirm")
+        try:
+            return self._read(prompt).strip()
+        except EOFError:
+            raise Refused(f"{prompt}no answer") from None
+
+    def number(self, question: str, default: float, most: float = 1e9) -> float:
+        """A number; asked again where the answer is none, or larger either way."""
+        while True:
+            answer = self.ask(question, f"{default:g}")
+            with contextlib.suppress(ValueError):
+                if abs(number := float(answer)) <= most:
+                    return number
+            self.say(f"  must be a number in [{-most:g}, {most:g}], got {answer!r}")
+
+    def choose(self, question: str, known: list[str], default: str) -> str:
+        """One of ``known``; asked again where the answer is none of them."""
+        while (answer := self.ask(question, default)) not in known:
+            self.say(f"  must be one of {', '.join(known)}, got {answer!r}")
+        return answer
+
+    def confirm(self, what: str, word: str) -> None:
+        """Refused where the operator does not type the word: Enter moves nothing."""
+        self.say(what)
+        if self.yes:
+            self.say(f"confirmed by --yes: {word}")
+        elif self._answer(f"Type {word} to continue: ") != word:
+            raise Refused(f"not confirmed ({word!r} was not typed); nothing was done")
 
 
 class TurnReached(Exception):
@@ -89,7 +152,7 @@ class Site:
         motion = config.motion.model_copy(update={"approach_overshoot_deg": 0.0})
         config = config.model_copy(update={"axes": axes, "motion": motion})
         # Homed drives are where they were left; the gearing is still to be checked.
-        check: session.Check = functools.partial(check_drives, geared=False)
+        check: Check = functools.partial(check_drives, geared=False)
         with BusLock(config.bus).acquire(name) as lock:
             run = Run(
                 config if limits else unlimited(config),
@@ -109,11 +172,6 @@ class Site:
                 return EXIT_OK
 
             return run_safely(run, whole)
-
-
-def own_folder(config: RigConfig) -> pathlib.Path:
-    """A new one, of a simulated device."""
-    return new_run_folder(pathlib.Path(config.output), "simulated")
 
 
 def show_identity(site: Site) -> None:
@@ -136,10 +194,8 @@ def go_home(site: Site, here: bool) -> int:
         )
     what = "nothing moves; the present position becomes the origin of the counts"
     if not here:
-        what = (
-            f"the drives run their own homing one after another, {', '.join(names)}, "
-        )
-        what += "as far and as fast as they are set"
+        what = f"the drives run their own homing one after another, {', '.join(names)},"
+        what += " as far and as fast as they are set"
     site.operator.confirm(
         "home: the drives are armed; keep out of the device's reach, hand on the "
         f"emergency stop; {what}",
@@ -193,9 +249,8 @@ def jog(site: Site, name: str, way_deg: float) -> int:
                 f"  stopped: {device.geometry.told} {turned} {device.geometry.unit} "
                 f"after {gone:.2g} {unit} commanded. Check the reduction of {name}"
             )
-        run.say(
-            f"  {name} stands at {moved.to_deg(device.positions()[axis]):.3f} {unit}"
-        )
+        stands = moved.to_deg(device.positions()[axis])
+        run.say(f"  {name} stands at {stands:.3f} {unit}")
 
     return site.run("jog", procedure, limits=homed, again=f"jog {name} {way_deg:g}")
 
@@ -255,3 +310,43 @@ def commissioned(path: pathlib.Path, config: RigConfig, through: str) -> DeviceR
     for state in STATES[: STATES.index(through) + 1] if through else ():
         record.reach(state, config)
     return record
+
+
+def edit(path: pathlib.Path, values: Mapping[str, Any]) -> RigConfig:
+    """Set keys of a configuration such as ``axes.roll.unit``; None takes one out.
+
+    Comments and layout stay. The old file is kept beside it with its time in its name;
+    the new one appears at once and whole, and only if it is valid.
+
+    Raises ConfigError: the result would not be valid; the file is as it was.
+    """
+    text = read_text(path)
+    edited = set_values(text, values)
+    config = parse_config(edited, path.parent, str(path))
+    if edited != text:
+        stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S-%f")
+        shutil.copy2(path, path.with_name(f"{path.name}.{stamp}.bak"))
+        write_text(path, edited)
+    return config
+
+
+def set_values(text: str, values: Mapping[str, Any]) -> str:
+    """A TOML text with other values; ``axes.NAME.KEY`` is the axis of that name."""
+    import tomlkit
+
+    document: Any = tomlkit.parse(text)
+    for where, value in values.items():
+        *path, key = where.split(".")
+        table = document
+        if path and path[0] == "axes":
+            named = [axis for axis in document.get("axes", []) if axis["name"] in path]
+            if not named:
+                raise ConfigError("rig.toml", [f"{where}: no such axis"])
+            table, path = named[0], []
+        for part in path:
+            table = table.setdefault(part, tomlkit.table())
+        if value is None:
+            table.pop(key, None)
+        else:
+            table[key] = value
+    return tomlkit.dumps(document)

@@ -1,31 +1,29 @@
 """Every way that the software has to stop the drives, tried in a slow move.
 
-The axes move together, 3 degrees (or mm) either side of where they stood, less of more
-than three, which may add up, or one after another where their line moves them in turn,
-and are stopped on the way: by the frame to each unit, by the broadcast where the map
-has one, and by the drives' own watch of the line where they have one. Each must stand
-short of its target, by its drive and by the phone, and must stay there. The stop of
-each unit is then tried in a faster move: how far an axis went on at either speed says
-how fast it may be near a limit.
+The axes move together (one by one where their line moves them in turn), 3 degrees or
+mm either side, less of more than three, and are stopped on the way: by the frame to
+each unit, by the broadcast and by the drives' own watch of the line where they have
+one. Each must stand short of its target, by drive and phone, and stay there. The stop
+of each unit is tried again in a faster move: how far an axis went on at either speed
+says how fast it may be near a limit.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from rig.command_run import Run
 from rig.config.axis import Pulses
 from rig.core import stop
 from rig.core.device import Device, Posture
 from rig.core.motion import move
-from rig.core.stop_distance import FASTER, StopDistance, stop_distances
+from rig.core.proof import FASTER, StopDistance, stop_distances
 from rig.drives import Drive
 from rig.drives.drive import STILL_COUNTS, Status
 from rig.faults import MotionFault
@@ -46,6 +44,7 @@ TURNED_DEG = 0.3  # of the phone, while the drives stand
 BY_UNITS = "the stop of each unit"
 
 Times = list[tuple[float, float]]
+Act = Callable[[Device], Times]
 
 
 class _ShareReached(Exception):
@@ -64,32 +63,28 @@ class StopTrial(NamedTuple):
 def prove_stops(run: Run, device: Device) -> None:
     """Try each way to stop; the device is STOP_PROVED.
 
-    Raises:
-        MotionFault: an axis went on, or moved again.
+    Raises MotionFault: an axis went on, or moved again.
     """
-    start = device.positions()
+    start, axes = device.positions(), run.config.axes
     evidence: dict[str, dict[str, float]] = {}
     distances: dict[str, dict[str, Any]] = {}
-    reach = REACH_DEG * min(1.0, ADD_UP / len(run.config.axes))
-    offsets = [axis.to_pulses(reach) for axis in run.config.axes]
-    low = tuple(int(p) for p in np.subtract(start, offsets))
-    high = tuple(int(p) for p in np.add(start, offsets))
-    timeout_s = max(run.config.comm_timeouts_s.values(), default=0.0)
-    ways: dict[str, tuple[Callable[[], Times], float]] = {
-        BY_UNITS: (functools.partial(_stop_units, device), SPEED_DEG_S)
-    }
+    way = _way_deg(run)
+    offsets = [axis.to_pulses(way / 2) for axis in axes]
+    low = tuple(p - offset for p, offset in zip(start, offsets, strict=True))
+    high = tuple(p + offset for p, offset in zip(start, offsets, strict=True))
+    silent_s = max(run.config.comm_timeouts_s.values(), default=0.0) + SILENCE_S
+    ways: dict[str, tuple[Act, float]] = {BY_UNITS: (_stop_units, SPEED_DEG_S)}
     if device.line.stops_at_once(device.drives):
-        ways["the broadcast stop"] = (lambda: _broadcast(device), SPEED_DEG_S)
-    if timeout_s:
-        left_deg = (1.0 - LATE - SHORT) * 2 * reach
-        slow = min(SPEED_DEG_S, left_deg / (timeout_s + SILENCE_S))
-        silent = timeout_s + SILENCE_S
-        ways["their watch of the line"] = (lambda: _be_silent(device, silent), slow)
-    every = [*range(len(device.drives))]
+        ways["the broadcast stop"] = (_broadcast, SPEED_DEG_S)
+    if silent_s > SILENCE_S:
+        slow = min(SPEED_DEG_S, (1.0 - LATE - SHORT) * way / silent_s)
+        be_silent = functools.partial(_be_silent, seconds=silent_s)
+        ways["their watch of the line"] = (be_silent, slow)
+    every = [*range(len(axes))]
     together = [[i] for i in every] if device.line.in_turn else [every]
     for name, (act, speed) in ways.items():
         for moved in together:
-            end = tuple(b if i in moved else a for i, (a, b) in _numbered(low, high))
+            end = tuple(high[i] if i in moved else low[i] for i in every)
             tried = _prove(run, device, name, act, speed, low, end)
             evidence[name] = evidence.get(name, {}) | tried.after_deg
             if name == BY_UNITS:
@@ -99,26 +94,25 @@ def prove_stops(run: Run, device: Device) -> None:
     more = {"ways": evidence, "distances": distances}
     run.emit("stop_proved", sync=True, **more)
     run.record.reach(STOP_PROVED, run.config, **more, run=run.folder.name)
-    device.proof.stops = stop_distances(run.record, run.config.axes)
+    device.proof.stops = stop_distances(run.record, axes)
     run.say(f"the drives stop and do not move on: {', '.join(evidence)}")
+
+
+def _way_deg(run: Run) -> float:
+    return 2 * REACH_DEG * min(1.0, ADD_UP / len(run.config.axes))
 
 
 def _distances(
     run: Run, device: Device, first: StopTrial, low: Pulses, high: Pulses
 ) -> dict[str, dict[str, Any]]:
-    """Speeds of two stops and how far each axis went on, for ``StopDistance.of``.
-
-    The second is only as fast as leaves all short of their targets, were it the square
-    of the speed that the first distance is to be blamed on.
-    """
-    tries, way = [first], 2 * REACH_DEG * min(1.0, ADD_UP / len(run.config.axes))
-    fast, rest = FAST_DEG_S, (1.0 - LATE - SHORT) * way
-    for axis in run.config.axes:
-        if axis.name in first.speeds:
-            speed, accel = axis.drive_motion
-            grown = (rest / max(abs(first.after_deg[axis.name]), 1e-3)) ** 0.5
-            reached = (BEGIN * way * accel) ** 0.5  # within less than BEGIN of its way
-            fast = min(fast, speed, reached, first.speeds[axis.name] * grown)
+    """Speeds of two stops and how far each axis went on, for ``StopDistance.of``."""
+    tries, way, fast = [first], _way_deg(run), FAST_DEG_S
+    timed = [axis for axis in run.config.axes if axis.name in first.speeds]
+    for axis in timed:
+        speed, accel = axis.drive_motion
+        rest = (1.0 - LATE - SHORT) * way / max(abs(first.after_deg[axis.name]), 1e-3)
+        reached = (BEGIN * way * accel) ** 0.5  # within less than BEGIN of its way
+        fast = min(fast, speed, reached, first.speeds[axis.name] * rest**0.5)
     if fast > FASTER * max(first.speeds.values()):
         usual = max(_least_s(drive) for drive in device.drives)
         device.proof.stop_proved = True
@@ -130,23 +124,22 @@ def _distances(
         finally:
             device.proof.stop_proved = False
     points = {}
-    for axis in run.config.axes:
-        if axis.name in first.speeds:
-            speed, accel = axis.drive_motion
-            point: dict[str, Any] = {
-                "speeds": [round(trial.speeds[axis.name], 4) for trial in tries],
-                "distances": [round(trial.distances[axis.name], 4) for trial in tries],
-                "accel": round(accel, 4),
-            }
-            points[axis.name] = point
-            distance, unit = StopDistance.of(**point), axis.unit_name
-            slowest = distance.fastest(axis, 0.0)
-            run.say(
-                f"  {axis.name}: stopping distance {distance.at(speed):.2g} {unit} at "
-                f"{speed:.4g} {unit}/s"
-                + f"; moves that end at a limit run at {slowest:.3g} {unit}/s, moves "
-                "that end further inside run faster" * (slowest < speed)
-            )
+    for axis in timed:
+        speed, accel = axis.drive_motion
+        point: dict[str, Any] = {
+            "speeds": [round(trial.speeds[axis.name], 4) for trial in tries],
+            "distances": [round(trial.distances[axis.name], 4) for trial in tries],
+            "accel": round(accel, 4),
+        }
+        points[axis.name] = point
+        distance, unit = StopDistance.of(**point), axis.unit_name
+        slowest = distance.fastest(axis, 0.0)
+        run.say(
+            f"  {axis.name}: stopping distance {distance.at(speed):.2g} {unit} at "
+            f"{speed:.4g} {unit}/s"
+            + f"; moves that end at a limit run at {slowest:.3g} {unit}/s, moves that "
+            "end further inside run faster" * (slowest < speed)
+        )
     return points
 
 
@@ -159,16 +152,11 @@ def _timed(
     high: Pulses,
     usual_s: float,
 ) -> StopTrial:
-    """The stop at a speed whose times are known best, of those before and of new ones
-    while a busy computer has made them uncertain."""
+    """The trial of a speed whose times are surest, tried again on a busy computer."""
     name = f"{BY_UNITS}, at {speed:.3g} {run.config.axis_unit}/s"
-    stop_units = functools.partial(_stop_units, device)
-    while not trials or min(t.unsure_s for t in trials) > UNSURE * usual_s + UNSURE_S:
-        if len(trials) == REPEATS:
-            break
-        trials.append(
-            _prove(run, device, name, stop_units, speed, low, high, look=False)
-        )
+    sure_s = UNSURE * usual_s + UNSURE_S
+    while len(trials) < REPEATS and all(t.unsure_s > sure_s for t in trials):
+        trials.append(_prove(run, device, name, _stop_units, speed, low, high, False))
     return min(trials, key=lambda trial: trial.unsure_s)
 
 
@@ -178,15 +166,11 @@ def _least_s(drive: Drive) -> float:
     return 1.5 * min(look.time - look.asked for look in looks)
 
 
-def _numbered(low: Pulses, high: Pulses) -> Iterator[tuple[int, tuple[int, int]]]:
-    return enumerate(zip(low, high, strict=True))
-
-
 def _prove(
     run: Run,
     device: Device,
     name: str,
-    act: Callable[[], Times],
+    act: Act,
     speed_deg_s: float,
     low: Pulses,
     high: Pulses,
@@ -209,18 +193,14 @@ def _prove(
         )
     last = [_last(drive) for drive in device.drives]
     told = [drive.axis.drive_motion[0] for drive in device.drives]
-    sent = act()
+    sent = act(device)
     statuses = _wait_until_still(device)
     at = [status.position for status in statuses]
     gone = _shares(device, low, high, at)
-    names = run.config.axis_names
-    going = [names[i] for i, (a, b) in _numbered(low, high) if a != b]
-    if look:
-        shares = dict(zip(going, gone, strict=True))
-        _require_stopped(run, device, name, statuses, shares)
-    else:
-        _reset_alarms(run, device, name)
-        device.untrack()
+    ends = zip(run.config.axis_names, low, high, strict=True)
+    going = [axis for axis, a, b in ends if a != b]
+    shares = dict(zip(going, gone, strict=True))
+    _require_stopped(run, device, name, statuses, shares, look)
     after_deg = {
         axis.name: round(axis.to_deg(b - a), 3)
         for axis, a, b in zip(run.config.axes, places, at, strict=True)
@@ -256,11 +236,12 @@ def _require_stopped(
     name: str,
     statuses: list[Status],
     shares: dict[str, float],
+    look: bool,
 ) -> None:
-    """Refuse a stop after which an axis went on, or moved again; alarms are reset.
-
-    The drives stood with these statuses, the axes after these shares of their way.
-    """
+    """Reset alarms; ``look``: MotionFault where an axis went on, or moved again."""
+    if not look:
+        _reset_alarms(run, device, name)
+        return device.untrack()
     went_on = [axis for axis, share in shares.items() if share > 1.0 - SHORT]
     attitude = device.attitude(time.monotonic())
     after = _look(device, statuses)
@@ -296,9 +277,8 @@ def _go(device: Device, low: Pulses, high: Pulses) -> list[int]:
 
     device.meanwhile = look
     try:
-        move(device, Posture("try the stop", high))
-    except _ShareReached:
-        pass
+        with contextlib.suppress(_ShareReached):
+            move(device, Posture("try the stop", high))
     finally:
         device.meanwhile = lambda: None
     return [_last(drive).position for drive in device.drives]

@@ -18,8 +18,6 @@ from rig.faults import EXIT_OK, Refused
 from rig.journal.device import HOMED, IDENTIFIED, STOP_PROVED, ZEROED
 from rig.prove import steps
 from rig.prove.home import can_home
-from rig.prove.operator import Operator
-from rig.prove.rig_toml import edit, set_values
 from rig.prove.scan import (
     OF_LINE,
     Answer,
@@ -28,6 +26,7 @@ from rig.prove.scan import (
     scan,
     serial_lines,
 )
+from rig.prove.steps import Operator, edit, set_values
 from rig_workbench.commission.connections import look_at_phone
 from rig_workbench.model import joint_names
 from rig_workbench.outputs import template

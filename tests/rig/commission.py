@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from rig.__main__ import main
 from rig.config import AXIS_NAMES
-from rig.prove.rig_toml import set_values
 from rig.prove.scan import parse_bus
+from rig.prove.steps import set_values
 from rig_workbench.commission.setup import setting
 from rig_workbench.simulator import Truth
 

@@ -57,8 +57,7 @@ from rig.journal.device import (
     DeviceRecord,
 )
 from rig.journal.run_folder import read_journal
-from rig.prove.operator import Operator
-from rig.prove.steps import Site, go_home, show_identity
+from rig.prove.steps import Operator, Site, go_home, show_identity
 from rig.prove.steps import axes as check_the_axes
 from rig_workbench.simulator import Truth, parse_fault
 

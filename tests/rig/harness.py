@@ -34,7 +34,7 @@ from rig.journal.device import (
 )
 from rig.journal.lock import BusLock
 from rig.journal.run_folder import JOURNAL, read_journal
-from rig.outputs import results
+from rig.outputs import messages
 from rig.outputs.console import listen
 from rig.procedures.calibrate import calibrate
 from rig.signals import Signals
@@ -312,7 +312,7 @@ def no_figures():
         report.write_report(folder, read_journal(folder / JOURNAL))
 
     with (
-        mock.patch.object(results, "write_report", here),
+        mock.patch.object(messages, "write_report", here),
         mock.patch.object(report, "drawn", lambda *_: "no figures in this test"),
     ):
         yield

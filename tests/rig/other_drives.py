@@ -8,7 +8,7 @@ from harness import SESSION, fast_text
 from rig.config import parse_config
 from rig.journal.device import DeviceRecord
 from rig.prove import steps
-from rig.prove.operator import Operator
+from rig.prove.steps import Operator
 from rig_workbench.simulator.faults import FaultInjector
 from rig_workbench.simulator.sensor import SimSensor
 

@@ -15,7 +15,7 @@ from harness import Simulator, commissioned, fast_config, fast_text, simulator
 from rig.config import AXIS_NAMES
 from rig.journal.run_folder import read_journal
 from rig.prove import steps
-from rig.prove.operator import Operator
+from rig.prove.steps import Operator
 from rig_workbench.commission import characterise
 from rig_workbench.commission.characterise import ENOUGH_DEG
 from rig_workbench.simulator import Truth

@@ -16,8 +16,7 @@ from rig.core.record_check import check_drives
 from rig.faults import Refused
 from rig.journal.device import HOMED, SIGN_CHECKED, ZEROED, DeviceRecord
 from rig.prove import home, steps
-from rig.prove.operator import Operator
-from rig.prove.rig_toml import edit
+from rig.prove.steps import Operator, edit
 from rig_workbench.simulator import Truth
 from rig_workbench.simulator.drive import SimDrive
 

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from rig.config import AXIS_NAMES
-from rig.identification.drift import estimate_drift, without_drift
-from rig.identification.fit_affine import uncertainty
+from rig.identification.conclusion import estimate_drift, uncertainty, without_drift
 from rig.outputs.messages import drift_text, recalibrate
 from rig.readings.attitude import (
     ORDERS,

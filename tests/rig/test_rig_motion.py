@@ -51,11 +51,16 @@ def bench(config=None, arm=True, **options):
         served = sim.start()
         run = SimpleNamespace(
             config=served,
+            predict=None,
+            signals=Signals(),
+            simulated=False,
+            lines=line_here,
             emit=lambda event, **fields: sim.hear({"event": event, **fields}),
             journal=SimpleNamespace(records=[]),
         )
         checked = SimpleNamespace(missing=lambda *_: None, state=lambda _: None)
-        device = Device(served, run, checked, Signals(), lines=line_here)
+        run.record = checked
+        device = Device(run)
         with device.imu as imu, device.line:
             sim.start_phone(imu.port)
             imu.wait_for_stream(5)

@@ -14,14 +14,14 @@ from harness import (
 
 import jaxcal
 from rig.config import example_text, parse_config
-from rig.identification.fit_affine import held_out_errors
-from rig.procedures.goto import _command
+from rig.identification.conclusion import held_out_errors
 from rig.procedures.plan import (
     choose,
     draw_candidates,
     draw_held_out,
     travel_order,
 )
+from rig.procedures.verify import _command
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from harness import (
 
 from rig.command_run import run_safely
 from rig.journal.run_folder import read_journal
-from rig.procedures.collect import collect
+from rig.procedures.calibrate import collect
 from rig_workbench.simulator import Truth, parse_fault
 
 TURNED = 25.0  # degrees: beyond the envelope of the limits, too

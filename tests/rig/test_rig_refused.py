@@ -24,7 +24,7 @@ from rig.journal import lock
 from rig.journal.device import HOMED, STOP_PROVED
 from rig.journal.lock import BusLock
 from rig.journal.run_folder import Journal
-from rig.procedures.collect import collect
+from rig.procedures.calibrate import collect
 
 BAD = '\n[session]\nmethod = "exact"\nverify_postures = 1\nverify_limit_deg = 0.001\n'
 

@@ -9,8 +9,8 @@ from harness import fast_text
 from rig.__main__ import main
 from rig.config import ConfigError, parse_config
 from rig.config.config import EXAMPLES
-from rig.prove.rig_toml import edit, set_values
 from rig.prove.scan import parse_bus
+from rig.prove.steps import edit, set_values
 from rig_workbench.simulator.drive import DriveException
 
 

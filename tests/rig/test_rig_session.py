@@ -34,8 +34,7 @@ from rig.config import parse_config
 from rig.faults import Refused
 from rig.identification.conclusion import order_residuals
 from rig.journal.run_folder import read_journal
-from rig.procedures.calibrate import calibrate
-from rig.procedures.collect import collect
+from rig.procedures.calibrate import calibrate, collect
 from rig.procedures.plan import choose, draw_candidates
 from rig_workbench.simulator import Truth
 

@@ -19,8 +19,8 @@ from rig.config.config import EXAMPLES
 from rig.faults import Refused
 from rig.journal.device import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED, DeviceRecord
 from rig.prove import steps
-from rig.prove.operator import Operator
 from rig.prove.scan import Answer
+from rig.prove.steps import Operator
 from rig_workbench.commission import setup
 from rig_workbench.simulator import Truth
 

@@ -33,7 +33,7 @@ from rig.faults import StopRequested
 from rig.journal import lock
 from rig.journal.lock import BusLock, read_armed
 from rig.outputs.messages import event_lines
-from rig.procedures.collect import collect
+from rig.procedures.calibrate import collect
 from rig.signals import Signals
 from rig_workbench.simulator import parse_fault
 

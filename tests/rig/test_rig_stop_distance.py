@@ -13,7 +13,7 @@ from recorder import axis_with
 from test_rig_motion import bench
 
 from rig.__main__ import main
-from rig.core.stop_distance import StopDistance, stop_distances
+from rig.core.proof import StopDistance, stop_distances
 from rig.journal.device import STOP_PROVED, DeviceRecord
 from rig_workbench.simulator import Truth
 from rig_workbench.simulator import drive as sim_drive

@@ -38,9 +38,8 @@ from rig.journal.device import (
     DeviceRecord,
 )
 from rig.journal.run_folder import read_journal
-from rig.procedures.collect import collect
-from rig.procedures.goto import unchecked
-from rig.procedures.verify import load_calibration, verify
+from rig.procedures.calibrate import collect
+from rig.procedures.verify import load_calibration, unchecked, verify
 from rig.readings.attitude import euler_to_matrix, frame_at
 from rig.readings.geometry import geometry_of
 from rig.readings.phone import Imu

@@ -16,7 +16,7 @@ from rig.core import proof
 from rig.core.proof import GROWTH, Reach
 from rig.faults import MotionFault, Refused
 from rig.prove.axis_check import require_gearing, require_unit
-from rig.prove.operator import Operator
+from rig.prove.steps import Operator
 from rig_workbench.commission import connections
 from rig_workbench.simulator import Truth, parse_fault
 from rig_workbench.simulator.drive import SimDrive
