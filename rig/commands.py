@@ -79,10 +79,7 @@ def scan(given: DeviceOptions, *, bus: BusName = "", units: Units = 16) -> int:
 
 
 def jog(
-    axis: AxisName,
-    step: Annotated[float, "degrees, or mm", (-10, 10)],
-    *,
-    given: Step,
+    axis: AxisName, step: Annotated[float, "degrees, or mm", (-10, 10)], *, given: Step
 ) -> int:
     """move one axis by a step"""
     return _step(given, "IDENTIFIED", "jog", axis, step)

@@ -1,7 +1,5 @@
-"""What moves, measures and stops a device. Begin with `session`; then, downwards:
-
-`motion` and `measure` on `proof` (how far), `record_check` (is it the device, where
-it was), `device` (drives, phone, guards), `stop`, `drive` and `bus` (Modbus), `phone`,
-`stream` and `attitude` (the IMU), `faults` (how a session ends).
-It imports `rig.config` and `rig.journal` and nothing else of rig.
+"""What moves, measures and stops a device: `session` on `motion`, `measure`, `proof`
+(how far), `record_check` (is it the device) and `device` (drives, phone, guards), these
+on `stop` and on a process of its own that owns the line. It imports drives, readings,
+journal and config, and nothing else of rig.
 """

@@ -21,12 +21,7 @@ from rig.core.record_check import check_drives
 from rig.drives import Drive, Line
 from rig.drives.drive import Status
 from rig.drives.line import BusError
-from rig.faults import (
-    LimitError,
-    MotionFault,
-    PauseRequested,
-    Requests,
-)
+from rig.faults import LimitError, MotionFault, PauseRequested, Requests
 from rig.journal.device import SIGN_CHECKED, DeviceRecord
 from rig.journal.run_folder import Record, RunFolder
 from rig.readings import make_source

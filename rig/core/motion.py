@@ -201,7 +201,6 @@ def _most_s(device: Device, here: Pulses, target: Pulses) -> float:
 
 
 def _require_on_way(axis: Axis, start: int, goal: int, status: Status) -> None:
-    """An axis is between its start and its goal."""
     begin, end, angle = map(axis.to_deg, (start, goal, status.position))
     low, high = min(begin, end) - FOLLOWING_DEG, max(begin, end) + FOLLOWING_DEG
     if not low <= angle <= high:

@@ -211,9 +211,7 @@ class Findings:
 
 
 def find(
-    config: RigConfig,
-    stands: Mapping[str, Stand],
-    expected: Array | None = None,
+    config: RigConfig, stands: Mapping[str, Stand], expected: Array | None = None
 ) -> Findings:
     """Read the findings from the places that ``measure_axes`` went to.
 

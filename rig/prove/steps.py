@@ -315,10 +315,8 @@ def commissioned(path: pathlib.Path, config: RigConfig, through: str) -> DeviceR
 def edit(path: pathlib.Path, values: Mapping[str, Any]) -> RigConfig:
     """Set keys of a configuration such as ``axes.roll.unit``; None takes one out.
 
-    Comments and layout stay. The old file is kept beside it with its time in its name;
-    the new one appears at once and whole, and only if it is valid.
-
-    Raises ConfigError: the result would not be valid; the file is as it was.
+    Comments and layout stay, and the old file beside it. The new one appears at once
+    and whole; ConfigError: it would not be valid, and the file is as it was.
     """
     text = read_text(path)
     edited = set_values(text, values)
