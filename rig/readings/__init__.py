@@ -1,7 +1,7 @@
 """What is measured: a phone's attitude, or the numbers of a sensor.
 
-``source`` is what motion and measurement ask; ``phone`` with ``receiver``, ``stream``
-and ``attitude``, and ``rig_workbench.numbers`` are its kinds; ``geometry`` is how two
+``source`` is what motion and measurement ask; ``phone`` with ``stream`` and
+``attitude``, and ``rig_workbench.numbers`` are its kinds; ``geometry`` is how two
 readings compare.
 """
 

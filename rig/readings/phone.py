@@ -1,18 +1,32 @@
-"""The phone's stream over a socket, as readings of its attitude."""
+"""The phone's stream over a socket as attitudes, and who is heard on its port."""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import dataclasses
+import http
+import re
+import socket
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from rig.config.settings import ImuSettings
 from rig.readings.attitude import Array, Reading
-from rig.readings.receiver import Receiver
 from rig.readings.source import Source
-from rig.readings.stream import StreamParser
+from rig.readings.stream import MAX_BODY, LineSplitter, StreamParser
+
+RECONNECT_S = 0.2
+MOST_OPEN = 4  # connections at a time
+BACKLOG = 128  # connections that wait for an answer; past that a phone waits 1 s
+PATIENCE_S = 5.0  # of a connection for a line, or a whole message
+MAX_HEAD = 8192  # bytes of a message before its body
+LOOK_S = 0.05  # between two looks at whether to end
 
 
 class Imu(Source):
@@ -104,3 +118,204 @@ class Imu(Source):
     def _store(self, readings: list[Reading]) -> bool:
         turned = [Reading(r.time, self.world @ r.value) for r in readings]
         return self.store(turned)
+
+
+@dataclasses.dataclass(eq=False)
+class Connection:
+    """One that is open."""
+
+    reader: asyncio.StreamReader
+    writer: asyncio.StreamWriter
+    address: str
+    since: float  # it was made, or is heard
+    used: float = 0.0  # a reading of it was last of use
+    splitter: LineSplitter = dataclasses.field(default_factory=LineSplitter)
+
+
+class Receiver:
+    """Hears one phone, whoever else connects.
+
+    Who may not be heard is refused before a byte of it is read. At most MOST_OPEN
+    connections are open, none for longer than PATIENCE_S without a word; where they are
+    all taken, the oldest that has sent nothing makes way for the next. Messages are
+    pushed over any connection of one address. Lines come over one connection: a phone
+    that lost its Wi-Fi leaves it half open and comes back on another, which takes its
+    place once no reading of it was of use for ``stale_s``. While one still is, another
+    connection is another sender.
+    """
+
+    def __init__(self, imu: Imu) -> None:
+        """OSError where the port cannot be opened."""
+        self._imu = imu
+        self._settings = s = imu.settings
+        self.port = s.port
+        self.phone = ""  # address that is heard, once a reading of it was used
+        self.refused: list[str] = []  # addresses
+        self._current: Connection | None = None  # that lines are taken of
+        self._unheard: list[asyncio.Task[None]] = []  # that have sent nothing yet
+        self._closing = threading.Event()
+        self._listener: socket.socket | None = None
+        if s.transport == "listen":
+            self._listener = socket.create_server((s.host, s.port), backlog=BACKLOG)
+        elif s.transport == "udp":
+            self._listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._listener.bind((s.host, s.port))
+        if self._listener is not None:
+            self._listener.setblocking(False)
+            self.port = self._listener.getsockname()[1]
+        self._thread = threading.Thread(
+            target=lambda: asyncio.run(self._run()), name="imu", daemon=True
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        self._closing.set()
+        self._thread.join(2.0)
+
+    def refuse(self, address: str, why: str) -> None:
+        """Tell of a sender that is not heard, once for each address."""
+        if address not in self.refused:
+            self.refused.append(address)
+            text = f"refused a sender on the IMU port, {address}: {why}"
+            self._imu.report("sender_refused", address=address, reason=text)
+
+    def _admits(self, address: str) -> bool:
+        allowed = self._settings.allow
+        if allowed and address not in allowed:
+            self.refuse(address, f"it is not in imu.allow ({', '.join(allowed)})")
+        elif self.phone and address != self.phone:
+            self.refuse(address, f"{self.phone} is the phone of this session")
+        else:
+            return True
+        return False
+
+    async def _run(self) -> None:
+        if self._listener is None:
+            way = self._connect()
+        elif self._settings.transport == "udp":
+            way = self._datagrams(self._listener)
+        else:
+            way = self._accept(self._listener)
+        receiving = asyncio.create_task(way)  # which ends with this
+        while not (self._closing.is_set() or receiving.done()):
+            await asyncio.sleep(LOOK_S)
+
+    async def _datagrams(self, listener: socket.socket) -> None:
+        """Lines of datagrams, each of them whole."""
+        loop = asyncio.get_running_loop()
+        self._imu.begin()
+        with listener:
+            while True:
+                data, (address, *_) = await loop.sock_recvfrom(listener, 65536)
+                lines = [line for line in re.split(rb"[\r\n]+", data) if line]
+                if self._admits(address) and lines:
+                    if self._imu.take_lines(lines, time.monotonic()):
+                        self.phone = address
+
+    async def _connect(self) -> None:
+        s = self._settings
+        while True:
+            await self._hear(s.host, host=s.host, port=s.port)
+            await asyncio.sleep(RECONNECT_S)
+
+    async def _accept(self, listener: socket.socket) -> None:
+        loop, tasks = asyncio.get_running_loop(), set[asyncio.Task[None]]()
+        leaving: list[socket.socket] = []
+        with listener:
+            while True:
+                try:
+                    made, (address, _) = await loop.sock_accept(listener)
+                except OSError:
+                    await asyncio.sleep(LOOK_S)
+                    continue
+                room = MOST_OPEN - len(tasks)
+                if self._admits(address) and (room > 0 or self._unheard):
+                    if room <= 0:
+                        self._unheard.pop(0).cancel()
+                    task = loop.create_task(self._hear(address, sock=made))
+                    tasks.add(task)
+                    self._unheard.append(task)
+                    task.add_done_callback(tasks.discard)
+                    task.add_done_callback(self._has_sent)
+                else:  # it is still sending: closed at once, it would not see why
+                    with contextlib.suppress(OSError):
+                        made.send(_answer(403, False))
+                    leaving = [
+                        connection for connection in leaving if connection.fileno() >= 0
+                    ] + [made]
+                    loop.call_later(LOOK_S * (len(leaving) < BACKLOG), made.close)
+
+    def _has_sent(self, task: asyncio.Task[None] | None) -> None:
+        if task in self._unheard:
+            self._unheard.remove(task)
+
+    async def _hear(self, address: str, **how: Any) -> None:
+        """Take what one connection sends, until it ends or says nothing."""
+        pushed = self._settings.format == "sensorlogger"
+        with contextlib.suppress(
+            OSError, EOFError, ValueError, asyncio.LimitOverrunError
+        ):
+            async with asyncio.timeout(PATIENCE_S):
+                streams = await asyncio.open_connection(limit=MAX_HEAD, **how)
+            connection = Connection(*streams, address, time.monotonic())
+            stays = True
+            try:
+                while stays:  # not wait_for, which may lose the cancelling of a task
+                    async with asyncio.timeout(PATIENCE_S):
+                        stays = await (self._message if pushed else self._lines)(
+                            connection
+                        )
+                    self._has_sent(asyncio.current_task())
+            finally:
+                connection.writer.close()
+                self._current = None if self._current is connection else self._current
+
+    async def _lines(self, connection: Connection) -> bool:
+        """Take what has come in; whether the connection stays open."""
+        data = await connection.reader.read(4096)
+        now, current = time.monotonic(), self._current
+        stale_s = self._settings.stale_s
+        if data and current is not connection:
+            if current and now - max(current.since, current.used) <= stale_s:
+                if goes_on := current.used > connection.since + stale_s:
+                    why = f"{current.address} is connected and sending"
+                    self.refuse(connection.address, why)
+                return not goes_on  # old once it may be heard, so it is lost
+            if current:
+                current.writer.close()
+            self._current, connection.since = connection, now
+            self._imu.begin()
+        if self._imu.take_lines(connection.splitter.feed(data), now):
+            connection.used, self.phone = now, connection.address
+        return bool(data)
+
+    async def _message(self, connection: Connection) -> bool:
+        """Answer one message; whether the connection stays open."""
+        head = (await connection.reader.readuntil(b"\r\n\r\n")).decode("latin-1")
+        first, *lines = head.lower().split("\r\n")
+        parts = (line.partition(":") for line in lines)
+        fields = {name.strip(): value.strip() for name, _, value in parts}
+        length = fields.get("content-length", "")
+        admitted, code = False, 413
+        if first.startswith("post ") and length.isdecimal() and int(length) <= MAX_BODY:
+            if fields.get("expect") == "100-continue":
+                connection.writer.write(b"HTTP/1.1 100 Continue\r\n\r\n")
+            body = await connection.reader.readexactly(int(length))
+            if admitted := self._admits(connection.address):
+                used, foreign = self._imu.take_body(body)
+                if foreign:
+                    why = "another device sends from there now"
+                    self.refuse(connection.address, why)
+                admitted = not foreign
+                self.phone = connection.address if used else self.phone
+            code = 200 if admitted else 403
+        stays = admitted and fields.get("connection") != "close"
+        connection.writer.write(_answer(code, stays))
+        await connection.writer.drain()
+        return stays
+
+
+def _answer(code: int, stays: bool) -> bytes:
+    closes = "" if stays else "Connection: close\r\n"
+    phrase = http.HTTPStatus(code).phrase
+    return f"HTTP/1.1 {code} {phrase}\r\nContent-Length: 0\r\n{closes}\r\n".encode()

@@ -1,4 +1,4 @@
-"""The phone: its attitude in the published formats, at a steady rate."""
+"""What sends readings to a rig, on a thread: a phone as its apps do, a sensor."""
 
 from __future__ import annotations
 
@@ -7,17 +7,19 @@ import http.client
 import json
 import random
 import socket
+import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rig.config.settings import ImuSettings
+from rig.config.settings import ImuSettings, ReadingsSettings
 from rig.readings.attitude import Array, euler_to_matrix, matrix_to_euler
 from rig_workbench.simulator.faults import FaultInjector
-from rig_workbench.simulator.sender import Sender
 
+AGAIN_S = 0.05  # before it connects again
 INTRUSION_S = 0.15  # that another sender is heard, where it is let
 BATCH = 5  # readings that Sensor Logger pushes at once
 HEADER = b"loggingTime(txt)" + b"".join(b",motionQuaternion%c(R)" % c for c in b"XYZW")
@@ -50,6 +52,59 @@ def format_line(
     if settings.stamp_column >= 0:
         fields[settings.stamp_column] = str(round(stamp_s * 1000))
     return settings.separator.join(fields)
+
+
+class Sender:
+    """Sends at ``rate_hz`` until closed; connects again by itself."""
+
+    listens = ""  # transport in which it is the one that listens
+
+    def __init__(self, settings: Any, faults: FaultInjector, rate_hz: float) -> None:
+        self.settings = settings
+        self._take = faults.take
+        self._period = 1.0 / rate_hz
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._port = settings.port
+        self._listener: socket.socket | None = None
+
+    def start(self, port: int) -> int:
+        """Send to the port the rig listens on, or listen there; returns the port."""
+        self._port = port
+        if not self._thread.is_alive():
+            if self.settings.transport == self.listens:
+                self._listener = socket.create_server(("127.0.0.1", port), backlog=4)
+                self._listener.settimeout(0.1)
+                self._port = int(self._listener.getsockname()[1])
+            self._thread.start()
+        return self._port
+
+    def close(self) -> None:
+        self._closing.set()
+        if self._thread.is_alive():
+            self._thread.join(2.0)
+        if self._listener:
+            self._listener.close()
+
+    def connected(self) -> socket.socket:
+        """A connection to the rig, whoever of the two listens."""
+        if self.settings.transport == "udp":
+            made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            made.connect(("127.0.0.1", self._port))
+            return made
+        if self._listener is not None:
+            return self._listener.accept()[0]
+        return socket.create_connection(("127.0.0.1", self._port), timeout=1.0)
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            with contextlib.suppress(OSError, http.client.HTTPException):
+                self.send()
+            self._closing.wait(AGAIN_S)
+
+    def send(self) -> None:
+        """Connect, and send until the connection ends."""
+        raise NotImplementedError("a kind of sender defines this itself")  # abstract
 
 
 class Phone(Sender):
@@ -161,3 +216,44 @@ class Phone(Sender):
                 headers = {"Content-Type": "application/json"}
                 connection.request("POST", "/", self._garbled(body), headers)
                 connection.getresponse().read()
+
+
+class SimSensor(Sender):
+    """Sends lines of ``numbers()``."""
+
+    listens = "tcp"
+
+    def __init__(
+        self,
+        settings: ReadingsSettings,
+        numbers: Callable[[], Array],
+        faults: FaultInjector,
+        rate_hz: float = 100.0,
+    ) -> None:
+        super().__init__(settings, faults, rate_hz)
+        self._numbers = numbers
+        self._frozen = b""
+
+    def send(self) -> None:
+        due = time.monotonic()
+        with self.connected() as connection:
+            while not self._closing.is_set() and not self._take("imu_disconnect"):
+                if not self._take("imu_gap"):
+                    connection.sendall(self._line())
+                due += self._period
+                self._closing.wait(max(0.0, due - time.monotonic()))
+
+    def _line(self) -> bytes:
+        if not self._frozen or not self._take("imu_frozen"):
+            s = self.settings
+            factors = s.factors or (1.0,) * len(s.names)
+            columns = s.columns or tuple(range(len(s.names)))
+            fields = ["0"] * (1 + max(columns))
+            for column, value, factor in zip(
+                columns, self._numbers(), factors, strict=True
+            ):
+                fields[column] = f"{value / factor:.9g}"
+            self._frozen = (s.separator.join(fields) + "\r\n").encode()
+        if self._take("imu_garbage"):
+            return b"?\0" + self._frozen
+        return self._frozen

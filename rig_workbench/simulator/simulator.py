@@ -8,9 +8,8 @@ from rig.config.config import RigConfig
 from rig.readings.attitude import Array
 from rig_workbench.simulator.drive import SimDrive
 from rig_workbench.simulator.faults import FaultInjector, FaultSpec
-from rig_workbench.simulator.phone import Phone
+from rig_workbench.simulator.phone import Phone, SimSensor
 from rig_workbench.simulator.plant import Plant
-from rig_workbench.simulator.sensor import SimSensor
 from rig_workbench.simulator.server import ModbusServer
 from rig_workbench.simulator.truth import Truth
 

@@ -10,7 +10,7 @@ from rig.journal.device import DeviceRecord
 from rig.prove import steps
 from rig.prove.steps import Operator
 from rig_workbench.simulator.faults import FaultInjector
-from rig_workbench.simulator.sensor import SimSensor
+from rig_workbench.simulator.phone import SimSensor
 
 AXIS = """
 [[axes]]

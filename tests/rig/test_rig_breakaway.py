@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from rig_workbench.commission.breakaway import OUTLIERS, Breakaway
+from rig_workbench.commission.characterise import OUTLIERS, Breakaway
 
 CELL, CELLS, SIGMA, SPREAD = 0.02, 16, 0.005, 0.008
 
