@@ -80,13 +80,8 @@ def registers_in(words: Sequence[Word]) -> int:
 def motion_counts(
     units: Any, pulses_per_rev: int, speed: float, accel: float
 ) -> dict[str, int]:
-    """Register values of a speed and of ramps, never faster or harder than these.
-
-    Args:
-        units: of the map's registers.
-        pulses_per_rev: for one turn of the motor.
-        speed, accel: pulses a second, and a second squared.
-    """
+    """Register values, in the ``units`` of a map, of a speed and of ramps, in pulses a
+    second and a second squared: never faster or harder than these."""
     per = {"pulse_per_s": 1.0, "pulse_per_s2": 1.0}
     per_pulse = per.get(units.speed, 1.0 / pulses_per_rev) * units.speed_per_unit
     counts = {"speed": math.floor(speed * per_pulse * (1.0 + ROUNDING))}

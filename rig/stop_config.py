@@ -1,9 +1,7 @@
 """What a stop, or who moves drives, needs of rig.toml: bus, units and maps of axes.
 
-Nothing else of the file is looked at, and what is wrong with it does not matter. Of a
-file that is not TOML every line counts that can be read. A value that is none is
-replaced by its default, and a name by the nearest there is; what cannot be read so is
-told, and the rest is stopped.
+Of a file that is not TOML every line counts that can be read. A value that is none is
+replaced by its default, a name by the nearest there is; the rest is told.
 """
 
 from __future__ import annotations
@@ -39,6 +37,13 @@ FRAMES = (  # of a map, besides its stop
 Faults = list[str]
 
 
+def where_of(bus: Any) -> str:
+    """A bus in words."""
+    if bus.transport not in NETWORK:
+        return f"{bus.device} at {bus.baudrate} baud"
+    return f"{bus.host}:{bus.port} ({bus.transport})"
+
+
 @dataclasses.dataclass
 class Bus:
     """``[bus]``, with the defaults of its keys."""
@@ -55,9 +60,7 @@ class Bus:
     timeout_s: float = 0.3
     read_retries: int = 2
 
-    @property
-    def where(self) -> str:
-        return where_of(self)
+    where = property(where_of)
 
 
 @dataclasses.dataclass
@@ -76,23 +79,16 @@ class StopConfig:
         return max((axis.map.inter_frame_s for axis in self.axes), default=0.0)
 
 
-def where_of(bus: Any) -> str:
-    """A bus in words."""
-    if bus.transport not in NETWORK:
-        return f"{bus.device} at {bus.baudrate} baud"
-    return f"{bus.host}:{bus.port} ({bus.transport})"
-
-
 def read_file(path: pathlib.Path) -> StopConfig:
     """All that is of use in a configuration file; OSError where it cannot be opened."""
     faults: Faults = []
     data = tables_of(_decoded(path.read_bytes()), faults)
-    return _read(data, _rows(_near(data, "axes")), path.parent, faults)
+    return _read(data, rows_of(_near(data, "axes")), path.parent, faults)
 
 
 def read_armed(armed: dict[str, Any]) -> StopConfig:
     """All that is of use in what a session left beside its lock."""
-    return _read(armed, _rows(armed.get("drives")), None, [])
+    return _read(armed, rows_of(armed.get("drives")), None, [])
 
 
 def _read(
@@ -131,7 +127,7 @@ def _read(
 
 def bus_of(table: Any, faults: Faults) -> Bus | None:
     """The bus of a table; None where it does not say where that is."""
-    table = _rows(table)[0] if _rows(table) else {}
+    table = rows_of(table)[0] if rows_of(table) else {}
     bus = Bus()
     for field in dataclasses.fields(bus):
         value, default = _near(table, field.name), getattr(bus, field.name)
@@ -161,15 +157,13 @@ def bus_of(table: Any, faults: Faults) -> Bus | None:
         fault = fault or "host or device is missing"
         bus.transport = "tcp" if bus.host else "rtu"
     if fault:
-        text = f"bus.transport: {fault}, {given!r}; trying {bus.transport}"
-        faults.append(text)
+        faults.append(f"bus.transport: {fault}, {given!r}; trying {bus.transport}")
     return bus
 
 
 def _map_of(
     row: dict[str, Any], folder: pathlib.Path | None, faults: Faults
 ) -> SimpleNamespace | None:
-    """The map of an axis: by name or path, or its text where a session left it."""
     name = _near(row, "map")
     if not isinstance(name, str) or not name:
         faults.append("it has no map")
@@ -224,15 +218,14 @@ def map_of(text: str, folder: pathlib.Path, faults: Faults) -> SimpleNamespace |
         faults.append(f"the map {drive_map.name} has no readable [stop]")
         return None
     if drive_map.drive == "modbus" and not (drive_map.status and drive_map.position):
-        faults.append(
-            f"[status] or [position] of the map {drive_map.name} cannot be read"
-        )
+        name = drive_map.name
+        faults.append(f"[status] or [position] of the map {name} cannot be read")
     return drive_map
 
 
 def _frames(table: Any) -> Frames | None:
     """Frames of a table; None where one cannot be read."""
-    rows = _rows(table.get("write")) if _rows(table) == [table] else []
+    rows = rows_of(table.get("write")) if rows_of(table) == [table] else []
     try:
         frames = []
         for row in rows:
@@ -275,7 +268,7 @@ def _table(value: Any) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def _rows(tables: Any) -> list[dict[str, Any]]:
+def rows_of(tables: Any) -> list[dict[str, Any]]:
     """Tables of a list, or the one that stands alone."""
     listed = tables if isinstance(tables, list) else [tables]
     return [table for table in listed if isinstance(table, dict)]
@@ -327,7 +320,7 @@ def tables_of(text: str, faults: Faults) -> dict[str, Any]:
             for part in path:
                 table = _inner(table, part)
             if lines[0].lstrip().startswith("[[") or last == "axes":
-                table[last] = [*_rows(table.get(last)), {}]
+                table[last] = [*rows_of(table.get(last)), {}]
             table = _inner(table, last)
         else:
             values, count = _first_value(lines)
@@ -338,8 +331,7 @@ def tables_of(text: str, faults: Faults) -> dict[str, Any]:
 
 def _inner(table: dict[str, Any], name: str) -> dict[str, Any]:
     """The table of a name, or the last of several, made where there is none."""
-    rows = _rows(table.setdefault(name, {})) or [{}]
-    return rows[-1]
+    return (rows_of(table.setdefault(name, {})) or [{}])[-1]
 
 
 def _first_value(lines: Sequence[str]) -> tuple[dict[str, Any], int]:

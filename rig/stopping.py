@@ -1,12 +1,10 @@
 """The command ``stop``: ask who moves the device, end them, stop every drive itself.
 
-The holder of a bus is asked first. One that has not told its drives to stop ASK_S
-later, because it hangs or is suspended, is killed: the kernel frees the lock and the
-port. Then each drive is stopped and looked at from here. What a session left beside the
-lock when it armed is enough for that, and so is what ``stop_config`` can read of the
-configuration file; each makes up for what the other lacks. No signal ends this before
-the drives were told. Nothing is loaded but the standard library, the lock, the drives
-and, of a serial port, pyserial.
+A holder of the bus that has not told its drives to stop ASK_S after it was asked is
+killed: the kernel frees lock and port. Then each drive is stopped and looked at, by
+what a session left beside the lock when it armed and what ``stop_config`` can read of
+the file; each makes up for what the other lacks. No signal ends this before the drives
+were told. Only the standard library, the lock, the drives and pyserial are loaded.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ from rig.drives import make_drives
 from rig.drives.line import BusError
 from rig.faults import EXIT_FAULT, EXIT_OK, Fault, Refused, told
 from rig.journal.lock import BusLock, armed_files, held_by, read_armed
-from rig.stop_config import Bus, StopConfig, read_file
+from rig.stop_config import StopConfig, read_file
 from rig.stop_config import read_armed as config_of
 
 if TYPE_CHECKING:
@@ -64,10 +62,9 @@ def main(words: Sequence[str]) -> int:
 class ArmedBus:
     """One bus: its lock, and what of it was armed last."""
 
-    def __init__(self, bus: Bus, file: StopConfig | None = None) -> None:
-        settings: Any = bus
+    def __init__(self, bus: Any, file: StopConfig | None = None) -> None:
         self.bus, self.file = bus, file
-        self.lock = BusLock(settings)
+        self.lock = BusLock(bus)
         self.armed = read_armed(self.lock.armed_path)
         self.since = time.monotonic()
         self.holder: dict[str, Any] | None = None
@@ -99,11 +96,8 @@ class ArmedBus:
                 self.lock.signal_holder(signal.SIGKILL)
             if not self.lock.freed(KILLED_S) and not (self._stand and self._stayed()):
                 _say("it still uses the bus")
-        _say(
-            "it reported that all its drives are at rest"
-            if self._stand
-            else "it did not report that its drives are at rest"
-        )
+        reported = "reported that all" if self._stand else "did not report that"
+        _say(f"it {reported} its drives are at rest")
 
     def _stayed(self) -> bool:
         """Wait while it looks whether its drives stay; whether it let go."""
@@ -118,13 +112,8 @@ class ArmedBus:
 
 
 def stop_device(path: pathlib.Path, given: bool = True) -> int:
-    """Stop what is armed on the bus of a configuration file; 0 if all drives stand.
-
-    Without a file of use, everything that sessions of this user have armed.
-
-    Args:
-        path: of rig.toml.
-        given: an operator named it.
+    """Stop what is armed on the bus of rig.toml, else all that sessions of this user
+    have armed; 0 if all drives stand. ``given``: an operator named the file.
 
     Raises:
         Fault: no drive was told to stop.
@@ -153,16 +142,12 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
             raise faults[0]
         for fault in faults:
             _say(told(fault))
-        good = all(result.acknowledged and result.standing for result in results)
+        good = all(unit.acknowledged and unit.standing for unit in results)
         return EXIT_OK if good and not faults else EXIT_FAULT
 
 
 def _targets(path: pathlib.Path, given: bool) -> list[ArmedBus]:
-    """The buses to stop; what is wrong with the file is said.
-
-    Raises:
-        Fault: neither the file names one, nor has a session armed one.
-    """
+    """The buses to stop; what is wrong with the file is said. Fault: there are none."""
     targets: list[ArmedBus] = []
     try:
         config = read_file(path)
@@ -267,12 +252,8 @@ def stop_units(target: ArmedBus, stay: bool = False) -> list[UnitStop]:
 
 
 def _drives(target: ArmedBus) -> tuple[Any, float, list[Any], list[UnitStop]]:
-    """Bus, silence, axes that can be stopped, and those that cannot: of what is armed,
-    else of the file, else as armed last. Each makes up for what the one before lacks.
-
-    Raises:
-        Fault: no axis can be stopped.
-    """
+    """Bus, silence, axes that can be stopped (Fault: none can), and those that cannot:
+    of what is armed, else of the file, else as armed last; each helps the others."""
     from rig.core.stop import UnitStop
 
     armed = config_of(target.armed) if target.armed else None

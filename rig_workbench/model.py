@@ -63,11 +63,8 @@ class DeviceModel:
         assert self.rotations is not None
         steps = np.vstack([0 * command, np.eye(len(command))])
         here, *turned = self.rotations(command + steps)
-        return (
-            Rotation.from_matrix([here.T @ each for each in turned])
-            .as_rotvec(degrees=True)
-            .T
-        )
+        turns = Rotation.from_matrix([here.T @ each for each in turned])
+        return turns.as_rotvec(degrees=True).T
 
     def outputs(self, config: RigConfig, records: list[Record]) -> tuple[Array, Array]:
         """(N, n) commands and (N, m) of what it predicts, of N posture records."""
@@ -101,12 +98,8 @@ class DeviceModel:
         if not records:
             return {}
         commands, measured = self.outputs(config, records)
-        designed = self.model.predict(commands)
-        predicted = calibration.predict(commands)
-        return {
-            "before": spread(measured - designed),
-            "prediction": spread(measured - predicted),
-        }
+        of = {"before": self.model, "prediction": calibration}
+        return {key: spread(measured - of[key].predict(commands)) for key in of}
 
     def conclude(
         self,

@@ -21,13 +21,16 @@ from rig.config.settings import BusSettings, ReadingsSettings
 from rig.drives.bus import Bus
 from rig.drives.modbus import decoded
 from rig.readings.attitude import Array, Reading
-from rig.readings.source import ReadingError, Source
+from rig.readings.source import JumpGate, ReadingError, Source, listener_of
 
 NUMBER = re.compile(r"[+-]?[0-9]{1,15}(?:\.[0-9]{0,17})?(?:[eE][+-]?[0-9]{1,2})?")
 MAX_LINE = 1024  # bytes
 RECONNECT_S = 0.2
 LOOK_S = 0.1  # between two looks at whether to end
-REJOIN = 5  # readings in a row near each other after a jump
+
+
+def _largest_change(before: Array, now: Array) -> float:
+    return float(np.abs(now - before).max())
 
 
 class Sensor(Source):
@@ -45,8 +48,7 @@ class Sensor(Source):
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sensor", daemon=True)
         self._socket: socket.socket | None = None
-        self._last: Array | None = None
-        self._far: list[Array] = []
+        self._gate = JumpGate(_largest_change, settings.most_jump)
 
     @property
     def port(self) -> int:
@@ -58,13 +60,8 @@ class Sensor(Source):
         return s.device or f"{s.host}:{self.port}"
 
     def open(self) -> Sensor:
-        s = self.settings
         try:
-            if s.transport == "listen":
-                self._socket = socket.create_server((s.host, s.port))
-            elif s.transport == "udp":
-                self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-                self._socket.bind((s.host, s.port))
+            self._socket = listener_of(self.settings)
         except OSError as error:
             raise self.closed(error) from None
         if self._socket is not None:
@@ -153,20 +150,17 @@ class Sensor(Source):
         while not self._closing.is_set():
             with contextlib.suppress(TimeoutError):
                 data, (address, *_) = self._socket.recvfrom(65536)
-                if self._hears(address):
-                    for line in re.split(rb"[\r\n]+", data):
-                        if line:
-                            self._take(line)
+                lines = re.split(rb"[\r\n]+", data) if self._hears(address) else ()
+                for line in filter(None, lines):
+                    self._take(line)
 
     def _registers(self) -> None:
         """Poll the registers."""
         with self._bus() as bus:
             while not self._closing.wait(self.settings.period_s):
                 asked = time.monotonic()
-                values = [
-                    decoded(bus, each, each.unit, each.word_order, 1)
-                    for each in self.settings.registers
-                ]
+                places = self.settings.registers
+                values = [decoded(bus, p, p.unit, p.word_order, 1) for p in places]
                 self._accept(np.array(values, dtype=np.float64), asked)
 
     def _bus(self) -> Bus:
@@ -202,19 +196,11 @@ class Sensor(Source):
         values = values * factors
         if not np.isfinite(values).all():
             return self._drop("not numbers")
-        if self._last is not None and self._jumps(self._last, values):
-            if self._far and self._jumps(self._far[-1], values):
-                self._far.clear()
-            self._far.append(values)
-            if len(self._far) < REJOIN:
-                return self._drop("an impossible jump")
-        self._far, self._last = [], values
+        if self._gate.jumps(values):
+            return self._drop("an impossible jump")
         with self._lock:
             self._counts["accepted"] += 1
             self.store([Reading(now, values)])
-
-    def _jumps(self, before: Array, now: Array) -> bool:
-        return bool(np.abs(now - before).max() > self.settings.most_jump)
 
     def _drop(self, reason: str) -> None:
         with self._lock:

@@ -32,16 +32,8 @@ def attitudes(record: Record) -> Array:
 
 
 def reread(records: list[Record], then: RigConfig, now: RigConfig) -> list[Record]:
-    """Zero, postures and held-out pairs as another configuration reads them.
-
-    Args:
-        records: of the journal of a calibration.
-        then: its configuration.
-        now: the same but for orders, signs or mounting.
-
-    Raises:
-        Refused: not enough was measured to identify from.
-    """
+    """Zero, postures and held-out pairs of a journal, made with the configuration
+    ``then``, as ``now`` reads them; Refused where not enough was measured."""
     postures = measured_postures(records)
     chosen = [r for r in postures.values() if r["role"] == "select"]
     zeros = [r for r in records if r["event"] == "zero"]
@@ -91,16 +83,12 @@ def _attitudes(then: RigConfig, now: RigConfig) -> Callable[[Record], Any]:
 
 
 def _numbers(record: Record) -> tuple[Array, Record]:
-    """(samples, m) numbers of a record, and the fields that hold them otherwise."""
     return np.array(record["readings"]), {}
 
 
 def _changed(then: RigConfig, wanted: dict[str, Any]) -> dict[str, list[Any]]:
-    """Keys that are to be read otherwise, as they were and as they will be.
-
-    Raises:
-        Refused: a key is not of what the run was measured with.
-    """
+    """Keys that are to be read otherwise, as they were and as they will be; Refused
+    where one is not of what the run was measured with."""
     imu, described = then.imu, json.loads(json.dumps(then.described()))
     changed = {}
     for name, value in wanted.items():
@@ -135,11 +123,9 @@ def refit(
 
     Args:
         folder, held, then: of the run, the records of its journal, its configuration.
-        wanted: keys of rig.toml to values; None leaves one as it was.
+        wanted: keys of rig.toml to values; None leaves one as it was. Refused, and
+            nothing written, where the run does not allow it.
         say: is told what came of it.
-
-    Raises:
-        Refused: the run does not allow it; nothing was written.
     """
     start, changed = held[0], _changed(then, wanted)
     text = set_values(then.text, {key: value for key, (_, value) in changed.items()})
@@ -153,12 +139,8 @@ def refit(
             warnings = check_matrix(now, calibration.matrix)
         except MotionFault as fault:
             raise Refused(f"nothing was written: with these keys, {fault}") from None
-    summary |= {
-        "mode": "refit",
-        "refit_of": folder.name,
-        "changed": changed,
-        "simulated": start["simulated"],
-    }
+    summary |= {"mode": "refit", "refit_of": folder.name, "changed": changed}
+    summary["simulated"] = start["simulated"]
     into = new_run_folder(folder.resolve().parent, "refit")
     write_text(into / "rig.toml", text)
     begun = {key: start[key] for key in ("simulated", "maps_from")}

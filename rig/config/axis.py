@@ -28,11 +28,8 @@ OF_TRANSLATION = {
 
 
 class Scale(Section):
-    """Pulses and degrees of one axis: ``theta = 360 p / (omega kappa)``.
-
-    What is called degrees here is millimetres of an axis that is a translation:
-    ``x = lead p / (omega kappa)``.
-    """
+    """Pulses and degrees of one axis: ``theta = 360 p / (omega kappa)``; degrees are
+    millimetres of a translation: ``x = lead p / (omega kappa)``."""
 
     kind: Literal["rotation", "translation"] = key("what the axis does", "rotation")
     lead_mm: float | None = key(
@@ -98,11 +95,7 @@ Range = tuple[JointAngle, JointAngle]
 
 
 class Axis(Scale):
-    """One joint and the drive that moves it.
-
-    A translation has ``min_mm``, ``max_mm``, ``speed_mm_s``, ``accel_mm_s2`` and
-    ``range_mm`` for the keys in degrees.
-    """
+    """One joint and its drive; a translation has the keys of OF_TRANSLATION."""
 
     name: str = key("of the joint", pattern="^[a-z][a-z0-9_]{0,39}$")
     rotates: Literal["X", "Y", "Z"] | None = key(
@@ -122,7 +115,6 @@ class Axis(Scale):
         "the drive stops itself when the line is silent for this time",
         "that of [bus], if the map has it", 0.01, 60, by=lambda made: None,
     )  # fmt: skip
-
     range_deg: Range | None = advanced("of the candidates; absent: the limits", None)
 
     @model_validator(mode="before")
@@ -159,42 +151,33 @@ class Axis(Scale):
 
     def _counts_per_deg(self, units: Units) -> tuple[float, float]:
         """Register counts of 1 deg/s and of 1 deg/s^2 (of its inverse for a time)."""
-        turns = self.turns_per_deg
-        per_deg = {
-            "rev_per_s": turns, "rev_per_s2": turns, "s_per_rev_per_s": 1.0 / turns,
-            "pulse_per_s": abs(self.pulses_per_deg),
-            "pulse_per_s2": abs(self.pulses_per_deg),
-        }  # fmt: skip
-        speed, accel = per_deg[units.speed], per_deg[units.accel]
+        turns, pulses = self.turns_per_deg, abs(self.pulses_per_deg)
+        per_deg = {"s_per_rev_per_s": 1.0 / turns}
+        per_deg |= {"pulse_per_s": pulses, "pulse_per_s2": pulses}
+        speed, accel = (per_deg.get(u, turns) for u in (units.speed, units.accel))
         return speed * units.speed_per_unit, accel * units.accel_per_unit
 
     def motion_counts(self) -> dict[str, int]:
         """Speed and ramps as register values, never faster than configured; none of a
-        drive that takes them as they are.
-
-        Raises:
-            ValueError: ``key: rule, value`` where the drive cannot move so slowly, or
-                the register cannot hold the value.
-        """
+        drive that takes them as they are. ValueError, ``key: rule, value``, where it
+        cannot move so slowly, or the register cannot hold the value."""
         if (units := self.map.register_units) is None:
             return {}
-        place_of = self.map.place_of
         per_speed, per_accel = self._counts_per_deg(units)
         motion = self.speed_deg_s, self.accel_deg_s2
         in_pulses = (value * abs(self.pulses_per_deg) for value in motion)
         counts = motion_counts(units, self.pulses_per_rev, *in_pulses)
         for name, count in counts.items():
-            place = place_of(name)
-            if place is None:
+            if (place := self.map.place_of(name)) is None:
                 continue
-            key_name, unit, per = "accel_deg_s2", "deg/s^2", per_accel
+            key_name, unit, per, value = "accel_deg_s2", "/s^2", per_accel, motion[1]
             if name == "speed":
-                key_name, unit, per = "speed_deg_s", "deg/s", per_speed
+                key_name, unit, per, value = "speed_deg_s", "/s", per_speed, motion[0]
             if count < 1:
                 raise ValueError(
                     f"{self.key_of(key_name)}: must be at least {1.0 / per:.6g} "
-                    f"{unit.replace('deg', self.unit_name)}, one count "
-                    f"of the drive's register, got {getattr(self, key_name):g}"
+                    f"{self.unit_name}{unit}, one count of the drive's register, got "
+                    f"{value:g}"
                 )
             try:
                 encode(count, place[1], "big")

@@ -8,14 +8,7 @@ import tomllib
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from rig.config.axis import (
-    AXIS_NAMES,
-    DEFAULT_ROTATES,
-    MOST_AXES,
-    Axis,
-    Pulses,
-    Scale,
-)
+from rig.config.axis import AXIS_NAMES, DEFAULT_ROTATES, MOST_AXES, Axis, Pulses, Scale
 from rig.config.schema import ConfigError, Section, key, parse, read_text
 from rig.config.settings import (
     BusSettings,
@@ -27,6 +20,7 @@ from rig.config.settings import (
     SessionSettings,
     SettleSettings,
 )
+from rig.stop_config import rows_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -51,12 +45,10 @@ UNMEASURED = (
     "settle.timeout_s", "session.verify_limit_deg",
     "session.reference_tolerance_deg", "session.max_unreachable",
 )  # fmt: skip
-UNMEASURED_OF_AXES = (".comm_timeout_s",)  # of each axis, may change as well
 
 
 def names_of(described: dict[str, Any]) -> tuple[list[str], list[str]]:
-    """Names of the axes, and of what is measured, of a configuration as a journal
-    keeps it."""
+    """Names of the axes, and of what is measured, of a journal's configuration."""
     axes = [str(axis["name"]) for axis in described.get("axes", ())]
     by_phone = UP if (described.get("model") or {}).get("urdf") else axes
     readings = described.get("readings") or {"names": by_phone}
@@ -64,8 +56,7 @@ def names_of(described: dict[str, Any]) -> tuple[list[str], list[str]]:
 
 
 def units_of(described: dict[str, Any]) -> tuple[str, str]:
-    """Units of the commands, and of what is measured, of a configuration as a journal
-    keeps it."""
+    """Units of the commands, and of what is measured, of a journal's configuration."""
     kinds = [axis.get("kind", "rotation") for axis in described.get("axes", ())]
     units = dict.fromkeys("mm" if kind == "translation" else "deg" for kind in kinds)
     readings = described.get("readings") or {"unit": "deg"}
@@ -125,10 +116,7 @@ class RigConfig(Section):
     motion: MotionSettings = MotionSettings()
     session: SessionSettings = SessionSettings()
     output: str = key("every run makes a folder in this folder", "runs")
-    device: str = key(
-        "record of how the device was commissioned, relative to this file",
-        "device.json",
-    )
+    device: str = key("how it was commissioned, relative to this file", "device.json")
 
     @property
     def device_path(self) -> pathlib.Path:
@@ -250,21 +238,15 @@ class RigConfig(Section):
 
     @property
     def heartbeat_s(self) -> float:
-        """How long the motion loop may be silent while something moves.
-
-        Between two signs of life lies at most one exchange, which may have to connect
-        first, and the pause between polls; POLLS of these are allowed for, and a
-        computer that pauses for HICCUP_S.
-        """
+        """How long the motion loop may be silent while something moves: POLLS pauses
+        between polls, or a computer's of HICCUP_S, and an exchange that may have to
+        connect first."""
         return max(POLLS * self.motion.poll_s, HICCUP_S) + 2.0 * self.bus.timeout_s
 
     @property
     def comm_timeouts_s(self) -> dict[str, float]:
-        """Axis to seconds, of the drives that watch their line.
-
-        Unless configured, a drive waits longer than the heartbeat, by one read with
-        all its tries.
-        """
+        """Axis to seconds, of the drives that watch their line: unless configured, the
+        heartbeat and one read with all its tries."""
         default = self.heartbeat_s + self._slowest_read_s
         return {
             axis.name: axis.comm_timeout_s or default
@@ -296,34 +278,25 @@ class RigConfig(Section):
         else:
             data["model"]["digest"] = self._model_digest
         # Those left out too.
-        session = {"ranges": self.ranges, "k": self.k, "method": self.method}
-        data["session"] |= session
+        data["session"] |= {"ranges": self.ranges, "k": self.k, "method": self.method}
         for axis, described in zip(self.axes, data["axes"], strict=True):
             described["map"] = {"name": axis.map.name, "digest": axis.map.digest}
         return data
 
     def changed_since(self, described: dict[str, Any]) -> list[str]:
-        """Keys that would make a resumed run move or measure differently, in words.
-
-        Args:
-            described: ``described()`` when the run began, from its journal.
-        """
+        """Keys that would make a resumed run move or measure differently, in words;
+        ``described()`` when it began is in its journal."""
         now = json.loads(json.dumps(self.described(), default=str))
         then, now = _flat(described), _flat(now)
         # Keys that came after the run began had their defaults in it.
-        then = {
-            key: then[key]
-            for key in then
-            if not (key.startswith(UNMEASURED) or key.endswith(UNMEASURED_OF_AXES))
-        }
-        return differences(then, {key: now.get(key) for key in then})
+        ends = ".comm_timeout_s"  # of each axis: may change as well
+        named = [k for k in then if not (k.startswith(UNMEASURED) or k.endswith(ends))]
+        then, now = ({key: data.get(key) for key in named} for data in (then, now))
+        return differences(then, now)
 
     def device_fingerprint(self) -> dict[str, Any]:
-        """Key of rig.toml to value, of all that says which place a pulse count means.
-
-        Of a map it is the part that turns counts into places: one that learns another
-        register by an update is the same family.
-        """
+        """Key of rig.toml to value, of all that says which place a pulse count means;
+        of a map only what turns counts into places."""
         fingerprint: dict[str, Any] = {}
         for axis in self.axes:
             scale = axis.model_dump(include={*Scale.model_fields, "unit", "rotates"})
@@ -370,10 +343,8 @@ class RigConfig(Section):
         by_letters = self.axes if self.imu and not self.is_arm else ()
         for axis in by_letters:
             if axis.kind != "rotation" or axis.rotates is None:
-                yield (
-                    f"axes.{axis.name}.rotates: missing; a phone measures rotations "
-                    "about X, Y, Z"
-                )
+                why = "missing; a phone measures rotations about X, Y, Z"
+                yield f"axes.{axis.name}.rotates: {why}"
                 return
         for middle in by_letters:
             within = -90.0 < middle.min_deg and middle.max_deg < 90.0
@@ -395,11 +366,9 @@ class RigConfig(Section):
         if axis.range_deg or axis.name not in AXIS_NAMES:
             span = f"{at}.{axis.key_of('range_deg')}"
         if axis.speed_deg_s > motion.max_speed_deg_s:
-            yield (
-                f"{at}.{axis.key_of('speed_deg_s')}: must be at most "
-                "motion.max_speed_deg_s = "
-                f"{motion.max_speed_deg_s:g}, got {axis.speed_deg_s:g}"
-            )
+            most = f"at most motion.max_speed_deg_s = {motion.max_speed_deg_s:g}"
+            name = axis.key_of("speed_deg_s")
+            yield f"{at}.{name}: must be {most}, got {axis.speed_deg_s:g}"
         if abs(1.0 / axis.pulses_per_deg) > motion.position_tolerance_deg:
             yield f"{at}: one pulse is coarser than motion.position_tolerance_deg"
         if axis.comm_timeout_s is not None and axis.comm_timeout_s <= slowest:
@@ -411,18 +380,13 @@ class RigConfig(Section):
         if low >= high:
             yield f"{span}: must be [low, high], got [{low}, {high}]"
         elif low - overshoot < axis.min_deg - 1e-9 or high > axis.max_deg + 1e-9:
+            ends = f"[{low}, {high}] with an overshoot of {overshoot}"
             limits = f"[{axis.min_deg}, {axis.max_deg}]"
-            yield (
-                f"{span}: [{low}, {high}] with an overshoot of {overshoot} exceeds the "
-                f"axis's limits {limits}"
-            )
+            yield f"{span}: {ends} exceeds the axis's limits {limits}"
 
     def _rules_of_model(self, model: ModelSettings) -> Iterator[str]:
         if self.session.k is None:
-            yield (
-                "session.k: missing; with a [model] give the number of postures to "
-                "measure"
-            )
+            yield "session.k: missing; with a [model] give how many postures to measure"
         if not model.urdf:
             return
         for axis in self.axes:
@@ -462,10 +426,10 @@ def parse_config(
 def _repeated(data: dict[str, Any]) -> Iterator[str]:
     """Names, units and letters that axes share; told even beside other faults."""
     tables = data.get("axes")
-    axes = (
-        [a for a in tables if isinstance(a, dict)] if isinstance(tables, list) else []
-    )
-    axes = [{"rotates": DEFAULT_ROTATES.get(str(a.get("name"))), **a} for a in axes]
+    axes = [
+        {"rotates": DEFAULT_ROTATES.get(str(table.get("name")))} | table
+        for table in rows_of(tables)
+    ]
     if isinstance(tables, list) and not 1 <= len(tables) <= MOST_AXES:
         yield f"axes: must be 1 to {MOST_AXES} tables, got {len(tables)}"
     by_letters = "readings" not in data and not (

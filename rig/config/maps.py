@@ -13,12 +13,7 @@ import tomllib
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    BeforeValidator,
-    Field,
-    PlainValidator,
-    WithJsonSchema,
-)
+from pydantic import BeforeValidator, Field, PlainValidator, WithJsonSchema
 
 from rig import registers
 from rig.config.schema import Section, key, parse, read_text
@@ -147,13 +142,10 @@ class Move(Writes):
         *_, (address, last) = self.write[-1].places()
         if (address, last.value) != (self.trigger.address, self.trigger.value):
             yield "trigger: must be the last word of the last frame"
-        places = (place for frame in self.write for place in frame.places())
-        for address, word in places:
+        for address, word in (p for frame in self.write for p in frame.places()):
             if word.value in RELATIVE.get(address, ()):
-                yield (
-                    f"write: 0x{word.value:04X} in register 0x{address:04X} is a "
-                    "relative move; targets must be absolute"
-                )
+                place = f"0x{word.value:04X} in register 0x{address:04X}"
+                yield f"write: {place} is a relative move; targets must be absolute"
 
 
 Positive = Annotated[float, Field(ge=1e-12, le=1e12)]
@@ -191,13 +183,9 @@ class DriveMap(Section):
         "long", 2.0, 2.0, 60,
     )  # fmt: skip
     absolute_encoder: bool = key("the position survives a loss of power", False)
-    ready_s: float = key(
-        "longest time that the drive needs to enable, or to reset an alarm", 1.0, 0, 30
-    )
+    ready_s: float = key("longest, to enable or reset an alarm", 1.0, 0, 30)
     inter_frame_s: float = key("silence that the drive needs between frames", 0.0, 0, 1)
-    settings: dict[str, str | int | float | bool] = key(
-        "data of your own class, for a kind other than modbus", {}
-    )
+    settings: dict[str, str | int | float | bool] = key("data of your own class", {})
 
     @property
     def register_units(self) -> Units | None:
@@ -215,8 +203,7 @@ class DriveMap(Section):
 
     @property
     def digest(self) -> str:
-        known = tomllib.loads(self.text)
-        data = json.dumps(known, sort_keys=True, default=str)
+        data = json.dumps(tomllib.loads(self.text), sort_keys=True, default=str)
         return hashlib.sha256(data.encode()).hexdigest()
 
 
@@ -246,35 +233,24 @@ class RegisterMap(DriveMap):
     )
     stop: Writes = key("`write`: frames of the quick stop; torque must stay on")
     hold: Writes | None = key(
-        "`write` with `position`: the drive's target becomes its present position, "
-        "so that it does not continue a move after a stop",
-        None,
+        "`write` with `position`: its place becomes its target, after a stop", None
     )
     broadcast_stop: bool = key("all units of a serial line obey a stop to 0", False)
     enable: Writes | None = key("`write`: switch the power stage on", None)
     alarm_reset: Writes | None = key("`write`: reset an alarm", None)
     comm_timeout: CommTimeout | None = key(
-        "`write` with `timeout`, counts `per_s`: the drive's watch of the line",
-        None,
+        "`write` with `timeout`, counts `per_s`: the drive's watch of the line", None
     )
     limits: Writes | None = key("`write` with `min` and `max` in pulses", None)
     set_zero: Writes | None = key(
-        "`write`: the present position becomes 0; or `home:i32` if the drive takes a "
-        "value: 2^30 is written, which it never counts when it is switched on",
-        None,
+        "`write`: its place becomes 0; or `home:i32`: 2^30, if it takes a value", None
     )
     identity: dict[str, Read] = key("registers that `identify` prints", {})
     recognise: dict[str, tuple[int, int]] = key(
         "[lowest, highest] value of identity registers for drives of this family", {}
     )
-    pulses_per_rev: Read | None = key(
-        "register of the drive's pulses per motor turn", None
-    )
-    target: Position | None = key(
-        "register of the last target written; it is read back if the reply to a move "
-        "is lost",
-        None,
-    )
+    pulses_per_rev: Read | None = key("register of pulses per motor turn", None)
+    target: Position | None = key("of the last move; read if its reply is lost", None)
     home: Writes | None = key("`write`: start the drive's own homing", None)
     homed: Predicate | None = key(
         "bits of the status word that homing sets and a loss of power clears", None
@@ -297,12 +273,8 @@ def available_maps() -> list[str]:
 
 
 def load_map(name: str, folder: pathlib.Path | None = None) -> DriveMap:
-    """Read a map by name (one that ships) or by path, relative to ``folder``.
-
-    Raises:
-        ValueError: no such map.
-        ConfigError: not TOML, or the schema is broken; lists every fault.
-    """
+    """Read a map by name (one that ships; ValueError where there is none) or by path,
+    relative to ``folder``; ConfigError lists every fault."""
     path = MAP_FOLDER / f"{name}.toml"
     if name.endswith(".toml"):
         path = (folder or pathlib.Path()) / name
@@ -315,11 +287,8 @@ def load_map(name: str, folder: pathlib.Path | None = None) -> DriveMap:
 
 
 def parse_map(text: str, source: str, folder: pathlib.Path) -> DriveMap:
-    """The text of a map; ``folder`` is where the file of a class is looked for.
-
-    Raises:
-        ConfigError: not TOML, or the schema is broken; lists every fault.
-    """
+    """The map of a text; ConfigError lists every fault. ``folder`` is where the file of
+    a class is looked for."""
     kind: type[DriveMap] = RegisterMap
     with contextlib.suppress(tomllib.TOMLDecodeError):  # which `parse` words
         if tomllib.loads(text).get("drive", "modbus") != "modbus":

@@ -66,11 +66,8 @@ def key(
     advanced: bool = False,
     **more: Any,
 ) -> Any:
-    """A key of a file: what it means, its default (``...``: required) and bounds.
-
-    ``by`` makes the default from the keys before it; ``default`` then says in words
-    what that comes to.
-    """
+    """A key of a file: what it means, its default (``...``: required) and bounds; where
+    ``by`` makes the default from the keys before it, ``default`` is that in words."""
     extra: dict[str, Any] = {"advanced": True} if advanced else {}
     if by is not None:
         more["default_factory"] = by
@@ -116,12 +113,8 @@ def parse(
     context: Any = None,
     more: Callable[[Any], Iterable[str]] = lambda data: (),
 ) -> Model:
-    """A TOML text as a model.
-
-    Raises:
-        ConfigError: every fault as ``section.key: rule, value``, and those that
-            ``more`` finds in what was parsed.
-    """
+    """A TOML text as a model; ConfigError has every fault as ``section.key: rule,
+    value``, and those that ``more`` finds in what was parsed."""
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -163,8 +156,7 @@ def rule(described: dict[str, Any], root: dict[str, Any]) -> str:
     kind = described.get("type")
     if kind == "array":
         item = described.get("items") or described["prefixItems"][0]
-        count = described.get("minItems", "")
-        most = described.get("maxItems")
+        count, most = described.get("minItems", ""), described.get("maxItems")
         number = f"{count} to {most}" if most else "items"
         number = str(count) if count and count == most else number
         return f"a list of {number}, each {rule(item, root)}"

@@ -17,6 +17,7 @@ Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
 Sign = Literal[1, -1]
 Column = Annotated[int, Field(ge=0, le=200)]
 Angle = Annotated[float, Field(ge=-360, le=360)]
+Method = Literal["policy", "auto", "exact", "exchange", "greedy", "random"]
 
 # key(what it means, default (... where required), lowest, highest)
 
@@ -25,8 +26,7 @@ class BusSettings(Section):
     """One line for all drives."""
 
     transport: Literal["tcp", "rtu_tcp", "rtu", "serial", "can"] = key(
-        "rtu: Modbus on a serial port; tcp: Modbus TCP; rtu_tcp: RTU frames over "
-        "TCP; serial, can: lines of your own drives"
+        "rtu: a serial port; rtu_tcp: RTU over TCP; serial, can: of your own drives"
     )
     host: str = key("address of a tcp or rtu_tcp bus", "")
     port: int = key("TCP port of a tcp or rtu_tcp bus", 502, 1, 65535)
@@ -37,16 +37,9 @@ class BusSettings(Section):
     bytesize: int = key("of an rtu bus", 8, 7, 8)
     echo: bool = key("RTU: the adapter echoes what it is sent", False)
     timeout_s: float = key("for one reply", 0.3, 0.01, 5)
-    read_retries: int = advanced(
-        "retries of a move that the drive did not take; a read has twice as many",
-        2,
-        0,
-        10,
-    )
+    read_retries: int = advanced("of a move not taken; twice for a read", 2, 0, 10)
 
-    @property
-    def where(self) -> str:
-        return where_of(self)
+    where = property(where_of)
 
     def broken_rules(self) -> Iterator[str]:
         required = "host" if self.transport in NETWORK else "device"
@@ -65,12 +58,9 @@ class ImuSettings(Section):
         "app of the phone; sensorlog: lines below a header; json: one object per line"
     )
     transport: Literal["listen", "connect", "udp"] = key(
-        "listen: the phone connects to this computer; udp: it sends datagrams here",
-        "listen",
+        "listen: the phone connects here; udp: it sends datagrams here", "listen"
     )
-    host: str = key(
-        "listen: this computer's address; connect: the phone's", "127.0.0.1"
-    )
+    host: str = key("of this computer; connect: of the phone", "127.0.0.1")
     port: int = key("TCP port; 0: any free one", ..., 0, 65535)
     # HyperIMU sends azimuth, pitch, roll, which turn about Z, X, Y; the order is ZYX.
     columns: tuple[Column, Column, Column] = key(
@@ -86,12 +76,9 @@ class ImuSettings(Section):
         by=_by_format(0, -1),
     )  # fmt: skip
     stamp_unit: Literal["s", "ms", "us", "ns"] | None = advanced(
-        "unit of the phone's clock; absent: from the first stamp, else ms (json: ns)",
-        None,
+        "of the phone's clock; absent: from the first stamp, else ms (json: ns)", None
     )
-    column_count: int = advanced(
-        "lines of another width are refused; 0: width of the first line", 0, 0, 200
-    )
+    column_count: int = advanced("of a line; 0: as the first line", 0, 0, 200)
     separator: str = advanced("between columns", ",")
     unit: Literal["deg", "rad"] = key("of the angles", "deg")
     order: Order | None = key(
@@ -108,12 +95,9 @@ class ImuSettings(Section):
     mounting_deg: tuple[Angle, Angle, Angle] = key(
         "turn of the phone on the end-effector about Z, then Y, then X", (0.0, 0.0, 0.0)
     )
-    allow: tuple[str, ...] = key(
-        "addresses that may send; none: the first phone that does", ()
-    )
+    allow: tuple[str, ...] = key("addresses that may send; none: the first", ())
     heading: Literal["relative", "absolute"] = advanced(
-        "absolute: the phone has the same heading after every start",
-        "relative",
+        "absolute: the phone has the same heading after every start", "relative"
     )
     stale_s: float = key("oldest reading allowed while moving", 0.4, 0.02, 10)
     max_jump_deg: float = advanced("largest change between readings", 20.0, 0.1, 180)
@@ -178,8 +162,7 @@ class ReadingsSettings(Section):
     """Numbers that a sensor sends, in place of a phone."""
 
     names: tuple[str, ...] = key(
-        "of the readings, 1 to 12; a reading named like an axis rises with it",
-        min_length=1,
+        "1 to 12; a reading named like an axis rises with it", min_length=1
     )
     unit: str = key("of all of them", "mm", min_length=1)
     transport: Literal["tcp", "listen", "udp", "serial", "modbus"] = key(
@@ -237,14 +220,8 @@ class ModelSettings(Section):
         "phone or an accelerometer at rest), or the position in the file's metres",
         "gravity",
     )
-    magnitude: float = advanced(
-        "magnitude of gravity in the unit of [readings]", 9.81, 1e-6, 1e6
-    )
-    factory: str = key(
-        "FILE.py:NAME or MODULE:NAME of a jaxcal model, or of a function that "
-        "returns one",
-        "",
-    )
+    magnitude: float = advanced("gravity in the readings' unit", 9.81, 1e-6, 1e6)
+    factory: str = key("FILE.py:NAME or MODULE:NAME of a model, or what makes one", "")
 
     @property
     def file(self) -> str:
@@ -269,9 +246,8 @@ class MotionSettings(Section):
     """How the device is moved."""
 
     max_speed_deg_s: float = key(
-        "limit of speed_deg_s of all axes; raise it only with a reason",
-        120.0, 1e-3, 5000,
-    )  # fmt: skip
+        "limit of all speed_deg_s; raise it only with a reason", 120.0, 1e-3, 5000
+    )
     max_step_deg: float = key("longer moves are split", 15.0, 0.1, 360)
     approach_overshoot_deg: float = key(
         "> 0: approach every posture from below, against backlash", 0.0, 0, 20
@@ -283,9 +259,7 @@ class MotionSettings(Section):
     stall_s: float = advanced(
         "a drive that stands still off its target this long has a fault", 1.0, 0.05, 30
     )
-    envelope_margin_deg: float = advanced(
-        "how far the IMU may read beyond the limits", 15.0, 0.1, 90
-    )
+    envelope_margin_deg: float = advanced("of the IMU past the limits", 15.0, 0.1, 90)
     mirror_limits: bool = advanced("also write the soft limits to the drives", False)
 
 
@@ -308,13 +282,8 @@ class SessionSettings(Section):
     """What a calibration session does."""
 
     candidates: int = key("M, postures drawn", 50, 5, 100_000)
-    k: int | None = key(
-        "K, postures to choose; absent: axes plus one, which leaves no residual",
-        None, 2, 10_000,
-    )  # fmt: skip
-    method: (
-        Literal["policy", "auto", "exact", "exchange", "greedy", "random"] | None
-    ) = key("method of selection; absent: policy for three axes, auto for others", None)
+    k: int | None = key("K, to choose; absent: axes plus one", None, 2, 10_000)
+    method: Method | None = key("absent: policy for three axes, else auto", None)
     min_efficiency: float = advanced("below this D-efficiency exact is used", 0.9, 0, 1)
     seed: int = advanced("seed of the candidates", 0, 0, 2**31 - 1)
     pitch_range_deg: Range | None = key("range_deg of the axis pitch", None)
@@ -322,9 +291,7 @@ class SessionSettings(Section):
     roll_range_deg: Range | None = key("range_deg of the axis roll", None)
     verify_postures: int = key("held out, measured before and after", 4, 0, 1000)
     verify_limit_deg: float = key("largest good error, compensated", 0.5, 1e-3, 45)
-    drift_limit_deg: float = key(
-        "largest nonlinear drift of the zero in a session", 0.2, 1e-3, 45
-    )
+    drift_limit_deg: float = key("largest nonlinear drift of zero", 0.2, 1e-3, 45)
     reference_tolerance_deg: float = advanced(
         "largest distance of the zero posture from its earlier place", 0.5, 1e-3, 45
     )

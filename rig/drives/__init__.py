@@ -25,11 +25,8 @@ KINDS = {"modbus": "rig.drives.modbus:ModbusDrive"}
 
 
 def named(text: str, folder: pathlib.Path) -> Any:
-    """What ``MODULE:NAME`` names, or ``FILE.py:NAME`` of a folder.
-
-    Raises:
-        Exception: whatever the import of foreign code raises.
-    """
+    """What ``MODULE:NAME`` names, or ``FILE.py:NAME`` of a folder; raises whatever the
+    import of foreign code raises."""
     place, _, name = text.rpartition(":")
     if not place.endswith(".py"):
         return getattr(importlib.import_module(place), name)
@@ -42,11 +39,7 @@ def named(text: str, folder: pathlib.Path) -> Any:
 
 
 def kind_of(drive_map: DriveMap) -> type[Drive]:
-    """The class of a map's drives.
-
-    Raises:
-        Refused: there is no such class.
-    """
+    """The class of a map's drives; Refused where there is no such class."""
     text = KINDS.get(drive_map.drive, drive_map.drive)
     try:
         drive_type: type[Drive] = named(text, drive_map.folder)
@@ -79,15 +72,10 @@ def make_drives(
     silence_s: float = 0.0,
     emit: Callable[..., Any] = lambda event, **fields: None,
 ) -> tuple[Line, list[Drive]]:
-    """The line of a device, to be opened, and the drive of each axis on it.
-
-    Raises:
-        Refused: the drives are of several kinds of line, or of none on this bus.
-    """
-    kinds: dict[str, type[Drive]] = {}
-    for axis in axes:
-        if axis.map.drive not in kinds:
-            kinds[axis.map.drive] = kind_of(axis.map)
+    """The line of a device, to be opened, and the drive of each axis on it; Refused
+    where they are of several kinds of line, or of none on this bus."""
+    maps = {axis.map.drive: axis.map for axis in axes}
+    kinds = {name: kind_of(drive_map) for name, drive_map in maps.items()}
     lines = {kind.line_type for kind in kinds.values()}
     if len(lines) > 1:
         raise Refused(f"the drives of a device must be of one kind: {', '.join(kinds)}")

@@ -1,11 +1,9 @@
-"""Modbus: the line.
+"""Modbus: the line. ``wire`` does the framing.
 
-``wire`` does the framing. Here exception replies are errors, replies are checked
-against their request, the silence between frames is kept, reads are retried, and a
-motion write is sent exactly once. RTU frames bear no number, so a reply that comes late
-could be taken for the answer to the next request: after a failed exchange the line is
-emptied, and a unit that owes a reply is asked for another number of registers first,
-until what it answers can only be the answer to that. The connection is kept.
+Replies are checked against their request, the silence between frames is kept, reads are
+retried, and a motion write is sent exactly once. RTU frames bear no number: after a
+failed exchange the line is emptied, and a unit that owes a reply is asked for another
+number of registers first, until what it answers can only be the answer to that.
 """
 
 from __future__ import annotations
@@ -107,7 +105,7 @@ class Bus(Line):
     @property
     def late(self) -> set[int]:
         """Units whose replies came after their time."""
-        return set() if self._client is None else self._client.late
+        return self._client.late if self._client else set()
 
     def answers_for_every_unit(self) -> bool:
         """Whether the server also answers for a unit number that no device has."""
@@ -157,17 +155,10 @@ class Bus(Line):
         quantity: int,
         retries: int | None = None,
     ) -> bytes:
-        """Read registers, or bits, with ``Line.read_tries`` or as many as given.
+        """The data of ``quantity`` registers, two bytes each, or bits from the lowest.
 
-        Args:
-            unit: that is asked.
-            function: 3 holding or 4 input registers, 1 coils, 2 discrete inputs.
-            address: of the first.
-            quantity: of registers, or of bits.
-            retries: after the first try.
-
-        Returns:
-            The data of the reply: two bytes a register; bits from the lowest up.
+        ``function``: 3 holding or 4 input registers, 1 coils, 2 discrete inputs;
+        ``retries`` after the first try, where not as ``Line.read_tries``.
 
         Raises:
             BusError: no valid reply after all tries.
@@ -196,10 +187,8 @@ class Bus(Line):
         raise AssertionError("unreachable")
 
     def _tell_late(self, unit: int, error: BusError) -> None:
-        """Say of a unit that has never answered whether its reply is only late.
-
-        Nothing was moved over this line then, so there is time to wait for it.
-        """
+        """Say of a unit that has never answered, so that nothing was moved and there is
+        time to wait, whether its reply is only late."""
         if self._urgent or unit in self._readable or error.refused or error.lost:
             return
         if unit not in self.silent or unit == NOBODY or self._client is None:
@@ -211,12 +200,8 @@ class Bus(Line):
                 error.advice = LATER
 
     def write(self, unit: int, address: int, function: int, words: list[int]) -> None:
-        """Write registers once. Never retried: a lost reply may hide a started move.
-
-        Raises:
-            BusError: no valid reply; whether the drive obeyed is unknown.
-            Rejected: the drive refused.
-        """
+        """Write registers once. Never retried: after a BusError that is not Rejected it
+        is unknown whether the drive obeyed; a lost reply may hide a started move."""
         self.tell(unit, address=address, words=words)
         if not self._urgent:  # an acknowledgement of a stop tells of a stop, also late
             self._catch_up(unit, self._readable.get(unit))
@@ -247,14 +232,9 @@ class Bus(Line):
         return reply[1:]
 
     def _catch_up(self, unit: int, place: tuple[int, int] | None) -> None:
-        """Be sure that no earlier reply of a unit on an RTU line is still to come.
-
-        A unit answers in order: once it has answered a question whose reply has a
-        length that it owes nowhere, all before it has come, or is lost.
-
-        Raises:
-            BusError: it is silent, or what it says is always the answer to another.
-        """
+        """Be sure that no earlier reply of a unit on an RTU line is still to come, else
+        BusError. A unit answers in order: once it has answered a question whose reply
+        has a length that it owes nowhere, all before it has come, or is lost."""
         place = self._readable.get(unit, place)
         if place is None:
             return
@@ -284,9 +264,8 @@ class Bus(Line):
                 del owed[: sizes.index(received) + 1]
                 self.late.add(unit)
         if self._owed.get(unit):
-            raise BusError(
-                f"unit {unit}: its replies are too late to be assigned", LATER
-            )
+            why = f"unit {unit}: its replies are too late to be assigned"
+            raise BusError(why, LATER)
 
     def broadcast(self, address: int, function: int, words: list[int]) -> None:
         """Write registers of every unit on a serial line; no unit answers."""
@@ -301,11 +280,8 @@ class Bus(Line):
     def _exchange(
         self, function: int, unit: int, request: bytes, address: int, owed: int
     ) -> bytes:
-        """The data of the reply to one request.
-
-        Where none is valid, the line is emptied before BusError is raised; a reply of
-        ``owed`` bytes may still come.
-        """
+        """The data of the reply to one request. Before BusError the line is emptied;
+        a reply of ``owed`` bytes may still come."""
         with self._lock:
             if not self._urgent:
                 self.check()  # holding the lock: nothing is sent after another's stop
@@ -394,5 +370,4 @@ def data_size(function: int, quantity: int) -> int:
 
 
 def words_of(data: bytes) -> list[int]:
-    """The registers of a reply."""
     return [*struct.unpack(f">{len(data) // 2}H", data)]

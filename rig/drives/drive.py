@@ -83,14 +83,9 @@ class Drive(abc.ABC):
 
     @abc.abstractmethod
     def move(self, count: int, speed: float, accel: float) -> None:
-        """Start an absolute move, and return.
-
-        Sent once: whether a move without a reply was taken is found out by looking.
-
-        Args:
-            count: where to.
-            speed, accel: counts a second, and a second squared; no faster.
-        """
+        """Start an absolute move to a count, no faster than ``speed`` counts a second
+        and ``accel`` a second squared, and return. Sent once: whether a move without a
+        reply was taken is found out by looking."""
 
     @abc.abstractmethod
     def standing(self) -> bool:
@@ -170,11 +165,9 @@ class Drive(abc.ABC):
 
     @property
     def origin(self) -> int:
-        """What the drive itself counts at home: HOME where it was set so, else 0.
-
-        All pulses here are from it. It is told from the count as first read and holds
-        from then on: a drive that loses its count meanwhile is seen far away.
-        """
+        """What the drive itself counts at home, from which all pulses are: HOME where
+        it was set so, else 0. It is told from the count as first read and holds from
+        then on: a drive that loses its count meanwhile is seen far away."""
         if self._origin is None:
             self.status()
         return self._origin or 0
@@ -184,11 +177,7 @@ class Drive(abc.ABC):
         self._origin = None if self.counts_from_home else 0
 
     def status(self, retries: int | None = None) -> Status:
-        """Read status and position.
-
-        Args:
-            retries: of each read, where not ``Line.read_tries``.
-        """
+        """Read status and position; ``retries`` where not as ``Line.read_tries``."""
         if retries is None:
             retries = self.line.read_tries - 1
         asked = time.monotonic()
@@ -202,10 +191,8 @@ class Drive(abc.ABC):
         return self.last
 
     def steady(self, retries: int | None = None) -> Status:
-        """Status of a drive that stands: two readings of its position that agree.
-
-        One reading may be mangled and look whole. Where no two agree it is the last.
-        """
+        """Status of a drive that stands: two readings of its position that agree, since
+        one may be mangled and look whole; the last where no two do."""
         new = self.last is None
         status = self.status(retries)
         for _ in range(LOOKS):
@@ -236,12 +223,8 @@ class Drive(abc.ABC):
         return status
 
     def go(self, pulses: int) -> None:
-        """Start an absolute move; every frame is sent exactly once.
-
-        Raises:
-            LimitError: the target leaves the axis's limits.
-            BusError: a frame was not acknowledged.
-        """
+        """Start an absolute move; every frame is sent exactly once. LimitError where
+        the target leaves the axis's limits, BusError where one is not acknowledged."""
         axis = self.axis
         if not axis.min_pulses <= pulses <= axis.max_pulses:
             raise LimitError(
@@ -255,11 +238,8 @@ class Drive(abc.ABC):
     def bring(
         self, act: Callable[[], object], ready: Callable[[Status], bool]
     ) -> Status:
-        """Act and poll until the effect shows, at most the map's ready_s.
-
-        The last look begins after that time: a look before it may have waited for the
-        tries of a spoilt frame, and tells of the time before them.
-        """
+        """Act and poll until the effect shows, at most the map's ready_s. The last look
+        begins after that: one before may tell of the time before a spoilt frame."""
         act()
         end = time.monotonic() + self.axis.map.ready_s
         while True:

@@ -131,10 +131,8 @@ class Line(abc.ABC):
 
     @contextlib.contextmanager
     def urgent(self, timeout_s: float | None = None) -> Iterator[None]:
-        """Keep the line for a stop: no exchange of another thread, no ``check``.
-
-        A reply is waited for ``timeout_s``, or as configured where that is shorter.
-        """
+        """Keep the line for a stop: no other thread's exchange, no ``check``; a reply
+        is waited for ``timeout_s``, or as configured where that is shorter."""
         with self._lock:
             before = self._urgent, self._timeout_s
             outermost = not self._urgent
@@ -151,11 +149,8 @@ class Line(abc.ABC):
 
     @contextlib.contextmanager
     def exchange(self, unit: int) -> Iterator[float]:
-        """Around one request and its reply: seconds in which it is to come.
-
-        Raises:
-            BusError: what was raised within, of whatever kind, in words.
-        """
+        """Around one request and its reply: seconds in which it is to come. Whatever is
+        raised within becomes a BusError, in words."""
         with self._lock:
             if not self._urgent:
                 self.check()  # holding the lock: nothing is sent after another's stop

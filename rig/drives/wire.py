@@ -1,12 +1,10 @@
 """Modbus frames on one connection: numbered over TCP; with a CRC on a serial port, or
 through a socket.
 
-A reply over TCP bears the number of its request, so the connection is kept when one is
-late, and a late one is dropped: a gateway that gives one connection would give no other
-for seconds. Gateways serve one request after the other, so the same is asked but a few
-times before it is answered: little stands in the way of a stop. A reply of RTU is
-looked for in all that came: what an adapter sends back of a request, and bytes before a
-reply, are passed over.
+A reply over TCP bears its request's number: a late one is dropped and the connection
+kept, since a gateway may give no other for seconds. Gateways serve one request after
+the other, so the same is asked but a few times: little stands in the way of a stop. A
+reply of RTU is looked for in all that came, past an adapter's echo and noise.
 """
 
 from __future__ import annotations
@@ -106,11 +104,8 @@ class Wire:
     def exchange(
         self, unit: int, pdu: bytes, timeout_s: float, answered: bool = True
     ) -> bytes:
-        """Send a request once; the PDU of its reply, empty where none is ``answered``.
-
-        Raises:
-            BusError: none came in time; ``lost`` where the connection is.
-        """
+        """Send a request once; the PDU of its reply, empty where none is ``answered``;
+        BusError where none came in time, ``lost`` where the connection is."""
         try:
             return self._exchange(unit, pdu, timeout_s, answered)
         except BusError:
@@ -206,10 +201,8 @@ class Wire:
         return any(sent > recent for sent in self._unanswered.values())
 
     def _numbered_request(self, request: bytes) -> bytes:
-        """A frame to send; empty where the same was sent often enough.
-
-        Whichever of several numbers of one request is answered answers it.
-        """
+        """A frame to send; empty where the same was sent often enough, since the answer
+        to any number of one request is its answer."""
         if request != self._asked:
             self._asked, self._accepted = request, set()
         elif len(self._accepted) >= MOST_UNANSWERED and self.owes:
@@ -259,11 +252,8 @@ class Wire:
         return reply
 
     def _read(self, seconds: float) -> bytes:
-        """What comes within a time, empty where that is nothing.
-
-        Raises:
-            OSError: the peer has closed the connection, or the port is gone.
-        """
+        """What comes within a time; OSError where the peer has closed the connection,
+        or the port is gone."""
         if not select.select([self.socket], [], [], seconds)[0]:
             return b""
         if not self._is_socket:

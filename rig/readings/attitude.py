@@ -35,11 +35,8 @@ class Reading:
 
 
 def euler_to_matrix(angles_deg: ArrayLike, order: str) -> Array:
-    """(..., 3, 3) of (..., 3) degrees in the sequence of ``order``, one of ORDERS.
-
-    Written out, as its inverse: scipy's Rotation takes ten times as long for the one
-    attitude of a reading, and a phone sends hundreds in a second.
-    """
+    """(..., 3, 3) of (..., 3) degrees in the sequence of ``order``, one of ORDERS;
+    written out, as its inverse: scipy's takes ten times as long for one attitude."""
     i, j, k, sign = _sequence(order)
     turns = np.radians(np.asarray(angles_deg, dtype=np.float64))
     sine_a, sine_b, sine_c = np.moveaxis(sign * np.sin(turns), -1, 0)

@@ -18,12 +18,11 @@ import numpy as np
 
 from rig.config.settings import ImuSettings
 from rig.readings.attitude import Array, Reading
-from rig.readings.source import Source
+from rig.readings.source import BACKLOG, Source, listener_of
 from rig.readings.stream import MAX_BODY, LineSplitter, StreamParser
 
 RECONNECT_S = 0.2
 MOST_OPEN = 4  # connections at a time
-BACKLOG = 128  # connections that wait for an answer; past that a phone waits 1 s
 PATIENCE_S = 5.0  # of a connection for a line, or a whole message
 MAX_HEAD = 8192  # bytes of a message before its body
 LOOK_S = 0.05  # between two looks at whether to end
@@ -45,8 +44,8 @@ class Imu(Source):
         self.settings: ImuSettings = settings
         self.connections = 0
         self.world = np.eye(3)
-        self._parser = StreamParser(settings)
-        self._counts = self._parser.counts
+        self.parser = StreamParser(settings)
+        self._counts = self.parser.counts
         self._receiver: Receiver | None = None
 
     def open(self) -> Imu:
@@ -75,16 +74,6 @@ class Imu(Source):
         return f"{self.settings.host}:{self.port}"
 
     @property
-    def first(self) -> str:
-        """The first record that was used, as it came; empty before that."""
-        return self._parser.first
-
-    @property
-    def taken_for(self) -> str:
-        """What its fields are taken for, in words."""
-        return self._parser.taken_for
-
-    @property
     def refused(self) -> list[str]:
         return self._receiver.refused if self._receiver else []
 
@@ -101,19 +90,19 @@ class Imu(Source):
         """Lines come over another connection from now on."""
         self.connections += 1
         with self._lock:
-            self._parser.reconnected()
+            self.parser.reconnected()
 
     def take_lines(self, lines: list[bytes], now: float) -> bool:
         """Lines that came at a monotonic time; whether a reading of them was used."""
         with self._lock:
-            return self._store(self._parser.lines(lines, now))
+            return self._store(self.parser.lines(lines, now))
 
     def take_body(self, body: bytes) -> tuple[bool, bool]:
         """A message; whether it was used, and whether it is another device's."""
         with self._lock:
-            used = self._store(self._parser.body(body, time.monotonic()))
-            self.connections = max(1, self._parser.sessions)
-            return used, self._parser.foreign
+            used = self._store(self.parser.body(body, time.monotonic()))
+            self.connections = max(1, self.parser.sessions)
+            return used, self.parser.foreign
 
     def _store(self, readings: list[Reading]) -> bool:
         turned = [Reading(r.time, self.world @ r.value) for r in readings]
@@ -135,13 +124,11 @@ class Connection:
 class Receiver:
     """Hears one phone, whoever else connects.
 
-    Who may not be heard is refused before a byte of it is read. At most MOST_OPEN
-    connections are open, none for longer than PATIENCE_S without a word; where they are
-    all taken, the oldest that has sent nothing makes way for the next. Messages are
-    pushed over any connection of one address. Lines come over one connection: a phone
-    that lost its Wi-Fi leaves it half open and comes back on another, which takes its
-    place once no reading of it was of use for ``stale_s``. While one still is, another
-    connection is another sender.
+    Who may not be heard is refused unread. At most MOST_OPEN connections are open, none
+    for longer than PATIENCE_S without a word; the oldest that has sent nothing makes
+    way for the next. Messages are pushed over any connection of one address. Lines come
+    over one: a phone that lost its Wi-Fi comes back on another, which takes its place
+    once no reading of the old was of use for ``stale_s``; until then it is refused.
     """
 
     def __init__(self, imu: Imu) -> None:
@@ -154,12 +141,7 @@ class Receiver:
         self._current: Connection | None = None  # that lines are taken of
         self._unheard: list[asyncio.Task[None]] = []  # that have sent nothing yet
         self._closing = threading.Event()
-        self._listener: socket.socket | None = None
-        if s.transport == "listen":
-            self._listener = socket.create_server((s.host, s.port), backlog=BACKLOG)
-        elif s.transport == "udp":
-            self._listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            self._listener.bind((s.host, s.port))
+        self._listener = listener_of(s)
         if self._listener is not None:
             self._listener.setblocking(False)
             self.port = self._listener.getsockname()[1]
@@ -240,9 +222,7 @@ class Receiver:
                 else:  # it is still sending: closed at once, it would not see why
                     with contextlib.suppress(OSError):
                         made.send(_answer(403, False))
-                    leaving = [
-                        connection for connection in leaving if connection.fileno() >= 0
-                    ] + [made]
+                    leaving = [*(c for c in leaving if c.fileno() >= 0), made]
                     loop.call_later(LOOK_S * (len(leaving) < BACKLOG), made.close)
 
     def _has_sent(self, task: asyncio.Task[None] | None) -> None:
@@ -252,9 +232,9 @@ class Receiver:
     async def _hear(self, address: str, **how: Any) -> None:
         """Take what one connection sends, until it ends or says nothing."""
         pushed = self._settings.format == "sensorlogger"
-        with contextlib.suppress(
-            OSError, EOFError, ValueError, asyncio.LimitOverrunError
-        ):
+        hear = self._message if pushed else self._lines
+        ended = (OSError, EOFError, ValueError, asyncio.LimitOverrunError)
+        with contextlib.suppress(*ended):
             async with asyncio.timeout(PATIENCE_S):
                 streams = await asyncio.open_connection(limit=MAX_HEAD, **how)
             connection = Connection(*streams, address, time.monotonic())
@@ -262,9 +242,7 @@ class Receiver:
             try:
                 while stays:  # not wait_for, which may lose the cancelling of a task
                     async with asyncio.timeout(PATIENCE_S):
-                        stays = await (self._message if pushed else self._lines)(
-                            connection
-                        )
+                        stays = await hear(connection)
                     self._has_sent(asyncio.current_task())
             finally:
                 connection.writer.close()

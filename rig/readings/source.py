@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import itertools
+import socket
 import threading
 import time
 from collections import Counter, deque
@@ -16,10 +17,44 @@ from rig.faults import Fault
 from rig.readings.attitude import Array, Reading
 
 RING = 8192  # readings kept: over half a minute at 200 Hz
+REJOIN = 5  # readings in a row that agree with each other after a jump
+BACKLOG = 128  # connections that wait for an answer; past that a phone waits 1 s
 
 
 class ReadingError(Fault):
     """Readings are stale, their line is closed, or they are not to be trusted."""
+
+
+class JumpGate:
+    """Tells impossible jumps, until REJOIN readings in a row agree with each other."""
+
+    def __init__(self, apart: Callable[[Array, Array], float], most: float) -> None:
+        self._apart, self._most = apart, most
+        self._last: Array | None = None
+        self._far: list[Array] = []
+
+    def jumps(self, value: Array) -> bool:
+        """Whether a reading is not to be used; else the next are compared with it."""
+        if self._last is not None and self._apart(self._last, value) > self._most:
+            if self._far and self._apart(self._far[-1], value) > self._most:
+                self._far.clear()
+            self._far.append(value)
+            if len(self._far) < REJOIN:
+                return True
+        self._far, self._last = [], value
+        return False
+
+
+def listener_of(settings: Any) -> socket.socket | None:
+    """What hears, where this computer is called; OSError where it cannot be opened."""
+    place = (settings.host, settings.port)
+    if settings.transport == "listen":
+        return socket.create_server(place, backlog=BACKLOG)
+    if settings.transport != "udp":
+        return None
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    made.bind(place)
+    return made
 
 
 class Source(abc.ABC):
@@ -139,11 +174,8 @@ class Source(abc.ABC):
     @property
     def dropped(self) -> str:
         """What was dropped, in words; empty where nothing was."""
-        counts = {
-            reason: n for reason, n in self.counts.items() if reason != "accepted"
-        }
-        each = (f"{count} {reason}" for reason, count in counts.items())
-        return f"; records dropped: {', '.join(each)}" if counts else ""
+        reasons = [f"{n} {why}" for why, n in self.counts.items() if why != "accepted"]
+        return f"; records dropped: {', '.join(reasons)}" if reasons else ""
 
     def wait_for_stream(self, timeout_s: float) -> Reading:
         """The first fresh reading; ReadingError where none came in time."""

@@ -11,7 +11,7 @@ import json
 import math
 import re
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from rig.config.settings import ImuSettings
 from rig.readings.attitude import Array, Reading, angle_between_deg, euler_to_matrix
+from rig.readings.source import JumpGate
 
 MAX_LINE = 8192  # bytes; SensorLog's header has under 3000, other lines under 1000
 MAX_BODY = 1 << 20  # bytes of one pushed message
@@ -27,7 +28,6 @@ TOKEN = re.compile(r"[-+.:0-9A-Za-z_ ()/]{0,64}")  # a date has a blank
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of stamps
 DAY_S = 86400.0  # a phone's clock is no further off
 QUATERNION = ("quaternion{}", "quat{}", "q{}", "rotationvector{}")  # ends of names
-REJOIN = 5  # readings in a row that agree with each other after a jump
 ODD_STAMPS = 50  # stamps in a row out of line that mean the phone's clock was set
 AHEAD_S = 1.0  # a stamp so far ahead of the clock is torn, not early
 ROUNDED = 1 + 1e-5  # full turns in radians are written a little too large
@@ -95,8 +95,7 @@ class StreamParser:
         self._stamp: float | None = None
         self._odd = 0
         self._offset, self._offset_at = math.inf, 0.0  # of the clocks; inf: unknown
-        self._last: Array | None = None
-        self._far: deque[Array] = deque(maxlen=REJOIN)
+        self._gate = JumpGate(angle_between_deg, self._settings.max_jump_deg)
 
     def lines(self, lines: list[bytes], now: float) -> list[Reading]:
         """Readings of CSV lines that arrived at ``now`` (monotonic s)."""
@@ -140,7 +139,8 @@ class StreamParser:
             try:
                 stamp, matrix = parse(record)
                 time = self._time(stamp, now)
-                self._gate(matrix)
+                if self._gate.jumps(matrix):
+                    raise _Dropped("an impossible jump")
                 readings.append(Reading(time, matrix))
                 text = record.decode() if isinstance(record, bytes) else record
                 self.first = self.first or str(text)
@@ -188,8 +188,8 @@ class StreamParser:
             if all(len(columns) == 1 for columns in places):
                 x, y, z, w = (columns[0] for columns in places)
                 self._quaternion, self._width = (x, y, z, w), len(fields)
-                starts = [n.startswith("motiontimestamp") for n in names]
-                stamps = [i for i, starts_so in enumerate(starts) if starts_so]
+                name = "motiontimestamp"
+                stamps = [i for i, n in enumerate(names) if n.startswith(name)]
                 self._stamp_column = stamps[0] if stamps else -1
                 self._unit_s = 1.0 if stamps else None
                 used = [*self._quaternion, *stamps[:1]]
@@ -252,10 +252,8 @@ class StreamParser:
         return seconds, _quaternion(values)
 
     def _time(self, stamp: float | None, now: float) -> float:
-        """When the phone measured, on the computer's clock.
-
-        The least delay seen so far is taken for the clocks' difference, so a record
-        that waited in a buffer is as old as it really is.
+        """When the phone measured, on the computer's clock: the least delay so far is
+        the clocks' difference, so a record that waited in a buffer is as old as it is.
         """
         if stamp is None:
             return now
@@ -266,32 +264,19 @@ class StreamParser:
         if older or AHEAD_S < self._offset - delay < math.inf:
             self._odd += 1
             if self._odd < ODD_STAMPS:
-                raise _Dropped(
-                    "older than the previous reading" if older else "from the future"
-                )
+                why = "older than the previous reading" if older else "from the future"
+                raise _Dropped(why)
             self._offset = math.inf
         self._odd, self._stamp = 0, stamp
         crept = self._offset + CLOCK_CREEP * max(0.0, now - self._offset_at)
         self._offset, self._offset_at = min(delay, crept), now
         return stamp + self._offset
 
-    def _gate(self, matrix: Array) -> None:
-        limit = self._settings.max_jump_deg
-        if self._last is not None and angle_between_deg(self._last, matrix) > limit:
-            if self._far and angle_between_deg(self._far[-1], matrix) > limit:
-                self._far.clear()
-            self._far.append(matrix)
-            if len(self._far) < REJOIN:
-                raise _Dropped("an impossible jump")
-        self._far.clear()
-        self._last = matrix
-
 
 def _orientations(data: Any) -> Iterator[tuple[Any, list[Any]]]:
-    """Stamp and numbers, x y z and mostly w, of each orientation in what an app sent:
-    ``{"rotationVector": {"timestamp": .., "value": [..]}}``, ``{"type":
-    "android.sensor.rotation_vector", "values": [..]}``, ``{"name": "orientation",
-    "values": {"qx": ..}}``, alone, in a list or as a ``payload``."""
+    """Stamp and numbers, x y z and mostly w, of each orientation in what an app sent,
+    alone, in a list or as a ``payload``: ``{"rotationVector": {"timestamp": ..,
+    "value": [..]}}``, ``{"name": "orientation", "values": {"qx": ..}}``."""
     if isinstance(data, list):
         for entry in data:
             yield from _orientations(entry)

@@ -1,11 +1,10 @@
 """Play, dead zone and breakaway of one axis.
 
-Play and dead zone have a fixed plan of PAIRS differences, since each says as much as
-any other. The play comes first, away from where a dead zone may be: the difference of
-the readings at one place that is reached from either side. Then the dead zone, always
-from below, so that the play shifts all alike: the difference of the readings on its two
-sides. Then the breakaway: steps from rest, on in the direction in which the axis came,
-so that no play enters; there every step follows from the last.
+Play and dead zone have a fixed plan of PAIRS differences. The play comes first, away
+from where a dead zone may be: of one place that is reached from either side. Then the
+dead zone, always from below, so that the play shifts all alike: of its two sides. Then
+the breakaway: steps from rest, on in the direction in which the axis came, so that no
+play enters; there every step follows from the last.
 
 Ways are degrees of the axis's commands from where it stood, upwards.
 """
@@ -55,7 +54,6 @@ class Estimate(NamedTuple):
 
     @property
     def width(self) -> float:
-        """Width of the interval."""
         return self.high - self.low
 
 
@@ -65,11 +63,9 @@ class Breakaway:
     def __init__(
         self, cell_deg: float, cells: int, sigma_deg: float, spread_deg: float
     ) -> None:
-        """A uniform belief of ``cells`` of this size for each direction.
-
-        ``sigma_deg``: noise of the difference of the readings before and after a step;
-        ``spread_deg``: standard deviation of a threshold from one test to the next.
-        """
+        """A uniform belief of ``cells`` of this size for each direction; standard
+        deviations ``sigma_deg`` of the difference of the readings before and after a
+        step, ``spread_deg`` of a threshold from one test to the next."""
         self.centres = (np.arange(cells) + 0.5) * cell_deg
         self.edges = np.arange(cells + 1) * cell_deg
         self.steps = np.arange(1, cells) * cell_deg  # (S,) that may be tried
@@ -81,11 +77,9 @@ class Breakaway:
         self.moved = OUTLIERS / 2.0 + (1.0 - OUTLIERS) * moved
 
     def propose(self, limit_deg: float, risk: float) -> tuple[int, int]:
-        """Direction, 0 up or 1 down, and number of the step that tells most.
-
-        Of the steps whose probability to exceed the threshold by more than
-        ``limit_deg`` is at most ``risk``; where there is none, of the least risky.
-        """
+        """Direction, 0 up or 1 down, and number of the step that tells most, of those
+        whose probability to exceed the threshold by more than ``limit_deg`` is at most
+        ``risk``; where there is none, of the least risky."""
         past = self.steps[:, None] - self.centres > limit_deg
         risks = self.weights @ past.T  # (2, S)
         chances = self.weights @ self.moved.T
@@ -112,7 +106,6 @@ class Breakaway:
 
 
 def _entropy(probability: Array) -> Array:
-    """Nats of an outcome that has this probability, or not."""
     return special.entr(probability) + special.entr(1.0 - probability)
 
 
@@ -175,9 +168,8 @@ class Probe:
 
     def read(self, found: Stand) -> float:
         """Commanded degrees along the axis, by the phone."""
-        return float(
-            self.geometry.way(self._base, found.attitude) @ self._line / self._rate
-        )
+        way = self.geometry.way(self._base, found.attitude)
+        return float(way @ self._line / self._rate)
 
     def off(self, label: str, *ways_deg: float) -> float:
         """Reading less command at the last of the ways, degrees of the commands."""
@@ -185,18 +177,13 @@ class Probe:
         return self.read(found) - self.way(found)
 
     def play(self) -> tuple[Estimate, float]:
-        """The play, and the noise of a reading.
-
-        It begins with how far and about what the axis turns the phone, from two moves
-        of one length within which the direction does not change.
-        """
+        """The play, and the noise of a reading: first how far and about what the axis
+        turns the phone, from two moves of one length in one direction each."""
         at, far = BASE_DEG, FAR_DEG
         up = [self.stand("up", at - far, at), self.stand("top", at + far)]
         down = [self.stand("down", at), self.stand("bottom", at - far)]
         self._base = self.geometry.mean([up[0].attitude, down[0].attitude])
-        turns = [
-            self.geometry.way(self._base, stand.attitude) for stand in [*up, *down]
-        ]
+        turns = [self.geometry.way(self._base, s.attitude) for s in [*up, *down]]
         deg = (self.way(up[1]) - self.way(up[0]) + self.way(down[0])) / 2.0
         deg -= self.way(down[1]) / 2.0
         rate = (turns[1] - turns[0] + turns[2] - turns[3]) / 2.0 / deg
@@ -265,9 +252,8 @@ class Probe:
 def characterise(run: Run, device: Device, axis: int) -> None:
     """Measure an axis, say what is found and journal it, in degrees of its commands.
 
-    Raises:
-        Refused: the axis stands too near to a limit; nothing was moved.
-        MotionFault: it does not turn the phone, or has more than is looked for.
+    Refused where it stands too near to a limit, before it moves; MotionFault where it
+    does not turn the phone, or has more than is looked for.
     """
     probe = Probe(run, device, axis)
     play, sigma = probe.play()

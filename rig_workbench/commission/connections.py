@@ -37,7 +37,8 @@ def look_at_phone(site: Site, seconds: float = WATCH_S) -> str:
         geometry = geometry_of(config)
         watch(imu, geometry, seconds, STREAM_WAIT_S, site.say)
         if isinstance(imu, Imu):
-            site.say(f"  it sends {imu.first[:SHOWN]}\n  read as {imu.taken_for}")
+            sent = imu.parser
+            site.say(f"  it sends {sent.first[:SHOWN]}\n  read as {sent.taken_for}")
         return imu.sender
 
 
@@ -58,11 +59,8 @@ def watch(
     wait_s: float,
     say: Callable[[str], None],
 ) -> None:
-    """Wait for an open stream and look at it for so long, telling each second.
-
-    Raises:
-        ReadingError: nothing came, or the stream is not to be trusted.
-    """
+    """Wait for an open stream and look at it for so long, telling each second;
+    ReadingError where nothing comes, or the stream is not to be trusted."""
     start, spent = imu.wait_for_stream(wait_s).time, 0.0
     while spent < seconds:
         time.sleep(min(LOOK_S, seconds - spent))

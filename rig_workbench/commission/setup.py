@@ -18,14 +18,7 @@ from rig.faults import EXIT_OK, Refused
 from rig.journal.device import HOMED, IDENTIFIED, STOP_PROVED, ZEROED
 from rig.prove import steps
 from rig.prove.home import can_home
-from rig.prove.scan import (
-    OF_LINE,
-    Answer,
-    parse_bus,
-    place_of,
-    scan,
-    serial_lines,
-)
+from rig.prove.scan import OF_LINE, Answer, parse_bus, place_of, scan, serial_lines
 from rig.prove.steps import Operator, edit, set_values
 from rig_workbench.commission.connections import look_at_phone
 from rig_workbench.model import joint_names
@@ -65,6 +58,9 @@ OF_READINGS = {  # keys of [readings]
     "serial": ("device", "baudrate"),
     "modbus": ("host", "port"),
 }
+SENSORS = (
+    "tcp:HOST:PORT, listen:PORT, udp:PORT, serial:DEVICE[,BAUD] or modbus:HOST[:PORT]"
+)
 
 
 def axis_kinds(text: str) -> dict[str, str]:
@@ -84,11 +80,7 @@ def axis_kinds(text: str) -> dict[str, str]:
 
 
 def asked(*, axes: str, **given: Any) -> SetupOptions:
-    """What the command line says.
-
-    Raises:
-        Refused: an option is not what it must be.
-    """
+    """What the command line says; Refused where an option is not what it must be."""
     options = {name: value for name, value in given.items() if value}
     if axes:
         options["axes"] = axis_kinds(axes)
@@ -97,10 +89,8 @@ def asked(*, axes: str, **given: Any) -> SetupOptions:
     made = SetupOptions(**options)
     if made.readings and made.imu:
         raise Refused("--imu and --readings: give only one, a phone or a sensor")
-    by_phone = {"X", "Y", "Z"} | ({"deg"} if made.model else set())
-    wrong = [
-        f"{name}:{kind}" for name, kind in made.axes.items() if kind not in by_phone
-    ]
+    by_phone = ("X", "Y", "Z", "deg") if made.model else ("X", "Y", "Z")
+    wrong = [f"{n}:{kind}" for n, kind in made.axes.items() if kind not in by_phone]
     if wrong and not made.readings:
         raise Refused(
             f"--axes {', '.join(wrong)}: a phone measures rotations about X, Y, Z; "
@@ -110,13 +100,9 @@ def asked(*, axes: str, **given: Any) -> SetupOptions:
 
 
 def sensor_of(text: str) -> dict[str, Any]:
-    """Keys of ``[readings]`` of ``tcp:HOST:PORT``, ``listen:PORT``, ``udp:PORT``,
-    ``serial:DEVICE[,BAUD]`` or ``modbus:HOST[:PORT]``."""
+    """Keys of ``[readings]`` of a text as SENSORS."""
     if (sensor := place_of(text, OF_READINGS)) is None:
-        raise Refused(
-            "--readings must be tcp:HOST:PORT, listen:PORT, udp:PORT, "
-            f"serial:DEVICE[,BAUD] or modbus:HOST[:PORT], got {text!r}"
-        )
+        raise Refused(f"--readings must be {SENSORS}, got {text!r}")
     if sensor["transport"] in ("listen", "udp"):
         sensor["host"] = "0.0.0.0"  # every address of this computer
     return sensor
@@ -188,19 +174,16 @@ def write_config(
     source: dict[str, Any]
     if options.readings:
         say("4 sensor")
-        kinds = set(options.axes.values())
         source = {"names": list(options.axes), "sensor": sensor_of(options.readings)}
-        source["unit"] = operator.ask(
-            "unit of the readings", "mm" if "mm" in kinds else "deg"
-        )
+        unit = "mm" if "mm" in options.axes.values() else "deg"
+        source["unit"] = operator.ask("unit of the readings", unit)
         if options.model:
             source |= {"names": ["x", "y", "z"], "unit": "m"}
     else:
         say("4 phone")
         form, _, port = (options.imu or "").partition(":")
-        form = form or operator.choose(
-            f"app of the phone ({', '.join(FORMATS)})", FORMATS, FORMATS[0]
-        )
+        question = f"app of the phone ({', '.join(FORMATS)})"
+        form = form or operator.choose(question, FORMATS, FORMATS[0])
         port = port or operator.ask("TCP port that the phone sends to", "2055")
         source = {"form": form, "port": int(port)}
     values = dict(options.values)
@@ -228,12 +211,10 @@ def new_text(
 
     Args:
         bus: as it was reached.
-        axes: name, kind (X, Y, Z, deg or mm), unit, family, pulses and, of mm, lead of
-            each.
+        axes: name, kind, unit, family, pulses and, of mm, lead of each.
         form, port: of the phone's app, and that it connects to.
         model: URDF file of an arm.
-        numbers: without a phone ``names`` and ``unit`` of what is measured, and
-            ``sensor``, keys of ``[readings]`` that say where it comes from.
+        numbers: without a phone ``names`` and ``unit`` of readings, and ``sensor``.
     """
     keys = OF_LINE[bus.transport] + ("echo",) * bus.echo
     new = template(pathlib.Path(__file__).with_name("new.toml.j2"))
@@ -249,13 +230,12 @@ def _ask_axes(
         usable = {unit: Answer(unit, (options.drives,), {}) for unit in range(1, 7)}
     if len(usable) < len(options.axes):
         unknown = [answer.unit for answer in answers if not answer.families]
+        others = f"; units {unknown} answer, but are of no known family"
         raise Refused(
             f"{len(options.axes)} drives of a known family are needed for "
-            f"{', '.join(options.axes)}; found {len(usable)}"
-            + f"; units {unknown} answer, but are of no known family"
-            * bool(unknown)
-            + ". Check power, wiring, termination, the line format, and that every "
-            "drive has its own unit id; another family needs a map (docs/rig.md)"
+            f"{', '.join(options.axes)}; found {len(usable)}{others * bool(unknown)}. "
+            "Check power, wiring, termination, the line format, and that every drive "
+            "has its own unit id; another family needs a map (docs/rig.md)"
         )
     free, axes = sorted(usable), []
     for name, kind in options.axes.items():
@@ -267,9 +247,8 @@ def _ask_axes(
         if len(answer.families) > 1:
             question = f"unit {unit} could be {' or '.join(answer.families)}: which"
             family = operator.choose(question, list(answer.families), family)
-        pulses = answer.pulses_per_rev or int(
-            operator.number(f"{name}: pulses per motor turn", 10000)
-        )
+        question = f"{name}: pulses per motor turn"
+        pulses = answer.pulses_per_rev or int(operator.number(question, 10000))
         axis = dict(name=name, kind=kind, unit=unit, family=family, pulses=pulses)
         if kind == "mm":
             question = f"{name}: mm per turn of its screw, pulley or pinion"
@@ -299,10 +278,7 @@ def go(site: steps.Site, options: SetupOptions) -> int:
             steps.jog(site, name, way)
         how = "here"
         if can_home(site.config):
-            question = (
-                "here (the device is in its home posture), or drive (each drive runs "
-                "its own homing)"
-            )
+            question = "here (it is in its home posture), or drive (by its own homing)"
             how = operator.choose(question, ["here", "drive"], options.home)
         if code := steps.go_home(site, how == "here"):
             return code

@@ -21,13 +21,7 @@ Points = list[list[Any]]  # (x, y) of one axis
 def charts(
     state: RunState, samples: Sequence[Record], end: float
 ) -> dict[str, dict[str, Any]]:
-    """The plots by their titles.
-
-    Args:
-        state: of the run.
-        samples: of telemetry.
-        end: Unix time at the right edge of those over time.
-    """
+    """The plots by their titles; ``end`` is the Unix time at their right edge."""
     step = max(1, -(-len(samples) // POINTS))
     shown = [s for s in list(samples)[::step] if s["time"] > end - SHOWN_S]
 
@@ -49,16 +43,10 @@ def charts(
     settling = _lines(outputs, over_time("std", len(outputs), 0.001))
     limit = state.setting("settle", "std_deg", None)
     if limit and settling:
-        settling[0]["markLine"] = {
-            "silent": True,
-            "symbol": "none",
-            "lineStyle": {"color": "#d1453b", "type": "dashed"},
-            "label": {
-                "formatter": f"limit {limit:g}{mark}",
-                "position": "insideStartTop",
-            },
-            "data": [{"yAxis": limit}],
-        }
+        text = {"formatter": f"limit {limit:g}{mark}", "position": "insideStartTop"}
+        look = {"color": "#d1453b", "type": "dashed"}
+        line = {"silent": True, "symbol": "none", "lineStyle": look, "label": text}
+        settling[0]["markLine"] = line | {"data": [{"yAxis": limit}]}
     begin = state.drift[0][0] if state.drift else 0.0
     visits: list[Points] = [
         [[(when - begin) / 60, deg[i]] for when, deg in state.drift]

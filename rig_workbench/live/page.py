@@ -76,11 +76,8 @@ class LivePage:
                 self._charts[title] = ui.echart({})
 
     async def tick(self) -> None:
-        """Ten times a second: turn the device; draw anew what has changed.
-
-        A browser that is slower than that is waited for, so that it shows the present
-        less often and not an ever older past.
-        """
+        """Ten times a second: turn the device; draw anew what has changed. A slower
+        browser is waited for: it shows the present, and no ever older past."""
         self._ticks += 1
         self._follow()
         if self.watcher.version != self._version:
@@ -95,12 +92,8 @@ class LivePage:
         sample = watcher.samples[-1] if watcher.running and watcher.samples else {}
         now = watcher.state.present(sample, watcher.running)
         self._device.show(now["measured"], now["commanded"])
-        self._parts["numbers"].set_content(
-            draw(
-                "numbers",
-                rows=view.numbers(now, watcher.running, watcher.state.names),
-            )
-        )
+        rows = view.numbers(now, watcher.running, watcher.state.names)
+        self._parts["numbers"].set_content(draw("numbers", rows=rows))
         self._stream.set_text(view.stream(sample, time.time()))
 
     def _plot(self) -> None:
@@ -121,12 +114,11 @@ class LivePage:
         tone = view.headline(state, watcher.running)[0]
         lines = view.trouble(state, watcher.running, str(watcher.folder))
         result = view.verdict(state, watcher.summary)
+        postures, count = view.queue(state), len(state.postures)
         for name, content in {
             "trouble": draw("trouble", lines=lines),
             "verdict": draw("verdict", lines=result, report=watcher.report),
-            "queue": draw(
-                "queue", postures=view.queue(state), count=len(state.postures)
-            ),
+            "queue": draw("queue", postures=postures, count=count),
             "log": draw("log", lines=state.log),
         }.items():
             part = self._parts[name]

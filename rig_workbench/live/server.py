@@ -40,11 +40,8 @@ HEADERS = {
 
 
 def guarded(app: ASGIApp) -> ASGIApp:
-    """Only requests of the page itself reach it.
-
-    The name by which it is called defeats DNS rebinding. Browsers name the origin of
-    whatever changes anything, and of websockets: another site's are answered 403.
-    """
+    """Only requests of the page itself reach it: the name by which it is called defeats
+    DNS rebinding; what another site's page sends, by its origin, is answered 403."""
 
     async def guard(scope: Scope, receive: Receive, send: Send) -> None:
         async def sent(message: Message) -> None:
@@ -57,23 +54,16 @@ def guarded(app: ASGIApp) -> ASGIApp:
             origin = f"http://{headers['host']}"
             reads = scope.get("method") in ("GET", "HEAD")
             if headers.get("origin", origin if reads else "").lower() != origin.lower():
-                refusal = PlainTextResponse(
-                    "Refused: a request from another site.\n", 403
-                )
-                return await refusal(scope, receive, send)
+                text = "Refused: a request from another site.\n"
+                return await PlainTextResponse(text, 403)(scope, receive, send)
         await app(scope, receive, sent)
 
     return TrustedHostMiddleware(guard, [HOST, "localhost"])
 
 
 def make_app(watcher: Watcher, linger_s: float | None = None) -> FastAPI:
-    """The application, unguarded.
-
-    Args:
-        watcher: of the run that is shown.
-        linger_s: end the server when no session ran and no browser looked for so long;
-            None: never.
-    """
+    """The application, unguarded. The server ends when no session ran and no browser
+    looked for ``linger_s``; None: never."""
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -99,8 +89,7 @@ def make_app(watcher: Watcher, linger_s: float | None = None) -> FastAPI:
     @app.post("/pause")
     async def pause() -> PlainTextResponse:
         watcher.ask(PAUSE)
-        text = "pause requested: the session finishes this posture first"
-        return PlainTextResponse(text)
+        return PlainTextResponse("pause requested: it finishes this posture first")
 
     @app.get("/report")
     async def report() -> FileResponse:

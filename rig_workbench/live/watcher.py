@@ -27,11 +27,8 @@ ASK_S = 0.5  # between two looks at the journal's lock; for a session to say it 
 
 
 class Tail:
-    """Records of a file of JSON lines, each given once; the file may come later.
-
-    A line counts once its end is written. A file that was replaced by a new one is read
-    from its beginning.
-    """
+    """Records of a file of JSON lines that may come later, each given once its end is
+    written; a file that was replaced is read from its beginning."""
 
     def __init__(self, path: pathlib.Path) -> None:
         self.path = path
@@ -76,17 +73,15 @@ class Watcher:
     def poll(self) -> None:
         """Take what is new; the server's loop and a stop's thread both ask."""
         with self._polling:
-            self._poll()
-
-    def _poll(self) -> None:
-        records = self._journal.read()
-        for record in records:
-            self.state.apply(record)
-        self.samples.extend(self._telemetry.read())
-        before, now = self.running, time.monotonic()
-        if records or now - self._asked > ASK_S:
-            self._asked, self.running = now, is_written(self.folder / JOURNAL)
-        if records or self.running != before:
+            records = self._journal.read()
+            for record in records:
+                self.state.apply(record)
+            self.samples.extend(self._telemetry.read())
+            before, now = self.running, time.monotonic()
+            if records or now - self._asked > ASK_S:
+                self._asked, self.running = now, is_written(self.folder / JOURNAL)
+            if not records and self.running == before:
+                return
             self.version += 1
             if self.state.ended is not None:
                 with contextlib.suppress(OSError, ValueError):  # it may have none
@@ -104,11 +99,8 @@ class Watcher:
         return self.running and self.state.host == platform.node()
 
     def ask(self, number: signal.Signals) -> None:
-        """Send the session SIGTERM (stop now) or PAUSE (after this posture).
-
-        Raises:
-            Refused: nothing was sent, and why.
-        """
+        """Send the session SIGTERM (stop now) or PAUSE (after this posture); Refused
+        where nothing was sent, and why."""
         self.poll()
         pid = self.state.pid
         if not self.here or pid is None or not is_written(self.folder / JOURNAL):
@@ -127,10 +119,8 @@ class Watcher:
             ) from None
 
     def stop(self) -> list[UnitStop]:
-        """Ask the session to stop; what the drives say.
-
-        It is waited for what the session says of its drives; where it says nothing,
-        the session is ended and the drives are stopped from here.
+        """Ask the session to stop; what it says of its drives. Where it says nothing,
+        it is ended and the drives are stopped from here.
 
         Raises:
             Refused: nothing was sent. Fault: no drive was told to stop.

@@ -1,10 +1,9 @@
 """A calibration's inverse map in the languages of controllers.
 
 C and Structured Text compute the same: a desired posture to commands in degrees and
-pulses; beyond the limits the command within them whose posture is nearest, as
-`command_for(..., clip=True)`, with a status of one bit for each axis that is held at a
-limit. An input that is not a finite number sets the status and nothing else, so that
-the caller keeps its last command. JSON and ROS parameters hold the numbers.
+pulses; beyond the limits as `command_for(..., clip=True)`, with a status of one bit for
+each axis that is held at a limit. An input that is not a finite number sets the status
+and nothing else. JSON and ROS parameters hold the numbers.
 """
 
 from __future__ import annotations
@@ -32,18 +31,12 @@ NAME = re.compile("[a-z][a-z0-9_]{0,39}")
 
 
 def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
-    """The inverse map of the calibration in a run's folder, and its journal's records.
+    """The inverse map of the calibration in a run's folder, and its journal's records;
+    Refused where it holds none, or A does not determine a command.
 
-    Returns:
-        matrix (n, m) M, the inverse of A or, where m > n, what comes nearest, and
-        offset_deg (n,) c = -M b; min_deg, max_deg (n,) soft limits of the commands, the
-        same in pulses, pulses_per_deg (n,) signed; forward (m, n + 1) [A | b] and
-        half_widths, 95 % of all of them at once; follow (2 ** n, n, n) of each set of
-        held axes; run, created; device, its fingerprint as keys of rig.toml; warnings;
-        axes, outputs and their units; checksum.
-
-    Raises:
-        Refused: it holds none, or A does not determine a command.
+    matrix (n, m) M, the (pseudo-)inverse of A; offset_deg (n,) c = -M b; soft limits
+    (n,) in degrees and pulses; pulses_per_deg (n,) signed; forward (m, n + 1) [A | b]
+    and half_widths, 95 % of all at once; follow (2 ** n, n, n); device: fingerprint.
     """
     if model := records[0]["config"].get("model"):
         use = "calibrated.urdf in its folder" if model["urdf"] else "calibration.json"
@@ -108,11 +101,8 @@ def _calibrated(folder: pathlib.Path) -> tuple[Any, Array, dict[str, Any]]:
 
 
 def _inverse(matrix: Array) -> Array:
-    """(n, m) of (m, n) A: what gives the command whose measurement is nearest.
-
-    Raises:
-        ValueError: several commands give the same.
-    """
+    """(n, m) of (m, n) A: what gives the command whose measurement is nearest;
+    ValueError where several give the same."""
     if np.linalg.matrix_rank(matrix) < matrix.shape[1]:
         raise ValueError(
             f"{matrix.shape[0]} measurements do not determine {matrix.shape[1]} "
@@ -125,14 +115,9 @@ def follow(matrix: Array) -> Array:
     """How free axes follow those that are held at a limit, for the nearest posture.
 
     The nearest posture |A (u - free)| over the free axes F of u, where the others H are
-    given, has (u - free)_F = -pinv(A_F) A_H (u - free)_H.
-
-    Args:
-        matrix: (m, n) A, of rank n.
-
-    Returns:
-        (2 ** n, n, n): for the set of held axes with bit 1 << j of each, degrees of
-        axis i for a degree of axis j; zero but for a free i and a held j.
+    given, has (u - free)_F = -pinv(A_F) A_H (u - free)_H. Of (m, n) A of rank n
+    (2 ** n, n, n): for the set of held axes with bit 1 << j of each, degrees of a free
+    axis i for a degree of a held axis j; else zero.
     """
     count = matrix.shape[1]
     by = np.zeros((2**count, count, count))
@@ -145,10 +130,8 @@ def follow(matrix: Array) -> Array:
 
 
 def checksum(inverse: dict[str, Any]) -> str:
-    """SHA-256 of the numbers that make the map, in the order of NUMBERS.
-
-    Each as Python's repr of a float, one a line.
-    """
+    """SHA-256 of the map's numbers in the order of NUMBERS, each as Python's repr of a
+    float, one a line."""
     values = np.concatenate([np.ravel(inverse[name]) for name in NUMBERS])
     text = "\n".join(map(repr, values.astype(float).tolist()))
     return hashlib.sha256(text.encode()).hexdigest()

@@ -44,10 +44,8 @@ def write_report(folder: pathlib.Path, records: list[Record]) -> pathlib.Path:
     intro = [Text(f"{made}."), Text(f"{headline(state, running)[1]}.")]
     intro += [Text(f"{text}.", "warning") for text in told]
     sections = [*_result(state, summary), _measured(state, records)]
-    rows = [
-        [f"{datetime.datetime.fromtimestamp(when):%H:%M:%S}", line]
-        for when, line in state.log
-    ]
+    time_of = datetime.datetime.fromtimestamp
+    rows = [[f"{time_of(when):%H:%M:%S}", line] for when, line in state.log]
     table = Table(["", ""], rows, numeric=False)
     sections.append(Section("What happened", [table]))
     path, kind = folder / "report.html", str(start["mode"])
@@ -94,13 +92,11 @@ def _result(state: RunState, summary: Record) -> list[Section]:
 
 def _matrix(summary: Record, outputs: Sequence[str], title: str) -> Table:
     """A and b, each with its half-width."""
+    values, wide = np.column_stack([summary["A"], summary["b"]]), summary["ci95"]
     rows = [
-        [name, *(f"{value:.5f} ± {wide:.5f}" for value, wide in zip(a, w, strict=True))]
-        for name, a, w in zip(
-            outputs, np.column_stack([summary["A"], summary["b"]]), summary["ci95"],
-            strict=True,
-        )
-    ]  # fmt: skip
+        [name, *(f"{a:.5f} ± {w:.5f}" for a, w in zip(*row, strict=True))]
+        for name, *row in zip(outputs, values, wide, strict=True)
+    ]
     return Table(["", *(f"u {name}" for name in summary["axes"]), "b"], rows, title)
 
 

@@ -36,13 +36,11 @@ class DeviceHistory:
 
 
 def read_runs(folder: pathlib.Path) -> tuple[list[DeviceHistory], list[str]]:
-    """The devices with finished calibrations and verifications under a folder.
+    """The devices with finished calibrations and verifications under a folder, and a
+    line for each journal that could not be read.
 
     Runs of different device fingerprints are never compared. A refit stands at the time
     at which its run was measured.
-
-    Returns:
-        The devices, and a line for each journal that could not be read.
     """
     runs_of_device: dict[str, list[Record]] = {}
     skipped = []
@@ -72,10 +70,9 @@ def _device(runs: list[Record]) -> DeviceHistory:
     for run in sorted(runs, key=lambda run: run["time"]):
         moved, error = "", "not measured"
         if "A" in run or "parameters" in run:
-            before = device.calibrations[-1:]
-            moved = (
-                (", ".join(_moved(before[0], run)) or "nothing") if before else "first"
-            )
+            moved = "first"
+            if device.calibrations:
+                moved = ", ".join(_moved(device.calibrations[-1], run)) or "nothing"
             device.calibrations.append(run)
         if "prediction" in run:
             _, worst = held_out(run)

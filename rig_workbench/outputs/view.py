@@ -8,12 +8,7 @@ from typing import Any
 
 from rig.core.stop import UnitStop
 from rig.faults import EXIT_RECALIBRATE
-from rig.outputs.messages import (
-    error_text,
-    event_lines,
-    prediction_text,
-    summary_lines,
-)
+from rig.outputs.messages import error_text, event_lines, prediction_text, summary_lines
 from rig.outputs.run_state import ACTIVE, SESSIONS, PostureState, Record, RunState
 from rig.parts import PLACES
 
@@ -100,12 +95,8 @@ def trouble(state: RunState, running: bool, folder: str) -> list[str]:
 def numbers(
     now: dict[str, Any], running: bool, names: tuple[list[str], list[str]]
 ) -> list[tuple[str, ...]]:
-    """A row for each axis or measurement: commanded, drive, measured, difference,
-    scatter; of an axis and a measurement of one name in one row.
-
-    After a run the last posture is shown, and no difference: it is of a command that
-    was not compensated, beside drives that are at rest.
-    """
+    """A row for each name of an axis or measurement: commanded, drive, measured,
+    difference (none after a run, whose drives are at rest), scatter."""
     axes, outputs = names
     columns = [
         dict(zip(of, now[what] or [None] * len(of), strict=True))

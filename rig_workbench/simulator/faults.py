@@ -66,9 +66,8 @@ def parse_fault(text: str, names: Sequence[str] = AXIS_NAMES) -> FaultSpec:
     if kind not in KINDS:
         raise ValueError(f"unknown fault {kind!r}; there are {', '.join(KINDS)}")
     fields: dict[str, Any] = {}
-    readers: dict[str, Any] = {"count": int, "seconds": float, "share": float}
-    readers["factor"] = float
-    readers["axis"] = list(names).index
+    readers: dict[str, Any] = {"count": int, "axis": list(names).index}
+    readers |= dict.fromkeys(("seconds", "share", "factor"), float)
     try:
         if when:
             fields["phase"] = PHASES[PHASES.index(when)]
@@ -117,15 +116,12 @@ class FaultInjector:
         now = time.monotonic()
         with self._lock:
             for spec in self._specs:
-                if spec.kind != kind or (
-                    axis is not None and spec.axis not in (None, axis)
-                ):
+                hits = axis is None or spec.axis in (None, axis)
+                if spec.kind != kind or not hits or spec.begun is None:
                     continue
                 # Of these the seconds are those of each event.
-                lasts = spec.seconds if kind not in OF_EVENT else None
-                over = spec.begun is None or (
-                    lasts is not None and now > spec.begun + lasts
-                )
+                lasts = None if kind in OF_EVENT else spec.seconds
+                over = lasts is not None and now > spec.begun + lasts
                 if spec.count > 0 and not over:
                     spec.count -= 1
                     return spec

@@ -23,6 +23,7 @@ AGAIN_S = 0.05  # before it connects again
 INTRUSION_S = 0.15  # that another sender is heard, where it is let
 BATCH = 5  # readings that Sensor Logger pushes at once
 HEADER = b"loggingTime(txt)" + b"".join(b",motionQuaternion%c(R)" % c for c in b"XYZW")
+QUATERNION = ("qx", "qy", "qz", "qw")
 SAMPLED = "2026-11-27 19:05:11.000 +0000"
 
 
@@ -174,11 +175,10 @@ class Phone(Sender):
         if self._take("imu_radians"):
             s = s.model_copy(update={"unit": "rad"})
         fields = format_line(s, self._frozen, time.time(), order).split(s.separator)
-        if s.format in ("json", "sensorlog"):  # faults of columns are of others
-            return self._garbled(s.separator.join(fields).encode() + b"\r\n")
-        if self._take("imu_nan"):
+        by_column = s.format not in ("json", "sensorlog")
+        if by_column and self._take("imu_nan"):
             fields[(s.quaternion_columns or s.columns)[0]] = "NaN"
-        if self._take("imu_columns"):
+        if by_column and self._take("imu_columns"):
             fields.append("1.0")
         return self._garbled(s.separator.join(fields).encode() + b"\r\n")
 
@@ -186,11 +186,8 @@ class Phone(Sender):
         if not self._take("imu_garbage"):
             return data
         cut = self._random.randrange(len(data))
-        return (
-            data[:cut]
-            + self._random.randbytes(self._random.randint(1, 40))
-            + data[cut:]
-        )
+        noise = self._random.randbytes(self._random.randint(1, 40))
+        return data[:cut] + noise + data[cut:]
 
     def _push(self) -> None:
         connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=2.0)
@@ -203,9 +200,7 @@ class Phone(Sender):
                 for _ in range(BATCH):
                     q = Rotation.from_matrix(self._attitude()).as_quat()
                     q = q * np.nan if self._take("imu_nan") else q
-                    values = dict(
-                        zip(("qx", "qy", "qz", "qw"), q.tolist(), strict=True)
-                    )
+                    values = dict(zip(QUATERNION, q.tolist(), strict=True))
                     stamped = {"name": "orientation", "time": time.time_ns()}
                     payload.append(stamped | {"values": values})
                     self._closing.wait(self._period)
@@ -249,10 +244,9 @@ class SimSensor(Sender):
             factors = s.factors or (1.0,) * len(s.names)
             columns = s.columns or tuple(range(len(s.names)))
             fields = ["0"] * (1 + max(columns))
-            for column, value, factor in zip(
-                columns, self._numbers(), factors, strict=True
-            ):
-                fields[column] = f"{value / factor:.9g}"
+            values = np.divide(self._numbers(), factors)
+            for column, value in zip(columns, values, strict=True):
+                fields[column] = f"{value:.9g}"
             self._frozen = (s.separator.join(fields) + "\r\n").encode()
         if self._take("imu_garbage"):
             return b"?\0" + self._frozen

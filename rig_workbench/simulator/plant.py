@@ -64,11 +64,9 @@ class Plant:
         self._geared[axis] = before * factor, offset + before * (1.0 - factor) * at
 
     def joints(self) -> Array:
-        """(n,) joint angles in degrees now, or (m,) of an affine device's numbers.
-
+        """(n,) joint angles in degrees now, or (m,) of an affine device's numbers:
         ``A u + b`` behind the play, the friction (a joint at rest stays until its drive
-        is ``breakaway_deg`` away, then follows it until that stands) and the dead zone.
-        """
+        is ``breakaway_deg`` away, then follows until it stands) and the dead zone."""
         for drive in self._drives:
             drive.advance()
         for axis in range(len(self._drives)):

@@ -143,10 +143,8 @@ class ModbusServer:
                 dead = faults.take("dead_drive", self._axis[unit_id])
                 if drive.map.broadcast_stop and not dead:
                     self._execute(drive, pdu, broadcast=True)
-        axis = self._axis.get(unit)
-        if axis is None or any(
-            faults.take(kind, axis) for kind in ("dead_drive", "lost_request")
-        ):
+        axis, silent = self._axis.get(unit), ("dead_drive", "lost_request")
+        if axis is None or any(faults.take(kind, axis) for kind in silent):
             return None
         if self._spoils(axis):  # some drives say that the CRC was wrong, most nothing
             wrong_crc = (b"", bytes([function | 0x80, 8]), False)
@@ -185,9 +183,8 @@ class ModbusServer:
                     address, count, size = struct.unpack(">HHB", data[:5])
                     if size != 2 * count or len(data) != 5 + size:
                         raise DriveException(3)
-                    drive.write(
-                        address, [*struct.unpack(f">{count}H", data[5:])], broadcast
-                    )
+                    words = [*struct.unpack(f">{count}H", data[5:])]
+                    drive.write(address, words, broadcast)
                     return pdu[:5]
                 raise DriveException(1)
         except DriveException as error:

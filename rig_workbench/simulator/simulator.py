@@ -32,10 +32,9 @@ class Simulator:
         self.faults = FaultInjector(faults)
         self.transport = transport
         self.drives: list[SimDrive] = []
+        here = config.session.zero == "here"
         for number, axis in enumerate(config.axes):
-            at_deg = 0.0
-            if config.session.zero == "here":
-                at_deg = float(self.truth.jig_deg[number])
+            at_deg = float(self.truth.jig_deg[number]) if here else 0.0
             drive = SimDrive(axis, number, self.truth, self.faults, speedup, at_deg)
             drive.power_cycle(self.truth.lost_origin_deg[number])
             self.drives.append(drive)

@@ -14,11 +14,8 @@ from rig_workbench.model import model_of
 
 @dataclasses.dataclass(frozen=True)
 class Truth:
-    """What a calibration should find, and what disturbs it.
-
-    The defaults are the set values of the paper's Table 1 (pitch, yaw, roll) with a
-    little cross-coupling; ``of_axes`` has those of other numbers.
-    """
+    """The defaults are the set values of the paper's Table 1 (pitch, yaw, roll) with a
+    little cross-coupling; ``of_axes`` has those of other numbers."""
 
     matrix: tuple[tuple[float, ...], ...] = (
         (0.43, 0.012, -0.008),
@@ -101,11 +98,8 @@ REALISTIC: dict[str, Any] = {
 
 
 def truth_of(options: dict[str, Any], config: RigConfig) -> Truth:
-    """The simulated device that the options of a command line describe.
-
-    Raises:
-        ValueError: ``swapped`` or ``reversed`` names no axes of the device.
-    """
+    """The simulated device that the options of a command line describe; ValueError
+    where ``swapped`` or ``reversed`` names no axes of it."""
     names = config.axis_names
     order = list(range(len(names)))
     for key in ("swapped", "reversed"):
