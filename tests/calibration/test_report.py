@@ -13,8 +13,7 @@ import pytest
 import jaxcal
 from jaxcal.commands import main
 from jaxcal.models.verdict import left_out
-from jaxcal.reports.calibration import SCHEMA, moved
-from jaxcal.reports.calibration_page import leverage
+from jaxcal.reports.calibration import SCHEMA, leverage, moved
 
 
 def table(path, rng, gain=0.71, rows=9):

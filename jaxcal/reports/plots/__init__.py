@@ -6,14 +6,16 @@
 from jaxcal.extras import needs
 
 with needs("plots", "jaxcal.reports.plots"):
-    from jaxcal.reports.plots.curves import (
+    from jaxcal.reports.plots.drawings import (
         before_after,
+        ellipsoid,
         pareto,
         plan,
+        postures,
         residuals,
         scenarios,
+        selection,
     )
-    from jaxcal.reports.plots.scatter import ellipsoid, postures, selection
     from jaxcal.reports.plots.style import as_bytes
 
 __all__ = [
