@@ -37,7 +37,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcal.commands.train_solvers import teacher
+from jaxcal.commands.train_configuration import teacher
 from jaxcal.extras import versions
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.information.regression import log_det_information

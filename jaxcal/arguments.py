@@ -29,7 +29,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 from jaxcal.checks import nearest
-from jaxcal.extras import typed
+from jaxcal.extras import MissingExtraError, typed
 
 T = TypeVar("T")
 _METAVARS = {int: "N", float: "X", pathlib.Path: "FILE"}
@@ -281,22 +281,23 @@ def outdated(program: str, old: str, new: str) -> None:
     print(f"{program}: {text}", file=sys.stderr)
 
 
-def unread() -> int:
-    """0: the reader of a pipe, such as head, has left."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return 0
-
-
-def exit_code(command: Callable[[], None], program: str, interrupted: str) -> int:
-    """Run a command: 0; 2 where something given is bad, 130 where it is interrupted."""
+def exit_code(
+    command: Callable[[], int | None], program: str, interrupted: str = ""
+) -> int:
+    """Run a command: what it returns or 0; 2 where something given is bad, 130 where it
+    is interrupted, 143 where terminated; ``interrupted`` says what was kept."""
     try:
-        command()
-    except KeyboardInterrupt:
-        print(f"{program}: interrupted; {interrupted}", file=sys.stderr)
-        return 130
-    except (ValueError, OSError) as error:
+        return command() or 0
+    except KeyboardInterrupt as stop:
+        how = str(stop) or "interrupted"
+        more = f", {interrupted}" if interrupted else ""
+        print(f"{program}: {how}{more}", file=sys.stderr)
+        return 143 if how == "terminated" else 130
+    except BrokenPipeError:  # the reader of a pipe, such as head, has left
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (ValueError, OSError, MissingExtraError) as error:
         return refused(program, error)
-    return 0
 
 
 def number_type(

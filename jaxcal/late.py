@@ -17,9 +17,6 @@ class late:
     def __init__(self, path: str) -> None:
         self.path = path
 
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
-
     @functools.cached_property
     def function(self) -> Callable[..., Any]:
         """The function, its module loaded."""

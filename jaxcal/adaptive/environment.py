@@ -9,9 +9,14 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcal.adaptive.policy.features import NUM_FEATURES, Shortlist
-from jaxcal.adaptive.policy.network import Correction
-from jaxcal.adaptive.policy.sessions import Exercise, Sessions, State
+from jaxcal.adaptive.policy.network import (
+    NUM_FEATURES,
+    Correction,
+    Exercise,
+    Sessions,
+    Shortlist,
+    State,
+)
 from jaxcal.adaptive.rules import SHARES, Rule
 from jaxcal.learning.environments.functional import FunctionalEnv
 

@@ -56,7 +56,6 @@ def play(task: SequentialTask, decider: Decider, keys: jax.Array) -> Episodes:
 
 @jit_by_class
 def _played(task: SequentialTask, decider: Decider, keys: jax.Array) -> Episodes:
-    """Sessions played at once."""
     key_truth, key_begin, key_steps = jax.vmap(
         lambda key: jax.random.split(key, 3), out_axes=1
     )(keys)

@@ -19,11 +19,11 @@ from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.policy import training as policies
 from jaxcal.adaptive.rules import (
     SHARES,
-    CostRule,
     Gain,
     GainRate,
     Priced,
     Random,
+    Rule,
     StateRule,
 )
 from jaxcal.adaptive.session import jit_by_class
@@ -74,7 +74,7 @@ class DeciderEvaluation(Evaluation):
     options: Mapping[str, Any]
     results: tuple[DeciderResult, ...]
     rival: str  # the method that the others are compared with in pairs
-    rules: Mapping[str, CostRule]
+    rules: Mapping[str, Rule]
     outside: tuple[str, ...]  # sizes beyond those that ``ahead`` was measured on
 
     def __getitem__(self, method: str) -> DeciderResult:
@@ -230,7 +230,7 @@ def _rules(
     retune: bool,
     seed: int,
     progress: Progress,
-) -> dict[str, CostRule]:
+) -> dict[str, Rule]:
     """Priced rules: as they ship with the task, or tuned on it now."""
     rules = {}
     for name in needed:
@@ -281,3 +281,26 @@ def seconds_a_choice(task: Any, decider: Any, seed: int) -> float:
             passes += 1
         best = min(best, (time.process_time() - begun) / passes / count)
     return best
+
+
+def decider_figures(evaluation: DeciderEvaluation) -> dict[str, Any]:
+    """Mean nats by method, and less those of the rival in pairs, 95 % intervals."""
+    from jaxcal.evaluation.figures import intervals, styles_of
+    from jaxcal.reports.plots.style import GREY, panels
+
+    results, rival = evaluation.results, evaluation.rival
+    names = [result.method for result in results]
+    size = (9.0, 0.9 + 0.42 * len(names))
+    figure, axes_pair = panels(size, shape=(1, 2))
+    nats_of = [result.values[:, 0] for result in results]
+    less = [evaluation.less(result)[:, 0] for result in results]
+    for axes, samples in zip(axes_pair, (nats_of, less), strict=True):
+        ends = []
+        for values in samples:
+            half = 1.96 * values.std(ddof=1) / np.sqrt(len(values))
+            ends.append(values.mean() + np.array([-half, 0.0, half]))
+        intervals(axes, names, ends, styles_of(results))
+    axes_pair[0].set_xlabel("information gained in a session (nats)")
+    axes_pair[1].set_xlabel(f"paired difference to {rival} (nats)")
+    axes_pair[1].axvline(0.0, color=GREY, linestyle="--", zorder=0)
+    return {"sequential": figure}

@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.journal import fingerprint
 from jaxcal.adaptive.lookahead import AHEAD, Ahead, tree
 from jaxcal.adaptive.rules import SHARES, Shares
 from jaxcal.adaptive.search_kernel import NODE, SUM
+from jaxcal.adaptive.session import fingerprint
 from jaxcal.adaptive.tuning import search
 
 Array = NDArray[np.float32]

@@ -1,10 +1,10 @@
-"""What was measured so far, checked entry by entry, and the belief that follows."""
+"""Checks of what was measured, entry by entry, and the belief that follows."""
 
 from __future__ import annotations
 
 import operator
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -25,13 +25,7 @@ _NEAR = 1e-5  # of a coordinate's range: tolerance for coordinates of a design
 def begin(
     task: SequentialTask, seconds: float | None, uses: int | None, seed: int
 ) -> tuple[Any, Session]:
-    """The belief and the session at the start, with this budget.
-
-    Args:
-        task: what is measured.
-        seconds: of the session; the task's when not given.
-        uses: that end the session; the task's when not given.
-        seed: of whatever the task draws.
+    """The belief and the session at the start; a budget of None is the task's.
 
     Raises:
         ValueError: a budget is not given and the task draws it at random.
@@ -77,46 +71,16 @@ def step_keys(seed: int, number: int) -> StepKeys:
     return StepKeys(*jax.random.split(key, 4))
 
 
-def replay(
-    task: SequentialTask, history: History, belief: Any, session: Session, seed: int
-) -> tuple[Any, Session, list[tuple[Any, Any]]]:
-    """Belief and session after a history, and its entries as the task has them.
+class State(Protocol):
+    """A session and what is known in it; a ``Loop``."""
 
-    Raises:
-        ValueError: naming the entry, from 0: a design or an outcome that the task does
-            not have, an outcome that cannot follow what was measured before, or an
-            entry after the budget was spent.
-    """
-    entries = []
-    for number, entry in enumerate(history):
-        where = f"history[{number}]"
-        try:
-            design, outcome = entry
-        except (TypeError, ValueError):
-            raise ValueError(
-                f"{where} must be a pair (design, outcome), got {entry!r}"
-            ) from None
-        if bool(session.spent):
-            raise ValueError(
-                f"{where} was measured after the budget was used up: {_left(session)}"
-            )
-        entries.append(checked_entry(task, belief, session, design, outcome, where))
-        key = step_keys(seed, number).update
-        belief, session = after(task, belief, session, *entries[-1], key)
-        if any(np.isnan(leaf).any() for leaf in jax.tree.leaves(belief)):
-            raise ValueError(
-                f"{where}: outcome {outcome!r} is impossible after the earlier ones"
-            )
-    return belief, session, entries
+    task: SequentialTask
+    belief: Any
+    session: Session
 
 
 def checked_entry(
-    task: SequentialTask,
-    belief: Any,
-    session: Session,
-    design: Any,
-    outcome: Any,
-    where: str,
+    state: State, design: Any, outcome: Any, where: str
 ) -> tuple[Any, Any]:
     """Design and outcome as the task has them, of a measurement that can be paid.
 
@@ -126,26 +90,19 @@ def checked_entry(
     Raises:
         ValueError: naming the entry, the rule and the value.
     """
-    table = getattr(task, "designs", None)
+    table = getattr(state.task, "designs", None)
     if table is not None:
-        at = _index(np.asarray(table, np.float64), design, f"{where}: design")
-        design = jnp.int32(at)
+        index = _index(np.asarray(table, np.float64), design, f"{where}: design")
+        design = jnp.int32(index)
     else:
-        design = _as_designs(task, belief, session, design, f"{where}: design")
-    if isinstance(task, GridTask):
-        return design, _row_outcome(task, belief, session, design, outcome, where)
-    return design, _answer(belief, design, outcome, where)
+        design = _as_designs(state, design, f"{where}: design")
+    of_kind = _of_table if isinstance(state.task, GridTask) else _of_particles
+    return design, of_kind(state, design, outcome, where)
 
 
-def _row_outcome(
-    task: GridTask,
-    belief: Any,
-    session: Session,
-    design: jax.Array,
-    outcome: Any,
-    where: str,
-) -> jax.Array:
+def _of_table(state: Any, design: jax.Array, outcome: Any, where: str) -> jax.Array:
     """Outcome of a design of a table, which the budget must have paid."""
+    task, session = state.task, state.session
     count = task.likelihood.shape[1]
     index = _whole(outcome)
     if index is None or not 0 <= index < count:
@@ -153,7 +110,7 @@ def _row_outcome(
             f"{where}: outcome must be a whole number in [0, {count}), got {outcome!r}"
         )
     likelihood = np.asarray(task.likelihood[design, index], np.float64)
-    if not (likelihood * np.asarray(belief.weights, np.float64)).sum() > 0.0:
+    if not (likelihood * np.asarray(state.belief.weights, np.float64)).sum() > 0.0:
         raise ValueError(
             f"{where}: outcome {index} of design "
             f"{in_words(np.asarray(task.designs[design], np.float64))} is impossible "
@@ -163,16 +120,15 @@ def _row_outcome(
         cost = task.travel[session.place, design] + task.most_extra[design]
         raise ValueError(
             f"{where} takes up to {float(cost):.6g} s and "
-            f"{int(task.most_uses[design])} uses: {_left(session)}; tasks with "
+            f"{int(task.most_uses[design])} uses: {what_is_left(session)}; tasks with "
             "overrun=True may exceed the budget"
         )
     return jnp.int32(index)
 
 
-def _answer(belief: Any, design: Any, outcome: Any, where: str) -> jax.Array:
-    """Outcome that a particle of the belief can give."""
-    shape = outcome_shape(belief.model)
-    values = array_of(f"{where}: outcome", outcome, *shape)
+def _of_particles(state: State, design: Any, outcome: Any, where: str) -> jax.Array:
+    belief = state.belief
+    values = array_of(f"{where}: outcome", outcome, *outcome_shape(belief.model))
     answer = jnp.asarray(values, jnp.float32)
     support = belief.model.support
     if support is not None and not (answer == support).any():
@@ -207,15 +163,13 @@ def after(
 _can_answer = jit_by_class(ParticleBelief.can_answer)
 
 
-def _as_designs(
-    task: SequentialTask, belief: Any, session: Session, design: Any, where: str
-) -> Any:
+def _as_designs(state: State, design: Any, where: str) -> Any:
     """A design in the structure, the shapes and the types of the task's options."""
 
     def typed(leaf: Any, values: Any) -> jax.Array:
         return jnp.asarray(array_of(where, values, *leaf.shape[1:]), leaf.dtype)
 
-    like = _like(task, belief, session)
+    like = _like(state)
     try:
         jax.tree.structure(like).flatten_up_to(design)  # type: ignore[attr-defined]  # jaxlib
     except ValueError:
@@ -226,16 +180,15 @@ def _as_designs(
     return jax.tree.map(typed, like, design)
 
 
-def from_leaves(
-    task: SequentialTask, belief: Any, session: Session, leaves: list[Any]
-) -> Any:
+def from_leaves(state: State, leaves: list[Any]) -> Any:
     """A design from the list of its leaves, as a journal has it."""
-    return jax.tree.unflatten(jax.tree.structure(_like(task, belief, session)), leaves)
+    return jax.tree.unflatten(jax.tree.structure(_like(state)), leaves)
 
 
-def _like(task: SequentialTask, belief: Any, session: Session) -> Any:
+def _like(state: State) -> Any:
     """Shapes and types of the task's options, leaves (A, ...)."""
-    return jax.eval_shape(task.options, belief, session, jax.random.key(0)).designs
+    now = state.belief, state.session, jax.random.key(0)
+    return jax.eval_shape(state.task.options, *now).designs
 
 
 def _index(table: NDArray[np.float64], design: Any, where: str) -> int:
@@ -273,5 +226,5 @@ def _whole(value: Any) -> int | None:
         return None
 
 
-def _left(session: Session) -> str:
+def what_is_left(session: Session) -> str:
     return f"{float(session.seconds):.6g} s and {int(session.uses)} uses were left"

@@ -11,10 +11,9 @@ import numpy as np
 from flax import struct
 
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.host import on_host
 from jaxcal.adaptive.rules import SHARES, Shares
 from jaxcal.adaptive.search_kernel import Tree
-from jaxcal.adaptive.session import Options, Session
+from jaxcal.adaptive.session import Options, Session, on_host
 
 
 @struct.dataclass

@@ -20,16 +20,23 @@ from jaxcal.adaptive.history import (
     begin,
     checked_entry,
     from_leaves,
-    replay,
     step_keys,
+    what_is_left,
 )
-from jaxcal.adaptive.journal import fingerprint, open_journal
 from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.particles import ParticleBelief
 from jaxcal.adaptive.rules import Gain
-from jaxcal.adaptive.session import Decider, SequentialTask, Session, jit_by_class
+from jaxcal.adaptive.session import (
+    Decider,
+    SequentialTask,
+    Session,
+    fingerprint,
+    jit_by_class,
+)
 from jaxcal.checks import Array
+from jaxcal.jsonlines import JsonLines, Record
 
+_KIND = "jaxcal adaptive session"  # of a journal
 _DRAWS = 32  # of the gain that is told, which a single one leaves uncertain by a third
 
 
@@ -46,15 +53,6 @@ class Proposal:
     belief: Any
     session: Session  # what is left
     outside: tuple[str, ...]  # ``fit_ahead.outside``; empty where a decider was given
-
-
-@dataclasses.dataclass(frozen=True)
-class SessionResult:
-    """A session that has ended."""
-
-    history: list[tuple[Any, Any]]  # (design, outcome)
-    belief: Any
-    session: Session
 
 
 def next_measurement(
@@ -82,11 +80,9 @@ def next_measurement(
     Raises:
         ValueError: an entry of the history that cannot be, by its number.
     """
-    belief, session = begin(task, seconds, uses, seed)
-    beyond = outside(task) if decider is None else ()
-    decider = _default(task, session) if decider is None else decider
-    belief, session, _ = replay(task, history, belief, session, seed)
-    return _proposal(task, decider, belief, session, seed, beyond)
+    with Loop(task, decider, seconds=seconds, uses=uses, seed=seed) as loop:
+        loop.follow(history)
+        return loop.suggest()
 
 
 def run(
@@ -98,8 +94,8 @@ def run(
     seconds: float | None = None,
     uses: int | None = None,
     seed: int = 0,
-) -> SessionResult:
-    """Propose, measure, update, until the budget is spent.
+) -> Loop:
+    """Propose, measure, update, until the budget is spent; the loop at its end.
 
     Args:
         task, decider, seconds, uses, seed: as in ``next_measurement``.
@@ -118,18 +114,15 @@ def run(
         while True:
             proposal = loop.suggest()
             if proposal.design is None:
-                return SessionResult(loop.history, loop.belief, loop.session)
+                return loop
             loop.observed(measure(proposal))
 
 
 class Loop:
-    """A session step by step, for a program that has its own loop; see ``run``.
+    """A session step by step, for a program that has its own loop.
 
-    Args:
-        task, decider, journal, seconds, uses, seed: as of ``run``.
-
-    Raises:
-        ValueError: as ``run``.
+    It holds ``history``, pairs (design, outcome), ``belief`` and ``session``. Arguments
+    and errors are those of ``run``.
     """
 
     def __init__(
@@ -143,40 +136,90 @@ class Loop:
         seed: int = 0,
     ) -> None:
         self.task, self._seed = task, seed
-        belief, session = begin(task, seconds, uses, seed)
-        budget = float(session.seconds)
+        self.belief, self.session = begin(task, seconds, uses, seed)
+        self.history: list[tuple[Any, Any]] = []
+        budget = float(self.session.seconds)
         header = {
             "task": fingerprint(task),
             "decider": fingerprint(decider),
             "seconds": budget if math.isfinite(budget) else "no limit",
-            "uses": int(session.uses),
+            "uses": int(self.session.uses),
             "seed": seed,
         }
         self._outside = outside(task) if decider is None else ()
-        self._decider = _default(task, session) if decider is None else decider
-        self._journal = None if journal is None else open_journal(journal, header)
+        self._decider = _default(task, self.session) if decider is None else decider
+        self._proposal: Proposal | None = None
+        self._journal = None if journal is None else _opened(journal, header)
+        lines = [] if self._journal is None else self._journal.records[1:]
         try:
-            lines = [] if self._journal is None else self._journal.records[1:]
-            made = [
-                (from_leaves(task, belief, session, line["design"]), line["outcome"])
-                for line in lines
-            ]
-            self.belief, self.session, self.history = replay(
-                task, made, belief, session, seed
+            self.follow(
+                (from_leaves(self, line["design"]), line["outcome"]) for line in lines
             )
         except BaseException:
             self.close()
             raise
-        self._proposal: Proposal | None = None
+
+    def follow(self, history: History) -> None:
+        """Take measurements that were made before, which no journal notes.
+
+        Raises:
+            ValueError: naming the entry, from 0: a design or an outcome that the task
+                does not have, an outcome that cannot follow what was measured before,
+                or an entry after the budget was spent.
+        """
+        for number, entry in enumerate(history):
+            where = f"history[{number}]"
+            try:
+                design, outcome = entry
+            except (TypeError, ValueError):
+                raise ValueError(
+                    f"{where} must be a pair (design, outcome), got {entry!r}"
+                ) from None
+            if bool(self.session.spent):
+                raise ValueError(
+                    f"{where} was measured after the budget was used up: "
+                    f"{what_is_left(self.session)}"
+                )
+            self._advance(checked_entry(self, design, outcome, where))
+            if any(np.isnan(leaf).any() for leaf in jax.tree.leaves(self.belief)):
+                raise ValueError(
+                    f"{where}: outcome {outcome!r} is impossible after the earlier ones"
+                )
+
+    def _advance(self, entry: tuple[Any, Any]) -> None:
+        key = step_keys(self._seed, int(self.session.made)).update
+        state = self.task, self.belief, self.session
+        self.belief, self.session = after(*state, *entry, key)
+        self.history.append(entry)
+        self._proposal = None
 
     def suggest(self) -> Proposal:
         """What to measure next; its design is None where the session is over."""
         if self._proposal is None:
-            self._proposal = _proposal(
-                self.task, self._decider, self.belief, self.session, self._seed,
-                self._outside,
-            )  # fmt: skip
+            self._proposal = self._proposed()
         return self._proposal
+
+    def _proposed(self) -> Proposal:
+        task, belief, session = self.task, self.belief, self.session
+        number = int(session.made)
+        rest = number, belief, session, self._outside
+        end = Proposal(None, None, 0.0, 0.0, 0.0, *rest)
+        if bool(task.over(session)):
+            return end
+        keys = step_keys(self._seed, number)
+        design, gain, took, uses, payable = _choose(
+            task, self._decider, belief, session, keys
+        )
+        if not took >= 0.0:
+            raise ValueError(f"a measurement costs at least 0 s, got {float(took):g}")
+        if not payable:
+            return end
+        table = getattr(task, "designs", None)
+        design = jax.tree.map(np.asarray, design)
+        coordinates = design if table is None else np.asarray(table[int(design)])
+        design = design if table is None else int(design)
+        numbers = float(gain), float(took), float(uses)
+        return Proposal(design, coordinates, *numbers, *rest)
 
     def observed(self, outcome: Any, design: Any = None) -> None:
         """Take an outcome: of what was suggested, or of another design that was made.
@@ -186,24 +229,16 @@ class Loop:
         Raises:
             ValueError: the session is over, or the design or the outcome cannot be.
         """
-        number = int(self.session.made)
+        where = f"measurement {int(self.session.made)}"
         if design is None:
             design = self.suggest().design
         if design is None or bool(self.task.over(self.session)):
-            raise ValueError(f"measurement {number}: the session is over")
-        entry = checked_entry(
-            self.task, self.belief, self.session, design, outcome,
-            f"measurement {number}",
-        )  # fmt: skip
+            raise ValueError(f"{where}: the session is over")
+        entry = checked_entry(self, design, outcome, where)
         if self._journal is not None:
             line = {"design": _leaves(entry[0]), "outcome": _leaves(entry[1])[0]}
             self._journal.append(lambda: line, sync=True)
-        key = step_keys(self._seed, number).update
-        self.belief, self.session = after(
-            self.task, self.belief, self.session, *entry, key
-        )
-        self.history.append(entry)
-        self._proposal = None
+        self._advance(entry)
 
     def close(self) -> None:
         """Let another process write the journal."""
@@ -226,31 +261,34 @@ def _default(task: SequentialTask, session: Session) -> Decider:
     return fit(task, float(session.seconds), int(session.uses)).decider
 
 
-def _proposal(
-    task: SequentialTask,
-    decider: Decider,
-    belief: Any,
-    session: Session,
-    seed: int,
-    beyond: tuple[str, ...],
-) -> Proposal:
-    number = int(session.made)
-    end = Proposal(None, None, 0.0, 0.0, 0.0, number, belief, session, beyond)
-    if bool(task.over(session)):
-        return end
-    keys = step_keys(seed, number)
-    design, gain, took, uses, any_left = _choose(task, decider, belief, session, keys)
-    if not took >= 0.0:
-        raise ValueError(f"a measurement costs at least 0 s, got {float(took):g}")
-    if not any_left:
-        return end
-    table = getattr(task, "designs", None)
-    design = jax.tree.map(np.asarray, design)
-    coordinates = design if table is None else np.asarray(table[int(design)])
-    return Proposal(
-        design if table is None else int(design), coordinates,
-        float(gain), float(took), float(uses), number, belief, session, beyond,
-    )  # fmt: skip
+def _opened(path: str | os.PathLike[str], header: Record) -> JsonLines:
+    """A journal: a header, which says what is measured and how, then measurements.
+
+    Raises:
+        ValueError: the file is of another task, decider or budget, damaged, or another
+            process is writing it.
+    """
+    header = {"kind": _KIND, "version": 1, **header}
+
+    def whole(number: int, record: Record) -> bool:
+        return number == 0 or {"design", "outcome"} <= record.keys()
+
+    def check(records: list[Record]) -> None:
+        if not records:
+            return
+        if records[0].get("kind") != _KIND:
+            raise ValueError(f"{path} is not a journal of a session")
+        for name, value in header.items():
+            if (written := records[0].get(name)) != value:
+                raise ValueError(
+                    f"{path} is of a session with another {name}: {written!r}, "
+                    f"not {value!r}. Use another path, or the same {name}"
+                )
+
+    lines = JsonLines(path, whole, check)
+    if not lines.records:
+        lines.append(lambda: header, sync=True)
+    return lines
 
 
 @jit_by_class
@@ -271,7 +309,6 @@ def _choose(
 
 
 def _leaves(value: Any) -> list[Any]:
-    """Numbers, or lists of them, for JSON."""
     return [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(value)]
 
 

@@ -19,8 +19,7 @@ from flax import struct
 from numpy.typing import ArrayLike
 
 from jaxcal.adaptive.grid_tables import single
-from jaxcal.adaptive.host import on_host
-from jaxcal.adaptive.session import Session
+from jaxcal.adaptive.session import Session, on_host
 from jaxcal.checks import Array, numbers, table
 from jaxcal.models.from_jax import FromJax
 from jaxcal.models.function import FromFunction
@@ -207,8 +206,6 @@ def _outputs(model: Model, commands: Array, mean: Array) -> Callable[..., jax.Ar
 
 
 class _JaxReadings:
-    """Readings of a function in JAX."""
-
     def __init__(self, f: Callable[[Any, Any], Any]) -> None:
         self._f = f
 

@@ -1,13 +1,6 @@
 """A closed loop for other programs: a JSON object per line, each with an answer.
 
-    {"do": "suggest"}
-    {"number": 3, "design": 12, "coordinates": [2.7], "gain": 0.31, "seconds": 1.0, ...}
-    {"do": "observed", "outcome": 0.42}
-    {"number": 4}
-    {"do": "state"}
-    {"number": 4, "over": false, "seconds": 16.0, "uses": 20, "entropy": 1.9,
-     "unknowns": {"centre": {"mean": 2.71, "low": 2.65, "high": 2.77}}}
-
+``suggest``, ``observed`` and ``state`` are what ``do`` may be: see docs/adaptive.md.
 ``number`` counts measurements. ``observed`` takes the outcome of what was suggested;
 with a ``design``, an index or coordinates, that of another one; with a ``number`` it
 is refused unless that measurement is the next, so a program that does not know whether
@@ -16,11 +9,13 @@ its last line arrived sends it again. What is wrong is answered by ``{"error": .
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+import jax
 import numpy as np
 
 from jaxcal.adaptive.loop import Loop, estimates
@@ -100,7 +95,7 @@ def _state(loop: Loop) -> dict[str, Any]:
         "uses": int(session.uses),
         "entropy": _finite(loop.belief.entropy()),
         "unknowns": {
-            name: {"mean": one.mean, "low": one.low, "high": one.high}
+            name: dataclasses.asdict(one)
             for name, one in estimates(loop.task, loop.belief).items()
         }
         if named
@@ -114,9 +109,4 @@ def _finite(value: Any) -> float | None:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers and lists of them."""
-    if isinstance(value, dict):
-        return {name: _plain(part) for name, part in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(part) for part in value]
-    return np.asarray(value).tolist()
+    return jax.tree.map(lambda leaf: np.asarray(leaf).tolist(), value)

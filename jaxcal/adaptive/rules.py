@@ -110,10 +110,21 @@ class Rule(abc.ABC):
         return dataclasses.replace(self, **changed)  # type: ignore[type-var]  # flax
 
     @abc.abstractmethod
+    def price(
+        self, task: Any, session: Session, options: Options, *expected: jax.Array
+    ) -> jax.Array:
+        """(A,) what the measurements are taken to cost.
+
+        ``expected``: their gains, seconds and uses, (A,) each.
+        """
+
     def judged(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """(A,) gains in nats and (A,) prices."""
+        gains = belief.gains(task, options, key)
+        expected = task.expected(belief, session, options)
+        return gains, self.price(task, session, options, gains, *expected)
 
     def __call__(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
@@ -140,11 +151,10 @@ class Shares(Rule):
     prices: ClassVar[Mapping[str, int]] = {"time": 0, "use": 1, "haste": 0}
     exponents: ClassVar[Mapping[str, int]] = {"a": 2, "b": 3}
 
-    def judged(
-        self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        gains = belief.gains(task, options, key)
-        s, u = task.expected(belief, session, options)
+    def price(
+        self, task: Any, session: Session, options: Options, *expected: jax.Array
+    ) -> jax.Array:
+        gains, s, u = expected
         e = jnp.maximum(session.uses.astype(gains.dtype), 1.0)
         # Uses that every measurement takes limit the number of measurements.
         always = jnp.where(options.allowed, u, jnp.inf).min()
@@ -154,13 +164,12 @@ class Shares(Rule):
         limited = jnp.isfinite(session.seconds)
         t = jnp.where(limited, jnp.maximum(session.seconds, 1e-9), n * typical)
         number = jnp.minimum(n, jnp.maximum(t / typical, 0.1))
-        price = (
+        return (
             1.0 / n
             + jnp.where(limited, self.time, self.haste) * jnp.minimum(s / t, 1.0)
             + self.use * jnp.clip((u - always) / e, 0.0, 1.0)
             * number**self.a * e**self.b
         )  # fmt: skip
-        return gains, price
 
 
 SHARES = Shares(1.4, 1.8, 0.2, -0.7)
@@ -168,23 +177,8 @@ SHARES = Shares(1.4, 1.8, 0.2, -0.7)
 --tune`` makes."""
 
 
-class CostRule(Rule):
-    """A price by seconds and uses alone."""
-
-    def judged(
-        self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        gains = belief.gains(task, options, key)
-        seconds, uses = task.expected(belief, session, options)
-        return gains, self.price(session, seconds, uses)
-
-    @abc.abstractmethod
-    def price(self, session: Session, seconds: jax.Array, uses: jax.Array) -> jax.Array:
-        """(A,) what the measurements are taken to cost."""
-
-
 @struct.dataclass
-class Priced(CostRule):
+class Priced(Rule):
     """``c0 + c1 seconds + c2 uses``, the same throughout a session."""
 
     c0: Any = 1.0
@@ -192,12 +186,15 @@ class Priced(CostRule):
     c2: Any = 1.0
     prices: ClassVar[Mapping[str, int]] = {"c0": 0, "c2": 1}
 
-    def price(self, session: Session, seconds: jax.Array, uses: jax.Array) -> jax.Array:
+    def price(
+        self, task: Any, session: Session, options: Options, *expected: jax.Array
+    ) -> jax.Array:
+        _, seconds, uses = expected
         return self.c0 + self.c1 * seconds + self.c2 * uses
 
 
 @struct.dataclass
-class StateRule(CostRule):
+class StateRule(Rule):
     """A price that follows what is left: e uses and t seconds.
 
     ``c0 exp(d0 (e - 1)) + c1 seconds + c2 exp(d1 (e - 1) + d2 t / scale) uses``
@@ -213,7 +210,10 @@ class StateRule(CostRule):
     prices: ClassVar[Mapping[str, int]] = {"c0": 0, "c2": 1}
     exponents: ClassVar[Mapping[str, int]] = {"d0": 2, "d1": 3, "d2": 4}
 
-    def price(self, session: Session, seconds: jax.Array, uses: jax.Array) -> jax.Array:
+    def price(
+        self, task: Any, session: Session, options: Options, *expected: jax.Array
+    ) -> jax.Array:
+        _, seconds, uses = expected
         more = session.uses - 1.0
         left = jnp.where(jnp.isfinite(session.seconds), session.seconds, 0.0)
         fixed = self.c0 * jnp.exp(self.d0 * more)

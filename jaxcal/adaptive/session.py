@@ -10,11 +10,15 @@ plays thousands of sessions at once.
 from __future__ import annotations
 
 import functools
+import hashlib
+import re
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import jax
+import numpy as np
 from flax import struct
+from jax.experimental.buffer_callback import buffer_callback
 
 _ROUNDING = 1e-4  # of a cost: sums of float32 may miss the budget by less
 
@@ -48,6 +52,46 @@ def _classes(structure: jax.tree_util.PyTreeDef) -> tuple[Any, ...]:
     """The classes of a structure's nodes, nested as the nodes are."""
     node = structure.node_data()
     return (node and node[0], *map(_classes, structure.children()))
+
+
+def fingerprint(tree: Any) -> str:
+    """A hash of a task or a decider: its tables, its numbers and its kind."""
+    leaves, structure = jax.tree.flatten(tree)
+    digest = hashlib.sha256(re.sub(r" at 0x[0-9a-f]+", "", str(structure)).encode())
+    for leaf in leaves:
+        array = np.ascontiguousarray(leaf)
+        digest.update(f"{array.dtype}{array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def on_host(
+    function: Callable[..., Any], result: jax.ShapeDtypeStruct, *arrays: Any
+) -> jax.Array:
+    """``function(*arrays)`` on the host, of numpy arrays.
+
+    Under ``vmap`` arrays get leading axes that broadcast (``expand_dims``).
+    On a CPU the function reads the program's own memory and must not keep it:
+    ``pure_callback`` copies its arguments on the thread pool, and on a single core it
+    deadlocks, because the pool's only thread is the one waiting for the copy.
+
+    Args:
+        function: returns an array of the result's shape and type.
+        result: without the axes of ``vmap``.
+        arrays: its arguments.
+    """
+    if jax.default_backend() != "cpu":  # memory that numpy cannot read
+        copied: jax.Array = jax.pure_callback(
+            function, result, *arrays, vmap_method="expand_dims"
+        )
+        return copied
+
+    def call(context: Any, out: Any, *buffers: Any) -> None:
+        np.asarray(out)[...] = function(*map(np.asarray, buffers))
+
+    call_host = buffer_callback(call, result, vmap_method="expand_dims")
+    answer: jax.Array = call_host(*arrays)
+    return answer
 
 
 @struct.dataclass

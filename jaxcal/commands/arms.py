@@ -311,7 +311,6 @@ def _run_model(path: str) -> Model:
 
 
 def _read_model(path: str) -> Model:
-    """The model in a JSON file."""
     if path.lower().endswith(".xacro"):
         raise ValueError(f"{path}: expand it first: xacro {path} > arm.urdf")
     try:

@@ -327,7 +327,6 @@ def command(
 
 
 def _emit(output: Output, names: Sequence[str], values: Array) -> None:
-    """Rows (N, len(names)) as JSON, else as CSV."""
     rows = values.tolist()
     if not output.written(names, rows):
         write_rows("", names, rows)

@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 from jaxcal.arguments import (
     Parser,
-    refused,
+    exit_code,
     several,
     told,
     typed_line,
-    unread,
     values_of,
 )
-from jaxcal.extras import MissingExtraError, needs
+from jaxcal.extras import needs
 from jaxcal.files import require_kept, require_writable_folder, write_text
 
 if TYPE_CHECKING:
@@ -208,28 +207,24 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
     """
     words = list(sys.argv[1:] if argv is None else argv)
     command = ["python", prog] if prog.endswith(".py") else prog.split()
-    of_task = any(word.partition("=")[0] == "--task" for word in words)
-    kept, before = "nothing was written", signal.signal(signal.SIGTERM, _terminate)
-    try:
-        made = parser(prog, typed_line(prog), of_task).parse_args(words)
+    flags = {word.partition("=")[0] for word in words}
+    kept = "nothing was written"
+    if "--stream" in flags and "--task" not in flags:
+        kept = "finished parts are kept; run the same command again to resume"
+
+    def run() -> None:
+        made = parser(prog, typed_line(prog), "--task" in flags).parse_args(words)
         options = values_of(made)["options"]
         options.command = [*command, *words]
-        if not of_task and options.stream is not None:
-            kept = "finished parts are kept; run the same command again to resume"
         require_kept(vars(made))
         with told():
             made.function(options)
-    except KeyboardInterrupt as stop:
-        how = str(stop) or "interrupted"
-        print(f"{prog}: {how}, {kept}", file=sys.stderr)
-        return 143 if how == "terminated" else 130
-    except BrokenPipeError:
-        return unread()
-    except (ValueError, OSError, MissingExtraError) as error:
-        return refused(prog, error)
+
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        return exit_code(run, prog, kept)
     finally:
         signal.signal(signal.SIGTERM, before)
-    return 0
 
 
 def parser(prog: str, typed: str, of_task: bool = False) -> Parser:
@@ -264,9 +259,8 @@ def _run(options: EvaluateOptions) -> None:
     from jaxcal.evaluation.methods import DEFAULT_METHODS, POLICIES, check_methods
     from jaxcal.progress import Progress
 
-    methods = check_methods(
-        DEFAULT_METHODS if options.methods is None else options.methods
-    )
+    asked = DEFAULT_METHODS if options.methods is None else options.methods
+    methods = check_methods(asked)
     if options.checkpoint:
         if not set(methods) & set(POLICIES):
             raise ValueError(
@@ -293,7 +287,6 @@ def _show(
     progress: Progress,
     runs: Sequence[Path] = (),
 ) -> None:
-    """Print the table of each evaluation, write the page and the JSON of all."""
     from jaxcal.evaluation.report import json_document, text_table, write_report
 
     summaries: list[Summary] = []
@@ -342,8 +335,7 @@ def _whole(
 
 
 def _dataset(name: str, options: EvaluateOptions) -> Dataset:
-    """The first episodes of one of the paper's datasets, or of a file."""
-    from jaxcal.commands.pools import draw_sets, holds_sets
+    from jaxcal.commands.tables import draw_sets, holds_sets
     from jaxcal.evaluation.dataset import Dataset
     from jaxcal.evaluation.dataset_files import load_dataset
     from jaxcal.paper.constants import EPISODES
@@ -368,7 +360,6 @@ def _dataset(name: str, options: EvaluateOptions) -> Dataset:
 def _streamed(
     options: EvaluateOptions, methods: Sequence[str], progress: Progress
 ) -> Iterator[tuple[Summary, None]]:
-    """One dataset in parts."""
     assert options.stream is not None  # it was given
     from jaxcal.evaluation.stream import evaluate_stream
     from jaxcal.paper.datasets import drawn
@@ -401,7 +392,6 @@ def _streamed(
 
 
 def _check_outputs(options: EvaluateOptions) -> None:
-    """Refuse outputs that cannot be written before anything is computed."""
     options.require_writable()
     if options.stream is not None:
         require_writable_folder(options.stream)
@@ -413,7 +403,6 @@ def _check_outputs(options: EvaluateOptions) -> None:
 
 
 def _run_folders(given: Sequence[Path], checkpoints: list[str | None]) -> list[Path]:
-    """Run folders named, and those the checkpoints lie in."""
     found = list(given)
     for checkpoint in filter(None, checkpoints):
         folder = Path(checkpoint)
@@ -426,13 +415,8 @@ def _run_task(options: TaskOptions) -> None:
     from jaxcal.progress import Progress
 
     options.require_writable()
-    progress = Progress(quiet=options.quiet)
-    _show(
-        options,
-        _sessions(options, progress),
-        "jaxcal.adaptive.figures:decider_figures",
-        progress,
-    )
+    progress, figures = Progress(quiet=options.quiet), "jaxcal.adaptive.evaluation"
+    _show(options, _sessions(options, progress), f"{figures}:decider_figures", progress)
 
 
 def _sessions(

@@ -11,10 +11,10 @@ import sys
 import warnings
 from typing import Annotated
 
-from jaxcal.arguments import Parser, outdated, refused, told, unread, values_of
+from jaxcal.arguments import Parser, exit_code, outdated, told, values_of
 from jaxcal.checks import aligned
 from jaxcal.commands.tables import write_json
-from jaxcal.extras import MissingExtraError, install
+from jaxcal.extras import install
 from jaxcal.files import require_kept
 
 _HERE = {  # command: one line of help, and the module with its flags and function
@@ -69,26 +69,22 @@ def run(argv: list[str] | None = None) -> int:
         outdated("jaxcal", "score", "select --score")
         words[0] = "select"
     arguments = _parser(words).parse_args(words)
-    code = 0
-    try:
+    program = f"jaxcal {arguments.command}"
+
+    def command() -> int:
         with told(arguments.command != "loop"), warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = lambda warning, *_: print(
-                f"jaxcal {arguments.command}: warning:",
+                f"{program}: warning:",
                 "; ".join(str(warning).splitlines()),
                 file=sys.stderr,
             )
             require_kept(vars(arguments))
             code = arguments.function(**values_of(arguments))
         sys.stdout.flush()
-    except BrokenPipeError:
-        return unread()
-    except KeyboardInterrupt:
-        print(f"jaxcal {arguments.command}: interrupted", file=sys.stderr)
-        return 130
-    except (ValueError, OSError, MissingExtraError) as error:
-        return refused(f"jaxcal {arguments.command}", error)
-    return int(code or 0)
+        return int(code or 0)
+
+    return exit_code(command, program)
 
 
 def _parser(given: list[str]) -> Parser:

@@ -297,12 +297,10 @@ def _rows_of(subset: Table, table: Table) -> NDArray[np.int64]:
 
 
 def _one_or_all(values: list[float]) -> float | list[float]:
-    """The number itself where there is one."""
     return values[0] if len(values) == 1 else values
 
 
 def _show(selection: Selection, table: Table, output: Output) -> None:
-    """The rows chosen, as a table for people, CSV or JSON."""
     names = [*table.labels, *table.names]
     rows: list[list[Any]] = [
         [*(column[i] for column in table.labels.values()), *table.values[i].tolist()]

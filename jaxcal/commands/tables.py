@@ -1,4 +1,4 @@
-"""What the commands write: rows as CSV or JSON, ``-`` for standard output."""
+"""Rows that commands write, CSV or JSON, ``-`` for stdout; files of candidates."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from jaxcal.checks import Array
 from jaxcal.files import write_text
+from jaxcal.tables import read_table
 
 TablePath = Annotated[str, "CSV, or - (standard input)"]
 
@@ -76,3 +78,28 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     raise TypeError(f"cannot write {type(value).__name__} as JSON")
+
+
+def holds_sets(path: str) -> bool:
+    """Whether a file holds episodes of candidates, in the format of datasets."""
+    if path.lower().endswith(".npz"):
+        return True
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
+        return "episode" in [cell.strip() for cell in file.readline().split(",")]
+
+
+def read_pool(path: str) -> tuple[Array, Any]:
+    """(N, n) candidates of a table, and (N,) available; None where all are."""
+    table = read_table(path)
+    mask = table.available()
+    return table.columns(table.commands(None, option=None), mask), mask
+
+
+def draw_sets(path: str, episodes: int, seed: int, size: int = 50) -> Array:
+    """(episodes, M, n): of each episode M of the available rows, at most ``size``."""
+    rows, mask = read_pool(path)
+    rows = rows if mask is None else rows[mask]
+    rng = np.random.default_rng(seed)
+    count = min(size, len(rows))
+    picked = [rng.choice(len(rows), count, replace=False) for _ in range(episodes)]
+    return rows[np.stack(picked)]

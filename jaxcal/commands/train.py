@@ -19,7 +19,12 @@ from typing import TYPE_CHECKING, Any
 
 from jaxcal.arguments import refused, told, typed_line
 from jaxcal.checks import aligned
-from jaxcal.commands.train_configuration import of_postures, of_task
+from jaxcal.commands.train_configuration import (
+    fixed_validation,
+    of_postures,
+    of_task,
+    teacher,
+)
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.learning.runtime import cache, processes
 
@@ -115,7 +120,6 @@ def _run(arguments: TrainOptions, prog: str) -> int:
 
 
 def _export(run: pathlib.Path, path: str, of_task: bool) -> None:
-    """Write the weights of a run's policy alone, without what a training needs."""
     from jaxcal.adaptive.policy import training
     from jaxcal.learning.runtime import weights
     from jaxcal.learning.training import checkpoint
@@ -126,7 +130,6 @@ def _export(run: pathlib.Path, path: str, of_task: bool) -> None:
 
 
 def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) -> int:
-    """Updates made."""
     import numpy as np
 
     from jaxcal.learning.runtime import devices
@@ -141,7 +144,6 @@ def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) 
         schema, unit, columns = trainer.SCHEMA, "decisions", _TASK
         introduction = f"task {config.task}, seed {config.seed}; run folder {out}"
     else:
-        from jaxcal.commands.train_solvers import fixed_validation, teacher
         from jaxcal.learning.training import checkpoint
         from jaxcal.learning.training import postures as trainer
 
@@ -157,7 +159,14 @@ def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) 
         )
         if validates:
             more["validation"] = fixed_validation(config)
-        _begin_table(unit, columns)
+        reward, *measured = columns
+        heads = f"{reward:>8} " + " ".join(f"{name:>16}" for name in measured)
+        print(
+            "compiling the training step (some 15 s; a few seconds where this "
+            "machine has compiled it before) ...\n"
+            f"   update {unit:>10}     /s   elapsed      left {heads}",
+            flush=True,
+        )
     state = trainer.train(
         config,
         out,
@@ -213,7 +222,6 @@ def _num_runs(arguments: TrainOptions, out: pathlib.Path) -> int:
 
 
 def _introduction(config: TrainConfig, out: pathlib.Path, devices: str) -> str:
-    """What will be trained, in one line."""
     import jax
 
     shapes = jax.eval_shape(config.learners[0].init, jax.random.key(0))
@@ -250,20 +258,11 @@ def _stop_on_signals() -> Iterator[Stop]:
             signal.signal(number, handler)
 
 
-def _begin_table(unit: str, columns: tuple[str, str, str]) -> None:
-    reward, first, second = columns
-    print(
-        "compiling the training step (some 15 s; a few seconds where this "
-        "machine has compiled it before) ...\n"
-        f"   update {unit:>10}     /s   elapsed      left {reward:>8} {first:>16} "
-        f"{second:>16}",
-        flush=True,
-    )
-
-
 def _show(report: Report, measured: tuple[str, ...]) -> None:
     """One line of progress; of several seeds the mean and the standard deviation."""
-    metrics, reward = report.metrics, report.metrics.get("reward_mean")
+    metrics, reward = report.metrics, " imitate"
+    if (mean := metrics.get("reward_mean")) is not None:
+        reward = "-" if math.isnan(mean) else f"{mean:.4f}"  # -: no session ended
     cells = []
     for name in measured:
         if name in metrics:
@@ -272,17 +271,11 @@ def _show(report: Report, measured: tuple[str, ...]) -> None:
             cells.append(f"{cell:>16}")
     print(
         f"{report.update:9,d} {report.played:10,d} {report.per_second:6,.0f} "
-        f"{_clock(report.seconds):>9} {_clock(report.eta):>9} "
-        + (" imitate " if reward is None else f"{_or_dash(reward, '.4f'):>8} ")
+        f"{_clock(report.seconds):>9} {_clock(report.eta):>9} {reward:>8} "
         + " ".join(cells)
         + f"  {report.skipped} updates skipped (not finite)" * bool(report.skipped),
         flush=True,
     )
-
-
-def _or_dash(value: float, form: str) -> str:
-    """A number; a dash where no session ended, so that there is none."""
-    return "-" if math.isnan(value) else format(value, form)
 
 
 def _compare_runs(
@@ -311,5 +304,4 @@ def _compare_runs(
 
 
 def _clock(seconds: float) -> str:
-    """h:mm:ss."""
     return str(datetime.timedelta(seconds=round(seconds)))

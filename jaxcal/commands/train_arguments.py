@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.arguments import Parser, number_type, typed_line, values_of
-from jaxcal.commands.pools import holds_sets, read_pool
+from jaxcal.commands.tables import holds_sets, read_pool
 from jaxcal.learning.config import TRACED, Setting, StreamsConfig, settings_of
 from jaxcal.learning.environments.task import GivenCandidates
 from jaxcal.learning.runtime import processes

@@ -1,4 +1,5 @@
-"""The configuration that ``train`` begins with: from flags, or from a run."""
+"""What ``train`` begins with: its configuration, from flags or from a run; the sets to
+validate on, and what to imitate."""
 
 from __future__ import annotations
 
@@ -6,6 +7,8 @@ import dataclasses
 import pathlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from jaxcal.extras import needs
 from jaxcal.files import require_writable_folder
@@ -16,7 +19,10 @@ if TYPE_CHECKING:
     from jaxcal.adaptive.tasks.registry import Entry
     from jaxcal.commands.train_arguments import TrainOptions
     from jaxcal.learning.environments.task import GivenCandidates
+    from jaxcal.learning.training.postures import Validation
     from jaxcal.learning.training.presets import TrainConfig
+
+_VALIDATED = 500  # sets that a training run is measured on
 
 
 def of_postures(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
@@ -54,7 +60,6 @@ def of_postures(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
 def _configuration_of(
     out: pathlib.Path, candidates: GivenCandidates | None
 ) -> TrainConfig:
-    """The configuration of a run to go on with, on the same candidates."""
     from jaxcal.learning.training import checkpoint
     from jaxcal.learning.training.presets import TrainConfig
 
@@ -182,3 +187,48 @@ def _refuse_to_overwrite(out: pathlib.Path) -> None:
             f"--out {out} already holds a run: pass --resume, or name another folder "
             f"such as {out}_2"
         )
+
+
+def fixed_validation(config: TrainConfig) -> Validation:
+    """500 sets as the first task has them, and their optima.
+
+    Uniform ones, never trained on, that depend on M and n only, so runs with other
+    seeds or networks are measured on the same ones. Where the user gave candidates, 500
+    draws of those.
+    """
+    import jax
+
+    from jaxcal.learning.training.postures import Validation
+    from jaxcal.selection import exact_batch
+
+    task = config.tasks[0]
+    env = task.environment
+    if task.given is not None:
+        states = jax.vmap(task.reset)(
+            jax.random.split(jax.random.key(20261121), _VALIDATED)
+        )
+        sets = np.asarray(states.candidates, np.float64)
+        free = np.asarray(states.available)
+    else:
+        rng = np.random.default_rng([20261121, env.num_candidates, env.num_inputs])
+        sets = rng.uniform(size=(_VALIDATED, env.num_candidates, env.num_inputs))
+        free = np.ones(sets.shape[:2], bool)
+    best = exact_batch(sets, env.num_selected, available=free, num_outputs=1).log_det
+    return Validation(sets, np.asarray(best), env.num_outputs, free)
+
+
+def teacher(
+    candidates: np.ndarray, available: np.ndarray, given: np.ndarray, k: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The best postures of every set, as ``imitation.Teacher`` wants them.
+
+    The proven optimum where k is the number of regressors. Above it, what Fedorov
+    exchange finds from its default restarts: almost always optimal, and in a time that
+    does not depend on the shape of the candidates, as that of a proof does.
+    """
+    from jaxcal.selection import exact_batch, exchange_batch
+
+    required = given if given.shape[1] else None
+    solve = exact_batch if k == candidates.shape[2] + 1 else exchange_batch
+    solved = solve(candidates, k, available=available, required=required, num_outputs=1)
+    return solved.indices, solved.log_det

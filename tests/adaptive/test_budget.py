@@ -9,8 +9,12 @@ from jaxcal.adaptive import next_measurement, play, run
 from jaxcal.adaptive.fit_ahead import fit
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import AHEAD
-from jaxcal.adaptive.policy.network import PolicyDecider, initial
-from jaxcal.adaptive.policy.sessions import Exercise, Sessions
+from jaxcal.adaptive.policy.network import (
+    Exercise,
+    PolicyDecider,
+    Sessions,
+    initial,
+)
 from jaxcal.adaptive.rules import SHARES, Gain, Random, StateRule
 
 RULE = StateRule(0.1, 1.0, 1.0)

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.history import replay
-from jaxcal.adaptive.journal import fingerprint
-from jaxcal.adaptive.loop import next_measurement, run
+from jaxcal.adaptive.loop import Loop, next_measurement, run
 from jaxcal.adaptive.rules import Gain, Priced, Random
+from jaxcal.adaptive.session import fingerprint
 from jaxcal.adaptive.tasks.knee import PRICED, knee
 
 SMALL = {"cells": 6, "sigma": 0.05}
@@ -138,9 +137,9 @@ def test_a_closed_loop_measures_until_the_budget_is_spent(sharp):
 
 
 def replay_of(task, history):
-    from jaxcal.adaptive.history import begin
-
-    return replay(task, history, *begin(task, None, None, 0), 0)[1]
+    loop = Loop(task, PRICED)
+    loop.follow(history)
+    return loop.session
 
 
 @pytest.mark.parametrize("decider", [PRICED, Random()], ids=["priced", "random"])

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from jaxcal.commands import evaluate as command
-from jaxcal.commands import pools
+from jaxcal.commands import tables
 from jaxcal.evaluation import figures, stream
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import save_csv, save_npz
@@ -68,7 +68,7 @@ def test_a_table_is_a_pool_that_episodes_draw_from(tmp_path, capsys) -> None:
     (result,) = json.loads(out.read_text())["results"]
     assert result["dataset"]["episodes"] == 5
     assert len(result["methods"]["exact"]["indices"]) == 5
-    sets = pools.draw_sets(str(path), 5, 0)
+    sets = tables.draw_sets(str(path), 5, 0)
     drawn = {tuple(row) for row in sets.reshape(-1, 2)}
     assert drawn <= {tuple(row) for row in rows[free]} and len(drawn) > 50
     assert all(len({tuple(row) for row in one}) == 50 for one in sets)

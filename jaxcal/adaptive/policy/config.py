@@ -51,8 +51,7 @@ class PolicyConfig(RunConfig):
     @property
     def learners(self) -> tuple[Streams, ...]:
         """One learner."""
-        from jaxcal.adaptive.policy.network import Correction
-        from jaxcal.adaptive.policy.sessions import Sessions
+        from jaxcal.adaptive.policy.network import Correction, Sessions
         from jaxcal.learning.core.streams import Streams
 
         return (Streams(self.ppo, Sessions(self.per_group), Correction(self.width)),)

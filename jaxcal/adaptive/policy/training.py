@@ -11,8 +11,7 @@ import jax.numpy as jnp
 
 from jaxcal.adaptive.episodes import play
 from jaxcal.adaptive.policy.config import PolicyConfig
-from jaxcal.adaptive.policy.network import PolicyDecider, initial
-from jaxcal.adaptive.policy.sessions import Exercise
+from jaxcal.adaptive.policy.network import Exercise, PolicyDecider, initial
 from jaxcal.adaptive.tasks import registry
 from jaxcal.learning.core.ppo import TrainState
 from jaxcal.learning.runtime import devices, weights
