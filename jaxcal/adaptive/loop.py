@@ -202,8 +202,9 @@ class Loop:
     def _proposed(self) -> Proposal:
         task, belief, session = self.task, self.belief, self.session
         number = int(session.made)
-        rest = number, belief, session, self._outside
-        end = Proposal(None, None, 0.0, 0.0, 0.0, *rest)
+        end = Proposal(
+            None, None, 0.0, 0.0, 0.0, number, belief, session, self._outside
+        )
         if bool(task.over(session)):
             return end
         keys = step_keys(self._seed, number)
@@ -218,8 +219,14 @@ class Loop:
         design = jax.tree.map(np.asarray, design)
         coordinates = design if table is None else np.asarray(table[int(design)])
         design = design if table is None else int(design)
-        numbers = float(gain), float(took), float(uses)
-        return Proposal(design, coordinates, *numbers, *rest)
+        return dataclasses.replace(
+            end,
+            design=design,
+            coordinates=coordinates,
+            gain=float(gain),
+            seconds=float(took),
+            uses=float(uses),
+        )
 
     def observed(self, outcome: Any, design: Any = None) -> None:
         """Take an outcome: of what was suggested, or of another design that was made.
