@@ -18,8 +18,7 @@ from jaxcal.arguments import several
 from jaxcal.checks import Array, one_of
 from jaxcal.models.model import Model, as_model
 from jaxcal.models.recording import Recording
-from jaxcal.tables import COMMANDS, Table
-from jaxcal.tables.names import say
+from jaxcal.tables import COMMANDS, Table, say
 
 if TYPE_CHECKING:
     from jaxcal.arms import Sensor, SerialChain

@@ -1,10 +1,6 @@
-"""Tables: one reader for files and frames, one decision for each column.
+"""Tables: one reader for files and frames, one decision for each column."""
 
-A column that has a name is never read by its place; what is not read, or could be meant
-otherwise, is said in one line.
-"""
-
-from jaxcal.tables.decisions import Decision
+from jaxcal.tables.decisions import COMMANDS, MEASURED, Decision, columns_by_name, say
 from jaxcal.tables.files import csv_text, parse, read_table
 from jaxcal.tables.frames import (
     header_of,
@@ -15,7 +11,6 @@ from jaxcal.tables.frames import (
     say_order,
     table_of_frame,
 )
-from jaxcal.tables.names import COMMANDS, MEASURED, columns_by_name
 from jaxcal.tables.table import Table
 
 __all__ = [
@@ -32,6 +27,7 @@ __all__ = [
     "outputs_of",
     "parse",
     "read_table",
+    "say",
     "say_order",
     "table_of_frame",
 ]

@@ -11,16 +11,6 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
-__all__ = [
-    "UNIT",
-    "Ambiguity",
-    "decimal_mark",
-    "has_unit",
-    "is_number",
-    "numbers_of",
-    "truths_of",
-]
-
 _BLANKS = " \u00a0\u202f\u2009'\u2019"  # between groups of three digits
 _GROUPS = re.compile(rf"([+-]?\d{{1,3}})([{_BLANKS}])(\d{{3}}(?:\2\d{{3}})*)([.,]\d*)?")
 _MARKED = re.compile(r"[+-]?\d*(?:[.,]\d+)+(?:[eE][+-]?\d+)?")
@@ -73,9 +63,7 @@ def has_unit(cells: Sequence[str]) -> bool:
     if any(unit[0] == "/" for unit in units):
         return all(unit[1:].isdecimal() for unit in units)
     unit = units.pop()
-    sure = (
-        len(unit) > 1 or unit in "%°" or any(x in cell for cell in cells for x in ".,")
-    )
+    sure = len(unit) > 1 or unit in "%°" or not {*".,"}.isdisjoint("".join(cells))
     return not units and sure and UNIT.fullmatch(unit) is not None
 
 
@@ -109,17 +97,10 @@ def _vote(cell: str) -> str | None:
 def numbers_of(
     cells: Sequence[str], mark: str = ".", decided: bool = True
 ) -> list[float | None]:
-    """Each cell as a number, NaN where it is empty, None where it holds none.
-
-    Raises:
-        Ambiguity: a cell could be two numbers.
-    """
+    """Each cell as a number, NaN where it is empty, None where it holds none."""
     numbers = [_number(cell, mark) for cell in cells]
-    doubtful = [
-        i
-        for i, cell in enumerate(cells)
-        if cell[-4:-3] in (".", ",") and _THOUSANDS.fullmatch(_plain(cell))
-    ]
+    marked = [i for i, cell in enumerate(cells) if cell[-4:-3] in (".", ",")]
+    doubtful = [i for i in marked if _THOUSANDS.fullmatch(_plain(cells[i]))]
     if grouped := [i for i in doubtful if mark not in cells[i] and not decided]:
         raise Ambiguity(cells, grouped[0])
     if decimals := [i for i in doubtful if mark in cells[i]]:

@@ -1,11 +1,12 @@
-"""What each column of a table is: one rule for files and frames.
-
-Names decide first: u_, y_, available, id and the like; values where names do not.
+"""What each column of a table is, by its name first, then by its values; columns by
+name, whatever prefix or unit they bear; and what is said of them.
 """
 
 from __future__ import annotations
 
+import logging
 import re
+import warnings
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -13,11 +14,9 @@ import numpy as np
 
 from jaxcal.checks import Array
 from jaxcal.tables.cells import has_unit, truths_of
-from jaxcal.tables.names import COMMANDS, MEASURED
 
-__all__ = ["AVAILABLE", "COUNTED", "Decision", "decide", "is_available", "sentence"]
-
-
+COMMANDS, MEASURED = "u_", "y_"  # how the names of columns begin
+_LOG = logging.getLogger("jaxcal")
 AVAILABLE = "available"
 _AVAILABLE = re.compile(
     r"(is[ _]?)?avail(able|ability)?([ _](rows?|flags?|mask|now))?\W*([\[(].*)?",
@@ -59,13 +58,8 @@ class Decision(NamedTuple):
 def decide(
     table: Any, outputs: Collection[str] = (), *, fit: bool = False
 ) -> dict[str, Decision]:
-    """The decision for each column of a ``Table``, in its order.
-
-    Args:
-        table: has ``header``, ``names``, ``values``, ``labels`` and ``headed``.
-        outputs: columns that are known to be readings, or weights.
-        fit: the table must hold readings.
-    """
+    """The decision for each column of a table; ``outputs`` are readings; ``fit``: it
+    has some."""
     marked = [x for x in table.header if table.headed and x.startswith(COMMANDS)]
     decisions = {}
     for name in table.header:
@@ -75,25 +69,27 @@ def decide(
             decision = Decision("available")
         elif name.startswith(COMMANDS):
             decision = Decision("input")
-        elif name in table.labels and has_unit(table.labels[name]):
-            cell = next(filter(None, table.labels[name]))
-            decision = Decision(
-                "label", f"holds numbers and units, {cell!r}", asks=True
-            )
         elif name in table.labels:
-            truths = truths_of(table.labels[name], ("true", "false"))
-            words = "holds words" if truths is None else "holds TRUE and FALSE"
-            decision = Decision("label", f"it {words}")
+            decision = _of_words(table.labels[name])
         else:
             column = table.values[:, table.names.index(name)]
             decision = _of_numbers(name, column, table.header, marked, outputs, fit)
         decisions[name] = decision
-    if not any(decision.role == "input" for decision in decisions.values()):
-        for name, decision in decisions.items():  # a course over time, say
-            if decision.role == "time" and not _is_stamp(name):
+    if not of_role("input", decisions):
+        for name in of_role("time", decisions):  # a course over time, say
+            if not _is_stamp(name):
                 decisions[name] = Decision("input", "it is the only one")
                 break
     return decisions if marked else decisions | _counting(table, decisions)
+
+
+def _of_words(cells: Sequence[str]) -> Decision:
+    if has_unit(cells):
+        cell = next(filter(None, cells))
+        return Decision("label", f"holds numbers and units, {cell!r}", asks=True)
+    truths = truths_of(cells, ("true", "false"))
+    words = "words" if truths is None else "TRUE and FALSE"
+    return Decision("label", f"it holds {words}")
 
 
 def is_available(name: str) -> bool:
@@ -118,15 +114,12 @@ def _of_numbers(
     if timed := _of_time(name, numbers):
         if timed.role == "time" or not marked:
             return timed
-    whole = bool((numbers == np.round(numbers)).all())
-    distinct = len(np.unique(numbers)) == len(column)
-    if whole and (
-        _NUMBERS.fullmatch(name.strip()) or (distinct and _RUNS.fullmatch(name.strip()))
-    ):
+    distinct, plain = len(np.unique(numbers)) == len(column), name.strip()
+    counts = _NUMBERS.fullmatch(plain) or (distinct and _RUNS.fullmatch(plain))
+    if counts and (numbers == np.round(numbers)).all():
         return Decision("left out", COUNTED)
     if marked:
-        reason = f"commands begin with {COMMANDS}"
-        return Decision("left out", reason)
+        return Decision("left out", f"commands begin with {COMMANDS}")
     if _LIKE_Y.fullmatch(name) and any(_LIKE_U.fullmatch(x) for x in header):
         return Decision("input", f"readings begin with {MEASURED}")
     return Decision("input")
@@ -140,10 +133,8 @@ def _of_y(
     digits = root.isdecimal() or root in ("x", "y", "z")
     depth = f"z_{root}".casefold() in names
     axis = depth or (f"x_{root}".casefold() in names and not digits)
-    if axis and marked:
-        return Decision("output", f"x_{root} is beside it", asks=True)
     if marked:
-        return Decision("output")
+        return Decision("output", f"x_{root} is beside it" if axis else "", asks=axis)
     if axis or (outputs and not any(x.startswith(MEASURED) for x in outputs)):
         return Decision("input", "a coordinate: no column begins with u_")
     if outputs:
@@ -210,18 +201,15 @@ def _count(column: Array) -> str | None:
 
 def sentence(decisions: dict[str, Decision]) -> str:
     """What was read as what, in one line; "" where names alone say it."""
-    groups: dict[tuple[str, str], list[str]] = {}
+    groups: dict[str, list[str]] = {}
     for name, (role, reason, _) in decisions.items():
         if reason:
-            verb = f"read as {role}" if role in ("input", "output", "label") else ""
-            groups.setdefault((verb or "not read", reason), []).append(name)
-    if not groups:
-        return ""
-    parts = [f"inputs {', '.join(of_role('input', decisions))}"]
-    parts += [
-        listed(names, f"{verb}: {reason}") for (verb, reason), names in groups.items()
-    ]
-    return "; ".join(parts)
+            read = role in ("input", "output", "label")
+            what = f"read as {role}: {reason}" if read else f"not read: {reason}"
+            groups.setdefault(what, []).append(name)
+    parts = [listed(names, what) for what, names in groups.items()]
+    inputs = f"inputs {', '.join(of_role('input', decisions))}"
+    return "; ".join([inputs, *parts]) if parts else ""
 
 
 def of_role(role: str, decisions: Mapping[str, Decision]) -> tuple[str, ...]:
@@ -238,3 +226,55 @@ def listed(names: Sequence[str], what: str) -> str:
     for one, several in _PLURALS.items():
         what = what.replace(f": {one} ", f": {several} ")
     return f"columns {quoted} are {what}"
+
+
+def say(text: str) -> None:
+    """A line on standard error in the shell, a warning in Python."""
+    if _LOG.isEnabledFor(logging.INFO):
+        _LOG.info(text)
+    else:
+        warnings.warn(text, stacklevel=2)
+
+
+def split(text: str) -> tuple[str, ...]:
+    """Names that are separated by commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def columns_by_name(
+    wanted: Sequence[str], header: Sequence[str], prefix: str, unit: str = ""
+) -> list[Any]:
+    """For each of the wanted the column of its name, or that which differs by the
+    prefix or the unit alone; None where there is none.
+
+    Raises:
+        ValueError: two columns could be one of the wanted, or one is two of them.
+    """
+    exact = set(wanted) & set(header)
+    rest = [(name, bare(name, prefix, unit)) for name in header if name not in exact]
+    matches: list[str | None] = []
+    for name in wanted:
+        like = [column for column, root in rest if root == bare(name, prefix, unit)]
+        if name not in exact and len(like) > 1:
+            raise ValueError(
+                f"columns {' and '.join(map(repr, like))} could both be {name!r}"
+            )
+        matches.append(name if name in exact else next(iter(like), None))
+    for column in matches:
+        if column is not None and matches.count(column) > 1:
+            doubled = [
+                name for name, c in zip(wanted, matches, strict=True) if c == column
+            ]
+            raise ValueError(f"column {column!r} could be {' or '.join(doubled)}")
+    return matches
+
+
+def bare(name: str, prefix: str, unit: str = "") -> str:
+    """A name without prefix and unit: "pitch" of "u_pitch", "u_deg_pitch"."""
+    name = name.removeprefix(prefix) or name
+    if unit:
+        u = re.escape(unit)
+        for pattern in (rf"{u}_(.+)", rf"(.+)_{u}", rf"(.+?) ?[\[(]{u}[\])]"):
+            if match := re.fullmatch(pattern, name):
+                return match[1]
+    return name

@@ -18,11 +18,9 @@ import numpy as np
 
 from jaxcal.checks import axis_letter
 from jaxcal.tables.cells import UNIT, decimal_mark, is_number, numbers_of
+from jaxcal.tables.decisions import say
 from jaxcal.tables.frames import table_of_frame
-from jaxcal.tables.names import say
 from jaxcal.tables.table import Table, table_of
-
-__all__ = ["csv_text", "parse", "read_table"]
 
 _DELIMITERS = "\t;, "  # the first of those that serve alike
 _OF_R = " \t"  # with which R names rows, and not the column of these names
@@ -113,9 +111,8 @@ def _require_decimals(source: str, sheet: Sheet) -> None:
     if sheet.delimiter != "," or width % 2:
         return
     cells = [cell for _, row in sheet.rows for cell in row]
-    if not all(cell.lstrip("+-").isdecimal() for cell in cells):
-        return
-    for line, row in sheet.rows:
+    whole = all(cell.lstrip("+-").isdecimal() for cell in cells)
+    for line, row in sheet.rows if whole else ():
         if any(cell in ("-0", "+0") or re.match(r"0\d", cell) for cell in row):
             raise ValueError(
                 f"{source}: line {line} may hold {width // 2} numbers with decimal "
@@ -150,11 +147,7 @@ class Sheet:
 
 
 def decoded(source: str, data: bytes) -> tuple[str, str]:
-    """The text of a file, and a note where it is not UTF-8.
-
-    Raises:
-        ValueError: the file is a spreadsheet's own, JSON, XML, or no text.
-    """
+    """The text of a file, and a note where it is not UTF-8."""
     if data.startswith(b"\x1f\x8b"):
         data = gzip.decompress(data)
     if data.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0", b"PAR1", b"{", b"<")):
@@ -179,11 +172,7 @@ def decoded(source: str, data: bytes) -> tuple[str, str]:
 
 
 def sheet_of(source: str, text: str) -> Sheet:
-    """Rows of a text, its comments and its row of units left out.
-
-    Raises:
-        ValueError: naming the line at fault.
-    """
+    """Rows of a text, its comments and its row of units left out."""
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     notes: list[str] = []
     stated = re.fullmatch(r"\"?sep=(.)\"?", lines[0].strip())
@@ -213,10 +202,8 @@ def sheet_of(source: str, text: str) -> Sheet:
 def _without_comments(
     lines: list[str], notes: list[str]
 ) -> tuple[list[str], tuple[int, str] | None]:
-    """Lines that begin with # made empty, and the last one above all others.
-
-    A table whose header or whose rows begin so keeps them.
-    """
+    """Lines that begin with # made empty, and the last one above all others; a table
+    whose header or whose rows begin so keeps them."""
     filled = [i for i, line in enumerate(lines) if line.strip()]
     begin = [i for i in filled if lines[i].lstrip().startswith("#")]
     if not begin or re.match(r"\s*#\s*[,;\t]", lines[filled[0]]):
@@ -226,9 +213,8 @@ def _without_comments(
     if len(inside) > (len(filled) - len(above)) // 2:
         return lines, None  # names of rows: #1, #2
     if inside:
-        listed = ", ".join(str(i + 1) for i in inside[:5])
-        more = ", ..." if len(inside) > 5 else ""
-        notes.append(f"ignored comment (#): line {listed}{more}")
+        lines_of = [str(i + 1) for i in inside[:5]] + ["..."] * (len(inside) > 5)
+        notes.append(f"ignored comment (#): line {', '.join(lines_of)}")
     head = None
     if above and (names := lines[above[-1]].strip().lstrip("# \t")):
         head = (above[-1] + 1, names)
@@ -255,9 +241,8 @@ def _delimiter(lines: Sequence[str]) -> str:
         if max(widths) > 1 and share > most:
             best, most = delimiter, share
     first = sample[0] if sample else ""
-    marks = max(",;\t", key=first.count)
-    single = not any(mark in first for mark in ",;\t")  # its name holds none
-    return best or (";" if single else marks)
+    mark = max(",;\t", key=first.count)
+    return best or (mark if mark in first else ";")  # of a single column
 
 
 def _cells(lines: Sequence[str], delimiter: str) -> list[tuple[int, list[str]]]:
@@ -299,9 +284,7 @@ def _rows(
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
     width = len(rows[0][1]) if rows else 0
-    numbered = [cells[0] for _, cells in rows[1:]] == [
-        str(i) for i in range(1, len(rows))
-    ]
+    numbered = all(row[0] == str(i) for i, (_, row) in enumerate(rows[1:], 1))
     if (
         (delimiter in _OF_R or numbered)
         and {len(cells) for _, cells in rows[1:]} == {width + 1}
@@ -327,22 +310,14 @@ def _holds_units(cells: Sequence[str], rows: Sequence[tuple[int, list[str]]]) ->
         for i, cell in enumerate(cells)
         if all(is_number(row[i]) for _, row in rows if row[i])
     ]
-    units = [cell for cell in of_numbers if cell and not is_number(cell)]
+    units = [cell for cell in of_numbers if cell]
     recognised = sum(bool(UNIT.fullmatch(cell)) for cell in units)
-    return (
-        any(cell != "-" for cell in units)
-        and len(units) == sum(map(bool, of_numbers))
-        and 2 * recognised > len(units)
-    )
+    some = any(cell != "-" for cell in units) and not any(map(is_number, units))
+    return some and 2 * recognised > len(units)
 
 
 def csv_text(columns: Mapping[str, Sequence[Any] | Any], digits: int = 12) -> str:
-    """Columns of equal length as text; NaN becomes an empty cell.
-
-    Args:
-        columns: by the name in the header.
-        digits: of a float.
-    """
+    """Columns of equal length as text; NaN becomes an empty cell."""
 
     def cell(value: Any) -> str:
         if not isinstance(value, float | np.floating):

@@ -7,27 +7,22 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.tables.decisions import COUNTED, decide
-from jaxcal.tables.names import COMMANDS, MEASURED, columns_by_name, say
+from jaxcal.tables.decisions import (
+    COMMANDS,
+    COUNTED,
+    MEASURED,
+    columns_by_name,
+    decide,
+    say,
+)
 from jaxcal.tables.table import Table, table_of
-
-__all__ = [
-    "header_of",
-    "inputs_of",
-    "names_in",
-    "of_frame",
-    "outputs_of",
-    "say_order",
-    "table_of_frame",
-]
 
 
 def header_of(argument: str, values: Any) -> list[str]:
     """Names of the columns of a frame, or of a row's numbers; [] where there are none.
 
     Raises:
-        ValueError: a name comes twice, or some columns have none; a row has another
-            name, or the index one that begins as commands and readings do.
+        ValueError: a name comes twice or is no text; a row has another.
     """
     names = _names(values)
     if not any(isinstance(name, str | tuple) for name in names):
@@ -121,10 +116,6 @@ def of_frame(
     """The ``wanted`` columns (..., n) of a frame, or of rows, by name; else as given.
 
     Args:
-        argument: its name in errors.
-        frame: what ``header_of`` takes.
-        wanted: names.
-        prefix: that they, or the columns, may lack.
         used: (N,) rows whose numbers must be finite; all when not given.
         levels: of each column the words that are read as 0, 1, ...; () of numbers.
 
@@ -136,8 +127,9 @@ def of_frame(
     if names is None:
         return frame
     block: Any = None
-    if hasattr(frame, "columns") and hasattr(frame, "__getitem__"):
-        block = None if hasattr(frame, "column_names") else frame[[*names]]
+    plain = hasattr(frame, "columns") and not hasattr(frame, "column_names")
+    if plain and hasattr(frame, "__getitem__"):
+        block = frame[[*names]]
     if block is None or np.asarray(block).dtype.kind not in "iuf":
         columns = [
             _numbers(argument, name, _column(frame, name), words)
@@ -156,14 +148,9 @@ def of_frame(
 
 def say_order(commands: Any, measured: Any) -> None:
     """Say that two frames whose indices differ are paired by place."""
-    orders = [
-        None if index is None or callable(index) else [*index]
-        for index in (getattr(frame, "index", None) for frame in (commands, measured))
-    ]
-    one, other = orders
-    if one is None or other is None or one == other or len(one) != len(other):
-        return
-    if set(one) & set(other):
+    pair = getattr(commands, "index", None), getattr(measured, "index", None)
+    one, other = ([] if x is None or callable(x) else [*x] for x in pair)
+    if one != other and len(one) == len(other) and set(one) & set(other):
         same = set(one) == set(other)
         what = "the same index in different orders" if same else "indices that differ"
         k = next(k for k in range(len(one)) if one[k] != other[k])
@@ -183,7 +170,6 @@ def _collected(frame: Any) -> Any:
 
 
 def _numbers(argument: str, name: str, values: Any, levels: Sequence[str] = ()) -> Any:
-    """Numbers of a column, or of a row's cell."""
     array = np.asarray(values)
     if array.dtype.kind == "b":
         return array.astype(np.float64)
@@ -204,10 +190,8 @@ def names_in(
     prefix: str,
     beside: Collection[str] | None = None,
 ) -> Any:
-    """The columns of a frame that ``of_frame`` takes; None: it has no names.
-
-    With ``beside``, columns that are read too, all others are said.
-    """
+    """The columns of a frame that ``of_frame`` takes; None: it has no names. All but
+    these and ``beside`` are said."""
     header = header_of(argument, frame)
     if not header:
         _require_no_rows_of(argument, frame, wanted, prefix)
@@ -244,11 +228,8 @@ def _require_no_rows_of(
 
 
 def table_of_frame(argument: str, frame: Any) -> Table:
-    """The table of a frame, or of rows that have names; its index, if named, a label.
-
-    Raises:
-        ValueError: it has no names, or a column under u_ holds words.
-    """
+    """The table of a frame, or of rows that have names; its index, if named, a
+    label."""
     frame = _collected(frame)
     if isinstance(frame, Table):
         return frame
@@ -273,21 +254,16 @@ def table_of_frame(argument: str, frame: Any) -> Table:
 
 
 def inputs_of(argument: str, frame: Any, outputs: Sequence[str] = ()) -> Any:
-    """Names of the commands in a frame, by the rules of files; None: it has no names.
-
-    ``outputs`` are those of its columns that are known to be readings.
-    """
+    """Names of the commands in a frame, by the rules of files; None: it has no
+    names."""
     if not header_of(argument, frame):
         return None
     return table_of_frame(argument, frame).commands(None, None, outputs)
 
 
 def outputs_of(argument: str, frame: Any, beside: bool) -> Any:
-    """Names of the readings in a frame; None: it has no names.
-
-    All but u_..., the time and numbers of the rows; where commands are ``beside`` them,
-    y_... alone.
-    """
+    """Names of the readings in a frame: y_... where commands are ``beside`` them, else
+    all but u_..., the time and numbers of the rows; None: it has no names."""
     if not header_of(argument, frame):
         return None
     table = table_of_frame(argument, frame)

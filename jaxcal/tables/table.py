@@ -7,26 +7,25 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaxcal.checks import Array
+from jaxcal.checks import Array, Mask
 from jaxcal.tables.cells import Ambiguity, decimal_mark, numbers_of, truths_of
 from jaxcal.tables.decisions import (
     AVAILABLE,
+    COMMANDS,
     COUNTED,
+    MEASURED,
     Decision,
+    bare,
+    columns_by_name,
     decide,
     is_available,
     listed,
     of_role,
+    say,
     sentence,
+    split,
 )
-from jaxcal.tables.names import COMMANDS, MEASURED, bare, columns_by_name, say
-from jaxcal.tables.names import split_names as split
-
-__all__ = ["Table", "table_of"]
-
-Mask = NDArray[np.bool_]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,15 +51,12 @@ class Table:
     @property
     def row_names(self) -> list[str] | None:
         """(N,) the first column of words that are no TRUE and FALSE; None: none is."""
-        for cells in self.labels.values():
-            if truths_of(cells) is None:
-                return cells
-        return None
+        words = (cells for cells in self.labels.values() if truths_of(cells) is None)
+        return next(words, None)
 
     @property
     def decisions(self) -> dict[str, Decision]:
-        """For each column its role and why: input, output, label, available, time or
-        left out; where nothing but the table says it."""
+        """For each column its role and why, where nothing but the table says it."""
         return decide(self)
 
     def columns(
@@ -71,12 +67,11 @@ class Table:
     ) -> Array:
         """(N, len(wanted)) the columns of these very names, in that order.
 
-        TRUE and FALSE are 1 and 0. The ``levels`` of a column are words that are read
-        as 0, 1, ...; () of numbers.
+        TRUE and FALSE are 1 and 0, words of ``levels`` 0, 1, ...
 
         Raises:
             ValueError: there is no such column, or a cell of a row that is ``used``
-                (N,), all when not given, is empty, NaN or infinite.
+                (N,), all when not given, is no finite number.
         """
         values = np.empty((len(self), len(wanted)))
         for place, name in enumerate(wanted):
@@ -186,10 +181,6 @@ class Table:
             chosen: names separated by commas, where the user gave them.
             option: by which they are given; None where a command has none.
             but: columns that hold readings, or weights.
-
-        Raises:
-            ValueError: there is none, or the values of one number the rows; of a frame,
-                whose columns were chosen, that is said.
         """
         if chosen is not None:
             return self._chosen(chosen, COMMANDS)
@@ -226,11 +217,7 @@ class Table:
         return names
 
     def outputs(self, chosen: str | None, option: str = "--outputs") -> tuple[str, ...]:
-        """Columns of measurements: those chosen, else ``y_...``.
-
-        Raises:
-            ValueError: there is none, or y_... is an axis beside x_... or z_....
-        """
+        """Columns of measurements: those chosen, else ``y_...``."""
         if chosen is not None:
             return self._chosen(chosen, MEASURED)
         decisions = decide(self, fit=True)
@@ -256,44 +243,37 @@ class Table:
             raise ValueError(f"{self.source}: columns {both} could both be {AVAILABLE}")
         if not names:
             return None
-        name = names[0]
-        cells = self.labels.get(name, ())
-        truths = truths_of(cells)
-        for line, cell in zip(self.lines, cells, strict=False):
-            if truths is None and truths_of([cell]) is None:
+        cells = self.labels.get(names[0])
+        if cells is None:
+            cells = numbers = self.values[:, self.names.index(names[0])].tolist()
+        else:
+            numbers = [(truths_of([cell]) or [np.nan])[0] for cell in cells]
+        for line, cell, number in zip(self.lines, cells, numbers, strict=True):
+            if number not in (0.0, 1.0):
                 raise ValueError(
-                    f"{self.source}: {self.row} {line}, {name} must be 1 or 0, TRUE or "
-                    f"FALSE, or yes or no, got {cell!r}"
+                    f"{self.source}: {self.row} {line}, {names[0]} must be 1 or 0, "
+                    f"TRUE or FALSE, or yes or no, got {cell!r}"
                 )
-        mask = np.array(truths or self.columns([name])[:, 0])
-        for row in np.flatnonzero((mask != 0.0) & (mask != 1.0)):
-            raise ValueError(
-                f"{self.source}: {self.row} {self.lines[row]}, available must be 0 or "
-                f"1, got {mask[row]:g}"
-            )
-        return np.asarray(mask == 1.0)
+        return np.array(numbers) == 1.0
 
     def say(self, columns: Sequence[Any], more: str = "") -> None:
         """Say where columns stand in another order than is asked for, and ``more``."""
         order = [name for name in self.header if name in columns]
-        parts = ["columns reordered by name"] if order != [*columns] else []
-        if parts := parts + [more] * bool(more):
+        moved = "" if order == [*columns] else "columns reordered by name"
+        if parts := [*filter(None, [moved, more])]:
             say(f"{self.source}: {'; '.join(parts)}")
 
     def bare(self, prefix: str) -> list[str]:
         """Names of all columns without the prefix."""
         return [bare(name, prefix) for name in self.header]
 
-    # -- inside ------------------------------------------------------------------------
-
     def _chosen(self, chosen: str, prefix: str, unit: str = "") -> tuple[str, ...]:
         """The columns of the names given, which must be there, each once."""
         given = split(chosen)
-        for name in given:
-            if given.count(name) > 1:
-                raise ValueError(f"{self.source}: column {name!r} is named twice")
         columns = columns_by_name(given, self.header, prefix, unit)
         for name, column in zip(given, columns, strict=True):
+            if given.count(name) > 1:
+                raise ValueError(f"{self.source}: column {name!r} is named twice")
             if column is None:
                 self.columns([name])  # says that there is none
         return tuple(columns)
@@ -308,8 +288,7 @@ class Table:
         spare = [
             name
             for name in self.names
-            if name not in beside
-            and not name.startswith(other)
+            if not (name in beside or name.startswith(other))
             and decisions[name].reason != COUNTED
             and decisions[name].role != AVAILABLE
         ]
@@ -328,10 +307,6 @@ def table_of(
     """The table of columns of cells, or of numbers (N,).
 
     ``mark`` is what ``decimal_mark`` says of all cells; None: of each column by itself.
-
-    Raises:
-        ValueError: a column mixes numbers and words, or holds words under a name that
-            begins with u_, or with y_ beside these.
     """
     numeric: dict[str, Any] = {}
     table = Table(source, (), np.empty((len(lines), 0)), {}, tuple(lines), headed, row)
