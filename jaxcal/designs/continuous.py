@@ -75,11 +75,7 @@ _MINUTE = 60.0  # seconds where no limit is given
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Refinement(Selection):
-    """Commands between the candidates, and how good they are; printed, a table.
-
-    Its ``indices`` count the rows of ``problem.candidates``, of which the first k are
-    the commands.
-    """
+    """Commands between the candidates: the first k rows of ``problem.candidates``."""
 
     began: float = np.nan  # value of the design that it began with
     search_error: float = np.nan  # share by which two searches for the bound disagree
@@ -91,9 +87,7 @@ class Refinement(Selection):
         assert self.problem.candidates is not None
         return self.problem.candidates[self.indices]
 
-    @property
-    def _noun(self) -> str:
-        return "command"
+    _noun = "command"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, text and lists, as a JSON file takes them."""
@@ -106,30 +100,18 @@ class Refinement(Selection):
             "bound_is_proven": self.certain,
         }
 
-    def __str__(self) -> str:
+    def _table(self) -> list[str]:
         rows = [[f"{x:.6g}" for x in row] for row in self.commands]
-        side = "upper" if self.problem.criterion.larger_is_better else "lower"
-        proof = (
-            "proven"
-            if self.certain
-            else "by a search, not a proof; repeated searches differ by "
-            f"{self.search_error:.1g}"
-        )
-        name = self.criterion
-        lines = [
-            f"{len(rows)} commands, method {self.method}",
-            *aligned([self._axes(), *rows]),
-            f"{self.problem.criterion.says:13} {self.value:.6g}"
-            + ("" if np.isnan(self.began) else f" (started at {self.began:.6g})"),
-            f"{side + ' bound':13} {self.bound:.6g} ({proof})",
-            f"{name + '-efficiency':13} {self.efficiency:.6f} or more",
-            f"{'without one':13} {self._lost()}",
-            *(self.in_scenarios.summary() if self.in_scenarios else ()),
-            f"time          {self.seconds:.3g} s, seed {self.seed}",
-        ]
-        return "\n".join(lines)
+        title = f"{len(rows)} commands, method {self.method}"
+        return [title, *aligned([self._axes(), *rows])]
 
-    __repr__ = __str__
+    def _limit(self) -> str:
+        began = "" if np.isnan(self.began) else f"started at {self.began:.6g}; "
+        proof = "proven"
+        if not self.certain:
+            off = f"repeated searches differ by {self.search_error:.1g}"
+            proof = f"by a search, not a proof; {off}"
+        return f"{began}{super()._limit()}, {proof}"
 
 
 def optimise(
@@ -157,18 +139,13 @@ def optimise(
         prior, noise, criterion, measured, scenarios: as of ``Design`` and ``select``.
         region: (R, n) commands of criterion I; spread over the limits when not given.
         allowed: f(u (n,)) -> whether the command may be given.
-        starts: of the search.
-        seed: of points that are drawn.
+        starts, seed: of the search; of points that are drawn.
         time_limit: seconds, 60 when not given; the best so far is returned.
-
-    Returns:
-        The commands, the value, and a bound by a search.
 
     Raises:
         ValueError: naming the argument, the rule and the value.
     """
-    deadline = _deadline(time_limit)
-    box = _limits(limits)
+    deadline, box = _deadline(time_limit), _limits(limits)
     model = as_model(model) if model is not None else Affine(len(box), len(box))
     count = _affordable(model, box, deadline, max(16, 3 * (k or 1)), _POOL)
     pool = _drawn(box, count, allowed, seed)
@@ -201,8 +178,7 @@ def refine(
         criterion: that of the selection when not given.
         region: of I; the available candidates when not given.
         allowed: f(u (n,)) -> whether a command may be given.
-        starts: of the search, the selection among them.
-        seed: of points that are drawn.
+        starts, seed: of the search, the selection among them; of points that are drawn.
         time_limit: seconds, 60 when not given; the best so far is returned.
 
     Raises:
@@ -215,35 +191,24 @@ def refine(
         raise ValueError("constraints work with select and score, not with refine")
     if offer.model is None or candidates is None:
         raise ValueError("refine needs candidates and a model, not blocks")
-    begun = _commands_of(selection, candidates)
-    if criterion is None and isinstance(selection, Selection):
-        criterion = _same_criterion(selection)
-    box = _limits(_range(candidates[available], allowed) if limits is None else limits)
-    _require_inputs(box, candidates)
-    _require_within(begun, box, allowed)
-    search = _Ascent(offer, box, allowed, len(begun), criterion, region, seed, deadline)
-    return search.run(begun, whole_number("starts", starts, 1))
-
-
-def _commands_of(selection: Selection | ArrayLike, candidates: Array) -> Array:
-    """(k, n) the chosen of the candidates (M, n)."""
-    rows = selection.indices if isinstance(selection, Selection) else selection
+    rows: Any = selection
+    if isinstance(selection, Selection):
+        rows = selection.indices
+        criterion = _same_criterion(selection) if criterion is None else criterion
     rows = array_of("selection", rows, "k").astype(np.int64)
     outside = (rows < 0) | (rows >= len(candidates))
     require_none(outside, rows, f"selection must lie in [0, {len(candidates)})")
-    return np.asarray(candidates[rows])
-
-
-def _require_within(begun: Array, box: Array, allowed: Allowed | None) -> None:
-    """Refuse commands (k, n) that the search itself could not reach."""
+    begun = candidates[rows]
+    box = _limits(_range(candidates[available], allowed) if limits is None else limits)
+    _require_inputs(box, candidates)
     beyond = (begun < box[:, 0]) | (begun > box[:, 1])
     require_none(beyond, begun, "selection must be within the limits")
-    if allowed is not None:
-        bad = ~_permitted(allowed, begun)
-        if bad.any():
-            raise ValueError(
-                f"allowed is False for the starting command {in_words(begun[bad][0])}"
-            )
+    for command in begun[~_permitted(allowed, begun)]:
+        raise ValueError(
+            f"allowed is False for the starting command {in_words(command)}"
+        )
+    search = _Ascent(offer, box, allowed, len(begun), criterion, region, seed, deadline)
+    return search.run(begun, whole_number("starts", starts, 1))
 
 
 def _range(commands: Array, allowed: Allowed | None) -> Array:
@@ -277,10 +242,8 @@ def _deadline(time_limit: float | None) -> Deadline:
 def _affordable(
     model: Model, box: Array, deadline: Deadline, least: int, most: int
 ) -> int:
-    """Points at which a model may be asked for derivatives in an eighth of the time.
-
-    Only of a function, whose differences cost what it costs.
-    """
+    """Points at which a model may be asked for derivatives in an eighth of the time:
+    only a function's differences cost what it costs."""
     if not model.resolution:
         return most
     begun, points = time.perf_counter(), box.mean(axis=1)[None].repeat(2, axis=0)
@@ -292,12 +255,10 @@ def _affordable(
 
 def _limits(limits: ArrayLike) -> Array:
     box = array_of("limits", limits, "n", 2)
-    if not len(box) or not (box[:, 0] < box[:, 1]).all():
-        bad = box[~(box[:, 0] < box[:, 1])]
-        raise ValueError(
-            "limits must be (n, 2), lower below upper, got "
-            f"{in_words(bad[0]) if len(bad) else 'none'}"
-        )
+    bad = box[~(box[:, 0] < box[:, 1])]
+    if not len(box) or len(bad):
+        got = in_words(bad[0]) if len(bad) else "none"
+        raise ValueError(f"limits must be (n, 2), lower below upper, got {got}")
     return box
 
 
@@ -325,10 +286,8 @@ def _permitted(allowed: Allowed | None, commands: Array) -> NDArray[np.bool_]:
 
 
 def _drawn(box: Array, count: int, allowed: Allowed | None, seed: int) -> Array:
-    """(count, n) allowed points that fill the limits evenly, corners among them.
-
-    Where few are, points next to them too: a thin set is found by its neighbours.
-    """
+    """(count, n) allowed points that fill the limits evenly, corners among them; where
+    few are allowed, points next to them too: a thin set is found by its neighbours."""
     n, rng = len(box), np.random.default_rng(seed)
     # The sequence of Roberts (2018): shares of the root of x^(n + 1) = x + 1.
     root = 2.0
@@ -372,8 +331,7 @@ def _descended(
 ) -> Array:
     """The lowest point on the way down from x between low and high.
 
-    Spectral projected gradients (Birgin, Martinez and Raydan, 2000): steps as long as
-    the last change of the gradient says, that need not go down each. Unlike L-BFGS of
+    Spectral projected gradients (Birgin, Martinez and Raydan, 2000). Unlike L-BFGS of
     scipy it calls no BLAS, whose threads wait for each other.
     """
     value, slope = down(x)
@@ -449,17 +407,25 @@ class _Ascent:
         seed: int,
         deadline: Deadline,
     ) -> None:
-        self.deadline = deadline
-        self.offer, self.box = offer, box
+        self.offer, self.box, self.deadline = offer, box, deadline
         self.allowed, self.seed = allowed, seed
         self.low, self.span = box[:, 0], np.ptp(box, axis=1)
         assert offer.candidates is not None and offer.model is not None
         _require_inputs(box, offer.candidates)
         self.asked, self.region = criterion, region
-        problem = problem_of(offer, k, criterion, region)
-        self.problem, self.objective = problem, problem.criterion
-        self.k = problem.k
-        self._take_scenarios(problem)
+        problem = self.problem = problem_of(offer, k, criterion, region)
+        self.k, self.objective = problem.k, problem.criterion
+        # What joins the values of S scenarios; S is 1 where there are none.
+        self.members, self.weights, self.worst = problem.members, np.ones(1), False
+        self.scale, self.shift, self.each = np.ones(1), np.zeros(1), problem.criterion
+        if (joint := problem.joint) is not None:
+            if joint.criterion.of_efficiency:
+                raise ValueError(
+                    f"refine does not support criterion {joint.criterion.name}: "
+                    "between candidates no scenario's own optimum is proven"
+                )
+            self.weights, (self.scale, self.shift) = joint.weights, joint.terms()
+            self.each, self.worst = joint.criterion.each, joint.criterion.least
         # Their least is climbed smoothed.
         self.smooth = self.worst or self.each.kind == "least"
         self.prior = np.stack([member.prior for member in self.members])
@@ -470,23 +436,6 @@ class _Ascent:
         # Commands lie on a surface in the limits, as of an arm that touches something.
         self.surface = hasattr(allowed, "onto")
         self.rough = _ROUGH if offer.model.resolution else _STEP
-
-    def _take_scenarios(self, problem: Problem) -> None:
-        """What joins the values of S scenarios; S is 1 where there are none."""
-        self.members: tuple[Problem, ...] = (problem,)
-        self.weights, self.scale, self.shift = np.ones(1), np.ones(1), np.zeros(1)
-        self.each, self.worst = problem.criterion, False
-        if isinstance(problem, ScenarioProblem):
-            if problem.criterion.of_efficiency:
-                raise ValueError(
-                    f"refine does not support criterion {problem.criterion.name}: "
-                    "between candidates no scenario's own optimum is proven"
-                )
-            self.members, self.weights = problem.members, problem.weights
-            self.scale, self.shift = problem.terms()
-            self.each, self.worst = problem.criterion.each, problem.criterion.least
-
-    # -- the criterion, of S scenarios; S is 1 where there are none --------------------
 
     def blocks(self, commands: Array) -> Array:
         """(N, S, q, p) whitened."""
@@ -507,16 +456,16 @@ class _Ascent:
 
     def phi(self, information: Array) -> Array:
         """(...,) joined value of (..., S, p, p)."""
-        values = np.stack(
-            [
-                scale * member.criterion.value(information[..., s, :, :]) + shift
-                for s, (member, scale, shift) in enumerate(
-                    zip(self.members, self.scale, self.shift, strict=True)
-                )
-            ],
-            axis=-1,
-        )
+        each = [
+            member.criterion.value(information[..., s, :, :])
+            for s, member in enumerate(self.members)
+        ]
+        values = self.scale * np.stack(each, axis=-1) + self.shift
         return np.asarray(values.min(axis=-1) if self.worst else values @ self.weights)
+
+    def phi_of(self, commands: Array) -> float:
+        """The joined value of commands (k, n)."""
+        return float(self.phi(self.information(self.blocks(commands))))
 
     def unit(self, phi: float) -> float:
         """The change of the joined value of which a hundredth is a percent."""
@@ -540,11 +489,8 @@ class _Ascent:
 
         The bound is the third plus ``trace(W (N - information))``, W the second. E is
         the least ``trace(W M)`` over W of trace 1 in its own coordinates, so any such W
-        bounds it; the worst scenario is bounded by any mixture of bounds of all.
-
-        Args:
-            information: (S, p, p).
-            sharp: how sharply the least stands out, by one over phi.
+        bounds it; a worst scenario is bounded by any mixture of all. ``sharp``: how
+        sharply the least stands out, by one over phi.
         """
         values, metrics, bounds = [], [], []  # of what the least is taken of
         for s, member in enumerate(self.members):
@@ -572,6 +518,16 @@ class _Ascent:
             shares = shares * self.weights[:, None]
         metric = np.einsum("sl,slab->sab", shares, np.array(metrics))
         return float(least), metric, float((shares * np.array(bounds)).sum())
+
+    def goal(
+        self, information: Array, phi: float, sharp: float, unit: float
+    ) -> tuple[float, Array]:
+        """What is climbed, smoothed where it has to be, and its slope (S, p, p)."""
+        if self.smooth:
+            value, metric, _ = self.soft(information, sharp / unit)
+            return value / unit, metric / unit
+        score, rate = self.score(phi)
+        return score, rate * self.gradient(information)
 
     def score(self, phi: float) -> tuple[float, float]:
         """What is climbed, in which a hundredth is a percent, and its slope by phi."""
@@ -616,15 +572,11 @@ class _Ascent:
             total += slopes[: len(commands)]
         return total
 
-    # -- the search --------------------------------------------------------------------
-
     def run(self, begun: Array | None, starts: int) -> Refinement:
         """From ``begun`` (k, n), and other starts."""
         rng = np.random.default_rng(self.seed)
-        began, best, best_phi = np.nan, begun, -np.inf
-        if begun is not None:
-            best_phi = float(self.phi(self.information(self.blocks(begun))))
-        first_phi = best_phi
+        first_phi = -np.inf if begun is None else self.phi_of(begun)
+        began, best, best_phi = np.nan, begun, first_phi
         for start in self._starts(begun, starts, rng):
             commands, phi = self._climbed(start)
             if phi > best_phi:
@@ -682,13 +634,9 @@ class _Ascent:
     def _climbed(self, commands: Array) -> tuple[Array, float]:
         """All commands together up to a local optimum, never lower than they were."""
         shape = commands.shape
-        best, best_phi = (
-            commands,
-            float(self.phi(self.information(self.blocks(commands)))),
-        )
+        best, best_phi = commands, self.phi_of(commands)
         if not np.isfinite(best_phi):
             return best, best_phi
-
         unit = self.unit(best_phi)
 
         def down(x: Array) -> tuple[float, Array]:
@@ -699,24 +647,27 @@ class _Ascent:
             phi = float(self.phi(information))
             if not np.isfinite(phi):
                 return 1e10, np.zeros_like(x)
-            if self.smooth:
-                value, metric, _ = self.soft(information, _SHARP[-1] / unit)
-                return -value / unit, -self.slopes(at, metric).ravel() / unit
-            score, rate = self.score(phi)
-            return -score, -rate * self.slopes(at, self.gradient(information)).ravel()
+            value, metric = self.goal(information, phi, _SHARP[-1], unit)
+            return -value, -self.slopes(at, metric).ravel()
 
         if self.surface:
             return self._tried(best, best_phi)
-        start = ((commands - self.low) / self.span).clip(0.0, 1.0).ravel()
-        ends = _descended(down, start, 0.0, 1.0, 300, self.deadline)
-        there = self.low + ends.reshape(shape) * self.span
-        there = there.clip(self.box[:, 0], self.box[:, 1])
-        phi = float(self.phi(self.information(self.blocks(there))))
+        there = self._lowest(down, commands, 300)
+        phi = self.phi_of(there)
         if phi > best_phi and _permitted(self.allowed, there).all():
             best, best_phi = there, phi
         if self.allowed is not None or self.smooth:
             best, best_phi = self._tried(best, best_phi)
         return best, best_phi
+
+    def _lowest(self, down: Any, commands: Array, iterations: int) -> Array:
+        """Commands (N, n) within the limits, gone down by shares of these."""
+        start = ((commands - self.low) / self.span).clip(0.0, 1.0).ravel()
+        ends = _descended(down, start, 0.0, 1.0, iterations, self.deadline)
+        return self._within(self.low + ends.reshape(commands.shape) * self.span)
+
+    def _within(self, commands: Array) -> Array:
+        return commands.clip(self.box[:, 0], self.box[:, 1])
 
     def _tried(self, commands: Array, phi: float) -> tuple[Array, float]:
         """Commands moved one by one by trial, where they are allowed."""
@@ -749,11 +700,9 @@ class _Ascent:
     def _trials(
         self, command: Array, radius: float, slope: Array, ahead: Array, rng: Any
     ) -> Array:
-        """(T, n) allowed commands about one, at a distance of the radius in limits.
-
-        Along the slope, along it beside what is not allowed, on as before, along axes
-        and their differences, and anywhere.
-        """
+        """(T, n) allowed commands about one, at a distance of the radius in limits:
+        along the slope, also beside what is not allowed, on as before, along axes and
+        their differences, and anywhere."""
         n = len(command)
         ways = [slope, ahead, *np.eye(n), *-np.eye(n), *rng.normal(size=(_TRIALS, n))]
         if n <= _PAIRED:
@@ -762,8 +711,7 @@ class _Ascent:
         unit = np.array(ways)
         unit = unit[unit.any(axis=1)]
         unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-        trial = command + radius * unit * self.span
-        trial = trial.clip(self.box[:, 0], self.box[:, 1])
+        trial = self._within(command + radius * unit * self.span)
         if self.surface:
             return _moved(self.allowed, trial)
         free = _permitted(self.allowed, trial)
@@ -782,7 +730,7 @@ class _Ascent:
         trial = command + np.outer(radius * np.array([1.0, 0.3, 0.1]), along) * (
             self.span / (np.linalg.norm(along) or 1.0)
         )
-        trial = trial.clip(self.box[:, 0], self.box[:, 1])
+        trial = self._within(trial)
         return trial[_permitted(self.allowed, trial)]
 
     def _swapped(self, commands: Array, phi: float) -> tuple[Array, float]:
@@ -805,8 +753,6 @@ class _Ascent:
             commands, phi = there, higher
         return commands, phi
 
-    # -- the bound ---------------------------------------------------------------------
-
     @functools.cached_property
     def _spread(self) -> Array:
         """(R, n) points over the limits, where d is looked at."""
@@ -823,22 +769,16 @@ class _Ascent:
     def _peaks(self, metric: Array) -> tuple[Array, Array, float]:
         """Local maxima (A, n) of d, d there, and by how much two searches disagree."""
         d = self.leverage(self._spread_blocks, metric)
-        order = np.argsort(-d)
-        starts: list[int] = []
-        for row in order:  # far from each other
-            apart = [
-                np.abs((self._spread[row] - self._spread[other]) / self.span).max()
-                for other in starts
-            ]
-            if not apart or min(apart) > 0.05:
-                starts.append(int(row))
+        shares, starts = self._spread / self.span, list[int]()
+        for row in np.argsort(-d).tolist():  # far from each other
+            apart = np.abs(shares[row] - shares[starts]).max(axis=1)
+            if apart.min(initial=np.inf) > 0.05:
+                starts.append(row)
             if len(starts) == 2 * _ASCENTS:
                 break
         ends, heights = self._ascents(self._spread[starts], metric)
-        halves = [heights[half::2].max(initial=-np.inf) for half in (0, 1)]
-        most = max(halves)
-        error = float(most - min(halves)) if np.isfinite(min(halves)) else float(most)
-        return ends, heights, error
+        other, most = sorted(heights[half::2].max(initial=-np.inf) for half in (0, 1))
+        return ends, heights, float(most - other if np.isfinite(other) else most)
 
     def _ascents(self, points: Array, metric: Array) -> tuple[Array, Array]:
         """Ends (A, n) of climbs from points, and d there."""
@@ -853,10 +793,7 @@ class _Ascent:
             value = self.leverage(self.blocks(at), metric).sum() / size
             return -value, -self.slopes(at, metric).ravel() / size
 
-        start = ((points - self.low) / self.span).clip(0.0, 1.0).ravel()
-        ends = _descended(down, start, 0.0, 1.0, 150, self.deadline)
-        there = self.low + ends.reshape(shape) * self.span
-        there = there.clip(self.box[:, 0], self.box[:, 1])
+        there = self._lowest(down, points, 150)
         higher = self.leverage(self.blocks(there), metric)
         kept = (higher > d) & _permitted(self.allowed, there)
         return np.where(kept[:, None], there, points), np.where(kept, higher, d)
@@ -867,8 +804,7 @@ class _Ascent:
         for radius in 0.1 * 0.7 ** np.arange(20):
             for i in range(len(points)):
                 ways = rng.normal(size=(8, points.shape[1]))
-                trial = points[i] + radius * ways * self.span
-                trial = trial.clip(self.box[:, 0], self.box[:, 1])
+                trial = self._within(points[i] + radius * ways * self.span)
                 trial = _moved(self.allowed, trial)
                 if not len(trial):
                     continue
@@ -974,9 +910,8 @@ class _Ascent:
         x = begun.ravel()
         for sharp in _SHARP_BOUND:
             smoothed = functools.partial(down, sharp=sharp)
-            x = of(_descended(smoothed, x, -np.inf, np.inf, 300, self.deadline))[
-                0
-            ].ravel()
+            x = _descended(smoothed, x, -np.inf, np.inf, 300, self.deadline)
+            x = of(x)[0].ravel()
         return of(x)[2]
 
     def _new_support(self, peaks: Array, heights: Array, support: Array) -> Array:
@@ -987,42 +922,32 @@ class _Ascent:
         return np.asarray(new[(apart > 1e-6).all(axis=1)])
 
     def _share(self, phi: float, bound: float) -> float:
-        reported = self.objective.reported
-        return float(
-            self.objective.efficiency(float(reported(phi)), float(reported(bound)))
-        )
+        value, best = map(float, map(self.objective.reported, (phi, bound)))
+        return float(self.objective.efficiency(value, best))
 
     def _weights(self, blocks: Array, weights: Array) -> Array:
         """(S,) of sum 1, near the best for k commands at these blocks (S, q, p)."""
         grams = self.k * self.squares(blocks)
         information = np.tensordot(weights, grams, 1) + self.prior
         unit = self.unit(float(self.phi(information)))
-        sharp = _SHARP[0]
 
-        def down(z: Array) -> tuple[float, Array]:
+        def down(z: Array, sharp: float) -> tuple[float, Array]:
             e = np.exp(z - z.max())
             w = e / e.sum()
             information = np.tensordot(w, grams, 1) + self.prior
             phi = float(self.phi(information))
             if not np.isfinite(phi) and self.each.kind != "least":
                 return 1e10, np.zeros_like(z)
-            if self.smooth:
-                value, metric, _ = self.soft(information, sharp / unit)
-                slope = (grams * metric).sum(axis=(1, 2, 3)) / unit
-                return -value / unit, -w * (slope - w @ slope)
-            score, rate = self.score(phi)
-            slope = rate * (grams * self.gradient(information)).sum(axis=(1, 2, 3))
-            return -score, -w * (slope - w @ slope)
+            value, metric = self.goal(information, phi, sharp, unit)
+            slope = (grams * metric).sum(axis=(1, 2, 3))
+            return -value, -w * (slope - w @ slope)
 
-        start = np.log(np.maximum(weights, 1e-9))
-        logits = _descended(down, start, -np.inf, np.inf, 300, self.deadline)
-        for sharper in _SHARP[1:] if self.smooth else ():
-            sharp = sharper
-            logits = _descended(down, logits, -np.inf, np.inf, 300, self.deadline)
+        logits = np.log(np.maximum(weights, 1e-9))
+        for sharp in _SHARP if self.smooth else _SHARP[:1]:
+            smoothed = functools.partial(down, sharp=sharp)
+            logits = _descended(smoothed, logits, -np.inf, np.inf, 300, self.deadline)
         e = np.exp(logits - logits.max())
         return np.asarray(e / e.sum())
-
-    # -- the answer --------------------------------------------------------------------
 
     def _judged(self, commands: Array) -> tuple[Problem, float, float]:
         """The problem of commands and all candidates; value and log det of them."""
@@ -1030,15 +955,10 @@ class _Ascent:
         assert offer.candidates is not None
         pool = offer.candidates[offer.available]
         region = self.region
-        of_criterion = getattr(
-            getattr(self.asked, "criterion", self.asked), "region", None
-        )
-        if region is None and of_criterion is None and self.each.of_region:
+        of_one = getattr(self.asked, "criterion", self.asked)
+        if region is getattr(of_one, "region", None) is None and self.each.of_region:
             region = pool
-        scenarios = None
-        if len(self.members) > 1:
-            assert offer.scenarios is not None
-            scenarios = offer.scenarios.parameters, offer.scenarios.weights
+        scenarios = tuple(offer.scenarios) if len(self.members) > 1 else None
         beside = CandidateSet(
             np.concatenate([commands, pool]), offer.model, offer.prior, offer.noise,
             offer.measured, scenarios=scenarios,

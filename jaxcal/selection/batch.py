@@ -6,6 +6,7 @@ The solvers take candidates (B, M, n) and k, and by keyword ``available`` (B, M)
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import os
 import time
@@ -14,15 +15,27 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import whole_number
+from jaxcal.checks import Indices, whole_number
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.exchange import exchange
 from jaxcal.selection.problem import Problem, Solution, log_dets, make_problems
-from jaxcal.selection.result import BatchSelection
 from jaxcal.selection.solvers import checked_seed, random_indices
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class BatchSelection:
+    """One selection per candidate set."""
+
+    indices: Indices  # (B, k)
+    log_det: NDArray[np.float64]  # (B,) natural log det S
+    proven: NDArray[np.bool_]  # (B,)
+    bound: NDArray[np.float64]  # (B,) upper bound on log det S, inf where none is known
+    nodes: Indices  # (B,) nodes examined, 0 where not counted
+    method: str
+    seconds: float  # wall time of the whole batch
 
 
 def random_batch(

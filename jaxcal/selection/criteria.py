@@ -82,7 +82,6 @@ class Criterion:
     def of_rows(
         cls, root: Array, times: int = 1, offset: float = 0.0, unit: float = 1.0
     ) -> Self:
-        """The criterion of the combinations ``root`` (s, p), as they are."""
         criterion = cls.__new__(cls)
         criterion.root, criterion.times = root, times
         criterion.offset, criterion.unit = offset, unit
@@ -90,7 +89,6 @@ class Criterion:
 
     @property
     def each(self) -> Criterion:
-        """The criterion of each scenario."""
         return self
 
     @property
@@ -105,8 +103,8 @@ class Criterion:
     def within(self, at: Coordinates) -> Self:
         """The criterion in the coordinates of one problem.
 
-        The size of C, which may be in any units, goes into ``unit`` or ``offset``, so
-        that values are near 1; by powers of two, which is exact.
+        The size of C goes into ``unit`` or ``offset`` by powers of two, which is exact:
+        values are near 1 in any units.
         """
         root, times = self.rows(at), 1 if self.per_output else at.times
         if self.kind == "det":
@@ -323,13 +321,7 @@ def offered() -> list[str]:
 
 
 def criterion_of(criterion: Any, region: Any, default: str) -> Criterion:
-    """The criterion asked for by its letters, or as an object that carries its data.
-
-    Args:
-        criterion: a name of ``CRITERIA``, one of its classes' objects, or None.
-        region: of I and G, where they are asked for by their letter.
-        default: the criterion where none is asked for.
-    """
+    """The criterion asked for by its letters (``default`` if None), or as an object."""
     if isinstance(criterion, Criterion):
         asked = criterion
     else:

@@ -26,10 +26,9 @@ from jaxcal.selection.problem import (
     Solution,
     problem_of,
 )
-from jaxcal.selection.result import Selection, Subset
+from jaxcal.selection.result import Selection, Subset, optima_of
 from jaxcal.selection.solvers import OPTIONS, SOLVERS, checked_options
 
-_REFERENCES = ("bound", "exact")
 _LARGE_S = 0.1  # to make a problem: of a larger one time_limit takes account
 _PROVEN = 1e-9  # a value this near a proven optimum, relative above 1, is that optimum
 
@@ -133,24 +132,15 @@ class Design:
         return self.candidate_set.axes
 
     def __repr__(self) -> str:
-        model = self.candidate_set.model
+        model, usable = self.candidate_set.model, self.available
         what = "blocks" if model is None else type(model).__name__
-        count, usable = len(self.available), int(self.available.sum())
-        return (
-            f"{type(self).__name__} of {count} candidates, {usable} available, {what}"
-        )
+        return f"Design of {len(usable)} candidates, {usable.sum()} available, {what}"
 
     def problem(
         self, k: int | None = None, criterion: Any = None, region: Any = None
     ) -> Problem:
-        """The problem of choosing k by a criterion, checked and whitened.
-
-        Args:
-            k: candidates to choose; the fewest that identify when not given.
-            criterion: letters of ``CRITERIA`` or an object of it; D for the affine
-                model and blocks, else I.
-            region: of I, where it is given by its letter.
-        """
+        """The problem of choosing k (the fewest that identify, if None), checked,
+        whitened."""
         return problem_of(self.candidate_set, k, criterion, region)
 
     def select(
@@ -178,24 +168,20 @@ class Design:
             options: those that the method reads:
 
                 - seed: whole number, 0, or numpy Generator; of all but greedy.
-                - restarts: starts of exchange, and of the one that starts exact and
-                  auto; see ``exchange.default_restarts``, 30 with these.
+                - restarts: starts of exchange; 30 where it starts exact and auto.
                 - time_limit: seconds after which exact and auto return the best found
-                  with a true ``bound``, not proven, and exchange what it has;
-                  ``math.inf`` for none. 10, of exchange none, and 2 for auto with
-                  several readings per candidate, a prior or another criterion than D.
+                  with a true ``bound``, and exchange what it has; 10, of exchange none,
+                  and 2 for auto with blocks, a prior or another criterion than D.
                 - best: of exact, how many best subsets to prove, in ``alternatives``.
-                - least_efficiency: of auto, the efficiency in (0, 1] that suffices,
-                  0.999.
-                - checkpoint: of policy, folder of a trained one, else that which ships.
-                - decoding, num: of policy, how it chooses and how many it tries.
+                - least_efficiency: of auto, what suffices, 0.999.
+                - checkpoint, decoding, num: of policy, a folder, else what ships; how
+                  it chooses and how many it tries.
 
         Returns:
             The selection; never a singular one.
 
         Raises:
-            ValueError: naming the argument, the rule and the value; also where an
-                option is given that the method does not read.
+            ValueError: naming the argument, the rule and the value.
         """
         checked = checked_options(method, options)
         start = time.perf_counter()
@@ -227,10 +213,16 @@ class Design:
         Raises:
             ValueError: also where the subset is singular.
         """
-        one_of("reference", reference, _REFERENCES)
+        one_of("reference", reference, ("bound", "exact"))
         limit = TIME_LIMIT if time_limit is None else seconds("time_limit", time_limit)
         start = time.perf_counter()
-        subset = _whole_numbers(indices)
+        subset = np.asarray(indices)
+        if subset.ndim != 1 or subset.dtype.kind not in "iu" or not len(subset):
+            raise ValueError(
+                "indices must be a (k,) array of whole numbers, at least one, got "
+                f"shape {subset.shape} and dtype {subset.dtype}"
+            )
+        subset = subset.astype(np.int64)
         problem = _with_optima(self._problem_with(subset, criterion))
         if reference == "bound":
             return self._judged(problem, Solution(subset), "score", start)
@@ -272,17 +264,25 @@ class Design:
     def _judged(
         self, problem: Problem, solution: Solution, method: str, start: float
     ) -> Selection:
-        """What a solver found, judged by the caller's numbers.
-
-        Raises:
-            RuntimeError: it is no selection of this problem: the solver is wrong.
-        """
+        """What a solver found, judged by the caller's numbers."""
         indices, value = np.asarray(solution.indices), solution.value
         _require_allowed(problem, indices, method)
         log_det = solution.log_det
         if value is None or log_det is None:
             value, log_det = (float(pair[0]) for pair in problem.values(indices[None]))
-        self._require_numbers(problem, indices, value, log_det, method)
+        if log_det == -math.inf:
+            name = "indices" if method == "score" else "method"
+            whose = "" if method == "score" else f", which {method!r} returned"
+            raise ValueError(
+                f"{name} must give an invertible information matrix, but that of "
+                f"{indices.tolist()}{whose} is singular{self._why_singular(indices)}"
+            )
+        least = problem.criterion.kind == "least"
+        if not math.isfinite(value) or (least and not value > 0.0):
+            raise ValueError(
+                f"criterion {problem.criterion.name} is {value} in double precision; "
+                "give the commands in other units"
+            )
         return Selection(
             indices=indices,
             value=value,
@@ -301,29 +301,6 @@ class Design:
             names=self.candidate_set.names,
             axes=self.axes,
         )
-
-    def _require_numbers(
-        self,
-        problem: Problem,
-        indices: Indices,
-        value: float,
-        log_det: float,
-        method: str,
-    ) -> None:
-        """Refuse a selection that is singular, or whose value no double holds."""
-        if log_det == -math.inf:
-            name = "indices" if method == "score" else "method"
-            whose = "" if method == "score" else f", which {method!r} returned"
-            raise ValueError(
-                f"{name} must give an invertible information matrix, but that of "
-                f"{indices.tolist()}{whose} is singular{self._why_singular(indices)}"
-            )
-        least = problem.criterion.kind == "least"
-        if not math.isfinite(value) or (least and not value > 0.0):
-            raise ValueError(
-                f"criterion {problem.criterion.name} is {value} in double precision; "
-                "give the commands in other units"
-            )
 
     def _why_singular(self, indices: Indices) -> str:
         """What choosing among these candidates alone would be refused for."""
@@ -345,34 +322,19 @@ def _with_optima(problem: Problem) -> Problem:
     """With the optimum of each scenario, where the criterion compares by these."""
     if (joint := problem.joint) is None or not joint.criterion.of_efficiency:
         return problem
-    from jaxcal.selection.in_scenarios import optima_of
-
     return dataclasses.replace(joint, optima=optima_of(joint)[0])
-
-
-def _whole_numbers(indices: ArrayLike) -> Indices:
-    """A subset (k,) as the caller gives it, k at least 1."""
-    subset = np.asarray(indices)
-    if subset.ndim != 1 or not np.issubdtype(subset.dtype, np.integer):
-        raise ValueError(
-            "indices must be a (k,) array of whole numbers, got shape "
-            f"{subset.shape} and dtype {subset.dtype}"
-        )
-    if not len(subset):
-        raise ValueError("indices must name at least one candidate, got none")
-    return subset.astype(np.int64)
 
 
 def _require_allowed(problem: Problem, indices: Indices, method: str) -> None:
     """Refuse what is no selection of this problem: the solver is wrong."""
-    right: bool = indices.ndim == 1 and indices.dtype.kind in "iu"
-    right = right and len(indices) == problem.k
-    right = right and bool((0 <= indices).all())
-    right = right and bool((indices < len(problem.available)).all())
-    if right:
+    right = indices.shape == (problem.k,) and indices.dtype.kind in "iu"
+    if right and ((0 <= indices) & (indices < len(problem.available))).all():
         counts = np.bincount(indices, minlength=len(problem.available))
         right = bool(((problem.lower <= counts) & (counts <= problem.upper)).all())
-    if not right or not problem.allows(indices):
+        right = right and problem.allows(indices)
+    else:
+        right = False
+    if not right:
         raise RuntimeError(
             f"method {method!r} must return {problem.k} candidates within the bounds "
             f"lower and upper of its problem, got {indices.tolist()}"
@@ -403,19 +365,11 @@ def select(
 
     Args:
         candidates: (M, n) commands that could be measured, or None with blocks.
-        k: candidates to choose; the fewest that identify when not given.
-        method: "auto", "exact", "exchange", "greedy", "random" or "policy".
-        criterion, region: see ``Design.select``.
+        k, method, criterion, region: see ``Design.select``.
         given: model, prior, noise, measured, available, required, max_replicates,
-            constraints, blocks, commands, scenarios, names: of the problem, see
-            ``Design``; seed, restarts, time_limit, best, least_efficiency, checkpoint,
-            decoding, num: those that the method reads, see ``Design.select``.
-
-    Returns:
-        The selection; never a singular one.
-
-    Raises:
-        ValueError: naming the argument, the rule and the value.
+            constraints, blocks, commands, scenarios, names: of ``Design``; seed,
+            restarts, time_limit, best, least_efficiency, checkpoint, decoding, num:
+            those that the method reads, of ``Design.select``.
     """
     options = {name: given.pop(name) for name in OPTIONS if name in given}
     for name in given:

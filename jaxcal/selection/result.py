@@ -1,22 +1,31 @@
-"""What every solver returns."""
+"""What every solver returns, and what it is worth in each scenario.
+
+An efficiency in a scenario is measured by the optimum of that scenario alone, which is
+proven or bounded within a share of a time limit: then it is at least what is said.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.checks import Indices, aligned, axis_names, lasted
+from jaxcal.checks import Array, Indices, aligned, axis_names, lasted
+from jaxcal.deadline import Deadline
 from jaxcal.information.blocks import rank_of_blocks
 from jaxcal.late import late
-from jaxcal.selection.problem import Problem
+from jaxcal.selection.exact.exact import solve_exact, upper_bound
+from jaxcal.selection.problem import Problem, ScenarioProblem
 
 if TYPE_CHECKING:
     from jaxcal.information.criteria import Criteria
-    from jaxcal.selection.in_scenarios import ScenarioTable
+
+_LIMIT = 2.0  # seconds for the optima of all scenarios together
+_LEAST_LIMIT = 0.02  # and at least of each
+_ENOUGH = 0.999  # an efficiency that ends the search for an optimum
 
 
 class Subset(NamedTuple):
@@ -25,6 +34,51 @@ class Subset(NamedTuple):
     indices: Indices  # (k,)
     value: float  # of the criterion
     log_det: float  # natural log det S, whatever the criterion
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ScenarioTable:
+    """A selection in each of S scenarios; printing it shows a table."""
+
+    weights: Array  # (S,) of sum 1
+    values: Array  # (S,) of the criterion
+    optima: Array  # (S,) no selection of the scenario alone has a better value
+    proven: NDArray[np.bool_]  # (S,) whether that is within 0.1 % of its optimum
+    efficiencies: Array  # (S,) against ``optima``
+    nominal_indices: Indices | None  # (k,) the design made at the nominal alone
+    nominal_efficiencies: Array | None  # (S,) what it would have had; 0 is singular
+
+    @property
+    def least(self) -> float:
+        """The smallest efficiency."""
+        return float(self.efficiencies.min())
+
+    @property
+    def mean(self) -> float:
+        """The weighted mean efficiency."""
+        return float(self.weights @ self.efficiencies)
+
+    def summary(self) -> list[str]:
+        """Two lines: this design, and the nominal's own."""
+        count = len(self.weights)
+        bounded = (
+            "" if self.proven.all() else f", {int(self.proven.sum())} of them proven"
+        )
+        lines = [
+            f"scenarios     {count}, efficiency against the optimum of each{bounded}"
+        ]
+        named = (
+            ("this one", self.efficiencies),
+            ("nominal's", self.nominal_efficiencies),
+        )
+        for name, shares in named:
+            if shares is not None:
+                least, mean = shares.min(), self.weights @ shares
+                lines.append(f"  {name:9}   least {least:.4f}, mean {mean:.4f}")
+        return lines
+
+    def __str__(self) -> str:
+        return "\n".join(self.summary())
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -74,8 +128,6 @@ class Selection:
         """
         bound = self.known_bound
         if bound is None:
-            from jaxcal.selection.exact.exact import upper_bound
-
             bound = upper_bound(self.problem)
         better = max if self.problem.criterion.larger_is_better else min
         return better(bound, self.value)
@@ -99,8 +151,6 @@ class Selection:
         joint = self.problem.joint
         if joint is None or self.criterion == "G":
             return None
-        from jaxcal.selection.in_scenarios import in_scenarios
-
         return in_scenarios(joint, self.indices)
 
     @cached_property
@@ -113,7 +163,7 @@ class Selection:
         return criteria(chosen, problem.root, region, problem.multiplicity)
 
     @cached_property
-    def left_without(self) -> NDArray[np.float64]:
+    def left_without(self) -> Array:
         """(k,) det S without each of the chosen, as a share of det S; 0 is singular.
 
         Of scenarios the least over them.
@@ -149,10 +199,7 @@ class Selection:
             }
         return content
 
-    @property
-    def _noun(self) -> str:
-        """What a measurement is called in the table."""
-        return "candidate"
+    _noun: ClassVar[str] = "candidate"  # what a measurement is called in the table
 
     def _axes(self) -> tuple[str, ...]:
         assert self.problem.candidates is not None
@@ -173,7 +220,8 @@ class Selection:
         share, name = self.left_without[worst], f"{self._noun} {self.labels[worst]}"
         return f"losing {name} costs most: {100 * share:.3g} % of det S remains"
 
-    def __str__(self) -> str:
+    def _table(self) -> list[str]:
+        """What was chosen, a line each, under a title."""
         head = ["candidate"] + (["name"] if self.names is not None else [])
         cells = [[str(i)] for i in self.indices.tolist()]
         if self.names is not None:
@@ -183,42 +231,33 @@ class Selection:
             for row, i in zip(cells, self.indices, strict=True):
                 row += [f"{x:.6g}" for x in self.problem.candidates[i]]
         count = int(self.problem.available.sum())
+        title = f"{len(self.indices)} of {count} candidates, method {self.method}"
+        return [title, *aligned([head, *cells])]
+
+    def _limit(self) -> str:
+        """The bound of the value, in words."""
         side = "upper" if self.problem.criterion.larger_is_better else "lower"
-        best = "proven optimal" if self.proven else f"{side} bound {self.bound:.6g}"
+        return "proven optimal" if self.proven else f"{side} bound {self.bound:.6g}"
+
+    def __str__(self) -> str:
         share = self.problem.criterion.efficiency_name
         extra = "" if self.seed is None else f", seed {self.seed}"
         lines = [
-            f"{len(self.indices)} of {count} candidates, method {self.method}",
-            *aligned([head, *cells]),
-            f"{self.problem.criterion.says:13} {self.value:.6g} ({best})",
+            *self._table(),
+            f"{self.problem.criterion.says:13} {self.value:.6g} ({self._limit()})",
             f"{share:13} {self.efficiency:.6f}" + ("" if self.proven else " or more"),
             *(() if self.in_scenarios is None else self.in_scenarios.summary()),
             f"{'without one':13} {self._lost()}",
             f"time          {lasted(self.seconds)}{extra}",
         ]
-        return "\n".join(
-            lines + ([f"reason        {self.reason}"] if self.reason else [])
-        )
+        return "\n".join(lines + [f"reason        {self.reason}"] * bool(self.reason))
 
     __repr__ = __str__
     plot = late("jaxcal.reports.shown:plot_selection")
     _repr_html_ = late("jaxcal.reports.shown:as_html")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class BatchSelection:
-    """One selection per candidate set."""
-
-    indices: Indices  # (B, k)
-    log_det: NDArray[np.float64]  # (B,) natural log det S
-    proven: NDArray[np.bool_]  # (B,)
-    bound: NDArray[np.float64]  # (B,) upper bound on log det S, inf where none is known
-    nodes: Indices  # (B,) nodes examined, 0 where not counted
-    method: str
-    seconds: float  # wall time of the whole batch
-
-
-def _shares_without(problem: Problem, indices: Indices) -> NDArray[np.float64]:
+def _shares_without(problem: Problem, indices: Indices) -> Array:
     """(k,) det S without each of the chosen (k,), as a share of det S."""
     k = len(indices)
     others = np.tile(indices, (k, 1))[~np.eye(k, dtype=np.bool_)].reshape(k, -1)
@@ -226,3 +265,53 @@ def _shares_without(problem: Problem, indices: Indices) -> NDArray[np.float64]:
         return np.zeros(1)
     log_det = rank_of_blocks(problem.raw[others], problem.root, problem.white.size)[1]
     return np.asarray(np.exp(problem.multiplicity * log_det - problem.log_det(indices)))
+
+
+def _optimum(problem: Problem, limit: float) -> tuple[Indices, float, bool]:
+    """A good selection, the value that none betters, and whether that is proven."""
+    deadline = Deadline(limit)
+    solution = solve_exact(problem, deadline=deadline, restarts=8, enough=_ENOUGH)
+    assert solution.value is not None and solution.bound is not None
+    share = problem.criterion.efficiency(solution.value, solution.bound)
+    return solution.indices, solution.bound, solution.proven or share >= _ENOUGH
+
+
+def optima_of(problem: ScenarioProblem) -> tuple[Array, NDArray[np.bool_]]:
+    """(S,) values that no selection of a scenario betters, and which are proven."""
+    limit = max(_LIMIT / len(problem.members), _LEAST_LIMIT)
+    each = [_optimum(member, limit)[1:] for member in problem.members]
+    return np.array([x for x, _ in each]), np.array([proven for _, proven in each])
+
+
+def in_scenarios(problem: ScenarioProblem, indices: Indices) -> ScenarioTable:
+    """A selection (k,) in each scenario."""
+    optima, proven = optima_of(problem)
+    values = problem.scenario_values(indices[None])[0][:, 0]
+    better = np.maximum if problem.criterion.each.larger_is_better else np.minimum
+    optima = better(optima, values)
+    nominal = nominal_efficiencies = None
+    if problem.nominal is not None:
+        nominal = _optimum(problem.nominal, _LIMIT / 4.0)[0]
+        nominal_efficiencies = _efficiencies(problem, nominal, optima)
+    return ScenarioTable(
+        weights=problem.weights,
+        values=values,
+        optima=optima,
+        proven=proven,
+        efficiencies=_efficiencies(problem, indices, optima),
+        nominal_indices=nominal,
+        nominal_efficiencies=nominal_efficiencies,
+    )
+
+
+def _efficiencies(problem: ScenarioProblem, indices: Indices, optima: Array) -> Array:
+    """(S,) of a selection; 0 where it is singular."""
+    values, log_dets = problem.scenario_values(indices[None])
+    return np.array(
+        [
+            member.criterion.efficiency(value, best) if np.isfinite(log_det) else 0.0
+            for member, value, log_det, best in zip(
+                problem.members, values[:, 0], log_dets[:, 0], optima, strict=True
+            )
+        ]
+    ).clip(0.0, 1.0)

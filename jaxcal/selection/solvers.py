@@ -22,7 +22,7 @@ from jaxcal.selection.problem import Problem, Solution, log_dets
 _TRIES = 200  # random selections, before the greedy one, where all are singular
 
 
-def solve_random(problem: Problem, *, seed: int | np.random.Generator) -> Solution:
+def solve_random(problem: Problem, *, seed: int) -> Solution:
     """The baseline of the paper: drawn uniformly, never singular, required first."""
     rng = np.random.default_rng(seed)
     ruled = problem.constraints is not None or np.ndim(problem.max_replicates) > 0
@@ -30,7 +30,7 @@ def solve_random(problem: Problem, *, seed: int | np.random.Generator) -> Soluti
     for _ in range(_TRIES):  # none singular in any scenario
         indices = start() if start else random_indices([problem], rng)[0][0]
         if problem.allows(indices) and np.isfinite(problem.log_det(indices)):
-            return Solution(indices, seed=seed if isinstance(seed, int) else None)
+            return Solution(indices, seed=seed)
     return exchange.solve_greedy(problem)
 
 
@@ -64,13 +64,8 @@ def random_indices(
 
 @functools.cache
 def _options(solve: Callable[..., Solution]) -> tuple[str, ...]:
-    """Names of the options that a solver reads."""
     arguments = inspect.signature(solve).parameters.values()
-    return tuple(
-        argument.name
-        for argument in arguments
-        if argument.kind == argument.KEYWORD_ONLY
-    )
+    return tuple(x.name for x in arguments if x.kind == x.KEYWORD_ONLY)
 
 
 def _policy(
@@ -86,7 +81,7 @@ def _policy(
         "max_replicates above 1": np.max(problem.upper) > 1,
         "constraints": problem.constraints is not None,
     }
-    for argument in (name for name, other in taken.items() if other):
+    for argument in filter(taken.get, taken):
         raise ValueError(
             'use method auto, exact or exchange here: "policy" is trained to choose '
             f"different candidates of y = A u + b by D alone, got {argument}"
@@ -122,14 +117,10 @@ OPTIONS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
 def checked_options(method: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """The options that a method reads, checked; defaults where they are not given.
 
-    Args:
-        method: a name of ``SOLVERS``.
-        given: options of ``select`` by name.
-
     Raises:
         ValueError: an option is unknown, has a bad value, or belongs to other methods.
     """
-    one_of("method", method, tuple(SOLVERS))
+    one_of("method", method, METHODS)
     reads = _options(SOLVERS[method])
     checked = {name: OPTIONS[name][0] for name in reads if name in OPTIONS}
     for name, value in given.items():

@@ -324,6 +324,6 @@ def test_the_noise_of_an_arm_counts_as_it_does_for_select():
     arm = SerialChain.from_dh([(0, 90, 90, 0), (-425, 0, 0, 0), (-390, 0, 0, 0)])
     poses = np.random.default_rng(0).uniform(-90, 90, (12, 3))
     motion = Motion((30.0,), (200.0,))
-    found = select_fastest(poses, 6, motion=motion, model=arm, method="heuristic")
+    found = select_fastest(poses, 6, motion=motion, model=arm)
     judged = score(poses, found.indices, model=arm, criterion="D")
     assert found.log_det == pytest.approx(judged.log_det)

@@ -47,7 +47,6 @@ def test_the_run_is_efficient_enough_and_close_to_the_fastest():
                 motion=MOTION,
                 start=HOME,
                 least_efficiency=least,
-                method="heuristic",
             )
             assert found.efficiency >= least - 1e-9
             assert not found.proven
@@ -68,7 +67,6 @@ def test_masked_and_required_postures_are_respected(required):
         least_efficiency=0.6,
         available=np.arange(12) >= 3,
         required=required,
-        method="heuristic",
     )
     assert set(required) <= set(found.indices.tolist())
     assert found.indices.min() >= 3 and len(set(found.indices.tolist())) == 4
@@ -78,7 +76,7 @@ def test_the_front_ascends_to_the_optimum_and_is_never_faster_than_the_proven_on
     candidates = drawn(11)
     value, seconds = every_run(candidates)
     efficiency = np.exp((value - value.max()) / 4)
-    front = pareto_front(candidates, motion=MOTION, start=HOME, method="heuristic")
+    front = pareto_front(candidates, motion=MOTION, start=HOME)
     points = front.points
     assert not front.proven and len(points) >= 3
     assert points[-1].efficiency == pytest.approx(1.0, abs=1e-9)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection import select
 from jaxcal.selection.exact import volume
-from jaxcal.selection.exact.volume import Volumes, largest_volumes
+from jaxcal.selection.exact.volume import Volume, largest_volume
 
 Array = np.ndarray
 
@@ -40,11 +40,11 @@ def brute_force(vectors: Array) -> float:
 
 def prepared(
     monkeypatch: pytest.MonkeyPatch, vectors: Array, deadline: Deadline = NEVER
-) -> Volumes:
+) -> Volume:
     """From a known volume, however few subsets there are."""
     with monkeypatch.context() as patch:
         patch.setattr(volume, "_PREPARED", 0)
-        return largest_volumes(vectors, deadline=deadline)
+        return largest_volume(vectors, deadline)
 
 
 def make(kind: str, seed: int, h: int, q: int) -> Array:
@@ -88,34 +88,26 @@ def test_the_search_finds_what_brute_force_finds(
     expected = np.sort(determinants(vectors, subsets))[::-1]
     with pytest.MonkeyPatch.context() as patch:
         answers = [prepared(patch, vectors)]
-    answers += [largest_volumes(vectors, best) for best in (1, 4, len(subsets))]
+    answers.append(largest_volume(vectors))
     # A volume is known to the rounding of the longest vectors; where fewer than q are
     # not zero, it is zero to the rounding of the longest alone.
     lengths = np.sort(np.linalg.norm(vectors, axis=1))
     size = np.prod(np.where(lengths[-q:] > 0.0, lengths[-q:], 1e-3 * lengths[-1]))
     tolerance = {"rel": 1e-9, "abs": 1e-12 * size}
-    for found, best in zip(answers, (1, 1, 4, len(subsets)), strict=True):
-        assert found.complete
-        assert found.bound == found.volumes[0]
-        assert all(len(set(subset)) == q for subset in found.subsets.tolist())
-        assert len(np.unique(found.subsets, axis=0)) == len(found.subsets)
-        reached = np.zeros(min(best, len(subsets)))  # those left out have no volume
-        reached[: len(found.volumes)] = found.volumes
-        assert reached == pytest.approx(expected[:best], **tolerance)
-        actual = determinants(vectors, found.subsets)
-        assert actual == pytest.approx(reached[: len(actual)], **tolerance)
+    for found in answers:
+        assert found.complete and found.bound == found.size
+        assert len(set(found.subset.tolist())) == q
+        assert found.size == pytest.approx(expected[0], **tolerance)
+        assert determinants(vectors, found.subset[None]) == pytest.approx(
+            found.size, **tolerance
+        )
 
 
 @pytest.mark.parametrize("q", [2, 3, 4, 5])
 @pytest.mark.parametrize("h", [8, 12])
 def test_volumes_are_in_the_callers_unit(q: int, h: int) -> None:
     vectors = 7.0 * np.random.default_rng(q).normal(size=(h, q))
-    for best in (1, 3):
-        found = largest_volumes(vectors, best)
-        np.testing.assert_allclose(
-            found.volumes, determinants(vectors, found.subsets), rtol=1e-12
-        )
-        assert found.volumes[0] == pytest.approx(brute_force(vectors))
+    assert largest_volume(vectors).size == pytest.approx(brute_force(vectors))
 
 
 @pytest.mark.parametrize(("h", "q"), [(60, 4), (90, 3), (200, 3), (30, 5)])
@@ -126,22 +118,24 @@ def test_many_are_found_too(
     vectors = make(kind, h, h, q)
     subsets = np.array(list(itertools.combinations(range(h), q)))
     size = determinants(vectors, subsets)
-    order = np.argsort(-size)[:5]
-    for found in (prepared(monkeypatch, vectors), largest_volumes(vectors, 5)):
-        first = order[: len(found.subsets)]
-        np.testing.assert_array_equal(found.subsets, subsets[first])
-        assert found.volumes == pytest.approx(size[first], rel=1e-11)
+    first = int(size.argmax())
+    for found in (prepared(monkeypatch, vectors), largest_volume(vectors)):
+        np.testing.assert_array_equal(found.subset, subsets[first])
+        assert found.size == pytest.approx(size[first], rel=1e-11)
         assert found.examined < len(subsets) / 10
 
 
-def test_the_search_for_pairs_ends_on_the_clock() -> None:
+def test_the_search_for_pairs_ends_on_the_clock(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     angles = np.random.default_rng(0).uniform(0, np.pi, 200_000)
     vectors = np.column_stack([np.cos(angles), np.sin(angles)])
     begun = time.perf_counter()
-    found = largest_volumes(vectors, 3, Deadline(1.0))
+    monkeypatch.setattr(volume, "_PREPARED", 10**12)
+    found = largest_volume(vectors, Deadline(1.0))
     assert time.perf_counter() - begun < 5.0  # all pairs: 20 s
-    assert not found.complete and found.bound >= found.volumes[0]
-    assert found.volumes[0] > 0.9 or not found.examined  # a busy machine got no turn
+    assert not found.complete and found.bound >= found.size
+    assert found.size > 0.9 or not found.examined  # a busy machine got no turn
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.002, 0.02])
@@ -149,20 +143,20 @@ def test_a_deadline_leaves_an_honest_bound(
     monkeypatch: pytest.MonkeyPatch, seconds: float
 ) -> None:
     vectors = rows(sphere(4, 200, 6))
-    optimum = prepared(monkeypatch, vectors).volumes[0]
+    optimum = prepared(monkeypatch, vectors).size
     found = prepared(monkeypatch, vectors, deadline=Deadline(seconds))
     if seconds == 0.0:
         assert not found.complete and found.examined == 0
-    assert found.volumes[0] <= optimum * (1 + 1e-12) and optimum <= found.bound
-    assert found.volumes[0] == pytest.approx(determinants(vectors, found.subsets)[0])
-    assert found.volumes[0] > 0.9 * optimum
+    assert found.size <= optimum * (1 + 1e-12) and optimum <= found.bound
+    assert found.size == pytest.approx(determinants(vectors, found.subset[None])[0])
+    assert found.size > 0.9 * optimum
 
 
 @pytest.mark.parametrize("vectors", [np.zeros((6, 3)), np.eye(4)[:3].repeat(3, axis=0)])
 def test_no_volume_at_all(monkeypatch: pytest.MonkeyPatch, vectors: Array) -> None:
-    for found in (largest_volumes(vectors), prepared(monkeypatch, vectors)):
-        assert found.volumes[0] == pytest.approx(0.0, abs=1e-12)
-        assert found.complete and found.subsets.shape == (1, vectors.shape[1])
+    for found in (largest_volume(vectors), prepared(monkeypatch, vectors)):
+        assert found.size == pytest.approx(0.0, abs=1e-12)
+        assert found.complete and found.subset.shape == vectors.shape[1:]
 
 
 @pytest.mark.parametrize(("count", "n"), [(500, 3), (600, 3), (300, 4), (200, 7)])

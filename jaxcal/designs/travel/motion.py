@@ -39,18 +39,11 @@ class Motion:
 
 
 def travel_times(points: ArrayLike, others: ArrayLike, motion: Motion) -> Array:
-    """Seconds from each of some postures to each of others, without settling.
+    """(A, B) seconds from each of postures (A, n) to each of others (B, n), not
+    settling.
 
-    An axis that moves d at speed v and acceleration a takes ``d / v + v / a``, or
-    ``2 sqrt(d / a)`` where it never reaches v (d < v^2 / a); the slowest axis counts.
-
-    Args:
-        points: (A, n).
-        others: (B, n) in the same unit.
-        motion: limits of the axes.
-
-    Returns:
-        (A, B).
+    An axis that moves d at speed v and acceleration a takes ``d / v + v / a``, or ``2
+    sqrt(d / a)`` where it never reaches v (d < v^2 / a); the slowest axis counts.
     """
     a, b = numbers("points", points), numbers("others", others)
     if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1]:
@@ -80,22 +73,16 @@ def _limits_of(motion: Motion, num_axes: int) -> tuple[Array, Array]:
 def fastest_tour(
     times: ArrayLike, start: ArrayLike | None = None
 ) -> tuple[NDArray[np.int64], float]:
-    """The order of least time through all postures, ending anywhere.
+    """The (K,) order of least time through all postures, ending anywhere, and its
+    seconds.
 
-    Optimal up to 12 postures (Held and Karp 1962). Beyond that the shortest
-    nearest-neighbour tours are improved by reversing pieces (2-opt) and moving single
-    postures, which proves nothing.
+    Optimal up to 12 postures (Held and Karp 1962); beyond, the shortest
+    nearest-neighbour tours are improved by 2-opt and moves of single postures, which
+    proves nothing.
 
     Args:
         times: (K, K) seconds from each posture to each, symmetric.
-        start: (K,) seconds to each from where the device stands; it begins at any
-            posture when not given.
-
-    Returns:
-        (K,) order, and the seconds of travel.
-
-    Raises:
-        ValueError: naming the argument, the rule and the value.
+        start: (K,) seconds to each from where the device stands; any when not given.
     """
     between = np.ascontiguousarray(numbers("times", times))
     k = len(between) if between.ndim else 0

@@ -15,16 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.checks import Array, Indices, array_of, one_of, seconds, share
+from jaxcal.checks import Array, Indices, array_of, seconds, share
 from jaxcal.deadline import Deadline
 from jaxcal.designs.travel.motion import Motion, travel_times
 from jaxcal.selection.design import Design
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.exchange.exchange import exchange_indices
-from jaxcal.selection.problem import (
-    CandidateSet,
-    problem_of,
-)
+from jaxcal.selection.problem import CandidateSet, problem_of
 from jaxcal.selection.solvers import checked_seed
 
 SAME_TIME = 1e-9  # seconds: two runs this close take as long
@@ -70,7 +67,6 @@ def fastest(
     *,
     least_efficiency: float = 0.95,
     start: ArrayLike | None = None,
-    method: str = "heuristic",
     time_limit: float = 60.0,
     seed: int | np.random.Generator = 0,
 ) -> FastSelection:
@@ -82,7 +78,6 @@ def fastest(
         motion: speeds and accelerations in the candidates' unit, settle time.
         least_efficiency: in (0, 1], against the proven D-optimum.
         start: (n,) where the device stands; it begins at any posture by default.
-        method: "heuristic", the only one.
         time_limit: seconds of the search for the D-optimum.
         seed: of the starts and of the random swaps.
 
@@ -94,7 +89,6 @@ def fastest(
             replicates, which have no such run.
     """
     least = share("least_efficiency", least_efficiency)
-    one_of("method", method, ("heuristic",))
     search = _TourSearch(design.candidate_set, k, motion, start, time_limit, seed)
     answer = search.answer(least, None)
     if answer is None:
@@ -111,7 +105,6 @@ def pareto(
     motion: Motion,
     *,
     least_efficiency: float = 0.7,
-    method: str = "heuristic",
     **options: Any,
 ) -> ParetoFront:
     """Time against D-efficiency, from ``least_efficiency`` up to the D-optimum.
@@ -122,30 +115,20 @@ def pareto(
         design: what may be measured; ``design.pareto(k, motion)`` asks the same.
         k, motion: as in ``fastest``.
         least_efficiency: where to cut the front off, in (0, 1].
-        method: "heuristic", the only one.
         options: start, seed and time_limit of ``fastest``.
     """
     least = share("least_efficiency", least_efficiency)
-    one_of("method", method, ("heuristic",))
-    defaults = {"start": None, "time_limit": 60.0, "seed": 0}
-    search = _TourSearch(design.candidate_set, k, motion, **(defaults | options))
+    search = _TourSearch(design.candidate_set, k, motion, **options)
     points: list[FastSelection] = []
     point = search.answer(least, None)
     while point is not None and len(points) < _MOST_POINTS:
         points.append(point)
         point = search.answer(least, point.log_det)
-    return ParetoFront(_undominated(points), least)
-
-
-def _undominated(points: list[FastSelection]) -> tuple[FastSelection, ...]:
-    """The points that no other exceeds in efficiency within the same time."""
-    return tuple(
-        p
-        for p in points
-        if not any(
-            q.seconds <= p.seconds + SAME_TIME and q.log_det > p.log_det for q in points
-        )
-    )
+    front: list[FastSelection] = []
+    for point in sorted(points, key=lambda point: -point.log_det):
+        if not front or point.seconds < front[-1].seconds - SAME_TIME:
+            front.append(point)
+    return ParetoFront(tuple(front[::-1]), least)
 
 
 def _require_travel(offer: CandidateSet, motion: Motion) -> Array:
@@ -175,9 +158,9 @@ class _TourSearch:
         offer: CandidateSet,
         k: int | None,
         motion: Motion,
-        start: ArrayLike | None,
-        time_limit: float,
-        seed: int | np.random.Generator,
+        start: ArrayLike | None = None,
+        time_limit: float = 60.0,
+        seed: int | np.random.Generator = 0,
     ) -> None:
         points = _require_travel(offer, motion)
         self.problem = problem = problem_of(offer, k, "D")
@@ -197,10 +180,8 @@ class _TourSearch:
         self.optimum = solve_exact(problem, deadline=deadline)
 
     def answer(self, least: float, above: float | None) -> FastSelection | None:
-        """The fastest run with efficiency ``least``, and log det S over ``above``.
-
-        None where the search finds no subset with that determinant.
-        """
+        """The fastest run of an efficiency, and log det S over ``above``; None: none
+        found."""
         begun, problem, optimum = time.perf_counter(), self.problem, self.optimum
         m, scale = problem.multiplicity, problem.white.log_scale
         # Whitened. The optimum itself must meet its own value; a bound that is not the
@@ -239,10 +220,8 @@ class _TourSearch:
     def _local(
         self, wanted: float, rng: np.random.Generator
     ) -> tuple[Indices | None, float]:
-        """The fastest subset (k,) found from near-optimal ones, and its travel.
-
-        None and infinity where no start has the log det ``wanted``.
-        """
+        """The fastest subset (k,) from near-optimal ones, and its travel; None: none
+        reaches it."""
         starts = [self.optimum.indices] + [
             exchange_indices(self.problem, 1, int(rng.integers(2**31)))
             for _ in range(_STARTS - 1)
@@ -292,16 +271,11 @@ class _TourSearch:
         return tour, travel
 
     def _refills(self, kept: Indices, wanted: float) -> list[tuple[float, Indices]]:
-        """Ways to complete k - 1 postures to k, by their estimated seconds of travel.
+        """Ways to complete k - 1 postures to k: seconds, ascending, and (k,) subset of
+        each.
 
-        The estimate inserts the new posture where it adds least to the tour kept.
-
-        Args:
-            kept: (k - 1,) postures in the order visited.
-            wanted: least whitened log det, met to 1e-6.
-
-        Returns:
-            Seconds and (k,) subset of each, ascending.
+        The new posture is inserted where it adds least to the tour (k - 1,); the
+        whitened log det ``wanted`` is met to 1e-6.
         """
         times, begin = self.times, self.start
         legs = np.concatenate([begin[kept[:1]], times[kept[:-1], kept[1:]], [0.0]])

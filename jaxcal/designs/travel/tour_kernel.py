@@ -14,15 +14,8 @@ _SHORTER = cython.declare(cython.double, 1e-10)  # seconds that a change must sa
 
 
 def best_order(times, start):
-    """Order of least time, ending anywhere: exact for few postures, else improved.
-
-    Args:
-        times: (K, K) float64 seconds, symmetric.
-        start: (K,) float64 seconds from the start.
-
-    Returns:
-        (K,) int64 order, and its seconds.
-    """
+    """(K,) order of least time, ending anywhere, and its seconds; exact for few
+    postures."""
     k = len(start)
     if k <= MOST_EXACT:
         return _exact_order(times, start)
@@ -60,18 +53,10 @@ def _exact_order(times, start):
 
 
 def _extend(tours, times, start, chosen, depth):
-    """Add a posture to the table of best open tours (Held and Karp).
+    """Add posture ``chosen[depth]`` to the table of best open tours (Held and Karp).
 
-    Args:
-        tours: (2^K, K); ``tours[mask, last]`` is the least time over the postures in
-            ``mask`` that ends in ``last``, known below ``2^depth``.
-        times: (M, M) seconds from each posture to each, symmetric.
-        start: (M,) seconds to each from the start.
-        chosen: (K,) into ``times``; bit c of a mask stands for ``chosen[c]``.
-        depth: the posture to add is ``chosen[depth]``.
-
-    Returns:
-        Seconds of the best tour through the first ``depth + 1`` chosen.
+    ``tours[mask, last]`` is the least time over the postures in ``mask`` that ends in
+    ``last``, known below ``2^depth``. Returns that of the first ``depth + 1`` chosen.
     """
     one: cython.Py_ssize_t = 1
     bit = one << depth

@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,10 +21,8 @@ from jaxcal.checks import Array, Indices
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.information.blocks import gram, largest_rank
 from jaxcal.selection.criteria import Criterion
+from jaxcal.selection.problem import Constraints
 from jaxcal.selection.problem.scenarios import ScenarioCriterion
-
-if TYPE_CHECKING:
-    from jaxcal.selection.problem.constraints import Constraints
 
 TOLERANCE = 1e-10  # of phi of "det"; of the others a share of it
 _MEMORY = 64 * 2**20  # bytes of open nodes up to which the best bound goes first
@@ -52,7 +50,6 @@ class Scenario(NamedTuple):
     criterion: Criterion
 
     def search(self, upper: Indices, start: Indices, incumbents: Any) -> _KernelSearch:
-        """The kernel's search; ``upper`` (M,), ``start`` (M,) counts."""
         root, scale, shift, largest = _near_one(*self, start, upper)
         blocks, prior, criterion = self
         useful = min(largest, _USEFUL.get(criterion.kind, np.inf))
@@ -74,7 +71,6 @@ class JointScenarios(NamedTuple):
     terms: tuple[Array, Array]  # (S,) scale and shift of phi
 
     def search(self, upper: Indices, start: Indices, incumbents: Any) -> _KernelSearch:
-        """The search of the kernel in all scenarios; ``upper``, ``start`` (M,)."""
         scenarios, criterion, weights, terms = self
         kernel = compiled.kernel("jaxcal.selection.exact.branch_kernel")
         near = [_near_one(*scenario, start, upper) for scenario in scenarios]
@@ -86,10 +82,8 @@ class JointScenarios(NamedTuple):
         largest = float(most.min() if criterion.least else weights @ most)
         unit = 1.0
         if criterion.kind != "det":  # values near 1
-            begun = [-1.0 if criterion.kind == "trace" else 1.0] * scale + shift
-            unit = float(
-                np.abs(begun).max() if criterion.least else weights @ np.abs(begun)
-            )
+            begun = np.abs((-scale if criterion.kind == "trace" else scale) + shift)
+            unit = float(begun.max() if criterion.least else weights @ begun)
             scale, shift, largest = scale / unit, shift / unit, largest / unit
         useful = min(largest, _USEFUL.get(criterion.kind, np.inf))
         k = start.sum()
@@ -138,16 +132,9 @@ def branch_and_bound(
     """The ``best`` selections by phi of the criterion, with proof.
 
     Args:
-        judged_by: blocks, prior and criterion, of one scenario or of several.
-        lower: (M,) least counts.
-        upper: (M,) largest counts.
-        start: (M,) counts of a good selection, sum k.
-        best: how many selections.
-        deadline: when to stop with what there is.
-        enough: share of the best possible (its efficiency) at which to stop, once the
-            proof has had a fair try.
+        lower, upper, start: (M,) bounds of counts, and counts of a good selection.
+        enough: efficiency at which to stop, once the proof has had a fair try.
         root_only: stop at the bound of the relaxation.
-        rules: on the counts.
     """
     incumbents = _incumbents(best, len(start))
     started = judged_by.search(upper, start, incumbents)
@@ -166,8 +153,7 @@ def _price(search: Any, rules: Constraints, begun: Array, deadline: Deadline) ->
     """Have the search keep the rules, at prices that make the bound at the root least.
 
     Any prices from 0 give true bounds; these are optimum by cutting planes (Kelley).
-    ``begun`` (3, M): bounds of the counts, and counts. Returns (M,) those where the
-    relaxation ended.
+    Returns (M,) counts where the relaxation ended.
     """
     from scipy import optimize
 
@@ -228,42 +214,33 @@ def _searched(
 ) -> BranchResult:
     """Branch from the whole problem until it is solved, or as far as is asked for.
 
-    Args:
-        started: the kernel's search.
-        incumbents: its best selections.
-        begun: (3, M) lower and upper bounds of the counts, and a good selection.
-        begin: (M,) counts that the relaxation begins with.
-        deadline: when to stop with what there is.
-        good: enough is a bound of at most the first times the best, plus the second.
-        root_only: stop at the bound of the relaxation.
+    ``begun`` (3, M): bounds of the counts, and a good selection; ``good``: enough is a
+    bound of at most the first times the best, plus the second.
     """
     search, scale, shift, largest, work = started
     best_counts, best_values, order = incumbents
-    low, high, counts = begun
-    num_blocks = len(low)
-    search.offer(low, high, counts, deadline.remaining_s)
-    nodes, bounds = np.empty((64, 3, num_blocks)), np.full(64, np.inf)
-    nodes[0] = low, high, begin
+    search.offer(*begun, deadline.remaining_s)
+    nodes, bounds = np.empty((64, *begun.shape)), np.full(64, np.inf)
+    nodes[0] = *begun[:2], begin
+    widest = max(256, _MEMORY // nodes[0].nbytes)
     tries = 1 if root_only else int(_FREE / work)
-    size, done, bound, going = 1, 0, np.inf, True
+    size, done, going = 1, 0, True
     while size and going:
         if size + 2 > len(bounds):
-            room = np.empty((len(bounds), 3, num_blocks))
-            nodes = np.concatenate([nodes, room])
+            nodes = np.concatenate([nodes, np.empty_like(nodes)])
             bounds = np.concatenate([bounds, np.full(len(bounds), np.inf)])
         size, more, going = search.run(
-            nodes, bounds, size, TOLERANCE, max(256, _MEMORY // (24 * num_blocks)),
-            max(1, tries - done), deadline.remaining_s, *good,
+            nodes, bounds, size, TOLERANCE, widest, max(1, tries - done),
+            deadline.remaining_s, *good,
         )  # fmt: skip
         done += more
-    if size:
-        bound = max(bounds[:size].max(), best_values[0])
-        bound = min(bound, largest)
+    bound = min(bounds[:size].max(initial=best_values[0]), largest)
+    bound = bound if size else best_values[0]
     reached = np.isfinite(best_values)
     return BranchResult(
         best_counts[order[reached]].astype(np.int64),
         scale * best_values[reached] + shift,
-        float(scale * (bound if size else best_values[0]) + shift),
+        float(scale * bound + shift),
         done,
         size == 0,
     )

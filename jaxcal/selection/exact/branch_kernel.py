@@ -96,10 +96,8 @@ _SAME = declare(cython.double, 1e-7)  # apart in value, selections are two
 
 
 class Search:
-    """A problem, where the relaxation of a node is, and the work space of both.
-
-    ``branch_kernel.pxd`` says what each attribute is.
-    """
+    """A problem, where a node's relaxation is, and work space: see
+    ``branch_kernel.pxd``."""
 
     def __init__(
         self,
@@ -195,15 +193,11 @@ class Search:
     # --- linear rules of the counts -------------------------------------------------
 
     def limit(self, rules, most, order, prices):
-        """Let ``rules @ counts <= most`` hold, which a bound pays ``prices`` for.
+        """Let ``rules @ counts <= most`` hold, which a bound pays ``prices`` (r,) for.
 
         phi of a selection is at most ``phi - prices @ (rules @ counts - most)``, for
-        prices from 0: Lagrange's relaxation, concave where phi is.
-
-        Args:
-            rules, most: (r, M) and (r,).
-            order: (r, M) candidates, the cheapest of each rule first.
-            prices: (r,) in the kernel's phi.
+        prices from 0: Lagrange's relaxation. ``order`` (r, M): the cheapest of each
+        rule first.
         """
         self.ruled = True
         self.rules, self.most_of, self.order_of = rules, most, order
@@ -285,10 +279,8 @@ class Search:
                 gram[b * p + a] = gram[a * p + b]
 
     def _evaluate(self, kind):
-        """Value to climb by at P, N and M, -inf where M is singular; sets ``base``.
-
-        The base differs from it by rounding, and for E.
-        """
+        """Value to climb by at P, N and M, -inf where M is singular; sets ``base``,
+        which differs from it by rounding, and for E."""
         p: cython.int = self.p
         value: cython.double = 0.0
         self.base = 0.0
@@ -331,17 +323,14 @@ class Search:
         return max(total - share, 0.0) + 8.0 * _EPS * size
 
     def _covariance(self, det, root, s, gradient):
-        """Value of Ds and the traces by C (s, p), W being there, and their gradient."""
         return covariance(
             det, root, self.inverse, s, self.p, self.reach, self.scaled, self.small,
             self.spare, self.vectors, gradient,
         )  # fmt: skip
 
     def _weakest(self):
-        """Set the reciprocals l, their y in ``basis``, slopes and base; the value of E.
-
-        Eigenvalues of V below rounding have no slope, whatever they are.
-        """
+        """Reciprocals l, their y in ``basis``, slopes and base; the value of E.
+        Eigenvalues of V below rounding have no slope."""
         p: cython.int = self.p
         basis, reach, values, slopes = self.basis, self.reach, self.values, self.slopes
         multiply(False, False, p, p, p, self.root, self.inverse, self.scaled)
@@ -453,10 +442,8 @@ class Search:
         return _RANK_TRACE if sharper else TRACE
 
     def _weigh(self):
-        """Fill ``weights`` and ``lines``: u and ``v.T inverse(H)``, by rows.
-
-        Then ``C.T C`` is the sum of u times the outer product of a row with itself.
-        """
+        """Fill ``weights`` and ``lines``: u and ``v.T inverse(H)``, by rows: ``C.T C``
+        is the sum of u times the outer product of a row with itself."""
         p: cython.int = self.p
         s: cython.int = self.s
         multiply(False, True, s, p, p, self.root, self.half, self.reach)
@@ -600,8 +587,8 @@ class Search:
     def _linear_gain(self, low, high, c):
         """Largest ``sum of (c'_i - c_i) d_i`` within the bounds; sets the multiplier.
 
-        The multiplier minimises ``k cut + sum of max(low_i (d_i - cut), high_i (d_i -
-        cut))``, by bisection; any value of it gives a true bound.
+        It minimises ``k cut + sum of max(low_i (d_i - cut), high_i (d_i - cut))``, by
+        bisection; any value of it gives a true bound.
         """
         least: cython.double = INFINITY
         most: cython.double = -INFINITY
@@ -708,10 +695,8 @@ class Search:
             self.wish[best] = 0.0
 
     def _solve(self, m, size):
-        """Where the free counts would go: ``right``; the multiplier of their sum.
-
-        Solves by the curvature at ``free[:size]`` for the slope and for ones.
-        """
+        """Where the free counts would go, ``right``, by the curvature at
+        ``free[:size]``; the multiplier of their sum."""
         face, right, ones = self.face, self.right, self.right + size
         for f in range(size):
             right[f], ones[f] = self.slope[self.free[f]], 1.0
@@ -740,10 +725,8 @@ class Search:
         return total / weight
 
     def _quadratic_step(self, m):
-        """Maximise ``slope.x - x.curvature.x / 2``, sum x = 0, least <= x <= most.
-
-        ``move`` is filled with x, the slope changed to that at the solution.
-        """
+        """Fill ``move`` by max ``slope.x - x.curvature.x / 2``, sum x = 0, least <= x
+        <= most; the slope becomes that at the solution."""
         curvature = self.curvature
         largest: cython.double = 0.0
         for i in range(m):
@@ -802,7 +785,6 @@ class Search:
                 self.side[other] = 0
 
     def _gather(self, low, c):
-        """N and M of the counts, P being there."""
         self._sum(low, c, cython.NULL, self.rest)
         for a in range(self.p * self.p):
             self.gram[a] = self.known[a] + self.rest[a]
@@ -824,14 +806,8 @@ class Search:
     def _relax(self, kind, low, high, c, goal, share):
         """Climb the relaxation of a node until it is pruned, or solved well enough.
 
-        Args:
-            kind: of the criterion, or RANK or RANK_TRACE; P has been set for it.
-            low, high, c: (M,) bounds, and the counts to start from, changed.
-            goal: a bound at or below it ends the climb.
-            share: so does a bound this share of its distance to the goal from solved.
-
-        Returns:
-            The bound, -inf where every selection of the node is singular.
+        A bound at or below ``goal`` ends the climb; so does one this ``share`` of its
+        distance to the goal from solved. Returns the bound, -inf where all is singular.
         """
         value = self._begin(kind, low, high, c)
         if not value > -INFINITY:
@@ -929,7 +905,6 @@ class Search:
         return self._evaluate(self.kind)
 
     def _gather_whole(self, counts):
-        """M of a selection, to be judged by the criterion itself."""
         self.now = self.kind
         self._sum(cython.NULL, counts, self.prior, self.gram)
 
@@ -962,12 +937,8 @@ class Search:
         counts: cython.double[::1],
         seconds: cython.double,
     ):
-        """Offer a selection and, where several are wanted, all one swap away from it.
-
-        Args:
-            low, high, counts: (M,) float64 bounds and counts, as they were afterwards.
-            seconds: after which no more swaps are offered.
-        """
+        """Offer a selection (M,) and, where several are wanted, all one swap away from
+        it."""
         self.watch = begin(seconds)
         chosen = address(counts[0])
         self._offer(chosen)
@@ -1009,11 +980,9 @@ class Search:
         return True
 
     def _stiffen(self, c):
-        """Let ``wish`` be how much the bound bends as a fractional count is forced.
-
-        A count that moves by d, the others following, costs ``d^2 / 2`` over its entry
-        in the inverse of the curvature among counts of one sum.
-        """
+        """Let ``wish`` be how much the bound bends as a fractional count is forced: a
+        count that moves by d, the others following, costs ``d^2 / 2`` over its entry in
+        the inverse of the curvature among counts of one sum."""
         m: cython.int = 0
         largest: cython.double = 1e-300
         total: cython.double = 0.0
@@ -1046,19 +1015,12 @@ class Search:
             self.wish[self.which[f]] = 1.0 / (largest * max(free, 1e-300))
 
     def _process(self, low, high, c, slack, share, bound):
-        """Solve, tighten and, where settled, close one node.
+        """Solve, tighten and, where settled, close one node; the candidate to branch
+        on, or -1.
 
         Forcing one count away from the side the multiplier puts it on costs the bound
-        |d_i - cut| a unit, which tightens low and high (reduced-cost fixing).
-
-        Args:
-            low, high, c: (M,) bounds and starting counts, changed.
-            slack: a bound this far above the incumbent still closes the node.
-            share: see ``_relax``.
-            bound: written.
-
-        Returns:
-            The candidate to branch on, -1 where the node is closed.
+        |d_i - cut| a unit, which tightens low and high (reduced-cost fixing). A bound
+        ``slack`` above the incumbent still closes the node.
         """
         last = self.best_values.shape[0] - 1
         goal = self.best_values[last] + slack
@@ -1128,14 +1090,11 @@ class Search:
         """Branch until no open node is left, the room is full or the time is over.
 
         Args:
-            nodes, bounds: (room, 3, M) and (room,) open nodes: lower and upper bounds
-                of the counts, and counts to start from.
-            size: open nodes at the start.
+            nodes, bounds: (room, 3, M) and (room,) open nodes: bounds of the counts,
+                and counts to start from; ``size`` of them at the start.
             slack: a bound this far above the last incumbent still closes a node.
             widest: open nodes up to which the best bound goes first, then the newest.
-            tries: nodes before which a bound that is good enough ends nothing; of the
-                first one alone the relaxation is solved.
-            seconds: to stop after.
+            tries: nodes before which a bound that is good enough ends nothing.
             slope, shift: good enough is a bound of slope times the best, plus shift.
 
         Returns:
@@ -1230,7 +1189,6 @@ class JointSearch(Search):
             cast(Search, self.members[s])._gather_whole(counts)
 
     def _evaluate(self, kind):
-        """The joined value, the mixture of the scenarios, and the base of a bound."""
         lowest: cython.double = INFINITY
         value: cython.double = 0.0
         total: cython.double = 0.0

@@ -3,8 +3,7 @@
 k = n + 1 affine postures: the absolute determinant is convex in each posture, so only
 vertices of the convex hull matter, and ``jaxcal.selection.exact.volume`` finds the
 largest volume. Everything else (more postures, blocks, priors, other criteria, many
-runners-up) goes to branch and bound, started from the exchange. The runner-up need not
-lie on the hull, so ``best`` > 1 does without it.
+runners-up) goes to branch and bound, started from the exchange.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import numpy as np
 
 from jaxcal.checks import Indices
 from jaxcal.deadline import NEVER, Deadline
-from jaxcal.selection.exact.volume import largest_volumes
+from jaxcal.selection.exact.volume import largest_volume
 from jaxcal.selection.exchange.exchange import (
     default_restarts,
     exchange_indices,
@@ -65,13 +64,8 @@ def solve_auto(
 ) -> Solution:
     """The solver "auto": the cheapest way to an answer that is proven good enough.
 
-    Small problems are solved to the proven optimum. On larger ones the search stops as
-    soon as its bound proves the best selection found (by exchange, at first) to have
-    ``least_efficiency``; the bound at the root often does. Where no time limit is given
-    10 s, 2 s on blocks.
-
-    The answer's ``method`` is "exact" where the search was run to its end or its time
-    limit, "exchange" where the bound proved enough before.
+    The search ends as soon as its bound proves ``least_efficiency``. The answer's
+    ``method`` is "exact" where it ran to its end or its time limit, else "exchange".
     """
     limit = time_limit or (TIME_LIMIT if problem.rank_one else _BLOCKS_LIMIT)
     deadline = Deadline(limit)
@@ -87,13 +81,10 @@ def solve_auto(
         name = problem.criterion.efficiency_name
         article = "an" if name[0] in "AEIe" else "a"
         at_least = f"{article} {name} of at least {share:.6f}"
-        request = f"{least_efficiency:g} was asked for"
-        reason = (
-            f"the exact search stopped after {limit:g} s with {at_least} proven; "
-            f"{request}"
-        )
+        reason = f"the exact search stopped after {limit:g} s with {at_least} proven; "
         if share >= least_efficiency:
-            method, reason = "exchange", f"the bound proves {at_least}, and {request}"
+            method, reason = "exchange", f"the bound proves {at_least}, and "
+        reason += f"{least_efficiency:g} was asked for"
     return dataclasses.replace(solution, method=method, reason=reason, **started)
 
 
@@ -114,30 +105,21 @@ def solve_exact(
 ) -> Solution:
     """The ``best`` selections, or the best found by ``deadline`` and a true bound.
 
-    They are the ``alternatives``, best first; none of them is singular.
-
-    Args:
-        problem: what to choose from.
-        best: how many selections to prove.
-        deadline: when to stop.
-        restarts, seed: of the exchange that starts branch and bound.
-        enough: efficiency in (0, 1] at which to stop, unless the proof is cheap.
+    They are the ``alternatives``, best first; none of them is singular. ``enough`` is
+    the efficiency in (0, 1] at which to stop, unless the proof is cheap.
     """
-    if problem.simplex:
-        pool = _pool(problem, hull=best == 1)
-        free = problem.k - len(problem.required)
-        cheap = math.comb(len(pool), free) <= _CHEAP
-        if best == 1 or cheap:
-            if enough and not cheap:
-                part = deadline.part(0.5)
-                begun = np.sort(exchange_indices(problem, restarts, seed, part))
-                least = relaxed(problem, begun, deadline)
-                relaxation = _solution_of(problem, [begun], best, least, 1)
-                value, bound = relaxation.value, relaxation.bound
-                assert value is not None and bound is not None
-                if problem.criterion.efficiency(value, bound) >= enough:
-                    return relaxation
-            return _enumerate(problem, pool, best, deadline)
+    if best == 1 and problem.simplex:
+        pool, cheap = _pool(problem)
+        if enough and not cheap:
+            part = deadline.part(0.5)
+            begun = np.sort(exchange_indices(problem, restarts, seed, part))
+            least = relaxed(problem, begun, deadline)
+            relaxation = _solution_of(problem, [begun], best, least, 1)
+            value, bound = relaxation.value, relaxation.bound
+            assert value is not None and bound is not None
+            if problem.criterion.efficiency(value, bound) >= enough:
+                return relaxation
+        return _enumerate(problem, pool, deadline)
     # Half of the time: a bound takes time as well.
     start = exchange_indices(problem, restarts, seed, deadline.part(0.5))
     keep, first = _groups(problem, merge=best == 1)
@@ -162,15 +144,11 @@ def solve_exact(
 
 
 def upper_bound(problem: Problem) -> float:
-    """The value that no selection betters: the optimum if cheap, or the relaxation's.
-
-    As reported: of A, As and I a lower bound.
-    """
+    """The reported value that no selection betters, by the optimum if that is cheap."""
     if problem.simplex:
-        pool = _pool(problem, hull=True)
-        free = problem.k - len(problem.required)
-        if math.comb(len(pool), free) <= _CHEAP:
-            solution = _enumerate(problem, pool, 1, NEVER)
+        pool, cheap = _pool(problem)
+        if cheap:
+            solution = _enumerate(problem, pool, NEVER)
             assert solution.bound is not None
             return solution.bound
     bound = relaxed(problem, greedy_indices(problem))
@@ -201,22 +179,27 @@ def _branched(
     ]
     judged_by: Scenario | JointScenarios = members[0]
     if (joint := problem.joint) is not None:
-        judged_by = JointScenarios(
-            members, joint.criterion, joint.weights, joint.terms()
-        )
-    of_counts = problem.constraints
-    options["rules"] = None if of_counts is None else of_counts.of(keep)
+        terms = joint.terms()
+        judged_by = JointScenarios(members, joint.criterion, joint.weights, terms)
+    if problem.constraints is not None:
+        options["rules"] = problem.constraints.of(keep)
     return branch_and_bound(judged_by, *rules, **options)
 
 
-def _pool(problem: Problem, hull: bool) -> Indices:
-    """Candidates that may join the required ones in an optimum with k = p."""
+def _pool(problem: Problem) -> tuple[Indices, bool]:
+    """What may join the required ones in an optimum with k = p; are choices few?"""
+    pool = _hull(problem)
+    return pool, math.comb(len(pool), problem.k - len(problem.required)) <= _CHEAP
+
+
+def _hull(problem: Problem) -> Indices:
+    """Candidates that are not required; of many those on the convex hull."""
     usable = problem.available.copy()
     usable[problem.required] = False
     pool = np.flatnonzero(usable)
     n = problem.num_regressors - 1
     few = math.comb(len(pool), n + 1) <= _CHEAP  # faster than loading qhull
-    if not hull or n > _LARGEST_HULL_DIMENSION or few:
+    if n > _LARGEST_HULL_DIMENSION or few:
         return pool
     # Whitened postures lie in a plane across the sum of all rows: reflected so that it
     # is the first axis, the other axes are coordinates in that plane.
@@ -234,36 +217,28 @@ def _pool(problem: Problem, hull: bool) -> Indices:
         return pool
 
 
-def _enumerate(
-    problem: Problem, pool: Indices, best: int, deadline: Deadline
-) -> Solution:
-    """Largest volumes beside the required rows, in the space these leave free."""
+def _enumerate(problem: Problem, pool: Indices, deadline: Deadline) -> Solution:
+    """The largest volume beside the required rows, in the space these leave free."""
     required = problem.rows[problem.required]
     vectors = problem.rows[pool]
     if len(required):
         # The rows outside the span of the required ones keep all the volume there is.
         basis = np.linalg.qr(required.T, mode="complete")[0][:, len(required) :]
         vectors = vectors @ basis
-    volumes = largest_volumes(vectors, best, deadline)
-    subsets = [
-        np.sort(np.concatenate([problem.required, pool[s]])) for s in volumes.subsets
-    ]
-    if volumes.complete:
-        return _solution_of(problem, subsets, best, None, volumes.examined)
+    volume = largest_volume(vectors, deadline)
+    subset = np.sort(np.concatenate([problem.required, pool[volume.subset]]))
+    if volume.complete:
+        return _solution_of(problem, [subset], 1, None, volume.examined)
     # Out of time: whatever greedy has, if that is better, and the sharper bound.
     greedy = np.sort(greedy_indices(problem))
     # log det(X_s.T X_s) is twice the log of the volume, beside that of ``required``.
     fixed = np.linalg.slogdet(required @ required.T)[1] if len(required) else 0.0
-    bound = min(relaxed(problem, greedy), fixed + 2.0 * float(np.log(volumes.bound)))
-    return _solution_of(problem, [*subsets, greedy], best, bound, volumes.examined)
+    bound = min(relaxed(problem, greedy), fixed + 2.0 * float(np.log(volume.bound)))
+    return _solution_of(problem, [subset, greedy], 1, bound, volume.examined)
 
 
 def _solution_of(
-    problem: Problem,
-    subsets: list[Indices],
-    best: int,
-    phi: float | None,
-    nodes: int,
+    problem: Problem, subsets: list[Indices], best: int, phi: float | None, nodes: int
 ) -> Solution:
     """Values in the caller's unit, singular subsets left out, best first.
 
@@ -296,10 +271,7 @@ def _solution_of(
 def _proof(
     problem: Problem, indices: Indices, value: float, phi: float | None
 ) -> tuple[float, bool, str]:
-    """Bound of a reported value, whether it is proven, and why not where phi is None.
-
-    ``phi`` is a bound from above that a search did not reach.
-    """
+    """Bound of a reported value, given one on phi; is it proven, and if not why."""
     criterion, bound = problem.criterion, value
     if phi is not None:
         better = max if criterion.larger_is_better else min
@@ -307,17 +279,17 @@ def _proof(
     unsure = problem.uncertainty(indices)
     off = float(getattr(problem.model, "resolution", 0.0))  # 0: exact derivatives
     if off > _ROUGH:
-        about = "not proven: the model's derivatives are differences"
-        reason = f"{about}, off by {off:.1g}"
-        return criterion.bettered(bound, min(2.0 * off, 1.0)), False, reason
-    if unsure <= TOLERATED:
+        unsure = min(2.0 * off, 1.0)
+        reason = (
+            f"not proven: the model's derivatives are differences, off by {off:.1g}"
+        )
+    elif unsure <= TOLERATED:
         return bound, phi is None, ""
-    reason = ""
-    if phi is None:
+    else:
         reason = (
             "not proven in double precision: the search is complete, but rounding may "
             f"change the variances by {unsure:.1g} (relative)"
-        )
+        ) * (phi is None)
     return criterion.bettered(bound, unsure), False, reason
 
 
@@ -346,15 +318,12 @@ def _expand(
     """(k,) sorted candidates of group counts (G,), of a group the required first."""
     if len(first) == len(keep):
         return np.repeat(keep, counts)
-    chosen: list[int] = []
-    for members, missing in zip(
-        np.split(keep, first[1:]), counts.tolist(), strict=True
+    take = problem.lower[keep]
+    room = problem.upper[keep] - take
+    for group, count in zip(
+        np.split(np.arange(len(keep)), first[1:]), counts, strict=True
     ):
-        take = problem.lower[members]
-        missing -= int(take.sum())
-        for position, room in enumerate((problem.upper[members] - take).tolist()):
-            taken = min(missing, room)
-            take[position] += taken
-            missing -= taken
-        chosen.extend(np.repeat(members, take))
-    return np.sort(np.asarray(chosen, dtype=np.int64))
+        before = np.cumsum(room[group]) - room[group]  # in the places before
+        missing = count - take[group].sum()
+        take[group] += (missing - before).clip(0, room[group])
+    return np.sort(np.repeat(keep, take))

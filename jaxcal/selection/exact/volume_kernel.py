@@ -27,23 +27,17 @@ def descend(
     points: cython.double[:, :, ::1],
     index: cython.Py_ssize_t[:, ::1],
     place: cython.Py_ssize_t[::1],
-    subsets: cython.Py_ssize_t[:, ::1],
+    subset: cython.Py_ssize_t[::1],
     largest: cython.double[::1],
     seconds: cython.double,
 ):
-    """Search until nothing is open or the time is over.
+    """Search until nothing is open or the time is over: is it complete, and nodes done.
 
     Args:
         points: (q - 1, h, q) coordinates of the vectors left at each depth, longest
-            first; only the first q - depth of them count. The first depth is given.
-        index: (q - 1, h) int64 which vectors these are.
-        place: (q - 1,) int64 written: how many were chosen first at each depth.
-        subsets, largest: (best, q) int64 vectors and (best,) volumes of the incumbents,
-            0 where there is none, as a heap with the least first; updated.
-        seconds: time limit.
-
-    Returns:
-        Whether the search is complete, and the nodes done.
+            first; only the first q - depth count. The first depth is given.
+        index, place: (q - 1, h) which these are; (q - 1,) how many were chosen first.
+        subset, largest: (q,) and (1,) the incumbent and its volume, 0 of none.
     """
     q, h = points.shape[2], points.shape[1]
     size: cython.Py_ssize_t[::1] = np.full(q - 1, h)
@@ -61,16 +55,10 @@ def descend(
                 break
             if depth == q - 2:
                 nodes += 1
-                if _best_pairs(
-                    points[depth],
-                    index,
-                    size,
-                    volume,
-                    chosen,
-                    subsets,
-                    largest,
+                if _best_pair(
+                    points[depth], index, size, volume, chosen, subset, largest,
                     cython.address(watch),
-                ):
+                ):  # fmt: skip
                     break
                 depth -= 1
                 continue
@@ -106,12 +94,7 @@ def _too_short(points, first, size, dimension, needed):
 
 
 def _open(points, index, size, volume, depth, c, reached, room, order):
-    """Fill depth + 1 with what comes after c, without what is too short to matter.
-
-    Args:
-        room: (h, q + 1) to work in: a vector and its length each.
-        order: (2, h) likewise.
-    """
+    """Fill depth + 1 with what comes after c, without what is too short to matter."""
     q = points.shape[2]
     dimensions = q - depth - 1  # after the choice
     below, names = points[depth + 1], index[depth + 1]
@@ -180,8 +163,8 @@ def _longest_first(room, order, count):
         width *= 2
 
 
-def _best_pairs(plane, index, size, volume, chosen, subsets, largest, watch):
-    """Keep the pairs of the planar points that are large enough; 1 if time is over."""
+def _best_pair(plane, index, size, volume, chosen, subset, largest, watch):
+    """Keep the largest pair of the planar points; 1 if time is over."""
     last = chosen.shape[0] - 2
     count = size[last]
     needed = (1.0 + _TOLERANCE) * largest[0] / volume[last]
@@ -195,28 +178,9 @@ def _best_pairs(plane, index, size, volume, chosen, subsets, largest, watch):
             area = volume[last] * fabs(x * plane[j, 1] - y * plane[j, 0])
             if area > largest[0]:
                 chosen[last], chosen[last + 1] = index[last, i], index[last, j]
-                _keep(chosen, area, subsets, largest)
+                largest[0] = area
+                subset[:] = chosen
     return 0
-
-
-def _keep(chosen, reached, subsets, largest):
-    """Put the chosen in the place of the least incumbent, and the new least first.
-
-    The incumbents are a heap: those at 2 k + 1 and 2 k + 2 are no smaller than k.
-    """
-    best = largest.shape[0]
-    k: cython.Py_ssize_t = 0
-    while 2 * k + 1 < best:
-        child: cython.Py_ssize_t = 2 * k + 1
-        if child + 1 < best and largest[child + 1] < largest[child]:
-            child += 1
-        if largest[child] >= reached:
-            break
-        largest[k] = largest[child]
-        subsets[k, :] = subsets[child, :]
-        k = child
-    largest[k] = reached
-    subsets[k, :] = chosen
 
 
 def _polygon_bound(plane, count):

@@ -12,7 +12,7 @@ still because two are equal.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,10 +21,7 @@ from jaxcal import compiled
 from jaxcal.checks import Array, Indices
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection.criteria import Criterion
-from jaxcal.selection.problem import Problem, ScenarioProblem, Solution
-
-if TYPE_CHECKING:
-    from jaxcal.selection.problem.constraints import Constraints
+from jaxcal.selection.problem import Constraints, Problem, ScenarioProblem, Solution
 
 # (k + 8) M q^2 p of the default starts of one call, about 10 ms; swaps for a trace or a
 # subset of the parameters cost twice those for D. E, whose local optima differ more,
@@ -49,7 +46,7 @@ def solve(
     restarts: int | None,
     time_limit: float | None = None,
 ) -> Solution:
-    """The solver "exchange"; without a time limit all starts are climbed."""
+    """The solver "exchange"."""
     restarts = restarts or default_restarts(problem)
     deadline = NEVER if time_limit is None else Deadline(time_limit)
     indices = exchange_indices(problem, restarts, seed, deadline)
@@ -76,14 +73,11 @@ def greedy_indices(problem: Problem) -> Indices:
         chosen, value = climbs.climbed(problem.required, share, 0)
         if not phi > -np.inf or value > phi + 1e-9 * max(1.0, abs(phi)):
             best, phi = chosen, value
-    if (
-        problem.joint is None
-        and problem.criterion.name == "D"
-        and not problem.root.size
-    ):
+    if problem.criterion.name == "D" and not problem.root.size:
         for blocks in _coordinates(problem):
             chosen, value = climbs.climbed(_textbook(problem, blocks), 0.0, 0)
-            best, phi = max((best, phi), (chosen, value), key=lambda pair: pair[1])
+            if value > phi:
+                best, phi = chosen, value
     if phi > -np.inf:
         return best
     chosen, phi = climbs.climbed(problem.required, climbs.share)
@@ -121,9 +115,8 @@ def _textbook(problem: Problem, raw: Array) -> Indices:
 def default_restarts(problem: Problem) -> int:
     """Starts that found the proven optimum of nearly all small problems tried.
 
-    None of 12,000 distinct selections was missed (4, 8 or 12 of 50, three inputs) by
-    200; replicates leave more local optima, and 1 in 1,000 selections of 12 was by 400,
-    so they get more. Large problems of blocks get fewer, to take 10 to 15 ms.
+    Of 12,000 distinct selections (4, 8 or 12 of 50, three inputs) 200 missed none;
+    replicates leave more local optima. Large problems of blocks get fewer: 10 to 15 ms.
     """
     most = 200 if np.max(problem.max_replicates) == 1 else 600
     if problem.rank_one:
@@ -145,8 +138,7 @@ class Climbs:
     """A problem as the compiled kernel takes it; E is grown and climbed as A."""
 
     def __init__(self, problem: Problem, seed: int, deadline: Deadline = NEVER) -> None:
-        self._required, self._deadline = problem.required, deadline
-        self._problem, self._allows = problem, problem.allows
+        self._problem, self._deadline = problem, deadline
         _, q, p = problem.blocks.shape
         self.share = _SHARE * min(1.0, problem.k * q / p) ** 6
         self._terms: tuple[tuple[Array, Array], ...] = ()  # of the swaps that raise E
@@ -185,16 +177,16 @@ class Climbs:
         """``start`` completed and climbed, required first, and its phi; 2 climbs E."""
         if self._terms:
             self._climber.weigh(*self._terms[swaps == 2])
-        found: tuple[Indices, float]
-        found = self._climber.climb(start, share, swaps, self._deadline.remaining_s)
-        return found if self._allows(found[0]) else (found[0], -np.inf)
+        remaining_s = self._deadline.remaining_s
+        chosen, phi = self._climber.climb(start, share, swaps, remaining_s)
+        return chosen, (phi if self._problem.allows(chosen) else -np.inf)
 
     def best_of(self, restarts: int) -> tuple[Indices, float]:
         """The best local optimum from greedy selections and then random starts."""
-        best, phi = self._required, -np.inf
+        best, phi = self._problem.required, -np.inf
         shares = (self.share, *_FURTHER)[:restarts]
         for share in shares:
-            chosen, value = self.climbed(self._required, share)
+            chosen, value = self.climbed(self._problem.required, share)
             if not phi > -np.inf or value > phi + 1e-10 * max(1.0, abs(phi)):
                 best, phi = chosen, value
             if self._deadline.passed and phi > -np.inf:
@@ -208,16 +200,14 @@ class Climbs:
             one = self._problem  # rules that a choice one by one runs against
             counts = rules.selection(one.k, one.lower, one.upper)
             assert counts is not None  # or there were no problem
-            return self.climbed(_in_order(one, counts))
+            rest = np.repeat(np.arange(len(counts)), counts - one.lower)
+            return self.climbed(np.concatenate([one.required, rest]))
         return best, phi
 
     def best_least(self, problem: Problem, restarts: int) -> tuple[Indices, float]:
-        """The best local optimum of E, and E.
-
-        From local optima of A, the best first, and from random selections as often: the
-        former come closer where there are many parameters, the latter where there are
-        few.
-        """
+        """The best local optimum of E, and E: from local optima of A, the best first,
+        which come closer where parameters are many, and from random selections as
+        often."""
         many = (restarts + 1) // 2
         work = problem.k * problem.num_regressors**3
         most = int(min(max(_CLIMBS / work, 1), many))
@@ -233,14 +223,7 @@ class Climbs:
         return max(climbed, key=lambda one: one[1])
 
 
-def _in_order(problem: Problem, counts: Indices) -> Indices:
-    """(k,) candidates of counts (M,), the required first."""
-    rest = np.repeat(np.arange(len(counts)), counts - problem.lower)
-    return np.concatenate([problem.required, rest])
-
-
 def _lengths(criterion: Criterion) -> Array:
-    """(s,) by which combinations are divided for a kernel: variances near 1."""
     if criterion.form == "subset":
         return np.asarray(np.linalg.norm(criterion.root, axis=1))
     return np.ones(len(criterion.root))
@@ -277,10 +260,7 @@ def exchange_indices(
     seed: int = 0,
     deadline: Deadline = NEVER,
 ) -> Indices:
-    """(k,) the best local optimum, required candidates first.
-
-    After ``deadline`` no more swaps are made.
-    """
+    """(k,) the best local optimum, required first; no more swaps after ``deadline``."""
     restarts = restarts or default_restarts(problem)
     climbs = Climbs(problem, seed, deadline)
     if problem.criterion.kind == "least":
@@ -295,10 +275,7 @@ def exchange_indices(
 
 
 def fewest_regular(problem: Problem) -> Problem:
-    """The problem with the fewest to choose that identify in every scenario.
-
-    One scenario alone needs ``problem.k``; none of them may hold all of several.
-    """
+    """The problem with the fewest to choose that identify in every scenario."""
     if not isinstance(problem, ScenarioProblem):
         return problem
     most = int(problem.upper.sum())
@@ -310,15 +287,8 @@ def fewest_regular(problem: Problem) -> Problem:
 
 
 def exchange_from(problem: Problem, indices: ArrayLike) -> Indices:
-    """The local optimum that a given selection climbs to; never worse than it was.
-
-    Args:
-        problem: what may be chosen; its required candidates stay.
-        indices: (k,) where to start, not singular.
-
-    Returns:
-        (k,) the required candidates first.
-    """
+    """(k,) the local optimum that a selection climbs to, required first; never
+    worse."""
     start = np.asarray(indices, dtype=np.int64)
     if np.isneginf(problem.log_det(start)):
         raise ValueError(

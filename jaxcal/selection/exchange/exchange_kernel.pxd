@@ -4,7 +4,7 @@ from jaxcal.watch cimport Watch
 cdef enum:
     WIDE = 64  # candidates in a group
 
-cdef class Choice:
+cdef class Climber:
     cdef int k, fixed, groups  # to choose, of them required; groups of candidates
     cdef Py_ssize_t available  # candidates that may be chosen
     cdef const Py_ssize_t[::1] caps  # (M,) how often each may be
@@ -37,9 +37,6 @@ cdef class Choice:
     cdef Py_ssize_t _replacement(self, Py_ssize_t out, double value, double rise) noexcept nogil
     cdef double _least_of_chosen(self) noexcept nogil
     cdef Py_ssize_t _strongest(self, Py_ssize_t at, double* least) noexcept nogil
-
-@cython.final
-cdef class Climber(Choice):
     cdef int kind  # of ``criterion_kinds.pxd``
     cdef int parts  # 1 where V is enough, 2 with X
     cdef int dets  # of which the determinant counts
@@ -97,7 +94,7 @@ cdef class Climber(Choice):
     cdef Py_ssize_t _next(self, double least) noexcept nogil
 
 @cython.final
-cdef class JointClimber(Choice):
+cdef class JointClimber(Climber):
     cdef list climbers
     cdef Py_ssize_t[::1] addresses  # (S,) of the climbers: a call takes no reference
     cdef void** members  # the same
@@ -108,7 +105,7 @@ cdef class JointClimber(Choice):
     cdef double[::1] phi  # of the chosen
     cdef double[::1] after  # of those after a swap
     cdef double[::1] total  # (WIDE,)
-    cdef double[::1] ahead  # (groups WIDE,) bounds on E in the first scenario
+    cdef double[:, ::1] ahead  # (S, groups WIDE) bounds on E in each
     cdef double _join(self, const double* phi) noexcept nogil
     cdef void _totals(self, Py_ssize_t c, bint swaps) noexcept nogil
     cdef Py_ssize_t _best(self, bint swaps, double most) noexcept nogil

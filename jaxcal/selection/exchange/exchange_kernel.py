@@ -187,298 +187,16 @@ def _best_of(gain, closed, most):
     return -1
 
 
-class Choice:
-    """What is chosen of the candidates, grown and climbed by the phi of a subclass."""
-
-    def climb(self, start, share, swaps, seconds):
-        """Complete ``start`` (size,), required first, and swap while that helps.
-
-        Args:
-            share: of the information of k mean candidates, what stands in for those
-                not chosen yet while the selection grows.
-            swaps: 0 none, 1 those that raise phi, 2 those that raise E.
-            seconds: after which no more swaps are made.
-
-        Returns:
-            (k,) chosen, and phi, or E; -inf where that is singular.
-        """
-        self.watch = begin(seconds)
-        size: cython.Py_ssize_t = len(start)
-        kept: cython.double = share
-        how: cython.int = swaps
-        value: cython.double = 0.0
-        for r in range(size):
-            self.chosen[r] = start[r]
-        with cython.nogil:
-            self._clear()
-            for c in range(size):
-                self._count(self.chosen[c], 1)
-            if how == 2:
-                self._set_known(0.0, 0.0)
-                value = self._climb(True)
-            else:
-                self._grow(size, kept)
-                value = self._finish(how)
-        return np.array(self.chosen), value
-
-    def random_climbs(self, count, chosen, phi, seconds):
-        """The best of ``chosen`` (k,) with its phi, and ``count`` random starts."""
-        self.watch = begin(seconds)
-        best: cython.Py_ssize_t[::1] = np.array(chosen)
-        value: cython.double = phi
-        starts: cython.Py_ssize_t = count
-        with cython.nogil:
-            for _ in range(starts):
-                if self._late() and value > -INFINITY:
-                    break
-                self._random_start()
-                reached = self._finish(True)
-                if not self._allowed():
-                    continue
-                least = value + 1e-10 * max(1.0, fabs(value))
-                if reached > least or not value > -INFINITY:
-                    value = reached
-                    best[:] = self.chosen
-        return np.asarray(best), value
-
-    def random_start(self):
-        """(k,) the required, then others at random."""
-        self._random_start()
-        return np.array(self.chosen)
-
-    # --- what is chosen -------------------------------------------------------------
-
-    def _clear(self):
-        """Nothing is chosen."""
-        for i in range(self.counts.shape[0]):
-            self.counts[i] = 0
-            self.closed[i] = 0.0 if self.caps[i] > 0 else INFINITY
-
-    def _count(self, i, more):
-        """Candidate i is chosen once more, or once less."""
-        self.counts[i] += more
-        self.closed[i] = 0.0 if self.counts[i] < self.caps[i] else INFINITY
-
-    def _restrict(self, out, more):
-        """Close what breaks a rule once ``out`` (-1: none) has gone, with ``more`` yet
-        to come, which take the cheapest at least; true where one is remains open."""
-        remains: cython.bint = False
-        for i in range(self.counts.shape[0]):
-            self._count(i, 0)
-        if out >= 0:
-            self.closed[out] = 0.0
-        for r in range(self.rules.shape[0]):
-            room: cython.double = self.most[r]
-            to_come: cython.Py_ssize_t = more
-            for i in range(self.counts.shape[0]):
-                room -= self.counts[i] * self.rules[r, i]
-            if out >= 0:
-                room += self.rules[r, out]
-            for t in range(self.counts.shape[0]):
-                i = self.order[r, t]
-                if to_come <= 0:
-                    break
-                taken = min(self.caps[i] - self.counts[i], to_come)
-                room -= taken * self.rules[r, i]
-                to_come -= taken
-            for i in range(self.counts.shape[0]):
-                if self.rules[r, i] > room:
-                    self.closed[i] = INFINITY
-        for i in range(self.counts.shape[0]):
-            remains = remains or self.closed[i] == 0.0
-        return remains
-
-    def _allowed(self):
-        """Whether what is chosen keeps the rules."""
-        for r in range(self.rules.shape[0]):
-            room: cython.double = self.most[r]
-            for i in range(self.counts.shape[0]):
-                room -= self.counts[i] * self.rules[r, i]
-            if room < 0.0:
-                return False
-        return True
-
-    def _draw(self, below):
-        """A whole number in [0, below) from a xorshift generator."""
-        self.state ^= self.state << 13
-        self.state ^= self.state >> 7
-        self.state ^= self.state << 17
-        return ((self.state >> 32) * below) >> 32
-
-    def _random_start(self):
-        """Fill ``chosen`` at random, distinct where there are enough candidates."""
-        ruled: cython.bint = self.rules.shape[0] > 0
-        distinct: cython.bint = self.k <= self.available and not ruled
-        self._clear()
-        for c in range(self.k):
-            if ruled and c >= self.fixed and not self._restrict(-1, self.k - c - 1):
-                for i in range(self.counts.shape[0]):  # a selection of no use
-                    self._count(i, 0)
-            i = self.chosen[c] if c < self.fixed else self._draw(self.counts.shape[0])
-            while c >= self.fixed and (
-                self.closed[i] > 0.0 or (distinct and self.counts[i] > 0)
-            ):
-                i = self._draw(self.counts.shape[0])
-            self.chosen[c] = i
-            self._count(i, 1)
-
-    def _late(self):
-        """``late`` of the watch, asked after some work."""
-        self.looked += self.sweep
-        if self.looked < _PATIENCE:
-            return 0
-        self.looked = 0
-        return late(address(self.watch))
-
-    # --- greedy and exchange --------------------------------------------------------
-
-    def _grow(self, size, share):
-        """Complete the first ``size`` chosen, the largest gain first."""
-        if size == self.k:
-            return 0
-        self._set_known(share, 0.0)
-        self._evaluate(size, False)
-        self._refresh()
-        while True:
-            best = -1
-            if self.rules.shape[0] > 0:
-                self._restrict(-1, self.k - size - 1)
-            if not self._late():
-                best = self._addition()
-            if best < 0:
-                for i in range(self.counts.shape[0]):
-                    self._count(i, 0)
-                self._fill(size)
-                return 0
-            self.chosen[size] = best
-            self._count(best, 1)
-            size += 1
-            if size == self.k:
-                return 0
-            self._evaluate(size, True)
-            self._carry(best, -1)
-
-    def _fill(self, size):
-        """Complete the first ``size`` chosen, each candidate in turn: time is over."""
-        i: cython.Py_ssize_t = 0
-        while size < self.k:
-            if self.closed[i] == 0.0:
-                self.chosen[size] = i
-                self._count(i, 1)
-                size += 1
-            i = i + 1 if i + 1 < self.counts.shape[0] else 0
-
-    def _finish(self, climbs):
-        """phi of the chosen, climbed; swaps may mend a singular start.
-
-        The more surely the smaller the ridge that makes it regular.
-        """
-        value: cython.double = 0.0
-        for attempt in range(5):
-            ridge: cython.double = 0.0
-            if attempt % 2:
-                ridge = _RIDGE if attempt == 1 else 1e-4 * _RIDGE
-            self._set_known(0.0, ridge)
-            if not climbs:
-                return self._evaluate(self.k, False)
-            value = self._climb(False)
-            if ridge == 0.0 and value > -INFINITY:
-                break
-        return value
-
-    def _climb(self, least):
-        """Swap each chosen for its best replacement until none helps; phi, or E."""
-        k = self.k
-        value: cython.double = 0.0
-        if least:
-            value = self._least_of_chosen()
-        else:
-            value = self._evaluate(k, False)
-        if k == self.fixed or not value > -INFINITY:
-            return value
-        if not least:
-            self._refresh()
-        position, since, swaps = self.fixed, 0, 0
-        for i in range(self.tried.shape[0]):
-            self.tried[i] = -1
-        while since < k - self.fixed and swaps < _MOST_SWAPS * k:
-            if late(address(self.watch)) if least else self._late():
-                break
-            at, out, after = position, self.chosen[position], value
-            since += 1
-            position = position + 1 if position + 1 < k else self.fixed
-            if self.tried[out] == swaps:  # another measurement of the same
-                continue
-            self.tried[out] = swaps
-            rise = _IMPROVES * max(1.0, fabs(value))
-            if self.rules.shape[0] > 0:
-                self._restrict(out, 0)
-            if least:
-                best = self._strongest(at, address(after))
-            else:
-                best = self._replacement(out, value, rise)
-            if best < 0:
-                continue
-            self.chosen[at] = best
-            if not least:
-                after = self._evaluate(k, True)
-                if not after > value + rise:  # the formulas promised more
-                    self.chosen[at] = out
-                    continue
-            value, since = after, 0
-            swaps += 1
-            self._count(out, -1)
-            self._count(best, 1)
-            if not least:
-                self._carry(best, out)
-        return value
-
-    # --- what a subclass answers ----------------------------------------------------
-
-    def _set_known(self, share, ridge):
-        """Count ``share`` of k mean candidates' information, and a ridge, beside."""
-
-    def _evaluate(self, size, trial):
-        """phi of the first ``size`` chosen; of a ``trial`` beside what is kept."""
-        return -INFINITY
-
-    def _refresh(self):
-        """The gain of every candidate alone, after ``_evaluate``."""
-
-    def _carry(self, came, went):
-        """What is kept, after a trial that swapped; -1: none went."""
-
-    def _addition(self):
-        """The candidate whose addition gives the largest phi; -1: none."""
-        return -1
-
-    def _replacement(self, out, value, rise):
-        """The best in the place of ``out``, by over ``rise`` of ``value``; -1: none."""
-        return -1
-
-    def _least_of_chosen(self):
-        """E of the chosen; -inf where it is singular."""
-        return -INFINITY
-
-    def _strongest(self, at, least):
-        """The best in place ``at`` by E, which ``least`` becomes; -1: none lifts it."""
-        return -1
-
-
-class Climber(Choice):
+class Climber:
     """One scenario, with its work space; ``exchange_kernel.pxd`` says what is where.
 
     Args:
         form: "det", "subset" or "trace", of the criterion.
-        blocks: (M, q, p) whitened.
-        prior: (p, p).
-        root: C (s, p).
+        blocks, prior, root: whitened (M, q, p), (p, p) and C (s, p).
         caps: (M,) how often each may be chosen; blocks of those that may not are zero.
         required: (r,) candidates that are chosen in any case.
-        k: candidates to choose.
-        seed: of the random starts.
-        rules, most: (r, M) and (r,): ``rules @ counts <= most``.
-        order: (r, M) candidates, the cheapest of each rule first.
+        k, seed: candidates to choose; of the random starts.
+        rules, most, order: (r, M) ``rules @ counts <= most`` (r,); the cheapest first.
     """
 
     def __init__(
@@ -547,10 +265,248 @@ class Climber(Choice):
         self.lapack = take(at, 1 + 6 * p + 2 * p * p)
         return room - first
 
+    def climb(self, start, share, swaps, seconds):
+        """Complete ``start`` (size,), required first, and swap while that helps.
+
+        Args:
+            share: of k mean candidates' information, for those not chosen yet.
+            swaps: 0 none, 1 those that raise phi, 2 those that raise E.
+            seconds: after which no more swaps are made.
+
+        Returns:
+            (k,) chosen, and phi, or E; -inf where that is singular.
+        """
+        self.watch = begin(seconds)
+        size: cython.Py_ssize_t = len(start)
+        kept: cython.double = share
+        how: cython.int = swaps
+        value: cython.double = 0.0
+        for r in range(size):
+            self.chosen[r] = start[r]
+        with cython.nogil:
+            self._clear()
+            for c in range(size):
+                self._count(self.chosen[c], 1)
+            if how == 2:
+                self._set_known(0.0, 0.0)
+                value = self._climb(True)
+            else:
+                self._grow(size, kept)
+                value = self._finish(how)
+        return np.array(self.chosen), value
+
+    def random_climbs(self, count, chosen, phi, seconds):
+        """The best of ``chosen`` (k,) with its phi, and ``count`` random starts."""
+        self.watch = begin(seconds)
+        best: cython.Py_ssize_t[::1] = np.array(chosen)
+        value: cython.double = phi
+        starts: cython.Py_ssize_t = count
+        with cython.nogil:
+            for _ in range(starts):
+                if self._late() and value > -INFINITY:
+                    break
+                self._random_start()
+                reached = self._finish(True)
+                if not self._allowed():
+                    continue
+                least = value + 1e-10 * max(1.0, fabs(value))
+                if reached > least or not value > -INFINITY:
+                    value = reached
+                    best[:] = self.chosen
+        return np.asarray(best), value
+
+    def random_start(self):
+        """(k,) the required, then others at random."""
+        self._random_start()
+        return np.array(self.chosen)
+
+    # --- what is chosen -------------------------------------------------------------
+
+    def _clear(self):
+        """Nothing is chosen."""
+        for i in range(self.counts.shape[0]):
+            self.counts[i] = 0
+            self.closed[i] = 0.0 if self.caps[i] > 0 else INFINITY
+
+    def _count(self, i, more):
+        """Candidate i is chosen once more, or once less."""
+        self.counts[i] += more
+        self.closed[i] = 0.0 if self.counts[i] < self.caps[i] else INFINITY
+
+    def _restrict(self, out, more):
+        """Close what breaks a rule once ``out`` (-1: none) has gone, with ``more`` to
+        come at the cheapest; true where one remains open."""
+        remains: cython.bint = False
+        for i in range(self.counts.shape[0]):
+            self._count(i, 0)
+        if out >= 0:
+            self.closed[out] = 0.0
+        for r in range(self.rules.shape[0]):
+            room: cython.double = self.most[r]
+            to_come: cython.Py_ssize_t = more
+            for i in range(self.counts.shape[0]):
+                room -= self.counts[i] * self.rules[r, i]
+            if out >= 0:
+                room += self.rules[r, out]
+            for t in range(self.counts.shape[0]):
+                i = self.order[r, t]
+                if to_come <= 0:
+                    break
+                taken = min(self.caps[i] - self.counts[i], to_come)
+                room -= taken * self.rules[r, i]
+                to_come -= taken
+            for i in range(self.counts.shape[0]):
+                if self.rules[r, i] > room:
+                    self.closed[i] = INFINITY
+        for i in range(self.counts.shape[0]):
+            remains = remains or self.closed[i] == 0.0
+        return remains
+
+    def _allowed(self):
+        """Whether what is chosen keeps the rules."""
+        for r in range(self.rules.shape[0]):
+            room: cython.double = self.most[r]
+            for i in range(self.counts.shape[0]):
+                room -= self.counts[i] * self.rules[r, i]
+            if room < 0.0:
+                return False
+        return True
+
+    def _draw(self, below):
+        """A whole number in [0, below) from a xorshift generator."""
+        self.state ^= self.state << 13
+        self.state ^= self.state >> 7
+        self.state ^= self.state << 17
+        return ((self.state >> 32) * below) >> 32
+
+    def _random_start(self):
+        """Fill ``chosen`` at random, distinct where there are enough candidates."""
+        ruled: cython.bint = self.rules.shape[0] > 0
+        distinct: cython.bint = self.k <= self.available and not ruled
+        self._clear()
+        for c in range(self.k):
+            if ruled and c >= self.fixed and not self._restrict(-1, self.k - c - 1):
+                for i in range(self.counts.shape[0]):  # a selection of no use
+                    self._count(i, 0)
+            i = self.chosen[c] if c < self.fixed else self._draw(self.counts.shape[0])
+            while c >= self.fixed and (
+                self.closed[i] > 0.0 or (distinct and self.counts[i] > 0)
+            ):
+                i = self._draw(self.counts.shape[0])
+            self.chosen[c] = i
+            self._count(i, 1)
+
+    def _late(self):
+        self.looked += self.sweep
+        if self.looked < _PATIENCE:
+            return 0
+        self.looked = 0
+        return late(address(self.watch))
+
+    # --- greedy and exchange --------------------------------------------------------
+
+    def _grow(self, size, share):
+        """Complete the first ``size`` chosen, the largest gain first."""
+        if size == self.k:
+            return 0
+        self._set_known(share, 0.0)
+        self._evaluate(size, False)
+        self._refresh()
+        while True:
+            best = -1
+            if self.rules.shape[0] > 0:
+                self._restrict(-1, self.k - size - 1)
+            if not self._late():
+                best = self._addition()
+            if best < 0:
+                for i in range(self.counts.shape[0]):
+                    self._count(i, 0)
+                self._fill(size)
+                return 0
+            self.chosen[size] = best
+            self._count(best, 1)
+            size += 1
+            if size == self.k:
+                return 0
+            self._evaluate(size, True)
+            self._carry(best, -1)
+
+    def _fill(self, size):
+        """Complete the first ``size`` chosen, each candidate in turn: time is over."""
+        i: cython.Py_ssize_t = 0
+        while size < self.k:
+            if self.closed[i] == 0.0:
+                self.chosen[size] = i
+                self._count(i, 1)
+                size += 1
+            i = i + 1 if i + 1 < self.counts.shape[0] else 0
+
+    def _finish(self, climbs):
+        """phi of the chosen, climbed; swaps mend a singular start, surer by a smaller
+        ridge."""
+        value: cython.double = 0.0
+        for attempt in range(5):
+            ridge: cython.double = 0.0
+            if attempt % 2:
+                ridge = _RIDGE if attempt == 1 else 1e-4 * _RIDGE
+            self._set_known(0.0, ridge)
+            if not climbs:
+                return self._evaluate(self.k, False)
+            value = self._climb(False)
+            if ridge == 0.0 and value > -INFINITY:
+                break
+        return value
+
+    def _climb(self, least):
+        """Swap each chosen for its best replacement until none helps; phi, or E."""
+        k = self.k
+        value: cython.double = 0.0
+        if least:
+            value = self._least_of_chosen()
+        else:
+            value = self._evaluate(k, False)
+        if k == self.fixed or not value > -INFINITY:
+            return value
+        if not least:
+            self._refresh()
+        position, since, swaps = self.fixed, 0, 0
+        for i in range(self.tried.shape[0]):
+            self.tried[i] = -1
+        while since < k - self.fixed and swaps < _MOST_SWAPS * k:
+            if late(address(self.watch)) if least else self._late():
+                break
+            at, out, after = position, self.chosen[position], value
+            since += 1
+            position = position + 1 if position + 1 < k else self.fixed
+            if self.tried[out] == swaps:  # another measurement of the same
+                continue
+            self.tried[out] = swaps
+            rise = _IMPROVES * max(1.0, fabs(value))
+            if self.rules.shape[0] > 0:
+                self._restrict(out, 0)
+            if least:
+                best = self._strongest(at, address(after))
+            else:
+                best = self._replacement(out, value, rise)
+            if best < 0:
+                continue
+            self.chosen[at] = best
+            if not least:
+                after = self._evaluate(k, True)
+                if not after > value + rise:  # the formulas promised more
+                    self.chosen[at] = out
+                    continue
+            value, since = after, 0
+            swaps += 1
+            self._count(out, -1)
+            self._count(best, 1)
+            if not least:
+                self._carry(best, out)
+        return value
+
     # --- phi ------------------------------------------------------------------------
 
     def _set_known(self, share, ridge):
-        """Fill ``known``: prior, ``share`` of k mean candidates' information, ridge."""
         p = self.p
         weight = share * self.k / self.available
         for a in range(p):
@@ -901,16 +857,11 @@ class Climber(Choice):
         return True
 
 
-class JointClimber(Choice):
+class JointClimber(Climber):
     """One choice in several scenarios, the mean or the least of whose phi counts.
 
-    phi of a scenario counts as ``scale phi + shift``. What is chosen, and which may be
-    chosen once more, is held in common with the first climber.
-
-    Args:
-        climbers: a ``Climber`` each, of one shape, with the same rules.
-        weights: (S,) of the mean; ignored where the least counts.
-        least: whether the least counts.
+    phi of a scenario counts as ``scale phi + shift``. What is chosen is held in common
+    with the first of the ``climbers``, which are of one shape, with the same rules.
     """
 
     def __init__(self, climbers, weights, least):
@@ -928,7 +879,7 @@ class JointClimber(Choice):
         self.rules, self.most, self.order = lead.rules, lead.most, lead.order
         self.counts, self.tried, self.chosen = lead.counts, lead.tried, lead.chosen
         self.closed, self.state = lead.closed, lead.state
-        self.ahead = np.zeros(self.groups * WIDE)
+        self.ahead, self.p = np.zeros((count, self.groups * WIDE)), lead.p
         self.sweep = lead.groups * cast(cython.int, count)
         for s in range(count):
             member: Climber = self.climbers[s]
@@ -958,7 +909,6 @@ class JointClimber(Choice):
         return value
 
     def _evaluate(self, size, trial):
-        """The joined phi of the first ``size`` chosen; fills V and X of each."""
         for s in range(self.addresses.shape[0]):
             value = cast(Climber, self.members[s])._evaluate(size, trial)
             if not value > -INFINITY:
@@ -976,7 +926,6 @@ class JointClimber(Choice):
             cast(Climber, self.members[s])._refresh()
 
     def _carry(self, came, went):
-        """After a swap, or where ``went`` is -1 one more, judged by ``_evaluate``."""
         for s in range(self.addresses.shape[0]):
             self.phi[s] = self.after[s]
             cast(Climber, self.members[s])._carry(came, went)
@@ -1004,11 +953,9 @@ class JointClimber(Choice):
                     total[j] += weight * rise
 
     def _addition(self):
-        """The candidate whose addition gives the largest joined phi; -1: none."""
         return self._best(False, -INFINITY)
 
     def _replacement(self, out, value, rise):
-        """The candidate that raises the joined phi most in place of ``out``."""
         for s in range(self.addresses.shape[0]):
             cast(Climber, self.members[s])._take_out(out)
         best = self._best(True, value + rise)
@@ -1050,8 +997,7 @@ class JointClimber(Choice):
             scale, shift, weight = self.scale[s], self.shift[s], self.weights[s]
             for i in range(groups * WIDE):
                 value: cython.double = scale * bound[i] + shift
-                if s == 0:
-                    self.ahead[i] = value
+                self.ahead[s, i] = value
                 if not self.least:
                     value *= weight
                 if s == 0:
@@ -1077,19 +1023,14 @@ class JointClimber(Choice):
         Bounds give way to values one scenario after the other, until it cannot be.
         """
         total: cython.double = INFINITY if self.least else 0.0
+        for s in range(0 if self.least else self.addresses.shape[0]):
+            total += self.weights[s] * self.ahead[s, e]
         for s in range(self.addresses.shape[0]):
-            if not self.least:
-                ahead = (
-                    self.scale[s] * cast(Climber, self.members[s]).bounds[e]
-                    + self.shift[s]
-                )
-                total += self.weights[s] * (self.ahead[e] if s == 0 else ahead)
-        for s in range(self.addresses.shape[0]):
-            copy(
+            gram, rest = (
                 cast(Climber, self.members[s]).gram,
                 cast(Climber, self.members[s]).rest,
-                cast(Climber, self.members[s]).p * cast(Climber, self.members[s]).p,
             )
+            copy(gram, rest, self.p * self.p)
             cast(Climber, self.members[s])._add(e)
             value = cast(Climber, self.members[s])._least(False)
             if not value > -INFINITY:
@@ -1098,13 +1039,7 @@ class JointClimber(Choice):
             if self.least:
                 total = min(total, value)
             else:
-                ahead = (
-                    self.scale[s] * cast(Climber, self.members[s]).bounds[e]
-                    + self.shift[s]
-                )
-                total += self.weights[s] * (
-                    value - (self.ahead[e] if s == 0 else ahead)
-                )
+                total += self.weights[s] * (value - self.ahead[s, e])
             if not total > least[0]:
                 return False
         least[0] = total

@@ -37,11 +37,10 @@ class Chooser(Protocol):
 
 
 def load_policy(checkpoint: str | pathlib.Path | None = None) -> Chooser:
-    """The newest policy of a checkpoint; read again only where its files have changed.
+    """The newest policy of a weights file or a run's folder, or (None) that which
+    ships.
 
-    Args:
-        checkpoint: a weights file or a training run's folder; the policy that ships
-            when None.
+    Read again only where its files have changed.
 
     Raises:
         ValueError: it is missing, damaged, or made by another version.
@@ -54,7 +53,7 @@ def load_policy(checkpoint: str | pathlib.Path | None = None) -> Chooser:
 
 @functools.lru_cache(maxsize=8)
 def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Chooser:
-    """Args: a weights file or a run's step, and what changes when it is replaced."""
+    """A weights file or a run's step; the state is what changes when it is replaced."""
     if path.is_file():
         stored = weights.read(path)
         held = stored.meta | {"network": stored.network}
@@ -80,12 +79,7 @@ class _ThroughJax:
         self._path, self._policy = path, checkpoint.load(path)
 
     def _require_read(self, problems: Sequence[Problem]) -> None:
-        """Refuse sets that the network would read as something else.
-
-        Raises:
-            ValueError: of another number of inputs, or with candidates masked where the
-                network takes what is not available for chosen.
-        """
+        """Refuse sets that the network would read as something else."""
         trained = self._policy.meta["tasks"][0]["environment"]["num_inputs"]
         inputs = problems[0].num_regressors - 1
         if inputs != trained:
@@ -129,10 +123,9 @@ class _ThroughJax:
 
 
 def _in_unit_range(problem: Problem) -> NDArray[np.float32]:
-    """(M, n) candidates on [0, 1], on which such networks are trained.
+    """(M, n) candidates on [0, 1], where such networks are trained; 0 where masked.
 
-    Those of a set that lies in [0, 1] are left as they are; others are mapped axis by
-    axis, the least available one to 0 and the largest to 1. 0 where masked.
+    Sets in [0, 1] stay as they are; others are mapped axis by axis.
     """
     assert problem.candidates is not None  # blocks are refused before
     usable = problem.candidates[problem.available]

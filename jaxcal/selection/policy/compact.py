@@ -44,24 +44,16 @@ class _Decision(NamedTuple):
 
 
 def _product(a: Array32, b: Array32) -> Array32:
-    """``a @ b`` by rows of ``a``, few enough that BLAS starts no thread of its own.
-
-    Its threads wait for each other, so a busy core made a product 20 times slower.
-    """
+    """``a @ b`` by rows of ``a``, few enough that BLAS starts no thread of its own: a
+    busy core would make a product 20 times slower."""
     size = max(1, _ONE_THREAD // (a.shape[-1] * b.shape[-1]))
     begins = range(0, a.shape[-2], size)
     return np.concatenate([a[..., i : i + size, :] @ b for i in begins], axis=-2)
 
 
 class CompactScorer:
-    """Chooses for problems of one shape, in pieces, on every core.
-
-    It is the ``Scorer`` that ``learning.policies.decoding`` asks.
-
-    Args:
-        config: fields of a ``NetworkConfig`` of kind "compact".
-        arrays: weights by flat name.
-    """
+    """The ``Scorer`` of ``learning.policies.decoding``: fields of a ``NetworkConfig``,
+    weights."""
 
     piece_rows = _ROWS
 

@@ -32,14 +32,11 @@ def describe(x, chosen, active, k, depth, best_only, features, moments, ahead):
 
     Args:
         x: (E, p, M) whitened regressors with mean square 1, 0 where masked.
-        chosen: (E, c) int64 choices made.
-        active: (E, M) True where a candidate counts.
-        k: choices in all.
+        chosen, active: (E, c) int64 choices made, of k; (E, M) who counts.
         depth: choices to look ahead, the next included; at least 1.
         best_only: write ``ahead`` alone, and that as ``look_ahead`` says.
         features: (E, M, F) float32 written, 0 where not active; close-ups if F = 16.
-        moments: (E, p (p + 1) / 2, M) float32 written: second moments of what is left
-            of the candidates, scaled so that messages keep their size.
+        moments: (E, p (p + 1) / 2, M) float32 written, scaled second moments.
         ahead: (E, M) written: log-volume at the end of the look-ahead, behind the best.
     """
     p, m = x.shape[1:]
@@ -125,7 +122,7 @@ def _conditional(x, chosen, active, k, y, inner):
 
     With k = p every choice is a new direction, which leaves the other candidates. With
     more, the result is in the metric of the chosen, ``|y_i|^2 = x_i.T G^-1 x_i`` with
-    ``G = C.T C + ridge I``: each choice shortens its direction. ``inner`` is (M,) room.
+    ``G = C.T C + ridge I``: each choice shortens its direction.
     """
     p, m = x.shape[0], x.shape[1]
     least = _RIDGE if chosen.shape[0] < p else _LEAST_RIDGE
@@ -192,12 +189,7 @@ def look_ahead(y, active, spanned, depth, best_only, factors, values):
 
 
 def _look_ahead(y, active, spanned, depth, best_only, factors, values, work, weights):
-    """``look_ahead``; raises KeyboardInterrupt.
-
-    Args:
-        work: (p + depth + 2, M) room.
-        weights: (p + depth,) room.
-    """
+    """``look_ahead``, with room (p + depth + 2, M) and (p + depth,)."""
     p, m = y.shape[0], y.shape[1]
     priced: cython.bint = factors is not None
     base = 1.0 if spanned else 0.0

@@ -4,6 +4,7 @@ from jaxcal.selection.problem.assembly import make_problems, problem_of
 from jaxcal.selection.problem.blocks import Blocks, blocks_of, shares_regressor
 from jaxcal.selection.problem.candidate_set import CandidateSet
 from jaxcal.selection.problem.problem import (
+    Constraints,
     Problem,
     ScenarioProblem,
     Solution,
@@ -14,6 +15,7 @@ from jaxcal.selection.problem.scenarios import Scenarios
 __all__ = [
     "Blocks",
     "CandidateSet",
+    "Constraints",
     "Problem",
     "ScenarioProblem",
     "Scenarios",

@@ -7,7 +7,7 @@ their own, joined. ``make_problems`` makes a batch of the affine model's.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,13 +20,8 @@ from jaxcal.information.blocks import (
     rank_of_blocks,
     whiten,
 )
-from jaxcal.information.singular import (
-    SINGULAR,
-    directions_in_words,
-    require_excited,
-)
+from jaxcal.information.singular import SINGULAR, directions_in_words, require_excited
 from jaxcal.models.affine import Affine
-from jaxcal.models.model import Model
 from jaxcal.selection.criteria import CRITERIA, Coordinates, Criterion, G, criterion_of
 from jaxcal.selection.problem.blocks import blocks_of
 from jaxcal.selection.problem.candidate_set import (
@@ -41,9 +36,6 @@ from jaxcal.selection.problem.candidate_set import (
 from jaxcal.selection.problem.problem import Problem, ScenarioProblem, joined_problem
 from jaxcal.selection.problem.scenarios import Largest, Mean, ScenarioCriterion
 
-if TYPE_CHECKING:
-    from jaxcal.selection.problem.constraints import Constraints
-
 _LARGEST = 3e7  # numbers of all predictions' problems: 240 MB
 
 
@@ -53,15 +45,8 @@ def problem_of(
     criterion: Any = None,
     region: ArrayLike | None = None,
 ) -> Problem:
-    """The problem of choosing k of the candidates by a criterion.
-
-    Args:
-        offer: what may be measured.
-        k: candidates to choose; the fewest that identify when not given.
-        criterion: letters of ``CRITERIA`` or an object of it; D for the affine model
-            and blocks, else I.
-        region: of I, where it is given by its letter.
-    """
+    """The problem of choosing k of the candidates by a criterion; see
+    ``Design.select``."""
     joined = criterion if isinstance(criterion, ScenarioCriterion) else Mean(criterion)
     default = "I" if offer.model and not offer.model.multiplicity else "D"
     of_one = criterion_of(joined.criterion, region, default)
@@ -102,12 +87,8 @@ def _problem_of_one(
     if where is None and criterion.of_region:
         where = blocks.predicted()
     region = None if where is None else blocks.at("region", where, readings=False)
-    return _checked_problem(
-        raw, root, criterion, k, offer.available, offer.required,
-        offer.max_replicates, names=blocks.names, times=blocks.times, region=region,
-        candidates=offer.candidates, model=offer.model,
-        constraints=offer.constraints,
-    )  # fmt: skip
+    rest = {"names": blocks.names, "times": blocks.times, "region": region}
+    return _checked_problem(offer, raw, root, criterion, k, **rest)
 
 
 def _of_largest(problems: list[Problem]) -> Problem:
@@ -140,18 +121,11 @@ def make_problems(
     max_replicates: int = 1,
     num_outputs: int | None = None,
 ) -> list[Problem]:
-    """Check a batch of candidate sets of the affine model, for criterion D.
+    """The problems of candidate sets (B, M, n) of the affine model, for criterion D.
 
     Args:
-        candidates: (B, M, n) float, any unit; NaN where masked does no harm.
-        k: postures to choose in each set, at least n + 1, which is the default.
-        available: (B, M) bool, True where a candidate may be chosen.
-        required: (B, r) indices that must be chosen.
-        max_replicates: how often one candidate may be chosen.
+        available: (B, M); ``required`` (B, r); the others as of ``Design``.
         num_outputs: m; as many as inputs when not given.
-
-    Raises:
-        ValueError: naming the argument, the rule and the value.
     """
     array = filled("candidates", candidates, "B", "M", "n")
     mask = check_available(available, array.shape[:2])
@@ -170,62 +144,51 @@ def make_problems(
     k = _check_k(k, raw[0], mask[0], root, regressors=True)  # of no one set
     problems = []
     for b in range(len(array)):
+        offer = CandidateSet(
+            array[b], model, available=mask[b], max_replicates=max_replicates,
+            required=None if forced is None else forced[b],
+        )  # fmt: skip
+        rest = {"white": white[b], "times": m}
         try:
-            problems.append(_checked_problem(
-                raw[b], root, criterion, k, mask[b],
-                None if forced is None else forced[b], max_replicates,
-                white=white[b], times=m, candidates=array[b], model=model,
-            ))  # fmt: skip
+            problems.append(_checked_problem(offer, raw[b], root, criterion, k, **rest))
         except ValueError as error:
             raise ValueError(f"in set {b}: {error}") from None
     return problems
 
 
 def _checked_problem(
+    offer: CandidateSet,
     raw: Array,
     root: Array,
     criterion: Criterion,
     k: int | None,
-    available: Mask,
-    required: ArrayLike | None,
-    max_replicates: int | Indices,
     *,
     white: WhiteBlocks | None = None,
     names: tuple[str, ...] = (),
     times: int = 1,
     region: Array | None = None,
-    candidates: Array | None = None,
-    model: Model | None = None,
-    constraints: Constraints | None = None,
 ) -> Problem:
-    """The problem of blocks (M, q, p) that were checked; whitened here.
+    """The problem of checked blocks (M, q, p), zero where not available; whitened here.
 
     Args:
-        raw: in the caller's numbers, zero where not available.
-        root: (r, p) of the precision known beforehand.
-        criterion: what is best.
-        k, required, max_replicates: what may be chosen, as asked for.
-        available: (M,), checked.
         white: the blocks whitened, where they are already.
         names: (p,) of the parameters; empty where the blocks are [u, 1].
         times: how often log det and trace count.
         region: (R, q, p) blocks that the criterion is about, if it is of a region.
-        candidates: (M, n), where there are any.
-        model: what made blocks of them.
-        constraints: on how often candidates are chosen.
     """
+    available, candidates = offer.available, offer.candidates
     readings, count = raw, int(np.count_nonzero(available)) * raw.shape[1]
     if raw.shape[1] > raw.shape[2]:  # as much information in p rows, at q^3 less cost
         if criterion.of_each and region is None:
             region = raw[available]
         raw = np.asarray(np.linalg.qr(raw, mode="r"))
     k = _check_k(k, raw, available, root, regressors=not names)
-    cap = max_replicates
+    cap = offer.max_replicates
     if np.ndim(cap) == 0:
         cap = whole_number("max_replicates", cap, 1)
     _require_enough(available, k, cap)
-    forced = _checked_required(required, available, k)
-    computed = bool(names) and model is not None
+    forced = _checked_required(offer.required, available, k)
+    computed = bool(names) and offer.model is not None
     if white is None:
         sets = raw[None], available[None]
         white = whiten(*sets, root, computed=computed)[0]
@@ -235,33 +198,26 @@ def _checked_problem(
             if not len(root):
                 about = "candidates", "available ones"
                 require_excited(candidates[available], names[:-1], *about)
-        raise _uninformed(raw[available], root, computed, names)
+        null = missing_directions(raw[available], root, computed)
+        raise ValueError(
+            "blocks must inform every parameter, but the available ones"
+            + (" and what is known" if len(root) else "")
+            + directions_in_words(" do not inform the direction{} ", null, names)
+            + "; give prior, the precision known beforehand"
+        )
     at = Coordinates(white, names, count, region, times)
     problem = Problem(
         white, k, available, forced, cap, criterion.within(at), times, raw, readings,
-        root, candidates, model, constraints,
+        root, candidates, offer.model, offer.constraints,
     )  # fmt: skip
     for array in (raw, readings, root, available, forced):
         array.flags.writeable = False
     if len(forced):
         _check_required_rank(problem)
-    if constraints is not None:
-        if constraints.selection(k, problem.lower, problem.upper) is None:
-            raise ValueError(f"constraints allow no selection of k = {k}")
+    rules = offer.constraints
+    if rules and rules.selection(k, problem.lower, problem.upper) is None:
+        raise ValueError(f"constraints allow no selection of k = {k}")
     return problem
-
-
-def _uninformed(
-    blocks: Array, root: Array, computed: bool, names: tuple[str, ...]
-) -> ValueError:
-    """The refusal of blocks (N, q, p): directions that they and the root leave open."""
-    null = missing_directions(blocks, root, computed)
-    return ValueError(
-        "blocks must inform every parameter, but the available ones"
-        + (" and what is known" if len(root) else "")
-        + directions_in_words(" do not inform the direction{} ", null, names)
-        + "; give prior, the precision known beforehand"
-    )
 
 
 def _require_enough(mask: Mask, k: int, cap: int | Indices) -> None:
@@ -305,13 +261,8 @@ def _checked_required(required: ArrayLike | None, mask: Mask, k: int) -> Indices
 def _check_k(
     k: int | None, raw: Array, mask: Mask, root: Array, regressors: bool
 ) -> int:
-    """k, by default the fewest candidates that identify every parameter alone.
-
-    Args:
-        k: as asked for.
-        raw, mask, root: blocks (M, q, p), available (M,), what is known (r, p).
-        regressors: the blocks are [u, 1].
-    """
+    """k, by default the fewest that identify alone; ``regressors``: blocks are [u,
+    1]."""
     p = raw.shape[2]
     usable = raw if raw.shape[1] == 1 and k is not None else raw[mask]
     most = largest_rank(usable)

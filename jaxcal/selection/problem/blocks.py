@@ -7,7 +7,6 @@ no parameter changes, else derivatives at the mean of the prior or in a scenario
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 
 import numpy as np
@@ -26,45 +25,12 @@ _MOVES = 1e-10  # of the size, below which a command is the same everywhere
 _OF_MODEL = " for this model"
 
 
-class Blocks(abc.ABC):
-    """The blocks of a candidate set, in the parameters of one question."""
+class Blocks:
+    """Blocks that no parameter changes: the caller's own, or [u, 1] of a model."""
 
     names: tuple[str, ...]  # (p,) of the parameters; empty where the blocks are [u, 1]
     root: Array  # (r, p) of the precision known beforehand
     times: int = 1  # how often log det and trace of the blocks count
-
-    @abc.abstractmethod
-    def of_candidates(self) -> Array:
-        """(M, q, p), zero where not available."""
-
-    @abc.abstractmethod
-    def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
-        """(N, q, p) of what was measured (``readings``), or of wanted predictions.
-
-        Args:
-            argument: the name of the values, in errors.
-            values: (N, n) commands, or (N, q, p) blocks where the caller gives these.
-            readings: noise of the commands counts, and what no parameter explains.
-        """
-
-    def predicted(self) -> Array | None:
-        """Commands of predictions, where their blocks are not those of readings."""
-        return None
-
-    def require_identified(self, measured: ArrayLike | None) -> None:
-        """Refuse what candidates leave unknown, by the names of parameters."""
-        return
-
-    def leverage_slopes(self, commands: Array, metric: Array) -> Array | None:
-        """(N, n) slopes of ``trace(B metric B.T)`` by commands, where a model has them.
-
-        B are the blocks of readings (q, p) and ``metric`` is (p, p).
-        """
-        return None
-
-
-class _FixedBlocks(Blocks):
-    """Blocks that no parameter changes: the caller's own, or [u, 1] of a model."""
 
     def __init__(self, offer: CandidateSet) -> None:
         self._model, self._noise, self._std = offer.model, offer.noise, 1.0
@@ -83,12 +49,25 @@ class _FixedBlocks(Blocks):
         self.names, self.root = (), np.zeros((0, self._blocks.shape[2]))
 
     def of_candidates(self) -> Array:
+        """(M, q, p), zero where not available."""
         return self._blocks
 
     def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
+        """(N, q, p) of commands, or blocks, that were measured, or of predictions."""
         rule = " as blocks have" if self._model is None else _OF_MODEL
         shape = ("N", *self._values.shape[1:])
         return self._of(array_of(argument, values, *shape, rule=rule))
+
+    def predicted(self) -> Array | None:
+        """Commands of predictions, where their blocks are not those of readings."""
+        return None
+
+    def require_identified(self, measured: ArrayLike | None) -> None:
+        """Refuse what candidates leave unknown, by the names of parameters."""
+
+    def leverage_slopes(self, commands: Array, metric: Array) -> Array | None:
+        """(N, n) slopes of ``trace(B metric B.T)`` by commands, where there are any."""
+        return None
 
     def _of(self, values: Array) -> Array:
         if self._model is not None:
@@ -100,11 +79,9 @@ class _ModelBlocks(Blocks):
     """Blocks of a model by its parameters, without those that are held.
 
     Args:
-        offer: the candidates, prior and noise.
-        model: that of the candidates, with the parameters of its misfit if they count.
         misfit: standard deviation of a reading by what no parameter explains.
-        invariant: parameters may be of commands counted from their middle, which
-            neither the determinant nor predictions depend on.
+        invariant: commands may be counted from their middle, which neither the
+            determinant nor predictions depend on.
     """
 
     def __init__(
@@ -219,16 +196,15 @@ def blocks_of(
     """The blocks of a candidate set.
 
     Args:
-        offer: what may be measured.
-        of_parameters: of all parameters by name, also where outputs share a regressor.
+        of_parameters: by name, also where outputs share a regressor.
         of_predictions: those of an arm without a prior have what no parameter explains.
         of_volume: their determinant alone counts.
     """
     model, prior = offer.model, offer.prior
     if model is None:
-        return _FixedBlocks(offer)
+        return Blocks(offer)
     if not of_parameters and shares_regressor(model, prior, offer.noise):
-        return _FixedBlocks(offer)
+        return Blocks(offer)
     if of_predictions and prior is None and model.misfit_std:
         misfit = model.misfit_std
         return _ModelBlocks(offer, model.with_misfit(), misfit, of_predictions)

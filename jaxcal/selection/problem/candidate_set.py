@@ -29,6 +29,7 @@ from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, as_model
 from jaxcal.models.predictions import answered
 from jaxcal.models.uncertainty import Prior, as_noise
+from jaxcal.selection.problem.problem import checked_constraints
 from jaxcal.selection.problem.scenarios import Scenarios, checked_weights, scenarios_of
 from jaxcal.tables import (
     COMMANDS,
@@ -46,11 +47,8 @@ _NUMBERS = 2**21  # of 8 bytes; beyond 32 MiB glibc no longer follows
 
 @dataclasses.dataclass(eq=False, repr=False)
 class CandidateSet:
-    """Candidates of a model or blocks, with what is known of them and the rules.
-
-    The fields are as a caller of ``jaxcal.Design`` gives them, and as ``checked`` then
-    leaves them.
-    """
+    """Candidates or blocks with the rules, as ``Design`` takes them, then
+    ``checked``."""
 
     candidates: Any  # (M, n) commands in the caller's unit, finite; None: blocks alone
     model: Any = None  # a Model; None where blocks are given
@@ -68,11 +66,7 @@ class CandidateSet:
     constraints: Any = None  # a Constraints on the counts; None: no more of them
 
     def checked(self) -> Self:
-        """Itself, its fields checked and the caller's arrays copied.
-
-        Raises:
-            ValueError: naming the argument, the rule and the value.
-        """
+        """Itself, its fields checked and the caller's arrays copied."""
         self.noise = as_noise(self.noise)
         if self.blocks is None:
             self._check_commands()
@@ -94,10 +88,7 @@ class CandidateSet:
             self.max_replicates = often = caps.astype(np.int64)
             require_none(often < 0, often, rule)
             self.available = self.available & (often > 0)
-        if self.constraints is not None:
-            from jaxcal.selection.problem.constraints import checked_constraints
-
-            self.constraints = checked_constraints(self.constraints, count)
+        self.constraints = checked_constraints(self.constraints, count)
 
     def _check_commands(self) -> None:
         """Commands (M, n) of a model, or a frame."""
@@ -139,9 +130,8 @@ class CandidateSet:
         if self.scenarios is not None:
             self.scenarios = scenarios_of(self.scenarios, model, self.prior)
         if model.multiplicity:  # which answers everywhere, by the commands themselves
-            rows = None
-            if self.measured is not None and self.measured.ndim == 2:
-                rows = self.measured[None, :, None]
+            measured = self.measured
+            rows = measured[None, :, None] if np.ndim(measured) == 2 else None
             mask = self.available[None]
             flatten_rounding(spacing, array[None, :, None], mask, rows, bias=True)
         else:
@@ -199,11 +189,9 @@ class CandidateSet:
                     "measured must have shape (S, N, q, p), blocks of every scenario, "
                     f"got {self.measured.shape}"
                 )
-        by_set = np.moveaxis(array, 1, 0) if joined else array[None]
-        rows = self.measured
-        if rows is not None:
-            rows = rows if joined else rows[None]
-            rows = rows if rows.ndim == 4 else None
+        by_set, rows = np.moveaxis(array, 1, 0) if joined else array[None], None
+        if self.measured is not None:
+            rows = self.measured if joined else self.measured[None]
         usable = np.broadcast_to(self.available, by_set.shape[:2])
         flatten_rounding(spacing, by_set, usable, rows)
 
@@ -271,12 +259,9 @@ def filled(name: str, values: ArrayLike, *letters: str) -> Array:
 def _keep_freed_pages() -> None:
     """Let glibc's malloc keep the pages of freed arrays for the next problem.
 
-    It returns the top of its heap to the system where that is larger than twice the
-    largest array freed so far. A problem frees two such arrays at least, its blocks and
-    the whitened ones, so the next one waits for all of their pages again: 109 page
-    faults, .3 of .7 ms, with blocks (2000, 3, 6). An array of 16 MiB that is freed
-    raises the limit to 32 MiB; nothing is written to it, so it takes no memory. Other
-    allocators ignore it.
+    It returns the top of its heap beyond twice the largest array freed so far, and the
+    next problem waits for those pages again: .3 of .7 ms with blocks (2000, 3, 6). An
+    array of 16 MiB, freed and never written, raises that limit.
     """
     np.empty(_NUMBERS)
 
@@ -311,14 +296,12 @@ def flatten_rounding(
 ) -> None:
     """Put blocks that lie in a plane but for rounding to float32 into it, in place.
 
-    In double precision that rounding would pass for information: of a third column that
-    is the sum of two others in float32 a design would be made, and proven.
+    In double precision that rounding would pass for information, and be proven so.
 
     Args:
-        spacing: of the numbers that the caller gave, see ``rounding_of``; 0: nothing.
-        candidates: (S, M, q, p) of S sets; readings and columns of any unit.
-        usable: (S, M) which of them count.
-        measured: (S, N, q, p) known beforehand, put into the plane with them.
+        spacing: of the caller's numbers, see ``rounding_of``; 0: nothing is done.
+        candidates: (S, M, q, p) of S sets; ``usable`` (S, M): which of them count.
+        measured: (S, N, q, p) put into the plane with them.
         bias: a column of ones stands beside them, so the plane need not pass through 0.
     """
     if not spacing:

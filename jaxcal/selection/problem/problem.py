@@ -17,29 +17,88 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from jaxcal.checks import Array, Indices, Mask
+from jaxcal.checks import Array, Indices, Mask, array_of
 from jaxcal.information.blocks import WhiteBlocks, rank_of_blocks
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model
 from jaxcal.selection.problem.scenarios import ScenarioCriterion
 
-if TYPE_CHECKING:
-    from jaxcal.selection.problem.constraints import Constraints
-
 _EPS = float(np.finfo(np.float64).eps)
 _IN_PLANE = 1e-7  # of whitened rows of height one above the origin
+_SLACK = 1e-9  # of the largest sum: rounding breaks no constraint
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Constraints:
+    """``costs @ counts <= most``: r rules for M candidates."""
+
+    costs: Array  # (r, M)
+    most: Array  # (r,) with what rounding may add
+
+    def broken(self, counts: Indices) -> str:
+        """The first rule that counts (M,) break, in words; "" where none is."""
+        total = self.costs @ counts
+        for r in np.flatnonzero(total > self.most):
+            return f"row {r} of A w is {total[r]:.6g}, more than {self.most[r]:.6g}"
+        return ""
+
+    def of(self, rows: Indices) -> Constraints:
+        """Constraints on the candidates ``rows`` alone."""
+        return Constraints(np.ascontiguousarray(self.costs[:, rows]), self.most)
+
+    @functools.cached_property
+    def order(self) -> NDArray[np.intp]:
+        """(r, M) candidates, the cheapest first."""
+        return np.argsort(self.costs, axis=1, kind="stable").astype(np.intp)
+
+    def selection(self, k: int, lower: Indices, upper: Indices) -> Indices | None:
+        """Counts (M,) of sum k within bounds that keep all rules; None: there are none.
+
+        Raises:
+            ValueError: the search for them did not end.
+        """
+        from scipy import optimize
+
+        within = optimize.LinearConstraint(
+            np.vstack([self.costs, np.ones(len(lower))]),
+            np.append(np.full(len(self.most), -np.inf), k),
+            np.append(self.most, k),
+        )
+        counts = optimize.milp(
+            np.zeros(len(lower)),
+            integrality=np.ones(len(lower)),
+            bounds=optimize.Bounds(lower, upper),
+            constraints=within,
+            options={"time_limit": 60.0},
+        )
+        if counts.status not in (0, 2):
+            raise ValueError(
+                f"constraints could not be checked for a selection: {counts.message}"
+            )
+        return None if counts.x is None else np.rint(counts.x).astype(np.int64)
+
+
+def checked_constraints(given: Any, count: int) -> Constraints | None:
+    """``(A, b)`` as given, A (r, M) or (M,) and b (r,) or a number."""
+    if given is None:
+        return None
+    if not isinstance(given, tuple | list) or len(given) != 2:
+        raise ValueError("constraints must be a pair (A, b) with A w <= b")
+    rule = ", a column for each candidate"
+    costs = array_of("A of constraints", np.atleast_2d(given[0]), "r", count, rule=rule)
+    most = array_of("b of constraints", np.atleast_1d(given[1]), len(costs))
+    size = np.abs(most) + np.abs(costs).max(axis=1, initial=0.0)
+    return Constraints(costs, most + _SLACK * size)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Problem:
-    """Choose ``k`` of M candidates so that a criterion of the information is best.
-
-    All arrays are the problem's own and cannot be written to.
-    """
+    """Choose ``k`` of M candidates; all arrays are its own and cannot be written to."""
 
     white: WhiteBlocks  # blocks and prior in coordinates where all of them are I
     k: int  # candidates to choose
@@ -109,18 +168,16 @@ class Problem:
 
     def allows(self, indices: Indices) -> bool:
         """Whether a selection (k,) keeps the constraints."""
-        rules = self.constraints
+        if self.constraints is None:
+            return True
         counts = np.bincount(indices, minlength=len(self.available))
-        return rules is None or not rules.broken(counts)
+        return not self.constraints.broken(counts)
 
     @property
     def simplex(self) -> bool:
-        """The k = p chosen span a simplex, and det is its squared volume.
-
-        True where each candidate gives one reading, nothing is known beforehand, D is
-        wanted and all rows lie in one plane off the origin, as those of [u, 1] do: the
-        optimum then uses vertices of the convex hull only.
-        """
+        """The k = p chosen span a simplex, and det is its squared volume: one reading
+        each, nothing known, D, all rows in a plane off the origin as those of [u, 1].
+        The optimum then uses vertices of the convex hull only."""
         if not self.rank_one or self.k != self.num_regressors or len(self.root):
             return False
         if self.constraints is not None:
@@ -138,11 +195,10 @@ class Problem:
     def uncertainty(self, indices: Indices) -> float:
         """By how much rounding may change phi of a selection (k,), as a share.
 
-        Of "det" the share of every eigenvalue: phi itself changes by it times s. With E
-        the errors of the chosen blocks B, one below the other, and M = L L.T, M changes
-        by ``E.T B + B.T E``, of itself by 2 |B L^-T| |E L^-T|, of which the first is at
-        most 1 and the second |E| / sqrt(least eigenvalue of M); beside what sums are
-        rounded by.
+        Of "det" the share of every eigenvalue. With E the errors of the chosen blocks
+        B, one below the other, and M = L L.T, M changes by ``E.T B + B.T E``, of itself
+        by 2 |B L^-T| |E L^-T|, the first at most 1, the second |E| / sqrt(least
+        eigenvalue of M); beside what sums are rounded by.
         """
         p = self.num_regressors
         rows = self.blocks[indices].reshape(-1, p)
@@ -186,10 +242,8 @@ class Problem:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ScenarioProblem(Problem):
-    """Choose k candidates so that a joined criterion is best.
-
-    The attributes of a ``Problem`` are those of the first scenario.
-    """
+    """Choose k by a joined criterion; attributes of a ``Problem`` are the first
+    scenario's."""
 
     members: tuple[Problem, ...] = ()  # (S,) the scenarios
     weights: Array = dataclasses.field(default_factory=lambda: np.zeros(0))  # (S,)
@@ -201,13 +255,11 @@ class ScenarioProblem(Problem):
         return self
 
     def of_size(self, k: int) -> Self:
-        """This problem with k candidates to choose."""
         members = tuple(member.of_size(k) for member in self.members)
         nominal = None if self.nominal is None else self.nominal.of_size(k)
         return dataclasses.replace(self, k=k, members=members, nominal=nominal)
 
     def uncertainty(self, indices: Indices) -> float:
-        """The largest of the scenarios, see ``Problem.uncertainty``."""
         return max(member.uncertainty(indices) for member in self.members)
 
     def log_det(self, indices: Indices) -> float:
@@ -242,7 +294,6 @@ class ScenarioProblem(Problem):
         return np.where(regular, value, worst), np.where(regular, log_det, -np.inf)
 
     def terms(self) -> tuple[Array, Array]:
-        """(S,) scale and shift of ``ScenarioCriterion.terms``."""
         criteria = [member.criterion for member in self.members]
         of_criteria: tuple[Array, Array] = self.criterion.terms(criteria, self.optima)
         return of_criteria
@@ -254,15 +305,8 @@ def joined_problem(
     criterion: ScenarioCriterion,
     nominal: Problem | None,
 ) -> Problem:
-    """The problem of scenarios; where all are equal it is that of one, but
-    for efficiencies.
-
-    Args:
-        members: (S,) problems that differ in blocks and prior only.
-        weights: (S,) positive, of sum 1.
-        criterion: as asked for.
-        nominal: the problem at the model's nominal, where there is a model.
-    """
+    """The problem of scenarios (S,) with weights (S,); that of one where all are equal
+    and no efficiencies count. ``nominal``: the problem at the model's nominal."""
     first, k = members[0], max(member.k for member in members)
     if not criterion.of_efficiency and all(
         (member.raw == first.raw).all() and np.array_equal(member.root, first.root)

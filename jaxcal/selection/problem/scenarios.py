@@ -27,14 +27,8 @@ class Scenarios(NamedTuple):
 
 
 def scenarios_of(scenarios: Any, model: Model, prior: Prior | None) -> Scenarios:
-    """Scenarios as they are asked for.
-
-    Args:
-        scenarios: a whole number of draws from the prior, which one seed makes; (S, p)
-            parameters; or ``(parameters, weights)``.
-        model: whose parameters they are.
-        prior: of them; the model's own when not given.
-    """
+    """Scenarios of a number of draws from the prior, parameters (S, p), or
+    ``(parameters, weights)``."""
     if isinstance(scenarios, tuple):
         if len(scenarios) != 2:
             raise ValueError(
@@ -92,9 +86,6 @@ def checked_weights(weights: ArrayLike | None, count: int) -> Array:
 class ScenarioCriterion:
     """A criterion over scenarios: ``Mean`` or ``Worst``.
 
-    As it is asked for it carries the criterion of each scenario. ``within`` gives that
-    of one problem, with what tells its values: they are read as those of a Criterion.
-
     Args:
         criterion: letters of ``CRITERIA`` or an object of it; when not given the
             design's own.
@@ -120,7 +111,6 @@ class ScenarioCriterion:
         return f"{type(self).__name__}({given})"
 
     def within(self, each: Criterion) -> Self:
-        """The criterion of a problem whose first scenario has ``each``."""
         joined = copy.copy(self)
         joined.each, joined.kind = each, each.kind
         return joined
@@ -132,22 +122,18 @@ class ScenarioCriterion:
 
     @property
     def says(self) -> str:
-        """What a table prints before the value."""
         return f"{self.each.says}, {self.word}"
 
     @property
     def larger_is_better(self) -> bool:
-        """Whether a larger reported value is better."""
         return self.of_efficiency or self.each.larger_is_better
 
     def efficiency(self, value: float, bound: float) -> float:
-        """Share in (0, 1] of the best possible, of reported values."""
         if self.of_efficiency:
             return value / bound
         return self.each.efficiency(value, bound)
 
     def bettered(self, value: float, share: float) -> float:
-        """A reported value where every variance is smaller by ``share`` of itself."""
         if self.of_efficiency:
             return min(1.0, value * (1.0 + share))
         return self.each.bettered(value, share)
@@ -164,12 +150,8 @@ class ScenarioCriterion:
     ) -> tuple[Array, Array]:
         """(S,) scale and shift: ``scale phi + shift`` of a scenario is what is joined.
 
-        It is the reported value, of a trace its negative. Of efficiencies e it is
-        log e (det), -1 / e (trace) or e (least), which are concave in the information.
-
-        Args:
-            criteria: (S,) of the scenarios.
-            optima: (S,) reported values that efficiencies are measured by.
+        It is the reported value, of a trace its negative. Of efficiencies e against
+        ``optima`` (S,) it is log e (det), -1 / e (trace) or e (least): concave.
         """
         if self.kind == "det":
             scale = np.array([float(one.times) for one in criteria])
@@ -200,11 +182,7 @@ class ScenarioCriterion:
 
 
 class Mean(ScenarioCriterion):
-    """The weighted mean over the scenarios of a criterion.
-
-    Args:
-        criterion: letters as "D", or an object that carries data, as ``I(region)``.
-    """
+    """The weighted mean over the scenarios of a criterion."""
 
     word, least = "mean", False
 
@@ -212,10 +190,8 @@ class Mean(ScenarioCriterion):
 class Worst(ScenarioCriterion):
     """The criterion in the scenario where it is worst.
 
-    Args:
-        criterion: letters as "I", or an object that carries data.
-        efficiency: compare scenarios by the efficiency in each, relative to its own
-            optimum, or to a bound if the optimum is not proven.
+    With ``efficiency`` scenarios are compared by the efficiency in each, relative to
+    its own optimum, or to a bound where that is not proven.
     """
 
     least = True

@@ -3,22 +3,27 @@
 With noise of standard deviation sigma on an output, the fitted model predicts that
 output at z = [u, 1] with the standard error ``sigma sqrt(z.T G^-1 z)``, G = Z.T Z of
 the postures measured; likewise any model, z a row of its derivative and G the
-information in units of the noise. Two summaries over the region of interest:
-
-- ``"G"``: the largest standard error anywhere in the region;
-- ``"I"``: the root of the mean variance over the region (I-optimality's average).
-
+information in units of the noise. Two summaries over the region of interest: "G", the
+largest standard error anywhere in it, and "I", the root of the mean variance over it.
 The standard errors of the parameters are those of a region of unit vectors.
 
-For each K ``best_of_size`` looks for a good design and says what no design of K
-measurements beats. The K returned is proven the smallest where the bound of K - 1 lies
-above the target. Source: Atkinson, Donev and Tobias, Optimum Experimental Designs.
+The best design of each K is looked for by exchange on the criterion itself, from the
+selection that exchange finds for D, the greedy one, the design of one measurement less
+plus its best addition, and random ones. What no design of K measurements beats: with
+weights w over the region and W = sum of w z z.T, the largest variance is at least the
+weighted mean trace(W M^-1), and that at least what the relaxation of branch and bound
+proves. For G the weights are those of the D-optimal measure of the region, which make
+the bound p / K where the region is the candidates and replicates are free (Kiefer and
+Wolfowitz 1960). The K returned is proven the smallest where the bound of K - 1 lies
+above the target. Sources: Atkinson, Donev and Tobias, Optimum Experimental Designs;
+Pukelsheim, Optimal Design of Experiments.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -26,17 +31,12 @@ from numpy.typing import ArrayLike
 
 from jaxcal.checks import Array, Indices, array_of, levels, one_of, whole_number
 from jaxcal.information.blocks import largest_rank
+from jaxcal.information.singular import significant
 from jaxcal.late import late
 from jaxcal.models.uncertainty import Noise
-from jaxcal.selection.criteria import positions
-from jaxcal.selection.exchange.exchange import greedy_indices
-from jaxcal.selection.plan.best_of_size import (
-    Case,
-    best_design,
-    lower_bound,
-    region_root,
-    variances_of,
-)
+from jaxcal.selection.criteria import I, positions
+from jaxcal.selection.exact.exact import relaxed
+from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
 from jaxcal.selection.problem import (
     Blocks,
     CandidateSet,
@@ -52,6 +52,12 @@ from jaxcal.selection.solvers import checked_seed
 if TYPE_CHECKING:
     from jaxcal.selection.design import Design
 
+# Over the region, of the variances of an output; of several the worst counts.
+_MEANS: dict[str, Callable[..., Any]] = {"G": np.max, "I": np.mean}
+
+_RANDOM_STARTS = 4  # where a candidate gives one reading: swaps of more take longer
+_D_RESTARTS = 50  # of the exchange that looks for the D-optimal selection
+_ITERATIONS = 300  # of the weights of G: any count gives a true bound
 _SUMMARIES = {"G": "largest", "I": "average", "parameters": "largest"}
 _LARGEST_K = 200  # looked for where max_k is not given
 _ENOUGH = 1.0 + 1e-12  # variance that is accurate enough
@@ -89,7 +95,6 @@ class Plan:
 
     @property
     def summary(self) -> str:
-        """The criterion in a word."""
         return _SUMMARIES[self.criterion]
 
     @property
@@ -175,78 +180,176 @@ def plan(
     ]
     request, problem = requests[0], requests[0].problem
     if offer.scenarios is not None:
-        problems = [request.problem for request in requests]
-        problem = joined_problem(problems, offer.scenarios.weights, Mean("D"), None)
+        members, weights = [x.problem for x in requests], offer.scenarios.weights
+        problem = joined_problem(members, weights, Mean("D"), None)
     identify, least_k = _fewest(problem)
-    max_k = _checked_max_k(max_k, least_k, problem.k)
-    cases = [Case(request.problem, request.points) for request in requests]
-    sizes = _Sizes(problem, cases, "I" if criterion == "I" else "G", start)
+    if max_k is None:
+        max_k = min(problem.k, max(_LARGEST_K, least_k))
+    elif whole_number("max_k", max_k, least_k) > problem.k:
+        raise ValueError(
+            f"max_k must not exceed the {problem.k} measurements allowed, got {max_k}"
+        )
+    sizes = _Sizes(problem, requests, "I" if criterion == "I" else "G", start)
     rows, chosen = _rows(sizes, request.unit, least_k, max_k, more)
     if chosen is None:
         raise _unreachable(sizes, request, rows, max_k, _SUMMARIES[criterion])
+    smallest = chosen.k == identify or sizes.bound(chosen.k - 1) > 1.0
     return Plan(
-        k=chosen.k,
-        indices=chosen.indices,
-        standard_error=chosen.standard_error,
-        accuracy=request.target,
-        noise_std=request.noise_std,
-        names=request.names,
-        criterion=criterion,
-        smallest_proven=chosen.k == identify or sizes.bound(chosen.k - 1) > 1.0,
-        rows=tuple(rows),
-        seconds=time.perf_counter() - begun,
-    )
-
-
-def _checked_max_k(max_k: int | None, least_k: int, total: int) -> int:
-    """The largest K to try: at least ``least_k``, of ``total`` that may be measured."""
-    if max_k is None:
-        return min(total, max(_LARGEST_K, least_k))
-    max_k = whole_number("max_k", max_k, least_k)
-    if max_k > total:
-        raise ValueError(
-            f"max_k must not exceed the {total} measurements allowed, got {max_k}"
-        )
-    return max_k
+        chosen.k, chosen.indices, chosen.standard_error, request.target,
+        request.noise_std, request.names, criterion, smallest, tuple(rows),
+        time.perf_counter() - begun,
+    )  # fmt: skip
 
 
 class _Sizes:
-    """Designs of every K, with variances of which 1 is accurate enough.
-
-    Args:
-        problem: of all that may be measured.
-        cases: its scenarios.
-        how: the criterion, "G" or "I".
-        seed: of the exchange.
-    """
+    """Designs of every K, with variances of which 1 is accurate enough."""
 
     def __init__(
-        self, problem: Problem, cases: list[Case], how: str, seed: int
+        self, problem: Problem, cases: list[_Request], how: str, seed: int
     ) -> None:
-        self.problem, self.cases, self.how, self.seed = problem, cases, how, seed
-        self._roots = [region_root(case.points, how) for case in cases]
+        self.problem = problem  # of all that may be measured
+        self.cases, self.seed = cases, seed
+        self.over = _MEANS[how]  # the region
+        self._roots = [_region_root(case.points, how) for case in cases]
         self._bounds: dict[int, float] = {}
 
     def bound(self, k: int) -> float:
         """No design of k has a smaller largest variance."""
-        if k not in self._bounds:
-            self._bounds[k] = self._bound(k)
-        return self._bounds[k]
-
-    def _bound(self, k: int) -> float:
+        if k in self._bounds:
+            return self._bounds[k]
         if k == self.problem.k:  # there is one design only
             every = np.repeat(np.arange(len(self.problem.blocks)), self.problem.upper)
-            return float(variances_of(self.cases, every, self.how).max())
-        return max(
-            lower_bound(case.problem, root, k)
-            for case, root in zip(self.cases, self._roots, strict=True)
-        )
+            bound = float(self.variances(every).max())
+        else:
+            alone = [
+                dataclasses.replace(case.problem, k=k, criterion=I.of_rows(root))
+                for case, root in zip(self.cases, self._roots, strict=True)
+            ]
+            bound = max(-relaxed(one, greedy_indices(one)) for one in alone)
+        self._bounds[k] = bound
+        return bound
+
+    def variances(self, indices: Indices) -> Array:
+        """(s,) the criterion of each output in the worst scenario; inf if singular."""
+        worst = [self._variances(case, indices) for case in self.cases]
+        return np.asarray(np.max(worst, axis=0))
+
+    def _variances(self, case: _Request, indices: Indices) -> Array:
+        problem, points = case.problem, case.points
+        rows = problem.blocks[indices].reshape(-1, points.shape[-1])
+        if problem.prior.any():
+            size, vectors = np.linalg.eigh(problem.prior)
+            rows = np.vstack([rows, np.sqrt(size.clip(0.0))[:, None] * vectors.T])
+        singular, right = np.linalg.svd(rows)[1:]
+        if significant(singular).sum() < rows.shape[1]:
+            return np.full(points.shape[1], np.inf)
+        return np.asarray(self.over(((points @ (right.T / singular)) ** 2).sum(2), 0))
 
     def best(self, k: int, previous: Indices | None) -> tuple[Indices, Array]:
-        """(k,) the best design, from that of k - 1, and its variances (m,)."""
-        of_size = self.problem.of_size(k)
-        indices = best_design(of_size, self.cases, self.how, previous, self.seed)
-        return indices, variances_of(self.cases, indices, self.how)
+        """(k,) the best design found, sorted, from that of k - 1; its variances
+        (s,)."""
+        problem = self.problem.of_size(k)
+        best = exchange_indices(problem, _D_RESTARTS, self.seed)
+        value = float(self.variances(best).max())
+        starts = [best, greedy_indices(problem)]
+        if previous is not None:
+            more = _room(problem, previous)
+            values = self._worst_after(previous, [None], more)[0]
+            starts.append(np.append(previous, more[int(values.argmin())]))
+        if problem.blocks.shape[1] == 1:
+            rng = np.random.default_rng([self.seed, k])
+            every = np.arange(len(problem.blocks))
+            room = np.repeat(every, problem.upper - problem.lower)
+            for _ in range(_RANDOM_STARTS):
+                drawn = rng.permutation(room)[: k - len(problem.required)]
+                starts.append(np.concatenate([problem.required, drawn]))
+        for start in starts:
+            indices, reached = self._exchanged(problem, start)
+            if reached < value * (1.0 - 1e-12):
+                best, value = indices, reached
+        best = np.sort(best)
+        return best, self.variances(best)
+
+    def _exchanged(self, problem: Problem, start: Indices) -> tuple[Indices, float]:
+        """Swap one posture at a time, the best swap first, until none helps.
+
+        The required stay, one measurement of each; so does a singular start.
+        """
+        chosen = np.array(start)
+        value = float(self.variances(chosen).max())
+        while np.isfinite(value):
+            fixed = [int(np.flatnonzero(chosen == i)[0]) for i in problem.required]
+            free = np.setdiff1d(np.arange(len(chosen)), fixed)
+            free = free[np.unique(chosen[free], return_index=True)[1]]
+            more = _room(problem, chosen)
+            if not len(free) or not len(more):
+                break
+            values = self._worst_after(chosen, list(chosen[free]), more)
+            i, j = divmod(int(values.argmin()), len(more))
+            tried = chosen.copy()
+            tried[free[i]] = more[j]
+            reached = float(self.variances(tried).max())
+            if not reached < value * (1.0 - 1e-9):
+                break
+            chosen, value = tried, reached
+        return chosen, value
+
+    def _worst_after(self, *swap: Any) -> Array:
+        """(out, new) criterion of the worst scenario after a swap, see ``_after``."""
+        after = [self._after(case, *swap) for case in self.cases]
+        return np.asarray(np.max(after, axis=0))
+
+    def _after(
+        self, case: _Request, chosen: Indices, out: list[int | None], new: Indices
+    ) -> Array:
+        """(out, new) criterion after taking one out (None: nothing) and one in.
+
+        By the Woodbury identity: with U the blocks that go and come, V = M^-1 and S =
+        -1 for a row that goes, 1 for one that comes, the variance at z falls by ``a.T
+        (S + U V U.T)^-1 a``, a = U V z, and that matrix is singular where the design
+        becomes so.
+        """
+        problem, points = case.problem, case.points
+        blocks, (regions, outputs, p) = problem.blocks, points.shape
+        held = blocks[chosen].reshape(-1, p)
+        inverse = np.linalg.inv(held.T @ held + problem.prior)
+        rows = points.reshape(-1, p)
+        before = np.einsum("np,pq,nq->n", rows, inverse, rows)
+        values = np.full((len(out), len(new)), np.inf)
+        q = blocks.shape[1]
+        for row, i in enumerate(out):
+            gone = blocks[[] if i is None else [i]].reshape(-1, p)
+            u = np.empty((len(new), len(gone) + q, p))
+            u[:, : len(gone)], u[:, len(gone) :] = gone, blocks[new]
+            scaled = u @ inverse
+            sign = np.r_[-np.ones(len(gone)), np.ones(q)]
+            inner = np.diag(sign) + scaled @ np.matrix_transpose(u)
+            sound = np.abs(np.linalg.det(inner)) > 1e-9
+            along = scaled[sound] @ rows.T
+            less = (along * np.linalg.solve(inner[sound], along)).sum(axis=1)
+            after = (before - less).reshape(-1, regions, outputs)
+            values[row, sound] = self.over(after, 1).max(axis=1)
+        return values
+
+
+def _room(problem: Problem, indices: Indices) -> Indices:
+    """Candidates that may be chosen once more."""
+    counts = np.bincount(indices, minlength=len(problem.blocks))
+    return np.flatnonzero(counts < problem.upper)
+
+
+def _region_root(points: Array, how: str) -> Array:
+    """(r, p) root of W, of points (R, s, p) and weights of sum 1: for "I" equal ones,
+    for "G" by Titterington's steps w <- w (z.T W^-1 z) / p."""
+    rows = points.reshape(-1, points.shape[-1])
+    weight = np.full(len(rows), 1.0 / len(rows))
+    for _ in range(_ITERATIONS if how == "G" else 0):
+        inverse = np.linalg.pinv((rows * weight[:, None]).T @ rows, hermitian=True)
+        weight *= np.einsum("ra,ab,rb->r", rows, inverse, rows)
+        weight /= weight.sum()
+    size, vectors = np.linalg.eigh((rows * weight[:, None]).T @ rows)
+    keep = significant(size, squares=True)
+    return np.asarray(np.sqrt(size[keep])[:, None] * vectors.T[keep])
 
 
 def _rows(
@@ -278,10 +381,8 @@ def _unreachable(
     sizes: _Sizes, request: _Request, rows: list[PlanRow], max_k: int, summary: str
 ) -> ValueError:
     """What can be reached with ``max_k``, where that is not accurate enough."""
-    if rows:
-        variance = variances_of(sizes.cases, rows[-1].indices, sizes.how)
-    else:
-        variance = sizes.best(max_k, None)[1]
+    indices = rows[-1].indices if rows else sizes.best(max_k, None)[0]
+    variance = sizes.variances(indices)
     unit = request.unit
     hardest = int((unit * np.sqrt(variance) / request.target).argmax())
     bound = sizes.bound(max_k)
@@ -299,7 +400,7 @@ class _Request(NamedTuple):
     """What a design is judged by: the errors of m outputs or parameters."""
 
     problem: Problem  # measuring all that may be, as often as it may
-    points: Array  # (R, s, p) whitened rows; a variance of 1 there is accurate enough
+    points: Array  # (R, s, p) whitened rows, where a variance of 1 is enough
     unit: Array  # (m,) or (1,) standard error that is 1 at ``points``, measured unit
     target: Array  # (m,) measured unit
     noise_std: Array | None  # one an output, measured unit; None where Noise says more
@@ -353,10 +454,8 @@ def _request(
 
 
 def _reading_std(offer: CandidateSet, noise_std: ArrayLike | None) -> Array | None:
-    """(m,) of one reading, as given or of the design; None where its noise says more.
-
-    None with blocks too, which are in units of the noise.
-    """
+    """(m,) of a reading, as given or of the design; None: blocks, or its noise says
+    more."""
     noise = offer.noise
     if offer.model is None:
         if not (noise_std is noise is None):
@@ -388,10 +487,8 @@ def _region_rows(blocks: Blocks, problem: Problem, region: ArrayLike | None) -> 
 
 
 def _fewest(problem: Problem) -> tuple[int, int]:
-    """Measurements below which none identify, and the fewest found that do.
-
-    The two differ only where blocks of several rows overlap in what they tell.
-    """
+    """Measurements below which none identify, and the fewest found that do: they differ
+    where blocks of several rows overlap in what they tell."""
     missing = problem.num_regressors - problem.held_rank
     most = largest_rank(problem.blocks)
     least = k = max(1, len(problem.required) - (-missing // most))
