@@ -93,8 +93,8 @@ class Refinement(Selection):
         """Plain numbers, text and lists, as a JSON file takes them."""
         content = super().to_dict()
         del content["indices"], content["labels"]
-        content["commands"] = content.pop("candidates")
         return content | {
+            "commands": content.pop("candidates"),
             "began": None if np.isnan(self.began) else self.began,
             "search_error": self.search_error,
             "bound_is_proven": self.certain,

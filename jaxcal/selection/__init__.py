@@ -3,20 +3,12 @@
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from jaxcal.selection.criteria import As, Ds, I
 from jaxcal.selection.design import Design, select
 from jaxcal.selection.problem.scenarios import Mean, Worst
 from jaxcal.selection.result import Selection
-
-if TYPE_CHECKING:
-    from jaxcal.selection.batch import (
-        exact_batch,
-        exchange_batch,
-        greedy_batch,
-        random_batch,
-    )
 
 __all__ = [
     "As",

@@ -250,29 +250,20 @@ def _cells(lines: Sequence[str], delimiter: str) -> list[tuple[int, list[str]]]:
     if delimiter == " ":
         lines = [re.sub(r"[ \t]+", " ", line.strip()) for line in lines]
     reader = csv.reader((f"{line}\n" for line in lines), delimiter=delimiter)
-    rows = []
+    rows, line, begun = [], 1, 1  # where the next row begins, and the last one
     try:
         for row in reader:
             cells = [cell.strip() for cell in row]
             if any(cells):
                 rows.append((reader.line_num, cells))
-    except csv.Error as error:
-        raise ValueError(f"line {reader.line_num}: {error}") from None
-    if rows and any("\n" in cell for cell in rows[-1][1]):
-        _require_closed(lines, delimiter)
-    return [(line, [_BREAK.sub(" ", cell) for cell in cells]) for line, cells in rows]
-
-
-def _require_closed(lines: Sequence[str], delimiter: str) -> None:
-    """Refuse a quote that is opened and takes all that follows into one cell."""
-    texts, line = (f"{line}\n" for line in lines), 1
-    reader = csv.reader(texts, delimiter=delimiter, strict=True)
-    try:
-        for _ in reader:
+                begun = line
             line = reader.line_num + 1
     except csv.Error as error:
-        if "end of data" in str(error):
-            raise ValueError(f'line {line}: a quote (") is never closed') from None
+        raise ValueError(f"line {reader.line_num}: {error}") from None
+    quoted = rows and any("\n" in cell for cell in rows[-1][1])
+    if quoted and "".join(lines).count('"') % 2:
+        raise ValueError(f'line {begun}: a quote (") is never closed')
+    return [(line, [_BREAK.sub(" ", cell) for cell in cells]) for line, cells in rows]
 
 
 def _rows(

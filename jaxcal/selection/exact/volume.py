@@ -46,7 +46,7 @@ def largest_volume(vectors: Array, deadline: Deadline = NEVER) -> Volume:
         return Volume(np.arange(q), unit, 1, True, unit)
     vectors = vectors / np.abs(vectors).max()
     if q == 1:
-        longest = np.abs(vectors[:, 0]).argmax(keepdims=True)
+        longest = np.abs(vectors[:, 0]).argmax(axis=0, keepdims=True)
         return Volume(longest, unit, h, True, unit)
     vectors, triangle = np.linalg.qr(vectors)
     unit *= float(np.prod(np.abs(np.diag(triangle))))

@@ -15,7 +15,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from jaxcal import compiled
 from jaxcal.checks import Array, Indices
@@ -224,9 +223,8 @@ class Climbs:
 
 
 def _lengths(criterion: Criterion) -> Array:
-    if criterion.form == "subset":
-        return np.asarray(np.linalg.norm(criterion.root, axis=1))
-    return np.ones(len(criterion.root))
+    subset = criterion.form == "subset"
+    return np.linalg.norm(criterion.root, axis=1) if subset else np.ones(1)
 
 
 def rules_of(rules: Constraints | None, count: int) -> tuple[Array, Array, Any]:
@@ -240,18 +238,14 @@ def rules_of(rules: Constraints | None, count: int) -> tuple[Array, Array, Any]:
 def _climber(problem: Problem, seed: int) -> Any:
     """The kernel's of one scenario; E is climbed as A."""
     kernel = compiled.kernel("jaxcal.selection.exchange.exchange_kernel")
-    criterion, root = problem.criterion, problem.criterion.root
-    if criterion.form == "subset":
-        root = root / _lengths(criterion)[:, None]
+    criterion = problem.criterion
+    root = criterion.root / _lengths(criterion)[:, None]
     return kernel.Climber(
         "trace" if criterion.form == "least" else criterion.form,
         *map(np.ascontiguousarray, (problem.blocks, problem.prior, root)),
-        problem.upper.astype(np.intp),
-        problem.required,
-        problem.k,
-        seed,
+        problem.upper.astype(np.intp), problem.required, problem.k, seed,
         *rules_of(problem.constraints, len(problem.available)),
-    )
+    )  # fmt: skip
 
 
 def exchange_indices(
@@ -286,20 +280,11 @@ def fewest_regular(problem: Problem) -> Problem:
     return problem
 
 
-def exchange_from(problem: Problem, indices: ArrayLike) -> Indices:
-    """(k,) the local optimum that a selection climbs to, required first; never
-    worse."""
-    start = np.asarray(indices, dtype=np.int64)
-    if np.isneginf(problem.log_det(start)):
-        raise ValueError(
-            "indices must give an invertible information matrix, but that of "
-            f"{start.tolist()} is singular"
-        )
+def exchange_from(problem: Problem, start: Indices) -> Indices:
+    """(k,) the local optimum that a regular selection climbs to, required first."""
     rest = start.tolist()
     for i in problem.required.tolist():
-        if i not in rest:
-            raise ValueError(f"indices lack the required candidate {i}")
         rest.remove(i)
-    start = np.array([*problem.required, *rest], dtype=np.int64)
     swaps = 2 if problem.criterion.kind == "least" else 1
+    start = np.array([*problem.required, *rest], dtype=np.int64)
     return Climbs(problem, 0).climbed(start, swaps=swaps)[0]

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import functools
 import pathlib
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,14 +25,9 @@ _CELLS = 4_000_000  # pairs of candidates that JAX scores at once: bounds memory
 _LARGEST_CALL = 512  # sets
 
 
-class Chooser(Protocol):
-    """A policy, ready to choose."""
-
-    def __call__(
-        self, problems: Sequence[Problem], decoding: str, num: int, seed: int
-    ) -> Indices:
-        """(B, k) for problems of one M, n, k and number of required, which come first,
-        then in the order of choice."""
+# A policy, ready to choose (B, k) for problems of one M, n, k and number of required,
+# which come first, then in the order of choice: of problems, decoding, num, seed.
+Chooser = Callable[[Sequence[Problem], str, int, int], Indices]
 
 
 def load_policy(checkpoint: str | pathlib.Path | None = None) -> Chooser:

@@ -33,7 +33,7 @@ from jaxcal.selection.problem.candidate_set import (
     rounding_of,
     usable_numbers,
 )
-from jaxcal.selection.problem.problem import Problem, ScenarioProblem, joined_problem
+from jaxcal.selection.problem.problem import Problem, joined_problem, scenario_problem
 from jaxcal.selection.problem.scenarios import Largest, Mean, ScenarioCriterion
 
 _LARGEST = 3e7  # numbers of all predictions' problems: 240 MB
@@ -87,7 +87,11 @@ def _problem_of_one(
     if where is None and criterion.of_region:
         where = blocks.predicted()
     region = None if where is None else blocks.at("region", where, readings=False)
-    rest = {"names": blocks.names, "times": blocks.times, "region": region}
+    rest: dict[str, Any] = {
+        "names": blocks.names,
+        "times": blocks.times,
+        "region": region,
+    }
     return _checked_problem(offer, raw, root, criterion, k, **rest)
 
 
@@ -106,10 +110,8 @@ def _of_largest(problems: list[Problem]) -> Problem:
             f"predictions with {problems[0].blocks.size} numbers of the candidates; "
             "give a smaller region"
         )
-    fields = {f.name: getattr(members[0], f.name) for f in dataclasses.fields(Problem)}
-    fields["criterion"] = Largest().within(members[0].criterion)
     weights = np.full(len(members), 1.0 / len(members))
-    return ScenarioProblem(**fields, members=tuple(members), weights=weights)
+    return scenario_problem(members, Largest(), weights)
 
 
 def make_problems(
@@ -148,7 +150,7 @@ def make_problems(
             array[b], model, available=mask[b], max_replicates=max_replicates,
             required=None if forced is None else forced[b],
         )  # fmt: skip
-        rest = {"white": white[b], "times": m}
+        rest: dict[str, Any] = {"white": white[b], "times": m}
         try:
             problems.append(_checked_problem(offer, raw[b], root, criterion, k, **rest))
         except ValueError as error:

@@ -130,7 +130,7 @@ class CandidateSet:
         if self.scenarios is not None:
             self.scenarios = scenarios_of(self.scenarios, model, self.prior)
         if model.multiplicity:  # which answers everywhere, by the commands themselves
-            measured = self.measured
+            measured: Any = self.measured
             rows = measured[None, :, None] if np.ndim(measured) == 2 else None
             mask = self.available[None]
             flatten_rounding(spacing, array[None, :, None], mask, rows, bias=True)

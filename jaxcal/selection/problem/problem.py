@@ -178,9 +178,8 @@ class Problem:
         """The k = p chosen span a simplex, and det is its squared volume: one reading
         each, nothing known, D, all rows in a plane off the origin as those of [u, 1].
         The optimum then uses vertices of the convex hull only."""
-        if not self.rank_one or self.k != self.num_regressors or len(self.root):
-            return False
-        if self.constraints is not None:
+        more = len(self.root) or self.constraints is not None
+        if not self.rank_one or self.k != self.num_regressors or more:
             return False
         height = self.rows @ self.rows.sum(axis=0)
         return bool((np.abs(height - 1.0) <= _IN_PLANE)[self.available].all())
@@ -315,14 +314,24 @@ def joined_problem(
         return first
     # The fewest that identify in every scenario, where k was not given.
     members = [one if one.k == k else one.of_size(k) for one in members]
-    fields = {f.name: getattr(members[0], f.name) for f in dataclasses.fields(Problem)}
-    fields["criterion"] = criterion.within(first.criterion)
-    weights = np.array(weights)
-    weights.flags.writeable = False
     if nominal is not None and nominal.k != k:
         nominal = nominal.of_size(k)
+    return scenario_problem(members, criterion, weights, nominal)
+
+
+def scenario_problem(
+    members: Sequence[Problem],
+    criterion: ScenarioCriterion,
+    weights: Array,
+    nominal: Problem | None = None,
+) -> ScenarioProblem:
+    """The problem of these scenarios, whose criterion is within that of the first."""
+    fields = {f.name: getattr(members[0], f.name) for f in dataclasses.fields(Problem)}
+    fields["criterion"] = criterion.within(members[0].criterion)
+    weights = np.array(weights)
+    weights.flags.writeable = False
     return ScenarioProblem(
-        **fields, members=tuple(members), weights=weights, nominal=nominal
+        **fields, members=(*members,), weights=weights, nominal=nominal
     )
 
 

@@ -29,27 +29,21 @@ class Scenarios(NamedTuple):
 def scenarios_of(scenarios: Any, model: Model, prior: Prior | None) -> Scenarios:
     """Scenarios of a number of draws from the prior, parameters (S, p), or
     ``(parameters, weights)``."""
+    weights = None
     if isinstance(scenarios, tuple):
         if len(scenarios) != 2:
             raise ValueError(
                 "scenarios must be a number, parameters (S, p), or (parameters, "
                 f"weights), got a tuple of {len(scenarios)}"
             )
-        parameters = _parameters(scenarios[0], model)
-        return Scenarios(parameters, checked_weights(scenarios[1], len(parameters)))
-    if np.ndim(scenarios) == 0:
-        parameters = _drawn(whole_number("scenarios", scenarios, 1), model, prior)
-    else:
-        parameters = _parameters(scenarios, model)
-    return Scenarios(parameters, checked_weights(None, len(parameters)))
-
-
-def _parameters(given: ArrayLike, model: Model) -> Array:
+        scenarios, weights = scenarios
+    elif np.ndim(scenarios) == 0:
+        scenarios = _drawn(whole_number("scenarios", scenarios, 1), model, prior)
     rule = f", {len(model.names)} parameters of the model a row"
-    parameters = array_of("scenarios", given, "S", len(model.names), rule=rule)
+    parameters = array_of("scenarios", scenarios, "S", len(model.names), rule=rule)
     if not len(parameters):
         raise ValueError("scenarios must hold at least one row of parameters, got none")
-    return parameters
+    return Scenarios(parameters, checked_weights(weights, len(parameters)))
 
 
 def _drawn(count: int, model: Model, prior: Prior | None) -> Array:
