@@ -70,7 +70,6 @@ _CORNERS = 14  # inputs up to which all corners are looked at
 _DRAWS = 200  # batches of points, until enough are allowed
 _TOLD = 1e-4  # efficiency that another round of the bound must gain
 _SETTLED = 1e-6  # of a weight, which would not change in another round
-_MINUTE = 60.0  # seconds where no limit is given
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -127,7 +126,7 @@ def optimise(
     allowed: Allowed | None = None,
     starts: int = 8,
     seed: int = 0,
-    time_limit: float | None = None,
+    time_limit: float = 60.0,
     scenarios: Any = None,
 ) -> Refinement:
     """The k commands within limits whose measurements say most about the parameters.
@@ -140,12 +139,12 @@ def optimise(
         region: (R, n) commands of criterion I; spread over the limits when not given.
         allowed: f(u (n,)) -> whether the command may be given.
         starts, seed: of the search; of points that are drawn.
-        time_limit: seconds, 60 when not given; the best so far is returned.
+        time_limit: seconds, after which the best so far is returned.
 
     Raises:
         ValueError: naming the argument, the rule and the value.
     """
-    deadline, box = _deadline(time_limit), _limits(limits)
+    deadline, box = Deadline(seconds("time_limit", time_limit)), _limits(limits)
     model = as_model(model) if model is not None else Affine(len(box), len(box))
     count = _affordable(model, box, deadline, max(16, 3 * (k or 1)), _POOL)
     pool = _drawn(box, count, allowed, seed)
@@ -166,7 +165,7 @@ def refine(
     allowed: Allowed | None = None,
     starts: int = 4,
     seed: int = 0,
-    time_limit: float | None = None,
+    time_limit: float = 60.0,
 ) -> Refinement:
     """The chosen commands moved between the candidates to a better design.
 
@@ -179,12 +178,12 @@ def refine(
         region: of I; the available candidates when not given.
         allowed: f(u (n,)) -> whether a command may be given.
         starts, seed: of the search, the selection among them; of points that are drawn.
-        time_limit: seconds, 60 when not given; the best so far is returned.
+        time_limit: seconds, after which the best so far is returned.
 
     Raises:
         ValueError: naming the argument, the rule and the value.
     """
-    deadline = _deadline(time_limit)
+    deadline = Deadline(seconds("time_limit", time_limit))
     offer = design.candidate_set
     candidates, available = offer.candidates, offer.available
     if offer.constraints is not None:
@@ -200,7 +199,9 @@ def refine(
     require_none(outside, rows, f"selection must lie in [0, {len(candidates)})")
     begun = candidates[rows]
     box = _limits(_range(candidates[available], allowed) if limits is None else limits)
-    _require_inputs(box, candidates)
+    n = candidates.shape[1]
+    if len(box) != n:
+        raise ValueError(f"limits must be ({n}, 2) for this model, got {box.shape}")
     beyond = (begun < box[:, 0]) | (begun > box[:, 1])
     require_none(beyond, begun, "selection must be within the limits")
     for command in begun[~_permitted(allowed, begun)]:
@@ -234,11 +235,6 @@ def _same_criterion(selection: Selection) -> Any:
     return criterion.name
 
 
-def _deadline(time_limit: float | None) -> Deadline:
-    limit = _MINUTE if time_limit is None else seconds("time_limit", time_limit)
-    return Deadline(limit)
-
-
 def _affordable(
     model: Model, box: Array, deadline: Deadline, least: int, most: int
 ) -> int:
@@ -260,12 +256,6 @@ def _limits(limits: ArrayLike) -> Array:
         got = in_words(bad[0]) if len(bad) else "none"
         raise ValueError(f"limits must be (n, 2), lower below upper, got {got}")
     return box
-
-
-def _require_inputs(box: Array, commands: Array) -> None:
-    n = commands.shape[1]
-    if len(box) != n:
-        raise ValueError(f"limits must be ({n}, 2) for this model, got {box.shape}")
 
 
 def _moved(allowed: Allowed | None, commands: Array) -> Array:
@@ -411,7 +401,6 @@ class _Ascent:
         self.allowed, self.seed = allowed, seed
         self.low, self.span = box[:, 0], np.ptp(box, axis=1)
         assert offer.candidates is not None and offer.model is not None
-        _require_inputs(box, offer.candidates)
         self.asked, self.region = criterion, region
         problem = self.problem = problem_of(offer, k, criterion, region)
         self.k, self.objective = problem.k, problem.criterion

@@ -295,7 +295,7 @@ class Design:
             seed=solution.seed,
             restarts=solution.restarts,
             nodes=solution.nodes,
-            alternatives=_alternatives(problem, solution)
+            alternatives=tuple(Subset(*x) for x in solution.alternatives)
             or (Subset(indices, value, log_det),),
             known_bound=solution.bound,
             names=self.candidate_set.names,
@@ -339,15 +339,6 @@ def _require_allowed(problem: Problem, indices: Indices, method: str) -> None:
             f"method {method!r} must return {problem.k} candidates within the bounds "
             f"lower and upper of its problem, got {indices.tolist()}"
         )
-
-
-def _alternatives(problem: Problem, solution: Solution) -> tuple[Subset, ...]:
-    """The best subsets, best first, where a solver has several."""
-    if len(solution.alternatives) < 2:
-        return ()
-    subsets = np.stack([indices for indices, _ in solution.alternatives])
-    pairs = np.stack(problem.values(subsets), axis=1).tolist()
-    return tuple(Subset(i, *pair) for i, pair in zip(subsets, pairs, strict=True))
 
 
 def select(

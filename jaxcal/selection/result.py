@@ -60,18 +60,12 @@ class ScenarioTable:
 
     def summary(self) -> list[str]:
         """Two lines: this design, and the nominal's own."""
-        count = len(self.weights)
-        bounded = (
-            "" if self.proven.all() else f", {int(self.proven.sum())} of them proven"
-        )
-        lines = [
-            f"scenarios     {count}, efficiency against the optimum of each{bounded}"
-        ]
-        named = (
-            ("this one", self.efficiencies),
-            ("nominal's", self.nominal_efficiencies),
-        )
-        for name, shares in named:
+        count = f"{len(self.weights)}, efficiency against the optimum of each"
+        if not self.proven.all():
+            count += f", {int(self.proven.sum())} of them proven"
+        lines = [f"scenarios     {count}"]
+        both = self.efficiencies, self.nominal_efficiencies
+        for name, shares in zip(("this one", "nominal's"), both, strict=True):
             if shares is not None:
                 least, mean = shares.min(), self.weights @ shares
                 lines.append(f"  {name:9}   least {least:.4f}, mean {mean:.4f}")
@@ -180,18 +174,12 @@ class Selection:
             "indices": self.indices.tolist(),
             "labels": list(self.labels),
             "candidates": chosen,
-            "criterion": self.criterion,
-            "value": self.value,
-            "log_det": self.log_det,
-            "bound": self.bound,
-            "efficiency": self.efficiency,
-            "proven": self.proven,
-            "left_without": self.left_without.tolist(),
-            "method": self.method,
-            "reason": self.reason,
-            "seconds": self.seconds,
-            "seed": self.seed,
         }
+        for name in ("criterion", "value", "log_det", "bound", "efficiency", "proven"):
+            content[name] = getattr(self, name)
+        content["left_without"] = self.left_without.tolist()
+        for name in ("method", "reason", "seconds", "seed"):
+            content[name] = getattr(self, name)
         if self.in_scenarios is not None:
             content["in_scenarios"] = {
                 name: None if value is None else value.tolist()

@@ -50,24 +50,14 @@ def travel_times(points: ArrayLike, others: ArrayLike, motion: Motion) -> Array:
         raise ValueError(
             f"points and others must be (A, n) and (B, n), got {a.shape} and {b.shape}"
         )
-    speed, ramp = _limits_of(motion, a.shape[1])
+    speed, ramp = np.array(motion.speed), np.array(motion.acceleration)
+    for name, limit in (("speed", speed), ("acceleration", ramp)):
+        if len(limit) not in (1, n := a.shape[1]):
+            raise ValueError(f"motion.{name} must hold 1 or {n}, got {len(limit)}")
     way = np.abs(a[:, None] - b[None])
     cruise = way >= speed**2 / ramp
     seconds = np.where(cruise, way / speed + speed / ramp, 2.0 * np.sqrt(way / ramp))
     return seconds.max(axis=2)
-
-
-def _limits_of(motion: Motion, num_axes: int) -> tuple[Array, Array]:
-    """(n,) speed and acceleration of each axis."""
-    limits = []
-    for name in ("speed", "acceleration"):
-        value = np.asarray(getattr(motion, name))
-        if len(value) not in (1, num_axes):
-            raise ValueError(
-                f"motion.{name} must hold 1 or {num_axes}, got {len(value)}"
-            )
-        limits.append(np.broadcast_to(value, (num_axes,)))
-    return limits[0], limits[1]
 
 
 def fastest_tour(

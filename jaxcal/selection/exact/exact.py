@@ -263,7 +263,7 @@ def _solution_of(
         bound=bound,
         proven=proven,
         nodes=nodes,
-        alternatives=tuple(zip(subsets, worth, strict=True)),
+        alternatives=tuple(zip(subsets, worth, log_det[order].tolist(), strict=True)),
         reason=reason,
     )
 

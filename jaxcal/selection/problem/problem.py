@@ -345,7 +345,7 @@ class Solution:
     bound: float | None = None  # no selection allowed has a better value
     proven: bool = False  # no selection is better by more than 1e-9
     nodes: int | None = None  # nodes of branch and bound or of the search
-    alternatives: tuple[tuple[Indices, float], ...] = ()  # best first
+    alternatives: tuple[tuple[Indices, float, float], ...] = ()  # with value, log det
     method: str | None = None  # the solver that answered, where another was asked
     reason: str = ""  # one sentence
     seed: int | None = None  # where it draws at random
