@@ -120,7 +120,7 @@ def checked_options(method: str, given: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ValueError: an option is unknown, has a bad value, or belongs to other methods.
     """
-    one_of("method", method, METHODS)
+    one_of("method", method, tuple(SOLVERS))
     reads = _options(SOLVERS[method])
     checked = {name: OPTIONS[name][0] for name in reads if name in OPTIONS}
     for name, value in given.items():
