@@ -212,7 +212,6 @@ def test_the_figure_holds_every_point(rng):
     ("change", "message"),
     [
         ({"least_efficiency": 0.0}, r"least_efficiency must be in \(0, 1\], got 0"),
-        ({"method": "exact"}, "method must be one of heuristic, got 'exact'"),
         ({"motion": 20.0}, "motion must be a Motion, got 20.0"),
         ({"k": 3}, "k must be at least 4"),
         ({"start": np.zeros(2)}, r"start must have shape \(3,\), got \(2,\)"),
