@@ -8,10 +8,4 @@ from jaxcal.calibration.pairing.judge import (
 )
 from jaxcal.calibration.pairing.verdict import against
 
-__all__ = [
-    "Mispairing",
-    "against",
-    "mispairing",
-    "of_new_readings",
-    "of_unfitted",
-]
+__all__ = ["Mispairing", "against", "mispairing", "of_new_readings", "of_unfitted"]

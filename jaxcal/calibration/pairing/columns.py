@@ -10,11 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.pairing.fit import (
-    Fitted,
-    fits_of,
-    solved,
-)
+from jaxcal.calibration.pairing.fit import Fitted, fits_of, solved
 from jaxcal.calibration.pairing.table import (
     ColumnChange,
     Hypothesis,
@@ -24,8 +20,6 @@ from jaxcal.calibration.pairing.table import (
 )
 from jaxcal.checks import Array
 from jaxcal.models.predictions import predict
-
-__all__ = ["by_nominal", "changed_columns", "places"]
 
 Rows = NDArray[np.intp]
 

@@ -15,24 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.pairing.table import (
-    AS_IT_IS,
-    Hypothesis,
-    Table,
-)
+from jaxcal.calibration.pairing.table import AS_IT_IS, Hypothesis, Table
 from jaxcal.checks import Array
 from jaxcal.models.predictions import predict
-
-__all__ = [
-    "OUTLIER",
-    "Fitted",
-    "fits_of",
-    "fitted",
-    "log_evidence",
-    "predicted",
-    "solved",
-    "top",
-]
 
 Rows = NDArray[np.intp]
 

@@ -17,12 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.pairing.fit import (
-    Fitted,
-    fits_of,
-    fitted,
-    top,
-)
+from jaxcal.calibration.pairing.fit import Fitted, fits_of, fitted, top
 from jaxcal.calibration.pairing.table import (
     FOREIGN,
     ColumnChange,
@@ -229,10 +224,7 @@ def _table(
 
 
 def _found(
-    table: Table,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-    unit: str,
+    table: Table, inputs: Sequence[str], outputs: Sequence[str], unit: str
 ) -> Mispairing | None:
     """The mispairing of a table."""
     plain = fitted(table, as_it_is(table))

@@ -7,20 +7,9 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.pairing.fit import (
-    Fitted,
-    fitted,
-    predicted,
-)
-from jaxcal.calibration.pairing.table import (
-    Hypothesis,
-    Table,
-    as_it_is,
-    path_match,
-)
+from jaxcal.calibration.pairing.fit import Fitted, fitted, predicted
+from jaxcal.calibration.pairing.table import Hypothesis, Table, as_it_is, path_match
 from jaxcal.checks import Array
-
-__all__ = ["exchanged", "polished", "sorted_alone"]
 
 Rows = NDArray[np.intp]
 

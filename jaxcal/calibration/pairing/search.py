@@ -13,10 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.pairing.fit import (
-    log_evidence,
-    solved,
-)
+from jaxcal.calibration.pairing.fit import log_evidence, solved
 from jaxcal.calibration.pairing.table import (
     AS_IT_IS,
     FOREIGN,
@@ -27,8 +24,6 @@ from jaxcal.calibration.pairing.table import (
     shifted,
 )
 from jaxcal.checks import Array
-
-__all__ = ["ranked"]
 
 Rows = NDArray[np.intp]
 

@@ -12,17 +12,6 @@ from jaxcal.checks import Array
 from jaxcal.models.model import Model
 from jaxcal.models.predictions import derivative, predict
 
-__all__ = [
-    "AS_IT_IS",
-    "FOREIGN",
-    "ColumnChange",
-    "Hypothesis",
-    "Table",
-    "as_it_is",
-    "path_match",
-    "shifted",
-]
-
 Rows = NDArray[np.intp]
 
 AS_IT_IS = "as it is"  # kind of a hypothesis

@@ -8,13 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal.calibration.pairing.fit import fitted, predicted
-from jaxcal.calibration.pairing.judge import (
-    LEAST,
-    RATIO,
-    benign_fits,
-    better,
-    of_fit,
-)
+from jaxcal.calibration.pairing.judge import LEAST, RATIO, benign_fits, better, of_fit
 from jaxcal.calibration.pairing.table import as_it_is
 from jaxcal.checks import in_words
 from jaxcal.models.reasons import Reason, bends, in_rows
@@ -48,10 +42,7 @@ def against(verdict: Verdict, fit: Calibration) -> Verdict:
         if reason is None:
             return verdict
         return dataclasses.replace(
-            verdict,
-            good=False,
-            reasons=(reason.fact, *others),
-            next_step=reason.remedy,
+            verdict, good=False, reasons=(reason.fact, *others), next_step=reason.remedy
         )
     what = "columns" if pairing.kind == "columns" else "table"
     step = f"correct the {what}, then identify again"

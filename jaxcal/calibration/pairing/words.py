@@ -7,16 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.pairing.fit import (
-    Fitted,
-)
-from jaxcal.calibration.pairing.table import (
-    FOREIGN,
-    Table,
-)
+from jaxcal.calibration.pairing.fit import Fitted
+from jaxcal.calibration.pairing.table import FOREIGN, Table
 from jaxcal.checks import in_words
-
-__all__ = ["sentence", "what_is_wrong"]
 
 Rows = NDArray[np.intp]
 
