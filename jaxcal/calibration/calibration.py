@@ -26,8 +26,6 @@ from jaxcal.models.verdict import Verdict
 if TYPE_CHECKING:
     from jaxcal.calibration.pairing import Mispairing
 
-__all__ = ["Calibration"]
-
 
 class Calibration(Fit):
     """The identified map from commands u (n inputs) to outputs y (m of them).
@@ -214,10 +212,7 @@ class Calibration(Fit):
         return steps
 
     def again(
-        self,
-        model: Any,
-        prior: Prior | None,
-        rows: NDArray[np.bool_] | None = None,
+        self, model: Any, prior: Prior | None, rows: NDArray[np.bool_] | None = None
     ) -> Calibration:
         """The calibration of the same readings by another model of the machine.
 

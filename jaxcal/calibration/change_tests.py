@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from jaxcal.calibration.fit import Fit
 from jaxcal.checks import Array
 
-__all__ = ["ALARMS", "POWER", "ChangeTests", "LevelTests"]
-
 ALARMS = 0.05  # share of false alarms
 POWER = 0.8
 KNOWN = 1e9  # degrees of freedom of noise that was given

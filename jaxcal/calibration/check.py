@@ -19,9 +19,6 @@ from jaxcal.models.model import recorded
 from jaxcal.models.recording import Recording
 from jaxcal.tables import say_order
 
-__all__ = ["Check", "check", "verification"]
-
-
 _DRIFT = 10.0  # standard deviations of the prior: no parameter drifts by more
 _MANY = 1000.0  # rows; advice to measure as many or more is not given
 _BLIND = 0.01  # of a parameter's effect, what is left of it where it cannot be seen

@@ -22,8 +22,6 @@ from jaxcal.files import write_text
 from jaxcal.models.from_dict import from_dict
 from jaxcal.models.model import Model, as_model
 
-__all__ = ["fields", "read", "save", "to_dict"]
-
 FORMAT = "jaxcal-calibration"
 VERSION = 3
 

@@ -19,8 +19,6 @@ from jaxcal.models.predictions import derivative, predict
 from jaxcal.models.uncertainty import Prior
 from jaxcal.tables import COMMANDS, MEASURED, of_frame
 
-__all__ = ["FAR", "Fit", "say_far"]
-
 FAR = 0.25  # of the range of what was measured, beyond it
 
 

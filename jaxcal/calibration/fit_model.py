@@ -10,12 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.least_squares import (
-    FitProblem,
-    FitSolution,
-    singular,
-    solve,
-)
+from jaxcal.calibration.least_squares import FitProblem, FitSolution, singular, solve
 from jaxcal.calibration.losses import LOSSES, Loss, constants
 from jaxcal.calibration.noise_levels import are_shared, levels_differ, pooled
 from jaxcal.calibration.prior_scales import (
@@ -41,9 +36,6 @@ from jaxcal.models.uncertainty import (
     reading_noise,
     with_play,
 )
-
-__all__ = ["fit_model", "require_fitting"]
-
 
 # Of -2 log likelihood, what misfit must gain where readings of one place do not tell
 # how it goes on elsewhere.

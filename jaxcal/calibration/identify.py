@@ -47,9 +47,6 @@ from jaxcal.tables import (
     say_order,
 )
 
-__all__ = ["identify"]
-
-
 _LITTLE_ENDIAN = np.dtype("<f8")
 
 

@@ -19,9 +19,6 @@ from jaxcal.information.singular import (
 from jaxcal.models.identifiability import unknown
 from jaxcal.models.predictions import derivative, predict
 
-__all__ = ["Responses", "command_for", "limits_of", "no_inverse"]
-
-
 _NAMED = 3  # targets in a warning
 _STARTS, _STEPS, _REACHED = 6, 60, 1e-9  # of the outputs' spread over the measurements
 _SURE = 3.0  # standard deviations from zero: a direction that the outputs respond to

@@ -27,14 +27,6 @@ from jaxcal.information.singular import significant
 from jaxcal.models.model import Model
 from jaxcal.models.predictions import derivative, predict, without_effect
 
-__all__ = [
-    "FitProblem",
-    "FitSolution",
-    "singular",
-    "solve",
-]
-
-
 _LIMIT = 300  # iterations
 _PATIENCE = 20  # iterations whose gain together decides whether the search creeps
 _MANY = 64  # readings of a measurement from which matrices of them are not made

@@ -15,8 +15,6 @@ import numpy as np
 
 from jaxcal.checks import Array
 
-__all__ = ["LOSSES", "Loss", "Student", "constants"]
-
 
 class Loss(abc.ABC):
     """Weights of measurements by their squared distances from the fit, in noise.

@@ -21,8 +21,6 @@ from jaxcal.calibration.losses import constants
 from jaxcal.checks import Array
 from jaxcal.models.predictions import derivative
 
-__all__ = ["are_shared", "levels_differ", "pooled"]
-
 Rows = NDArray[np.intp]
 
 _FEW = 30  # measurements from which on a level of its own costs a reading nothing

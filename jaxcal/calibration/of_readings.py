@@ -17,9 +17,6 @@ from jaxcal.calibration.fit import FAR, Fit
 from jaxcal.calibration.inverse import Responses, command_for, limits_of
 from jaxcal.checks import Array, aligned, numbers, whole_number
 
-__all__ = ["Inverse", "inverse"]
-
-
 _GRID, _HALVINGS = 257, 45
 
 

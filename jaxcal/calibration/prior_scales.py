@@ -25,9 +25,6 @@ from jaxcal.information.singular import significant
 from jaxcal.models.model import ErrorGroups, Model
 from jaxcal.models.predictions import derivative
 
-__all__ = ["PriorScales", "covariance_of_scales", "group_scales", "misfit_scale"]
-
-
 _LEVEL = 3.0  # factor of one standard deviation of the level, beforehand
 _MOST = 5.0  # of a logarithm
 _LARGEST = 2.5  # of a factor, 12: beyond it an arm in sockets shrinks until all fit

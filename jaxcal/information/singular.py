@@ -66,10 +66,7 @@ def _lengths(
 
 
 def rank_rule(
-    columns: Array,
-    largest: Array,
-    count: int | None = None,
-    computed: bool = False,
+    columns: Array, largest: Array, count: int | None = None, computed: bool = False
 ) -> tuple[list[int], Array]:
     """Rank and log det of ``columns.T @ columns``.
 

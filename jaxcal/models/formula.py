@@ -51,9 +51,7 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
 _CONSTANTS = {"pi": np.pi, "e": np.e}
 
 
-def parse(
-    formula: str,
-) -> tuple[dict[str, list[Factor]], set[str], dict[str, Levels]]:
+def parse(formula: str) -> tuple[dict[str, list[Factor]], set[str], dict[str, Levels]]:
     """Term -> its factors, in the order of the formula; the names that they use; and
     the levels of those that are categories.
 
