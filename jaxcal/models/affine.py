@@ -116,5 +116,4 @@ class Affine(Model):
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """What a file holds of the model."""
         return {"kind": "affine", **dataclasses.asdict(self)}

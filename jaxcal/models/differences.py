@@ -113,14 +113,10 @@ def look(
     names: Sequence[str],
     periods: Array | None = None,
 ) -> Differences:
-    """Choose steps for derivatives at ``at`` (p,).
+    """Choose steps for derivatives at ``at`` (p,), where values are finite.
 
-    Args:
-        evaluate: values at points (S, p); NaN where there are none.
-        at: (p,) finite values are there.
-        scale: (p,) by which the parameters may change.
-        names: p.
-        periods: (q,) of readings that wrap.
+    ``scale`` (p,) is by which the parameters may change, ``periods`` (q,) of readings
+    that wrap.
     """
     noise, size = _noise(evaluate, at, scale, periods)
     ladders = [

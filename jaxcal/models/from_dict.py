@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Mapping
 from typing import Any, cast
 
 from jaxcal.checks import one_of
 from jaxcal.extras import installed
-from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model
 
 _GROUP = "jaxcal.models"  # entry points by which others, as jaxcal.arms, add kinds
-_KINDS = ("affine", "linear", "polynomial")
+_KINDS = {"affine": "Affine", "linear": "Linear", "polynomial": "Polynomial"}
 _UNWRITTEN = ("function", "jax")  # kinds that hold a function
-
-
-def _maker(kind: str) -> Callable[..., Model]:
-    """What makes a model of a kind; its arguments are the keys of the file."""
-    if kind == "affine":
-        return Affine
-    from jaxcal.models.linear import Linear, Polynomial
-
-    return Linear if kind == "linear" else Polynomial
 
 
 def from_dict(data: Mapping[str, Any]) -> Model:
@@ -45,7 +36,10 @@ def from_dict(data: Mapping[str, Any]) -> Model:
         )
     if kind == "linear":  # a formula names its own
         fields.pop("terms", None)
-    make = others[kind].load() if kind in others else _maker(kind)
+    if kind in others:
+        make = others[kind].load()
+    else:  # of the room, which loads it when asked
+        make = getattr(sys.modules["jaxcal.models"], _KINDS[kind])
     try:
         return cast("Model", make(**fields))
     except TypeError as error:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.checks import Array, axis_names, numbers, table, whole_number
+from jaxcal.checks import Array, numbers, table, whole_number
 from jaxcal.extras import needs
-from jaxcal.models.model import Model, as_commands, as_parameters
+from jaxcal.models.model import Model, as_commands, as_parameters, parameter_names
 from jaxcal.models.predictions import checked_periods
 
 
@@ -49,9 +49,7 @@ class FromJax(Model):
         self.nominal = numbers("nominal", nominal)
         if self.nominal.ndim != 1 or not len(self.nominal):
             raise ValueError(f"nominal must have shape (p,), got {self.nominal.shape}")
-        p = len(self.nominal)
-        labels = tuple(f"t{i + 1}" for i in range(p)) if names is None else names
-        self.names = axis_names("names", labels, "t", p)
+        self.names = parameter_names(names, len(self.nominal))
         self._num_inputs: int | None = None
         self._periods = None if periods is None else np.asarray(periods)
         with needs("policy", "FromJax"):
@@ -110,29 +108,23 @@ class FromJax(Model):
     @functools.cached_property
     def _leverage(self) -> Callable[..., Any]:
         import jax
-        import jax.numpy as jnp
 
-        def f(command: jax.Array, parameters: jax.Array) -> jax.Array:
-            return jnp.atleast_1d(self.f(command, parameters))
-
-        def leverage(
-            command: jax.Array,
-            parameters: jax.Array,
-            white: jax.Array,
-            metric: jax.Array,
-        ) -> jax.Array:
-            block = white @ jax.jacfwd(f, argnums=1)(command, parameters)
+        def leverage(command: Any, parameters: Any, white: Any, metric: Any) -> Any:
+            block = white @ jax.jacfwd(self._readings, argnums=1)(command, parameters)
             return (block @ metric * block).sum()
 
         return jax.jit(jax.vmap(jax.grad(leverage), in_axes=(0, None, None, None)))
 
+    def _readings(self, command: Any, parameters: Any) -> Any:
+        """(q,) f of one command, of a scalar too."""
+        import jax.numpy as jnp
+
+        return jnp.atleast_1d(self.f(command, parameters))
+
     def to_dict(self) -> dict[str, Any]:
         """The function itself cannot be written."""
-        return {
-            "kind": "jax",
-            "names": list(self.names),
-            "nominal": self.nominal.tolist(),
-        }
+        names, nominal = list(self.names), self.nominal.tolist()
+        return {"kind": "jax", "names": names, "nominal": nominal}
 
     def _trace(self, num_inputs: int) -> None:
         """Find q, and whether JAX can follow f at all."""
@@ -179,11 +171,8 @@ class FromJax(Model):
     def _compiled(self) -> tuple[Callable[..., Any], ...]:
         """f and its derivatives by parameters and commands, each of N commands."""
         import jax
-        import jax.numpy as jnp
 
-        def f(command: jax.Array, parameters: jax.Array) -> jax.Array:
-            return jnp.atleast_1d(self.f(command, parameters))
-
+        f = self._readings
         return tuple(
             jax.jit(jax.vmap(function, in_axes=(0, None)))
             for function in (f, jax.jacfwd(f, argnums=1), jax.jacfwd(f, argnums=0))

@@ -22,7 +22,13 @@ from jaxcal.checks import (
     whole_number,
 )
 from jaxcal.models.differences import STENCILS, Differences, combined, look
-from jaxcal.models.model import Model, as_commands, as_parameters, by_name
+from jaxcal.models.model import (
+    Model,
+    as_commands,
+    as_parameters,
+    by_name,
+    parameter_names,
+)
 from jaxcal.models.predictions import checked_periods
 from jaxcal.models.runs import CommandLine, Runs
 from jaxcal.models.uncertainty import Noise, Prior, as_noise
@@ -83,19 +89,17 @@ class FromFunction(Model):
         quiet: bool = False,
     ) -> None:
         self.nominal = array_of("nominal", nominal, "p")
-        p = len(self.nominal)
-        if not p:
+        if not len(self.nominal):
             raise ValueError("nominal must hold at least one parameter, got none")
-        labels = tuple(f"t{i + 1}" for i in range(p)) if names is None else names
-        self.names = axis_names("names", labels, "t", p)
+        self.names = parameter_names(names, len(self.nominal))
         self.scale = self._scale(scale)
         self._num_inputs: int | None = None
-        self._inputs: tuple[str, ...] = ()
+        self.inputs = ()  # names of the commands, where they have some
         if isinstance(inputs, int):
             self._num_inputs = whole_number("inputs", inputs, 1)
         elif inputs is not None:
-            self._inputs = axis_names("inputs", inputs, "u", len(inputs))
-            self._num_inputs = len(self._inputs)
+            self.inputs = axis_names("inputs", inputs, "u", len(inputs))
+            self._num_inputs = len(self.inputs)
         if not callable(f):
             if not self.inputs or batch:
                 raise ValueError(
@@ -113,13 +117,9 @@ class FromFunction(Model):
             processes = whole_number("processes", processes, 1)
         self._runs = Runs(f, bool(batch), processes, quiet)
         self.f = f
-        self._known = _Memory()
+        self._reasons: dict[bytes, str] = {}  # why f fails, by command
+        self._results: dict[tuple[str, bytes], dict[bytes, Array]] = {}
         self._steps: dict[str, Differences] = {}
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """n names of the commands; () where they have none."""
-        return self._inputs
 
     # -- shapes ------------------------------------------------------------------------
 
@@ -151,28 +151,19 @@ class FromFunction(Model):
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
         """Outputs (N, q) at commands (N, n), NaN where f fails."""
-        rows, theta = self._asked(commands), as_parameters(self, parameters)
-        return self._known.of(
-            "f", theta, rows, lambda new: self._run([(new, theta)])[0]
-        )
+        return self._remembered(self._values, commands, parameters)
 
     def jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
         """(N, q, p), NaN where f fails."""
-        rows, theta = self._asked(commands), as_parameters(self, parameters)
-        return self._known.of(
-            "by parameters", theta, rows, lambda new: self._by_parameters(new, theta)
-        )
+        return self._remembered(self._by_parameters, commands, parameters)
 
     def command_jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
         """(N, q, n), NaN where f fails."""
-        rows, theta = self._asked(commands), as_parameters(self, parameters)
-        return self._known.of(
-            "by commands", theta, rows, lambda new: self._by_commands(new, theta)
-        )
+        return self._remembered(self._by_commands, commands, parameters)
 
     def differences(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
@@ -226,21 +217,14 @@ class FromFunction(Model):
 
     def to_dict(self) -> dict[str, Any]:
         """The function itself cannot be written."""
-        return {
-            "kind": "function",
-            "names": list(self.names),
-            "nominal": self.nominal.tolist(),
-        }
+        names, nominal = list(self.names), self.nominal.tolist()
+        return {"kind": "function", "names": names, "nominal": nominal}
 
     def close(self) -> None:
         """End the processes that run f, if they are not yours; they start if asked."""
         self._runs.close()
 
     # -- inside ------------------------------------------------------------------------
-
-    @property
-    def _reasons(self) -> dict[bytes, str]:
-        return self._known.reasons
 
     def _scale(self, scale: ArrayLike | None) -> Array:
         if scale is not None:
@@ -260,6 +244,37 @@ class FromFunction(Model):
         if not len(rows):
             raise ValueError("commands must hold at least one row, got none")
         return rows
+
+    def _remembered(
+        self,
+        make: Callable[[Array, Array], Array],
+        commands: ArrayLike,
+        parameters: ArrayLike | None,
+    ) -> Array:
+        """(N, ...) what ``make`` makes of commands and parameters.
+
+        Kept for the last sets of parameters: by command, of a long table as a whole.
+        """
+        rows, theta = self._asked(commands), as_parameters(self, parameters)
+        whole = len(rows) > _LONG
+        key = make.__name__, theta.tobytes() + (rows.tobytes() if whole else b"")
+        results = self._results.pop(key, {})
+        self._results[key] = results  # the newest
+        while len(self._results) > 3 * _SETS:
+            del self._results[next(iter(self._results))]
+        if whole:
+            if not results:
+                results[b""] = make(rows, theta)
+            return results[b""]
+        labels = [row.tobytes() for row in rows]
+        places = {label: i for i, label in enumerate(labels) if label not in results}
+        if places:
+            made = make(rows[[*places.values()]], theta)
+            results |= dict(zip(places, made, strict=True))
+        return np.array([results[x] for x in labels])
+
+    def _values(self, rows: Array, theta: Array) -> Array:
+        return self._run([(rows, theta)])[0]
 
     def _run(self, jobs: list[tuple[Array, Array]]) -> list[Array]:
         """(N, q) of each job."""
@@ -326,14 +341,7 @@ class FromFunction(Model):
         values: list[Array],
         sides: NDArray[np.int8],
     ) -> Array:
-        """(N, q, p) of the values at the offsets, four for each parameter.
-
-        Args:
-            steps: of the differences.
-            rows: (N, n) commands.
-            values: 4 p times (N, q).
-            sides: (p, N) places in ``SIDES``.
-        """
+        """(N, q, p) of 4 p values (N, q), by ``sides`` (p, N), places in ``SIDES``."""
         slopes = np.empty((*values[0].shape, len(steps.steps)))
         rough = np.empty_like(slopes)
         for j, step in enumerate(steps.steps):
@@ -356,7 +364,7 @@ class FromFunction(Model):
                 f"{in_words(rows[i])}{f' and {others} others' if others else ''}: its "
                 "derivative there may be wrong (a reading that wraps around needs "
                 "periods=)",
-                stacklevel=5,
+                stacklevel=4,
             )
         # A derivative that is the noise of f for all commands is none.
         return np.where(largest <= steps.rounding(), 0.0 * slopes, slopes)
@@ -379,26 +387,21 @@ class FromFunction(Model):
                 f"f fails for all {len(rows)} commands; for {in_words(rows[0])}: "
                 f"{self._reasons[rows[0].tobytes()]}"
             )
-        at = rows[pilots[:_PILOTS]]
+        at, n = rows[pilots[:_PILOTS]], rows.shape[1]
+
+        def by_parameters(points: Array) -> Array:
+            return np.array(self._run([(at, point) for point in points]))
+
+        def by_commands(points: Array) -> Array:
+            moved = (at + points[:, None]).reshape(-1, n)
+            return self._run([(moved, theta)])[0].reshape(len(points), len(at), -1)
+
         if what == "parameters":
-            steps = look(
-                lambda points: np.array(self._run([(at, point) for point in points])),
-                theta,
-                self.scale,
-                self.names,
-                self.periods,
-            )
+            where = by_parameters, theta, self.scale, self.names
         else:
-            steps = look(
-                lambda points: self._run(
-                    [((at[None] + points[:, None]).reshape(-1, at.shape[1]), theta)]
-                )[0].reshape(len(points), len(at), -1),
-                np.zeros(at.shape[1]),
-                self._spread(rows),
-                self.inputs or tuple(f"command {i + 1}" for i in range(at.shape[1])),
-                self.periods,
-            )
-        self._steps[what] = steps
+            names = self.inputs or tuple(f"command {i + 1}" for i in range(n))
+            where = by_commands, np.zeros(n), self._spread(rows), names
+        self._steps[what] = steps = look(*where, self.periods)
         return steps
 
     @staticmethod
@@ -407,33 +410,3 @@ class FromFunction(Model):
         spread, size = np.ptp(rows, axis=0), np.abs(rows).max(axis=0)
         whole = np.where(spread > 1e-6 * size, spread, size)
         return 0.1 * np.where(whole > 0.0, whole, 1.0)
-
-
-class _Memory:
-    """Results by parameters and command, of the last sets of parameters."""
-
-    def __init__(self) -> None:
-        self.reasons: dict[bytes, str] = {}  # by command
-        self._sets: dict[tuple[str, bytes], dict[bytes, Array]] = {}
-
-    def of(
-        self, what: str, theta: Array, rows: Array, make: Callable[[Array], Array]
-    ) -> Array:
-        """Results (N, ...) at rows, those made that are not known."""
-        whole = len(rows) > _LONG
-        key = what, theta.tobytes() + (rows.tobytes() if whole else b"")
-        results = self._sets.pop(key, {})
-        self._sets[key] = results  # the newest
-        while len(self._sets) > 3 * _SETS:
-            del self._sets[next(iter(self._sets))]
-        if whole:
-            if not results:
-                results[b""] = make(rows)
-            return results[b""]
-        labels = [row.tobytes() for row in rows]
-        new = list(dict.fromkeys(x for x in labels if x not in results))
-        if new:
-            places = {label: i for i, label in enumerate(labels)}
-            first = [places[label] for label in new]
-            results |= dict(zip(new, make(rows[first]), strict=True))
-        return np.array([results[x] for x in labels])

@@ -129,11 +129,8 @@ def identifiability(
 
 
 def _null_space(columns: Array, resolution: float) -> tuple[list[Array], Array]:
-    """Changes (k, p) that columns (R, p) do not show, those that go together in one.
-
-    Returns:
-        These; and the singular values of the columns, each of length 1.
-    """
+    """Changes (k, p) that columns (R, p) do not show, those that go together in one;
+    and the singular values of the columns, each of length 1."""
     largest = np.abs(columns).max(axis=0, initial=0.0)
     nonzero, p = largest > 0.0, columns.shape[1]
     # A triangle of p rows holds all that is needed of the R.
@@ -188,12 +185,8 @@ def unknown(
     precision: Array,
     free: NDArray[np.bool_],
 ) -> tuple[Direction, ...]:
-    """Directions that neither commands (N, n) nor a prior's precision (p,) determine.
-
-    Args:
-        mean: (p,) where the model is looked at.
-        free: (p,) False: held.
-    """
+    """Directions that neither commands (N, n) nor a prior's precision (p,) determine,
+    by the model at ``mean`` (p,); those not ``free`` (p,) are held."""
     flat_prior = precision == 0.0
     std = np.where(flat_prior, np.inf, 1.0 / np.sqrt(precision + flat_prior))
     held = [name for name, one in zip(model.names, free, strict=True) if not one]

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import Array, axis_names, numbers, whole_number
 from jaxcal.models.formula import Levels, input_names, parse
-from jaxcal.models.model import Model, as_commands, as_parameters
+from jaxcal.models.model import Model, as_commands, as_parameters, parameter_names
 
 
 class Linear(Model):
@@ -77,10 +77,7 @@ class Linear(Model):
         else:
             with np.errstate(all="ignore"):
                 count = self._call(np.zeros((1, self.num_inputs))).shape[1]
-            labels = (
-                tuple(f"f{i + 1}" for i in range(count)) if terms is None else terms
-            )
-            self.terms = axis_names("terms", labels, "f", count)
+            self.terms = parameter_names(terms, count, "f")
         if not self.terms:
             raise ValueError(f"features must hold at least one term, got {features!r}")
 
@@ -145,10 +142,8 @@ class Linear(Model):
     def _evaluate(self, commands: Array) -> Array:
         """(N, r), finite."""
         for name, levels in self._categories.items():
-            column, words = (
-                commands[:, self.inputs.index(name)],
-                isinstance(levels[0], str),
-            )
+            column = commands[:, self.inputs.index(name)]
+            words = isinstance(levels[0], str)
             offered = dict(enumerate(levels)) if words else dict.fromkeys(levels, "")
             for i in np.flatnonzero(~np.isin(column, [*offered]))[:1]:
                 rule = ", ".join(f"{x} {word}".strip() for x, word in offered.items())
@@ -174,13 +169,14 @@ class Linear(Model):
         if not isinstance(self.features, str):
             return self._call(commands)
         values = dict(zip(self.inputs, commands.T, strict=True))
-        columns = []
-        for factors in self._factors.values():
-            column = np.ones(len(commands), dtype=commands.dtype)
-            for factor in factors:
-                column = column * factor(values)
-            columns.append(column)
-        return np.stack(columns, axis=1)
+        ones = np.ones(len(commands), dtype=commands.dtype)
+        return np.stack(
+            [
+                math.prod((factor(values) for factor in factors), start=ones)
+                for factors in self._factors.values()
+            ],
+            axis=1,
+        )
 
     def _call(self, commands: Array) -> Array:
         assert callable(self.features)
@@ -261,12 +257,8 @@ class Polynomial(Linear):
         return rows[:, 1:], rows[:, 0]
 
     def to_dict(self) -> dict[str, Any]:
-        return {
-            "kind": "polynomial",
-            "degree": self.degree,
-            "num_inputs": self.num_inputs,
-            "num_outputs": self.num_outputs,
-        }
+        keys = "degree", "num_inputs", "num_outputs"
+        return {"kind": "polynomial"} | {key: getattr(self, key) for key in keys}
 
     def _features(self, commands: NDArray[Any]) -> NDArray[Any]:
         return np.asarray(np.prod(commands[:, None, :] ** self._powers, axis=-1))
@@ -274,6 +266,4 @@ class Polynomial(Linear):
 
 def input_letters(count: int) -> tuple[str, ...]:
     """x, y, z; u1, u2, ... where there are more."""
-    return (
-        tuple("xyz"[:count]) if count <= 3 else tuple(f"u{i + 1}" for i in range(count))
-    )
+    return tuple("xyz"[:count] if count <= 3 else (f"u{i + 1}" for i in range(count)))

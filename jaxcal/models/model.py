@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import Array, array_of
+from jaxcal.checks import Array, array_of, axis_names
 from jaxcal.models.predictions import within_half
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
@@ -53,35 +53,24 @@ class Quantity(NamedTuple):
 class Model(abc.ABC):
     """n commands, p parameters, q outputs; everything is float64 in the caller's units.
 
-    A model of one's own has ``names``, ``nominal``, ``num_inputs``, ``num_outputs``,
-    ``predict``, ``jacobian`` and ``command_jacobian``; the rest has defaults.
-    ``parameters=None`` stands for ``nominal`` in every method.
+    A model of one's own has ``names`` of the parameters, their ``nominal`` (p,),
+    ``num_inputs``, ``num_outputs``, ``predict``, ``jacobian`` and ``command_jacobian``;
+    the rest has defaults. ``inputs`` are n names of the commands' columns, () where
+    they have none. ``parameters=None`` stands for ``nominal`` in every method.
     """
 
     if TYPE_CHECKING:  # attributes or properties of every model
 
         @property
-        def names(self) -> tuple[str, ...]:
-            """p names of the parameters."""
-
+        def names(self) -> tuple[str, ...]: ...
         @property
-        def nominal(self) -> Array:
-            """(p,) parameters of the machine as it was designed."""
-
+        def nominal(self) -> Array: ...
         @property
-        def num_inputs(self) -> int:
-            """n."""
-
+        def num_inputs(self) -> int: ...
         @property
-        def num_outputs(self) -> int:
-            """q."""
+        def num_outputs(self) -> int: ...
 
-        @property
-        def inputs(self) -> tuple[str, ...]:
-            """n names of the columns of the commands; () where they have none."""
-
-    else:
-        inputs = ()
+    inputs: Any = ()
 
     # -- f and its derivatives ---------------------------------------------------------
 
@@ -122,10 +111,10 @@ class Model(abc.ABC):
     @property
     def title(self) -> str:
         """The model in the first line of a calibration's summary."""
-        return f"of {type(self).__name__}"
+        return f"of {self._kind}"
 
     def units_for(self, command_unit: str, measured_unit: str) -> tuple[str, ...]:
-        """p units of the parameters, "" where not known, for these of the commands."""
+        """p units of the parameters, "" where not known."""
         return tuple(getattr(self, "units", ("",) * len(self.names)))
 
     def quantities(self, measured_unit: str) -> tuple[Quantity, ...]:
@@ -155,11 +144,10 @@ class Model(abc.ABC):
         return None
 
     def parameter_sizes(self) -> Array:
-        """(p,) in which derivatives by different parameters are compared.
+        """(p,) in which derivatives are compared: those below 1e-14 are rounding.
 
-        A derivative below 1e-14 of the others is rounding. The default prior's standard
-        deviation, else the nominal value; NaN where neither says how large, or where
-        derivatives are exact: then zero alone is no effect.
+        The default prior's std, else the nominal value; NaN where neither says how
+        large, or where derivatives are exact: then zero alone is no effect.
         """
         if self.linear:
             return np.full(len(self.names), np.nan)
@@ -170,11 +158,8 @@ class Model(abc.ABC):
         return np.where(sizes > 0.0, sizes, np.nan)
 
     def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
-        """What is known besides the prior, as readings that need no command.
-
-        Returns:
-            (F,) how far off it is and (F, p) its derivative, in standard deviations.
-        """
+        """What is known besides the prior: (F,) how far off it is and (F, p) its
+        derivative, in standard deviations."""
         return np.zeros(0), np.zeros((0, len(self.names)))
 
     def error_groups(self) -> ErrorGroups | None:
@@ -182,12 +167,11 @@ class Model(abc.ABC):
         return None
 
     def log_size(self, commands: Array, parameters: Array) -> Array | None:
-        """Logarithm (N,) of what readings grow with that are zero, or near it.
+        """Logarithm (N,) of what contacts' readings, near zero, grow with.
 
-        Contacts do not show how large the machine is: were it half as large, with all
-        that it touches, they would be missed by half as much. A fit compares them (what
-        is below four times ``default_noise``) with its size, or a smaller machine would
-        always fit better. None: readings are as large as they are.
+        A fit compares them (what is below four times ``default_noise``) with the
+        machine's size, or a smaller machine would always fit better. None: readings are
+        as large as they are.
         """
         return None
 
@@ -199,13 +183,11 @@ class Model(abc.ABC):
 
     @property
     def periods(self) -> Array | None:
-        """(q,) periods of readings that wrap, as 360 of an angle in degrees, inf of
-        those that do not; None where none does."""
+        """(q,) of readings that wrap, as 360 degrees, inf of others; None: of none."""
         return None
 
     def wrapped(self, off: Array, commands: Array) -> Array:
-        """(N, q) differences of readings at commands, those that wrap within half a
-        period."""
+        """(N, q) differences of readings, those that wrap within half a period."""
         return within_half(off, self.periods)
 
     @property
@@ -215,15 +197,14 @@ class Model(abc.ABC):
 
     @property
     def rounding(self) -> Array | None:
-        """(q,) standard deviation of the model's own noise, as of a program that
-        prints six digits; None where it is as exact as numbers are."""
+        """(q,) standard deviation of the model's own noise, as of a program that prints
+        six digits; None: as exact as numbers are."""
         return None
 
     def unanswered(
         self, commands: Array, parameters: ArrayLike | None = None
     ) -> dict[int, str]:
-        """Rows of commands (N, n) for which there is no prediction, and why; only of a
-        model that may fail for some of them."""
+        """Rows of commands (N, n) for which the model fails, and why."""
         return {}
 
     # -- the commands and readings of a fit or a choice --------------------------------
@@ -234,11 +215,7 @@ class Model(abc.ABC):
         return slice(0, 0)
 
     def anew(self, commands: Array, measured: Array) -> Model:
-        """The model as ``prepared`` has it, where its sensor stood before forgotten.
-
-        Raises:
-            ValueError: as of ``prepared``.
-        """
+        """The model as ``prepared`` has it, where its sensor stood before forgotten."""
         return self
 
     def prepared(self, commands: Array, measured: Array | None = None) -> Model:
@@ -271,11 +248,8 @@ class Model(abc.ABC):
         return False
 
     def centred(self, centre: Array) -> Array | None:
-        """(p, p) that makes of parameters those for commands counted from ``centre``.
-
-        ``f(u; theta) = f(u - centre; centred(centre) @ theta)``; None where there are
-        none such.
-        """
+        """(p, p) with ``f(u; theta) = f(u - centre; centred(centre) @ theta)``, or
+        None."""
         return None
 
     @property
@@ -284,9 +258,8 @@ class Model(abc.ABC):
         return 0
 
     def blocks(self, commands: ArrayLike) -> Array:
-        """(..., N, 1, r) information of each output by itself, with unit noise."""
-        # No caller asks where multiplicity is 0; a model that has one overrides this.
-        raise NotImplementedError("the outputs share no regressor")  # multiplicity 0
+        """(..., N, 1, r) of each output by itself, with unit noise."""
+        raise NotImplementedError("the outputs share no regressor")
 
     def affine(self, parameters: Array) -> tuple[Array, Array] | None:
         """A (m, n) and b (m,) of a model ``y = A u + b``; None for any other."""
@@ -313,8 +286,7 @@ class Model(abc.ABC):
         return fit
 
     def unexplained(self, fit: Any, rows: Array) -> Array:
-        """(N, q) standard deviations of predictions at ``rows`` by what neither
-        parameters nor the sensor's noise explain."""
+        """(N, q) std of predictions by what neither parameters nor noise explain."""
         return np.zeros((len(rows), self.num_outputs))
 
     # -- a calibrated machine ----------------------------------------------------------
@@ -337,31 +309,19 @@ class Model(abc.ABC):
     def targets(
         self, desired: Array, start: Array | None
     ) -> Callable[[Array, Rows], Array]:
-        """What to reach, at commands, for ``Calibration.command_for``.
-
-        Args:
-            desired: (P, q) wanted outputs.
-            start: (P, n) where each search begins, if that was given.
-
-        Returns:
-            f(commands (R, n), rows (R,)) -> (R, q), what the machine answers at the
-            commands if it reaches the ``rows`` of ``desired``.
-        """
+        """f(commands (R, n), rows (R,)) -> (R, q), what the machine answers there if it
+        reaches those rows of ``desired`` (P, q); ``start`` (P, n) of the searches."""
         return lambda commands, rows: desired[rows]
 
     def verdict(self, fit: Any) -> Verdict:
-        """Whether a ``jaxcal.Calibration`` of this model can be trusted.
-
-        Printed, the reasons and the next step; ``good`` if it may be used. A model
-        that has an answer of its own returns a subclass of ``Verdict``.
-        """
+        """Whether a ``jaxcal.Calibration`` of this model can be trusted."""
         from jaxcal.models.verdict import verdict
 
         return verdict(fit)
 
     def of_chain(self, fit: Any, tip: str) -> dict[str, Any]:
         """The fields of a ``jaxcal.Calibration`` that are of one of several chains."""
-        raise ValueError(f"the model must be Chains, got {type(self).__name__}")
+        raise ValueError(f"the model must be Chains, got {self._kind}")
 
     def calibrated(self, parameters: ArrayLike) -> Model:
         """The machine whose nominal is this one's with ``parameters``."""
@@ -372,10 +332,8 @@ class Model(abc.ABC):
         return self
 
     def standing_as(self, other: Any, parameters: Array, commands: Array) -> Array:
-        """(p,) ``parameters`` with the machine moved as a whole to where ``other`` is.
-
-        ``commands`` (N, n) show the range of what has no limits.
-        """
+        """(p,) ``parameters`` with the machine moved as a whole to where ``other`` is;
+        ``commands`` (N, n) show the range of what has no limits."""
         return parameters
 
     def write(
@@ -384,8 +342,12 @@ class Model(abc.ABC):
         """Write the machine with ``parameters`` in a form that its controller reads."""
         raise self._no_arm()
 
+    @property
+    def _kind(self) -> str:
+        return type(self).__name__
+
     def _no_arm(self) -> ValueError:
-        return ValueError(f"the model must be an arm, got {type(self).__name__}")
+        return ValueError(f"the model must be an arm, got {self._kind}")
 
 
 class _Adapter(Model):
@@ -403,11 +365,8 @@ class _Adapter(Model):
         return object.__getattribute__(self, name)
 
     @property
-    def title(self) -> str:
-        return f"of {type(self._own).__name__}"
-
-    def _no_arm(self) -> ValueError:
-        return ValueError(f"the model must be an arm, got {type(self._own).__name__}")
+    def _kind(self) -> str:
+        return type(self._own).__name__
 
     # The object has them, or ``as_model`` refuses it.
     predict = jacobian = command_jacobian = None  # type: ignore[assignment]
@@ -450,6 +409,12 @@ def as_parameters(model: Model, parameters: ArrayLike | None) -> Array:
     return array_of("parameters", parameters, size, rule=" for this model")
 
 
+def parameter_names(names: Sequence[str] | None, count: int, letter: str = "t") -> Any:
+    """``count`` different names; t1, t2, ... when not given."""
+    labels = [f"{letter}{i + 1}" for i in range(count)] if names is None else names
+    return axis_names("terms" if letter == "f" else "names", labels, letter, count)
+
+
 def by_name(model: Any, commands: Any) -> Any:
     """The model's columns of a data frame, in its order; else as given."""
     inputs = getattr(model, "inputs", ())
@@ -460,15 +425,8 @@ def by_name(model: Any, commands: Any) -> Any:
 
 
 def recorded(model: Any, commands: Any, measured: Any) -> tuple[Any, Any, bool]:
-    """Commands and readings as given, or those of a ``Recording`` or of its path.
-
-    Returns:
-        Commands, readings, and whether the commands were recorded. Readings that are
-        given beside a recording count, and contacts need none.
-
-    Raises:
-        ValueError: there are no readings, or no such recording.
-    """
+    """Commands and readings as given, or those of a ``Recording`` or of its path; and
+    whether they were recorded. Readings that are given count; contacts need none."""
     is_recording = isinstance(commands, Recording)
     if isinstance(commands, str | os.PathLike):
         commands, is_recording = Recording(commands), True

@@ -75,15 +75,8 @@ def answered(
     rows: Rows | None = None,
     names: Sequence[str] | None = None,
 ) -> NDArray[np.bool_]:
-    """(N,) where the model has a prediction; a warning names the others.
-
-    Args:
-        model: any.
-        commands: (N, n).
-        parameters: (p,), the nominal ones for None.
-        rows: (N,) their numbers; counted when not given.
-        names: of all rows, where they have some.
-    """
+    """(N,) where the model has a prediction; a warning names the others, by the numbers
+    of their ``rows`` (N,), or ``names`` of all rows."""
     lost = model.unanswered(commands, parameters) if len(commands) else {}
     mask = np.ones(len(commands), dtype=np.bool_)
     if lost:
@@ -104,9 +97,7 @@ def answered(
 def without_effect(jacobian: Array, sizes: Array) -> NDArray[np.bool_]:
     """(p,) parameters by which a derivative (N, q, p) is zero, or rounding.
 
-    Args:
-        jacobian: (N, q, p); outputs are judged one by one, whatever their units.
-        sizes: (p,) of the parameters, as ``Model.parameter_sizes`` has them.
+    Outputs are judged one by one; ``sizes`` (p,) are ``Model.parameter_sizes``.
     """
     largest = np.abs(jacobian).max(axis=0, initial=0.0)
     zero = ~largest.any(axis=0)

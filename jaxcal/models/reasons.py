@@ -174,11 +174,8 @@ def _unknown(fit: Fit) -> Reason | None:
     if not fit.model.linear:
         bad |= np.isfinite(errors) & (errors > _SIZES * sizes)
     prior = fit.prior_precision[: len(errors)] > 0.0
-    if (
-        free.any()
-        and prior[free].all()
-        and (np.asarray(fit.from_data)[free] < 0.1).all()
-    ):
+    untouched = prior & (np.asarray(fit.from_data) < 0.1)
+    if free.any() and untouched[free].all():
         bad |= free
     if not (bad & free).any():
         return None
@@ -255,11 +252,8 @@ def _likelier_than_outliers(fit: Fit, distance: Array) -> bool:
     """Whether another noise explains the residuals better than outliers do.
 
     By the logarithms of both likelihoods: of one scale of all, or of one scale of each
-    outlier beside the noise that was given, where one row in twenty is an outlier.
-
-    Args:
-        fit: with a noise that was given.
-        distance: (k,) squared, in that noise, of the outliers.
+    outlier, at squared ``distance`` (k,) in the noise that was given, where one row in
+    twenty is an outlier.
     """
     dof, q = fit.dof, fit.num_readings
     scale = -0.5 * dof * (np.log(fit.square / dof) + 1.0)
@@ -333,7 +327,7 @@ def outlying(fit: Fit, rows: Sequence[int]) -> Reason | None:
 
 
 def in_rows(rows: Sequence[int]) -> str:
-    """Rows by number, the first few of many: ``rows 3, 14``."""
+    """``rows 3, 14``, the first few of many."""
     named = ", ".join(map(str, rows[:_NAMED]))
     more = f" and {len(rows) - _NAMED} more" if len(rows) > _NAMED else ""
     return f"row{'s' * (len(rows) > 1)} {named}{more}"

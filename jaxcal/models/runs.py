@@ -77,14 +77,7 @@ class CommandLine:
 
 
 class Runs:
-    """Runs of a caller's function, several at a time.
-
-    Args:
-        f: one command and the parameters, or with ``batch`` many commands.
-        batch: f takes commands (N, n) and returns (N, q).
-        processes: that run at a time, or the caller's own executor.
-        quiet: no progress on standard error.
-    """
+    """Runs of a caller's function, several at a time; arguments of ``FromFunction``."""
 
     def __init__(
         self,
@@ -137,10 +130,8 @@ class Runs:
         return tables, reasons
 
     def _checked(self, answer: Answer, commands: Array) -> Array | None:
-        """(N, q), NaN where there is a reason; None of failures alone.
-
-        What is not finite becomes a failure of the answer.
-        """
+        """(N, q), NaN where there is a reason, as of what is not finite; None of
+        failures alone."""
         values, why = answer
         if not len(values):
             return None
@@ -197,11 +188,7 @@ class Runs:
                 else:
                     futures[future] = (j, rows)
             for future in concurrent.futures.as_completed(futures):
-                try:
-                    answer: Answer = future.result()
-                except Exception as error:
-                    if not _process_ended(error):
-                        raise
+                if (answer := _result(future)) is None:
                     broken.append(futures[future])
                 else:
                     yield futures[future], answer
@@ -211,14 +198,10 @@ class Runs:
             alone = [(j, i) for j, rows in broken for i in range(rows.start, rows.stop)]
             for j, i in alone:
                 self.close()
-                try:
-                    answer = self._submit(jobs[j][0][[i]], jobs[j][1]).result()
-                except Exception as error:
-                    if not _process_ended(error):
-                        raise
-                    answer = np.zeros((0, 0)), {0: "its process ended"}
+                answer = _result(self._submit(jobs[j][0][[i]], jobs[j][1]))
                 self.close()
-                yield (j, slice(i, i + 1)), answer
+                ended = np.zeros((0, 0)), {0: "its process ended"}
+                yield (j, slice(i, i + 1)), answer or ended
         except BaseException:
             self.close()
             raise
@@ -241,9 +224,15 @@ class Runs:
         return self._pool.submit(_answer, self.f, self.batch, commands, parameters)
 
 
-def _process_ended(error: Exception) -> bool:
-    """Whether a run ended its process; ``KilledWorker`` is what dask calls it."""
-    return isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
+def _result(future: Any) -> Answer | None:
+    """The answer; None of a run that ended its process, dask's ``KilledWorker``."""
+    try:
+        answer: Answer = future.result()
+    except Exception as error:
+        if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":
+            return None
+        raise
+    return answer
 
 
 def _answer(

@@ -156,17 +156,16 @@ class Noise:
 
     def of(self, rows: NDArray[np.bool_]) -> Noise:
         """The noise of some of the N candidates, ``rows`` (N,) True at each of them."""
-        values = {name: np.asarray(getattr(self, name)) for name in self.by_row}
-        return dataclasses.replace(self, **{x: values[x][rows] for x in values})
+        values = {name: np.asarray(getattr(self, name))[rows] for name in self.by_row}
+        return dataclasses.replace(self, **values)
 
     def typical(self, rows: NDArray[np.bool_]) -> Noise:
         """Noise that does not differ by row: in root mean square over ``rows`` (N,)."""
-        means = {}
+        some, means = self.of(rows), {}
         for name in self.by_row:
-            values = np.asarray(getattr(self, name))[rows]
-            squares = values if name == "covariance" else values**2
-            mean = squares.mean(axis=0)
-            means[name] = mean if name == "covariance" else np.sqrt(mean)
+            power = 1 if name == "covariance" else 2
+            values = getattr(some, name) ** power
+            means[name] = values.mean(axis=0) ** (1.0 / power)
         return dataclasses.replace(self, **means)
 
     def beside(self, std: float) -> Noise:
@@ -184,11 +183,7 @@ class Noise:
         """W (N, q, q) with ``W Sigma W.T = I``: information blocks are ``W @ J``.
 
         A row is zero where nuisance commands leave nothing to learn from it.
-
-        Args:
-            count: N measurements.
-            num_outputs: q readings in each.
-            command_jacobian: (N, q, n) of the model; needed with ``command_std``.
+        ``command_jacobian`` (N, q, n) of the model is needed with ``command_std``.
         """
         shape = (count, num_outputs, num_outputs)
         if self.covariance is None and self.command_std is None:
@@ -229,12 +224,7 @@ class Noise:
             self._of_readings(count, num_outputs)
 
     def weigh(self, rows: Array, command_jacobian: ArrayLike | None = None) -> Array:
-        """(N, q, p) rows of readings ``W @ rows``, of thousands of readings too.
-
-        Args:
-            rows: (N, q, p).
-            command_jacobian: as of ``whitening``.
-        """
+        """(N, q, p) rows of readings ``W @ rows``, of thousands of readings too."""
         count, q = rows.shape[:2]
         if self.covariance is None and self.command_std is None:
             return np.asarray(rows * (1.0 / self._std(count, q)))
@@ -284,11 +274,7 @@ class Noise:
 
 
 def as_noise(noise: Any) -> Noise | None:
-    """A ``Noise`` as it is, its standard deviation made one, None where none is given.
-
-    Raises:
-        ValueError: it is neither.
-    """
+    """A ``Noise`` as it is, its standard deviation made one; None of None."""
     if noise is None or isinstance(noise, Noise):
         return noise
     if np.asarray(noise).dtype.kind not in "iuf":
@@ -302,13 +288,9 @@ def as_noise(noise: Any) -> Noise | None:
 def reading_noise(
     model: Any, noise: Noise, weights: Array, q: int
 ) -> tuple[Array, Array, NDArray[np.intp]]:
-    """The noise of the readings.
-
-    Returns:
-        Whitening (N, q, q) at these weights, or its diagonal (N, q) of independent
-        readings; standard deviations (N, q) at weight 1; and (q,) which outputs share a
-        level, from 0.
-    """
+    """Whitening (N, q, q) of readings at these weights, or its diagonal (N, q) where
+    they are independent; their std (N, q) at weight 1; and (q,) which outputs share a
+    level, from 0."""
     count, levels = len(weights), np.arange(q)
     if noise.covariance is None:
         std = noise.reading_std(count, q)

@@ -81,14 +81,8 @@ def left_out(fit: Fit) -> Array:
 def between_sessions(fit: Calibration, labels: NDArray[np.intp]) -> Array:
     """(m,) standard deviation of readings of another session, beyond what is expected.
 
-    Each session is predicted from a fit of the others.
-
-    Args:
-        fit: a calibration with an estimate or a statement of the noise.
-        labels: (N,) the session of each measurement.
-
-    Raises:
-        ValueError: there is no session whose others determine the model.
+    Each session of ``labels`` (N,) is predicted from a fit of the others; a ValueError
+    where none of these determines the model.
     """
     square, expected = [], []
     for label in np.unique(labels):
