@@ -8,20 +8,18 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.calibration.pairing.fit import Fitted, fits_of, solved
 from jaxcal.calibration.pairing.table import (
     ColumnChange,
     Hypothesis,
+    Rows,
     Table,
     as_it_is,
     shifted,
 )
 from jaxcal.checks import Array
 from jaxcal.models.predictions import predict
-
-Rows = NDArray[np.intp]
 
 _TURNS = 1.7453292519943295e-2  # radians in a degree
 _UNITS = {
@@ -108,8 +106,7 @@ def _kinds_of_columns(
     table: Table, inputs: Sequence[str], outputs: Sequence[str]
 ) -> list[Hypothesis]:
     """Columns with another sign or unit, or in the place of another's."""
-    width = np.arange(table.commands.shape[1])
-    moved = len(width) - len(width[table.model.sensed])
+    moved = table.commands.shape[1] - table.sensed
     tables = [(inputs, len(inputs), moved, False)]
     if not table.model.relative:
         tables.append((outputs, len(outputs), len(outputs), True))
@@ -119,52 +116,34 @@ def _kinds_of_columns(
     for names, size, count, of_readings in tables:
         if of_readings and not table.measured.any():
             continue
-        order, ones = tuple(range(size)), (1.0,) * size
-        single = [((i,), f"{names[i]}") for i in range(count)]
-        every = [
-            (
-                tuple(range(count)),
-                "every column of "
-                + ("the readings" if of_readings else "the commands"),
-            )
-        ]
-        for columns, words in single + (every if count > 1 else []):
+        kinds: list[tuple[str, list[int], float]] = []  # words, columns and factor
+        for i in range(count):
             for what, factor in {"has the other sign": -1.0, **units}.items():
-                if len(columns) > 1 and factor == -1.0:
-                    continue
-                factors = tuple(factor if i in columns else 1.0 for i in range(size))
-                changes.append(
-                    ColumnChange(f"{words} {what}", of_readings, order, factors)
-                )
+                kinds.append((f"{names[i]} {what}", [i], factor))
+        side = "the readings" if of_readings else "the commands"
+        for what, factor in units.items() if count > 1 else ():
+            every = f"every column of {side} {what}"
+            kinds.append((every, [*range(count)], factor))
         for i, j in itertools.combinations(range(count), 2):
-            swapped = list(order)
-            swapped[i], swapped[j] = j, i
-            changes.append(
-                ColumnChange(
-                    f"{names[i]} and {names[j]} are exchanged",
-                    of_readings, tuple(swapped), ones,
-                )
-            )  # fmt: skip
+            both = f"{names[i]} and {names[j]}"
+            kinds.append((f"{both} are exchanged", [i, j], 1.0))
             if not of_readings:
-                factors = tuple(-1.0 if k in (i, j) else 1.0 for k in range(size))
-                changes.append(
-                    ColumnChange(
-                        f"{names[i]} and {names[j]} have the wrong sign",
-                        of_readings, order, factors,
-                    )
-                )  # fmt: skip
-    code = _KINDS + np.log(len(changes) + 1.0)
-    rows, several = np.arange(len(table.commands)), np.log(20.0)
+                kinds.append((f"{both} have the wrong sign", [i, j], -1.0))
+        for words, columns, factor in kinds:
+            order, factors = np.arange(size), np.ones(size)
+            factors[columns] = factor
+            if factor == 1.0:  # exchanged
+                order[columns] = columns[::-1]
+            places = tuple(order.tolist()), tuple(factors.tolist())
+            changes.append(ColumnChange(words, of_readings, *places))
+    code, several = _KINDS + np.log(len(changes) + 1.0), np.log(20.0)
+    rows = np.arange(len(table.commands))
+    costs = [
+        several * (" and " in x.words) + _KINDS * ("every" in x.words) for x in changes
+    ]
     return [
-        Hypothesis(
-            "columns",
-            rows,
-            code
-            + several * (" and " in change.words)
-            + _KINDS * ("every" in change.words),
-            change=change,
-        )
-        for change in changes
+        Hypothesis("columns", rows, code + cost, change=x)
+        for x, cost in zip(changes, costs, strict=True)
     ]
 
 

@@ -15,11 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.pairing.table import AS_IT_IS, Hypothesis, Table
+from jaxcal.calibration.pairing.table import AS_IT_IS, Hypothesis, Rows, Table
 from jaxcal.checks import Array
 from jaxcal.models.predictions import predict
-
-Rows = NDArray[np.intp]
 
 OUTLIER = np.log(20.0)  # of one row in twenty
 _FLOOR = 1e-7  # of the spread of the readings: below it is rounding
@@ -70,13 +68,8 @@ def solved(matrix: Array, right: Array, known: Array) -> Array:
 
 
 def fitted(table: Table, hypothesis: Hypothesis, theta: Array | None = None) -> Fitted:
-    """The most probable parameters, noise and outliers of a hypothesis.
-
-    Args:
-        table: of the measurements.
-        hypothesis: how they belong together.
-        theta: (p,) where the search begins; where the table is linearised if None.
-    """
+    """The most probable parameters, noise and outliers of a hypothesis; the search
+    begins at ``theta`` (p,), where the table is linearised if None."""
     if theta is not None:
         table = dataclasses.replace(table, theta=theta)
     rows = np.flatnonzero((hypothesis.match >= 0) & table.counted)
@@ -123,11 +116,8 @@ def _misfit(table: Table, hypothesis: Hypothesis, rows: Rows, theta: Array) -> f
 
 
 def _robust(table: Table, slopes: Array, right: Array) -> tuple[Array, Array, Array]:
-    """Student's fit of a linear system.
-
-    Returns:
-        (r, c) the solution, (K,) weights, and (K, q) residuals of least squares.
-    """
+    """Student's fit of a linear system: (r, c) the solution, (K,) weights, and (K, q)
+    residuals of least squares."""
     ridge, (count, _, r), q = table.ridge(slopes.shape[-1]), slopes.shape, table.outputs
     size = count * slopes.shape[1]
     plain, aim = slopes.reshape(size, r), right.reshape(size, -1)

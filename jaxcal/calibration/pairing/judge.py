@@ -15,13 +15,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.calibration.pairing.fit import Fitted, fits_of, fitted, top
 from jaxcal.calibration.pairing.table import (
     FOREIGN,
     ColumnChange,
     Hypothesis,
+    Rows,
     Table,
     as_it_is,
     path_match,
@@ -32,8 +32,6 @@ from jaxcal.models.uncertainty import Prior
 
 if TYPE_CHECKING:
     from jaxcal.calibration.fit import Fit
-
-Rows = NDArray[np.intp]
 
 _SURE = 8.0  # log of the odds at which a mispairing is said
 RATIO = 2.0  # times the noise without it, least squares of the table as it stands
@@ -73,15 +71,8 @@ class Mispairing:
         return self.kind not in ("offset", "parameters")
 
     def repaired(self, commands: Array, measured: Array) -> tuple[Array, Array]:
-        """The rows that belong together, (K, n) and (K, q).
-
-        Args:
-            commands: (N, n) of the table.
-            measured: (N, q) of it.
-
-        Raises:
-            ValueError: rows of two sessions cannot be made one.
-        """
+        """The rows of the table that belong together, (K, n) and (K, q); a ValueError
+        where rows of two sessions cannot be made one."""
         if not self.mendable:
             raise ValueError(
                 "a table of two sessions cannot be repaired: identify each alone"
@@ -90,11 +81,11 @@ class Mispairing:
         paired, readings = commands[self.match[rows]], measured[rows]
         if self.sensed is not None:
             paired[:, self.sensed] = commands[rows, self.sensed]
-        if self.change is not None:
-            if self.change.of_readings:
-                return paired, self.change(readings)
-            return self.change(paired), readings
-        return paired, readings
+        if self.change is None:
+            return paired, readings
+        if self.change.of_readings:
+            return paired, self.change(readings)
+        return self.change(paired), readings
 
 
 def mispairing(fit: Fit) -> Mispairing | None:
@@ -110,10 +101,7 @@ def mispairing(fit: Fit) -> Mispairing | None:
         lack = fit.lack_of_fit()
         if lack is None or lack > 1e-3:
             return None
-    table = of_fit(fit)
-    if table is None:
-        return None
-    return _found(table, fit.input_names, fit.output_names, fit.measured_unit)
+    return _found(of_fit(fit), fit.input_names, fit.output_names, fit.measured_unit)
 
 
 def _taken_up(fit: Fit) -> Mispairing | None:
@@ -147,7 +135,7 @@ def of_unfitted(
     with contextlib.suppress(ValueError):
         prior = prior or model.default_prior()
         table = _table(model, commands, measured, counted, prior)
-        return None if table is None else _found(table, inputs, outputs, "")
+        return _found(table, inputs, outputs, "")
     return None
 
 
@@ -184,10 +172,8 @@ def _table(
     prior: Prior,
     held: bool = False,
 ) -> Table | None:
-    """The table, linearised at the prior's mean, or all parameters held there.
-
-    None where there is too little.
-    """
+    """The table, linearised at the prior's mean, or all parameters held there; None
+    where there is too little."""
     resolved = prior.resolve(model)
     free = resolved.free & (not held)
     most = _RUNS if model.resolution else _ROWS
@@ -224,9 +210,11 @@ def _table(
 
 
 def _found(
-    table: Table, inputs: Sequence[str], outputs: Sequence[str], unit: str
+    table: Table | None, inputs: Sequence[str], outputs: Sequence[str], unit: str
 ) -> Mispairing | None:
     """The mispairing of a table."""
+    if table is None:
+        return None
     plain = fitted(table, as_it_is(table))
     if (plain.rms <= _EXACT * table.width).all():
         return None
@@ -254,7 +242,7 @@ def _found(
             if by_itself and not better(benign, best, _BENIGN):
                 return None
     from jaxcal.calibration.pairing.orders import polished
-    from jaxcal.calibration.pairing.words import sentence, what_is_wrong
+    from jaxcal.calibration.pairing.verdict import sentence, what_is_wrong
 
     near: dict[int, list[int]] = {}
     if best.hypothesis.kind == "path":
@@ -296,14 +284,15 @@ def _as_good(table: Table, best: Fitted, fits: list[Fitted]) -> list[Fitted]:
     paired = best.hypothesis.match >= 0
     as_good = []
     for fit in top(fits, len(fits)):
-        kind = (fit.hypothesis.kind, fit.hypothesis.change)
-        fewer = 0
-        foreign = any(by == FOREIGN for _, by in fit.hypothesis.starts)
-        if fit.hypothesis.kind in _FREQUENT and not foreign:
-            fewer = int((paired & (fit.hypothesis.match < 0)).sum())
-        if kind != (best.hypothesis.kind, best.hypothesis.change):
-            if fit.evidence > best.evidence - _AS_GOOD - fewer * row:
-                as_good.append(fit)
+        other, fewer = fit.hypothesis, 0
+        foreign = any(by == FOREIGN for _, by in other.starts)
+        if other.kind in _FREQUENT and not foreign:
+            fewer = int((paired & (other.match < 0)).sum())
+        near = fit.evidence > best.evidence - _AS_GOOD - fewer * row
+        kind = best.hypothesis.kind, best.hypothesis.change
+        same = kind == (other.kind, other.change)
+        if near and not same:
+            as_good.append(fit)
     return as_good
 
 
@@ -395,11 +384,8 @@ def _apart(table: Table, plain: Fitted) -> list[Fitted]:
         if len(rows) < 3:
             continue
         start, end = int(rows[0]), int(rows[-1]) + 1
-        if (
-            start == 0
-            or end == count
-            or _chance(len(rows), end - start, count) > _CHANCE
-        ):
+        inner = 0 < start and end < count
+        if not inner or _chance(len(rows), end - start, count) > _CHANCE:
             continue
         path = ((0, 0), (start, FOREIGN), (end, 0))
         code = math.log(0.5 * count**2)

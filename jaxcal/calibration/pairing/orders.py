@@ -5,13 +5,16 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.calibration.pairing.fit import Fitted, fitted, predicted
-from jaxcal.calibration.pairing.table import Hypothesis, Table, as_it_is, path_match
+from jaxcal.calibration.pairing.table import (
+    Hypothesis,
+    Rows,
+    Table,
+    as_it_is,
+    path_match,
+)
 from jaxcal.checks import Array
-
-Rows = NDArray[np.intp]
 
 _MOST_ROWS = 150  # of a table whose lost order is looked for
 _STARTS, _REFINED, _ROUNDS = 12_000, 8, 12  # of that search: rows times starts, ...
@@ -85,8 +88,7 @@ def exchanged(table: Table, plain: Fitted) -> list[Fitted]:
     """Outliers whose readings fit one another's commands."""
     rows = np.flatnonzero(~plain.inside & table.counted)
     count = len(table.commands)
-    sensed = len(np.arange(table.commands.shape[1])[table.model.sensed])
-    if not 2 <= len(rows) <= count // 2 or sensed:
+    if not 2 <= len(rows) <= count // 2 or table.sensed:
         return []
     match = assigned(table, plain, rows)
     moved = np.flatnonzero(match != np.arange(count))
@@ -99,9 +101,8 @@ def exchanged(table: Table, plain: Fitted) -> list[Fitted]:
 def sorted_alone(table: Table, plain: Fitted) -> list[Fitted]:
     """Commands or readings that were sorted without the others."""
     count = len(table.commands)
-    sensed = len(np.arange(table.commands.shape[1])[table.model.sensed])
     poor = (plain.rms > 0.3 * table.width).any()
-    if sensed or not poor or count > _MOST_ROWS:
+    if table.sensed or not poor or count > _MOST_ROWS:
         return []
     kinds = []
     if _in_order(table.commands, 0.1):  # as levels, of which many rows have one
@@ -183,13 +184,8 @@ def matched_anew(table: Table, fit: Fitted) -> list[Rows]:
 
 
 def _sorted_matches(factors: Array, fixed: Array, read: Array) -> Rows:
-    """(K, N) matches of one output's readings (N,) that fit it best.
-
-    Args:
-        factors: (N, r) of the commands.
-        fixed: (N,) what is predicted besides.
-        read: (N,) readings.
-    """
+    """(K, N) matches of one output's readings (N,) that fit it best, by factors (N, r)
+    of the commands and what is ``fixed`` (N,) besides."""
     count = len(read)
     axes = np.linalg.svd(factors - factors.mean(axis=0), full_matrices=False)[0]
     into = factors @ np.linalg.pinv(factors)

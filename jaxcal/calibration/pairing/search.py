@@ -18,14 +18,14 @@ from jaxcal.calibration.pairing.table import (
     AS_IT_IS,
     FOREIGN,
     Hypothesis,
+    Path,
+    Rows,
     Table,
     as_it_is,
     path_match,
     shifted,
 )
 from jaxcal.checks import Array
-
-Rows = NDArray[np.intp]
 
 _SHIFTS = (0, 1, -1, 2, -2, 3, -3)
 _EDGES = 128  # rows at which a change is tried first, and of models of many parameters:
@@ -60,10 +60,7 @@ class _Systems:
     def __init__(self, table: Table) -> None:
         self.table, self.costs = table, table.costs()
         rows = np.arange(len(table.commands))
-        width = table.commands.shape[1]
-        self.fast = table.model.periods is None and not len(
-            np.arange(width)[table.model.sensed]
-        )
+        self.fast = table.model.periods is None and not table.sensed
         self.slopes, right = table.system(as_it_is(table), rows)
         read = (table.measured / table.scale).reshape(right.shape)
         self.read, self.of_commands = read, right - read
@@ -72,26 +69,15 @@ class _Systems:
         """Systems of matches (..., N), and which of their rows are paired."""
         paired = (match >= 0) & self.table.counted
         if self.fast:
-            slopes = self.slopes[match] * paired[..., None, None]
-            return (
-                slopes,
-                (self.read + self.of_commands[match]) * paired[..., None, None],
-                paired,
-            )
-        systems = [self._one(rows) for rows in match.reshape(-1, match.shape[-1])]
-        slopes, right = (np.stack(parts) for parts in zip(*systems, strict=True))
-        lead = match.shape[:-1]
-        return (
-            slopes.reshape(*lead, *slopes.shape[1:]),
-            right.reshape(*lead, *right.shape[1:]),
-            paired,
-        )
-
-    def _one(self, match: Rows) -> tuple[Array, Array]:
-        slopes, right = np.zeros_like(self.slopes), np.zeros_like(self.read)
-        rows = np.flatnonzero((match >= 0) & self.table.counted)
-        slopes[rows], right[rows] = self.table.system(Hypothesis("", match), rows)
-        return slopes, right
+            used = paired[..., None, None]
+            right = (self.read + self.of_commands[match]) * used
+            return self.slopes[match] * used, right, paired
+        slopes = np.zeros((*match.shape, *self.slopes.shape[1:]))
+        right = np.zeros((*match.shape, *self.read.shape[1:]))
+        for at in np.ndindex(match.shape[:-1]):
+            rows, hypothesis = np.flatnonzero(paired[at]), Hypothesis("", match[at])
+            slopes[at][rows], right[at][rows] = self.table.system(hypothesis, rows)
+        return slopes, right, paired
 
     def sums(self, match: Rows, edges: Rows) -> _Sums:
         """Sums of matches (..., N) up to each of the edges (B,): (..., B, ...)."""
@@ -153,23 +139,19 @@ def ranked(table: Table) -> tuple[float, list[tuple[float, Hypothesis]]]:
     ]
     base, hypotheses = hypotheses[0][0], hypotheses[1:]
     if count >= 2 * _LEAST:
-        paths = _paths(systems)
-        hypotheses += paths
-        hypotheses += _steps(systems)
+        hypotheses += _paths(systems) + _steps(systems)
     return base, sorted(hypotheses, key=lambda pair: -pair[0])
 
 
 def _of_all_rows(
     table: Table, fast: bool
-) -> tuple[Rows, list[tuple[str, float, tuple[tuple[int, int], ...]]]]:
+) -> tuple[Rows, list[tuple[str, float, Path]]]:
     """Pairings of all rows alike: (H, N), and kind, code and shift of each."""
     count = len(table.commands)
     rows = np.arange(count)
     matches = [rows, rows[::-1]]
-    names: list[tuple[str, float, tuple[tuple[int, int], ...]]] = [
-        (AS_IT_IS, 0.0, ()),
-        ("reversed", _KINDS, ()),
-    ]
+    names: list[tuple[str, float, Path]] = [(AS_IT_IS, 0.0, ())]
+    names.append(("reversed", _KINDS, ()))
     most = min(_LAGS, count // 3) if fast else 3
     for by in itertools.chain(range(1, most + 1), range(-most, 0)):
         if abs(by) < count - _LEAST:
@@ -196,13 +178,12 @@ def _paths(systems: _Systems) -> list[tuple[float, Hypothesis]]:
     most = _EDGES_OF_MANY if columns > _MANY else _EDGES
     edges = np.unique(np.linspace(0, count, min(count, most) + 1).astype(np.intp))
     last = len(edges) - 1
-    of_shift = systems.sums(
-        np.array([shifted(count, by) for by in _SHIFTS]), edges
-    )  # (S, B, ...)
+    shifts = np.array([shifted(count, by) for by in _SHIFTS])
+    of_shift = systems.sums(shifts, edges)  # (S, B, ...)
     code = _KINDS + np.log(12.0 * count)
     inner = np.arange(1, last)
     inner = inner[(edges[inner] >= _LEAST) & (count - edges[inner] >= 1)]
-    scored: list[tuple[float, tuple[tuple[int, int], ...]]] = []
+    scored: list[tuple[float, Path]] = []
     plain = of_shift.at(0)
     for index, by in enumerate(_SHIFTS[1:], 1):
         other = of_shift.at(index)
@@ -228,7 +209,7 @@ def _code(count: int, path: Sequence[tuple[int, int]]) -> float:
 
 def _blocks(
     systems: _Systems, of_shift: _Sums, edges: Rows
-) -> list[tuple[float, tuple[tuple[int, int], ...]]]:
+) -> list[tuple[float, Path]]:
     """Rows between two edges whose readings are shifted, or belong nowhere."""
     count, last = len(systems.table.commands), len(edges) - 1
     first, second = np.triu_indices(last + 1, 1)
@@ -241,7 +222,7 @@ def _blocks(
         return []
     code = _KINDS + np.log(0.5 * count**2)
     plain = of_shift.at(0)
-    scored: list[tuple[float, tuple[tuple[int, int], ...]]] = []
+    scored: list[tuple[float, Path]] = []
     around = plain.at([last]).plus(plain.at(second).plus(plain.at(first), -1.0), -1.0)
     costs = np.append(0.0, np.cumsum(systems.costs * systems.table.counted))[edges]
     none = around._replace(costs=around.costs + costs[second] - costs[first])
@@ -273,29 +254,22 @@ def _steps(systems: _Systems) -> list[tuple[float, Hypothesis]]:
     code = _KINDS + np.log(count)
     slopes, right, _ = systems.of(after[None])
     slopes, right = slopes[0], right[0]
-    factors = slopes[:, 0] if table.shared else None
+    kinds = [("offset", np.ones((count, 1)), _LEAST)]
+    if table.shared:
+        kinds.append(("parameters", slopes[:, 0], slopes.shape[-1] + 2))
     before = np.append(0, _distinct(table.commands)[:-1])
     behind = _distinct(table.commands[::-1])[::-1]
-    for whole in (False, True) if factors is not None else (False,):
-        best: tuple[float, Hypothesis] | None = None
-        widths = factors.shape[1] if whole and factors is not None else 1
-        least = widths + 2 if whole else _LEAST
+    for kind, factors, least in kinds:
         edges = after[(before >= least) & (behind >= least)]
         if not len(edges):
             continue
         edges = edges[:: len(edges) // _EDGES + 1]
-        step = (after[None] >= edges[:, None]).astype(np.float64)[..., None]
-        more = step * (factors if whole and factors is not None else 1.0)
+        more = (after >= edges[:, None]).astype(np.float64)[..., None] * factors
         scores = _with_columns(systems, slopes, right, more)
         at = int(scores.argmax())
-        kind = "parameters" if whole else "offset"
-        best = (
-            float(scores[at]) - code,
-            Hypothesis(
-                kind, after, code, ((0, 0), (int(edges[at]), 0)), None, more[at]
-            ),
-        )
-        scored.append(best)
+        path = ((0, 0), (int(edges[at]), 0))
+        hypothesis = Hypothesis(kind, after, code, path, extra=more[at])
+        scored.append((float(scores[at]) - code, hypothesis))
     return scored
 
 
@@ -314,26 +288,12 @@ def _with_columns(systems: _Systems, slopes: Array, right: Array, more: Array) -
     counted = np.repeat(table.counted, a)[:, None]
     flat, aim, extra = flat * counted, aim * counted, extra * counted
     corner = np.swapaxes(extra, 1, 2) @ flat  # (H, ea, r)
-    squares = np.concatenate(
-        [
-            np.concatenate(
-                [np.broadcast_to(flat.T @ flat, (len(more), r, r)),
-                 np.swapaxes(corner, 1, 2)], axis=2
-            ),
-            np.concatenate([corner, np.swapaxes(extra, 1, 2) @ extra], axis=2),
-        ],
-        axis=1,
-    )  # fmt: skip
-    products = np.concatenate(
-        [
-            np.broadcast_to(flat.T @ aim, (len(more), r, aim.shape[1])),
-            np.swapaxes(extra, 1, 2) @ aim,
-        ],
-        axis=1,
-    )
+    squares = np.empty((len(more), r + e * a, r + e * a))
+    squares[:, :r, :r], squares[:, r:, :r] = flat.T @ flat, corner
+    squares[:, :r, r:] = np.swapaxes(corner, 1, 2)
+    squares[:, r:, r:] = np.swapaxes(extra, 1, 2) @ extra
+    products = np.empty((len(more), r + e * a, aim.shape[1]))
+    products[:, :r], products[:, r:] = flat.T @ aim, np.swapaxes(extra, 1, 2) @ aim
     ones = np.ones(len(more))
-    sums = _Sums(
-        squares, products, ones[:, None] * (aim**2).sum(axis=0), 0.0 * ones,
-        ones * table.counted.sum(),
-    )  # fmt: skip
-    return systems.evidence(sums, e)
+    totals, count = ones[:, None] * (aim**2).sum(axis=0), ones * table.counted.sum()
+    return systems.evidence(_Sums(squares, products, totals, 0.0 * ones, count), e)

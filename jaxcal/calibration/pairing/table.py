@@ -13,6 +13,7 @@ from jaxcal.models.model import Model
 from jaxcal.models.predictions import derivative, predict
 
 Rows = NDArray[np.intp]
+Path = tuple[tuple[int, int], ...]  # shifts by rows, and from which row on
 
 AS_IT_IS = "as it is"  # kind of a hypothesis
 FOREIGN = 99  # shift of readings that belong to no command
@@ -44,7 +45,7 @@ class Hypothesis:
     kind: str
     match: Rows  # (N,) row of the command of each reading, -1 of none
     code: float = 0.0  # -log of its prior probability
-    starts: tuple[tuple[int, int], ...] = ()  # of shifts by rows: from which row on
+    starts: Path = ()
     change: ColumnChange | None = None
     extra: Array | None = None  # (N, e) columns that are fitted too, of each output
 
@@ -74,6 +75,11 @@ class Table:
     def outputs(self) -> int:
         """q."""
         return len(self.scale)
+
+    @property
+    def sensed(self) -> int:
+        """Columns of the commands that come with the readings."""
+        return self.commands[:, self.model.sensed].shape[1]
 
     @property
     def levels(self) -> int:
