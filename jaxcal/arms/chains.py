@@ -18,9 +18,9 @@ from jaxcal.arms.plausible import require_touched
 from jaxcal.arms.sensors import Sensor, Tip
 from jaxcal.arms.sensors.sensor import BASE, Readings, label
 from jaxcal.arms.sensors.several import in_noise
+from jaxcal.calibration import verdict as models
 from jaxcal.checks import Array, array_of, one_of
 from jaxcal.files import write_over
-from jaxcal.models import verdict as models
 from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
 from jaxcal.models.uncertainty import Noise, Prior
 

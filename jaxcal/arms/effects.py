@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxcal.calibration.verdict import left_out
 from jaxcal.checks import Array
 from jaxcal.models.uncertainty import Prior
-from jaxcal.models.verdict import left_out
 
 if TYPE_CHECKING:
     from jaxcal.arms.chain import SerialChain as Chain

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arms.sensors import Sensor, Socket, Wrench
+from jaxcal.calibration.verdict import Reason, outlying
 from jaxcal.checks import Array
-from jaxcal.models.reasons import Reason, outlying
 
 if TYPE_CHECKING:
     from jaxcal.arms.chain import SerialChain as Chain

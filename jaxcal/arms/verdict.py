@@ -25,11 +25,17 @@ from jaxcal.arms.findings import (
 from jaxcal.arms.plausible import mistaken_columns
 from jaxcal.arms.sensors import Pose, Socket
 from jaxcal.arms.sensors.sensor import hats
+from jaxcal.calibration import verdict as models
+from jaxcal.calibration.verdict import (
+    Reason,
+    computed,
+    in_rows,
+    left_out,
+    never_measured,
+    wrong_noise,
+)
 from jaxcal.checks import Array
 from jaxcal.information.singular import depends, significant
-from jaxcal.models import verdict as models
-from jaxcal.models.reasons import Reason, computed, in_rows, never_measured, wrong_noise
-from jaxcal.models.verdict import left_out
 
 if TYPE_CHECKING:
     from jaxcal.arms.chain import SerialChain as Chain

@@ -1,10 +1,8 @@
 """From measurements to a calibration: ``identify`` and the ``Calibration`` it returns.
 
-``identify`` checks the arguments, ``fit_model`` makes a problem of them and of its
-solution the fields of a calibration; ``least_squares`` is the search, for every model,
-``losses`` what an outlier counts, ``prior_scales`` how large a machine's errors are.
-``fit`` holds the fields and predicts; ``calibration`` adds ``check``, the ``inverse``,
-the summary and the ``file``.
+``identify`` checks the arguments, ``fit_model`` makes a problem of them, which
+``least_squares`` solves for every model, and of its solution the fields of a ``fit``;
+``calibration`` adds ``check``, the ``inverse``, the summary and the ``file``.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ from typing import Any
 
 from jaxcal.calibration.calibration import Calibration
 from jaxcal.calibration.identify import identify
-from jaxcal.models.verdict import CalibrationWarning, Verdict
+from jaxcal.calibration.verdict import CalibrationWarning, Verdict
 
 __all__ = [
     "Budget",

@@ -17,11 +17,11 @@ from jaxcal.calibration.file import save, to_dict
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.fit_model import fit_model
 from jaxcal.calibration.inverse import command_for, no_inverse
+from jaxcal.calibration.verdict import Verdict, verdict
 from jaxcal.checks import Array, aligned, in_words
 from jaxcal.late import late
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
-from jaxcal.models.verdict import Verdict
 
 if TYPE_CHECKING:
     from jaxcal.calibration.pairing import Mispairing
@@ -106,33 +106,26 @@ class Calibration(Fit):
 
     @functools.cached_property
     def verdict(self) -> Verdict:
-        """Whether the calibration may be used, why not, and what to do next.
-
-        ``print`` shows it; for an arm with cross-validated errors
-        (``jaxcal.arms.verdict.ArmVerdict``). The summary, ``report``, exit codes and
-        the warning of ``identify`` use it.
-        """
+        """Whether the calibration may be used, why not, and what to do next; of an arm
+        with cross-validated errors. The summary, ``report``, exit codes and the warning
+        of ``identify`` use it."""
         from jaxcal.calibration.pairing import against
 
-        return against(self.model.verdict(self), self)
+        return against(self.model.verdict(self) or verdict(self), self)
 
     @functools.cached_property
     def mispairing(self) -> Mispairing | None:
-        """How the readings and commands of the table were mispaired, if they were.
+        """How readings and commands were mispaired; None: not, or it cannot be decided.
 
-        ``reason`` describes it; ``repaired(commands, measured)`` returns the rows that
-        belong together. None: the rows are paired correctly, or it cannot be decided.
+        ``repaired(commands, measured)`` of it returns the rows that belong together.
         """
         from jaxcal.calibration.pairing import mispairing
 
         return mispairing(self)
 
     def of(self, tip: str) -> Calibration:
-        """The calibration of one of several chains, as if it were the only one.
-
-        Its readings are in its own unit, and its verdict, file and checks are those of
-        an arm; see ``jaxcal.models.Chains``.
-        """
+        """The calibration of one of several chains (``jaxcal.models.Chains``), as of an
+        arm of its own, its readings in its own unit."""
         return dataclasses.replace(self, **self.model.of_chain(self, tip))
 
     # -- an arm, written back ----------------------------------------------------------
@@ -214,13 +207,8 @@ class Calibration(Fit):
     def again(
         self, model: Any, prior: Prior | None, rows: NDArray[np.bool_] | None = None
     ) -> Calibration:
-        """The calibration of the same readings by another model of the machine.
-
-        Args:
-            model: of the same commands and readings.
-            prior: of its parameters; the default of ``identify`` when None.
-            rows: (N,) which of the readings; all when None.
-        """
+        """The calibration by another model of the machine and a prior, None: as of
+        ``identify``; of the same readings, or of some ``rows`` (N,) of them."""
         used = self.loss_weights > 0.0
         fields = fit_model(
             self.commands,
@@ -228,7 +216,7 @@ class Calibration(Fit):
             (used if rows is None else used & rows).astype(np.float64),
             model=model,
             prior=prior,
-            noise=Noise(std=self.noise_std) if self.noise_known else None,
+            noise=Noise(std=self.noise_std if self.noise_known else None),
             loss=self.loss,
             common_noise=None,
         )
@@ -277,16 +265,8 @@ class Calibration(Fit):
     def load(
         cls, path: str | os.PathLike[str], *, model: Model | None = None
     ) -> Calibration:
-        """Read a file that ``save`` wrote.
-
-        Args:
-            path: the file.
-            model: needed if it contains a function, which files cannot hold.
-
-        Raises:
-            OSError: it cannot be read.
-            ValueError: as of ``from_dict``; the message names the file too.
-        """
+        """Read a file that ``save`` wrote; ``model`` is needed if it contains a
+        function, which files cannot hold. A ValueError names file and key."""
         content = file.read(path)
         try:
             return cls.from_dict(content, model=model)
@@ -295,10 +275,5 @@ class Calibration(Fit):
 
     @classmethod
     def from_dict(cls, content: Any, *, model: Model | None = None) -> Calibration:
-        """The inverse of ``to_dict``.
-
-        Raises:
-            ValueError: it is not a calibration, of another version, or damaged; the
-                message names the key.
-        """
+        """The inverse of ``to_dict``; a ValueError names the key that is wrong."""
         return cls(**file.fields(content, model))

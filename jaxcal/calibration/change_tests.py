@@ -40,8 +40,7 @@ class LevelTests:
     def power(self, shifts: Array) -> Array:
         """(...,) chance that changes with noncentralities (..., G) are seen.
 
-        Noise that was estimated is as uncertain here as in the test: the ratio of the
-        squared estimate to the true variance is a chi-square over its dof.
+        The squared estimate of a noise over the true variance is a chi-square / dof.
         """
         from scipy import special
 

@@ -254,32 +254,21 @@ def _distinct(
 ) -> tuple[Array, Array]:
     """Commands (N, n) and readings (N, m), checked, those that are doubled left out."""
     postures = _postures(calibration, "commands", commands)
-    shape = len(postures), calibration.num_outputs
-    readings = array_of(
-        "measured",
-        calibration.by_name("measured", measured),
-        *shape,
-        rule=": as many rows as commands",
-    )
+    shape, rule = (len(postures), calibration.num_outputs), ": as many rows as commands"
+    given = calibration.by_name("measured", measured)
+    readings = array_of("measured", given, *shape, rule=rule)
     rows = calibration.model.distinct(postures, readings)
     return postures[rows], readings[rows]
 
 
 def _whitening(calibration: Fit, commands: Array, noise: Array) -> tuple[Array, float]:
-    """What whitens differences from predictions, and their least mean variance then.
-
-    Returns:
-        (N m, N m) for noise and all uncertainty of the predictions; the variance, of 1,
-        that is left where the misfit that they allow for is not there.
-    """
+    """(N m, N m) what whitens differences from predictions, for noise and their own
+    uncertainty; the variance, of 1, without the misfit that they allow for."""
     from scipy.linalg import lapack
 
-    def linear(misfit: bool) -> tuple[Array, Array]:
-        slopes, parameters = calibration.linear(commands, misfit=misfit)
-        return slopes.reshape(-1, slopes.shape[-1]), parameters
-
     variances = np.tile(noise**2, len(commands))
-    slopes, parameters = linear(True)
+    slopes, parameters = calibration.linear(commands)
+    slopes = slopes.reshape(len(variances), -1)
     try:
         factor = np.linalg.cholesky(np.diag(variances) + slopes @ parameters @ slopes.T)
     except np.linalg.LinAlgError:
@@ -289,8 +278,8 @@ def _whitening(calibration: Fit, commands: Array, noise: Array) -> tuple[Array, 
         ) from None
     root = np.asarray(lapack.dtrtri(factor, lower=1)[0])  # rest of factor: zeros
     # Misfit that is allowed for may not be there, and hides a drift all the same.
-    slopes, parameters = linear(False)
-    by = root @ slopes
+    slopes, parameters = calibration.linear(commands, misfit=False)
+    by = root @ slopes.reshape(len(variances), -1)
     least = (root**2 @ variances).sum() + ((by @ parameters) * by).sum()
     return root, float(least) / len(root)
 
@@ -346,11 +335,8 @@ def _tolerances(
 
 
 def _changes(calibration: Fit, tolerances: Mapping[str, float]) -> Array:
-    """(p,) what each parameter may change by, infinite where that is far.
-
-    Then readings of one unit at the calibration's commands change by its tolerance,
-    root mean square. Far is ten standard deviations of the prior: no machine drifts so.
-    """
+    """(p,) by which of each parameter the readings of one unit at the calibration's
+    commands change by its tolerance; inf where the prior lets no machine drift so."""
     at = calibration.commands, calibration.parameters
     slopes = np.asarray(calibration.model.jacobian(*at))
     by_parameter = slopes.transpose(0, 2, 1)  # (N, p, q)
@@ -368,11 +354,8 @@ def _changes(calibration: Fit, tolerances: Mapping[str, float]) -> Array:
 
 def _levels(calibration: Fit) -> NDArray[np.intp]:
     """(m,) from 0: outputs of the same number share an estimate of their noise."""
-    noise = calibration.require_noise("check")
-    if (
-        calibration.noise_dof >= (1.0 - 1e-9) * calibration.dof
-        or calibration.noise_known
-    ):
+    noise, dof = calibration.require_noise("check"), calibration.noise_dof
+    if not dof or dof >= (1.0 - 1e-9) * calibration.dof:  # given, or one estimate
         return np.zeros(len(noise), dtype=np.intp)
     return np.unique(noise, return_inverse=True)[1]
 
@@ -426,22 +409,17 @@ def verification(
 
 
 def _best_rows(value: Callable[[list[int]], Array], k: int) -> list[int]:
-    """k rows by greedy choice, then by swaps.
-
-    ``value`` is (M,), that of some rows together with each of all.
-    """
+    """k rows by greedy choice, then by swaps; ``value`` (M,) of some with each."""
     chosen: list[int] = []
-    for _ in range(k):
-        gains = value(chosen)
-        gains[chosen] = -np.inf
-        chosen.append(int(gains.argmax()))
-    for _ in range(_SWEEPS):
+    for turn in range(1 + _SWEEPS):
         before = list(chosen)
         for at in range(k):
             rest = chosen[:at] + chosen[at + 1 :]
             gains = value(rest)
             gains[rest] = -np.inf
-            if gains.max() > gains[chosen[at]] + 1e-12:
+            if not turn:
+                chosen.append(int(gains.argmax()))
+            elif gains.max() > gains[chosen[at]] + 1e-12:
                 chosen[at] = int(gains.argmax())
         if chosen == before:
             break

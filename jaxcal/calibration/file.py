@@ -85,15 +85,8 @@ def read(path: str | os.PathLike[str]) -> Any:
 
 
 def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
-    """The arguments of a calibration from the content of its file, checked.
-
-    Args:
-        content: as ``to_dict`` made it.
-        model: where the file cannot hold it.
-
-    Raises:
-        ValueError: it is no calibration, of another version, or damaged: which key.
-    """
+    """The arguments of a calibration from what ``to_dict`` made, checked; ``model``
+    where the file cannot hold it."""
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f'not a calibration: "format" is not "{FORMAT}"')
     version = content.get("version")

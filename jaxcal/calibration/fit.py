@@ -131,8 +131,7 @@ class Fit:
 
     @property
     def standard_errors(self) -> Array | None:
-        """(p,); infinite where nothing determines the parameter; None where the noise
-        is unknown."""
+        """(p,); inf where nothing determines the parameter; None without noise."""
         covariance = self.covariance
         if covariance is None:
             return None
@@ -142,10 +141,8 @@ class Fit:
 
     @property
     def from_data(self) -> Array | None:
-        """(p,) share of each parameter's prior variance that the measurements removed.
-
-        0: the value is the prior's; 1: it is the measurements'.
-        """
+        """(p,) share of the prior variance that measurements removed; 0: the value is
+        the prior's."""
         if self.standard_errors is None:
             return None
         precision = self.prior_precision[: len(self.parameters)]
@@ -223,11 +220,8 @@ class Fit:
         return {int(i): float(self.loss_weights[i]) for i in rows}
 
     def lack_of_fit(self) -> float | None:
-        """p-value of residuals at least this large under the noise that was given.
-
-        Small if the model is wrong, a measurement is an outlier, or the stated noise is
-        too small. None if no noise was given.
-        """
+        """p-value of residuals at least this large under a noise that was given, small
+        if the model, a row or that noise is wrong; None if none was given."""
         if not self.noise_known or self.dof < 0.5:
             return None
         from scipy import special
@@ -281,19 +275,16 @@ class Fit:
 
     @property
     def session_std(self) -> Array:
-        """(m,) standard deviation between sessions; 0 where ``identify`` was told of
-        one alone, though another day may differ."""
+        """(m,) standard deviation between sessions; 0 where one alone was stated."""
         of_sessions = self.provenance.get("sessions", {"std": [0.0]})
         return np.broadcast_to(np.array(of_sessions["std"]), (self.num_outputs,))
 
     # -- inside ------------------------------------------------------------------------
 
     def linear(self, rows: Array, *, misfit: bool = True) -> tuple[Array, Array]:
-        """(N, m, P) derivatives of predictions at ``rows`` (N, n), and what varies.
-
-        The latter is the covariance (P, P) of all parameters; without ``misfit`` of the
-        model's alone, as if there were no harmonics but those that were fitted.
-        """
+        """(N, m, P) derivatives of predictions at ``rows`` (N, n), and the covariance
+        (P, P) of all parameters; without ``misfit`` of the model's alone, as if there
+        were no harmonics but those that were fitted."""
         if self.centre is not None:
             rows = rows - self.centre
         joint, p = np.asarray(self.joint_covariance), len(self.names)

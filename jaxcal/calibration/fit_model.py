@@ -70,21 +70,16 @@ def fit_model(
     *,
     model: Model,
     prior: Prior | None,
-    noise: Noise | None,
+    noise: Noise,
     loss: str,
     common_noise: bool | Sequence[Any] | None,
     excited: tuple[str, ...] = (),
 ) -> dict[str, Any]:
-    """The fields of a ``Calibration`` but names and units.
-
-    Of its ``provenance``: prior "stated" where one was, and ``noise_levels`` where
-    readings share a level of noise. ``excited`` are names of commands that must vary in
-    every direction.
-    """
+    """The fields of a ``Calibration`` but names and units; of its ``provenance`` what
+    ``Fit`` says. ``excited`` names commands that must vary in every direction."""
     one_of("loss", loss, tuple(LOSSES))
     require_kind("prior", prior, Prior)
     weights, used = _distinct_weights(model, commands, measured, weights)
-    noise = noise or Noise()
     spread = command_noise(noise, commands, measured.shape[1])
     exact = not spread.any()
     model = model.prepared(commands[used], measured[used])
@@ -129,12 +124,10 @@ def fit_model(
 
 
 class _Observations(NamedTuple):
-    """All measurements, of which the fit uses some."""
-
     commands: Array  # (N, n)
     measured: Array  # (N, q)
     weights: Array  # (N,)
-    used: slice | NDArray[np.bool_]  # a slice: all
+    used: slice | NDArray[np.bool_]  # those of the fit; a slice: all
     command_std: Array  # (N, n)
 
 
@@ -147,11 +140,8 @@ def _problem(
     common_noise: bool | Sequence[Any] | None,
     excited: tuple[str, ...],
 ) -> tuple[FitProblem, Array | None]:
-    """The problem of the measurements that count, the rows that are ``used``.
-
-    Returns:
-        It, and (n,) what its commands are counted from, None: from zero.
-    """
+    """The problem of the ``used`` measurements, and (n,) what its commands are counted
+    from, None: from zero."""
     commands, measured, weights, used, command_std = observations
     exact, resolved = not command_std.any(), prior.resolve(model)
     centre, to_centred = None, None
@@ -204,12 +194,8 @@ def _distinct_weights(
     return distinct, _used(distinct)
 
 
-class _ScaledFit(NamedTuple):
-    """A fit whose prior has its scales from the readings."""
-
-    solution: FitSolution
-    scales: PriorScales
-    problem: FitProblem  # with the prior that was scaled
+# A solution, the scales of its prior by the readings, and the problem with that prior.
+_ScaledFit = tuple[FitSolution, PriorScales, FitProblem]
 
 
 def _solve_with_misfit(
@@ -219,7 +205,7 @@ def _solve_with_misfit(
     fit = _solve_with_scales(problem)
     if with_misfit is problem.model:
         return fit, 1.0
-    gain, factor = misfit_scale(with_misfit, problem, fit.solution, fit.scales)
+    gain, factor = misfit_scale(with_misfit, problem, *fit[:2])
     if gain <= _DECISIVE:
         return fit, factor
     resolved = with_misfit.default_prior().resolve(with_misfit)
@@ -256,17 +242,17 @@ def _solve_with_scales(problem: FitProblem) -> _ScaledFit:
         )
         solution = solve(scaled, solution, rough=not last)
     assert scales is not None
-    return _ScaledFit(solution, scales, scaled)
+    return solution, scales, scaled
 
 
 def _centre(
     model: Model, commands: Array, weights: Array, excited: tuple[str, ...]
 ) -> tuple[Array | None, Array | None]:
-    """(n,) what commands are counted from where that changes the parameters alone.
+    """(n,) what commands are counted from, as a bias and slopes far from zero can
+    hardly be told apart, and (p, p) what makes of parameters those from there.
 
-    Far from zero a bias and slopes can hardly be told apart. None where the commands
-    say little, which is refused with the names that are ``excited``. With it (p, p)
-    what makes of parameters those from there.
+    None where that changes more than the parameters, or the commands say little, which
+    is refused with the names that are ``excited``.
     """
     centre = weights @ commands / weights.sum()
     to_centred = model.centred(centre)
@@ -289,12 +275,9 @@ def _misfit(
     within: Array,
     times: float,
 ) -> dict[str, Any]:
-    """The fields with harmonics that were not fitted, but may be there.
-
-    They bend what was fitted and go on where nothing was measured, so predictions err
-    by more than the noise explains. ``within`` is the covariance (P, P) of the
-    parameters by the noise alone, ``times`` the size of the default prior's harmonics.
-    """
+    """The fields with harmonics that were not fitted, but may be there, and bend what
+    was fitted. ``within`` is the covariance (P, P) of the parameters by the noise
+    alone, ``times`` the size of the default prior's harmonics."""
     count = len(with_misfit.names) - len(problem.mean)
     std = times * np.asarray(with_misfit.default_prior().std)[-count:]
     none = np.zeros(count)
@@ -381,11 +364,8 @@ def _fields(
 def _noise_level(
     problem: FitProblem, solution: FitSolution
 ) -> tuple[Array | None, float]:
-    """The noise of a reading of weight 1, and its degrees of freedom.
-
-    Returns:
-        (q,) standard deviations, None where nothing tells; 0 where they were given.
-    """
+    """(q,) noise of a reading of weight 1, None where nothing tells, and its degrees of
+    freedom, 0 where it was given."""
     mean_square = (problem.reading_std**2).sum(axis=0) / len(problem.reading_std)
     std = solution.level * np.sqrt(mean_square)
     if problem.noise_known:
@@ -400,20 +380,14 @@ def _noise_level(
 def _covariance(
     problem: FitProblem, solution: FitSolution
 ) -> tuple[Array, Array | None]:
-    """(P, P) of what is determined, and directions (z, P) of what is not.
-
-    Raises:
-        ValueError: every reading is used up and parameters are still undetermined.
-    """
+    """(P, P) of what is determined, and directions (z, P) of what is not."""
     size, free = len(problem.mean), np.flatnonzero(problem.free)
     covariance = np.zeros((size, size))
     if solution.root is not None:
         covariance[free[:, None], free] = solution.root @ solution.root.T
         return covariance, None
-    rows = (
-        np.sqrt(_information_shares(problem, solution))[:, None, None] * solution.rows
-    )
-    rows = rows.reshape(-1, rows.shape[-1])
+    root_shares = np.sqrt(_information_shares(problem, solution))
+    rows = (root_shares[:, None, None] * solution.rows).reshape(-1, len(free))
     rows = np.concatenate([rows, problem.model.facts(solution.parameters)[1][:, free]])
     precision = problem.precision[free]
     scale = np.sqrt((rows**2).sum(axis=0) + precision)

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from jaxcal.calibration.calibration import Calibration
 from jaxcal.calibration.fit_model import fit_model, require_fitting
 from jaxcal.calibration.pairing import of_unfitted
+from jaxcal.calibration.verdict import CalibrationWarning, between_sessions
 from jaxcal.checks import (
     Array,
     array_of,
@@ -34,7 +35,6 @@ from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, recorded
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior, as_noise
-from jaxcal.models.verdict import CalibrationWarning, between_sessions
 from jaxcal.tables import (
     COMMANDS,
     MEASURED,
@@ -82,38 +82,32 @@ def identify(
             ``Recording``, or the path of one: a bag, a LeRobot dataset.
         measured: (N, m) readings in any unit. Not needed for contacts, recordings with
             readings, and tables with columns y_....
-        model: of ``jaxcal.models``, or any object with its methods; affine when not
-            given.
-        prior: prior knowledge of the parameters; ``model.default_prior()`` when not
-            given.
+        model: of ``jaxcal.models``, or any object with its methods; by default affine.
+        prior: of the parameters; by default ``model.default_prior()``.
         noise: of readings and commands; ``command_std`` makes the commands unknowns of
             their measurement. The level of the readings is estimated if not given.
-        noise_std: () or (m,) short for ``Noise(std=...)``: standard deviation of a
-            measurement of weight 1, in the measured unit.
+        noise_std: () or (m,) short for ``Noise(std=...)`` of a measurement of weight 1.
         weights: (N,) a measurement of weight w has variance noise_std^2 / w (the number
-            of readings averaged, say); 0 leaves it out. All 1 when not given.
+            of readings averaged, say); 0 leaves it out. By default 1.
         common_noise: estimate one noise level for all outputs (they must share a unit),
-            which has m times the degrees of freedom, or (False) one for each, or one
-            for each group of (m,) labels. When not given: one for each, but of an arm
-            one for positions and one for turns unless the residuals contradict it (F
-            test, 0.1 %), and one for all where ``command_std`` is given. Where fewer
-            than 30 measurements have outputs that share parameters, as trajectories,
-            one for all, one that varies smoothly along the outputs, or one for each
-            group or output, whichever the residuals show; the summary says which.
-        loss: "gaussian" is least squares; "student" (4 degrees of freedom, of a
-            measurement as a whole) gives outliers little weight. "student" when not
-            given, but least squares of an affine model without prior.
-        input_names: n names; those of a data frame, else u_x, u_y, u_z or u_1 ... u_n,
-            when not given.
+            or (False) one for each, or one for each group of (m,) labels. By default
+            one for each, but of an arm one for positions and one for turns unless the
+            residuals contradict it (F test, 0.1 %), and one for all where
+            ``command_std`` is given. Where fewer than 30 measurements have outputs that
+            share parameters, as trajectories, one for all, one that varies smoothly
+            along the outputs, or one for each group or output, whichever the residuals
+            show; the summary says which.
+        loss: "gaussian" is least squares, the default of an affine model without prior;
+            "student" (4 degrees of freedom, of a measurement as a whole), otherwise the
+            default, gives outliers little weight.
+        input_names: n names; by default a data frame's, else u_x, u_y, u_z or u_1, ...
         output_names: m names, likewise y_x or y_1.
-        command_unit: stored with the result.
-        measured_unit: stored with the result.
+        command_unit, measured_unit: stored with the result.
         notes: anything JSON can hold, stored under ``provenance["notes"]``.
-        accuracy: of an arm, the mean held-out error that is enough: of each unit that
-            is named, {"mm": 0.5, "deg": 0.1}; a number is of the first, lengths where
-            there are some. The verdict judges by it; stored in ``provenance``. When
-            not given, by whether the noise explains the readings, or the nominal
-            machine is far worse.
+        accuracy: of an arm, the mean held-out error that is enough and that the verdict
+            judges by: of each unit that is named, {"mm": 0.5, "deg": 0.1}; a number is
+            of the first, lengths where there are some. By default, whether the noise
+            explains the readings, or the nominal machine is far worse.
         sessions: (N,) a label of each row, its day or mounting. What differs between
             two or more is estimated by leaving out each, and counts in predictions.
 
@@ -132,17 +126,15 @@ def identify(
     n, m = len(inputs), len(outputs)
     noise, plain_noise = _noise(noise, noise_std, common_noise, m)
     about: dict[str, Any] = {
-        "input_names": inputs,
-        "output_names": outputs,
         "command_unit": command_unit,
         "measured_unit": measured_unit,
     }
-    for name in ("command_unit", "measured_unit"):
-        if not isinstance(about[name], str):
-            raise ValueError(f"{name} must be text, got {about[name]!r}")
-    provenance = about["provenance"] = _provenance((u, y, weight), notes)
-    model = _affine(n, m) if model is None else model
-    model = require_fitting(model, u, y)
+    for name, unit in about.items():
+        if not isinstance(unit, str):
+            raise ValueError(f"{name} must be text, got {unit!r}")
+    provenance = _provenance((u, y, weight), notes)
+    about |= dict(input_names=inputs, output_names=outputs, provenance=provenance)
+    model = require_fitting(_affine(n, m) if model is None else model, u, y)
     if accuracy is not None:
         units = model.accuracy_units(measured_unit)
         if not units:
@@ -192,11 +184,8 @@ def _measurements(
     input_names: Sequence[str] | None,
     output_names: Sequence[str] | None,
 ) -> tuple[Array, Array, Array, tuple[str, ...], tuple[str, ...]]:
-    """The arguments of ``identify``, checked; of a recording its rests.
-
-    Returns:
-        Commands (N, n), readings (N, m), weights (N,), n and m names.
-    """
+    """Commands (N, n), readings (N, m), weights (N,), n and m names, checked; of a
+    recording its rests."""
     commands, measured, is_recording = recorded(model, commands, measured)
     if is_recording:
         input_names = input_names or getattr(model, "inputs", ()) or None
@@ -263,7 +252,7 @@ def _noise(
     noise_std: ArrayLike | None,
     common_noise: bool | Sequence[Any] | None,
     num_outputs: int,
-) -> tuple[Noise | None, bool]:
+) -> tuple[Noise, bool]:
     """The noise as given, and whether that is at most a level of each output."""
     noise = as_noise(noise)
     if not (common_noise is None or isinstance(common_noise, bool)):
@@ -275,21 +264,15 @@ def _noise(
             )
     if noise is not None and noise_std is not None:
         raise ValueError("give noise_std or noise, not both")
+    noise = noise or Noise()
     # At most a level of each output, known or not, in every reading.
-    plain = noise is None or (
-        noise.covariance is None
-        and noise.command_std is None
-        and (noise.std is None or np.ndim(noise.std) < 2)
-    )
-    if plain:
-        level = noise_std if noise is None else noise.std
-        noise = None
-        if level is not None:
-            noise = Noise(std=levels("noise_std", level, num_outputs))
-    level_known = noise is not None and not (
-        noise.std is None and noise.covariance is None
-    )
-    if common_noise is not None and level_known:
+    plain = noise.covariance is None and noise.command_std is None
+    plain = plain and not noise.by_row
+    level = noise_std if noise.std is None else noise.std
+    if plain and level is not None:
+        noise = Noise(std=levels("noise_std", level, num_outputs))
+    estimated = noise.std is None and noise.covariance is None
+    if common_noise is not None and not estimated:
         raise ValueError(
             "give noise (the noise itself) or common_noise (how to estimate it), not "
             "both"

@@ -1,12 +1,10 @@
 """The fit of any model: Levenberg-Marquardt for the most probable parameters.
 
-Rows of residuals, whitened: the readings, the prior (one row for each parameter) and,
-where commands are uncertain, the commands. Those are unknowns of their own measurement
-and are eliminated there by an orthogonal projection. A model that is linear in its
-parameters is searched along orthogonal directions, so one step is enough whatever its
-units. A loss is iteratively reweighted least squares. A level of noise that was not
-given is estimated beside the parameters, from the residuals and the degrees of freedom
-that they really have.
+Rows of residuals, whitened: readings, prior (a row for each parameter) and uncertain
+commands, unknowns of their own measurement that an orthogonal projection eliminates.
+A linear model is searched along orthogonal directions, so one step is enough whatever
+its units. A loss is iteratively reweighted least squares. A level of noise that was not
+given is estimated from the residuals and the degrees of freedom that they have.
 
 Sources: Marquardt, 1963, with the damping of Nielsen, 1999; Lange, Little and Taylor,
 1989 (losses); Foerstner, 1979, and MacKay, 1992 (levels of noise and prior).
@@ -39,6 +37,11 @@ _TOUCHED = 4.0  # times the usual noise: most that is read of what is touched
 _AHEAD = 0.1  # of a step, where its curvature is looked for
 _BENT = 0.75  # curvature of a step, of its length, at most
 _LEAST_DAMPING = 1e-14  # keeps directions that nothing determines where they are
+# What a search takes over from another one of the same measurements.
+_SHARED = (
+    *("parameters", "commands", "residuals", "white", "weights", "level", "facts"),
+    *("fact_rows", "by_theta", "by_command", "sizes"),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,11 +63,8 @@ class FitProblem:
     first_log_size: Array | None  # (N,) of the model, at the prior's mean
 
     def growth(self, theta: Array) -> Array | None:
-        """(N, 1) by which contacts' readings are as large as at the prior's mean.
-
-        None where all are as they are. A machine that is larger by more has no merit of
-        it: a tool that grows without end would.
-        """
+        """(N, 1) by which contacts' readings are larger than at the prior's mean, up to
+        ``_LARGER``, or a tool would grow without end; None: by nothing."""
         log = self.model.log_size(self.commands, theta)
         if log is None or self.first_log_size is None:
             return None
@@ -81,10 +81,7 @@ class FitProblem:
 
     @functools.cached_property
     def _zeros(self) -> Array:
-        """(N, 1) 1 where no more was measured than contacts miss by, else 0.
-
-        What is farther off was read at a posture that nothing was touched at.
-        """
+        """(N, 1) 1 where no more was measured than contacts miss by, else 0."""
         noise = self.model.default_noise()
         most = 0.0 if noise is None else _TOUCHED * np.asarray(noise.std)
         near = np.all(np.abs(self.measured) <= most, axis=1, keepdims=True)
@@ -94,12 +91,10 @@ class FitProblem:
 def solve(
     problem: FitProblem, start: FitSolution | None = None, *, rough: bool = False
 ) -> FitSolution:
-    """The most probable parameters, from the prior's mean or from ``start``.
+    """The most probable parameters, from the prior's mean or from ``start``, a solution
+    of a problem that differs by prior, whitening, levels or loss alone.
 
-    ``start`` is a solution of a problem that differs by prior, whitening, levels or
-    loss alone.
-    ``rough`` is to .1 standard deviations, the weights of the loss to .03, for what
-    another fit begins at.
+    ``rough`` is to .1 standard deviations, the weights of the loss to .03.
 
     Raises:
         ValueError: the model fails at the start, a derivative is not finite, or the
@@ -117,8 +112,8 @@ def solve(
         done = search.step()
         # Along a curved valley that the measurements hardly close, the search creeps.
         # A gain of 0.1 moves it by a third of a standard deviation, so more is asked.
-        long = len(evidence) > _PATIENCE and not search.whole
-        creeps = long and search.damping < 1e-3
+        creeps = len(evidence) > _PATIENCE and search.damping < 1e-3
+        creeps = creeps and not search.whole
         if creeps:
             gain = evidence[-_PATIENCE] - search.evidence
             asked = max(1e-3, 0.1 * (len(evidence) // 60))
@@ -135,20 +130,12 @@ def solve(
 
 def _weighted(matrices: Array, rows: Array) -> Array:
     """(N, q, F) rows times matrices (N, q, q), or their diagonals (N, q)."""
-    if matrices.ndim == 2:
-        return matrices[..., None] * rows
-    return np.asarray(matrices @ rows)
-
-
-def _times(matrices: Array, vectors: Array) -> Array:
-    return _weighted(matrices, vectors[..., None])[..., 0]
+    return matrices[..., None] * rows if matrices.ndim == 2 else matrices @ rows
 
 
 def apart(rows: Array) -> list[NDArray[np.intp]]:
-    """Columns of rows (R, F) in groups that no row joins, as of independent outputs.
-
-    Each group is solved by itself, so a rounding of one is none of another.
-    """
+    """Columns of rows (R, F) in groups that no row joins, as of independent outputs,
+    so that a rounding of one is none of another."""
     filled = (rows != 0.0).astype(np.float64)
     joined = filled.T @ filled > 0.0
     np.fill_diagonal(joined, True)
@@ -161,21 +148,16 @@ def apart(rows: Array) -> list[NDArray[np.intp]]:
 
 
 def singular(rows: Array) -> list[tuple[NDArray[np.intp], Array, Array]]:
-    """For each group of ``apart`` columns (c,): these, singular values, right vectors.
-
-    The rows (R, F) must be F or more. The right singular vectors are (c, c).
-    """
+    """For each group of ``apart`` columns (c,) of F or more rows (R, F): these,
+    singular values, right vectors (c, c)."""
     groups = apart(rows)
     sizes = {len(columns) for columns in groups}
     if len(sizes) == 1 and len(rows) <= 128:  # all at once
         of_groups = rows.T[np.array(groups)].transpose(0, 2, 1)
         _, size, right = np.linalg.svd(of_groups, full_matrices=False)
         return list(zip(groups, size, right, strict=True))
-    decompositions = []
-    for columns in groups:
-        _, size, right = np.linalg.svd(triangle(rows[:, columns]))
-        decompositions.append((columns, size, right))
-    return decompositions
+    factors = [np.linalg.svd(triangle(rows[:, columns])) for columns in groups]
+    return [(groups[i], size, right) for i, (_, size, right) in enumerate(factors)]
 
 
 class FitSolution:
@@ -229,46 +211,32 @@ class FitSolution:
         self.all_free = bool(problem.free.all())
         self.informed = bool(np.logical_and(problem.free, problem.precision).any())
         linear = problem.model.linear and not self.num_uncertain
+        # From zero a linear model without a prior is as exact as its step.
         from_zero = linear and start is None and not self.informed
         if start is None:
-            self._begin(from_zero)
+            self.parameters, self.commands = problem.mean, problem.commands
+            if from_zero:
+                self.parameters = np.where(problem.free, 0.0, problem.mean)
+            if from_zero and self.all_free:
+                self._take(problem.measured)
+            else:
+                self._predict()
+            self.weights = np.ones(len(problem.measured))
+            self.level = self._first_level()
+            self.facts, self.fact_rows = problem.model.facts(self.parameters)
+            self._linearise()
         else:
-            self._continue(start)
+            for name in _SHARED:
+                if name in vars(start):
+                    setattr(self, name, getattr(start, name))
+            if start.problem.white is not problem.white:
+                self._take(start.residuals)
+                self.level = self._first_level()
+                self._linearise()
         if linear:
             self.basis, self.damping = self._directions(), _LEAST_DAMPING
             if from_zero and self.basis.shape[1] < len(self.basis):
                 self._keep_undetermined()
-
-    def _begin(self, from_zero: bool) -> None:
-        """At the prior's mean, or at parameters of zero: a linear model without a prior
-        is then as exact as its step."""
-        problem = self.problem
-        self.parameters, self.commands = problem.mean, problem.commands
-        if from_zero:
-            self.parameters = np.where(problem.free, 0.0, problem.mean)
-        if from_zero and self.all_free:
-            self._take(problem.measured)
-        else:
-            self._predict()
-        self.weights, self.level = np.ones(len(problem.measured)), self._first_level()
-        self.facts, self.fact_rows = problem.model.facts(self.parameters)
-        self._linearise()
-
-    def _continue(self, start: FitSolution) -> None:
-        """Go on from where another search of the same measurements ended."""
-        self.parameters, self.commands = start.parameters, start.commands
-        self.residuals, self.white = start.residuals, start.white
-        self.weights, self.level = start.weights, start.level
-        self.facts, self.fact_rows = start.facts, start.fact_rows
-        self.by_theta = start.by_theta
-        if start.problem.white is not self.problem.white:
-            self._take(start.residuals)
-            self.level = self._first_level()
-            self._linearise()
-        if self.num_uncertain:
-            self.by_command = start.by_command
-        if not self.problem.model.linear:
-            self.sizes = start.sizes
 
     @functools.cached_property
     def sizes(self) -> Array:
@@ -283,8 +251,8 @@ class FitSolution:
         self.shared, self.same = levels, 1.0 * (levels[:, None] == levels)
         self.floor = np.zeros(len(levels))
         if not self.problem.noise_known:
-            readings = _times(self.problem.white, self.problem.measured)
-            largest = np.abs(readings).max(axis=0)
+            readings = _weighted(self.problem.white, self.problem.measured[..., None])
+            largest = np.abs(readings).max(axis=(0, 2))
             if not largest.all():
                 largest[largest == 0.0] = largest.max() or 1e7
             self.floor = (self.same * (1e-13 * largest)).max(axis=1)
@@ -366,9 +334,8 @@ class FitSolution:
         for columns, size, right in singular(rows):
             determined = np.flatnonzero(significant(size))
             block = np.zeros((rows.shape[1], len(determined)))
-            block[columns] = (
-                right[determined] / size[determined, None] / scale[columns]
-            ).T
+            turned = right[determined] / size[determined, None] / scale[columns]
+            block[columns] = turned.T
             directions.append(block)
         return np.hstack(directions)
 
@@ -379,8 +346,7 @@ class FitSolution:
         if there are several, each have parameters of their own.
         """
         problem = self.problem
-        informed = len(self.facts) or self.informed
-        if self.basis is None or problem.loss or informed:
+        if self.basis is None or problem.loss or len(self.facts) or self.informed:
             return False
         output = None  # (F,) one that each parameter moves
         if not problem.noise_known:
@@ -460,7 +426,8 @@ class FitSolution:
         right = np.concatenate([right, moved * self.command_root, 0.0 * moved], axis=1)
         turn, triangle = np.linalg.qr(by_command, mode="complete")
         turn = np.matrix_transpose(turn)
-        rows, right = turn[..., : rows.shape[1]] @ rows, _times(turn, right)
+        rows = turn[..., : rows.shape[1]] @ rows
+        right = (turn @ right[..., None])[..., 0]
         self._back = triangle[:, :k], rows[:, :k], right[:, :k]
         return rows[:, k:], right[:, k:]
 
@@ -547,18 +514,16 @@ class FitSolution:
                 return True
             if self.damping > 1e9:  # rounding is all that is left, or
                 slope = np.abs(rows.T @ right).max() / np.linalg.norm(right)
-                if slope > 1e-3 and not np.isfinite(after):
-                    raise ValueError(
-                        "model.predict fails near the parameters "
-                        f"{in_words(self.parameters)}, which the fit reaches: narrow "
-                        "the prior, or start nearer with Prior(mean=...)"
-                    )
-                if slope > 1e-3:
-                    raise ValueError(
-                        "model.jacobian is not the derivative of model.predict: no "
-                        "step along it improves the fit"
-                    )
-                return True
+                if slope <= 1e-3:
+                    return True
+                raise ValueError(
+                    "model.jacobian is not the derivative of model.predict: no step "
+                    "along it improves the fit"
+                    if np.isfinite(after)
+                    else "model.predict fails near the parameters "
+                    f"{in_words(self.parameters)}, which the fit reaches: narrow the "
+                    "prior, or start nearer with Prior(mean=...)"
+                )
             self.damping *= self.grow
             self.grow *= 2.0
 
@@ -573,16 +538,13 @@ class FitSolution:
         return float(4.0 * beside + 2.0 * np.linalg.norm(share * off) ** 2)
 
     def _widened(self, rows: Array, scale: Array) -> tuple[Array, Array]:
-        """Rows and scale (F,) by the largest scale so far (Moré, 1978).
-
-        A parameter that loses its effect would take ever longer steps.
-        """
+        """Rows and scale (F,) by the largest scale so far (Moré, 1978), so that no
+        parameter that loses its effect takes ever longer steps."""
         size = float(np.exp(np.log(self.level).mean()))
-        wide = scale * size
-        if self.widest is not None:
-            wide = np.maximum(wide, self.widest)
-        self.widest = wide
-        wide = wide / size
+        self.widest = np.fmax(
+            scale * size, np.nan if self.widest is None else self.widest
+        )
+        wide = self.widest / size
         return rows * (scale / wide), wide
 
     def _still_falls(self, moved: Array) -> bool:
@@ -607,10 +569,8 @@ class FitSolution:
         return along
 
     def settle(self, slack: float) -> bool:
-        """Weights and levels that follow from the residuals; True where they stay.
-
-        Changes of ``slack`` times ``self.change`` are none.
-        """
+        """Weights and levels that follow from the residuals; True where they change by
+        at most ``slack`` times ``self.change``."""
         problem = self.problem
         before = self.weights, np.log(self.level)
         distance = self._distance(self.white, self.commands)
@@ -680,17 +640,12 @@ class FitSolution:
 
     @functools.cached_property
     def rows(self) -> Array:
-        """(N, R, F) whitened derivatives where the search ended, no weights.
-
-        The commands are eliminated.
-        """
+        """(N, R, F) whitened derivatives at the end, the commands eliminated."""
         return self._reduce(0.0)[0]
 
     def finish(self, solved: Array | None = None) -> FitSolution:
-        """Itself, with what is said of the measurements where it ended.
-
-        ``solved`` are the roots of the hat matrix there, if they are known.
-        """
+        """Itself, with what is said of the measurements where it ended; ``solved`` are
+        the roots of the hat matrix there, if they are known."""
         if self.stale:
             self._linearise()
         readings, uncertain = self._leverage(solved), self.num_uncertain
@@ -706,10 +661,8 @@ class FitSolution:
 
 
 def _deleted(readings: Array, right: Array) -> Array:
-    """(N, R) residuals of each measurement from the fit without it.
-
-    Of ``readings`` (N, R, F), roots of the hat matrix, and residuals ``right`` (N, R).
-    """
+    """(N, R) residuals of each measurement from the fit without it, by roots of the hat
+    matrix (N, R, F) and residuals ``right`` (N, R)."""
     count, columns = readings.shape[1:]
     back = readings.transpose(0, 2, 1)
     if count <= max(_MANY, columns):
@@ -722,10 +675,8 @@ def _deleted(readings: Array, right: Array) -> Array:
 
 
 def _factor(rows: Array, damping: float, once: bool = False) -> tuple[Array, Array]:
-    """The inverse of R (F, F), and Q (R, F), of the damped rows (R, F).
-
-    ``once``: to 1e-8 or so is enough.
-    """
+    """The inverse of R (F, F), and Q (R, F), of the damped rows (R, F); ``once``: 1e-8
+    or so is enough."""
     inverse, across = _cholesky(rows, damping, once)
     if inverse is not None:
         return inverse, across
@@ -747,10 +698,10 @@ def _cholesky(
     turned, inverse = rows, None
     for _ in range(2):
         square = gram(turned)
-        if damping:
-            square += damping * (
-                np.eye(len(square)) if inverse is None else inverse.T @ inverse
-            )
+        if damping and inverse is None:
+            square += damping * np.eye(len(square))
+        elif damping and inverse is not None:
+            square += damping * (inverse.T @ inverse)
         root, failed = dpotrf(square)
         size = root.diagonal().tolist()
         if failed or (size and min(size) < _CHOLESKY * max(size)):

@@ -1,14 +1,14 @@
 """How much a measurement counts that lies far from the fit: the losses of ``identify``.
 
 Iteratively reweighted least squares needs of a loss its weight of a measurement and
-the slope of that. A loss of one's own is a class here and a row in ``LOSSES``.
+the slope of that. A loss of one's own is a class here and a row in ``LOSSES``. At the
+fit its weight is one, so that where no residual is large the fit is least squares'.
 
 Source: Lange, Little and Taylor, 1989 (Student).
 """
 
 from __future__ import annotations
 
-import abc
 import functools
 
 import numpy as np
@@ -16,20 +16,20 @@ import numpy as np
 from jaxcal.checks import Array
 
 
-class Loss(abc.ABC):
-    """Weights of measurements by their squared distances from the fit, in noise.
+class Loss:
+    """Student's distribution: outliers count little, all others nearly in full."""
 
-    At the fit the weight is one, so that where no residual is large the fit is that of
-    least squares.
-    """
+    degrees_of_freedom = 4.0
 
-    @abc.abstractmethod
     def weight(self, square: Array, q: int) -> Array:
-        """(N,) of measurements of q readings at squared distances (N,)."""
+        """(N,) of measurements of q readings, at squared distances (N,) in noise."""
+        size = self.degrees_of_freedom + q
+        return np.asarray(size / (size + square))
 
-    @abc.abstractmethod
     def slope(self, square: Array, q: int) -> Array:
         """(N,) derivative of the weight by the squared distance."""
+        size = self.degrees_of_freedom + q
+        return np.asarray(-size / (size + square) ** 2)
 
 
 @functools.lru_cache
@@ -53,19 +53,5 @@ def constants(loss: Loss, q: int) -> tuple[float, float, float]:
     return float(share @ (weight * square) / q), float(share @ weight), efficiency
 
 
-class Student(Loss):
-    """Student's distribution: outliers count little, all others nearly in full."""
-
-    degrees_of_freedom = 4.0
-
-    def weight(self, square: Array, q: int) -> Array:
-        size = self.degrees_of_freedom + q
-        return np.asarray(size / (size + square))
-
-    def slope(self, square: Array, q: int) -> Array:
-        size = self.degrees_of_freedom + q
-        return np.asarray(-size / (size + square) ** 2)
-
-
-LOSSES: dict[str, Loss | None] = {"student": Student(), "gaussian": None}
+LOSSES: dict[str, Loss | None] = {"student": Loss(), "gaussian": None}
 """The losses by name; None is least squares."""

@@ -46,11 +46,10 @@ def are_shared(problem: FitProblem) -> bool:
 
     Of noise that is of nothing but the readings, and whose levels are not known.
     """
-    if problem.noise_known or problem.command_std.any():
+    model, many = problem.model, not 1 < len(problem.commands) < _FEW
+    if problem.noise_known or problem.command_std.any() or model.multiplicity:
         return False
-    if problem.model.default_noise() is not None or problem.model.multiplicity:
-        return False
-    if not 1 < len(problem.commands) < _FEW or len(problem.levels) < 2:
+    if model.default_noise() is not None or many or len(problem.levels) < 2:
         return False
     slopes = derivative(problem.model, problem.commands, problem.mean)
     moved = (slopes != 0.0).any(axis=0)
@@ -58,11 +57,8 @@ def are_shared(problem: FitProblem) -> bool:
 
 
 def pooled(problem: FitProblem) -> tuple[FitProblem, FitSolution, str]:
-    """The fit with as many levels of noise as the readings tell, and which, in words.
-
-    Args:
-        problem: of independent readings, each with a level of its own.
-    """
+    """The fit with as many levels of noise as the readings, independent and each with a
+    level of its own in ``problem``, tell; and which, in words."""
     q = len(problem.levels)
     levels = _Levels(_one(q), np.zeros(q, np.intp), None, 1)
     fitted = _with(problem, levels)
@@ -86,12 +82,9 @@ def levels_differ(problem: FitProblem, solution: FitSolution) -> bool:
     along it.
     """
     q = len(solution.freedom)
-    if (
-        problem.noise_known
-        or q == 1
-        or solution.freedom.min() < 1.0
-        or problem.command_std.any()
-    ):
+    if problem.noise_known or q == 1 or problem.command_std.any():
+        return False
+    if solution.freedom.min() < 1.0:
         return False
     from scipy import special
 
@@ -225,9 +218,7 @@ def _smooth(
     log = np.log(mean) + 1.0 / freedom[seen]
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(30):
-            weights = np.linalg.lstsq(root * basis[seen], root[:, 0] * log, rcond=None)[
-                0
-            ]
+            weights = np.linalg.lstsq(root * basis[seen], root[:, 0] * log)[0]
             along = basis[seen] @ weights
             log = along + np.clip(mean * np.exp(-along) - 1.0, -1.0, 3.0)
             if not np.isfinite(log).all():

@@ -96,19 +96,18 @@ def inverse(
     points = fit.points("readings", given, m)
     flat, shape = points.reshape(-1, m), points.shape[:-1]
     bounds = limits_of(limits, fit.input_names)
+    solved: list[tuple[float, Array, str]] = []
     if n > 1:
         commands = command_for(fit, flat, limits, start=start)
-        pieces: list[Array] = []
-        methods = ["delta"] * len(flat)
     else:
         curve = _Curve(fit, variance, factor, bounds[0], limits is not None)
         solved = [curve.solve(float(reading)) for reading in flat[:, 0]]
-        commands = np.array([[command] for command, _, _ in solved]).reshape(-1, 1)
-        pieces = [ends for _, ends, _ in solved]
-        methods = [method for _, _, method in solved]
+        commands = np.array([command for command, _, _ in solved]).reshape(-1, 1)
     std = _first_order(fit, commands, variance)
     half = factor * std
     interval = np.stack([commands - half, commands + half], axis=-1)
+    pieces = [ends for _, ends, _ in solved]
+    methods = [method for _, _, method in solved] or ["delta"] * len(flat)
     for i, ends in enumerate(pieces):
         if methods[i] == "delta":
             pieces[i] = interval[i]

@@ -47,12 +47,10 @@ class PriorScales(NamedTuple):
 def group_scales(
     problem: FitProblem, solution: FitSolution, start: PriorScales | None
 ) -> PriorScales:
-    """The factors that make the readings most probable.
+    """The factors, of the problem's prior, that make the readings most probable.
 
-    Args:
-        problem: with the prior that the factors are of, and a model with groups.
-        solution: a fit with any such prior; the model is made linear there.
-        start: where the search begins; with factors of one where there is nothing.
+    The model is made linear at ``solution``; the search begins at ``start``, with
+    factors of one where there is nothing.
     """
     p = len(problem.mean)
     of_model = problem.model.error_groups()
@@ -63,11 +61,11 @@ def group_scales(
         evidence.most[:-1] = _FIRST
     # A level that is known floats too: misfit beyond it is no size of the errors.
     best = evidence.middle if start is None else start.logs
-    least = evidence.at(best)
+    least = _EvidenceOfScales(evidence, best)
     for _ in range(_SCORES):
         step = np.linalg.solve(least.curvature, least.slope)
         trial = np.clip(best - step, -_MOST, evidence.most)
-        while (after := evidence.at(trial)).value > least.value + 1e-9:
+        while (after := _EvidenceOfScales(evidence, trial)).value > least.value + 1e-9:
             step *= 0.5
             trial = np.clip(best - step, -_MOST, evidence.most)
         gain, best, least = least.value - after.value, trial, after
@@ -78,7 +76,9 @@ def group_scales(
     if start is None:  # of a rough fit, which begin the next
         return PriorScales(best, factors, groups, np.zeros((num_groups, num_groups)))
     steps = 1e-3 * np.eye(len(best))
-    curves = [evidence.at(best + step).slope - least.slope for step in steps]
+    curves = [
+        _EvidenceOfScales(evidence, best + step).slope - least.slope for step in steps
+    ]
     # Half the value's, in units of what was thought, which the readings only sharpen.
     wide = evidence.wide
     curve = np.array(curves) / 2e-3 * np.outer(wide, wide)
@@ -117,13 +117,9 @@ class _Evidence:
         self.rest = float((factor[top:, width] ** 2).sum())
         self.rows, self.right = factor[:top, :width], factor[:top, width]
 
-    def at(self, logs: Array) -> _EvidenceOfScales:
-        """The evidence of the logarithms (G + 1,)."""
-        return _EvidenceOfScales(self, logs)
-
 
 class _EvidenceOfScales:
-    """The value for some scales; slope and curvature where they are asked for."""
+    """The value for logarithms of scales (G + 1,); slope and curvature when asked."""
 
     def __init__(self, evidence: _Evidence, logs: Array) -> None:
         from scipy.linalg.lapack import dpotrf, dpotrs
@@ -188,16 +184,9 @@ class _EvidenceOfScales:
 def misfit_scale(
     with_misfit: Model, problem: FitProblem, solution: FitSolution, scales: PriorScales
 ) -> tuple[float, float]:
-    """What misfit that was not fitted would gain, and how large it is.
-
-    Args:
-        with_misfit: the model with it: its last parameters, the last of its groups.
-        problem, solution, scales: without it, with the prior that the factors are of.
-
-    Returns:
-        How much less -2 log marginal likelihood is at best with it, and the root of its
-        mean squared factor.
-    """
+    """How much less -2 log marginal likelihood is at best with misfit that was not
+    fitted, the last parameters and group of ``with_misfit``; and the root of its mean
+    squared factor."""
     more = len(with_misfit.names) - len(problem.mean)
     std = np.asarray(with_misfit.default_prior().std)[-more:]
     groups = with_misfit.error_groups()
@@ -217,12 +206,12 @@ def misfit_scale(
     for k, tried in enumerate(_TRIED):
         logs[-2] = tried
         for _ in range(2):  # steps of the other scales
-            trial = evidence.at(logs)
+            trial = _EvidenceOfScales(evidence, logs)
             curve = trial.curvature[np.ix_(rest, rest)]
             step = np.linalg.solve(curve, trial.slope[rest])
             after = logs[rest] - np.clip(step, -1.0, 1.0)
             logs[rest] = np.clip(after, -_MOST, evidence.most[rest])
-        least[k] = evidence.at(logs).value
+        least[k] = _EvidenceOfScales(evidence, logs).value
     shares = np.exp(-0.5 * (least - least.min()))
     square = float(shares @ np.exp(2.0 * _TRIED) / shares.sum())
     thought = (_TRIED - evidence.middle[-2]) / evidence.wide[-2]
@@ -233,11 +222,8 @@ def misfit_scale(
 def covariance_of_scales(
     problem: FitProblem, solution: FitSolution, scales: PriorScales
 ) -> Array:
-    """(P, P) what the scales, which are estimates too, add to the covariance.
-
-    Mean and covariance of the parameters are averaged over the scales; the model is
-    linear.
-    """
+    """(P, P) what the scales, which are estimates too, add to the covariance: mean and
+    covariance of a linear model's parameters are averaged over them."""
     free = problem.free
     groups = scales.groups[free]
     weights = np.sqrt(np.minimum(solution.weights, 1.0))[:, None, None]
@@ -287,11 +273,8 @@ def _moments(variance: Array, wide: Array) -> tuple[Array, Array]:
     Where few errors show a size its logarithm has a long upper tail, which ends as what
     was thought of it does. As many errors as make it so sharp have squares of a chi
     squared distribution. The mean is such that 1.96 standard deviations of an error of
-    that size hold 95 % of them.
-
-    Args:
-        variance: (G,) one over the curvature of the density, at its top.
-        wide: (G,) a standard deviation of what was thought.
+    that size hold 95 % of them. ``variance`` (G,) is one over the curvature of the
+    density at its top, ``wide`` (G,) a standard deviation of what was thought.
     """
     from scipy import special
 

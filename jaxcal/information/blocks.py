@@ -54,10 +54,8 @@ class _CentredBlocks(NamedTuple):
 def _centred(
     blocks: Array, usable: Mask | None, root: Array, look: bool = False
 ) -> _CentredBlocks:
-    """Blocks (S, M, q, p), zero where not ``usable`` (S, M), and ``root``, centred.
-
-    ``look`` whether rows are far from the others.
-    """
+    """Blocks (S, M, q, p), zero where not ``usable`` (S, M), and ``root``, centred;
+    ``look`` whether rows are far from the others."""
     sets, count, q, p = blocks.shape
     first, masked = blocks[:, :1], usable is not None and not usable.all()
     if masked:
@@ -132,11 +130,8 @@ def _shift(constant: Array, centre: Array) -> tuple[Array, Array]:
 def _far(
     ordered: Array, largest: Array, same: Mask
 ) -> tuple[Mask | None, Array | None]:
-    """Where entries (S, q, p, N), in order, are far, and where densest, (S, q, p).
-
-    By the smallest distance between a few neighbours that is not zero; not where all
-    are the ``same``. None where no entry is far.
-    """
+    """Where entries (S, q, p, N), in order, are far, and where densest, (S, q, p), by
+    the smallest distance between a few neighbours; None where none is far."""
     few = 1 + ordered.shape[-1] // 32
     apart = ordered[..., few:] - ordered[..., :-few]
     near = apart * _FAR < largest[:, None, :, None]
@@ -181,11 +176,8 @@ def gram(rows: Array) -> Array:
 
 
 def triangle(rows: Array) -> Array:
-    """(min(R, p), p) R of the QR factors of rows (R, p).
-
-    Many rows go in parts: BLAS shares a large part out among threads, which for these
-    sizes takes ten times as long as one thread does.
-    """
+    """(min(R, p), p) R of the QR factors of rows (R, p), in parts: BLAS shares large
+    ones out among threads, which here takes ten times as long as one."""
     count, p = rows.shape
     part = max(128, 2 * p)
     while count > part:
@@ -205,11 +197,7 @@ def without(nuisance: Array, *others: Array) -> list[Array]:
 
 
 def prior_root(precision: Array) -> Array:
-    """(r, p) root of a precision (p, p) of rank r, ``root.T @ root = precision``.
-
-    Raises:
-        ValueError: it is not symmetric or not positive semidefinite.
-    """
+    """(r, p) root of a precision (p, p) of rank r, ``root.T @ root = precision``."""
     p = len(precision)
     size = np.sqrt(np.abs(np.diagonal(precision)))
     scale = np.where(size > 0.0, size, 1.0)
@@ -264,10 +252,7 @@ def rank_of_blocks(
 
 
 def largest_rank(blocks: Array) -> int:
-    """Largest rank of single blocks (N, q, p); the first is nearly always of full rank.
-
-    1 for one reading each, looked at or not: what is zero adds no direction anyway.
-    """
+    """Largest rank of single blocks (N, q, p); 1 for one reading each, zero or not."""
     if blocks.shape[1] == 1:
         return 1
     full, none = min(blocks.shape[1:]), np.zeros((0, blocks.shape[2]))
@@ -385,10 +370,8 @@ def whiten(
 def _cholesky_factors(
     rows: Array, largest: Array, far: Mask | None
 ) -> tuple[Array, Array, Array, Mask]:
-    """Inverse(R), R, log det of ``R.T R = rows.T rows``, and which can be trusted.
-
-    Of S sets of rows (S, N, p), by Cholesky's factor in units of the columns' lengths.
-    """
+    """Inverse(R), R, log det of ``R.T R = rows.T rows`` (S, N, p), by Cholesky's factor
+    in units of the columns' lengths, and which can be trusted."""
     information = gram(rows)
     scale = np.sqrt(information.diagonal(axis1=1, axis2=2))
     kernel = compiled.kernel("jaxcal.information.rank_kernel")
@@ -402,11 +385,8 @@ def _cholesky_factors(
 
 
 def _by_rotations(rows: Array, far: bool) -> tuple[Array, Array, Array]:
-    """Inverse(R), R and ``rows @ inverse(R)``, by rotations, twice.
-
-    Columns with rows ``far`` from the others come first, and these rows, so that the
-    others keep their digits; what is left of rounding becomes zero.
-    """
+    """Inverse(R), R and ``rows @ inverse(R)``, by rotations, twice; columns with rows
+    ``far`` from the others come first, and these rows, so that others keep digits."""
     p = rows.shape[1]
     order, sorted_rows = np.arange(p), rows
     if far:
@@ -430,10 +410,8 @@ def _by_rotations(rows: Array, far: bool) -> tuple[Array, Array, Array]:
 
 
 def _sizes(blocks: Array, centred: _CentredBlocks) -> Array:
-    """(S, p) of what the blocks were computed beside: the largest entries.
-
-    A row that is far from the others, as x = 1e7 beside 1, is rounded more than these.
-    """
+    """(S, p) largest entries, beside which the blocks were computed; a row that is far
+    from the others, as x = 1e7 beside 1, is rounded more than these."""
     largest = centred.largest * (1.0 if centred.scale is None else centred.scale)
     for n in () if centred.far is None else np.flatnonzero(centred.far):
         size = np.abs(blocks[n]).reshape(-1, blocks.shape[3])

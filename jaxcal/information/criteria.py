@@ -55,13 +55,10 @@ class Criteria:
 
 
 def criteria(blocks: Array, root: Array, region: Array, times: int) -> Criteria:
-    """Every criterion of information that is not singular.
+    """Every criterion of blocks (N, q, p), not singular, and a prior's root (r, p).
 
-    Args:
-        blocks: (N, q, p) measured.
-        root: (r, p) of the prior precision, r = 0 without one.
-        region: (R, m, p) where predictions are wanted, for I and G.
-        times: m, how often the eigenvalues of the information count.
+    ``region`` (R, m, p) is where predictions are wanted, ``times`` how often the
+    eigenvalues of the information count.
     """
     p = blocks.shape[2]
     s = np.linalg.svd(np.concatenate([blocks.reshape(-1, p), root]), compute_uv=False)

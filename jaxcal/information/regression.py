@@ -33,14 +33,7 @@ def _as_commands(commands: ArrayLike) -> Array:
 
 
 def regressors(commands: ArrayLike) -> Array:
-    """Regressors ``Z = [commands, 1]``.
-
-    Args:
-        commands: (..., N, n) in any unit.
-
-    Returns:
-        (..., N, n + 1).
-    """
+    """Regressors ``Z = [commands, 1]`` (..., N, n + 1) of commands (..., N, n)."""
     commands = _as_commands(commands)
     *batch, n = commands.shape
     rows = np.empty((*batch, n + 1))
@@ -51,9 +44,8 @@ def regressors(commands: ArrayLike) -> Array:
 def regression_matrix(commands: ArrayLike, num_outputs: int | None = None) -> Array:
     """Regression matrix of the stacked measurements ``[y_1; y_2; ...; y_N]``.
 
-    Columns follow the paper's parameter vector: A row by row, then the biases,
-    ``[a11 a12 a13 a21 ... a33 | bx by bz]`` (Equation 9); rows are the outputs of
-    posture 1, then of posture 2, and so on (Equation 2).
+    Columns are A row by row, then the biases, ``[a11 a12 a13 a21 ... a33 | bx by bz]``
+    (Equation 9); rows the outputs of posture 1, then of posture 2, ... (Equation 2).
 
     Args:
         commands: (..., N, n).

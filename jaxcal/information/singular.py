@@ -41,17 +41,8 @@ def power_of_two(size: NDArray[Any]) -> Array:
 def _lengths(
     columns: Array, largest: Array, count: int, computed: bool
 ) -> tuple[Array, Array]:
-    """Lengths of columns (S, R, p), and the share of each set that is rounding.
-
-    Args:
-        columns: of entries near 1 before they were centred.
-        largest: (S, p) these entries.
-        count: rows that rounding errors add up over.
-        computed: the columns are rounded themselves.
-
-    Returns:
-        (S, p), zero where a column is rounding, and (S,).
-    """
+    """Lengths (S, p) of columns (S, R, p), zero where they are rounding, and the share
+    (S,) of each set that is; arguments as of ``rank_rule``."""
     resolution = _EPS * max(count, 1)
     lengths = np.sqrt((columns * columns).sum(axis=1))
     with np.errstate(over="ignore"):  # of a column without a length
@@ -68,16 +59,13 @@ def _lengths(
 def rank_rule(
     columns: Array, largest: Array, count: int | None = None, computed: bool = False
 ) -> tuple[list[int], Array]:
-    """Rank and log det of ``columns.T @ columns``.
+    """(S,) ranks and natural log det (-inf below rank p) of ``columns.T @ columns``.
 
     Args:
         columns: (S, R, p) stacked blocks of S sets, centred.
         largest: (S, p) largest entry of each column before centring.
         count: rows that rounding errors add up over; R when not given.
         computed: the columns are rounded themselves, as a model's derivatives are.
-
-    Returns:
-        (S,) ranks, and (S,) natural log det, -inf where the rank is below p.
     """
     num_rows, p = columns.shape[1:]
     lengths, rounding = _lengths(columns, largest, count or num_rows, computed)
@@ -144,13 +132,9 @@ def null_directions(
 
 
 def significant(size: NDArray[Any], squares: bool = False, off: float = 0.0) -> Mask:
-    """Which singular values (..., r) of columns in comparable units are no rounding.
-
-    Args:
-        size: singular values, or eigenvalues.
-        squares: they are eigenvalues of a product of these columns with themselves.
-        off: share by which the columns are off beyond rounding, as differences are.
-    """
+    """Which singular values (..., r) of columns in comparable units are no rounding;
+    or (``squares``) eigenvalues of a product of these columns with themselves. ``off``
+    is the share by which columns are off beyond rounding, as differences are."""
     share = 8.0 * _EPS * size.shape[-1] if squares else max(SINGULAR, _OFF * off)
     return size > share * size.max(axis=-1, initial=0.0, keepdims=True)
 
@@ -161,10 +145,7 @@ def flat(size: NDArray[Any], beside: Any) -> Mask:
 
 
 def exact_zeros(directions: Array, off: float = 0.0) -> Array:
-    """Directions (..., p) in comparable units; an entry that is rounding becomes 0.
-
-    ``off``: share by which the columns that they come from are off beyond rounding.
-    """
+    """Directions (..., p) in comparable units, entries that are rounding made 0."""
     size = np.abs(directions)
     least = max(_NONE, _OFF * off) * size.max(axis=-1, initial=0.0, keepdims=True)
     return np.where(size > least, directions, 0.0)
@@ -182,14 +163,8 @@ def require_excited(
     argument: str = "commands",
     which: str = "postures",
 ) -> None:
-    """Refuse commands (N, n) that leave a direction unexcited, and name it.
-
-    Args:
-        commands: (N, n).
-        names: n names of the axes.
-        argument, which: what the message calls the commands: "candidates must vary in
-            every direction, but the 5 available ones lie in one plane ...".
-    """
+    """Refuse commands (N, n) that leave a direction unexcited, and name it; the message
+    calls them ``argument`` ("candidates") and ``which`` ("available ones")."""
     count, n = commands.shape
     offset = commands - commands.sum(axis=0) / count if count else commands
     largest = np.abs(commands).max(axis=0, initial=0.0)

@@ -19,11 +19,11 @@ from numpy.typing import ArrayLike
 
 from jaxcal.calibration.check import Check
 from jaxcal.calibration.fit import Fit
+from jaxcal.calibration.verdict import left_out
 from jaxcal.checks import Array
 from jaxcal.extras import needs
 from jaxcal.files import write_text
 from jaxcal.models.model import Quantity
-from jaxcal.models.verdict import left_out
 from jaxcal.reports import page as pages
 from jaxcal.reports.budget import Budget, Source, budget
 from jaxcal.tables import COMMANDS, MEASURED

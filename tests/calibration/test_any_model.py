@@ -13,6 +13,7 @@ from scipy import optimize, stats
 import jaxcal
 from jaxcal.calibration import Calibration, identify
 from jaxcal.calibration.losses import LOSSES, Loss, constants
+from jaxcal.calibration.verdict import Verdict, verdict
 from jaxcal.models import (
     Affine,
     FromFunction,
@@ -26,7 +27,6 @@ from jaxcal.models import (
     SerialChain,
     identifiability,
 )
-from jaxcal.models.verdict import Verdict, verdict
 
 
 class Wave:

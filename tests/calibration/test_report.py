@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import jaxcal
+from jaxcal.calibration.verdict import left_out
 from jaxcal.commands import main
-from jaxcal.models.verdict import left_out
 from jaxcal.reports.calibration import SCHEMA, leverage, moved
 
 
