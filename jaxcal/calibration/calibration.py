@@ -136,14 +136,12 @@ class Calibration(Fit):
         return self.whole.calibrated(self.estimate)
 
     def to_urdf(self, path: str | os.PathLike[str], *, force: bool = False) -> str:
-        """The arm's own file, corrected; see ``jaxcal.models.SerialChain.write``.
+        """Write the arm's own file, corrected; returns the tip link.
 
         Files cannot hold compliance and gear harmonics. Without compliance the arm is
         moved as a whole so that its tip agrees best with the calibration's over its
-        range; without harmonics only, the rest is fitted again. A warning gives the
-        difference.
-
-        Returns the tip link.
+        range; without harmonics only, the rest is fitted again. A warning says by how
+        much they differ.
         """
         return self.model.write("urdf", path, self._for_file(), force=force)
 
@@ -177,8 +175,7 @@ class Calibration(Fit):
         Args:
             path: the file to write.
             servos: the file that the postures were read with.
-            names: motors whose names differ from the joints': {"Rotation":
-                "shoulder_pan"}.
+            names: motors not named as the joints: {"Rotation": "shoulder_pan"}.
             force: overwrite an existing file.
 
         Returns:

@@ -19,11 +19,8 @@ _HALVINGS = 26  # of a search for the smallest change
 
 @dataclasses.dataclass(frozen=True)
 class LevelTests:
-    """Tests of whitened readings, one for each of G levels of noise, and their power.
-
-    Each level was estimated by itself, so each has an F test (chi-square where the
-    noise is known). The least of their p-values counts, by Sidak.
-    """
+    """An F test of whitened readings for each of G levels of noise (chi-square where it
+    is known), of which the least p-value counts, by Sidak; and their power."""
 
     counts: NDArray[np.intp]  # (G,) readings of each level
     dof: float  # of the noise of a level
@@ -38,10 +35,8 @@ class LevelTests:
         return float(-np.expm1(len(self.counts) * special.log1p(-of_levels.min())))
 
     def power(self, shifts: Array) -> Array:
-        """(...,) chance that changes with noncentralities (..., G) are seen.
-
-        The squared estimate of a noise over the true variance is a chi-square / dof.
-        """
+        """(...,) chance that changes with noncentralities (..., G) are seen. The
+        squared estimate of a noise over the true variance is a chi-square / dof."""
         from scipy import special
 
         alarms = -np.expm1(np.log1p(-self.alarms) / len(self.counts))  # of each level
@@ -63,19 +58,16 @@ class LevelTests:
         return np.asarray(1.0 - missed.prod(axis=-1))
 
     def smallest(self, seen: Array) -> Array:
-        """(p,) changes that are seen with the power asked for, infinite where none is.
-
-        ``seen`` are noncentralities (p, G) of a change by one.
-        """
+        """(p,) changes that are seen with the power asked for, inf where none is, by
+        noncentralities ``seen`` (p, G) of a change by one."""
         total = seen.sum(axis=1, keepdims=True)
         shares = np.divide(seen, total, out=np.ones_like(seen), where=total > 0.0)
         shares, of_share = np.unique(shares.round(12), axis=0, return_inverse=True)
         low, high = np.zeros((2, len(shares), 1))
         high += 1.0
-        while True:
-            short = (self.power(high * shares) < POWER)[:, None] & (high < 1e12)
-            if not short.any():
-                break
+        while (
+            short := (self.power(high * shares) < POWER)[:, None] & (high < 1e12)
+        ).any():
             low, high = np.where(short, high, low), np.where(short, 4.0 * high, high)
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
@@ -86,10 +78,8 @@ class LevelTests:
 
 
 class ChangeTests:
-    """A test of all readings, and one of each slip, the largest of which counts.
-
-    Each kind has half of the false alarms; where nothing slips, one has all.
-    """
+    """A test of all readings, and one of each slip, the largest of which counts; each
+    kind has half of the false alarms."""
 
     def __init__(
         self, counts: NDArray[np.intp], calibration: Fit, slips: int, least: float = 1.0

@@ -110,8 +110,7 @@ def check(
 
     A chi-square test (F where the noise was estimated, one for each level of it) of the
     readings against the predictions, with the uncertainty of both, at 5 % false alarms.
-    For an arm half of these go to a test of each joint's zero (Sidak): the slip of a
-    joint is one direction in many readings.
+    For an arm half of these go to a test of each joint's zero (Sidak).
 
     Args:
         calibration: what is checked.
@@ -120,17 +119,15 @@ def check(
             have them.
         tolerance: how far, root mean square over the calibration's commands, the
             outputs may drift: a number in the unit of the first (lengths of a pose), or
-            of each unit, {"mm": 0.5, "deg": 0.1}. When not given three times the
-            standard deviation of these measurements: the noise and what the calibration
-            does not know.
+            of each unit, {"mm": 0.5, "deg": 0.1}. By default three standard deviations
+            of these measurements: the noise and what the calibration does not know.
         placed_anew: for an arm: sockets, planes, anchors or the board were moved since
             the calibration. Parameters that cannot be separated from that, such as the
             first joint's zero, are named (``blind``) and not checked.
 
     Returns:
-        "holds", "does not hold", or "cannot be told": a drift of one parameter by more
-        than the tolerance would be detected with less than 80 % probability; the next
-        step gives the number of rows needed (``enough``).
+        "holds", "does not hold", or "cannot be told": a drift of one parameter by the
+        tolerance is detected with less than 80 %; ``enough`` says how many rows would.
     """
     all_commands, measured, _ = recorded(calibration.model, commands, measured)
     say_order(all_commands, measured)
@@ -238,10 +235,8 @@ def _deviations(
 
 
 def _taken_up(calibration: Fit, placed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(p,) parameters that do nothing but what moving the ``placed`` (p,) ones does.
-
-    At the calibration's postures: at a few that are alike any parameter would be one.
-    """
+    """(p,) parameters that do nothing but what moving the ``placed`` (p,) ones does, at
+    the calibration's postures: at a few alike any parameter would be one."""
     at = calibration.commands, calibration.parameters
     by = np.asarray(calibration.model.jacobian(*at))
     by = (by / np.asarray(calibration.noise_std)[:, None]).reshape(-1, by.shape[-1])

@@ -113,10 +113,8 @@ class Fit:
 
     @property
     def covariance(self) -> Array | None:
-        """(p, p) of ``parameters``, directions that nothing determines held fixed.
-
-        None where the noise is unknown.
-        """
+        """(p, p) of ``parameters``, directions that nothing determines held fixed; None
+        where the noise is unknown."""
         if self.joint_covariance is None:
             return None
         p, turn = len(self.names), self.to_parameters
@@ -172,16 +170,8 @@ class Fit:
         return self._affine("bias")[1]
 
     def confidence_intervals(self, confidence: float = 0.95) -> Array:
-        """(p, 2) lower and upper end for each parameter, one at a time.
-
-        Student's t where the noise was estimated, the normal where it was given.
-
-        Args:
-            confidence: probability in (0, 1).
-
-        Raises:
-            ValueError: the noise is unknown, or ``confidence`` is not in (0, 1).
-        """
+        """(p, 2) lower and upper end for each parameter, one at a time, by Student's t
+        where the noise was estimated. A ValueError where it is unknown."""
         self.require_noise("confidence intervals")
         half = self.quantile(confidence) * np.asarray(self.standard_errors)
         return np.stack([self.parameters - half, self.parameters + half], axis=-1)
@@ -195,9 +185,8 @@ class Fit:
     ) -> tuple[Array, Array]:
         """Lower and upper end, (..., m) each; arguments as for ``predict_std``."""
         centre = self.predict(commands)
-        half = self.quantile(confidence) * self.predict_std(
-            commands, new_measurement=new_measurement
-        )
+        std = self.predict_std(commands, new_measurement=new_measurement)
+        half = self.quantile(confidence) * std
         return centre - half, centre + half
 
     # -- the fit -----------------------------------------------------------------------
@@ -236,24 +225,16 @@ class Fit:
         rows = points.reshape(-1, self.num_inputs)
         sides = [(self.input_names, rows, self.commands)]
         say_far("command", self.loss_weights > 0.0, sides)
-        found = predict(self.whole, rows, self.estimate)
-        return found.reshape(*points.shape[:-1], self.num_outputs)
+        outputs = predict(self.whole, rows, self.estimate)
+        return outputs.reshape(*points.shape[:-1], self.num_outputs)
 
     def predict_std(
         self, commands: ArrayLike, *, new_measurement: bool = False
     ) -> Array:
-        """Standard deviation of ``predict``.
+        """(..., m) standard deviation of ``predict`` at commands (..., n), infinite
+        where it depends on undetermined parameters. A ValueError without noise.
 
-        Args:
-            commands: (..., n).
-            new_measurement: add the noise of the readings of one more measurement of
-                weight 1, for comparison with it.
-
-        Returns:
-            (..., m); infinite where it depends on undetermined parameters.
-
-        Raises:
-            ValueError: the noise is unknown.
+        ``new_measurement`` adds the noise of one more measurement of weight 1.
         """
         points = self.points("commands", commands, self.num_inputs)
         noise = self.require_noise("prediction uncertainty")
@@ -297,9 +278,8 @@ class Fit:
     @property
     def unseen(self) -> Array:
         """(z, P) directions that nothing determines, as ``linear`` has the slopes."""
-        null = np.zeros((0, len(self.estimate)))
-        if self.unidentified is not None:
-            null = self.unidentified
+        null = self.unidentified
+        null = np.zeros((0, len(self.estimate))) if null is None else null
         if self.centre is None:
             return null
         return null @ np.asarray(self.model.centred(self.centre)).T
@@ -365,10 +345,8 @@ class Fit:
 
 def above_rounding(variance: Array, rows: Array, covariance: Array) -> Array:
     """(...) variances of rows (..., P), none below what rounding leaves of theirs.
-
-    Where directions are known to very different degrees, a sum of their covariance
-    (P, P) may cancel to zero or less: that is not known to be certain.
-    """
+    Where directions are known to very different degrees, a sum of their covariance (P,
+    P) may cancel to zero or less: that is not known to be certain."""
     terms = (rows**2 * np.diag(covariance)).sum(axis=-1)
     return np.asarray(np.maximum(variance, np.finfo(np.float64).eps * terms))
 

@@ -249,11 +249,9 @@ def _centre(
     model: Model, commands: Array, weights: Array, excited: tuple[str, ...]
 ) -> tuple[Array | None, Array | None]:
     """(n,) what commands are counted from, as a bias and slopes far from zero can
-    hardly be told apart, and (p, p) what makes of parameters those from there.
-
-    None where that changes more than the parameters, or the commands say little, which
-    is refused with the names that are ``excited``.
-    """
+    hardly be told apart, and (p, p) what makes of parameters those from there. None
+    where that changes more than the parameters, or the commands say little, which is
+    refused with the names that are ``excited``."""
     centre = weights @ commands / weights.sum()
     to_centred = model.centred(centre)
     if to_centred is None:

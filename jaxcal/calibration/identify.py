@@ -133,7 +133,7 @@ def identify(
         if not isinstance(unit, str):
             raise ValueError(f"{name} must be text, got {unit!r}")
     provenance = _provenance((u, y, weight), notes)
-    about |= dict(input_names=inputs, output_names=outputs, provenance=provenance)
+    about |= {"input_names": inputs, "output_names": outputs, "provenance": provenance}
     model = require_fitting(_affine(n, m) if model is None else model, u, y)
     if accuracy is not None:
         units = model.accuracy_units(measured_unit)
@@ -169,7 +169,10 @@ def identify(
         calibration = model.improved(calibration)
     if sessions is not None:
         calibration = _with_sessions(calibration, sessions)
-    if not calibration.verdict.good and not _exact(calibration):
+    # Of y = A u + b by as many rows as it needs the summary says that it is unchecked.
+    unchecked = calibration.noise_std is None and calibration.dof < 0.5
+    exact = unchecked and calibration.affine is not None
+    if not exact and not calibration.verdict.good:
         warning = CalibrationWarning(str(calibration.verdict))
         warning.new = True
         warnings.warn(warning, stacklevel=2)
@@ -241,12 +244,6 @@ def _with_sessions(calibration: Calibration, labels: ArrayLike) -> Calibration:
 _affine = functools.lru_cache(Affine)
 
 
-def _exact(calibration: Calibration) -> bool:
-    """y = A u + b of as many rows as it needs, which the summary says is unchecked."""
-    affine = calibration.affine is not None
-    return affine and calibration.noise_std is None and calibration.dof < 0.5
-
-
 def _noise(
     noise: Noise | None,
     noise_std: ArrayLike | None,
@@ -267,7 +264,7 @@ def _noise(
     noise = noise or Noise()
     # At most a level of each output, known or not, in every reading.
     plain = noise.covariance is None and noise.command_std is None
-    plain = plain and not noise.by_row
+    plain = plain and (noise.std is None or np.ndim(noise.std) < 2)
     level = noise_std if noise.std is None else noise.std
     if plain and level is not None:
         noise = Noise(std=levels("noise_std", level, num_outputs))

@@ -95,9 +95,7 @@ def command_for(
 
 def no_inverse(fit: Fit) -> str:
     """Why ``command_for`` refuses whatever is desired; "" where it may find a command.
-
-    Of a linear model with as many inputs as outputs or more; others are not asked.
-    """
+    Of a linear model with as many inputs as outputs or more; others are not asked."""
     if fit.num_outputs > fit.num_inputs or not fit.model.linear:
         return ""
     responses, of_map = Responses(fit), fit.affine is not None
@@ -132,8 +130,8 @@ def limits_of(limits: ArrayLike | None, names: tuple[str, ...]) -> Array:
 
 
 def _sureness(fit: Fit, spread: Array) -> tuple[float, Array]:
-    """Least singular value of an affine map's matrix, in standard deviations; (n,) its
-    direction of the commands in their ``spread``. Infinite without noise."""
+    """Least singular value of an affine map's matrix, in standard deviations (inf
+    without noise); (n,) its direction of the commands in their ``spread``."""
     scaled = fit.matrix * spread
     rows = np.linalg.norm(scaled, axis=1)
     turn, size, right = np.linalg.svd(scaled / np.where(rows > 0.0, rows, 1.0)[:, None])
@@ -178,12 +176,9 @@ class Responses:
         return turn, singular, right, rows
 
     def require_regular(self, commands: Array) -> tuple[Array, Array, Array, Array]:
-        """Refuse commands at which a direction of the outputs does not respond.
-
-        Returns:
-            Of the last command the singular value decomposition of the derivative, its
-            columns in spreads and its rows divided by their length, which comes last.
-        """
+        """Refuse commands at which a direction of the outputs does not respond; the
+        singular value decomposition of the last one's derivative, its columns in
+        spreads and its rows divided by their length, and this."""
         effect = self.effects(commands)
         rows = np.linalg.norm(effect, axis=-1)
         for i, j in np.argwhere(flat(rows, np.abs(self.outputs(commands))))[:1]:
@@ -252,13 +247,12 @@ class _Search(Responses):
 
     def say_clipped(self, free: Array, commands: Array) -> None:
         """Warn of the targets (P, n) that the limits keep from being reached."""
-        rows = np.arange(len(commands))
-        arrived = self._arrived(self.gap(commands, rows))
-        moved = np.abs(commands - free) / self.spread
+        arrived = self._arrived(self.gap(commands, np.arange(len(commands))))
+        moved = (np.abs(commands - free) / self.spread).argmax(axis=1)
         clipped = [
             f"target {i + 1}, {self.fit.input_names[j]} = {free[i, j]:.6g} to "
             f"{commands[i, j]:.6g}"
-            for i, j in zip(rows, moved.argmax(axis=1), strict=True)
+            for i, j in enumerate(moved)
             if not arrived[i]
         ]
         if clipped:
@@ -329,8 +323,7 @@ class _Search(Responses):
         """(n,) within the bounds, whose output of an affine map is nearest."""
         from scipy import optimize
 
-        matrix, bias = self.model.affine(self.fit.estimate)  # type: ignore[misc]  # is affine
-        scaled = matrix * self.spread
+        scaled, bias = self.fit.matrix * self.spread, self.fit.bias
         unit = np.abs(scaled).max()
         solution = optimize.lsq_linear(
             scaled / unit,

@@ -244,10 +244,8 @@ class FitSolution:
         return self.problem.model.parameter_sizes()
 
     def _share(self, levels: NDArray[np.intp]) -> None:
-        """Let outputs of the same number in ``levels`` (q,) share one level.
-
-        The least level of contacts, whose readings are zero, is in usual noise.
-        """
+        """Let outputs of the same number in ``levels`` (q,) share one level. The least
+        level of contacts, whose readings are zero, is in usual noise."""
         self.shared, self.same = levels, 1.0 * (levels[:, None] == levels)
         self.floor = np.zeros(len(levels))
         if not self.problem.noise_known:
@@ -319,9 +317,7 @@ class FitSolution:
 
     def _directions(self) -> Array:
         """(F, r) changes of the parameters, those that nothing determines left out.
-
-        Orthogonal in what they change, the readings in noise and the prior.
-        """
+        Orthogonal in what they change, the readings in noise and the prior."""
         rows, _, scale = self.system = self._system(0.0)
         inverse, across = _cholesky(rows, 0.0)
         # The least singular value is above one over the length of the inverse.
@@ -340,11 +336,9 @@ class FitSolution:
         return np.hstack(directions)
 
     def direct(self) -> bool:
-        """Take the one step that is the answer; True where that is so.
-
-        Of least squares of a linear model without a prior, where the levels of noise,
-        if there are several, each have parameters of their own.
-        """
+        """Take the one step that is the answer; True where that is so. Of least squares
+        of a linear model without a prior, where the levels of noise, if there are
+        several, each have parameters of their own."""
         problem = self.problem
         if self.basis is None or problem.loss or len(self.facts) or self.informed:
             return False
@@ -442,10 +436,8 @@ class FitSolution:
         return commands
 
     def _system(self, damping: float) -> tuple[Array, Array, Array]:
-        """Weighted rows (R, F), residuals (R,), scale (F,): readings, prior, facts.
-
-        By directions, (R, r) and (r,), where the model is linear.
-        """
+        """Weighted rows (R, F), residuals (R,), scale (F,): readings, prior, facts. By
+        directions, (R, r) and (r,), where the model is linear."""
         rows, right = self._reduce(damping)
         weight = np.sqrt(self.weights)[:, None]
         rows = (weight[..., None] * rows).reshape(-1, rows.shape[-1])
@@ -553,11 +545,9 @@ class FitSolution:
         return self.whole and 1e-16 < self.last_move < 0.5 * before
 
     def _curve(self, step: Array, size: int) -> Array:
-        """(size,) half the residuals' second derivative along a step (F,).
-
-        Geodesic acceleration (Transtrum and Sethna, 2012): in a curved canyon the
-        step that follows the curve is far longer.
-        """
+        """(size,) half the residuals' second derivative along a step (F,). Geodesic
+        acceleration (Transtrum and Sethna, 2012): in a curved canyon the step that
+        follows the curve is far longer."""
         along = np.zeros(size)
         theta = self._changed(_AHEAD * step)
         off = self._off(self.commands, theta, finite=False)
@@ -689,10 +679,8 @@ def _cholesky(
     rows: Array, damping: float, once: bool = False
 ) -> tuple[Array | None, Array]:
     """The inverse of R, and Q of the damped rows (R, F); None where it is not exact.
-
     Cholesky twice (Yamamoto et al., 2015) is as exact as Householder's reflections
-    where it succeeds, and does not wait for BLAS's threads in every column.
-    """
+    where it succeeds, and does not wait for BLAS's threads in every column."""
     from scipy.linalg.lapack import dpotrf, dtrtri
 
     turned, inverse = rows, None

@@ -30,6 +30,8 @@ _TURNS = (2, 3, 4, 5, 6)  # readings taken in turn
 _ROUNDS = 4
 _SAME = 0.02  # of the logarithm of a profile, which would not change in another round
 _LEAST = 10.0  # degrees of freedom of a run of readings
+_ONE = "one level for all {} readings of a measurement"
+_OWN = "one level for each of the {} readings"
 
 
 class _Levels(NamedTuple):
@@ -42,10 +44,8 @@ class _Levels(NamedTuple):
 
 
 def are_shared(problem: FitProblem) -> bool:
-    """Whether few measurements are of parameters that several readings share.
-
-    Of noise that is of nothing but the readings, and whose levels are not known.
-    """
+    """Whether few measurements are of parameters that several readings share. Of noise
+    that is of nothing but the readings, and whose levels are not known."""
     model, many = problem.model, not 1 < len(problem.commands) < _FEW
     if problem.noise_known or problem.command_std.any() or model.multiplicity:
         return False
@@ -60,27 +60,29 @@ def pooled(problem: FitProblem) -> tuple[FitProblem, FitSolution, str]:
     """The fit with as many levels of noise as the readings, independent and each with a
     level of its own in ``problem``, tell; and which, in words."""
     q = len(problem.levels)
-    levels = _Levels(_one(q), np.zeros(q, np.intp), None, 1)
+    levels = _Levels(_ONE.format(q), np.zeros(q, np.intp), None, 1)
     fitted = _with(problem, levels)
     try:
         solution = solve(fitted)
     except ValueError:  # readings in other units may not converge together
-        return problem, solve(problem), _own(q)
+        return problem, solve(problem), _OWN.format(q)
     for _ in range(_ROUNDS):
         better = _best(*_squares(problem, fitted, solution))
-        if better.says == levels.says and _alike(better.profile, levels.profile):
-            break
+        if better.says == levels.says:  # a profile by less than it is known to
+            off = 0.0
+            if better.profile is not None and levels.profile is not None:
+                off = np.abs(np.log(better.profile / levels.profile)).max()
+            if off < _SAME:
+                break
         levels, fitted = better, _with(problem, better)
         solution = solve(fitted, solution)
     return fitted, solution, levels.says
 
 
 def levels_differ(problem: FitProblem, solution: FitSolution) -> bool:
-    """Whether levels that are shared contradict the residuals (F test, 0.1 %).
-
-    Those without what is known besides: a wrong distance of two sockets is no noise
-    along it.
-    """
+    """Whether levels that are shared contradict the residuals (F test, 0.1 %). Those
+    without what is known besides: a wrong distance of two sockets is no noise along
+    it."""
     q = len(solution.freedom)
     if problem.noise_known or q == 1 or problem.command_std.any():
         return False
@@ -114,13 +116,6 @@ def _by_facts(problem: FitProblem, solution: FitSolution) -> Array:
     size = np.linalg.norm(rows, axis=0) + 1e-300
     step = np.linalg.lstsq(rows / size, right, rcond=1e-10)[0] / size
     return np.asarray(slopes @ step)
-
-
-def _alike(new: Array | None, old: Array | None) -> bool:
-    """Whether profiles differ by less than what they are known to."""
-    if new is None or old is None:
-        return new is old
-    return bool(np.abs(np.log(new / old)).max() < _SAME)
 
 
 def _with(problem: FitProblem, levels: _Levels) -> FitProblem:
@@ -162,8 +157,8 @@ def _best(square: Array, freedom: Array) -> _Levels:
         cost = levels.numbers * np.log(freedom.sum())
         return float(fit[seen].sum() + cost)
 
-    one = _Levels(_one(q), none, None, 1)
-    others = [_Levels(_own(q), np.arange(q), None, q)]
+    one = _Levels(_ONE.format(q), none, None, 1)
+    others = [_Levels(_OWN.format(q), np.arange(q), None, q)]
     for turn in _TURNS:
         if q % turn == 0 and q > turn:
             says = f"one level for each of {turn} readings in turn"
@@ -226,11 +221,3 @@ def _smooth(
     profile = np.exp(0.5 * (basis @ weights))
     says = f"a level that varies smoothly over the {q} readings"
     return _Levels(says, np.zeros(q, np.intp), profile, degree + 1)
-
-
-def _one(q: int) -> str:
-    return f"one level for all {q} readings of a measurement"
-
-
-def _own(q: int) -> str:
-    return f"one level for each of the {q} readings"

@@ -47,11 +47,9 @@ class PriorScales(NamedTuple):
 def group_scales(
     problem: FitProblem, solution: FitSolution, start: PriorScales | None
 ) -> PriorScales:
-    """The factors, of the problem's prior, that make the readings most probable.
-
-    The model is made linear at ``solution``; the search begins at ``start``, with
-    factors of one where there is nothing.
-    """
+    """The factors, of the problem's prior, that make the readings most probable. The
+    model is made linear at ``solution``; the search begins at ``start``, with factors
+    of one where there is nothing."""
     p = len(problem.mean)
     of_model = problem.model.error_groups()
     assert of_model is not None
@@ -95,11 +93,8 @@ def _thought(groups: ErrorGroups) -> tuple[Array, Array]:
 
 
 class _Evidence:
-    """-2 log marginal likelihood of the scales, with what is thought of them.
-
-    The model is linear about a solution; scales are the logarithms (G + 1,) of the
-    groups' factors and the level.
-    """
+    """-2 log marginal likelihood of the logarithms (G + 1,) of the groups' factors and
+    the level, with what is thought of them; the model is linear about a solution."""
 
     def __init__(
         self, problem: FitProblem, solution: FitSolution, groups: ErrorGroups
@@ -202,7 +197,7 @@ def misfit_scale(
     )
     evidence = _Evidence(whole, beside, groups)
     logs, least = scales.logs.copy(), np.zeros(len(_TRIED))
-    rest = np.flatnonzero(np.arange(len(logs)) != len(logs) - 2)
+    rest = np.delete(np.arange(len(logs)), -2)
     for k, tried in enumerate(_TRIED):
         logs[-2] = tried
         for _ in range(2):  # steps of the other scales
@@ -269,13 +264,11 @@ def covariance_of_scales(
 
 def _moments(variance: Array, wide: Array) -> tuple[Array, Array]:
     """(G,) mean, above the most probable value, and variance of logarithms of sizes.
-
     Where few errors show a size its logarithm has a long upper tail, which ends as what
     was thought of it does. As many errors as make it so sharp have squares of a chi
     squared distribution. The mean is such that 1.96 standard deviations of an error of
     that size hold 95 % of them. ``variance`` (G,) is one over the curvature of the
-    density at its top, ``wide`` (G,) a standard deviation of what was thought.
-    """
+    density at its top, ``wide`` (G,) a standard deviation of what was thought."""
     from scipy import special
 
     logs = np.linspace(-3.0, 4.0, 141) * wide[:, None]
@@ -295,10 +288,8 @@ def _moments(variance: Array, wide: Array) -> tuple[Array, Array]:
 
 
 def _reduced(problem: FitProblem, solution: FitSolution) -> tuple[Array, Array]:
-    """Rows (R, s) by standard deviations of what a prior knows, and readings (R,).
-
-    Free of the parameters of which nothing is known.
-    """
+    """Rows (R, s) by standard deviations of what a prior knows, and readings (R,), free
+    of the parameters of which nothing is known."""
     free, precision = problem.free, problem.precision[problem.free]
     slopes = solution.by_theta
     more = len(problem.mean) - len(solution.problem.mean)

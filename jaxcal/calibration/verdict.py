@@ -90,10 +90,8 @@ def left_out(fit: Fit) -> Array:
 
 def between_sessions(fit: Fit, labels: NDArray[np.intp]) -> Array:
     """(m,) standard deviation of readings of another session, beyond what is expected.
-
     Each session of ``labels`` (N,) is predicted from a fit of the others; a ValueError
-    where none of these determines the model.
-    """
+    where none of these determines the model."""
     square, expected = [], []
     for label in np.unique(labels):
         try:
@@ -207,10 +205,8 @@ def _undetermined(fit: Fit) -> Reason | None:
 
 
 def _explains_nothing(fit: Fit) -> Reason | None:
-    """F test of the fit against constant outputs.
-
-    Of each output where it has parameters of its own and enough residuals, else of all.
-    """
+    """F test of the fit against constant outputs. Of each output where it has
+    parameters of its own and enough residuals, else of all."""
     from scipy import special
 
     m, dof = fit.num_outputs, float(fit.dof)
@@ -300,11 +296,9 @@ def _on_its_way(fit: Fit) -> Reason | None:
 
 
 def wrong_noise(fit: Fit) -> Reason | None:
-    """A noise that was given and that the residuals contradict, by which factor.
-
-    Too small where residuals are too large for it (``UNLIKELY``) and no few outliers
-    make them so; too large where it is over three times theirs.
-    """
+    """A noise that was given and that the residuals contradict, by which factor. Too
+    small where residuals are too large for it (``UNLIKELY``) and no few outliers make
+    them so; too large where it is over three times theirs."""
     from scipy import special
 
     if not fit.noise_known or fit.dof < 0.5:
@@ -337,12 +331,10 @@ def wrong_noise(fit: Fit) -> Reason | None:
 
 
 def _likelier_than_outliers(fit: Fit, distance: Array) -> bool:
-    """Whether another noise explains the residuals better than outliers do.
-
-    By the logarithms of both likelihoods: of one scale of all, or of one scale of each
+    """Whether another noise explains the residuals better than outliers do. By the
+    logarithms of both likelihoods: of one scale of all, or of one scale of each
     outlier, at squared ``distance`` (k,) in the noise that was given, where one row in
-    twenty is an outlier.
-    """
+    twenty is an outlier."""
     dof, q = fit.dof, fit.num_readings
     scale = -0.5 * dof * (np.log(fit.square / dof) + 1.0)
     of_rows = 0.5 * q * (np.log(distance / q) + 1.0) + _RARE
@@ -352,11 +344,9 @@ def _likelier_than_outliers(fit: Fit, distance: Array) -> bool:
 
 
 def bends(fit: Fit) -> Reason | None:
-    """Residuals that follow squares and products of the commands.
-
-    By an F test of these terms beside the model's own, to first order, where the noise
-    without them is at most half.
-    """
+    """Residuals that follow squares and products of the commands. By an F test of these
+    terms beside the model's own, to first order, where the noise without them is at
+    most half."""
     (count, n), m = fit.commands.shape, fit.measured.shape[1]
     every = max(count * m // _SAMPLE, 1)
     if count // every <= n * (n + 3) or n * (n + 3) * m > _TERMS:  # twice the terms
@@ -459,11 +449,9 @@ RULES: tuple[Rule, ...] = (
 
 
 def verdict(fit: Fit) -> Verdict:
-    """Good if no rule speaks against the fit and its inverse is not refused.
-
-    Where readings were not measured, that is the only reason given: the others would
-    follow from it.
-    """
+    """Good if no rule speaks against the fit and its inverse is not refused. Where
+    readings were not measured, that is the only reason given: the others would follow
+    from it."""
     first = never_measured(fit) or computed(fit)
     reasons = [first] if first else [reason for rule in RULES if (reason := rule(fit))]
     if not reasons and (refusal := not_invertible(fit)):

@@ -19,9 +19,8 @@ name      definition, noise of unit variance on every output             better
 ``O5``    1 / (1/s_1 + ... + 1/s_L)                                       larger
 ========  =============================================================  ==========
 
-``s_i`` are the L = m p singular values of the regression matrix, the roots of the
-eigenvalues of S. D, A, E and O1 to O5 depend on the unit of the commands; I and G do
-not, and neither does a ratio of two D.
+``s_i`` are the L = m p singular values of the regression matrix, the roots of S's
+eigenvalues. All but I, G and a ratio of two D depend on the unit of the commands.
 
 Sources: Atkinson, Donev and Tobias, Optimum Experimental Designs (D, A, I, E, G);
 Nahvi and Hollerbach, The noise amplification index for optimal pose selection in robot
@@ -56,10 +55,8 @@ class Criteria:
 
 def criteria(blocks: Array, root: Array, region: Array, times: int) -> Criteria:
     """Every criterion of blocks (N, q, p), not singular, and a prior's root (r, p).
-
     ``region`` (R, m, p) is where predictions are wanted, ``times`` how often the
-    eigenvalues of the information count.
-    """
+    eigenvalues of the information count."""
     p = blocks.shape[2]
     s = np.linalg.svd(np.concatenate([blocks.reshape(-1, p), root]), compute_uv=False)
     white = whiten(blocks[None], np.ones((1, len(blocks)), dtype=np.bool_), root)[0]

@@ -88,10 +88,8 @@ def rank_rule(
 
 
 def _distances(columns: Array) -> Array:
-    """(S, p) of each column of (S, R, p) to the span of those before it, R >= p.
-
-    Their product is the volume: cheaper than the singular values.
-    """
+    """(S, p) of each column of (S, R, p) to the span of those before it, R >= p. Their
+    product is the volume: cheaper than the singular values."""
     factor: Array = np.linalg.qr(columns, mode="raw")[0]
     return np.abs(factor.diagonal(axis1=1, axis2=2))
 
@@ -99,10 +97,8 @@ def _distances(columns: Array) -> Array:
 def null_directions(
     columns: Array, largest: Array, computed: bool = False
 ) -> list[Array]:
-    """Directions (p,) of which ``columns`` (R, p) say nothing by ``rank_rule``.
-
-    Axes that no row moves come first, then a basis of the rest of the null space.
-    """
+    """Directions (p,) of which ``columns`` (R, p) say nothing by ``rank_rule``. Axes
+    that no row moves come first, then a basis of the rest of the null space."""
     if len(columns):  # does the kernel leave no doubt that they are independent?
         kernel = compiled.kernel("jaxcal.information.rank_kernel")
         share = SINGULAR if computed else 0.0

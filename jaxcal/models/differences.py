@@ -19,6 +19,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from decimal import Decimal
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,32 +39,29 @@ _TWICE = 2.0  # standard deviations of noise that are stated as an error
 _EPS = float(np.finfo(np.float64).eps)
 
 
-@dataclasses.dataclass(frozen=True)
-class Stencil:
+class Stencil(NamedTuple):
     """Where f is asked, in steps, and what makes a derivative of the values."""
 
     offsets: Array  # (4,)
     fine: Array  # (4,) weights of the derivative times the step
     coarse: Array  # (4,) of a lower order, to see by how much they differ
-    amplifies: float  # noise of f, by the step
+
+    @property
+    def amplifies(self) -> float:
+        """Noise of f, by the step."""
+        return float(np.sqrt((self.fine**2).sum()))
 
 
-def _stencil(offsets: list[float], fine: list[float], coarse: list[float]) -> Stencil:
-    weights = np.array(fine)
-    size = float(np.sqrt((weights**2).sum()))
-    return Stencil(np.array(offsets), weights, np.array(coarse), size)
-
-
+_FORWARD = np.array(
+    [[0.0, 0.25, 0.5, 1.0], [-7.0, 32 / 3, -4.0, 1 / 3], [-6.0, 8.0, -2.0, 0.0]]
+)
+_CENTRAL = np.array(
+    [[1.0, 0.5, -0.5, -1.0], [-1 / 6, 4 / 3, -4 / 3, 1 / 6], [0.0, 1.0, -1.0, 0.0]]
+)
 STENCILS = {
-    "central": _stencil(
-        [1.0, 0.5, -0.5, -1.0], [-1 / 6, 4 / 3, -4 / 3, 1 / 6], [0.0, 1.0, -1.0, 0.0]
-    ),
-    "forward": _stencil(
-        [0.0, 0.25, 0.5, 1.0], [-7.0, 32 / 3, -4.0, 1 / 3], [-6.0, 8.0, -2.0, 0.0]
-    ),
-    "backward": _stencil(
-        [0.0, -0.25, -0.5, -1.0], [7.0, -32 / 3, 4.0, -1 / 3], [6.0, -8.0, 2.0, 0.0]
-    ),
+    "central": Stencil(*_CENTRAL),
+    "forward": Stencil(*_FORWARD),
+    "backward": Stencil(*-_FORWARD),
 }
 
 
@@ -113,11 +111,9 @@ def look(
     names: Sequence[str],
     periods: Array | None = None,
 ) -> Differences:
-    """Choose steps for derivatives at ``at`` (p,), where values are finite.
-
-    ``scale`` (p,) is by which the parameters may change, ``periods`` (q,) of readings
-    that wrap.
-    """
+    """Choose steps for derivatives at ``at`` (p,), where values are finite. ``scale``
+    (p,) is by which the parameters may change, ``periods`` (q,) of readings that
+    wrap."""
     noise, size = _noise(evaluate, at, scale, periods)
     ladders = [
         _Ladder(evaluate, at, scale, j, periods, noise, size) for j in range(len(at))
@@ -135,11 +131,9 @@ def look(
 def _noise(
     evaluate: Evaluate, at: Array, scale: Array, periods: Array | None
 ) -> tuple[Array, Array]:
-    """(q,) standard deviation of f's noise, and the largest reading.
-
-    Where most of an output's values are alike, as those of a program that prints six
-    digits, points that are farther apart say more.
-    """
+    """(q,) standard deviation of f's noise, and the largest reading. Where most of an
+    output's values are alike, as those of a program that prints six digits, points that
+    are farther apart say more."""
     least = 64.0 * _EPS * np.abs(at)
     along = np.where(np.arange(len(at)) % 2, -1.0, 1.0)
     noise = size = np.zeros(0)
@@ -177,21 +171,16 @@ def _of_differences(off: Array) -> Array:
         square = (table**2).mean(axis=(0, 1)) if table.size else np.zeros(off.shape[2])
         levels.append(np.sqrt(factor * square))
     by_order = np.array(levels)  # (6, q)
-    noise = by_order[-1].copy()
-    for q in range(by_order.shape[1]):
-        for k in range(1, len(by_order) - 2):
-            near = by_order[k : k + 3, q]
-            if near.max() <= 4.0 * near.min():
-                noise[q] = near[0]
-                break
+    noise = by_order[-1]
+    for k in range(len(by_order) - 3, 0, -1):  # the first three that are alike
+        near = by_order[k : k + 3]
+        noise = np.where(near.max(axis=0) <= 4.0 * near.min(axis=0), near[0], noise)
     return noise
 
 
 def _printed(values: Array) -> Array:
-    """(q,) unit of the last digit of values (R, q) that were printed, else 0.
-
-    Of the largest value; both significant digits and decimals are counted.
-    """
+    """(q,) unit of the last digit of values (R, q) that were printed, else 0. Of the
+    largest value; both significant digits and decimals are counted."""
     units = np.zeros(values.shape[1])
     for q, column in enumerate(values.T):
         shown = np.unique(np.abs(column[column != 0.0]))

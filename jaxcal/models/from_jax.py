@@ -26,10 +26,9 @@ class FromJax(Model):
         f: function of a command (n,) and parameters (p,) that returns (q,), or a scalar
             for one output; use ``jax.numpy``, no ``if`` on values.
         nominal: (p,) parameters of the machine as it was designed.
-        names: of the parameters; t1, t2, ... when not given.
-        num_inputs: n; that of the first commands when not given.
-        periods: (q,) of readings that wrap, 360 of an angle in degrees, inf of others;
-            one number for all.
+        names: of the parameters; by default t1, t2, ...
+        num_inputs: n; by default that of the first commands.
+        periods: (q,) or one for all readings that wrap: 360 degrees, inf of others.
     """
 
     names: tuple[str, ...]

@@ -41,8 +41,7 @@ _SETS = 6  # of parameters whose results are kept in memory
 
 
 class FromFunction(Model):
-    """``y = f(u, theta)`` of any function or program; derivatives by finite
-    differences.
+    """``y = f(u, theta)`` of any function or program; derivatives by differences.
 
     Steps are chosen from the noise of f at the first derivative; ``differences`` lists
     them with the errors of derivatives. Commands for which f raises, or returns values
@@ -50,19 +49,16 @@ class FromFunction(Model):
 
     Args:
         f: function of one command (n,) and parameters (p,) that returns the q readings,
-            or a program: its arguments with ``{name}`` where values go, which prints
-            them.
+            or a program that prints them: its arguments with ``{name}`` for values.
         nominal: (p,) parameters of the machine as it was designed.
-        scale: (p,) how far off each parameter may be: steps are a small part of it. A
-            tenth of the nominal value when not given, which then must not be 0.
-        names: of the parameters; t1, t2, ... when not given.
-        inputs: names of the n commands, or n; n is that of the first commands when not
-            given. A program needs them.
+        scale: (p,) how far off each parameter may be, of which steps are a small part;
+            by default a tenth of the nominal value, which then must not be 0.
+        names: of the parameters; by default t1, t2, ...
+        inputs: names of the n commands, which a program needs, or n; by default that of
+            the first commands.
         batch: f takes commands (N, n) and returns (N, q).
-        noise: usual noise of a reading, the default of ``select`` and ``identify``.
-        prior: prior of the parameters, the default of ``select`` and ``identify``.
-        periods: (q,) of readings that wrap, 360 of an angle in degrees, inf of others;
-            one number for all.
+        noise, prior: the usual ones, defaults of ``select`` and ``identify``.
+        periods: (q,) or one for all readings that wrap: 360 degrees, inf of others.
         processes: number that run f; f must then be importable. Or an executor of
             ``concurrent.futures``, such as a cluster's, which you close.
         timeout: seconds after which a run of a program has failed.
@@ -251,10 +247,8 @@ class FromFunction(Model):
         commands: ArrayLike,
         parameters: ArrayLike | None,
     ) -> Array:
-        """(N, ...) what ``make`` makes of commands and parameters.
-
-        Kept for the last sets of parameters: by command, of a long table as a whole.
-        """
+        """(N, ...) what ``make`` makes of commands and parameters. Kept for the last
+        sets of parameters: by command, of a long table as a whole."""
         rows, theta = self._asked(commands), as_parameters(self, parameters)
         whole = len(rows) > _LONG
         key = make.__name__, theta.tobytes() + (rows.tobytes() if whole else b"")

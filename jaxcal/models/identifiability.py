@@ -155,10 +155,8 @@ def _white(
     model: Model, jacobian: Array, commands: Array, mean: Array, noise: Noise | None
 ) -> Array:
     """(N, q, p) derivatives in comparable units, exactly zero where they are rounding.
-
     In the noise's, else the model's usual noise, else every output in its largest
-    derivative's.
-    """
+    derivative's."""
     still = without_effect(jacobian, model.parameter_sizes())
     jacobian = np.where(still, 0.0, jacobian)
     noise = model.default_noise() if noise is None else noise
@@ -208,22 +206,20 @@ def _parallel(
 ) -> tuple[list[int], list[Array]]:
     """The first of columns ``at`` that are multiples of each other, and vectors (k, p)
     of each of the others against it."""
-    first: list[int] = []
-    classes: list[list[Array]] = []
+    classes: dict[int, list[Array]] = {}  # by the first column of each
     for i in at:
+        first = [*classes]
         along = unit[:, first].T @ unit[:, i]
         apart = unit[:, [i]] - unit[:, first] * along
         sizes = np.append(1.0, np.linalg.norm(apart, axis=0))
         same = np.flatnonzero(~significant(sizes, off=off)[1:])
-        if same.size:
-            j = int(same[0])
+        if not same.size:
+            classes[int(i)] = []
+        for j in same[:1]:
             vector = np.zeros(unit.shape[1])
             vector[[first[j], i]] = 1.0, -np.sign(along[j])
-            classes[j].append(vector)
-        else:
-            first.append(int(i))
-            classes.append([])
-    return first, [np.array(vectors) for vectors in classes if vectors]
+            classes[first[j]].append(vector)
+    return [*classes], [np.array(vectors) for vectors in classes.values() if vectors]
 
 
 def _sparse_null(columns: Array, off: float) -> Array:

@@ -24,10 +24,8 @@ _NAMED = 5  # candidates that a warning names
 def predict(
     model: Model, commands: Array, parameters: Array, *, finite: bool = True
 ) -> Array:
-    """(N, q) outputs; with ``finite`` a ValueError names the first that is not.
-
-    Without it, as for trial steps, NaN stands for what the model refuses to answer.
-    """
+    """(N, q) outputs; with ``finite`` a ValueError names the first that is not. Without
+    it, as for trial steps, NaN stands for what the model refuses to answer."""
     shape = (len(commands), model.num_outputs)
     with np.errstate(all="ignore"):
         try:
@@ -95,10 +93,8 @@ def answered(
 
 
 def without_effect(jacobian: Array, sizes: Array) -> NDArray[np.bool_]:
-    """(p,) parameters by which a derivative (N, q, p) is zero, or rounding.
-
-    Outputs are judged one by one; ``sizes`` (p,) are ``Model.parameter_sizes``.
-    """
+    """(p,) parameters by which a derivative (N, q, p) is zero, or rounding. Outputs are
+    judged one by one; ``sizes`` (p,) are ``Model.parameter_sizes``."""
     largest = np.abs(jacobian).max(axis=0, initial=0.0)
     zero = ~largest.any(axis=0)
     sized = np.isfinite(sizes)

@@ -69,12 +69,11 @@ class Prior:
             )
 
     def sized(self) -> Prior:
-        """This prior with the scale of its groups estimated from the readings.
+        """This prior for an arm whose tolerances are not known.
 
-        Its standard deviations then say how errors compare within a group, not how
-        large they are: a factor each of lengths, turns of the axes, zeros of the joints
-        and their compliance follows from the readings by marginal likelihood. For an
-        arm whose tolerances are not known.
+        Its standard deviations then say how errors compare within a group: a factor
+        each of lengths, turns of the axes, zeros of the joints and their compliance
+        follows from the readings by marginal likelihood.
         """
         return dataclasses.replace(self, by_data=True)
 
@@ -321,11 +320,8 @@ def command_noise(noise: Noise, commands: Array, q: int) -> Array:
 
 
 def with_play(model: Any, noise: Noise, commands: Array, spread: Array) -> Noise:
-    """The noise of an arm's readings, that of its joints in it, to first order.
-
-    Joints are off by little, and by their own unknowns the arm's errors could not be
-    sized from the readings.
-    """
+    """The noise of an arm's readings, that of its joints in it, to first order: with
+    unknowns of their own the arm's errors could not be sized from the readings."""
     if not np.isfinite(spread).all():
         raise ValueError("command_std of an arm must be finite")
     slopes = model.command_jacobian(commands) * spread[:, None]
