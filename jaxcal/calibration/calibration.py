@@ -26,6 +26,8 @@ from jaxcal.models.uncertainty import Noise, Prior
 if TYPE_CHECKING:
     from jaxcal.calibration.pairing import Mispairing
 
+Path = str | os.PathLike[str]
+
 
 class Calibration(Fit):
     """The identified map from commands u (n inputs) to outputs y (m of them).
@@ -135,7 +137,7 @@ class Calibration(Fit):
         """The arm as calibrated, its parameters nominal, with Position()."""
         return self.whole.calibrated(self.estimate)
 
-    def to_urdf(self, path: str | os.PathLike[str], *, force: bool = False) -> str:
+    def to_urdf(self, path: Path, *, force: bool = False) -> str:
         """Write the arm's own file, corrected; returns the tip link.
 
         Files cannot hold compliance and gear harmonics. Without compliance the arm is
@@ -148,20 +150,18 @@ class Calibration(Fit):
     static_transform = late("jaxcal.arms.files.transforms:static_transform")
     to_transform = late("jaxcal.arms.files.transforms:to_transform")
 
-    def to_dh(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
+    def to_dh(self, path: Path, *, force: bool = False) -> None:
         """Write the DH table as CSV, corrected as ``to_urdf`` says."""
         self.model.write("dh", path, self._for_file(), force=force)
 
-    def to_ur_kinematics(
-        self, path: str | os.PathLike[str], *, force: bool = False
-    ) -> None:
+    def to_ur_kinematics(self, path: Path, *, force: bool = False) -> None:
         """Write Universal Robots' kinematics file, corrected as ``to_urdf`` says."""
         self.model.write("ur", path, self._for_file(), force=force)
 
     def to_lerobot(
         self,
-        path: str | os.PathLike[str],
-        servos: str | os.PathLike[str],
+        path: Path,
+        servos: Path,
         *,
         names: Mapping[str, str] | None = None,
         force: bool = False,
@@ -259,9 +259,7 @@ class Calibration(Fit):
     # -- from a file -------------------------------------------------------------------
 
     @classmethod
-    def load(
-        cls, path: str | os.PathLike[str], *, model: Model | None = None
-    ) -> Calibration:
+    def load(cls, path: Path, *, model: Model | None = None) -> Calibration:
         """Read a file that ``save`` wrote; ``model`` is needed if it contains a
         function, which files cannot hold. A ValueError names file and key."""
         content = file.read(path)

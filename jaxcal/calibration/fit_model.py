@@ -99,24 +99,21 @@ def fit_model(
     if prior.by_data and scaled:
         if fitted.error_groups() is None or not exact:
             raise ValueError("Prior.sized() needs an arm, without command_std")
-        fit, misfit_factor = _solve_with_misfit(problem, with_misfit)
-        solution, scales, problem = fit
+        solution, scales, misfit_factor = _solve_with_misfit(problem, with_misfit)
     elif common_noise is None and are_shared(problem):
-        problem, solution, shared = pooled(problem)
+        solution, shared = pooled(problem)
     else:
         solution = solve(problem)
     if common_noise is None and model.default_noise() is not None:
-        problem, solution = _with_levels_apart(problem, solution)
-    fields = _fields(problem, solution, observations, centre)
+        solution = _with_levels_apart(solution)
+    fields = _fields(solution, observations, centre)
     by_noise = fields["joint_covariance"]
     if by_noise is not None:  # count what was estimated besides: scales and misfit
         if scales is not None:
-            added = covariance_of_scales(problem, solution, scales)
+            added = covariance_of_scales(solution, scales)
             fields["joint_covariance"] = by_noise + added
-        if with_misfit is not problem.model:
-            fields |= _misfit(
-                with_misfit, problem, solution, fields, by_noise, misfit_factor
-            )
+        if with_misfit is not solution.problem.model:
+            fields |= _misfit(with_misfit, solution, fields, by_noise, misfit_factor)
     origin = {"noise_levels": shared} if shared else {}
     if stated:
         origin["prior"] = "stated"
@@ -194,20 +191,17 @@ def _distinct_weights(
     return distinct, _used(distinct)
 
 
-# A solution, the scales of its prior by the readings, and the problem with that prior.
-_ScaledFit = tuple[FitSolution, PriorScales, FitProblem]
-
-
 def _solve_with_misfit(
     problem: FitProblem, with_misfit: Model
-) -> tuple[_ScaledFit, float]:
-    """The fit, misfit fitted too where the readings tell it, and its factor."""
-    fit = _solve_with_scales(problem)
+) -> tuple[FitSolution, PriorScales, float]:
+    """The fit with scales of its prior by the readings, misfit fitted too where these
+    tell it, and its factor."""
+    solution, scales = _solve_with_scales(problem)
     if with_misfit is problem.model:
-        return fit, 1.0
-    gain, factor = misfit_scale(with_misfit, problem, *fit[:2])
+        return solution, scales, 1.0
+    gain, factor = misfit_scale(with_misfit, problem, solution, scales)
     if gain <= _DECISIVE:
-        return fit, factor
+        return solution, scales, factor
     resolved = with_misfit.default_prior().resolve(with_misfit)
     problem = dataclasses.replace(
         problem,
@@ -216,24 +210,22 @@ def _solve_with_misfit(
         precision=resolved.precisions,
         free=resolved.free,
     )
-    return _solve_with_scales(problem), factor
+    return *_solve_with_scales(problem), factor
 
 
-def _with_levels_apart(
-    problem: FitProblem, solution: FitSolution
-) -> tuple[FitProblem, FitSolution]:
+def _with_levels_apart(solution: FitSolution) -> FitSolution:
     """The fit with a level of noise for each output where the residuals ask for it."""
-    if levels_differ(problem, solution):
-        levels = np.arange(len(problem.levels))
-        apart = dataclasses.replace(problem, levels=levels)
+    if levels_differ(solution):
+        levels = np.arange(len(solution.problem.levels))
+        apart = dataclasses.replace(solution.problem, levels=levels)
         other = solve(apart, solution)
         if other.freedom.min() >= 1.0:
-            return apart, other
-    return problem, solution
+            return other
+    return solution
 
 
-def _solve_with_scales(problem: FitProblem) -> _ScaledFit:
-    solution, scaled = solve(problem, rough=True), problem
+def _solve_with_scales(problem: FitProblem) -> tuple[FitSolution, PriorScales]:
+    solution = solve(problem, rough=True)
     scales: PriorScales | None = None
     for last in (False, True):
         scales = group_scales(problem, solution, scales)
@@ -242,7 +234,7 @@ def _solve_with_scales(problem: FitProblem) -> _ScaledFit:
         )
         solution = solve(scaled, solution, rough=not last)
     assert scales is not None
-    return solution, scales, scaled
+    return solution, scales
 
 
 def _centre(
@@ -267,7 +259,6 @@ def _centre(
 
 def _misfit(
     with_misfit: Model,
-    problem: FitProblem,
     solution: FitSolution,
     fields: dict[str, Any],
     within: Array,
@@ -276,6 +267,7 @@ def _misfit(
     """The fields with harmonics that were not fitted, but may be there, and bend what
     was fitted. ``within`` is the covariance (P, P) of the parameters by the noise
     alone, ``times`` the size of the default prior's harmonics."""
+    problem = solution.problem
     count = len(with_misfit.names) - len(problem.mean)
     std = times * np.asarray(with_misfit.default_prior().std)[-count:]
     none = np.zeros(count)
@@ -283,7 +275,7 @@ def _misfit(
     waves = derivative(with_misfit, problem.commands, theta)[..., -count:]
     white = solution.whitened(waves * std) / solution.level[:, None]
     gram = np.einsum(
-        "n,nrf,nrw->fw", _information_shares(problem, solution), solution.rows, white
+        "n,nrf,nrw->fw", _information_shares(solution), solution.rows, white
     )
     turned = within[:, problem.free] @ gram
     joint = np.zeros((len(theta), len(theta)))
@@ -302,23 +294,21 @@ def _misfit(
     }
 
 
-def _information_shares(problem: FitProblem, solution: FitSolution) -> Array:
+def _information_shares(solution: FitSolution) -> Array:
     """(N,) how much each measurement says, one in full."""
-    if problem.loss is None:
+    if solution.problem.loss is None:
         return solution.weights
-    _, mean, efficiency = constants(problem.loss, solution.num_readings)
+    _, mean, efficiency = constants(solution.problem.loss, solution.num_readings)
     return np.asarray(efficiency * np.minimum(1.0, solution.weights / mean))
 
 
 def _fields(
-    problem: FitProblem,
-    solution: FitSolution,
-    observations: _Observations,
-    centre: Array | None,
+    solution: FitSolution, observations: _Observations, centre: Array | None
 ) -> dict[str, Any]:
+    problem = solution.problem
     commands, used = observations.commands, observations.used
-    covariance, null = _covariance(problem, solution)
-    noise_std, noise_dof = _noise_level(problem, solution)
+    covariance, null = _covariance(solution)
+    noise_std, noise_dof = _noise_level(solution)
     estimate, mean = solution.parameters, problem.mean
     if centre is not None:
         back = np.asarray(problem.model.centred(-centre))
@@ -359,14 +349,13 @@ def _fields(
     }
 
 
-def _noise_level(
-    problem: FitProblem, solution: FitSolution
-) -> tuple[Array | None, float]:
+def _noise_level(solution: FitSolution) -> tuple[Array | None, float]:
     """(q,) noise of a reading of weight 1, None where nothing tells, and its degrees of
     freedom, 0 where it was given."""
-    mean_square = (problem.reading_std**2).sum(axis=0) / len(problem.reading_std)
+    reading_std = solution.problem.reading_std
+    mean_square = (reading_std**2).sum(axis=0) / len(reading_std)
     std = solution.level * np.sqrt(mean_square)
-    if problem.noise_known:
+    if solution.problem.noise_known:
         return std, 0.0
     same = solution.level[:, None] == solution.level
     freedom = float((same @ solution.freedom).min())
@@ -375,16 +364,15 @@ def _noise_level(
     return std, freedom
 
 
-def _covariance(
-    problem: FitProblem, solution: FitSolution
-) -> tuple[Array, Array | None]:
+def _covariance(solution: FitSolution) -> tuple[Array, Array | None]:
     """(P, P) of what is determined, and directions (z, P) of what is not."""
+    problem = solution.problem
     size, free = len(problem.mean), np.flatnonzero(problem.free)
     covariance = np.zeros((size, size))
     if solution.root is not None:
         covariance[free[:, None], free] = solution.root @ solution.root.T
         return covariance, None
-    root_shares = np.sqrt(_information_shares(problem, solution))
+    root_shares = np.sqrt(_information_shares(solution))
     rows = (root_shares[:, None, None] * solution.rows).reshape(-1, len(free))
     rows = np.concatenate([rows, problem.model.facts(solution.parameters)[1][:, free]])
     precision = problem.precision[free]
@@ -407,25 +395,22 @@ def _covariance(
         of_rows += int(significant(alone, off=off).sum())
     factor, unseen = np.concatenate(root) / scale, np.concatenate(null) / scale
     if len(unseen):
-        _require_readings(problem, solution, of_rows, len(unseen))
+        _require_readings(solution, of_rows, len(unseen))
     directions = np.zeros((len(unseen), size))
     directions[:, free] = unseen
     covariance[free[:, None], free] = factor.T @ factor
     return covariance, directions if len(directions) else None
 
 
-def _require_readings(
-    problem: FitProblem, solution: FitSolution, used: int, undetermined: int
-) -> None:
+def _require_readings(solution: FitSolution, used: int, undetermined: int) -> None:
     """Refuse readings of which all are ``used`` up, with parameters undetermined."""
+    problem = solution.problem
     readings = solution.num_readings * len(problem.commands)
     if used < readings:
         return
     prior = solution.parameters, problem.precision, problem.free
-    words = "; ".join(
-        direction.words
-        for direction in unknown(problem.model, problem.commands, *prior)
-    )
+    directions = unknown(problem.model, problem.commands, *prior)
+    words = "; ".join(direction.words for direction in directions)
     raise ValueError(
         f"measured has {readings} independent readings, too few for "
         f"{int(problem.free.sum())} free parameters: {undetermined} combinations of "

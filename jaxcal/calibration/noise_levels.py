@@ -56,41 +56,40 @@ def are_shared(problem: FitProblem) -> bool:
     return bool((moved.sum(axis=0) > 1)[problem.free].any())
 
 
-def pooled(problem: FitProblem) -> tuple[FitProblem, FitSolution, str]:
+def pooled(problem: FitProblem) -> tuple[FitSolution, str]:
     """The fit with as many levels of noise as the readings, independent and each with a
     level of its own in ``problem``, tell; and which, in words."""
     q = len(problem.levels)
     levels = _Levels(_ONE.format(q), np.zeros(q, np.intp), None, 1)
-    fitted = _with(problem, levels)
     try:
-        solution = solve(fitted)
+        solution = solve(_with(problem, levels))
     except ValueError:  # readings in other units may not converge together
-        return problem, solve(problem), _OWN.format(q)
+        return solve(problem), _OWN.format(q)
     for _ in range(_ROUNDS):
-        better = _best(*_squares(problem, fitted, solution))
+        better = _best(*_squares(problem, solution))
         if better.says == levels.says:  # a profile by less than it is known to
             off = 0.0
             if better.profile is not None and levels.profile is not None:
                 off = np.abs(np.log(better.profile / levels.profile)).max()
             if off < _SAME:
                 break
-        levels, fitted = better, _with(problem, better)
-        solution = solve(fitted, solution)
-    return fitted, solution, levels.says
+        levels = better
+        solution = solve(_with(problem, levels), solution)
+    return solution, levels.says
 
 
-def levels_differ(problem: FitProblem, solution: FitSolution) -> bool:
+def levels_differ(solution: FitSolution) -> bool:
     """Whether levels that are shared contradict the residuals (F test, 0.1 %). Those
     without what is known besides: a wrong distance of two sockets is no noise along
     it."""
-    q = len(solution.freedom)
+    q, problem = len(solution.freedom), solution.problem
     if problem.noise_known or q == 1 or problem.command_std.any():
         return False
     if solution.freedom.min() < 1.0:
         return False
     from scipy import special
 
-    white = solution.white / solution.level - _by_facts(problem, solution)
+    white = solution.white / solution.level - _by_facts(solution)
     variance = solution.weights @ white**2 / solution.freedom
     high, low = int(variance.argmax()), int(variance.argmin())
     ratio = variance[high] / max(variance[low], np.finfo(np.float64).tiny)
@@ -98,10 +97,10 @@ def levels_differ(problem: FitProblem, solution: FitSolution) -> bool:
     return bool(chance * q * (q - 1) < 1e-3)
 
 
-def _by_facts(problem: FitProblem, solution: FitSolution) -> Array:
+def _by_facts(solution: FitSolution) -> Array:
     """(N, q) how far residuals are off by facts (``Model.facts``), in their noise."""
-    off, _ = problem.model.facts(solution.parameters)
-    if not len(off):
+    problem = solution.problem
+    if not len(solution.facts):
         return np.zeros_like(solution.white)
     slopes = solution.by_theta / solution.level[:, None]
     prior = np.sqrt(problem.precision[problem.free])
@@ -129,11 +128,9 @@ def _with(problem: FitProblem, levels: _Levels) -> FitProblem:
     )
 
 
-def _squares(
-    problem: FitProblem, fitted: FitProblem, solution: FitSolution
-) -> tuple[Array, Array]:
+def _squares(problem: FitProblem, solution: FitSolution) -> tuple[Array, Array]:
     """(q,) sums of squares at level 1, and their degrees of freedom."""
-    white = solution.white * (problem.white / fitted.white)
+    white = solution.white * (problem.white / solution.problem.white)
     square = solution.weights @ white**2
     if problem.loss is not None:
         square = square / constants(problem.loss, solution.num_readings)[0]

@@ -16,7 +16,6 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.calibration.least_squares import FitProblem, FitSolution
 from jaxcal.checks import Array
@@ -40,7 +39,6 @@ class PriorScales(NamedTuple):
 
     logs: Array  # (G + 1,) of the groups' factors and the level
     factors: Array  # (p,) 1 of parameters of no group
-    groups: NDArray[np.int64]  # (p,) -1 of no group
     covariance: Array  # (G, G) of the logarithms of the groups' factors
 
 
@@ -72,7 +70,7 @@ def group_scales(
     factors = np.ones(p)
     factors[groups >= 0] = np.exp(best[groups[groups >= 0]])
     if start is None:  # of a rough fit, which begin the next
-        return PriorScales(best, factors, groups, np.zeros((num_groups, num_groups)))
+        return PriorScales(best, factors, np.zeros((num_groups, num_groups)))
     steps = 1e-3 * np.eye(len(best))
     curves = [
         _EvidenceOfScales(evidence, best + step).slope - least.slope for step in steps
@@ -83,7 +81,7 @@ def group_scales(
     size, axes = np.linalg.eigh(curve)
     axes = wide[:, None] * axes
     inside = (axes / np.maximum(size, 1.0)) @ axes.T
-    return PriorScales(best, factors, groups, inside[:num_groups, :num_groups])
+    return PriorScales(best, factors, inside[:num_groups, :num_groups])
 
 
 def _thought(groups: ErrorGroups) -> tuple[Array, Array]:
@@ -214,13 +212,13 @@ def misfit_scale(
     return float(gains[0] - gains.min()), float(np.sqrt(square))
 
 
-def covariance_of_scales(
-    problem: FitProblem, solution: FitSolution, scales: PriorScales
-) -> Array:
+def covariance_of_scales(solution: FitSolution, scales: PriorScales) -> Array:
     """(P, P) what the scales, which are estimates too, add to the covariance: mean and
     covariance of a linear model's parameters are averaged over them."""
+    problem, of_model = solution.problem, solution.problem.model.error_groups()
+    assert of_model is not None
     free = problem.free
-    groups = scales.groups[free]
+    groups = of_model.members[free]
     weights = np.sqrt(np.minimum(solution.weights, 1.0))[:, None, None]
     rows = (weights * solution.rows).reshape(-1, solution.rows.shape[-1])
     fact_rows = problem.model.facts(solution.parameters)[1][:, free]
@@ -240,8 +238,6 @@ def covariance_of_scales(
         inverse = np.linalg.inv(square + np.diag(scale**2 * precision * factor)) - none
         return inverse @ right, inverse
 
-    of_model = problem.model.error_groups()
-    assert of_model is not None
     variance = np.diagonal(scales.covariance)
     there = of_model.medians >= 1.0  # else misfit, which may not be there
     above, tailed = _moments(variance, _thought(of_model)[1][:-1])

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from jaxcal.checks import Array, axis_letter, whole_number
 from jaxcal.information.regression import regressors
-from jaxcal.models.model import Model, as_commands, as_parameters
+from jaxcal.models.model import Model, Theta, as_commands, as_parameters
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,16 +49,12 @@ class Affine(Model):
         slopes = np.eye(self.num_outputs, self.num_inputs)
         return np.concatenate([slopes.ravel(), np.zeros(self.num_outputs)])
 
-    def predict(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def predict(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """Outputs (N, m) at commands (N, n) for parameters (m (n + 1),)."""
         matrix, bias = self.affine(as_parameters(self, parameters))
         return as_commands(self, commands) @ matrix.T + bias
 
-    def jacobian(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """(N, m, m (n + 1)) derivative of the outputs; ``parameters`` do not matter."""
         commands = as_commands(self, commands)
         (count, n), m = commands.shape, self.num_outputs
@@ -68,9 +64,7 @@ class Affine(Model):
         slopes[:, :, m * n :] = np.eye(m)
         return slopes
 
-    def command_jacobian(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def command_jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """(N, m, n): the matrix A for every command."""
         count = len(as_commands(self, commands))
         slopes = as_parameters(self, parameters)[: self.num_outputs * self.num_inputs]

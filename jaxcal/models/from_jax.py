@@ -12,7 +12,13 @@ from numpy.typing import ArrayLike
 
 from jaxcal.checks import Array, numbers, table, whole_number
 from jaxcal.extras import needs
-from jaxcal.models.model import Model, as_commands, as_parameters, parameter_names
+from jaxcal.models.model import (
+    Model,
+    Theta,
+    as_commands,
+    as_parameters,
+    parameter_names,
+)
 from jaxcal.models.predictions import checked_periods
 
 
@@ -76,21 +82,15 @@ class FromJax(Model):
         """(q,) of readings that wrap."""
         return self._periods
 
-    def predict(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def predict(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """Outputs (N, q) at commands (N, n)."""
         return self._run(0, commands, parameters)
 
-    def jacobian(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """(N, q, p)."""
         return self._run(1, commands, parameters)
 
-    def command_jacobian(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def command_jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """(N, q, n)."""
         return self._run(2, commands, parameters)
 

@@ -24,6 +24,7 @@ from jaxcal.checks import (
 from jaxcal.models.differences import STENCILS, Differences, combined, look
 from jaxcal.models.model import (
     Model,
+    Theta,
     as_commands,
     as_parameters,
     by_name,
@@ -143,21 +144,15 @@ class FromFunction(Model):
 
     # -- f and its derivatives ---------------------------------------------------------
 
-    def predict(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def predict(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """Outputs (N, q) at commands (N, n), NaN where f fails."""
         return self._remembered(self._values, commands, parameters)
 
-    def jacobian(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """(N, q, p), NaN where f fails."""
         return self._remembered(self._by_parameters, commands, parameters)
 
-    def command_jacobian(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def command_jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """(N, q, n), NaN where f fails."""
         return self._remembered(self._by_commands, commands, parameters)
 

@@ -13,7 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import Array, axis_names, numbers, whole_number
 from jaxcal.models.formula import Levels, input_names, parse
-from jaxcal.models.model import Model, as_commands, as_parameters, parameter_names
+from jaxcal.models.model import (
+    Model,
+    Theta,
+    as_commands,
+    as_parameters,
+    parameter_names,
+)
 
 
 class Linear(Model):
@@ -101,25 +107,19 @@ class Linear(Model):
         """(p,) zeros: the model is linear, so any start will do."""
         return np.zeros(self.num_parameters)
 
-    def predict(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def predict(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """Outputs (N, m) at commands (N, n), or at a data frame with their names."""
         coefficients = as_parameters(self, parameters)
         features = self._evaluate(as_commands(self, commands))
         return features @ coefficients.reshape(self.num_outputs, -1).T
 
-    def jacobian(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """(N, m, m r): the features; ``parameters`` do not matter."""
         features = self._evaluate(as_commands(self, commands))
         whole = np.einsum("ab,nr->nabr", np.eye(self.num_outputs), features)
         return whole.reshape(-1, self.num_outputs, self.num_parameters)
 
-    def command_jacobian(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def command_jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """(N, m, n); of a function by differences, exact to about 1e-9."""
         coefficients = as_parameters(self, parameters).reshape(self.num_outputs, -1)
         slopes = self._slopes(as_commands(self, commands))

@@ -23,6 +23,7 @@ from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.tables import COMMANDS, header_of, of_frame
 
 Rows = NDArray[np.intp]
+Theta = ArrayLike | None  # parameters (p,); None: the nominal ones
 
 _NOTHING_KNOWN = Prior(np.inf)
 
@@ -72,21 +73,15 @@ class Model(abc.ABC):
     # -- f and its derivatives ---------------------------------------------------------
 
     @abc.abstractmethod
-    def predict(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def predict(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """Outputs (N, q) at commands (N, n)."""
 
     @abc.abstractmethod
-    def jacobian(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """(N, q, p) derivative of the outputs by the parameters."""
 
     @abc.abstractmethod
-    def command_jacobian(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def command_jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """(N, q, n) derivative of the outputs by the commands."""
 
     def leverage_slopes(
