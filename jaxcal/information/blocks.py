@@ -80,9 +80,7 @@ def _centred(
         scale = power_of_two(largest)
         largest = largest / scale
         blocks, first = blocks / scale[:, None, None], first / scale[:, None, None]
-        columns, ordered = (
-            array / scale[:, None, :, None] for array in (columns, ordered)
-        )
+        columns, ordered = (x / scale[:, None, :, None] for x in (columns, ordered))
         root = root / scale[:, None]
     where_far, dense = _far(ordered, largest, same) if look else (None, None)
     shift, constant = None, first[:, 0] * same
@@ -351,19 +349,14 @@ def whiten(
     white = white[:, : num * q].reshape(blocks.shape)
     for part in (white, prior, back, inverse):
         part.flags.writeable = False
+    none = [None] * sets
+    parts = zip(
+        white, prior, back, none if sizes is None else sizes, log_det.tolist(),
+        none if shift is None else shift, inverse, strict=True,
+    )  # fmt: skip
     return [
-        None
-        if singular[n]
-        else WhiteBlocks(
-            white[n],
-            prior[n],
-            back[n],
-            None if sizes is None else sizes[n],
-            value,
-            None if shift is None else shift[n],
-            inverse[n],
-        )
-        for n, value in enumerate(log_det.tolist())
+        None if alone else WhiteBlocks(*part)
+        for part, alone in zip(parts, singular, strict=True)
     ]
 
 

@@ -66,16 +66,10 @@ def regression_matrix(commands: ArrayLike, num_outputs: int | None = None) -> Ar
 
 
 def log_det_gram(commands: ArrayLike) -> Array:
-    """Log-determinant of ``Z.T @ Z``, computed about the centroid.
+    """(...,) log det of ``Z.T @ Z`` of commands (..., N, n); ``-inf`` where singular.
 
     ``det(Z.T Z) = N det(C.T C)`` with C the commands less their mean, which keeps every
     digit when the commands lie far from zero (encoder pulses, say).
-
-    Args:
-        commands: (..., N, n).
-
-    Returns:
-        (...,) natural log; ``-inf`` where the postures span fewer than n dimensions.
     """
     z = regressors(commands)
     *batch, count, p = z.shape
@@ -86,10 +80,7 @@ def log_det_gram(commands: ArrayLike) -> Array:
 def log_det_information(
     commands: ArrayLike, num_outputs: int | None = None
 ) -> float | Array:
-    """Log-determinant of the information matrix ``S``.
-
-    The outputs share one regressor, so the 12 x 12 determinant is the cube of a 4 x 4
-    one: ``log det S = m log det(Z.T @ Z)``.
+    """Log-determinant of the information matrix ``S``, ``m log det(Z.T @ Z)``.
 
     Args:
         commands: (..., N, n) in the unit the value is to be quoted in.

@@ -66,10 +66,10 @@ class Affine(Model):
 
     def command_jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """(N, m, n): the matrix A for every command."""
-        count = len(as_commands(self, commands))
-        slopes = as_parameters(self, parameters)[: self.num_outputs * self.num_inputs]
-        shape = (self.num_outputs, self.num_inputs)
-        return np.broadcast_to(slopes.reshape(shape), (count, *shape))
+        matrix, _ = self.affine(as_parameters(self, parameters))
+        return np.broadcast_to(
+            matrix, (len(as_commands(self, commands)), *matrix.shape)
+        )
 
     def blocks(self, commands: ArrayLike) -> Array:
         """(..., N, 1, n + 1) information blocks [u, 1] of commands (..., N, n)."""

@@ -306,16 +306,14 @@ class FromFunction(Model):
 
     def _by_commands(self, rows: Array, theta: Array) -> Array:
         steps = self._steps_for("commands", rows, theta)
-        points = []
-        for i, (side, step) in enumerate(zip(steps.sides, steps.steps, strict=True)):
-            for offset in STENCILS[side].offsets * step:
-                moved = rows.copy()
-                moved[:, i] += offset
-                points.append(moved)
-        values = self._run([(np.concatenate(points), theta)])[0]
+        offsets = [STENCILS[side].offsets for side in steps.sides] * steps.steps[
+            :, None
+        ]
+        moves = np.eye(len(offsets))[:, None] * offsets[..., None]  # (n, 4, n)
+        points = rows + moves.reshape(-1, 1, rows.shape[1])
+        values = self._run([(points.reshape(-1, rows.shape[1]), theta)])[0]
         values = values.reshape(len(points), len(rows), -1)
-        sides = self._sides(steps, rows)
-        return self._slopes(steps, rows, [*values], sides)
+        return self._slopes(steps, rows, [*values], self._sides(steps, rows))
 
     @staticmethod
     def _sides(steps: Differences, rows: Array) -> NDArray[np.int8]:

@@ -9,13 +9,12 @@ from collections.abc import Mapping, Sequence
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """A recording of an arm that rested at each of several postures.
+    """A recording of an arm that rested at each of several postures, as commands.
 
-    ``identify`` and ``check`` take it as commands. Joints are found by name; what the
-    sensor read is the mean over each rest, of the bag's messages: points or poses
-    (geometry_msgs PointStamped, PoseStamped; of a board in the camera too), lengths of
-    a wire (sensor_msgs Range, std_msgs Float64), accelerations (sensor_msgs Imu),
-    wrenches (WrenchStamped), in metres, radians, newtons; contacts need none.
+    Joints are found by name; readings are the mean over each rest of the bag's points
+    or poses (geometry_msgs PointStamped, PoseStamped; of a board in the camera too),
+    lengths of a wire (sensor_msgs Range, std_msgs Float64), accelerations (sensor_msgs
+    Imu), wrenches (WrenchStamped), in metres, radians, newtons; contacts need none.
 
     Attributes:
         path: rosbag2 folder or MCAP file (extra ``ros``), or the folder of a LeRobot
