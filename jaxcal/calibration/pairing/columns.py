@@ -151,22 +151,19 @@ def _distance(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
     """Log size of what is off before anything is fitted that a prior is known of."""
     off = table.residuals(hypothesis, rows, table.theta)
     if table.flat:
-        with contextlib.suppress(ValueError):
-            off = _flat_fit(table, hypothesis, rows)
-    size = np.log(np.median(np.abs(off), axis=0) + 1e-300).sum()
-    change = hypothesis.change
-    return (
-        float(size - (change.log_size if change else 0.0)) if size == size else np.inf
-    )
-
-
-def _flat_fit(table: Table, hypothesis: Hypothesis, rows: Rows) -> Array:
-    """(K, q) residuals of least squares about ``theta``."""
-    slopes, right = table.system(hypothesis, rows)
-    flat = slopes.reshape(-1, slopes.shape[-1])
-    known = table.ridge(flat.shape[1])
-    solution = solved(flat.T @ flat, flat.T @ right.reshape(len(flat), -1), known)
-    return np.asarray((right - slopes @ solution).reshape(len(rows), -1))
+        with contextlib.suppress(ValueError):  # least squares about ``theta``
+            slopes, right = table.system(hypothesis, rows)
+            flat, known = (
+                slopes.reshape(-1, slopes.shape[-1]),
+                table.ridge(slopes.shape[-1]),
+            )
+            aim = flat.T @ right.reshape(len(flat), -1)
+            solution = solved(flat.T @ flat, aim, known)
+            off = np.asarray((right - slopes @ solution).reshape(len(rows), -1))
+    size = float(np.log(np.median(np.abs(off), axis=0) + 1e-300).sum())
+    if hypothesis.change is not None:
+        size -= hypothesis.change.log_size
+    return size if size == size else np.inf
 
 
 def _anew(table: Table, hypothesis: Hypothesis, rows: Rows) -> Table | None:

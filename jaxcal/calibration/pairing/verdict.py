@@ -25,13 +25,8 @@ _READINGS = 3  # for each parameter
 
 
 def against(verdict: Verdict, fit: Calibration) -> Verdict:
-    """The verdict, which no calibration passes of a mispaired table, outliers that hide
-    in its noise, or a curve.
-
-    Args:
-        verdict: of the fit by itself.
-        fit: the calibration.
-    """
+    """The verdict of the fit by itself, which no calibration passes of a mispaired
+    table, outliers that hide in its noise, or a curve."""
     pairing = fit.mispairing
     if pairing is None:
         follow = ("outlier", "The noise you gave")  # from these rows, or the curve
