@@ -65,7 +65,7 @@ class Calibration(Fit):
             + f", {self.loss} loss"
         ]
         lines += [f"  {line}" for line in aligned(self._parameter_rows(), "<")]
-        unit = f" {self.measured_unit}" if self.measured_unit else ""
+        unit = f" {self.measured_unit}".rstrip()
         size = np.sqrt(np.mean(self.residuals**2, axis=0))
         lack = self.lack_of_fit()
         lines.append(

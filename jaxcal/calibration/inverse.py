@@ -165,7 +165,7 @@ class Responses:
 
     def require_sure(self, centre: Array) -> tuple[Array, Array, Array, Array]:
         """``require_regular`` of an affine map, and by more than its noise."""
-        turn, singular, right, rows = self.require_regular(centre)
+        parts = self.require_regular(centre)
         sure, last = _sureness(self.fit, self.spread)
         if sure < _SURE:
             raise ValueError(
@@ -173,7 +173,7 @@ class Responses:
                 "standard deviations from zero. Within the noise, "
                 f"{self._insensitive(last)}"
             )
-        return turn, singular, right, rows
+        return parts
 
     def require_regular(self, commands: Array) -> tuple[Array, Array, Array, Array]:
         """Refuse commands at which a direction of the outputs does not respond; the

@@ -235,9 +235,8 @@ class _Curve:
         slope, square = 0.5 * (outputs[2] - outputs[0]), allowed**2
         bend = 0.5 * (square[2] + square[0]) - square[1]
         tilt = 0.5 * (square[2] - square[0])
-        off = reading - outputs[1]
+        off, name = reading - outputs[1], self.fit.output_names[0]
         if slope == 0.0:
-            name = self.fit.output_names[0]
             raise ValueError(
                 f"inverse needs {name} to depend on the command: the slope is 0"
             )
