@@ -153,12 +153,9 @@ def _distance(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
     if table.flat:
         with contextlib.suppress(ValueError):  # least squares about ``theta``
             slopes, right = table.system(hypothesis, rows)
-            flat, known = (
-                slopes.reshape(-1, slopes.shape[-1]),
-                table.ridge(slopes.shape[-1]),
-            )
+            flat = slopes.reshape(-1, slopes.shape[-1])
             aim = flat.T @ right.reshape(len(flat), -1)
-            solution = solved(flat.T @ flat, aim, known)
+            solution = solved(flat.T @ flat, aim, table.ridge(flat.shape[1]))
             off = np.asarray((right - slopes @ solution).reshape(len(rows), -1))
     size = float(np.log(np.median(np.abs(off), axis=0) + 1e-300).sum())
     if hypothesis.change is not None:
