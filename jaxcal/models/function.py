@@ -306,9 +306,8 @@ class FromFunction(Model):
 
     def _by_commands(self, rows: Array, theta: Array) -> Array:
         steps = self._steps_for("commands", rows, theta)
-        offsets = [STENCILS[side].offsets for side in steps.sides] * steps.steps[
-            :, None
-        ]
+        offsets = np.array([STENCILS[side].offsets for side in steps.sides])
+        offsets = offsets * steps.steps[:, None]
         moves = np.eye(len(offsets))[:, None] * offsets[..., None]  # (n, 4, n)
         points = rows + moves.reshape(-1, 1, rows.shape[1])
         values = self._run([(points.reshape(-1, rows.shape[1]), theta)])[0]
