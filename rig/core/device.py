@@ -204,6 +204,7 @@ class Device:
                 drive.mirror_limits()
         self.imu.latest()
         self.line_watch.apply()
+        self.rest = tuple(d.last.position for d in self.drives if d.last)
         self.armed = True
         self.heartbeat.start()
 

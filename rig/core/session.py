@@ -162,7 +162,9 @@ def take_zero(
     if moves:  # or the zero is measured first, where the device was put
         show(device)
     device.emit("phase", phase="zeroing")
-    zero = Posture("zero", at or device.positions())
+    here = device.positions()
+    device.check_untouched(here)  # since it was found
+    zero = Posture("zero", at or here)
     standing = Arrival(device, zero)
     if moves:
         standing = move(device, zero)  # from the side of all references

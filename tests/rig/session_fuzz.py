@@ -140,6 +140,7 @@ class World:
         self._beats = self._beating = False  # whether the line is free for the heart
         self.asleep = self.ended = False
         self.booting: dict[FuzzDrive, float] = {}  # silent until then
+        self.jogged: dict[FuzzDrive, float] = {}  # when another moved it
         self.wire_share = 0.0
         self._answers_stop: set[int] = set()
 
@@ -212,9 +213,8 @@ class World:
             if not axis.min_deg - 1.0 <= angle <= axis.max_deg + 1.0:
                 self.breaks(f"{axis.name} is at {angle:.2f} degrees")
             speed = abs(drive.velocity) / abs(drive.pulses_per_deg)
-            if speed > 2.0 * min(
-                axis.speed_deg_s, drive._speed / abs(drive.pulses_per_deg)
-            ):
+            most = min(axis.speed_deg_s, drive._speed / abs(drive.pulses_per_deg))
+            if speed > 2.0 * most and not self.just_jogged(drive):
                 self.breaks(f"{axis.name} moves at {speed:.1f} degrees/s")
         if self.now > 100.0 + MOST_S:
             raise Broken("the session does not end")
@@ -312,6 +312,11 @@ class World:
         target = round(angle * drive.pulses_per_deg) + drive.offset
         speed = 20.0 * abs(drive.pulses_per_deg)
         drive._move(target, speed, 10.0 * speed)
+        self.jogged[drive] = self.now
+
+    def just_jogged(self, drive: FuzzDrive) -> bool:
+        """Whether another moved it since a session can have looked, or slows it down."""
+        return self.now - self.jogged.get(drive, -1e9) < 0.5
 
     def reconnect(self) -> None:
         if self.imu is not None and not self.dead:
@@ -529,7 +534,8 @@ def require_true(world: World, record: dict) -> None:
     ):
         drive.advance()
         off = abs(drive.position - drive.offset - pulses) / abs(drive.pulses_per_deg)
-        if off > world.config.motion.position_tolerance_deg + 0.01:
+        tolerance = world.config.motion.position_tolerance_deg + 0.01
+        if off > tolerance and not world.just_jogged(drive):
             world.breaks(f"{record['name']}: {axis.name} is {off:.2f} degrees away")
     seen = np.array(record["attitude"])
     turned = world.plant.attitude().T @ seen  # of the phone as mounted
@@ -542,7 +548,7 @@ def require_stopped(world: World, event: dict, before: list[int]) -> None:
     """Who is said to stand stands, and who is said to have answered was asked."""
     for unit, drive, stops in zip(event["units"], world.drives, before, strict=True):
         drive.advance()
-        if unit["standing"] and drive.velocity:
+        if unit["standing"] and drive.velocity and not world.just_jogged(drive):
             world.breaks(f"{unit['axis']} is said to stand, and moves")
         if unit["acknowledged"] and len(drive.stops) == stops:
             world.breaks(f"{unit['axis']} is said to have answered, and was not asked")

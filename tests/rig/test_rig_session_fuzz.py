@@ -30,6 +30,13 @@ def test_a_thousand_more(first):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.parametrize("number", [2668, 2877, 3056, 3156])
+def test_sessions_that_broke_a_promise_once(number):
+    """A drive lost its origin between being armed and the zero; jogs are others'."""
+    done = played(number, 1)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_a_session_follows_from_its_number():
     one, again = played(2, 1), played(2, 1)
     assert one.stdout.splitlines()[:-1] == again.stdout.splitlines()[:-1]
